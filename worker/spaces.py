@@ -1,0 +1,71 @@
+"""What the numbers of an observation and an action mean, for every task: names, units, ranges.
+
+The simulator fills observations in this order, the learning code reads them by name, and the bundle's manifest repeats
+the table for whoever connects a real robot.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Field:
+    """One named stretch of an observation or action vector."""
+
+    name: str
+    size: int
+    unit: str
+    low: float
+    high: float
+    meaning: str
+
+
+@dataclass(frozen=True)
+class Space:
+    """An ordered list of fields, flattened into one vector."""
+
+    fields: tuple[Field, ...]
+
+    @property
+    def size(self) -> int:
+        """Length of the flattened vector."""
+        return sum(field.size for field in self.fields)
+
+    def slices(self) -> Iterator[tuple[Field, slice]]:
+        """Every field with its place in the vector."""
+        start = 0
+        for field in self.fields:
+            yield field, slice(start, start + field.size)
+            start += field.size
+
+    def slice_of(self, name: str) -> slice:
+        """The place of one field in the vector. Raises KeyError for a name the space does not have."""
+        for field, place in self.slices():
+            if field.name == name:
+                return place
+        known = ", ".join(field.name for field in self.fields)
+        raise KeyError(f"No field {name!r}; this space has {known}.")
+
+
+CONTROL_STEP_S = 0.1
+
+FEEDING_OBSERVATION = Space(
+    (
+        Field("spoon_position_m", 3, "m", -1.5, 1.5, "centre of the spoon's bowl, in the robot base frame"),
+        Field("spoon_forward", 3, "1", -1.0, 1.0, "unit vector along the spoon towards its tip, base frame"),
+        Field("spoon_up", 3, "1", -1.0, 1.0, "unit vector out of the spoon's bowl, base frame"),
+        Field("spoon_to_mouth_m", 3, "m", -1.5, 1.5, "mouth centre minus spoon position, base frame"),
+        Field("joint_positions_rad", 7, "rad", -6.2832, 6.2832, "angles of joints 1 to 7"),
+        Field("neck_to_mouth_m", 3, "m", -0.3, 0.3, "mouth centre minus the pivot of the neck, base frame"),
+        Field("face_direction", 3, "1", -1.0, 1.0, "unit vector out of the face, base frame"),
+        Field("force_on_person_n", 1, "N", 0.0, 50.0, "summed normal force of arm and spoon on the person"),
+        Field("food_on_spoon", 1, "1", 0.0, 1.0, "share of the portion still on the spoon"),
+        Field("food_eaten", 1, "1", 0.0, 1.0, "share of the portion eaten"),
+    )
+)
+
+JOINT_ACTION = Space(
+    (
+        Field("joint_deltas", 7, "1", -1.0, 1.0, "commanded change of joints 1 to 7, in units of 0.05 rad per step"),
+    )
+)

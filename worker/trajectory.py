@@ -1,0 +1,106 @@
+"""The arrays of one episode, with their shapes checked, and how they are stored (.npz, never pickle)."""
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import IO, Self
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float32]
+
+COSTS = ("C_d", "C_v", "C_f", "C_hf", "C_fd", "C_fdv")
+"""The paper's six preference items (r^H), unweighted and non-negative, one column each."""
+
+SIGNALS = (
+    "distance_m",
+    "speed_m_s",
+    "speed_squared_m2_s2",
+    "acceleration_squared_m2_s4",
+    "near_speed_squared_m2_s2",
+    "force_at_target_n",
+    "force_away_n",
+    "high_force_n",
+    "spilled_on_person",
+    "spilled",
+    "intake_speed_m_s",
+    "height_above_target_m",
+    "lateral_offset_m",
+    "tilt_rad",
+    "undelivered",
+    "action_change_squared",
+)
+"""What a robot can measure about one control step; the structured reward model is linear in these columns."""
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """One episode of T control steps with D observations, S signals and P particles.
+
+    Raises ValueError when an array's shape disagrees with the number of actions.
+    """
+
+    observations: Array
+    """(T + 1, D)"""
+    actions: Array
+    """(T, 7) as executed, in [-1, 1]"""
+    reference_actions: Array
+    """(T, 7) the frozen policy's mean action in the same states"""
+    signals: Array
+    """(T, S) columns as in SIGNALS"""
+    costs: Array
+    """(T, 6) columns as in COSTS"""
+    task_rewards: Array
+    """(T,)"""
+    joint_positions: Array
+    """(T + 1, 7) rad"""
+    particles: Array
+    """(T + 1, P, 3) m in the world frame; NaN once a particle has been eaten or lost"""
+    head_quaternion: Array
+    """(4,) xyzw in the world frame"""
+    contact_force_n: Array
+    """(T,) summed normal force on the person"""
+    success: bool
+    scenario: int
+    task: str
+
+    def __post_init__(self) -> None:
+        steps = len(self.actions)
+        expected = {
+            "observations": (steps + 1, None),
+            "actions": (steps, 7),
+            "reference_actions": (steps, 7),
+            "signals": (steps, len(SIGNALS)),
+            "costs": (steps, len(COSTS)),
+            "task_rewards": (steps,),
+            "joint_positions": (steps + 1, 7),
+            "particles": (steps + 1, None, 3),
+            "head_quaternion": (4,),
+            "contact_force_n": (steps,),
+        }
+        for name, shape in expected.items():
+            _require_shape(name, getattr(self, name), shape)
+
+    def __len__(self) -> int:
+        return len(self.actions)
+
+    def save(self, target: Path | IO[bytes]) -> None:
+        """Write every array and value to one compressed .npz file."""
+        arrays = {field.name: np.asarray(getattr(self, field.name)) for field in fields(self)}
+        np.savez_compressed(target, allow_pickle=False, **arrays)
+
+    @classmethod
+    def load(cls, source: Path | IO[bytes]) -> Self:
+        """Read what save() wrote. Raises ValueError for a file that holds anything but plain arrays."""
+        with np.load(source, allow_pickle=False) as stored:
+            values = {field.name: stored[field.name] for field in fields(cls)}
+        plain = {"success": bool, "scenario": int, "task": str}
+        return cls(**{name: plain[name](value) if name in plain else value for name, value in values.items()})
+
+
+def _require_shape(name: str, array: Array, shape: tuple[int | None, ...]) -> None:
+    matches = array.ndim == len(shape) and all(
+        wanted in (None, got) for wanted, got in zip(shape, array.shape, strict=True)
+    )
+    if not matches:
+        raise ValueError(f"{name} has shape {array.shape}, expected {shape}.")
