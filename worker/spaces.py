@@ -66,6 +66,13 @@ FEEDING_OBSERVATION = Space(
 
 JOINT_ACTION = Space(
     (
-        Field("joint_deltas", 7, "1", -1.0, 1.0, "commanded change of joints 1 to 7, in units of 0.05 rad per step"),
+        Field(
+            "joint_deltas",
+            7,
+            "1",
+            -1.0,
+            1.0,
+            "commanded change of joints 1 to 7, in units of 0.05 rad per step",
+        ),
     )
 )

@@ -1,0 +1,97 @@
+"""Runs of the worker, the models they leave, and the bundles published from them."""
+
+from datetime import datetime
+from enum import StrEnum
+from typing import Any
+
+from sqlalchemy import ForeignKey, String, Text, UniqueConstraint
+from sqlalchemy.orm import Mapped, mapped_column
+
+from app.db import Base, now
+
+
+class RunKind(StrEnum):
+    """What a run makes."""
+
+    CLIPS = "clips"
+    REWARD = "reward"
+    FILTER = "filter"
+
+
+class RunStatus(StrEnum):
+    """Where a run is."""
+
+    RUNNING = "running"
+    SUCCEEDED = "succeeded"
+    FAILED = "failed"
+
+
+class ModelKind(StrEnum):
+    """What a model is."""
+
+    REWARD = "reward"
+    FILTER = "filter"
+
+
+class Run(Base):
+    """One piece of work with its provenance. The workflow id is deterministic, so asking twice is asking once."""
+
+    __tablename__ = "run"
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    workflow_id: Mapped[str] = mapped_column(String(200), unique=True)
+    kind: Mapped[str] = mapped_column(String(20))
+    study_id: Mapped[int] = mapped_column(ForeignKey("study.id"), index=True)
+    participant_id: Mapped[int | None] = mapped_column(ForeignKey("participant.id"), index=True)
+    status: Mapped[str] = mapped_column(String(20), default=RunStatus.RUNNING)
+    stage: Mapped[str] = mapped_column(String(120), default="")
+    progress: Mapped[float] = mapped_column(default=0.0)
+    label_count: Mapped[int | None]
+    label_hash: Mapped[str | None] = mapped_column(String(64))
+    seed: Mapped[int | None]
+    attempt: Mapped[int] = mapped_column(default=1)
+    error: Mapped[str | None] = mapped_column(Text)
+    started_at: Mapped[datetime] = mapped_column(default=now)
+    heartbeat_at: Mapped[datetime] = mapped_column(default=now)
+    finished_at: Mapped[datetime | None]
+
+
+class Model(Base):
+    """The result of one run for one participant."""
+
+    __tablename__ = "model"
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    run_id: Mapped[int] = mapped_column(ForeignKey("run.id"), unique=True)
+    participant_id: Mapped[int] = mapped_column(ForeignKey("participant.id"), index=True)
+    kind: Mapped[str] = mapped_column(String(20))
+    artefact_sha256: Mapped[str] = mapped_column(String(64))
+    label_count: Mapped[int]
+    label_hash: Mapped[str] = mapped_column(String(64))
+    seed: Mapped[int]
+    metrics: Mapped[dict[str, Any]]
+    created_at: Mapped[datetime] = mapped_column(default=now)
+
+
+class Bundle(Base):
+    """A published export of one filter: a zip file that runs without this project."""
+
+    __tablename__ = "bundle"
+    __table_args__ = (UniqueConstraint("participant_id", "version"),)
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    participant_id: Mapped[int] = mapped_column(ForeignKey("participant.id"), index=True)
+    version: Mapped[int]
+    model_id: Mapped[int] = mapped_column(ForeignKey("model.id"), unique=True)
+    artefact_sha256: Mapped[str] = mapped_column(String(64))
+    byte_count: Mapped[int]
+    created_at: Mapped[datetime] = mapped_column(default=now)
+
+
+class WorkerPresence(Base):
+    """A worker's sign of life, so that the dashboard can say when nobody is computing."""
+
+    __tablename__ = "worker_presence"
+
+    name: Mapped[str] = mapped_column(String(80), primary_key=True)
+    last_seen_at: Mapped[datetime] = mapped_column(default=now)

@@ -1,0 +1,97 @@
+"""Queries (two clips side by side) and the append-only record of what was answered."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from enum import StrEnum
+
+from sqlalchemy import CheckConstraint, ForeignKey, String, UniqueConstraint, func, select
+from sqlalchemy.orm import Mapped, Session, mapped_column, relationship
+
+from app.db import Base, now
+from app.domain.clips import Clip
+
+
+class Response(StrEnum):
+    """What can be said about a pair."""
+
+    LEFT = "left"
+    RIGHT = "right"
+    EQUAL = "equal"
+    SKIP = "skip"
+
+
+class Query(Base):
+    """Two clips put to one participant; sides are fixed here and never drawn again."""
+
+    __tablename__ = "query"
+    __table_args__ = (
+        UniqueConstraint("participant_id", "ordinal"),
+        CheckConstraint("left_clip_id <> right_clip_id", name="two_clips"),
+    )
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    participant_id: Mapped[int] = mapped_column(ForeignKey("participant.id"), index=True)
+    ordinal: Mapped[int]
+    left_clip_id: Mapped[int] = mapped_column(ForeignKey("clip.id"), index=True)
+    right_clip_id: Mapped[int] = mapped_column(ForeignKey("clip.id"), index=True)
+    strategy: Mapped[str] = mapped_column(String(40))
+    propensity: Mapped[float]
+    predicted_right: Mapped[float | None]
+    """P(right preferred) by the newest model that had not seen this query's label."""
+    predicted_by_model_id: Mapped[int | None] = mapped_column(ForeignKey("model.id"))
+    created_at: Mapped[datetime] = mapped_column(default=now)
+    served_at: Mapped[datetime | None]
+
+    left_clip: Mapped[Clip] = relationship(foreign_keys=left_clip_id, lazy="raise")
+    right_clip: Mapped[Clip] = relationship(foreign_keys=right_clip_id, lazy="raise")
+
+
+class LabelEvent(Base):
+    """One answer, or the undoing of one. Never changed, never deleted; the highest revision of a query counts.
+
+    UNIQUE(query_id, revision) makes one of twenty racing answers win; UNIQUE(client_uuid) makes a repeat recognisable.
+    """
+
+    __tablename__ = "label_event"
+    __table_args__ = (UniqueConstraint("query_id", "revision"),)
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    query_id: Mapped[int] = mapped_column(ForeignKey("query.id"), index=True)
+    revision: Mapped[int]
+    response: Mapped[str | None] = mapped_column(String(8))
+    """One of Response; None means that the previous answer was undone."""
+    client_uuid: Mapped[str] = mapped_column(String(36), unique=True)
+    response_time_ms: Mapped[int | None]
+    """From the first frame of both videos to the answer; None when not measured."""
+    replay_count: Mapped[int | None]
+    play_error_count: Mapped[int | None]
+    created_at: Mapped[datetime] = mapped_column(default=now)
+
+
+@dataclass(frozen=True)
+class Label:
+    """The answer that counts for one query."""
+
+    query: Query
+    event: LabelEvent
+    response: Response
+
+
+def current_labels(session: Session, participant_id: int) -> Sequence[Label]:
+    """Every answer of the participant that has not been undone, in the order of the queries."""
+    newest = (
+        select(LabelEvent.query_id, func.max(LabelEvent.revision).label("revision"))
+        .join(Query, Query.id == LabelEvent.query_id)
+        .where(Query.participant_id == participant_id)
+        .group_by(LabelEvent.query_id)
+        .subquery()
+    )
+    rows = session.execute(
+        select(Query, LabelEvent)
+        .join(LabelEvent, LabelEvent.query_id == Query.id)
+        .join(newest, (newest.c.query_id == LabelEvent.query_id) & (newest.c.revision == LabelEvent.revision))
+        .where(LabelEvent.response.is_not(None))
+        .order_by(Query.ordinal)
+    )
+    return [Label(query, event, Response(event.response)) for query, event in rows if event.response is not None]

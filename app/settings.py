@@ -1,0 +1,34 @@
+"""Everything an operator may set, from the environment or a .env file, with units in the names."""
+
+from pathlib import Path
+
+from pydantic import Field
+from pydantic_settings import BaseSettings, SettingsConfigDict
+
+
+class Settings(BaseSettings):
+    """Settings of web server and worker. Every program is handed one instance; there is no global."""
+
+    model_config = SettingsConfigDict(env_file=".env", extra="ignore")
+
+    data_dir: Path = Field(default=Path("data"), description="The one directory that everything is written to.")
+    database_url: str | None = Field(default=None, description="SQLAlchemy URL; default: SQLite in the data dir.")
+    host: str = Field(default="127.0.0.1", description="Address the web server listens on.")
+    port: int = Field(default=8000, ge=0, le=65535, description="Port the web server listens on.")
+    public_url: str | None = Field(default=None, description="URL participants reach the server by, for links.")
+    secure_cookies: bool = Field(default=False, description="Set when the server is reached by HTTPS only.")
+    session_days: int = Field(default=30, ge=1, description="How long a participant's browser is remembered.")
+    login_hours: int = Field(default=12, ge=1, description="How long an experimenter stays logged in.")
+    login_attempts_per_minute: int = Field(default=10, ge=1, description="Password attempts per address.")
+    worker_name: str = Field(default="worker-1", description="Stable name: a restart resumes its own work.")
+    compute_processes: int = Field(default=2, ge=1, description="Processes for simulation and training.")
+
+    @property
+    def sqlalchemy_url(self) -> str:
+        """The database to use: as set, or studio.sqlite3 in the data directory."""
+        return self.database_url or f"sqlite:///{self.data_dir.resolve() / 'studio.sqlite3'}"
+
+    @property
+    def base_url(self) -> str:
+        """The address to print and to put into links, without a trailing slash."""
+        return (self.public_url or f"http://{self.host}:{self.port}").rstrip("/")

@@ -1,0 +1,73 @@
+"""Artefacts (videos, trajectories, models, bundles) in a directory, each under the hash of its content."""
+
+import hashlib
+import os
+import re
+import tempfile
+from pathlib import Path
+
+from app.errors import AppError
+
+_SHA256 = re.compile(r"[0-9a-f]{64}")
+
+
+class ArtefactMissing(AppError):
+    """A stored file is missing. Ask the experimenter to check that the data directory is complete."""
+
+
+class ArtefactStore:
+    """Files named by the SHA-256 of their bytes, so that a reference can neither dangle half-written nor go stale."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+
+    def put(self, content: bytes) -> str:
+        """Store the bytes and return their hash. Complete or absent, never half: temporary file, fsync, rename."""
+        sha256 = hashlib.sha256(content).hexdigest()
+        target = self.path(sha256)
+        if target.exists():
+            return sha256
+        target.parent.mkdir(parents=True, exist_ok=True)
+        descriptor, temporary = tempfile.mkstemp(dir=target.parent, prefix=".writing-")
+        try:
+            with os.fdopen(descriptor, "wb") as stream:
+                stream.write(content)
+                stream.flush()
+                os.fsync(stream.fileno())
+            Path(temporary).replace(target)
+        finally:
+            Path(temporary).unlink(missing_ok=True)
+        _sync_directory(target.parent)
+        return sha256
+
+    def path(self, sha256: str) -> Path:
+        """Where the artefact lies or would lie. Raises ArtefactMissing for anything that is not a hash."""
+        if not _SHA256.fullmatch(sha256):
+            raise ArtefactMissing
+        return self.root / sha256[:2] / sha256
+
+    def read(self, sha256: str) -> bytes:
+        """The bytes, verified against their name. Raises ArtefactMissing."""
+        path = self.path(sha256)
+        if not path.exists():
+            raise ArtefactMissing
+        content = path.read_bytes()
+        if hashlib.sha256(content).hexdigest() != sha256:
+            raise ArtefactMissing(f"The stored file {sha256[:12]} is damaged. Restore it from a backup.")
+        return content
+
+    def has(self, sha256: str) -> bool:
+        """Whether the artefact is there."""
+        return self.path(sha256).exists()
+
+    def delete(self, sha256: str) -> None:
+        """Remove the artefact if it is there."""
+        self.path(sha256).unlink(missing_ok=True)
+
+
+def _sync_directory(directory: Path) -> None:
+    descriptor = os.open(directory, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
