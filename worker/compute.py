@@ -1,0 +1,121 @@
+"""Processes for heavy work: simulation and training run there, the durable engine only waits for them.
+
+Two lanes, so that a training never stands behind a queue of videos. The processes are polite (niced), single-threaded,
+and die with their parent even when that is killed outright.
+"""
+
+import logging
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from enum import StrEnum
+from typing import Any, ParamSpec, TypeVar
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+log = logging.getLogger("worker.compute")
+
+HEARTBEAT_S = 5.0
+_NICENESS = 5
+_PARENT_CHECK_S = 1.0
+
+
+class Lane(StrEnum):
+    """Which processes do the work."""
+
+    CLIPS = "clips"
+    LEARNING = "learning"
+
+
+class ComputeLost(RuntimeError):
+    """A compute process died in the middle of its work, most often because the machine ran out of memory."""
+
+
+class Compute:
+    """Process pools, one per lane, started when first needed and replaced when one of their processes dies."""
+
+    def __init__(self, processes: int) -> None:
+        self._sizes = {Lane.CLIPS: processes, Lane.LEARNING: processes}
+        self._pools: dict[Lane, ProcessPoolExecutor] = {}
+
+    def warm_up(self, lane: Lane, function: Callable[[], object]) -> None:
+        """Have every process of a lane import what it will need, without waiting for it."""
+        for _ in range(self._sizes[lane]):
+            self._pool(lane).submit(function)
+
+    def run(
+        self, lane: Lane, beat: Callable[[], None], function: Callable[P, R], *args: P.args, **kwargs: P.kwargs
+    ) -> R:
+        """Call a top-level function in a process of the lane; ``beat`` is called every few seconds meanwhile.
+
+        Raises what the function raises, and ComputeLost when its process was killed.
+        """
+        return self._await(lane, beat, [self._submit(lane, function, *args, **kwargs)])[0]
+
+    def run_all(
+        self, lane: Lane, beat: Callable[[], None], function: Callable[..., R], arguments: list[tuple[Any, ...]]
+    ) -> list[R]:
+        """Call the function once per tuple of arguments, spread over the lane; results in the order of the tuples."""
+        return self._await(lane, beat, [self._submit(lane, function, *each) for each in arguments])
+
+    def _submit(self, lane: Lane, function: Callable[..., R], *args: Any, **kwargs: Any) -> "Future[R]":
+        try:
+            return self._pool(lane).submit(function, *args, **kwargs)
+        except BrokenProcessPool:
+            self._discard(lane)
+            return self._pool(lane).submit(function, *args, **kwargs)
+
+    def _await(self, lane: Lane, beat: Callable[[], None], futures: "list[Future[R]]") -> list[R]:
+        try:
+            pending: set[Future[R]] = set(futures)
+            while pending:
+                beat()
+                pending = wait(pending, timeout=HEARTBEAT_S).not_done
+            return [future.result() for future in futures]
+        except BrokenProcessPool as broken:
+            self._discard(lane)
+            raise ComputeLost(" ".join((ComputeLost.__doc__ or "").split())) from broken
+
+    def _pool(self, lane: Lane) -> ProcessPoolExecutor:
+        if lane not in self._pools:
+            self._pools[lane] = ProcessPoolExecutor(
+                self._sizes[lane],
+                mp_context=multiprocessing.get_context("spawn"),
+                initializer=_settle_in,
+                initargs=(os.getpid(),),
+            )
+        return self._pools[lane]
+
+    def _discard(self, lane: Lane) -> None:
+        pool = self._pools.pop(lane, None)
+        if pool is not None:
+            pool.shutdown(wait=False, cancel_futures=True)
+
+    def close(self) -> None:
+        """Stop every process; work in hand is abandoned and will be found again by the next worker."""
+        for pool in self._pools.values():
+            for process in list((pool._processes or {}).values()):
+                process.terminate()
+            pool.shutdown(wait=False, cancel_futures=True)
+        self._pools.clear()
+
+
+def _settle_in(parent: int) -> None:
+    """Run once in each new process."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's business
+    threading.Thread(target=_leave_with, args=(parent,), daemon=True).start()
+    os.nice(_NICENESS)
+    for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ[variable] = "1"
+
+
+def _leave_with(parent: int) -> None:
+    """End this process when its parent is gone (prctl's death signal would follow the thread that started us)."""
+    while os.getppid() == parent:
+        threading.Event().wait(_PARENT_CHECK_S)
+    os._exit(1)
