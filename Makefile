@@ -1,0 +1,94 @@
+# PbARL Studio: `make help` lists what can be done.
+SHELL := /bin/bash
+.DEFAULT_GOAL := help
+
+TORCH ?= cpu
+TORCH_VERSION := 2.13.0
+TORCH_CPU_INDEX := https://download.pytorch.org/whl/cpu
+VENV := .venv
+PY := $(VENV)/bin/python
+PIP := $(PY) -m pip --disable-pip-version-check --quiet
+
+.PHONY: help run link rehearse test lint types contracts pytest browser migrate reset-password benchmark clean
+
+help: ## List the commands
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-16s %s\n", $$1, $$2}'
+
+run: $(VENV)/run.stamp ## Install what is missing, then start web server and worker (Ctrl-C stops both)
+	@exec $(PY) -m app up
+
+link: $(VENV)/run.stamp ## Add a participant to the newest study and print the personal link
+	@$(PY) -m app link
+
+rehearse: $(VENV)/run.stamp ## Run scripted participants through the real pages to downloaded bundles (ARGS="--help")
+	@$(PY) -m worker rehearse $(ARGS)
+
+reset-password: $(VENV)/run.stamp ## Print a new one-time password for the experimenter
+	@$(PY) -m app reset-password
+
+migrate: $(VENV)/run.stamp ## Bring the database to the newest schema
+	@$(PY) -m app migrate
+
+test: lint types contracts pytest ## Everything that continuous integration runs
+
+lint: $(VENV)/dev.stamp ## Style of Python and templates, schema of the compose file
+	$(VENV)/bin/ruff check .
+	$(VENV)/bin/ruff format --check .
+	$(VENV)/bin/djlint --lint --quiet templates
+	$(VENV)/bin/check-jsonschema --builtin-schema vendor.compose-spec docker-compose.yml
+
+types: $(VENV)/dev.stamp ## Static types, strict
+	$(VENV)/bin/mypy
+
+contracts: $(VENV)/dev.stamp ## Who may import whom
+	$(VENV)/bin/lint-imports
+
+pytest: $(VENV)/dev.stamp browser ## The test suite
+	$(PY) -m pytest -n 2 --dist loadfile
+
+browser: ## Chromium for the browser tests (Debian package)
+	@command -v chromium >/dev/null || { \
+	  [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null && apt-get update -qq && apt-get install -y -qq chromium; } || { \
+	  echo "The browser tests need Chromium: install your system's package 'chromium'."; exit 1; }
+
+benchmark: $(VENV)/dev.stamp ## Print speed and quality figures (minutes; see tests/benchmarks)
+	@$(PY) tests/benchmarks/sim_speed.py
+	@$(PY) tests/benchmarks/render_speed.py
+
+clean: ## Remove the virtual environment and caches; the data directory stays
+	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .import_linter_cache
+
+# --- the virtual environment -------------------------------------------------------------------------------------
+
+$(VENV)/bin/python:
+	@python=$$(command -v python3.11 || true); \
+	if [ -z "$$python" ] && python3 -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' 2>/dev/null; then \
+	  python=$$(command -v python3); fi; \
+	if [ -z "$$python" ] || ! "$$python" -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' 2>/dev/null; then \
+	  echo "PbARL Studio needs Python 3.11 (the physics engine has no build for other versions)."; \
+	  echo "  Debian 12:      sudo apt-get install python3.11 python3.11-venv"; \
+	  echo "  Ubuntu:         sudo add-apt-repository ppa:deadsnakes/ppa && sudo apt-get install python3.11 python3.11-venv"; \
+	  echo "  With pyenv:     pyenv install 3.11 && pyenv local 3.11"; \
+	  echo "  With Docker:    docker compose up --build       (needs nothing but Docker)"; \
+	  exit 1; fi; \
+	echo "Creating $(VENV) with $$($$python --version) ..."; "$$python" -m venv $(VENV)
+
+# torch comes first and by itself: the default build on Linux would bring gigabytes of CUDA.
+$(VENV)/torch.stamp: $(VENV)/bin/python
+	@echo "Installing torch $(TORCH_VERSION) ($(TORCH)) ..."
+	@if [ "$(TORCH)" = cpu ]; then \
+	  $(PIP) install --no-deps "torch==$(TORCH_VERSION)+cpu" 2>/dev/null \
+	  || $(PIP) install --no-deps --index-url $(TORCH_CPU_INDEX) "torch==$(TORCH_VERSION)"; \
+	else $(PIP) install "torch==$(TORCH_VERSION)"; fi
+	@touch $@
+
+$(VENV)/run.stamp: requirements.lock $(VENV)/torch.stamp
+	@echo "Installing pinned dependencies ..."
+	@$(PIP) install --no-deps --require-hashes -r requirements.lock
+	@$(PIP) install --no-deps --no-build-isolation -e .
+	@touch $@
+
+$(VENV)/dev.stamp: requirements-dev.lock $(VENV)/run.stamp
+	@echo "Installing pinned development tools ..."
+	@$(PIP) install --no-deps --require-hashes -r requirements-dev.lock
+	@touch $@
