@@ -1,0 +1,155 @@
+"""What the worker writes to the database: runs and their progress, clips, queries, models, bundles.
+
+Every function is one short step inside a transaction of its caller; none computes.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import timedelta
+from typing import Any
+
+from sqlalchemy import func, select
+from sqlalchemy.orm import Session
+
+from app.db import now
+from app.domain.clips import Clip, Rollout
+from app.domain.models import Bundle, Model, ModelKind, Run, RunKind, RunStatus, WorkerPresence
+from app.domain.preferences import LabelEvent, Query
+
+ATTEMPTS = 3
+"""How often a failing run is tried before somebody has to look."""
+
+LEASE = timedelta(seconds=60)
+"""A running run that has not been heard of for this long belongs to nobody."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """What one run is about; travels through the durable engine as plain values."""
+
+    finding: str
+    kind: RunKind
+    study_id: int
+    participant_id: int | None = None
+    label_count: int | None = None
+    label_hash: str | None = None
+
+
+def begin_run(session: Session, task: Task, seed: int) -> int:
+    """The id of the run for this finding: a new one, or the earlier one set to running again."""
+    run = session.scalar(select(Run).where(Run.workflow_id == task.finding))
+    if run is None:
+        run = Run(workflow_id=task.finding, kind=task.kind, study_id=task.study_id)
+        session.add(run)
+    run.participant_id = task.participant_id
+    run.label_count, run.label_hash = task.label_count, task.label_hash
+    run.status, run.error, run.finished_at = RunStatus.RUNNING, None, None
+    run.seed, run.heartbeat_at = seed, now()
+    session.flush()
+    return run.id
+
+
+def report(session: Session, run_id: int, stage: str, progress: float) -> None:
+    """Say where the run is: a few words and a share between 0 and 1."""
+    run = session.get_one(Run, run_id)
+    run.stage, run.progress, run.heartbeat_at = stage, progress, now()
+
+
+def beat(session: Session, run_id: int) -> None:
+    """Say that somebody is still working on the run."""
+    session.get_one(Run, run_id).heartbeat_at = now()
+
+
+def finish_run(session: Session, run_id: int) -> None:
+    """Mark the run as done."""
+    run = session.get_one(Run, run_id)
+    run.status, run.stage, run.progress, run.finished_at = RunStatus.SUCCEEDED, "done", 1.0, now()
+
+
+def fail_run(session: Session, finding: str, error: str) -> None:
+    """Keep what went wrong; the run is tried again until its attempts are used up."""
+    run = session.scalar(select(Run).where(Run.workflow_id == finding))
+    if run is not None:
+        run.status, run.error, run.finished_at = RunStatus.FAILED, error, now()
+        run.attempt += 1
+
+
+def save_clip(session: Session, study_id: int, rollout: dict[str, Any], clip: dict[str, Any]) -> None:
+    """Record a rendered rollout; doing it twice changes nothing."""
+    place = (Rollout.study_id == study_id, Rollout.scenario == rollout["scenario"])
+    known = session.scalar(select(Rollout).where(*place, Rollout.behaviour == rollout["behaviour"]))
+    if known is None:
+        known = Rollout(study_id=study_id, **rollout)
+        session.add(known)
+        session.flush()
+    stretch = (Clip.first_step == clip["first_step"], Clip.step_count == clip["step_count"])
+    if session.scalar(select(Clip.id).where(Clip.rollout_id == known.id, *stretch)) is None:
+        session.add(Clip(rollout_id=known.id, **clip))
+
+
+def save_model(session: Session, run_id: int, kind: ModelKind, artefact_sha256: str, metrics: dict[str, Any]) -> Model:
+    """Record the result of a run; a repeat returns the model that is already there."""
+    known = session.scalar(select(Model).where(Model.run_id == run_id))
+    if known is not None:
+        return known
+    run = session.get_one(Run, run_id)
+    model = Model(
+        run_id=run_id,
+        participant_id=run.participant_id,
+        kind=kind,
+        artefact_sha256=artefact_sha256,
+        label_count=run.label_count,
+        label_hash=run.label_hash,
+        seed=run.seed,
+        metrics=metrics,
+    )
+    session.add(model)
+    session.flush()
+    return model
+
+
+def next_version(session: Session, participant_id: int) -> int:
+    """The version the participant's next bundle will have."""
+    newest = session.scalar(select(func.max(Bundle.version)).where(Bundle.participant_id == participant_id))
+    return (newest or 0) + 1
+
+
+def save_bundle(session: Session, model: Model, version: int, artefact_sha256: str, byte_count: int) -> None:
+    """Publish the export of a filter; doing it twice changes nothing."""
+    if session.scalar(select(Bundle.id).where(Bundle.model_id == model.id)) is None:
+        session.add(
+            Bundle(
+                participant_id=model.participant_id,
+                version=version,
+                model_id=model.id,
+                artefact_sha256=artefact_sha256,
+                byte_count=byte_count,
+            )
+        )
+
+
+def unanswered(session: Session, participant_id: int) -> Sequence[Query]:
+    """Queries that have never been answered, in their order."""
+    answered = select(LabelEvent.query_id).where(LabelEvent.query_id == Query.id).exists()
+    return session.scalars(
+        select(Query).where(Query.participant_id == participant_id, ~answered).order_by(Query.ordinal)
+    ).all()
+
+
+def newest_model(session: Session, participant_id: int, kind: ModelKind) -> Model | None:
+    """The model with the most labels behind it, the newest of equals."""
+    return session.scalar(
+        select(Model)
+        .where(Model.participant_id == participant_id, Model.kind == kind)
+        .order_by(Model.label_count.desc(), Model.id.desc())
+        .limit(1)
+    )
+
+
+def sign_presence(session: Session, name: str) -> None:
+    """Say that this worker lives."""
+    presence = session.get(WorkerPresence, name)
+    if presence is None:
+        session.add(WorkerPresence(name=name))
+    else:
+        presence.last_seen_at = now()
