@@ -1,0 +1,103 @@
+"""How a person comes into a study: the personal link, consent, instructions."""
+
+import hashlib
+import secrets
+from http import HTTPStatus
+
+from sqlalchemy import delete, func, select
+from sqlalchemy.orm import Session, joinedload
+
+from app.db import now
+from app.domain.people import BrowserSession
+from app.domain.studies import Participant, Study
+from app.errors import AppError
+from app.services import audit
+
+
+class LinkNotValid(AppError):
+    """This link is not valid. It may have been replaced by a newer one; please ask the person who sent it to you."""
+
+    status = HTTPStatus.NOT_FOUND
+
+
+class ParticipantNotFound(AppError):
+    """There is no such participant in this study."""
+
+    status = HTTPStatus.NOT_FOUND
+
+
+def add_participant(session: Session, study: Study, actor: str = audit.SYSTEM) -> tuple[Participant, str]:
+    """Add a person to the study. The token of the personal link is returned here and nowhere else: its hash is kept."""
+    session.scalar(select(Study.id).where(Study.id == study.id).with_for_update())  # numbers are given one at a time
+    newest = session.scalar(select(func.max(Participant.number)).where(Participant.study_id == study.id))
+    number, token = (newest or 0) + 1, _new_token()
+    participant = Participant(
+        study_id=study.id, number=number, token_sha256=_hash(token), seed=_participant_seed(study.seed, number)
+    )
+    session.add(participant)
+    session.flush()
+    audit.record(session, actor, "participant added", f"{study.slug}/{participant.code}")
+    return participant, token
+
+
+def renew_link(session: Session, study: Study, participant: Participant, actor: str) -> str:
+    """Give the participant a new link; the old one, and every browser that used it, is shut out."""
+    token = _new_token()
+    participant.token_sha256 = _hash(token)
+    session.execute(delete(BrowserSession).where(BrowserSession.participant_id == participant.id))
+    audit.record(session, actor, "link renewed", f"{study.slug}/{participant.code}")
+    return token
+
+
+def find_by_token(session: Session, token: str) -> Participant:
+    """The participant whose personal link this is, study loaded. Raises LinkNotValid."""
+    participant = session.scalar(
+        select(Participant).where(Participant.token_sha256 == _hash(token)).options(joinedload(Participant.study))
+    )
+    if participant is None:
+        raise LinkNotValid
+    return participant
+
+
+def find_by_code(session: Session, study: Study, code: str) -> Participant:
+    """The participant P07 of this study. Raises ParticipantNotFound."""
+    digits = code.removeprefix("P")
+    number = int(digits) if digits.isascii() and digits.isdigit() and len(digits) < 9 else None
+    participant = session.scalar(
+        select(Participant).where(Participant.study_id == study.id, Participant.number == number)
+    )
+    if participant is None or participant.code != code:
+        raise ParticipantNotFound
+    return participant
+
+
+def consent(participant: Participant, version: str) -> None:
+    """Store that this person agreed, to which text and when. The first agreement to a version is the one kept."""
+    if participant.consented_at is None or participant.consent_version != version:
+        participant.consented_at, participant.consent_version = now(), version
+
+
+def has_consented(participant: Participant) -> bool:
+    """Whether the person agreed to the text the study uses now."""
+    return participant.consented_at is not None and (
+        participant.consent_version == participant.study.settings.consent_version
+    )
+
+
+def instruct(participant: Participant) -> None:
+    """Store that the instructions were read."""
+    if participant.instructed_at is None:
+        participant.instructed_at = now()
+
+
+def _new_token() -> str:
+    return secrets.token_urlsafe(32)
+
+
+def _hash(token: str) -> str:
+    return hashlib.sha256(token.encode()).hexdigest()
+
+
+def _participant_seed(study_seed: int, number: int) -> int:
+    """Follows from the study's seed, so that a study can be repeated exactly."""
+    return int.from_bytes(hashlib.sha256(f"{study_seed}/participant/{number}".encode()).digest()[:4]) >> 1

@@ -1,0 +1,58 @@
+"""Studies: making one, finding one."""
+
+import re
+import secrets
+import unicodedata
+from http import HTTPStatus
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from app.domain.studies import Study, StudySettings
+from app.errors import AppError
+from app.services import audit
+
+_SEED_LIMIT = 2**31
+
+
+class StudyNotFound(AppError):
+    """There is no such study. It may have been renamed; the list of studies shows what there is."""
+
+    status = HTTPStatus.NOT_FOUND
+
+
+def create_study(
+    session: Session, name: str, settings: StudySettings, seed: int | None = None, actor: str = audit.SYSTEM
+) -> Study:
+    """Open a study; the worker finds it and begins to fill its pool. Without a seed one is drawn and kept."""
+    study = Study(
+        slug=_free_slug(session, name),
+        name=name,
+        stored_settings=settings.model_dump(mode="json"),
+        seed=secrets.randbelow(_SEED_LIMIT) if seed is None else seed,
+    )
+    session.add(study)
+    session.flush()
+    audit.record(session, actor, "study created", study.slug)
+    return study
+
+
+def find_study(session: Session, slug: str) -> Study:
+    """The study of that slug. Raises StudyNotFound."""
+    study = session.scalar(select(Study).where(Study.slug == slug))
+    if study is None:
+        raise StudyNotFound
+    return study
+
+
+def _free_slug(session: Session, name: str) -> str:
+    """A readable address made of the name, with a number behind it when it is taken."""
+    plain = unicodedata.normalize("NFKD", name).encode("ascii", "ignore").decode().lower()
+    base = re.sub(r"[^a-z0-9]+", "-", plain).strip("-")[:60] or "study"
+    taken = set(session.scalars(select(Study.slug).where(Study.slug.startswith(base, autoescape=True))))
+    reserved = {"new"}
+    number, slug = 1, base
+    while slug in taken | reserved:
+        number += 1
+        slug = f"{base}-{number}"
+    return slug
