@@ -12,11 +12,12 @@ from pathlib import Path
 
 import numpy as np
 from sqlalchemy import select
-from sqlalchemy.orm import Session, joinedload
+from sqlalchemy.orm import Session, contains_eager, joinedload
 
 from app.domain.clips import Clip, Rollout
 from app.domain.preferences import Label, Query, Response, current_labels
 from app.storage import ArtefactStore
+from worker.ml.segments import SegmentPairs
 from worker.trajectory import Array, Trajectory
 
 _TARGETS = {Response.LEFT: 0.0, Response.EQUAL: 0.5, Response.RIGHT: 1.0, Response.SKIP: None}
@@ -27,36 +28,23 @@ def target_of(response: Response) -> float | None:
     return _TARGETS[response]
 
 
-@dataclass(frozen=True)
-class PairArrays:
-    """N pairs of segments of T steps; index 0 of the second axis is the left one."""
-
-    observations: Array
-    """(N, 2, T, D)"""
-    actions: Array
-    """(N, 2, T, 7)"""
-    signals: Array
-    """(N, 2, T, S)"""
+CLIPS_AND_ROLLOUTS = (
+    joinedload(Query.left_clip).joinedload(Clip.rollout),
+    joinedload(Query.right_clip).joinedload(Clip.rollout),
+)
 
 
 @dataclass(frozen=True)
 class Preferences:
     """Everything one participant has said that a reward model may learn from."""
 
-    pairs: PairArrays
+    pairs: SegmentPairs | None
+    """None while nothing with a target has been said."""
     targets: Array
     """(N,) in {0, 1/2, 1}"""
     label_count: int
     """How many answers were given, those without a target included."""
     label_hash: str
-
-
-@dataclass(frozen=True)
-class PoolClip:
-    """A clip that can be shown, with the scenario it must share with its partner."""
-
-    clip_id: int
-    scenario: int
 
 
 def label_hash(labels: Sequence[Label]) -> str:
@@ -70,13 +58,7 @@ def label_hash(labels: Sequence[Label]) -> str:
 
 def labels_with_clips(session: Session, participant_id: int) -> Sequence[Label]:
     """The participant's current labels, each with its clips and their rollouts loaded."""
-    clips = (joinedload(Query.left_clip), joinedload(Query.right_clip))
-    session.scalars(
-        select(Query)
-        .where(Query.participant_id == participant_id)
-        .options(*(clip.joinedload(Clip.rollout) for clip in clips))
-    ).all()
-    return current_labels(session, participant_id)
+    return current_labels(session, participant_id, *CLIPS_AND_ROLLOUTS)
 
 
 def load_preferences(session: Session, store: ArtefactStore, participant_id: int) -> Preferences:
@@ -84,42 +66,34 @@ def load_preferences(session: Session, store: ArtefactStore, participant_id: int
     labels = labels_with_clips(session, participant_id)
     said = [(label, target) for label in labels if (target := target_of(label.response)) is not None]
     return Preferences(
-        pairs=pair_arrays(store, [(label.query.left_clip, label.query.right_clip) for label, _ in said]),
+        pairs=segment_pairs(store, [(label.query.left_clip, label.query.right_clip) for label, _ in said]),
         targets=np.array([target for _, target in said], np.float32),
         label_count=len(labels),
         label_hash=label_hash(labels),
     )
 
 
-def pair_arrays(store: ArtefactStore, pairs: Sequence[tuple[Clip, Clip]]) -> PairArrays:
-    """The segments of N pairs of clips. All clips of one study show equally many steps."""
-    segments = [[_segment(store, clip) for clip in pair] for pair in pairs]
-
-    def stacked(name: str) -> Array:
-        return np.array([[getattr(segment, name) for segment in pair] for pair in segments], np.float32)
-
-    return PairArrays(stacked("observations"), stacked("actions"), stacked("signals"))
+def segment_pairs(store: ArtefactStore, pairs: Sequence[tuple[Clip, Clip]]) -> SegmentPairs | None:
+    """The segments shown by N pairs of clips, left first; None for no pairs. All clips of a study are equally long."""
+    if not pairs:
+        return None
+    first, count = pairs[0][0].first_step, pairs[0][0].step_count
+    return SegmentPairs.cut([(_shown(store, left), _shown(store, right)) for left, right in pairs], first, count)
 
 
-def pool_clips(session: Session, study_id: int) -> Sequence[PoolClip]:
-    """Every clip of the study's pool."""
-    rows = session.execute(
-        select(Clip.id, Rollout.scenario).join(Rollout).where(Rollout.study_id == study_id).order_by(Clip.id)
-    )
-    return [PoolClip(clip_id, scenario) for clip_id, scenario in rows]
+def pool_clips(session: Session, study_id: int) -> Sequence[Clip]:
+    """Every clip of the study's pool with its rollout."""
+    return session.scalars(
+        select(Clip)
+        .join(Rollout)
+        .where(Rollout.study_id == study_id)
+        .order_by(Clip.id)
+        .options(contains_eager(Clip.rollout))
+    ).all()
 
 
-@dataclass(frozen=True)
-class _Segment:
-    observations: Array
-    actions: Array
-    signals: Array
-
-
-def _segment(store: ArtefactStore, clip: Clip) -> _Segment:
-    trajectory = _trajectory(store.path(clip.rollout.trajectory_sha256))
-    steps = slice(clip.first_step, clip.first_step + clip.step_count)
-    return _Segment(trajectory.observations[steps], trajectory.actions[steps], trajectory.signals[steps])
+def _shown(store: ArtefactStore, clip: Clip) -> Trajectory:
+    return _trajectory(store.path(clip.rollout.trajectory_sha256))
 
 
 @lru_cache(maxsize=1024)

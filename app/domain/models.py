@@ -24,6 +24,8 @@ class RunStatus(StrEnum):
     RUNNING = "running"
     SUCCEEDED = "succeeded"
     FAILED = "failed"
+    RETRY = "retry"
+    """Somebody has asked for another attempt."""
 
 
 class ModelKind(StrEnum):

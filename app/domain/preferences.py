@@ -7,6 +7,7 @@ from enum import StrEnum
 
 from sqlalchemy import CheckConstraint, ForeignKey, String, UniqueConstraint, func, select
 from sqlalchemy.orm import Mapped, Session, mapped_column, relationship
+from sqlalchemy.sql.base import ExecutableOption
 
 from app.db import Base, now
 from app.domain.clips import Clip
@@ -78,8 +79,11 @@ class Label:
     response: Response
 
 
-def current_labels(session: Session, participant_id: int) -> Sequence[Label]:
-    """Every answer of the participant that has not been undone, in the order of the queries."""
+def current_labels(session: Session, participant_id: int, *options: ExecutableOption) -> Sequence[Label]:
+    """Every answer of the participant that has not been undone, in the order of the queries.
+
+    ``options`` say what to load with each query.
+    """
     newest = (
         select(LabelEvent.query_id, func.max(LabelEvent.revision).label("revision"))
         .join(Query, Query.id == LabelEvent.query_id)
@@ -93,5 +97,6 @@ def current_labels(session: Session, participant_id: int) -> Sequence[Label]:
         .join(newest, (newest.c.query_id == LabelEvent.query_id) & (newest.c.revision == LabelEvent.revision))
         .where(LabelEvent.response.is_not(None))
         .order_by(Query.ordinal)
+        .options(*options)
     )
     return [Label(query, event, Response(event.response)) for query, event in rows if event.response is not None]

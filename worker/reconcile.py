@@ -1,0 +1,137 @@
+"""What is missing or stale, asked of the database again and again: the answer is always the whole truth.
+
+Nothing here is remembered between two rounds, so a lost message, a killed worker or a second worker cannot leave
+anything undone or do it twice: each finding has one name, and work is started under that name at most once.
+"""
+
+from collections.abc import Iterator
+from datetime import datetime, timedelta
+
+from sqlalchemy import func, select
+from sqlalchemy.orm import Session
+
+from app.db import now
+from app.domain.clips import Clip, Rollout
+from app.domain.models import Run, RunKind, RunStatus
+from app.domain.preferences import LabelEvent, Query, current_labels
+from app.domain.studies import Participant, Study, StudySettings
+from worker.records import ATTEMPTS, LEASE, Task, unanswered
+
+CLIPS_AHEAD = 2
+"""Scenarios per study in the making at a time: enough to keep busy, few enough that studies share fairly."""
+
+QUERIES_AHEAD = 12
+"""Unanswered queries each participant has waiting."""
+
+RETRY_AFTER = timedelta(seconds=10)
+
+
+def findings(session: Session) -> Iterator[tuple[Task, int]]:
+    """Every run that should exist and does not, or must be tried again, with the number of its attempt."""
+    runs = {run.workflow_id: run for run in session.scalars(select(Run))}
+    for study in session.scalars(select(Study).order_by(Study.id)).all():
+        for task in (*_missing_clips(session, study), *_stale_models(session, study)):
+            attempt = _attempt_due(runs.get(task.finding), now())
+            if attempt is not None:
+                yield task, attempt
+
+
+def abandoned(session: Session) -> list[str]:
+    """Names under which somebody began to work and has not been heard of since: ``finding#attempt``."""
+    lost = select(Run).where(Run.status == RunStatus.RUNNING, Run.heartbeat_at < now() - LEASE)
+    return [workflow_name(run.workflow_id, run.attempt) for run in session.scalars(lost)]
+
+
+def workflow_name(finding: str, attempt: int) -> str:
+    """The engine's name for one attempt at a finding."""
+    return f"{finding}#{attempt}"
+
+
+def short_of_queries(session: Session) -> list[int]:
+    """Participants who could soon run out of queries."""
+    return [
+        participant.id
+        for study in session.scalars(select(Study)).all()
+        for participant in session.scalars(select(Participant).where(Participant.study_id == study.id)).all()
+        if queries_wanted(session, participant.id, study.settings) > 0
+    ]
+
+
+def queries_wanted(session: Session, participant_id: int, settings: StudySettings) -> int:
+    """How many queries to make now so that the participant never waits and never gets more than planned."""
+    waiting = len(unanswered(session, participant_id))
+    made = session.scalar(select(func.count(Query.id)).where(Query.participant_id == participant_id)) or 0
+    return max(0, min(QUERIES_AHEAD - waiting, settings.labels_per_participant - made))
+
+
+def _attempt_due(run: Run | None, moment: datetime) -> int | None:
+    if run is None:
+        return 1
+    if run.status == RunStatus.RETRY:
+        return run.attempt
+    failed_since = moment - (run.finished_at or moment)
+    if run.status == RunStatus.FAILED and run.attempt <= ATTEMPTS and failed_since > RETRY_AFTER * (run.attempt - 1):
+        return run.attempt
+    return None
+
+
+def _missing_clips(session: Session, study: Study) -> list[Task]:
+    settings = study.settings
+    made = dict(
+        session.execute(
+            select(Rollout.scenario, func.count(Clip.id))
+            .join(Clip)
+            .where(Rollout.study_id == study.id, Clip.step_count == settings.clip_steps)
+            .group_by(Rollout.scenario)
+        ).tuples()
+    )
+    wanted = [scenario_seed(study.seed, index) for index in range(settings.pool_scenarios)]
+    missing = [seed for seed in wanted if made.get(seed, 0) < settings.behaviours_per_scenario]
+    return [Task(f"clips/study-{study.id}/scenario-{seed}", RunKind.CLIPS, study.id) for seed in missing[:CLIPS_AHEAD]]
+
+
+def scenario_seed(study_seed: int, index: int) -> int:
+    """The scenario at one place of a study's pool; below 10^9, where the evaluation scenarios begin."""
+    return study_seed % 1_000_000 * 1_000 + index
+
+
+def _stale_models(session: Session, study: Study) -> list[Task]:
+    tasks = []
+    for participant in session.scalars(select(Participant).where(Participant.study_id == study.id)).all():
+        count = len(current_labels(session, participant.id))
+        if count == 0:
+            continue
+        suffix = _last_answer(session, participant.id) if count >= study.settings.labels_per_participant else ""
+        reward = reward_due(study.settings, count)
+        if reward:
+            name = f"reward/participant-{participant.id}/labels-{reward}{suffix}"
+            tasks.append(Task(name, RunKind.REWARD, study.id, participant.id, reward))
+            milestone = filter_due(study.settings, count)
+            if milestone and _succeeded(session, name):
+                ending = suffix if milestone == study.settings.labels_per_participant else ""
+                name = f"filter/participant-{participant.id}/labels-{milestone}{ending}"
+                tasks.append(Task(name, RunKind.FILTER, study.id, participant.id, milestone))
+    return tasks
+
+
+def reward_due(settings: StudySettings, answered: int) -> int:
+    """The number of labels the newest reward model should have seen; 0 while there is nothing to learn from."""
+    if answered >= settings.labels_per_participant:
+        return settings.labels_per_participant
+    return answered // settings.retrain_every_labels * settings.retrain_every_labels
+
+
+def filter_due(settings: StudySettings, answered: int) -> int:
+    """The newest milestone that has been passed; 0 before the first. Milestones passed in the meantime are skipped."""
+    return max((milestone for milestone in settings.milestones if milestone <= answered), default=0)
+
+
+def _succeeded(session: Session, finding: str) -> bool:
+    run = session.scalar(select(Run).where(Run.workflow_id == finding))
+    return run is not None and run.status == RunStatus.SUCCEEDED
+
+
+def _last_answer(session: Session, participant_id: int) -> str:
+    """Makes the last model's name new when the participant changes an answer after the last one."""
+    events = select(func.max(LabelEvent.id)).join(Query).where(Query.participant_id == participant_id)
+    return f"/answer-{session.scalar(events)}"
