@@ -1,0 +1,100 @@
+"""The frozen reference policy: a small Gaussian network, in NumPy for control loops and as a torch module for training.
+
+pi(a | s) is tanh of a Gaussian with state-dependent mean and standard deviation (soft actor-critic's policy).
+"""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Self
+
+import numpy as np
+import numpy.typing as npt
+from safetensors.numpy import load_file, save_file
+
+if TYPE_CHECKING:
+    from torch import nn
+
+Array = npt.NDArray[np.float32]
+
+LOG_STD_LOW, LOG_STD_HIGH = -4.0, 1.0
+ACTION_STD_FLOOR = 0.05
+"""Where the policy is almost deterministic an action still counts as this uncertain."""
+LAYERS = 3
+
+
+class GaussianPolicy:
+    """Inference without torch. Every method takes observations (..., D) and works on any leading axes."""
+
+    def __init__(self, weights: dict[str, Array]) -> None:
+        """``weights``: offset (D,), scale (D,), and per layer i weight_i (in, out) and bias_i (out,)."""
+        self.weights = {name: np.ascontiguousarray(array, np.float32) for name, array in weights.items()}
+        # The input scaling is folded into the first layer: two operations less per control step.
+        first = self.weights["scale"][:, None] * self.weights["weight_0"]
+        self._matrices = [first, *(self.weights[f"weight_{index}"] for index in range(1, LAYERS))]
+        self._biases = [
+            self.weights["bias_0"] - self.weights["offset"] @ first,
+            *(self.weights[f"bias_{index}"] for index in range(1, LAYERS)),
+        ]
+        self.action_size = len(self.weights[f"bias_{LAYERS - 1}"]) // 2
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Read a policy.safetensors."""
+        return cls(load_file(path))
+
+    def save(self, path: Path) -> None:
+        """Write a policy.safetensors."""
+        save_file(self.weights, path)
+
+    @property
+    def offset(self) -> Array:
+        """(D,) subtracted from an observation before the first layer."""
+        return self.weights["offset"]
+
+    @property
+    def scale(self) -> Array:
+        """(D,) multiplies what is left."""
+        return self.weights["scale"]
+
+    def mean(self, observations: Array) -> Array:
+        """The deterministic action tanh(mu), (..., 7) in [-1, 1]."""
+        action: Array = np.tanh(self._raw(observations)[..., : self.action_size])
+        return action
+
+    def mean_and_std(self, observations: Array) -> tuple[Array, Array]:
+        """Deterministic action after the tanh and standard deviation before it, (..., 7) each."""
+        raw = self._raw(observations)
+        return np.tanh(raw[..., : self.action_size]), np.exp(self._log_std(raw))
+
+    def action_std(self, observations: Array) -> Array:
+        """How far actions spread around the deterministic one, in action units, (..., 7).
+
+        The Gaussian's deviation times the slope of the tanh at its mean, at least ACTION_STD_FLOOR.
+        """
+        action, deviation = self.mean_and_std(observations)
+        spread: Array = np.maximum(deviation * (1 - action**2), ACTION_STD_FLOOR)
+        return spread
+
+    def sample(self, observations: Array, rng: np.random.Generator) -> Array:
+        """An action drawn from the policy, (..., 7)."""
+        raw = self._raw(observations)
+        centre = raw[..., : self.action_size]
+        noise = rng.standard_normal(centre.shape, np.float32)
+        action: Array = np.tanh(centre + np.exp(self._log_std(raw)) * noise)
+        return action
+
+    def as_module(self) -> "nn.Module":
+        """The same policy as a frozen torch module: observations -> (action after the tanh, log_std before)."""
+        from worker.ml.policy_module import FrozenPolicy
+
+        return FrozenPolicy(self.weights)
+
+    def _log_std(self, raw: Array) -> Array:
+        share = 0.5 * (np.tanh(raw[..., self.action_size :]) + 1)
+        return np.asarray(LOG_STD_LOW + (LOG_STD_HIGH - LOG_STD_LOW) * share, np.float32)
+
+    def _raw(self, observations: Array) -> Array:
+        hidden = np.asarray(observations, np.float32)
+        for matrix, bias in zip(self._matrices[:-1], self._biases[:-1], strict=True):
+            hidden = np.maximum(hidden @ matrix + bias, 0.0)
+        output: Array = hidden @ self._matrices[-1] + self._biases[-1]
+        return output

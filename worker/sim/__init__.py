@@ -1,0 +1,7 @@
+"""The simulated robot, person and food. Importing this package registers its environments with Gymnasium."""
+
+import gymnasium
+
+FEEDING = "pbarl/Feeding-v0"
+
+gymnasium.register(FEEDING, entry_point="worker.sim.feeding:FeedingEnv", max_episode_steps=None)

@@ -1,0 +1,419 @@
+"""The one place that talks to pybullet: a private client, bodies by name, SI units, xyzw quaternions.
+
+One `Bullet` is one DIRECT client. A simulation steps it; a renderer opens further clients and only sets poses.
+"""
+
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import pybullet
+
+FloatArray = npt.NDArray[np.float64]
+Vector = Sequence[float] | FloatArray
+IDENTITY = (0.0, 0.0, 0.0, 1.0)
+
+_SHAPES = {"sphere": pybullet.GEOM_SPHERE, "capsule": pybullet.GEOM_CAPSULE, "box": pybullet.GEOM_BOX}
+
+
+@dataclass(frozen=True)
+class Shape:
+    """One primitive in its body's frame; a capsule lies along z and ``length_m`` excludes its round caps."""
+
+    kind: Literal["sphere", "capsule", "box"]
+    radius_m: float = 0.01
+    length_m: float = 0.0
+    half_extents_m: tuple[float, float, float] = (0.01, 0.01, 0.01)
+    position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    quaternion: tuple[float, float, float, float] = IDENTITY
+
+
+class Contact(NamedTuple):
+    """One contact point between a queried body and another one."""
+
+    other: str
+    position_m: tuple[float, float, float]
+    normal_force_n: float
+
+
+class Picture(NamedTuple):
+    """What a camera saw."""
+
+    rgb: npt.NDArray[np.uint8]
+    """(height, width, 3)"""
+
+
+def rotation_of(quaternion: Vector) -> FloatArray:
+    """The (3, 3) rotation matrix of an xyzw quaternion."""
+    return np.array(pybullet.getMatrixFromQuaternion(quaternion)).reshape(3, 3)
+
+
+def quaternion_of_euler(euler_rad: Vector) -> tuple[float, float, float, float]:
+    """The xyzw quaternion of roll, pitch, yaw about fixed x, y, z axes."""
+    return tuple(pybullet.getQuaternionFromEuler(list(euler_rad)))
+
+
+def capsule_between(start_m: Vector, end_m: Vector, radius_m: float) -> Shape:
+    """A capsule whose axis runs from start to end, both in the body's frame."""
+    start, end = np.asarray(start_m, float), np.asarray(end_m, float)
+    axis = end - start
+    length = float(np.linalg.norm(axis))
+    pitch, yaw = float(np.arccos(axis[2] / length)), float(np.arctan2(axis[1], axis[0]))
+    middle = (start + end) / 2
+    return Shape(
+        "capsule",
+        radius_m,
+        length,
+        position_m=(float(middle[0]), float(middle[1]), float(middle[2])),
+        quaternion=quaternion_of_euler((0.0, pitch, yaw)),
+    )
+
+
+class Bullet:
+    """A physics or render client. Bodies are known by the name they were added with."""
+
+    def __init__(self, time_step_s: float = 0.02, solver_iterations: int = 10) -> None:
+        self._client: int | None = pybullet.connect(pybullet.DIRECT)
+        self._bodies: dict[str, int] = {}
+        self._names: dict[int, str] = {}
+        self._links: dict[str, dict[str, int]] = {}
+        pybullet.setPhysicsEngineParameter(
+            fixedTimeStep=time_step_s,
+            numSolverIterations=solver_iterations,
+            deterministicOverlappingPairs=1,
+            enableFileCaching=0,
+            physicsClientId=self._client,
+        )
+        pybullet.setGravity(0.0, 0.0, -9.81, physicsClientId=self._client)
+
+    @property
+    def client(self) -> int:
+        """The engine's client number, for calls this class does not wrap. Raises RuntimeError after close()."""
+        if self._client is None:
+            raise RuntimeError("This simulation is closed; make a new one.")
+        return self._client
+
+    def close(self) -> None:
+        """Disconnect. Closing twice is fine."""
+        if self._client is not None and pybullet.isConnected(self._client):
+            pybullet.disconnect(self._client)
+        self._client = None
+
+    # Building the world
+
+    def add_urdf(self, name: str, urdf: str, position_m: Vector = (0, 0, 0), quaternion: Vector = IDENTITY) -> None:
+        """Load a fixed-base robot from URDF text. Mesh file names in it must be absolute."""
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / f"{name}.urdf"
+            path.write_text(urdf)
+            body = pybullet.loadURDF(
+                str(path), list(position_m), list(quaternion), useFixedBase=True, physicsClientId=self.client
+            )
+        self._register(name, body)
+
+    def add_body(
+        self,
+        name: str,
+        shapes: Sequence[Shape] = (),
+        mass_kg: float = 0.0,
+        position_m: Vector = (0, 0, 0),
+        quaternion: Vector = IDENTITY,
+        visual: int = -1,
+    ) -> None:
+        """Add a free body (static when its mass is 0) made of primitives; ``visual`` is from mesh_visual()."""
+        collision = self._collision(shapes) if shapes else -1
+        body = pybullet.createMultiBody(
+            mass_kg, collision, visual, list(position_m), list(quaternion), physicsClientId=self.client
+        )
+        self._register(name, body)
+
+    def mesh_visual(
+        self,
+        file: Path,
+        rgba: Sequence[float] = (1, 1, 1, 1),
+        specular: Sequence[float] = (0.05, 0.05, 0.05),
+        position_m: Vector = (0, 0, 0),
+        quaternion: Vector = IDENTITY,
+    ) -> int:
+        """A drawable mesh from an OBJ file in metres, for add_body()."""
+        shape: int = pybullet.createVisualShape(
+            pybullet.GEOM_MESH,
+            fileName=str(file),
+            rgbaColor=list(rgba),
+            specularColor=list(specular),
+            visualFramePosition=list(position_m),
+            visualFrameOrientation=list(quaternion),
+            physicsClientId=self.client,
+        )
+        return shape
+
+    def set_material(self, name: str, link: str | None = None, friction: float = 0.6, restitution: float = 0.0) -> None:
+        """Friction and bounciness of a body's base or of one link."""
+        pybullet.changeDynamics(
+            self._bodies[name],
+            self._link(name, link),
+            lateralFriction=friction,
+            restitution=restitution,
+            physicsClientId=self.client,
+        )
+
+    def set_damping(self, name: str, linear: float, angular: float) -> None:
+        """Air resistance of a body and all its links."""
+        for link in range(-1, len(self._links[name])):
+            pybullet.changeDynamics(
+                self._bodies[name],
+                link,
+                linearDamping=linear,
+                angularDamping=angular,
+                physicsClientId=self.client,
+            )
+
+    def set_colour(self, name: str, link: str | None, rgba: Sequence[float]) -> None:
+        """Recolour every visual of a body's base or of one link."""
+        pybullet.changeVisualShape(
+            self._bodies[name], self._link(name, link), rgbaColor=list(rgba), physicsClientId=self.client
+        )
+
+    # Poses and joints
+
+    def set_pose(self, name: str, position_m: Vector, quaternion: Vector = IDENTITY) -> None:
+        """Teleport a body and stop it."""
+        body = self._bodies[name]
+        pybullet.resetBasePositionAndOrientation(body, position_m, quaternion, physicsClientId=self.client)
+        pybullet.resetBaseVelocity(body, (0, 0, 0), (0, 0, 0), physicsClientId=self.client)
+
+    def position(self, name: str) -> tuple[float, float, float]:
+        """Where a body's base is."""
+        place: tuple[float, float, float] = pybullet.getBasePositionAndOrientation(
+            self._bodies[name], physicsClientId=self.client
+        )[0]
+        return place
+
+    def velocity(self, name: str) -> tuple[float, float, float]:
+        """Linear velocity of a body's base."""
+        speed: tuple[float, float, float] = pybullet.getBaseVelocity(self._bodies[name], physicsClientId=self.client)[0]
+        return speed
+
+    def set_joints(self, name: str, angles_rad: Vector) -> None:
+        """Put the first joints of a robot at these angles, at rest."""
+        body, client = self._bodies[name], self.client
+        for joint, angle in enumerate(angles_rad):
+            pybullet.resetJointState(body, joint, angle, 0.0, physicsClientId=client)
+
+    def joints(self, name: str, count: int) -> FloatArray:
+        """Angles of the first ``count`` joints in rad."""
+        states = pybullet.getJointStates(self._bodies[name], range(count), physicsClientId=self.client)
+        return np.array([state[0] for state in states])
+
+    def drive_joints(self, name: str, angles_rad: Vector, gain: float, force_nm: float) -> None:
+        """Set the position target of the first joints."""
+        count = len(angles_rad)
+        pybullet.setJointMotorControlArray(
+            self._bodies[name],
+            range(count),
+            pybullet.POSITION_CONTROL,
+            targetPositions=list(angles_rad),
+            positionGains=[gain] * count,
+            velocityGains=[1.0] * count,
+            forces=[force_nm] * count,
+            physicsClientId=self.client,
+        )
+
+    def link_pose(self, name: str, link: str) -> tuple[FloatArray, FloatArray]:
+        """Origin (3,) and xyzw orientation (4,) of a link's frame in the world."""
+        state = pybullet.getLinkState(
+            self._bodies[name], self._link(name, link), computeForwardKinematics=1, physicsClientId=self.client
+        )
+        return np.array(state[4]), np.array(state[5])
+
+    def link_velocity(self, name: str, link: str) -> tuple[float, float, float]:
+        """Linear velocity of a link's centre of mass in the world."""
+        velocity: tuple[float, float, float] = pybullet.getLinkState(
+            self._bodies[name], self._link(name, link), computeLinkVelocity=1, physicsClientId=self.client
+        )[6]
+        return velocity
+
+    # Stepping
+
+    def step(self) -> None:
+        """Advance by one physics step."""
+        pybullet.stepSimulation(physicsClientId=self.client)
+
+    def save(self) -> int:
+        """Remember the whole physical state in memory."""
+        state: int = pybullet.saveState(physicsClientId=self.client)
+        return state
+
+    def restore(self, state: int) -> None:
+        """Go back to a remembered state."""
+        pybullet.restoreState(state, physicsClientId=self.client)
+
+    def set_group(self, name: str, group: int, meets: int) -> None:
+        """Put a body and its links into a collision group (one bit) that only meets the groups in ``meets``.
+
+        This also makes the engine enter the body afresh and so forget at once whom it was near; left alone it drops
+        stale neighbours only gradually, which makes the order of contacts depend on what happened before.
+        """
+        for link in range(-1, len(self._links[name])):
+            pybullet.setCollisionFilterGroupMask(self._bodies[name], link, group, meets, physicsClientId=self.client)
+
+    def contacts(self, name: str) -> list[Contact]:
+        """Everything that presses on a body since the last step, with the contact points on that body."""
+        points = pybullet.getContactPoints(self._bodies[name], physicsClientId=self.client)
+        return [Contact(self._names[point[2]], point[5], point[9]) for point in points or () if point[9] > 0.0]
+
+    def clearance_m(self, name: str, other: str, within_m: float, skip_links: Sequence[str] = ()) -> float:
+        """Smallest gap between two bodies, at most ``within_m``; negative when they overlap."""
+        pybullet.performCollisionDetection(physicsClientId=self.client)
+        skipped = {self._link(name, link) for link in skip_links}
+        points = pybullet.getClosestPoints(
+            self._bodies[name], self._bodies[other], within_m, physicsClientId=self.client
+        )
+        return min((point[8] for point in points if point[3] not in skipped), default=within_m)
+
+    # Pictures
+
+    def load_plugin(self, library: Path, suffix: str) -> bool:
+        """Load a native plugin such as the EGL renderer; False when the machine cannot."""
+        return bool(pybullet.loadPlugin(str(library), suffix, physicsClientId=self.client) >= 0)
+
+    def picture(
+        self,
+        width: int,
+        height: int,
+        view: Sequence[float],
+        projection: Sequence[float],
+        hardware: bool = False,
+        **lighting: Any,
+    ) -> Picture:
+        """Render one frame. ``view`` and ``projection`` are from view_matrix() and projection_matrix()."""
+        renderer = pybullet.ER_BULLET_HARDWARE_OPENGL if hardware else pybullet.ER_TINY_RENDERER
+        _, _, rgba, _, _ = pybullet.getCameraImage(
+            width,
+            height,
+            view,
+            projection,
+            renderer=renderer,
+            flags=pybullet.ER_NO_SEGMENTATION_MASK,
+            physicsClientId=self.client,
+            **lighting,
+        )
+        return Picture(np.asarray(rgba, np.uint8).reshape(height, width, 4)[..., :3])
+
+    # Private
+
+    def _register(self, name: str, body: int) -> None:
+        if name in self._bodies:
+            raise ValueError(f"There already is a body named {name!r}.")
+        self._bodies[name], self._names[body] = body, name
+        count = pybullet.getNumJoints(body, physicsClientId=self.client)
+        infos = (pybullet.getJointInfo(body, joint, physicsClientId=self.client) for joint in range(count))
+        self._links[name] = {info[12].decode(): info[0] for info in infos}
+
+    def _link(self, name: str, link: str | None) -> int:
+        return -1 if link is None else self._links[name][link]
+
+    def _collision(self, shapes: Sequence[Shape]) -> int:
+        collision: int = pybullet.createCollisionShapeArray(
+            shapeTypes=[_SHAPES[shape.kind] for shape in shapes],
+            radii=[shape.radius_m for shape in shapes],
+            lengths=[shape.length_m for shape in shapes],
+            halfExtents=[list(shape.half_extents_m) for shape in shapes],
+            collisionFramePositions=[list(shape.position_m) for shape in shapes],
+            collisionFrameOrientations=[list(shape.quaternion) for shape in shapes],
+            physicsClientId=self.client,
+        )
+        return collision
+
+
+def view_matrix(eye_m: Vector, target_m: Vector, up: Vector = (0, 0, 1)) -> tuple[float, ...]:
+    """Camera pose for picture()."""
+    return tuple(pybullet.computeViewMatrix(list(eye_m), list(target_m), list(up)))
+
+
+def projection_matrix(field_of_view_deg: float, aspect: float, near_m: float, far_m: float) -> tuple[float, ...]:
+    """Lens for picture(); the field of view is vertical."""
+    return tuple(pybullet.computeProjectionMatrixFOV(field_of_view_deg, aspect, near_m, far_m))
+
+
+class Drawing(NamedTuple):
+    """What the software renderer saw: both arrays share memory with the engine's answer."""
+
+    rgba: npt.NDArray[np.uint8]
+    """(height, width, 4)"""
+    depth: npt.NDArray[np.float32]
+    """(height, width) in [0, 1], the normalised device depth"""
+
+
+class DrawingClient:
+    """A client that only draws: meshes that share one palette texture, placed by name, no physics."""
+
+    def __init__(self, palette: Path) -> None:
+        """`palette` is an image file; it is read at once."""
+        self._client: int | None = pybullet.connect(pybullet.DIRECT)
+        self._texture: int = pybullet.loadTexture(str(palette), physicsClientId=self._client)
+        self._bodies: dict[str, int] = {}
+
+    def close(self) -> None:
+        """Disconnect. Closing twice is fine."""
+        if self._client is not None and pybullet.isConnected(self._client):
+            pybullet.disconnect(self._client)
+        self._client = None
+
+    def add_mesh(
+        self, name: str, vertices_m: FloatArray, normals: FloatArray, texture: FloatArray, faces: npt.NDArray[np.int32]
+    ) -> None:
+        """Add a mesh of V vertices (V, 3), normals (V, 3), texture coordinates (V, 2) and triangles (F, 3)."""
+        shape = pybullet.createVisualShape(
+            pybullet.GEOM_MESH,
+            vertices=vertices_m.tolist(),
+            normals=normals.tolist(),
+            uvs=texture.tolist(),
+            indices=faces.ravel().tolist(),
+            rgbaColor=[1, 1, 1, 1],
+            physicsClientId=self._client,
+        )
+        body = pybullet.createMultiBody(0.0, -1, shape, physicsClientId=self._client)
+        pybullet.changeVisualShape(body, -1, textureUniqueId=self._texture, physicsClientId=self._client)
+        self._bodies[name] = body
+
+    def place(self, name: str, position_m: Vector, quaternion: Vector = IDENTITY) -> None:
+        """Put a mesh somewhere else."""
+        pybullet.resetBasePositionAndOrientation(
+            self._bodies[name], position_m, quaternion, physicsClientId=self._client
+        )
+
+    def draw(
+        self,
+        width: int,
+        height: int,
+        view: Sequence[float],
+        projection: Sequence[float],
+        light_direction: Sequence[float],
+        ambient: float,
+        diffuse: float,
+        specular: float,
+    ) -> Drawing:
+        """Draw without shadows; matrices are 16 numbers, column by column, as OpenGL wants them."""
+        _, _, rgba, depth, _ = pybullet.getCameraImage(
+            width,
+            height,
+            view,
+            projection,
+            shadow=0,
+            lightDirection=light_direction,
+            lightColor=(1.0, 1.0, 1.0),
+            lightAmbientCoeff=ambient,
+            lightDiffuseCoeff=diffuse,
+            lightSpecularCoeff=specular,
+            renderer=pybullet.ER_TINY_RENDERER,
+            flags=pybullet.ER_NO_SEGMENTATION_MASK,
+            physicsClientId=self._client,
+        )
+        return Drawing(
+            np.asarray(rgba, np.uint8).reshape(height, width, 4), np.asarray(depth, np.float32).reshape(height, width)
+        )

@@ -1,0 +1,53 @@
+"""From what a person experiences to a preference reward: r^H = -(weights * omega) . C, per control step.
+
+`omega` says how much one person cares about each of the six items (1 = the reference). Two forms of the items:
+
+* ``paper``: C_d, C_v, C_f, C_hf, C_fd, C_fdv as measured, with the benchmark's weights 1, .25, .01, .05, 1, 1. With
+  these, even a person who fears speed prefers to be fed faster, because time spent far away costs more.
+* ``calibrated``: the speed item is speed^2 / 0.2 m/s, weighted so that the reference person is content with the
+  policy's own speed; omegas then pull in different directions. The other five items are unchanged.
+"""
+
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from worker.trajectory import COSTS, SIGNALS
+
+Array = npt.NDArray[np.float32]
+FloatArray = npt.NDArray[np.float64]
+CostForm = Literal["paper", "calibrated"]
+
+BASE_WEIGHTS = {"C_d": 1.0, "C_v": 0.25, "C_f": 0.01, "C_hf": 0.05, "C_fd": 1.0, "C_fdv": 1.0}
+CALIBRATED_SPEED_WEIGHT = 1.06
+SPEED_SCALE_M_S = 0.2
+"""At this speed the calibrated item equals the paper's."""
+
+_SPEED = COSTS.index("C_v")
+_SPEED_SQUARED = SIGNALS.index("speed_squared_m2_s2")
+
+
+def base_weights(form: CostForm = "calibrated") -> FloatArray:
+    """(6,) weights of the six items for a person with omega = 1."""
+    weights = np.array([BASE_WEIGHTS[name] for name in COSTS])
+    if form == "calibrated":
+        weights[_SPEED] = CALIBRATED_SPEED_WEIGHT
+    return weights
+
+
+def cost_items(costs: Array, signals: Array, form: CostForm = "calibrated") -> FloatArray:
+    """The six unweighted items of a form: costs (..., 6) and signals (..., S) of a trajectory -> (..., 6)."""
+    items = np.array(costs, np.float64)
+    if form == "calibrated":
+        items[..., _SPEED] = np.asarray(signals, np.float64)[..., _SPEED_SQUARED] / SPEED_SCALE_M_S
+    return items
+
+
+def preference_rewards(
+    costs: Array, signals: Array, omega: npt.ArrayLike = 1.0, form: CostForm = "calibrated"
+) -> FloatArray:
+    """r^H of every step, (...,): zero or negative. ``omega`` is (6,) in the order of COSTS, or one number."""
+    weights = base_weights(form) * np.asarray(omega, np.float64)
+    rewards: FloatArray = -(cost_items(costs, signals, form) @ weights)
+    return rewards

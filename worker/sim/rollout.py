@@ -1,0 +1,52 @@
+"""Run one episode with any policy and keep everything about it."""
+
+from collections.abc import Callable
+
+import numpy as np
+import numpy.typing as npt
+
+from worker.sim.feeding import FeedingEnv
+from worker.trajectory import COSTS, SIGNALS, Trajectory
+
+Array = npt.NDArray[np.float32]
+Act = Callable[[Array], Array]
+"""observation (D,) -> action (7,)"""
+
+
+def rollout(env: FeedingEnv, act: Act, scenario: int, reference: Act | None = None) -> Trajectory:
+    """One whole episode of 100 steps. Whoever draws actions at random brings its own generator inside ``act``.
+
+    ``reference`` gives the frozen policy's mean in the same states; without it the executed actions stand in.
+    """
+    observation, _ = env.reset(seed=scenario)
+    observations, joints, particles = [observation], [env.joint_positions], [env.particles]
+    actions, references, signals, costs, rewards, forces = [], [], [], [], [], []
+    over = False
+    while not over:
+        action = np.clip(np.asarray(act(observation), np.float32), -1.0, 1.0)
+        references.append(action if reference is None else reference(observation))
+        observation, reward, terminated, truncated, info = env.step(action)
+        over = terminated or truncated
+        actions.append(action)
+        observations.append(observation)
+        joints.append(env.joint_positions)
+        particles.append(env.particles)
+        signals.append([info["signals"][name] for name in SIGNALS])
+        costs.append([info["costs"][name] for name in COSTS])
+        rewards.append(reward)
+        forces.append(info["contact_force_n"])
+    return Trajectory(
+        observations=np.array(observations, np.float32),
+        actions=np.array(actions, np.float32),
+        reference_actions=np.array(references, np.float32),
+        signals=np.array(signals, np.float32),
+        costs=np.array(costs, np.float32),
+        task_rewards=np.array(rewards, np.float32),
+        joint_positions=np.array(joints, np.float32),
+        particles=np.array(particles, np.float32),
+        head_quaternion=np.array(env.head_quaternion, np.float32),
+        contact_force_n=np.array(forces, np.float32),
+        success=env.success,
+        scenario=scenario,
+        task="feeding",
+    )
