@@ -1,0 +1,96 @@
+"""Two pinhole cameras in numpy: the one that looks at the scene, and the lamp seen as a camera.
+
+Matrices follow OpenGL: view space looks along -z, device coordinates run from -1 to 1. Pixels count from the top left.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from worker.sim.solids import Array
+
+Rectangle = tuple[float, float, float, float]
+"""left, top, right, bottom in pixels of the whole picture."""
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A camera whose picture is width x height pixels."""
+
+    eye_m: tuple[float, float, float]
+    target_m: tuple[float, float, float]
+    field_of_view_deg: float
+    width: int
+    height: int
+    near_m: float
+    far_m: float
+
+    @cached_property
+    def view(self) -> Array:
+        """World to camera (4, 4)."""
+        eye = np.asarray(self.eye_m)
+        back = eye - np.asarray(self.target_m)
+        back /= np.linalg.norm(back)
+        right = np.cross([0.0, 0.0, 1.0], back)
+        right /= np.linalg.norm(right)
+        matrix = np.eye(4)
+        matrix[:3, :3] = right, np.cross(back, right), back
+        matrix[:3, 3] = -matrix[:3, :3] @ eye
+        return matrix
+
+    def projection(self, rectangle: Rectangle | None = None) -> Array:
+        """Camera to device coordinates (4, 4), for the whole picture or for an off-centre part of it."""
+        left, top, right, bottom = rectangle or (0, 0, self.width, self.height)
+        half_height = self.near_m * math.tan(math.radians(self.field_of_view_deg) / 2)
+        half_width = half_height * self.width / self.height
+        x0, x1 = (half_width * (2 * x / self.width - 1) for x in (left, right))
+        y0, y1 = (half_height * (1 - 2 * y / self.height) for y in (bottom, top))
+        near, far = self.near_m, self.far_m
+        return np.array(
+            [
+                [2 * near / (x1 - x0), 0, (x1 + x0) / (x1 - x0), 0],
+                [0, 2 * near / (y1 - y0), (y1 + y0) / (y1 - y0), 0],
+                [0, 0, -(far + near) / (far - near), -2 * far * near / (far - near)],
+                [0, 0, -1, 0],
+            ]
+        )
+
+    @cached_property
+    def world_to_device(self) -> Array:
+        """World to device coordinates of the whole picture (4, 4)."""
+        return np.asarray(self.projection() @ self.view)
+
+    def pixels(self, points_m: Array) -> Array:
+        """Where world points (..., 3) appear (..., 2)."""
+        device = points_m @ self.world_to_device[:, :3].T + self.world_to_device[:, 3]
+        device = device[..., :2] / device[..., 3:]
+        return np.asarray((device * [1, -1] + 1) / 2 * [self.width, self.height])
+
+
+def flat(matrix: Array) -> Sequence[float]:
+    """The 16 numbers of a matrix column by column, as the engine takes them."""
+    numbers: list[float] = matrix.T.ravel().tolist()
+    return numbers
+
+
+EYE_M = (0.86, -1.02, 1.50)
+TARGET_M = (-0.20, -0.26, 1.09)
+
+
+def scene_camera(width: int, height: int) -> Camera:
+    """From the person's left front, so that the arm never hides the mouth."""
+    return Camera(EYE_M, TARGET_M, 38.0, width, height, 0.05, 6.0)
+
+
+LIGHT_CENTRE_M = np.array([-0.25, -0.15, 0.55])
+TOWARDS_LIGHT = np.array([0.45, -0.75, 2.2]) / np.linalg.norm([0.45, -0.75, 2.2])
+LIGHT_DISTANCE_M = 7.0
+
+
+def lamp(size: int) -> Camera:
+    """A distant lamp above the camera, for shadow maps of size x size texels."""
+    eye = LIGHT_CENTRE_M + LIGHT_DISTANCE_M * TOWARDS_LIGHT
+    return Camera((eye[0], eye[1], eye[2]), (-0.25, -0.15, 0.55), 18.0, size, size, 5.0, 9.0)

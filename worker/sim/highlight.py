@@ -1,0 +1,51 @@
+"""A gentle sign that the robot presses: a warm ring where the spoon is, and a warm frame around the inset."""
+
+import numpy as np
+from PIL import Image
+
+from worker.sim.camera import Camera
+from worker.sim.solids import Array, smooth_step
+
+NOTICED_FROM_N, STRONG_FROM_N = 2.0, 15.0
+RADIUS_PX = 34
+
+Rgb = tuple[int, int, int]
+
+
+class Highlight:
+    """The highlight of one clip of N frames."""
+
+    CALM: Rgb = (255, 255, 255)
+    WARM: Rgb = (246, 138, 60)
+
+    def __init__(self, camera: Camera, force_n: Array, spoon: Array, mouth_m: Array) -> None:
+        """force_n (N,) and the spoon's frame (N, 4, 4) in the world."""
+        strength = np.clip((force_n - NOTICED_FROM_N) / (STRONG_FROM_N - NOTICED_FROM_N), 0.0, 1.0)
+        self._strength = np.where(force_n > NOTICED_FROM_N, 0.25 + 0.75 * np.sqrt(strength), 0.0)
+        bowl = spoon[:, :3, 3]
+        near = np.linalg.norm(bowl - mouth_m, axis=1, keepdims=True) < 0.08
+        self._centres = camera.pixels(np.where(near, mouth_m, bowl)).round().astype(int)
+        self._ring = _ring()
+
+    def draw(self, picture: Image.Image, index: int) -> None:
+        """Draw the ring of one frame; nothing while the robot does not press."""
+        strength = float(self._strength[index])
+        if strength <= 0.0:
+            return
+        x, y = self._centres[index]
+        mask = self._ring.point(lambda value: round(value * strength))
+        picture.paste(self.WARM, (int(x) - RADIUS_PX, int(y) - RADIUS_PX), mask)
+
+    def border(self, index: int) -> Rgb:
+        """The colour of the inset's frame."""
+        share = float(self._strength[index])
+        r, g, b = (round(calm + (warm - calm) * share) for calm, warm in zip(self.CALM, self.WARM, strict=True))
+        return r, g, b
+
+
+def _ring() -> Image.Image:
+    """A soft ring as a mask, 2 RADIUS_PX wide."""
+    place = np.arange(2 * RADIUS_PX) + 0.5 - RADIUS_PX
+    distance = np.hypot(place[:, None], place[None, :]) / RADIUS_PX
+    profile = smooth_step(distance.ravel(), 0.55, 0.82) * (1 - smooth_step(distance.ravel(), 0.84, 1.0))
+    return Image.fromarray((profile.reshape(distance.shape) * 215).astype(np.uint8))

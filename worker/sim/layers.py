@@ -1,0 +1,185 @@
+"""One view of the scene, composed in layers: a still picture, soft moving shadows, and the moving parts on top.
+
+The still picture is drawn twice as large once per clip. Per frame only the rectangles that hold moving parts are
+drawn, with an off-centre frustum, and merged by depth; the shadow they cast comes from a small depth map seen from
+the lamp, looked up through a table made once per clip. TinyRenderer's own shadows are wrong for cropped frusta.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from PIL import Image, ImageFilter
+
+from worker.sim.camera import Camera, Rectangle, lamp
+from worker.sim.rectangles import Pixels, cover, even
+from worker.sim.scene import TOWARDS_FILL_LIGHT, TOWARDS_KEY_LIGHT, Layer, Lighting, Stage
+from worker.sim.solids import Array
+
+STILL_SCALE = 2
+STILL_LAMP_SIZE, MOVING_LAMP_SIZE = 640, 192
+SHADOW_BIAS = 0.0035
+"""How much nearer to the lamp something must be to cast a shadow, as a share of the lamp's depth range."""
+
+AMBIENT, KEY, FILL = 0.60, 0.46, 0.16
+SHADOW_KEY = 0.34
+"""Share of the key light that is left in full shadow."""
+
+MOVING_LIGHT = Lighting(TOWARDS_KEY_LIGHT, AMBIENT + 0.06, KEY, 0.30)
+DEPTH_ONLY = Lighting(TOWARDS_KEY_LIGHT, 1.0, 0.0)
+
+Colours = npt.NDArray[np.float32]
+
+
+class Shot(NamedTuple):
+    """Colours (h, w, 3) in the light and in the shadow, and depth (h, w)."""
+
+    lit: Colours
+    shadowed: Colours
+    depth: npt.NDArray[np.float32]
+
+
+def photograph(stage: Stage, camera: Camera, rectangle: Rectangle, width: int, height: int) -> Shot:
+    """Draw a stage under ambient, key and fill light, with and without the key light's full strength."""
+    ambient = stage.draw(camera, rectangle, width, height, Lighting(TOWARDS_KEY_LIGHT, 1.0, 0.0))
+    key = _lit(stage.draw(camera, rectangle, width, height, Lighting(TOWARDS_KEY_LIGHT, 0.0, 1.0, 0.06)), ambient)
+    fill = _lit(stage.draw(camera, rectangle, width, height, Lighting(TOWARDS_FILL_LIGHT, 0.0, 1.0)), ambient)
+    base = ambient.rgb * np.float32(AMBIENT) + fill * np.float32(FILL)
+    return Shot(base + key * np.float32(KEY), base + key * np.float32(KEY * SHADOW_KEY), ambient.depth)
+
+
+def _lit(light: Layer, ambient: Layer) -> Colours:
+    """The colours of one light; the background keeps its own colour under every light and must not count twice."""
+    return np.where((ambient.depth < 0.9999)[..., None], light.rgb, 0).astype(np.float32)
+
+
+class View:
+    """A part of the camera's picture, drawn at its own size."""
+
+    def __init__(
+        self, camera: Camera, rectangle: Rectangle, width: int, height: int, supersampling: float, still: Stage
+    ) -> None:
+        """Draws the still stage at once; start() must be called before the first frame."""
+        self._camera, self._rectangle = camera, rectangle
+        self.width, self.height, self._supersampling = width, height, supersampling
+        self._zoom = float(width / (rectangle[2] - rectangle[0]))
+        self._room = photograph(still, camera, rectangle, width * STILL_SCALE, height * STILL_SCALE)
+
+    def start(self, head: Stage, head_box: Pixels, lamp_depth: npt.NDArray[np.float32]) -> None:
+        """Prepare a clip: add the head, cast the still shadows, and make the tables for the moving ones."""
+        lit, shadowed, depth, on_head = self._with_head(head, head_box)
+        scale = STILL_SCALE
+        texel, distance = self._seen_from_lamp(depth, STILL_LAMP_SIZE)
+        # The head receives no still shadow: that of brows and hair would only make the face look dirty.
+        dark = (lamp_depth.ravel()[texel] < distance).reshape(depth.shape) & ~on_head
+        mask = Image.fromarray(dark.view(np.uint8) * np.uint8(255)).filter(ImageFilter.BoxBlur(2)).reduce(scale)
+        share = np.asarray(mask.filter(ImageFilter.BoxBlur(1)), np.float32)[..., None] / 255
+        lit, shadowed = _halved(lit), _halved(shadowed)
+        background: Colours = (lit + (shadowed - lit) * share).astype(np.float32)
+        self._background = _picture(background)
+        self._background_shadowed = _picture(np.minimum(shadowed, background))
+        self._depth = _resampled(depth, int(self.height * self._supersampling), int(self.width * self._supersampling))
+        coarse = depth[:: 2 * scale, :: 2 * scale]
+        self._texel, self._distance = self._seen_from_lamp(coarse, MOVING_LAMP_SIZE)
+
+    def frame(self, moving: Stage, boxes: Array, lamp_depth: npt.NDArray[np.float32]) -> Image.Image:
+        """One picture. boxes (K, 4) hold the moving parts, in pixels of the camera's whole picture."""
+        picture = self._background.copy()
+        self._cast_shadows(picture, lamp_depth)
+        for pixels in cover(self._own_pixels(boxes), self.width, self.height):
+            self._draw_moving(picture, moving, pixels)
+        return picture
+
+    def _own_pixels(self, boxes: Array) -> Array:
+        """Boxes (K, 4) of the whole picture in this view's pixels."""
+        left, top = self._rectangle[:2]
+        return np.asarray((boxes - [left, top, left, top]) * self._zoom)
+
+    def _part(self, pixels: Pixels) -> Rectangle:
+        """A rectangle of this view in pixels of the whole picture."""
+        left, top = self._rectangle[:2]
+        x0, y0, x1, y1 = (value / self._zoom for value in pixels)
+        return left + x0, top + y0, left + x1, top + y1
+
+    def _with_head(
+        self, head: Stage, head_box: Pixels
+    ) -> tuple[Colours, Colours, npt.NDArray[np.float32], npt.NDArray[np.bool_]]:
+        lit, shadowed, depth = self._room.lit.copy(), self._room.shadowed.copy(), self._room.depth.copy()
+        on_head: npt.NDArray[np.bool_] = np.zeros(depth.shape, dtype=np.bool_)
+        own = self._own_pixels(np.array([head_box], dtype=float))[0]
+        box = even((own[0], own[1], own[2], own[3]), self.width, self.height)
+        scale = STILL_SCALE
+        width, height = (box[2] - box[0]) * scale, (box[3] - box[1]) * scale
+        if width > 0 and height > 0:
+            shot = photograph(head, self._camera, self._part(box), width, height)
+            place = np.s_[box[1] * scale : box[3] * scale, box[0] * scale : box[2] * scale]
+            nearer = shot.depth < depth[place]
+            lit[place][nearer], shadowed[place][nearer] = shot.lit[nearer], shot.shadowed[nearer]
+            on_head[place] = nearer
+            depth[place] = np.minimum(depth[place], shot.depth)
+        return lit, shadowed, depth, on_head
+
+    def _seen_from_lamp(
+        self, depth: npt.NDArray[np.floating], size: int
+    ) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float32]]:
+        """For each pixel, its texel in a lamp map of this size and the depth below which something shades it."""
+        height, width = depth.shape
+        left, top, right, bottom = self._rectangle
+        x = (left + (np.arange(width) + 0.5) / width * (right - left)) / self._camera.width * 2 - 1
+        y = 1 - (top + (np.arange(height) + 0.5) / height * (bottom - top)) / self._camera.height * 2
+        # The crop shares the camera's near and far planes, so the whole picture's matrix inverts its depth too.
+        to_lamp = lamp(size).world_to_device @ np.linalg.inv(self._camera.world_to_device)
+        z = depth * 2.0 - 1.0
+        rows = [
+            to_lamp[k, 0] * x[None, :] + to_lamp[k, 1] * y[:, None] + to_lamp[k, 2] * z + to_lamp[k, 3]
+            for k in range(4)
+        ]
+        u, v, distance = (rows[0] / rows[3] + 1) / 2, (1 - rows[1] / rows[3]) / 2, (rows[2] / rows[3] + 1) / 2
+        inside = (u >= 0) & (u < 1) & (v >= 0) & (v < 1)
+        column = np.clip((u * size).astype(np.int32), 0, size - 1)
+        row = np.clip((v * size).astype(np.int32), 0, size - 1)
+        limit = np.where(inside, distance - SHADOW_BIAS, 0.0).astype(np.float32)
+        return (row * size + column).ravel().astype(np.int32), limit.ravel()
+
+    def _cast_shadows(self, picture: Image.Image, lamp_depth: npt.NDArray[np.float32]) -> None:
+        dark = lamp_depth.ravel()[self._texel] < self._distance
+        mask = Image.fromarray((dark.view(np.uint8) * np.uint8(255)).reshape(self.height // 2, self.width // 2))
+        found = mask.getbbox()
+        if found is None:
+            return
+        margin = 6
+        x0, y0 = max(0, found[0] - margin), max(0, found[1] - margin)
+        x1, y1 = min(self.width // 2, found[2] + margin), min(self.height // 2, found[3] + margin)
+        soft = mask.crop((x0, y0, x1, y1)).filter(ImageFilter.BoxBlur(max(1.5, 1.0 * self._zoom)))
+        full = (2 * x0, 2 * y0, 2 * x1, 2 * y1)
+        soft = soft.resize((full[2] - full[0], full[3] - full[1]), Image.Resampling.BILINEAR)
+        picture.paste(self._background_shadowed.crop(full), full[:2], soft)
+
+    def _draw_moving(self, picture: Image.Image, moving: Stage, pixels: Pixels) -> None:
+        scale = self._supersampling
+        width, height = round((pixels[2] - pixels[0]) * scale), round((pixels[3] - pixels[1]) * scale)
+        left, top = round(pixels[0] * scale), round(pixels[1] * scale)
+        rgba, depth = moving.draw_raw(self._camera, self._part(pixels), width, height, MOVING_LIGHT)
+        visible = depth < self._depth[top : top + height, left : left + width]
+        # Premultiplied alpha, so that resizing does not bleed hidden colours into the edges.
+        colour = (rgba.view(np.uint32)[..., 0] | np.uint32(0xFF000000)) * visible.view(np.uint8)
+        layer = Image.frombuffer("RGBa", (width, height), colour.tobytes(), "raw", "RGBa", 0, 1)
+        size = (pixels[2] - pixels[0], pixels[3] - pixels[1])
+        layer = layer.resize(size, Image.Resampling.HAMMING).convert("RGBA")
+        picture.paste(layer, pixels[:2], layer)
+
+
+def _halved(colours: Colours) -> Colours:
+    height, width = colours.shape[:2]
+    grid = colours.reshape(height // STILL_SCALE, STILL_SCALE, width // STILL_SCALE, STILL_SCALE, 3)
+    return np.asarray(grid.mean(axis=(1, 3)))
+
+
+def _picture(colours: Colours) -> Image.Image:
+    return Image.fromarray(colours.round().clip(0, 255).astype(np.uint8))
+
+
+def _resampled(depth: npt.NDArray[np.floating], height: int, width: int) -> npt.NDArray[np.float32]:
+    rows = ((np.arange(height) + 0.5) * depth.shape[0] / height).astype(int)
+    columns = ((np.arange(width) + 0.5) * depth.shape[1] / width).astype(int)
+    return np.ascontiguousarray(depth[rows][:, columns], dtype=np.float32)

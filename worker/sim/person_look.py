@@ -1,0 +1,410 @@
+"""How the person looks: a sculpted head with an open mouth, and a relaxed seated body. Landmarks come from human.py."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from worker.sim.colours import Palette
+from worker.sim.human import MOUTH_FROM_NECK_M
+from worker.sim.meshes import Mesh, curve, gradient, joined, openness, surface, tube, turned
+from worker.sim.solids import (
+    Array,
+    Field,
+    box,
+    carve,
+    chain,
+    common,
+    cone,
+    ellipsoid,
+    half_space,
+    mirrored,
+    smooth_step,
+    sphere,
+    torus,
+    union,
+)
+
+MOUTH = np.asarray(MOUTH_FROM_NECK_M)
+LIPS = MOUTH + np.array([0.0, 0.0035, 0.0])
+LIP_RADII = (0.0245, 0.0150)
+
+EYE = np.array([0.0310, -0.0765, 0.1165])
+EYE_RADIUS = 0.0145
+GAZE = np.array([-0.16, -1.0, -0.16])
+
+
+@dataclass(frozen=True)
+class Region:
+    """The box in which a surface is looked for, and how finely."""
+
+    lower: tuple[float, float, float]
+    upper: tuple[float, float, float]
+    cell_m: float
+
+
+HEAD_REGION = Region((-0.105, -0.135, -0.065), (0.105, 0.135, 0.245), 0.0044)
+
+
+# The head, in the head's frame: origin at the neck pivot, face towards -y.
+
+
+def skull() -> Field:
+    """The smooth mass of the head, without features."""
+    return union(
+        ellipsoid((0, 0.012, 0.138), (0.077, 0.097, 0.084)),
+        ellipsoid((0, -0.030, 0.088), (0.0665, 0.0650, 0.080)),
+        ellipsoid((0, -0.040, 0.030), (0.0510, 0.0480, 0.044)),
+        blend=0.045,
+    )
+
+
+def face() -> Field:
+    """The skin of the head with nose, ears, lips and an open mouth."""
+    solid = union(
+        skull(),
+        sphere((0, -0.0700, 0.0015), 0.0205),
+        mirrored(ellipsoid((0.0360, -0.0660, 0.0740), (0.024, 0.022, 0.024))),
+        blend=0.030,
+    )
+    solid = union(solid, mirrored(cone((0.010, -0.0900, 0.1330), (0.046, -0.0690, 0.1320), 0.0075, 0.006)), blend=0.022)
+    solid = carve(solid, mirrored(ellipsoid((0.0325, -0.1010, 0.1160), (0.0200, 0.0150, 0.0135))), blend=0.020)
+    solid = union(solid, _nose(), blend=0.012)
+    solid = union(solid, cone((0, 0.012, -0.060), (0, 0.004, 0.070), 0.053, 0.050), blend=0.018)
+    solid = union(solid, mirrored(_ear()), blend=0.007)
+    solid = union(solid, torus((LIPS[0], LIPS[1], LIPS[2]), LIP_RADII, 0.0068), blend=0.010)
+    return carve(solid, mouth_cavity(), blend=0.005)
+
+
+def mouth_cavity() -> Field:
+    x, y, z = LIPS
+    return ellipsoid((x, y + 0.022, z), (LIP_RADII[0] - 0.0025, 0.050, LIP_RADII[1] - 0.0020))
+
+
+def _nose() -> Field:
+    return union(
+        chain([(0, -0.0860, 0.1250), (0, -0.0990, 0.1000), (0, -0.1090, 0.0850)], [0.0060, 0.0075, 0.0110]),
+        mirrored(sphere((0.0105, -0.0970, 0.0810), 0.0078)),
+        blend=0.010,
+    )
+
+
+def _ear() -> Field:
+    turn = turned((0, 0, 1), 0.35) @ turned((1, 0, 0), -0.18)
+    lobe = ellipsoid((0.0790, 0.0150, 0.1000), (0.0065, 0.0185, 0.0300), turn)
+    return carve(lobe, ellipsoid((0.0870, 0.0110, 0.1010), (0.0065, 0.0110, 0.0190), turn), blend=0.006)
+
+
+def hair() -> Field:
+    """Short hair with a side parting, brushed back from the forehead."""
+    shell = union(
+        ellipsoid((0, 0.018, 0.1480), (0.0860, 0.1020, 0.0880)),
+        ellipsoid((0, 0.048, 0.0950), (0.0740, 0.0660, 0.0760)),
+        blend=0.03,
+    )
+    shell = carve(shell, ellipsoid((0.004, -0.1020, 0.0980), (0.0700, 0.0700, 0.0830)), blend=0.014)
+    shell = carve(shell, mirrored(ellipsoid((0.0880, -0.0100, 0.0830), (0.0320, 0.0420, 0.0480))), blend=0.012)
+    shell = common(shell, half_space((0, 0.06, 0.040), (0, 0.25, -1)), blend=0.012)
+    fringe = union(
+        chain([(0.040, -0.050, 0.206), (0.005, -0.074, 0.207), (-0.040, -0.066, 0.190)], [0.012, 0.019, 0.010]),
+        chain([(0.040, -0.030, 0.222), (0.000, -0.050, 0.222), (-0.052, -0.040, 0.200)], [0.010, 0.017, 0.010]),
+        blend=0.012,
+    )
+    return _combed(union(shell, fringe, blend=0.016))
+
+
+def _combed(field: Field) -> Field:
+    """Shallow grooves from the crown outwards."""
+
+    def distance(points: Array) -> Array:
+        return field(points) + 0.0010 * _strands(points)
+
+    return distance
+
+
+def _strands(points: Array) -> Array:
+    """A smooth wave in [-1, 1] (N,) that is constant along hairs running out from the parting."""
+    side = points[:, 0] + 0.45 * (points[:, 1] + 0.03) - 0.02
+    ahead = points[:, 1] + 0.15 - 0.4 * points[:, 0]
+    angle = np.arctan2(side, ahead)
+    return np.asarray(
+        0.55 * np.sin(31 * angle + 14 * points[:, 2]) + 0.3 * np.sin(67 * angle + 1.0) + 0.15 * np.sin(113 * angle)
+    )
+
+
+def head_meshes(palette: Palette) -> Mesh:
+    """The whole head as one mesh."""
+    skin_field, hair_field = face(), hair()
+    whole = union(skin_field, hair_field)
+    skin = _surface(skin_field, HEAD_REGION, lambda points: palette.along("skin", _complexion(points)))
+    skin = skin.shaded(_cavity_light(skin.vertices) * openness(whole, skin, 0.020, 0.75))
+    locks = _surface(
+        hair_field,
+        HEAD_REGION,
+        lambda points: palette.along("hair", 0.34 + 0.20 * _strands(points) + 1.2 * (points[:, 2] - 0.15)),
+    )
+    locks = locks.shaded(openness(whole, locks, 0.02, 0.6))
+    parts = [skin, locks, *_eyes(palette), *_brows(palette), *_inside_mouth(palette)]
+    return joined(*parts)
+
+
+def _surface(field: Field, region: Region, colour: object) -> Mesh:
+    return surface(field, region.lower, region.upper, region.cell_m, colour)  # type: ignore[arg-type]
+
+
+def _complexion(points: Array) -> Array:
+    """Where each point of the skin lies on the ramp from skin over blush and lips to the inside of the mouth (N,)."""
+    ring = torus((LIPS[0], LIPS[1] - 0.001, LIPS[2]), LIP_RADII, 0.0)(points)
+    lips = 0.66 * (1.0 - smooth_step(ring, 0.0072, 0.0098))
+    inside = smooth_step(-mouth_cavity()(points), -0.0015, 0.0015) * smooth_step(
+        points[:, 1], LIPS[1] - 0.001, LIPS[1] + 0.006
+    )
+    cheek = np.exp(-((np.linalg.norm((points - [0.0, 0, 0]) * [0, 1, 1] - [0, -0.070, 0.076], axis=1) / 0.022) ** 2))
+    cheek = cheek * np.exp(-(((np.abs(points[:, 0]) - 0.040) / 0.017) ** 2))
+    nose = np.exp(-((np.linalg.norm(points - [0, -0.114, 0.084], axis=1) / 0.014) ** 2))
+    ear = smooth_step(np.abs(points[:, 0]), 0.076, 0.088)
+    blush = 0.30 * np.clip(cheek + 0.6 * nose + 0.6 * ear, 0, 1)
+    return np.asarray(np.maximum(np.maximum(blush, lips), inside))
+
+
+def _cavity_light(points: Array) -> Array:
+    """The mouth gets dark with depth (N,)."""
+    depth = smooth_step(points[:, 1], LIPS[1] + 0.002, LIPS[1] + 0.030)
+    return np.where(mouth_cavity()(points) < 0.004, 1.0 - 0.8 * depth, 1.0)
+
+
+def _inside_mouth(palette: Palette) -> list[Mesh]:
+    """Upper teeth and tongue."""
+    x, y, z = LIPS
+    arch = [(x + 0.0195 * np.sin(a), y + 0.022 - 0.0175 * np.cos(a), z + 0.0112) for a in np.linspace(-1.25, 1.25, 13)]
+    path = np.array(arch)
+    teeth = tube(path, np.full(len(path), 0.0040), 8, np.full(len(path), palette.at("teeth")))
+    tongue = surface(
+        ellipsoid((x, y + 0.026, z - 0.0135), (0.0165, 0.024, 0.0075)),
+        (-0.03, y - 0.01, z - 0.03),
+        (0.03, y + 0.06, z + 0.01),
+        0.003,
+        palette.at("tongue", 0.3),
+    )
+    light = 1.0 - 0.75 * smooth_step(tongue.vertices[:, 1], LIPS[1] + 0.004, LIPS[1] + 0.032)
+    return [teeth.shaded(np.full(len(teeth.vertices), 0.86)), tongue.shaded(light)]
+
+
+def _eyes(palette: Palette) -> list[Mesh]:
+    meshes = []
+    for side in (-1.0, 1.0):
+        centre = EYE * [side, 1, 1]
+        gaze = GAZE + np.array([-0.05 * side, 0, 0])
+        meshes += [_eyeball(palette, centre, gaze / np.linalg.norm(gaze)), *_lids(palette, centre)]
+    return meshes
+
+
+def _eyeball(palette: Palette, centre: Array, gaze: Array) -> Mesh:
+    angles = np.radians([178, 120, 80, 60, 45, 34, 32, 25, 20, 14.5, 13.5, 8, 2])
+    names = ["eye"] * 6 + ["iris"] * 4 + ["pupil"] * 2
+    shares = [0.0] * 6 + [1.0, 0.6, 0.3, 0.1] + [0.0] * 2
+    path = centre + EYE_RADIUS * np.cos(angles)[:, None] * gaze
+    colours = np.array([palette.at(name, share) for name, share in zip(names, shares, strict=True)])
+    ball = tube(path, EYE_RADIUS * np.sin(angles), 20, colours)
+    glint = centre + EYE_RADIUS * 1.0 * _unit(gaze + np.array([0.16, 0.0, 0.20]))
+    dot = surface(sphere(tuple(glint), 0.0017), tuple(glint - 0.003), tuple(glint + 0.003), 0.0008, palette.at("teeth"))
+    upper = smooth_step(ball.vertices[:, 2] - centre[2], 0.010, 0.003)
+    return joined(ball.shaded(0.55 + 0.45 * upper), dot)
+
+
+def _lids(palette: Palette, centre: Array) -> list[Mesh]:
+    """Upper and lower lid as caps of a slightly larger ball, and the line of the lashes."""
+    cover = sphere(tuple(centre), EYE_RADIUS + 0.0016)
+    tilt = 0.35 * np.sign(centre[0])
+    upper = common(cover, half_space(tuple(centre + [0, 0, 0.0058]), (0.10 * np.sign(tilt), 0.42, -1.0)), blend=0.0012)
+    lower = common(cover, half_space(tuple(centre - [0, 0, 0.0078]), (0, 0.35, 1.0)), blend=0.0012)
+    margin = EYE_RADIUS + 0.004
+    box_ = (tuple(centre - margin), tuple(centre + margin))
+    skin = palette.at("skin", 0.10)
+    lids = [surface(part, box_[0], box_[1], 0.0014, skin) for part in (upper, lower)]
+    normal = _unit(np.array([0.10 * np.sign(tilt), 0.42, -1.0]))
+    middle = centre + [0, 0, 0.0058]
+    offset = float((middle - centre) @ normal)
+    ring_radius = np.sqrt((EYE_RADIUS + 0.0016) ** 2 - offset**2)
+    across = _unit(np.cross(normal, [0, 1.0, 0]))
+    front = _unit(np.cross(across, normal))
+    front = front if front[1] < 0 else -front
+    sweep = np.linspace(-1.15, 1.15, 15)
+    line = centre + normal * offset + ring_radius * (np.sin(sweep)[:, None] * across + np.cos(sweep)[:, None] * front)
+    width = 0.00135 * np.cos(sweep * 0.9) + 0.0004
+    lash = tube(line, width, 6, np.full(len(line), palette.at("hair", 0.0)))
+    return [*lids, lash]
+
+
+def _brows(palette: Palette) -> list[Mesh]:
+    field = face()
+    meshes = []
+    for side in (-1.0, 1.0):
+        points = curve(
+            [
+                (side * x, -0.095, z)
+                for x, z in ((0.0150, 0.1405), (0.0270, 0.1455), (0.0390, 0.1450), (0.0505, 0.1385))
+            ],
+            14,
+        )
+        points = _onto(field, points)
+        width = np.interp(np.linspace(0, 1, 14), [0, 0.2, 0.6, 1], [0.0022, 0.0034, 0.0030, 0.0009])
+        # Thick along the skin, thin out of it.
+        meshes.append(tube(points, np.column_stack([width * 0.62, width]), 8, np.full(14, palette.at("hair", 0.25))))
+    return meshes
+
+
+def _onto(field: Field, points: Array) -> Array:
+    for _ in range(6):
+        points = points - field(points)[:, None] * gradient(field, points)
+    return points
+
+
+def _unit(vector: Array) -> Array:
+    return np.asarray(vector / np.linalg.norm(vector))
+
+
+# The body, in the world frame.
+
+NECKLINE = np.array([0.0, 0.046, 1.092])
+
+
+def shirt() -> Field:
+    torso = union(
+        ellipsoid((0, 0.058, 0.930), (0.160, 0.104, 0.150)),
+        ellipsoid((0, 0.045, 0.740), (0.150, 0.118, 0.170)),
+        mirrored(cone((0.02, 0.064, 1.040), (0.145, 0.062, 1.006), 0.056, 0.058)),
+        blend=0.075,
+    )
+    sleeve = cone((0.166, 0.060, 1.002), (0.212, 0.050, 0.795), 0.058, 0.055)
+    sleeve = common(sleeve, half_space((0.21, 0.050, 0.838), (0.22, -0.05, -1)), blend=0.012)
+    solid = union(torso, mirrored(sleeve), blend=0.028)
+    collar_hole = cone((0, 0.050, 1.060), (0, 0.030, 1.20), 0.052, 0.075)
+    return carve(solid, collar_hole, blend=0.006)
+
+
+def collar() -> Field:
+    turn = turned((1, 0, 0), np.pi / 2 + 0.30)
+    return torus(tuple(NECKLINE), (0.0600, 0.0590), 0.0075, turn)
+
+
+def arms() -> Field:
+    arm = chain(
+        [
+            (0.211, 0.052, 0.900),
+            (0.211, 0.050, 0.765),
+            (0.207, 0.020, 0.733),
+            (0.201, -0.085, 0.728),
+            (0.197, -0.195, 0.724),
+        ],
+        [0.043, 0.040, 0.040, 0.039, 0.0265],
+    )
+    return mirrored(union(_softened(arm), hand(), blend=0.022))
+
+
+def _softened(field: Field) -> Field:
+    return lambda points: field(points) - 0.001
+
+
+def hand() -> Field:
+    """The left hand, lying relaxed over the end of the armrest."""
+    palm = union(
+        ellipsoid((0.196, -0.238, 0.7230), (0.038, 0.047, 0.0165)),
+        cone((0.196, -0.195, 0.7230), (0.196, -0.240, 0.7240), 0.024, 0.021),
+        blend=0.02,
+    )
+    solid = palm
+    for offset, length in ((0.027, 0.90), (0.0090, 1.03), (-0.0095, 1.0), (-0.0275, 0.80)):
+        x = 0.195 - offset
+        start = (x, -0.268, 0.7240)
+        middle = (x - offset * 0.18, -0.268 - 0.034 * length, 0.7170)
+        end = (x - offset * 0.25, -0.268 - 0.052 * length, 0.7000 - 0.006 * length)
+        solid = union(solid, chain([start, middle, end], [0.0096, 0.0089, 0.0078]), blend=0.006)
+    thumb = chain([(0.168, -0.212, 0.720), (0.151, -0.245, 0.716), (0.150, -0.270, 0.710)], [0.0125, 0.0108, 0.0088])
+    return union(solid, thumb, blend=0.012)
+
+
+def neck() -> Field:
+    return cone((0, 0.062, 1.030), (0, 0.034, 1.172), 0.060, 0.0515)
+
+
+def trousers() -> Field:
+    leg = chain(
+        [(0.080, 0.080, 0.550), (0.112, -0.390, 0.545), (0.112, -0.450, 0.500), (0.112, -0.470, 0.100)],
+        [0.098, 0.076, 0.072, 0.052],
+    )
+    return union(mirrored(leg), ellipsoid((0, 0.08, 0.57), (0.165, 0.14, 0.10)), blend=0.03)
+
+
+def shoes() -> Field:
+    shoe = union(
+        ellipsoid((0.115, -0.535, 0.060), (0.044, 0.105, 0.042)),
+        cone((0.112, -0.475, 0.07), (0.112, -0.475, 0.13), 0.045),
+        blend=0.03,
+    )
+    return mirrored(common(shoe, half_space((0, 0, 0.02), (0, 0, -1)), blend=0.01))
+
+
+def body_meshes(palette: Palette, around: Field) -> Mesh:
+    """Everything of the person but the head, as one mesh; `around` is what else keeps light away (the chair)."""
+    whole = union(shirt(), arms(), neck(), trousers(), collar(), around)
+    parts = [
+        (shirt(), Region((-0.29, -0.09, 0.56), (0.29, 0.20, 1.13), 0.009), "shirt", 0.5),
+        (collar(), Region((-0.08, -0.04, 1.04), (0.08, 0.13, 1.14), 0.0045), "shirt_trim", 0.0),
+        (neck(), Region((-0.075, -0.04, 1.06), (0.075, 0.14, 1.235), 0.006), "skin", 0.0),
+        (arms(), Region((-0.26, -0.345, 0.67), (0.26, 0.11, 0.92), 0.0058), "skin", 0.02),
+        (trousers(), Region((-0.22, -0.56, 0.04), (0.22, 0.24, 0.68), 0.014), "trousers", 0.0),
+        (shoes(), Region((-0.18, -0.66, 0.0), (0.18, -0.40, 0.20), 0.012), "shoe", 0.0),
+    ]
+    meshes = []
+    for field, region, name, share in parts:
+        mesh = surface(field, region.lower, region.upper, region.cell_m, palette.at(name, share))
+        meshes.append(mesh.shaded(openness(whole, mesh, 0.07, 0.75)))
+    return joined(*meshes)
+
+
+def chair() -> Field:
+    """Seat, back and armrests of the wheelchair, without its wheels."""
+    seat = box((0, 0.02, 0.425), (0.23, 0.25, 0.035), 0.02)
+    back = box((0, 0.235, 0.80), (0.215, 0.035, 0.33), 0.030, turned((1, 0, 0), 0.10))
+    rest = mirrored(box((0.215, -0.02, 0.668), (0.034, 0.235, 0.018), 0.016))
+    return union(seat, back, rest)
+
+
+def chair_meshes(palette: Palette, around: Field) -> Mesh:
+    """The chair as one mesh; `around` is the person who sits in it."""
+    whole = union(chair(), around)
+    region = Region((-0.27, -0.28, 0.36), (0.27, 0.33, 1.17), 0.012)
+    padding = surface(chair(), region.lower, region.upper, region.cell_m, palette.at("cushion"))
+    padding = padding.shaded(openness(whole, padding, 0.08, 0.8))
+    metal = palette.at("chair")
+    parts = [padding]
+    for side in (-1.0, 1.0):
+        for start, end in (
+            ((0.235, 0.19, 0.45), (0.225, 0.19, 0.66)),
+            ((0.235, -0.17, 0.45), (0.225, -0.17, 0.66)),
+            ((0.235, -0.20, 0.42), (0.235, 0.22, 0.42)),
+            ((0.200, 0.27, 0.60), (0.195, 0.30, 1.06)),
+        ):
+            path = np.array([start, end]) * [side, 1, 1]
+            parts.append(tube(path, np.array([0.013, 0.013]), 12, np.array([metal, metal])))
+        parts += _wheel(palette, side)
+    return joined(*parts)
+
+
+def _wheel(palette: Palette, side: float) -> list[Mesh]:
+    centre, radius = np.array([side * 0.315, 0.15, 0.29]), 0.275
+    angle = np.linspace(0, 2 * np.pi, 33)
+    circle = np.stack([0 * angle, np.cos(angle), np.sin(angle)], axis=1)
+    tyre = tube(centre + radius * circle, np.full(33, 0.014), 8, np.full(33, palette.at("tyre")), closed_ends=False)
+    hand_rim = tube(
+        centre + [side * 0.02, 0, 0] + 0.235 * circle,
+        np.full(33, 0.007),
+        7,
+        np.full(33, palette.at("metal", 0.6)),
+        closed_ends=False,
+    )
+    spokes = [
+        tube(np.stack([centre, centre + radius * point]), np.full(2, 0.003), 5, np.full(2, palette.at("metal", 0.2)))
+        for point in circle[:-1:3]
+    ]
+    return [tyre, hand_rim, *spokes]

@@ -1,0 +1,198 @@
+"""A piece of a trajectory as a short, calm video clip."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from PIL import Image
+
+from worker.sim import video
+from worker.sim.camera import Camera, Rectangle, lamp, scene_camera
+from worker.sim.highlight import Highlight
+from worker.sim.human import MOUTH_FROM_NECK_M, NECK_PIVOT_M
+from worker.sim.layers import DEPTH_ONLY, MOVING_LAMP_SIZE, STILL_LAMP_SIZE, View
+from worker.sim.motion import Motion, clip_motion, quaternions
+from worker.sim.rectangles import Pixels
+from worker.sim.scene import GONE_M, HAND_PARTS, Scene, food_name
+from worker.sim.solids import Array
+from worker.trajectory import Trajectory
+
+FOOD_RADIUS_M = 0.006
+HEAD_EXTENT_M = np.array([[x, y, z] for x in (-0.15, 0.15) for y in (-0.16, 0.16) for z in (-0.08, 0.27)])
+"""Corners of a box that holds the head however it is turned, around the neck pivot."""
+
+
+@dataclass(frozen=True)
+class RenderStyle:
+    """How clips look."""
+
+    fps: int = 15
+    width: int = 640
+    height: int = 480
+    supersampling: float = 1.5
+    inset: bool = True
+    inset_width: int = 216
+    inset_height: int = 162
+    inset_zoom: float = 2.6
+    highlight_pressing: bool = True
+    food_scale: float = 1.3
+    food_count: int = 8
+
+
+@dataclass(frozen=True)
+class RenderedClip:
+    """A finished clip."""
+
+    video: bytes
+    """MP4 (H.264, yuv420p), playable while it loads"""
+    poster: bytes
+    """JPEG of the first frame"""
+    width: int
+    height: int
+    fps: int
+    n_frames: int
+    duration_ms: int
+
+
+class ClipRenderer:
+    """Draws clips one after the other. Building one takes about a second; keep it for the life of the process."""
+
+    def __init__(self, style: RenderStyle = RenderStyle()) -> None:
+        self.style = style
+        self._camera = scene_camera(style.width, style.height)
+        self._scene = Scene(style.food_count, FOOD_RADIUS_M * style.food_scale)
+        whole = (0.0, 0.0, float(style.width), float(style.height))
+        self._main = View(self._camera, whole, style.width, style.height, style.supersampling, self._scene.still)
+        self._still_lamp_depth = self._lamp_depth("still")
+        self._parts = self._scene.boxes.names
+
+    def close(self) -> None:
+        """Free the drawing clients."""
+        self._scene.close()
+
+    def render_clip(self, trajectory: Trajectory, first_step: int, n_steps: int) -> RenderedClip:
+        """The video of steps first_step to first_step + n_steps. Raises ValueError when they do not exist."""
+        style = self.style
+        motion = clip_motion(trajectory, first_step, n_steps, style.fps)
+        frames = [np.asarray(picture) for picture in self.pictures(trajectory, motion)]
+        return RenderedClip(
+            video=video.encode_mp4(frames, style.width, style.height, style.fps),
+            poster=video.encode_poster(frames[0]),
+            width=style.width,
+            height=style.height,
+            fps=style.fps,
+            n_frames=len(frames),
+            duration_ms=round(1000 * len(frames) / style.fps),
+        )
+
+    def pictures(self, trajectory: Trajectory, motion: Motion) -> Iterator[Image.Image]:
+        """The frames of a motion, one after the other."""
+        style, scene = self.style, self._scene
+        mouth_m = self._turn_head(trajectory.head_quaternion)
+        head_box, lamp_depth = self._head_box(), np.minimum(self._still_lamp_depth, self._lamp_depth("head"))
+        self._main.start(scene.head, head_box, lamp_depth)
+        inset = self._inset(mouth_m, head_box, lamp_depth) if style.inset else None
+        boxes = self._moving_boxes(motion)
+        turns = quaternions(motion.frames[..., :3, :3])
+        highlight = Highlight(self._camera, motion.force_n, motion.frames[:, -1], mouth_m)
+        for index in range(len(motion)):
+            self._pose(motion, turns, index)
+            shadows = scene.casters.draw_raw(
+                lamp(MOVING_LAMP_SIZE), None, MOVING_LAMP_SIZE, MOVING_LAMP_SIZE, DEPTH_ONLY
+            )[1]
+            picture = self._main.frame(scene.moving, boxes[index], shadows)
+            if style.highlight_pressing:
+                highlight.draw(picture, index)
+            if inset is not None:
+                near = boxes[index, self._near_mouth]
+                border = highlight.border(index) if style.highlight_pressing else highlight.CALM
+                _paste_inset(picture, inset.frame(scene.hand, near, shadows), border)
+            yield picture
+
+    def _lamp_depth(self, stage: str) -> npt.NDArray[np.float32]:
+        drawn = {"still": self._scene.still, "head": self._scene.head}[stage]
+        return drawn.draw(lamp(STILL_LAMP_SIZE), None, STILL_LAMP_SIZE, STILL_LAMP_SIZE, DEPTH_ONLY).depth
+
+    def _turn_head(self, quaternion: npt.NDArray[np.float32]) -> Array:
+        """Turn the head and say where the mouth is."""
+        turn = np.asarray(quaternion, dtype=float)
+        self._scene.turn_head(turn.tolist())
+        mouth: Array = np.asarray(NECK_PIVOT_M) + _rotation(turn) @ np.asarray(MOUTH_FROM_NECK_M)
+        return mouth
+
+    def _head_box(self) -> Pixels:
+        corners = self._camera.pixels(np.asarray(NECK_PIVOT_M) + HEAD_EXTENT_M)
+        x0, y0 = np.floor(corners.min(axis=0))
+        x1, y1 = np.ceil(corners.max(axis=0))
+        return int(x0), int(y0), int(x1), int(y1)
+
+    def _inset(self, mouth_m: Array, head_box: Pixels, lamp_depth: npt.NDArray[np.float32]) -> View:
+        style = self.style
+        rectangle = _around(
+            self._camera, mouth_m, style.inset_width / style.inset_zoom, style.inset_height / style.inset_zoom
+        )
+        view = View(
+            self._camera, rectangle, style.inset_width, style.inset_height, style.supersampling, self._scene.still
+        )
+        view.start(self._scene.head, head_box, lamp_depth)
+        return view
+
+    @property
+    def _near_mouth(self) -> list[int]:
+        hand = [self._parts.index(name) for name in HAND_PARTS]
+        return hand + list(range(len(self._parts), len(self._parts) + self.style.food_count))
+
+    def _moving_boxes(self, motion: Motion) -> Array:
+        """Where every link and piece of food is in every frame (N, L + P, 4), in pixels."""
+        corners = np.einsum("nlij,lcj->nlci", motion.frames[..., :3, :3], self._scene.boxes.corners_m)
+        pixels = self._camera.pixels(corners + motion.frames[:, :, None, :3, 3])
+        links = np.concatenate([pixels.min(axis=2) - 1.5, pixels.max(axis=2) + 1.5], axis=-1)
+        centre = self._camera.pixels(np.where(np.isnan(motion.food_m), GONE_M, motion.food_m))
+        gone = np.isnan(motion.food_m).any(axis=-1)
+        food = np.concatenate([centre - 8, centre + 8], axis=-1)
+        food[gone] = 0.0
+        return np.concatenate([links, food], axis=1)
+
+    def _pose(self, motion: Motion, turns: Array, index: int) -> None:
+        scene = self._scene
+        for part, name in enumerate(self._parts):
+            place, turn = motion.frames[index, part, :3, 3].tolist(), turns[index, part].tolist()
+            for stage in (scene.moving, scene.casters):
+                stage.place(name, place, turn)
+            if name in HAND_PARTS:
+                scene.hand.place(name, place, turn)
+        for food, place_m in enumerate(motion.food_m[index, : self.style.food_count]):
+            where = GONE_M if np.isnan(place_m).any() else place_m.tolist()
+            scene.moving.place(food_name(food), where, (0, 0, 0, 1))
+            scene.hand.place(food_name(food), where, (0, 0, 0, 1))
+
+
+INSET_CORNER_PX = (12, 12)
+INSET_BORDER_PX = 3
+
+
+def _paste_inset(picture: Image.Image, inset: Image.Image, border: tuple[int, int, int]) -> None:
+    x, y = INSET_CORNER_PX
+    edge = INSET_BORDER_PX
+    picture.paste(border, (x - edge, y - edge, x + inset.width + edge, y + inset.height + edge))
+    picture.paste(inset, (x, y))
+
+
+def _around(camera: Camera, mouth_m: Array, width: float, height: float) -> Rectangle:
+    """A part of the picture with the mouth right of its middle, for the spoon comes from the left."""
+    x, y = camera.pixels(mouth_m).tolist()
+    left = min(max(0.0, x - 0.62 * width), camera.width - width)
+    top = min(max(0.0, y - 0.52 * height), camera.height - height)
+    return left, top, left + width, top + height
+
+
+def _rotation(quaternion: Array) -> Array:
+    x, y, z, w = quaternion / np.linalg.norm(quaternion)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
