@@ -25,8 +25,6 @@ class RunStatus(StrEnum):
     SUCCEEDED = "succeeded"
     FAILED = "failed"
     RETRY = "retry"
-    """An experimenter asked for another attempt; the worker takes it up."""
-    RETRY = "retry"
     """Somebody has asked for another attempt."""
 
 
