@@ -66,17 +66,17 @@ def load_preferences(session: Session, store: ArtefactStore, participant_id: int
     labels = labels_with_clips(session, participant_id)
     said = [(label, target) for label in labels if (target := target_of(label.response)) is not None]
     return Preferences(
-        pairs=segment_pairs(store, [(label.query.left_clip, label.query.right_clip) for label, _ in said]),
+        pairs=segment_pairs(store, [(each.query.left_clip, each.query.right_clip) for each, _ in said])
+        if said
+        else None,
         targets=np.array([target for _, target in said], np.float32),
         label_count=len(labels),
         label_hash=label_hash(labels),
     )
 
 
-def segment_pairs(store: ArtefactStore, pairs: Sequence[tuple[Clip, Clip]]) -> SegmentPairs | None:
-    """The segments shown by N pairs of clips, left first; None for no pairs. All clips of a study are equally long."""
-    if not pairs:
-        return None
+def segment_pairs(store: ArtefactStore, pairs: Sequence[tuple[Clip, Clip]]) -> SegmentPairs:
+    """The segments shown by one or more pairs of clips, left first. All clips of a study are equally long."""
     first, count = pairs[0][0].first_step, pairs[0][0].step_count
     return SegmentPairs.cut([(_shown(store, left), _shown(store, right)) for left, right in pairs], first, count)
 

@@ -15,13 +15,10 @@ from app.domain.clips import Clip, Rollout
 from app.domain.models import Run, RunKind, RunStatus
 from app.domain.preferences import LabelEvent, Query, current_labels
 from app.domain.studies import Participant, Study, StudySettings
-from worker.records import ATTEMPTS, LEASE, Task, unanswered
+from worker.records import ATTEMPTS, LEASE, Task, next_queries
 
 CLIPS_AHEAD = 2
 """Scenarios per study in the making at a time: enough to keep busy, few enough that studies share fairly."""
-
-QUERIES_AHEAD = 12
-"""Unanswered queries each participant has waiting."""
 
 RETRY_AFTER = timedelta(seconds=10)
 
@@ -53,15 +50,8 @@ def short_of_queries(session: Session) -> list[int]:
         participant.id
         for study in session.scalars(select(Study)).all()
         for participant in session.scalars(select(Participant).where(Participant.study_id == study.id)).all()
-        if queries_wanted(session, participant.id, study.settings) > 0
+        if next_queries(session, participant.id, study.settings)[1] > 0
     ]
-
-
-def queries_wanted(session: Session, participant_id: int, settings: StudySettings) -> int:
-    """How many queries to make now so that the participant never waits and never gets more than planned."""
-    waiting = len(unanswered(session, participant_id))
-    made = session.scalar(select(func.count(Query.id)).where(Query.participant_id == participant_id)) or 0
-    return max(0, min(QUERIES_AHEAD - waiting, settings.labels_per_participant - made))
 
 
 def _attempt_due(run: Run | None, moment: datetime) -> int | None:

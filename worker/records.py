@@ -10,14 +10,19 @@ from typing import Any
 
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
+from sqlalchemy.sql.base import ExecutableOption
 
 from app.db import now
 from app.domain.clips import Clip, Rollout
 from app.domain.models import Bundle, Model, ModelKind, Run, RunKind, RunStatus, WorkerPresence
 from app.domain.preferences import LabelEvent, Query
+from app.domain.studies import StudySettings
 
 ATTEMPTS = 3
 """How often a failing run is tried before somebody has to look."""
+
+QUERIES_AHEAD = 12
+"""Unanswered queries each participant has waiting."""
 
 LEASE = timedelta(seconds=60)
 """A running run that has not been heard of for this long belongs to nobody."""
@@ -33,6 +38,13 @@ class Task:
     participant_id: int | None = None
     label_count: int | None = None
     label_hash: str | None = None
+
+    @property
+    def participant(self) -> int:
+        """The participant the run is for. Raises ValueError for work that is for a whole study."""
+        if self.participant_id is None:
+            raise ValueError(f"{self.finding} is not about one participant.")
+        return self.participant_id
 
 
 def begin_run(session: Session, task: Task, seed: int) -> int:
@@ -128,12 +140,48 @@ def save_bundle(session: Session, model: Model, version: int, artefact_sha256: s
         )
 
 
-def unanswered(session: Session, participant_id: int) -> Sequence[Query]:
-    """Queries that have never been answered, in their order."""
+def unanswered(session: Session, participant_id: int, *options: ExecutableOption) -> Sequence[Query]:
+    """Queries that have never been answered, in their order; ``options`` say what to load with each."""
     answered = select(LabelEvent.query_id).where(LabelEvent.query_id == Query.id).exists()
-    return session.scalars(
-        select(Query).where(Query.participant_id == participant_id, ~answered).order_by(Query.ordinal)
-    ).all()
+    mine = select(Query).where(Query.participant_id == participant_id, ~answered)
+    return session.scalars(mine.order_by(Query.ordinal).options(*options)).all()
+
+
+def next_queries(session: Session, participant_id: int, settings: StudySettings) -> tuple[int, int]:
+    """The next free ordinal, and how many queries to make so that the participant neither waits nor gets too many."""
+    made = session.scalar(select(func.count(Query.id)).where(Query.participant_id == participant_id)) or 0
+    newest = session.scalar(select(func.max(Query.ordinal)).where(Query.participant_id == participant_id)) or 0
+    waiting = len(unanswered(session, participant_id))
+    return newest + 1, max(0, min(QUERIES_AHEAD - waiting, settings.labels_per_participant - made))
+
+
+def save_queries(session: Session, participant_id: int, ordinal: int, rows: list[dict[str, Any]]) -> None:
+    """Add queries, the first of them at this ordinal; nothing happens when somebody else has been faster."""
+    newest = session.scalar(select(func.max(Query.ordinal)).where(Query.participant_id == participant_id)) or 0
+    if newest + 1 == ordinal:
+        session.add_all(Query(participant_id=participant_id, **row) for row in rows)
+
+
+def drop_unseen_queries(session: Session, participant_id: int, keep: int) -> None:
+    """Forget queries nobody has seen, the next few excepted, so that a newer model can choose others."""
+    for query in unanswered(session, participant_id)[keep:]:
+        if query.served_at is None:
+            session.delete(query)
+
+
+def save_predictions(session: Session, model_id: int, probabilities: dict[int, float]) -> None:
+    """Write P(right preferred) to queries, by id, unless they have been answered in the meantime."""
+    answered = set(session.scalars(select(LabelEvent.query_id).where(LabelEvent.query_id.in_(probabilities))))
+    for query_id in probabilities.keys() - answered:
+        query = session.get(Query, query_id)
+        if query is not None:
+            query.predicted_right, query.predicted_by_model_id = probabilities[query_id], model_id
+
+
+def set_labels(session: Session, run_id: int, label_count: int, label_hash: str) -> None:
+    """Note which labels the run has really seen; there may be more than were due."""
+    run = session.get_one(Run, run_id)
+    run.label_count, run.label_hash = label_count, label_hash
 
 
 def newest_model(session: Session, participant_id: int, kind: ModelKind) -> Model | None:

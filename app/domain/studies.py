@@ -40,7 +40,7 @@ class StudySettings(BaseModel):
     labels_per_participant: int = Field(default=200, ge=10, le=1000)
     retrain_every_labels: int = Field(default=10, ge=1, le=100)
     filter_milestones: tuple[int, ...] = Field(default=(50, 100), description="Label counts; the end is implied.")
-    clip_steps: int = Field(default=80, ge=20, le=100, description="Control steps shown, from the start (10 Hz).")
+    clip_steps: int = Field(default=70, ge=20, le=100, description="Control steps shown, from the start (10 Hz).")
     pool_scenarios: int = Field(default=36, ge=1, le=500)
     behaviours_per_scenario: int = Field(default=4, ge=2, le=8)
     strategy: Strategy = Strategy.UNIFORM

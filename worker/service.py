@@ -1,0 +1,133 @@
+"""The worker as a service: asks the database every half second what is to be done, and has the engine do it."""
+
+import fcntl
+import logging
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+
+from dbos import DBOS, SetWorkflowID
+from sqlalchemy.exc import OperationalError
+
+from app.db import Database
+from app.domain.models import RunKind
+from app.errors import AppError
+from app.settings import Settings
+from app.storage import ArtefactStore
+from worker import laboratory, reconcile, records
+from worker.compute import Compute, Lane
+from worker.records import Task
+from worker.workflows import Workshop, as_arguments
+
+log = logging.getLogger("worker")
+
+ROUND_S = 0.5
+ENGINE_VERSION = "1"
+"""Raised when the steps of a workflow change so that a half-finished one could not be resumed."""
+
+QUEUES = {RunKind.CLIPS: 2, RunKind.REWARD: 1, RunKind.FILTER: 1}
+"""How many tasks of each kind one worker does at a time."""
+
+
+class WorkerAlreadyRunning(AppError):
+    """A worker of this name is already running on this data directory. Stop it first, or set WORKER_NAME."""
+
+
+def run(settings: Settings) -> int:
+    """Keep studies supplied with clips, queries, models and bundles until told to stop."""
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
+    logging.getLogger("dbos").setLevel(logging.ERROR)
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, _setter(stop))
+    with _only_one(settings):
+        database = Database(settings.sqlalchemy_url)
+        compute = Compute(settings.compute_processes)
+        compute.warm_up(Lane.CLIPS, laboratory.warm_up)
+        workshop = Workshop(database, ArtefactStore(settings.data_dir / "artefacts"), compute)
+        _launch_engine(settings)
+        log.info("worker %s is ready", settings.worker_name)
+        try:
+            _rounds(settings, workshop, stop)
+        finally:
+            compute.close()
+            DBOS.destroy()
+            database.dispose()
+    return 0
+
+
+def _setter(stop: threading.Event) -> Callable[[int, FrameType | None], None]:
+    def on_signal(_number: int, _frame: FrameType | None) -> None:
+        stop.set()
+
+    return on_signal
+
+
+@contextmanager
+def _only_one(settings: Settings) -> Iterator[None]:
+    """Two workers of one name would resume each other's work while it is being done."""
+    settings.data_dir.mkdir(parents=True, exist_ok=True)
+    path = Path(settings.data_dir / f"{settings.worker_name}.lock")
+    with path.open("w") as stream:
+        try:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise WorkerAlreadyRunning from error
+        stream.write(str(os.getpid()))
+        stream.flush()
+        yield
+
+
+def _launch_engine(settings: Settings) -> None:
+    url = settings.sqlalchemy_url
+    if url.startswith("sqlite"):
+        url = f"sqlite:///{settings.data_dir.resolve() / 'engine.sqlite3'}"
+    DBOS(
+        config={
+            "name": "pbarl-studio",
+            "system_database_url": url,
+            "executor_id": settings.worker_name,
+            "application_version": ENGINE_VERSION,
+            "log_level": "ERROR",
+        }
+    )
+    DBOS.launch()
+    for kind, count in QUEUES.items():
+        DBOS.register_queue(kind.value, worker_concurrency=count, polling_interval_sec=0.2)
+
+
+def _rounds(settings: Settings, workshop: Workshop, stop: threading.Event) -> None:
+    started: set[str] = set()
+    while not stop.wait(ROUND_S):
+        try:
+            _one_round(settings, workshop, started)
+        except OperationalError as error:
+            log.warning("the database could not be reached, trying again: %s", error.orig)
+
+
+def _one_round(settings: Settings, workshop: Workshop, started: set[str]) -> None:
+    """``started`` only saves the engine from being told again what it already knows."""
+    with workshop.database.writing() as session:
+        records.sign_presence(session, settings.worker_name)
+    with workshop.database.reading() as session:
+        due = list(reconcile.findings(session))
+        hungry = reconcile.short_of_queries(session)
+        lost = reconcile.abandoned(session)
+    for task, attempt in due:
+        _start(workshop, task, reconcile.workflow_name(task.finding, attempt), started)
+    for participant_id in hungry:
+        workshop.refill_queries(participant_id)
+    for name in lost:
+        log.warning("%s was left behind by another worker; taking it over", name)
+        DBOS.resume_workflow(name)
+
+
+def _start(workshop: Workshop, task: Task, name: str, started: set[str]) -> None:
+    if name not in started:
+        with SetWorkflowID(name):
+            DBOS.enqueue_workflow(task.kind, workshop.work, as_arguments(task))
+        started.add(name)
