@@ -1,0 +1,309 @@
+"""What the experimenter sees: counted from the rows each time, never stored, so it cannot disagree with them."""
+
+import shutil
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from enum import StrEnum
+from pathlib import Path
+
+from sqlalchemy import func, select
+from sqlalchemy.orm import Session
+
+from app.db import now
+from app.domain.clips import Clip, Rollout
+from app.domain.models import Bundle, Model, ModelKind, Run, RunKind, RunStatus, WorkerPresence
+from app.domain.preferences import LabelEvent, Query, Response
+from app.domain.studies import Participant, Study
+from app.services import accuracy, results
+
+WORKER_SILENCE = timedelta(seconds=15)
+DISK_LOW_BYTES = 2 * 1024**3
+RECENT_CLIPS = 8
+ACTIVE_WITHIN = timedelta(seconds=60)
+
+
+class Stage(StrEnum):
+    """Where a participant is."""
+
+    INVITED = "invited"
+    READING = "reading the instructions"
+    COMPARING = "comparing"
+    FINISHED = "finished"
+
+
+@dataclass(frozen=True)
+class Machine:
+    """Whether anybody computes, and whether there is room for the results."""
+
+    worker_seen_at: datetime | None
+    worker_alive: bool
+    disk_free_bytes: int
+    disk_low: bool
+
+
+@dataclass(frozen=True)
+class Pool:
+    """The clips of a study."""
+
+    made: int
+    wanted: int
+    recent: Sequence[Clip]
+    run: Run | None
+    """The run that fills it, while it works or after it failed."""
+
+
+@dataclass(frozen=True)
+class ParticipantRow:
+    """One participant in one line."""
+
+    participant: Participant
+    stage: Stage
+    active: bool
+    answered: int
+    wanted: int
+    curve: accuracy.Curve
+    run: Run | None
+    """What the worker is doing for them, or what failed; None when nothing is to be said."""
+    newest_filter: results.FilterVersion | None
+
+
+@dataclass(frozen=True)
+class StudyLine:
+    """One study in one line."""
+
+    study: Study
+    participants: int
+    finished: int
+    labels: int
+    labels_wanted: int
+    clips: int
+    clips_wanted: int
+
+
+@dataclass(frozen=True)
+class StudyOverview:
+    """One study with everybody in it."""
+
+    study: Study
+    pool: Pool
+    rows: Sequence[ParticipantRow]
+
+
+@dataclass(frozen=True)
+class ParticipantDetail:
+    """Everything about one participant."""
+
+    study: Study
+    row: ParticipantRow
+    counts: Mapping[Response, int]
+    median_response_ms: int | None
+    versions: Sequence[results.FilterVersion]
+    """The newest first."""
+    weights: Sequence[results.Weight]
+    runs: Sequence[Run]
+    """The newest first."""
+
+
+@dataclass(frozen=True)
+class _Answer:
+    response: Response
+    predicted_right: float | None
+    response_time_ms: int | None
+
+
+def machine(session: Session, data_dir: Path) -> Machine:
+    """The state of the worker and of the disk."""
+    seen_at = session.scalar(select(WorkerPresence.last_seen_at).order_by(WorkerPresence.last_seen_at.desc()).limit(1))
+    free = shutil.disk_usage(data_dir).free
+    alive = seen_at is not None and now() - seen_at <= WORKER_SILENCE
+    return Machine(seen_at, alive, free, free < DISK_LOW_BYTES)
+
+
+def fingerprint(session: Session) -> str:
+    """Changes whenever a page of the dashboard would: one cheap query instead of drawing everything again."""
+    newest = (
+        select(func.max(LabelEvent.id)).scalar_subquery(),
+        select(func.max(Model.id)).scalar_subquery(),
+        select(func.max(Bundle.id)).scalar_subquery(),
+        select(func.max(Clip.id)).scalar_subquery(),
+        select(func.max(Participant.last_seen_at)).scalar_subquery(),
+        select(func.max(Participant.id)).scalar_subquery(),
+        select(func.max(Participant.instructed_at)).scalar_subquery(),
+        select(func.max(Run.heartbeat_at)).scalar_subquery(),
+        select(func.max(Run.finished_at)).scalar_subquery(),
+        select(func.count(Run.id)).where(Run.status == RunStatus.RETRY).scalar_subquery(),
+        select(func.max(Study.id)).scalar_subquery(),
+    )
+    return repr(tuple(session.execute(select(*newest)).one()))
+
+
+def study_lines(session: Session) -> Sequence[StudyLine]:
+    """Every study, the newest first."""
+    counted = session.execute(select(Rollout.study_id, func.count(Clip.id)).join(Clip).group_by(Rollout.study_id))
+    clips = dict(counted.tuples().all())
+    people: dict[int, list[Participant]] = defaultdict(list)
+    for participant in session.scalars(select(Participant)):
+        people[participant.study_id].append(participant)
+    lines = []
+    for study in session.scalars(select(Study).order_by(Study.id.desc())):
+        answers = _answers(session, [person.id for person in people[study.id]])
+        given = [len(answers[person.id]) for person in people[study.id]]
+        wanted = study.settings.labels_per_participant
+        lines.append(
+            StudyLine(
+                study=study,
+                participants=len(given),
+                finished=sum(count >= wanted for count in given),
+                labels=sum(given),
+                labels_wanted=wanted * len(given),
+                clips=clips.get(study.id, 0),
+                clips_wanted=_clips_wanted(study),
+            )
+        )
+    return lines
+
+
+def study_overview(session: Session, study: Study) -> StudyOverview:
+    """One study: its pool and a row per participant."""
+    people = session.scalars(
+        select(Participant).where(Participant.study_id == study.id).order_by(Participant.number)
+    ).all()
+    return StudyOverview(study, _pool(session, study), _rows(session, study, people))
+
+
+def participant_detail(session: Session, study: Study, participant: Participant) -> ParticipantDetail:
+    """One participant: answers, models, filters, runs."""
+    answers = _answers(session, [participant.id])[participant.id]
+    times = sorted(answer.response_time_ms for answer in answers if answer.response_time_ms is not None)
+    counts = Counter(answer.response for answer in answers)
+    return ParticipantDetail(
+        study=study,
+        row=_rows(session, study, [participant])[0],
+        counts={response: counts[response] for response in Response},
+        median_response_ms=times[len(times) // 2] if times else None,
+        versions=_versions(session, [participant.id])[participant.id],
+        weights=results.learned_weights(_newest_reward_model(session, participant)),
+        runs=session.scalars(select(Run).where(Run.participant_id == participant.id).order_by(Run.id.desc())).all(),
+    )
+
+
+def _rows(session: Session, study: Study, people: Sequence[Participant]) -> Sequence[ParticipantRow]:
+    ids = [person.id for person in people]
+    answers, versions, runs = _answers(session, ids), _versions(session, ids), _noteworthy_runs(session, ids)
+    wanted = study.settings.labels_per_participant
+    return [
+        ParticipantRow(
+            participant=person,
+            stage=_stage(person, len(answers[person.id]), wanted),
+            active=person.last_seen_at is not None and now() - person.last_seen_at < ACTIVE_WITHIN,
+            answered=len(answers[person.id]),
+            wanted=wanted,
+            curve=accuracy.curve(_hits(answers[person.id])),
+            run=runs.get(person.id),
+            newest_filter=versions[person.id][0] if versions[person.id] else None,
+        )
+        for person in people
+    ]
+
+
+def _stage(participant: Participant, answered: int, wanted: int) -> Stage:
+    if answered >= wanted:
+        return Stage.FINISHED
+    if participant.instructed_at is not None:
+        return Stage.COMPARING
+    return Stage.READING if participant.consented_at is not None else Stage.INVITED
+
+
+def _hits(answers: Iterable[_Answer]) -> Sequence[bool]:
+    """Whether each predicted answer that prefers a side was foreseen."""
+    decided = [answer for answer in answers if answer.response in (Response.LEFT, Response.RIGHT)]
+    return [
+        (answer.predicted_right > 0.5) == (answer.response is Response.RIGHT)
+        for answer in decided
+        if answer.predicted_right is not None
+    ]
+
+
+def _answers(session: Session, participant_ids: Sequence[int]) -> dict[int, list[_Answer]]:
+    """The answers that count, by participant, in the order of the queries."""
+    newest = (
+        select(LabelEvent.query_id, func.max(LabelEvent.revision).label("revision"))
+        .join(Query, Query.id == LabelEvent.query_id)
+        .where(Query.participant_id.in_(participant_ids))
+        .group_by(LabelEvent.query_id)
+        .subquery()
+    )
+    rows = session.execute(
+        select(Query.participant_id, LabelEvent.response, Query.predicted_right, LabelEvent.response_time_ms)
+        .join(LabelEvent, LabelEvent.query_id == Query.id)
+        .join(newest, (newest.c.query_id == LabelEvent.query_id) & (newest.c.revision == LabelEvent.revision))
+        .order_by(Query.participant_id, Query.ordinal)
+    )
+    answers: dict[int, list[_Answer]] = defaultdict(list)
+    for participant_id, response, predicted_right, response_time_ms in rows:
+        if response is None:  # taken back
+            continue
+        answers[participant_id].append(_Answer(Response(response), predicted_right, response_time_ms))
+    return answers
+
+
+def _versions(session: Session, participant_ids: Sequence[int]) -> dict[int, list[results.FilterVersion]]:
+    """Every filter of these participants, the newest first."""
+    rows = session.execute(
+        select(Model, Bundle)
+        .outerjoin(Bundle, Bundle.model_id == Model.id)
+        .where(Model.participant_id.in_(participant_ids), Model.kind == ModelKind.FILTER)
+        .order_by(Model.label_count.desc(), Model.id.desc())
+    )
+    versions: dict[int, list[results.FilterVersion]] = defaultdict(list)
+    for model, bundle in rows:
+        versions[model.participant_id].append(results.filter_version(model, bundle))
+    return versions
+
+
+def _noteworthy_runs(session: Session, participant_ids: Sequence[int]) -> dict[int, Run]:
+    """Per participant the newest run at work; where none is, the newest failure that no later success has made good."""
+    runs = session.scalars(select(Run).where(Run.participant_id.in_(participant_ids)).order_by(Run.id))
+    by_person: dict[int, list[Run]] = defaultdict(list)
+    for run in runs:
+        if run.participant_id is not None:
+            by_person[run.participant_id].append(run)
+    chosen = {person: _noteworthy(theirs) for person, theirs in by_person.items()}
+    return {person: run for person, run in chosen.items() if run is not None}
+
+
+def _noteworthy(runs: Sequence[Run]) -> Run | None:
+    """Of runs in their order: one at work, else a failure that still stands."""
+    working = [run for run in runs if run.status in (RunStatus.RUNNING, RunStatus.RETRY)]
+    if working:
+        return working[-1]
+    newest_of_kind = {run.kind: run for run in runs}
+    return next((run for run in newest_of_kind.values() if run.status == RunStatus.FAILED), None)
+
+
+def _pool(session: Session, study: Study) -> Pool:
+    clips = select(Clip).join(Rollout).where(Rollout.study_id == study.id)
+    runs = session.scalars(
+        select(Run).where(Run.study_id == study.id, Run.kind == RunKind.CLIPS).order_by(Run.id)
+    ).all()
+    return Pool(
+        made=session.scalar(select(func.count()).select_from(clips.subquery())) or 0,
+        wanted=_clips_wanted(study),
+        recent=session.scalars(clips.order_by(Clip.id.desc()).limit(RECENT_CLIPS)).all(),
+        run=_noteworthy(runs),
+    )
+
+
+def _clips_wanted(study: Study) -> int:
+    return study.settings.pool_scenarios * study.settings.behaviours_per_scenario
+
+
+def _newest_reward_model(session: Session, participant: Participant) -> Model | None:
+    return session.scalar(
+        select(Model)
+        .where(Model.participant_id == participant.id, Model.kind == ModelKind.REWARD)
+        .order_by(Model.label_count.desc(), Model.id.desc())
+        .limit(1)
+    )

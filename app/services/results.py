@@ -1,0 +1,173 @@
+"""What the worker measured, read from the metrics of its models. Anything missing is None, never a guess."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from enum import StrEnum
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from app.domain.models import Bundle, Model
+
+COST_NAMES = {
+    "C_d": "Distance from the mouth",
+    "C_v": "Speed of the spoon",
+    "C_f": "Force away from the mouth",
+    "C_hf": "High force at the mouth",
+    "C_fd": "Food spilled on the person",
+    "C_fdv": "Food entering fast",
+}
+"""The paper's six preference costs in words; less of each is what its name calls bad."""
+
+
+class Verdict(StrEnum):
+    """What an interval allows to be said."""
+
+    BETTER = "better"
+    WORSE = "worse"
+    UNCLEAR = "unclear"
+
+
+@dataclass(frozen=True)
+class Change:
+    """One number with the reference policy and with the filter; the interval (95 %) belongs to the difference."""
+
+    name: str
+    symbol: str
+    more_is_better: bool
+    reference: float | None
+    filtered: float | None
+    delta: float
+    low: float
+    high: float
+
+    @property
+    def verdict(self) -> Verdict:
+        """Better or worse only when the whole interval is on that side of zero."""
+        if self.low > 0 or self.high < 0:
+            return Verdict.BETTER if (self.low > 0) == self.more_is_better else Verdict.WORSE
+        return Verdict.UNCLEAR
+
+
+@dataclass(frozen=True)
+class Weight:
+    """What the reward model thinks of one measurable thing, with the spread over its ensemble."""
+
+    name: str
+    mean: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class FilterVersion:
+    """One trained filter and what was measured about it."""
+
+    label_count: int
+    created_at: datetime
+    method: str | None
+    gate: float | None
+    mode: Sequence[tuple[str, float]]
+    notes: Sequence[str]
+    scenarios: int | None
+    success: Change | None
+    preference: Change | None
+    costs: Sequence[Change]
+    bundle_version: int | None
+    """None until the bundle is published."""
+    bundle_byte_count: int | None
+
+
+class _Metrics(BaseModel):
+    model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
+
+
+_M = TypeVar("_M", bound=_Metrics)
+
+
+class _Difference(_Metrics):
+    reference: float | None = None
+    filter: float | None = None
+    delta: float
+    low: float
+    high: float
+
+
+class _Evaluation(_Metrics):
+    scenarios: int | None = None
+    success: _Difference | None = None
+    preference: _Difference | None = None
+    costs: dict[str, _Difference] = Field(default_factory=dict)
+
+
+class _Filter(_Metrics):
+    evaluation: _Evaluation = Field(default_factory=_Evaluation)
+    gate: float | None = None
+    mode: dict[str, float] = Field(default_factory=dict)
+    method: str | None = None
+    notes: list[str] = Field(default_factory=list)
+
+
+class _Weight(_Metrics):
+    mean: float
+    low: float
+    high: float
+
+
+class _Reward(_Metrics):
+    weights: dict[str, _Weight] = Field(default_factory=dict)
+
+
+def filter_version(model: Model, bundle: Bundle | None) -> FilterVersion:
+    """What is known about one filter; unreadable numbers are left out."""
+    metrics = _read(_Filter, model.metrics)
+    evaluation = metrics.evaluation
+    costs = [
+        _change(COST_NAMES[symbol], symbol, evaluation.costs.get(symbol), more_is_better=False) for symbol in COST_NAMES
+    ]
+    return FilterVersion(
+        label_count=model.label_count,
+        created_at=model.created_at,
+        method=metrics.method,
+        gate=metrics.gate,
+        mode=sorted(metrics.mode.items()),
+        notes=metrics.notes,
+        scenarios=evaluation.scenarios,
+        success=_change("Success", "", evaluation.success, more_is_better=True),
+        preference=_change("Preference, as the model sees it", "", evaluation.preference, more_is_better=True),
+        costs=[cost for cost in costs if cost is not None],
+        bundle_version=bundle.version if bundle else None,
+        bundle_byte_count=bundle.byte_count if bundle else None,
+    )
+
+
+def learned_weights(model: Model | None) -> Sequence[Weight]:
+    """The weights of the newest reward model, the strongest first; empty when it has none to show."""
+    if model is None:
+        return []
+    weights = _read(_Reward, model.metrics).weights
+    found = [Weight(name, weight.mean, weight.low, weight.high) for name, weight in weights.items()]
+    return sorted(found, key=lambda weight: -abs(weight.mean))
+
+
+def _change(name: str, symbol: str, difference: _Difference | None, *, more_is_better: bool) -> Change | None:
+    if difference is None:
+        return None
+    return Change(
+        name=name,
+        symbol=symbol,
+        more_is_better=more_is_better,
+        reference=difference.reference,
+        filtered=difference.filter,
+        delta=difference.delta,
+        low=difference.low,
+        high=difference.high,
+    )
+
+
+def _read(kind: "type[_M]", metrics: dict[str, Any]) -> "_M":
+    try:
+        return kind.model_validate(metrics)
+    except ValidationError:
+        return kind()
