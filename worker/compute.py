@@ -10,7 +10,7 @@ import os
 import signal
 import threading
 from collections.abc import Callable
-from concurrent.futures import Future, ProcessPoolExecutor, wait
+from concurrent.futures import CancelledError, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from enum import StrEnum
 from typing import Any, ParamSpec, TypeVar
@@ -36,12 +36,17 @@ class ComputeLost(RuntimeError):
     """A compute process died in the middle of its work, most often because the machine ran out of memory."""
 
 
+class Interrupted(BaseException):
+    """The worker is stopping. No Exception: the engine must not record it as an outcome, but resume the work later."""
+
+
 class Compute:
     """Process pools, one per lane, started when first needed and replaced when one of their processes dies."""
 
     def __init__(self, processes: int) -> None:
         self._sizes = {Lane.CLIPS: processes, Lane.LEARNING: processes}
         self._pools: dict[Lane, ProcessPoolExecutor] = {}
+        self._closing = threading.Event()
 
     def warm_up(self, lane: Lane, function: Callable[[], object]) -> None:
         """Have every process of a lane import what it will need, without waiting for it."""
@@ -64,6 +69,8 @@ class Compute:
         return self._await(lane, beat, [self._submit(lane, function, *each) for each in arguments])
 
     def _submit(self, lane: Lane, function: Callable[..., R], *args: Any, **kwargs: Any) -> "Future[R]":
+        if self._closing.is_set():
+            raise Interrupted
         try:
             return self._pool(lane).submit(function, *args, **kwargs)
         except BrokenProcessPool:
@@ -77,7 +84,9 @@ class Compute:
                 beat()
                 pending = wait(pending, timeout=HEARTBEAT_S).not_done
             return [future.result() for future in futures]
-        except BrokenProcessPool as broken:
+        except (BrokenProcessPool, CancelledError) as broken:
+            if self._closing.is_set():
+                raise Interrupted from broken
             self._discard(lane)
             raise ComputeLost(" ".join((ComputeLost.__doc__ or "").split())) from broken
 
@@ -97,8 +106,9 @@ class Compute:
             pool.shutdown(wait=False, cancel_futures=True)
 
     def close(self) -> None:
-        """Stop every process; work in hand is abandoned and will be found again by the next worker."""
-        for pool in self._pools.values():
+        """Stop every process; whoever waits for work in hand is Interrupted, and the next worker will do it again."""
+        self._closing.set()
+        for pool in list(self._pools.values()):
             for process in list((pool._processes or {}).values()):
                 process.terminate()
             pool.shutdown(wait=False, cancel_futures=True)
