@@ -1,0 +1,102 @@
+"""A filter against the reference policy on the same unseen scenarios: differences with 95 % intervals.
+
+Every difference is paired by scenario, so that easy and hard scenarios cancel. Intervals of means of costs and
+preference use the normal approximation (hundreds of scenarios); success is 0 or 1 and its change is often 0 in almost
+every scenario, where that approximation claims too much, so it gets a percentile bootstrap over scenarios, widened to
+the exact binomial bound when no scenario changed.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from worker.analysis.agreement import Z_95, wilson_interval
+from worker.trajectory import COSTS, SIGNALS, Trajectory
+
+Floats = npt.NDArray[np.float64]
+
+RESAMPLES = 2000
+
+
+def evaluate(
+    reference: Sequence[Trajectory],
+    filtered: Sequence[Trajectory],
+    reference_returns: npt.ArrayLike,
+    filtered_returns: npt.ArrayLike,
+    seed: int,
+) -> dict[str, Any]:
+    """Everything the dashboard and the model card show, as plain values.
+
+    ``*_returns`` (N,): learned returns of the same trajectories; their change is given in standard deviations of the
+    reference's returns. Costs are means over episodes of the summed unweighted costs.
+    Raises ValueError when the two lists are not the same scenarios in the same order.
+    """
+    if [each.scenario for each in reference] != [each.scenario for each in filtered] or not reference:
+        raise ValueError("Both must have been run on the same scenarios, in the same order.")
+    before, after = np.asarray(reference_returns, np.float64), np.asarray(filtered_returns, np.float64)
+    unit = max(float(before.std()), 1e-9)
+    return {
+        "scenarios": len(reference),
+        "success": success_change(_successes(reference), _successes(filtered), np.random.default_rng(seed)),
+        "preference": _with_interval((after - before) / unit),
+        "costs": {
+            name: mean_change(_summed(reference, column), _summed(filtered, column))
+            for column, name in enumerate(COSTS)
+        },
+        "safety": {"reference": envelope(reference), "filter": envelope(filtered)},
+    }
+
+
+def mean_change(before: Floats, after: Floats) -> dict[str, float]:
+    """Means of both and of their paired difference, with its interval. (N,), (N,)"""
+    return {"reference": float(before.mean()), "filter": float(after.mean()), **_with_interval(after - before)}
+
+
+def success_change(before: Floats, after: Floats, rng: np.random.Generator) -> dict[str, float]:
+    """Success rates and their paired difference with a bootstrap interval. (N,) of 0 and 1."""
+    change = after - before
+    draws = rng.integers(len(change), size=(RESAMPLES, len(change)))
+    low, high = np.quantile(change[draws].mean(axis=1), [0.025, 0.975])
+    if not change.any():
+        high = wilson_interval(0, len(change))[1]
+        low = -high
+    return {
+        "reference": float(before.mean()),
+        "filter": float(after.mean()),
+        "delta": float(change.mean()),
+        "low": float(low),
+        "high": float(high),
+    }
+
+
+def envelope(trajectories: Sequence[Trajectory]) -> dict[str, float]:
+    """The largest speed and force seen in these rollouts, and the 95th percentile of each episode's largest."""
+    speeds = np.array([_column(each, "speed_m_s").max() for each in trajectories])
+    forces = np.array([each.contact_force_n.max() for each in trajectories])
+    return {
+        "max_speed_m_s": float(speeds.max()),
+        "p95_max_speed_m_s": float(np.quantile(speeds, 0.95)),
+        "max_force_n": float(forces.max()),
+        "p95_max_force_n": float(np.quantile(forces, 0.95)),
+    }
+
+
+def _with_interval(differences: Floats) -> dict[str, float]:
+    mean = float(differences.mean())
+    margin = Z_95 * float(differences.std(ddof=1)) / len(differences) ** 0.5 if len(differences) > 1 else float("inf")
+    return {"delta": mean, "low": mean - margin, "high": mean + margin}
+
+
+def _successes(trajectories: Sequence[Trajectory]) -> Floats:
+    return np.array([each.success for each in trajectories], np.float64)
+
+
+def _summed(trajectories: Sequence[Trajectory], column: int) -> Floats:
+    return np.array([each.costs[:, column].sum(dtype=np.float64) for each in trajectories])
+
+
+def _column(trajectory: Trajectory, name: str) -> npt.NDArray[np.float32]:
+    signal: npt.NDArray[np.float32] = trajectory.signals[:, SIGNALS.index(name)]
+    return signal

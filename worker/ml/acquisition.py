@@ -1,0 +1,100 @@
+"""Which pair to show next: pure functions on arrays, every choice with the probability it had.
+
+Random choice is the default: below 200 labels cleverer rules were no better, or worse (they chase outliers). Whatever
+the rule, a share of the choices stays random, so that every pair keeps a positive propensity and estimates made from
+the labels can be corrected for how the pairs were chosen.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+Rule = Literal["uniform", "disagreement"]
+Indices = npt.NDArray[np.int64]
+Floats = npt.NDArray[np.float64]
+
+RANDOM_SHARE = 0.3
+SHARPNESS = 4.0
+"""Disagreement: probability proportional to exp(SHARPNESS * standardised score). Greedy choices repeat themselves."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The chosen candidates in the order in which they should be shown."""
+
+    indices: Indices
+    """(K,) rows of the candidates"""
+    propensities: Floats
+    """(K,) probability of each choice at the moment it was made, given the choices before it"""
+    swapped: npt.NDArray[np.bool_]
+    """(K,) True: the candidate's second clip goes to the left"""
+
+
+def matched_pairs(scenarios: npt.ArrayLike, behaviours: npt.ArrayLike | None = None) -> Indices:
+    """Every pair of clips of the same scenario, (M, 2) rows into the clips; with ``behaviours`` only differing ones."""
+    scenario = np.asarray(scenarios)
+    first, second = np.triu_indices(len(scenario), k=1)
+    keep = scenario[first] == scenario[second]
+    if behaviours is not None:
+        behaviour = np.asarray(behaviours)
+        keep &= behaviour[first] != behaviour[second]
+    return np.stack([first[keep], second[keep]], axis=1).astype(np.int64)
+
+
+def disagreement(member_probabilities: Floats) -> Floats:
+    """(E, M) P(right) under every member -> (M,) their standard deviation."""
+    spread: Floats = member_probabilities.std(axis=0)
+    return spread
+
+
+def choose(
+    count: int,
+    candidates: int,
+    rng: np.random.Generator,
+    *,
+    rule: Rule = "uniform",
+    scores: Floats | None = None,
+    random_share: float = RANDOM_SHARE,
+) -> Choice:
+    """Draw up to ``count`` of ``candidates`` pairs without replacement and put them on sides.
+
+    ``scores`` (candidates,): needed by rules other than uniform; higher is more worth asking.
+    Raises ValueError when scores are missing or random_share is not in (0, 1].
+    """
+    if not 0.0 < random_share <= 1.0:
+        raise ValueError("random_share must lie in (0, 1]: a share of the choices always stays random.")
+    if rule != "uniform" and (scores is None or np.shape(scores) != (candidates,)):
+        raise ValueError(f"The rule {rule!r} needs one score per candidate.")
+    preference = np.zeros(candidates) if scores is None or rule == "uniform" else _standardised(scores)
+    count = min(count, candidates)
+    remaining = np.ones(candidates, bool)
+    indices, propensities = np.zeros(count, np.int64), np.zeros(count)
+    for turn in range(count):
+        probability = _mixture(preference, remaining, random_share)
+        indices[turn] = rng.choice(candidates, p=probability)
+        propensities[turn] = probability[indices[turn]]
+        remaining[indices[turn]] = False
+    return Choice(indices, propensities, balanced_sides(count, rng))
+
+
+def balanced_sides(count: int, rng: np.random.Generator) -> npt.NDArray[np.bool_]:
+    """Which pairs to swap: exactly half of them (up to an odd one), in random order."""
+    swapped = np.arange(count) < (count + int(rng.integers(2))) // 2
+    shuffled: npt.NDArray[np.bool_] = rng.permutation(swapped)
+    return shuffled
+
+
+def _standardised(scores: Floats) -> Floats:
+    spread = float(np.std(scores))
+    centred: Floats = scores - np.mean(scores)
+    return centred / spread if spread > 0.0 else centred
+
+
+def _mixture(preference: Floats, remaining: npt.NDArray[np.bool_], random_share: float) -> Floats:
+    uniform = remaining / remaining.sum()
+    pull = np.where(remaining, SHARPNESS * preference, -np.inf)
+    sharp = np.exp(pull - pull.max())
+    mixture: Floats = random_share * uniform + (1 - random_share) * sharp / sharp.sum()
+    return mixture / mixture.sum()

@@ -1,0 +1,152 @@
+"""The action filter as a torch module: what runs after the frozen policy, and what is exported.
+
+action = policy_mean + gate * (transform(observation, policy_mean) - policy_mean). With gate 0 the policy is untouched.
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal, Self
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from safetensors.numpy import load, save
+from torch import Tensor, nn
+
+from worker.ml.adapter import ResidualAdapter
+from worker.ml.pbarl_printed import PrintedEncoder
+from worker.ml.policies import ACTION_STD_FLOOR, GaussianPolicy
+from worker.ml.policy_module import FrozenPolicy
+from worker.ml.reward_models import stored_config
+from worker.modes import FEEDING_AXES, perceived, speed_factor
+
+Array = npt.NDArray[np.float32]
+Method = Literal["studio", "printed"]
+
+
+@dataclass(frozen=True)
+class FilterWeights:
+    """Everything personal about a filter as plain arrays: travels between processes, is stored, builds the module."""
+
+    method: Method = "studio"
+    mode: tuple[float, ...] = (0.0,) * len(FEEDING_AXES)
+    gate: float = 1.0
+    residual_share: float = 1.0
+    """share of the encoder's residual that is used; 0 means the mode alone"""
+    encoder: Mapping[str, Array] = field(default_factory=dict)
+    """state of ResidualAdapter or PrintedEncoder; empty: none was trained"""
+
+    def changed(self, **values: Any) -> Self:
+        """The same with some values replaced."""
+        return replace(self, **values)
+
+    def named_mode(self) -> dict[str, float]:
+        """The mode by the names of its axes."""
+        return {axis.name: float(value) for axis, value in zip(FEEDING_AXES, self.mode, strict=True)}
+
+    def to_bytes(self) -> bytes:
+        """One safetensors file."""
+        config = {
+            "gate": self.gate,
+            "kind": "action encoder",
+            "method": self.method,
+            "mode": self.named_mode(),
+            "residual_share": self.residual_share,
+        }
+        tensors = {name: np.ascontiguousarray(array) for name, array in self.encoder.items()}
+        return save(tensors, metadata={"config": json.dumps(config, sort_keys=True)})
+
+    @classmethod
+    def from_bytes(cls, stored: bytes) -> Self:
+        """Read what to_bytes() wrote."""
+        config = stored_config(stored)
+        mode = tuple(float(config["mode"][axis.name]) for axis in FEEDING_AXES)
+        return cls(config["method"], mode, config["gate"], config["residual_share"], load(stored))
+
+
+class ModeTransform(nn.Module):
+    """The person's execution mode around the frozen policy, and the residual adapter around that."""
+
+    mode: Tensor
+    residual_share: Tensor
+
+    def __init__(
+        self, policy: FrozenPolicy, mode: Sequence[float], adapter: ResidualAdapter | None, residual_share: float
+    ) -> None:
+        super().__init__()
+        self.policy = policy
+        self.adapter = adapter
+        self.register_buffer("mode", torch.tensor(list(mode), dtype=torch.float32))
+        self.register_buffer("residual_share", torch.tensor(residual_share, dtype=torch.float32))
+
+    def base(self, observation: Tensor) -> tuple[Tensor, Tensor]:
+        """The mode's action and the policy's deviation where the mode looks, (B, 7) each."""
+        action, log_std = self.policy(perceived(observation, self.mode, torch))
+        deviation = (log_std.exp() * (1.0 - action**2)).clamp_min(ACTION_STD_FLOOR)
+        return (speed_factor(observation, self.mode, torch) * action).clamp(-1.0, 1.0), deviation
+
+    def forward(self, observation: Tensor, policy_mean: Tensor) -> Tensor:
+        """(B, D), (B, 7) -> (B, 7). The policy is asked where the mode looks; policy_mean is not needed."""
+        action, deviation = self.base(observation)
+        if self.adapter is None:
+            return action
+        moved: Tensor = self.adapter(observation, action, deviation)
+        return action + self.residual_share * (moved - action)
+
+
+class PrintedTransform(nn.Module):
+    """The paper's encoder after the policy: encode (s, policy_mean), decode."""
+
+    def __init__(self, encoder: PrintedEncoder) -> None:
+        super().__init__()
+        self.encoder = encoder
+
+    def forward(self, observation: Tensor, policy_mean: Tensor) -> Tensor:
+        """(B, D), (B, 7) -> (B, 7)"""
+        action: Tensor = self.encoder(observation, policy_mean)
+        return action
+
+
+class ActionFilter(nn.Module):
+    """observation (B, D), policy_mean (B, 7) -> action (B, 7) in [-1, 1]. Deterministic."""
+
+    gate: Tensor
+
+    def __init__(self, transform: nn.Module, gate: float) -> None:
+        super().__init__()
+        self.transform = transform
+        self.register_buffer("gate", torch.tensor(gate, dtype=torch.float32))
+
+    def forward(self, observation: Tensor, policy_mean: Tensor) -> Tensor:
+        """See the class."""
+        change = self.transform(observation, policy_mean) - policy_mean
+        action: Tensor = (policy_mean + self.gate * change).clamp(-1.0, 1.0)
+        return action
+
+
+def build(policy: GaussianPolicy, weights: FilterWeights) -> ActionFilter:
+    """The module for these weights around this policy, in evaluation mode, on the CPU."""
+    frozen = FrozenPolicy(policy.weights)
+    transform: nn.Module
+    if weights.method == "printed":
+        encoder = PrintedEncoder(frozen.offset, frozen.scale)
+        load_state(encoder, weights.encoder)
+        transform = PrintedTransform(encoder)
+    else:
+        adapter = None
+        if weights.encoder and weights.residual_share > 0.0:
+            adapter = ResidualAdapter(frozen.offset, frozen.scale)
+            load_state(adapter, weights.encoder)
+        transform = ModeTransform(frozen, weights.mode, adapter, weights.residual_share)
+    return ActionFilter(transform, weights.gate).eval().requires_grad_(False)
+
+
+def state_of(module: nn.Module) -> dict[str, Array]:
+    """A module's state as arrays."""
+    return {name: tensor.detach().numpy().astype(np.float32) for name, tensor in module.state_dict().items()}
+
+
+def load_state(module: nn.Module, state: Mapping[str, Array]) -> None:
+    """Put arrays back into a module."""
+    module.load_state_dict({name: torch.from_numpy(np.array(array)) for name, array in state.items()})

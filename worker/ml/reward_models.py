@@ -1,0 +1,232 @@
+"""Reward models: an ensemble of functions from one control step to how much this person likes it.
+
+Inference is NumPy for both kinds, so a model works anywhere; training lives in reward_training. A learned reward has no
+natural zero or unit (pairs of equal length cannot identify an offset, and the scale grows with the labels), so
+every model is normalised to mean 0 and standard deviation 1 per step over rollouts of the reference policy.
+"""
+
+import json
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Self
+
+import numpy as np
+import numpy.typing as npt
+from safetensors.numpy import load, save
+
+from worker.ml.bradley_terry import preference_logits, probability_right
+from worker.ml.segments import LEFT, RIGHT, SegmentPairs
+from worker.trajectory import SIGNALS, Trajectory
+
+Array = npt.NDArray[np.float32]
+Floats = npt.NDArray[np.float64]
+
+CLIP = 8.0
+"""Normalised step rewards are cut here: one broken step must not decide an episode."""
+_SMALLEST_SCALE = 1e-6
+
+
+@dataclass(frozen=True)
+class Normalisation:
+    """r = (raw - offset) / scale; the same for all members, so that their disagreement survives."""
+
+    offset: float = 0.0
+    scale: float = 1.0
+
+    @classmethod
+    def over(cls, raw_rewards: npt.NDArray[np.floating]) -> Self:
+        """From raw step rewards of reference rollouts, (E, ...)."""
+        mean = raw_rewards.mean(axis=0, dtype=np.float64)
+        return cls(float(mean.mean()), max(float(mean.std()), _SMALLEST_SCALE))
+
+
+class RewardModel(ABC):
+    """E members, each a function of one step. Arrays have any leading axes, the same for all three arguments."""
+
+    kind: ClassVar[str]
+    normalisation: Normalisation
+
+    @abstractmethod
+    def raw_rewards(self, signals: Array, observations: Array, actions: Array) -> Floats:
+        """Unnormalised rewards. (..., S), (..., D), (..., 7) -> (E, ...)"""
+
+    @abstractmethod
+    def tensors(self) -> dict[str, Array]:
+        """Everything learned, by name."""
+
+    def step_rewards(self, signals: Array, observations: Array, actions: Array) -> Floats:
+        """Normalised and clipped rewards. (..., S), (..., D), (..., 7) -> (E, ...)"""
+        raw = self.raw_rewards(signals, observations, actions)
+        clipped: Floats = np.clip((raw - self.normalisation.offset) / self.normalisation.scale, -CLIP, CLIP)
+        return clipped
+
+    def returns(self, trajectories: Sequence[Trajectory]) -> Floats:
+        """Mean over members of the summed normalised rewards of each trajectory, (N,)."""
+        return np.array([self.rewards_of(trajectory).sum() for trajectory in trajectories])
+
+    def rewards_of(self, trajectory: Trajectory) -> Floats:
+        """Mean over members of the normalised reward of every step, (T,)."""
+        steps = len(trajectory)
+        rewards = self.step_rewards(trajectory.signals, trajectory.observations[:steps], trajectory.actions)
+        mean: Floats = rewards.mean(axis=0)
+        return mean
+
+    def logits(self, pairs: SegmentPairs) -> Floats:
+        """Every member's log odds that the right segment is preferred, (E, N). Not normalised, not clipped."""
+        returns = self.raw_rewards(pairs.signals, pairs.observations, pairs.actions).sum(axis=-1)
+        difference: Floats = preference_logits(returns[..., LEFT], returns[..., RIGHT])
+        return difference
+
+    def member_probabilities(self, pairs: SegmentPairs) -> Floats:
+        """P(right preferred) under every member, (E, N)."""
+        return probability_right(self.logits(pairs))
+
+    def probability_right(self, pairs: SegmentPairs) -> Floats:
+        """P(right preferred), the mean over members, (N,)."""
+        mean: Floats = self.member_probabilities(pairs).mean(axis=0)
+        return mean
+
+    def normalised_over(self, reference: Sequence[Trajectory]) -> Self:
+        """The same model with mean 0 and standard deviation 1 per step over these rollouts."""
+        raw = [
+            self.raw_rewards(each.signals, each.observations[: len(each)], each.actions).reshape(self.size, -1)
+            for each in reference
+        ]
+        return self.with_normalisation(Normalisation.over(np.concatenate(raw, axis=1)))
+
+    def signal_weights(self, reference: Sequence[Trajectory]) -> Floats:
+        """(S,) reward per unit of each signal: what the response surface of modes is searched with.
+
+        For a model that is not linear in the signals: the ridge regression of its episode returns on the episodes'
+        summed signals.
+        """
+        sums = np.array([each.signals.sum(axis=0, dtype=np.float64) for each in reference])
+        scale = np.maximum(sums.std(axis=0), 1e-9)
+        features = (sums - sums.mean(axis=0)) / scale
+        returns = self.returns(reference)
+        gram = features.T @ features + np.eye(features.shape[1])
+        weights: Floats = np.linalg.solve(gram, features.T @ (returns - returns.mean())) / scale
+        return np.where(sums.std(axis=0) > 1e-9, weights, 0.0)
+
+    @property
+    @abstractmethod
+    def size(self) -> int:
+        """E, the number of members."""
+
+    def to_bytes(self) -> bytes:
+        """One safetensors file; its metadata says what it is."""
+        config = {"kind": self.kind, "offset": self.normalisation.offset, "scale": self.normalisation.scale}
+        # A single metadata key: with several, safetensors writes them in an order that changes from run to run.
+        return save(self.tensors(), metadata={"config": json.dumps(config, sort_keys=True)})
+
+    @abstractmethod
+    def with_normalisation(self, normalisation: Normalisation) -> Self:
+        """The same model in other units."""
+
+
+@dataclass(frozen=True)
+class StructuredReward(RewardModel):
+    """Linear in the measured signals: r = w . signals. Members are samples of the weights' posterior."""
+
+    kind: ClassVar[str] = "structured"
+    weights: Floats
+    """(E, S), reward per unit of each signal"""
+    normalisation: Normalisation = Normalisation()
+
+    def raw_rewards(self, signals: Array, observations: Array, actions: Array) -> Floats:
+        """See RewardModel; observations and actions are not used."""
+        rewards: Floats = np.moveaxis(np.asarray(signals, np.float64) @ self.weights.T, -1, 0)
+        return rewards
+
+    def tensors(self) -> dict[str, Array]:
+        """See RewardModel."""
+        return {"weights": self.weights.astype(np.float32)}
+
+    def signal_weights(self, reference: Sequence[Trajectory] = ()) -> Floats:
+        """(S,) normalised reward per unit of each signal, the mean over members; exact for this kind."""
+        mean: Floats = self.weights.mean(axis=0) / self.normalisation.scale
+        return mean
+
+    @property
+    def size(self) -> int:
+        """See RewardModel."""
+        return len(self.weights)
+
+    def with_normalisation(self, normalisation: Normalisation) -> Self:
+        """See RewardModel."""
+        return replace(self, normalisation=normalisation)
+
+
+@dataclass(frozen=True)
+class MlpReward(RewardModel):
+    """An ensemble of small networks on (observation, action), each output in (-1, 1) as in B-Pref (Lee et al. 2021).
+
+    ``layers``: per layer a matrix (E, in, out) and a bias (E, 1, out). Inputs are standardised with ``offset`` and
+    ``scale`` (D + 7,) and clipped at 6 standard deviations.
+    """
+
+    kind: ClassVar[str] = "mlp"
+    layers: tuple[tuple[Array, Array], ...]
+    offset: Array
+    scale: Array
+    normalisation: Normalisation = Normalisation()
+
+    def raw_rewards(self, signals: Array, observations: Array, actions: Array) -> Floats:
+        """See RewardModel; the signals are not used."""
+        leading = np.shape(actions)[:-1]
+        inputs = np.concatenate([observations, actions], axis=-1).reshape(-1, len(self.offset))
+        hidden = np.clip((inputs - self.offset) / self.scale, -6.0, 6.0)[None]
+        for matrix, bias in self.layers[:-1]:
+            hidden = hidden @ matrix + bias
+            hidden = hidden / (1.0 + np.exp(-np.clip(hidden, -60.0, 60.0)))  # SiLU
+        matrix, bias = self.layers[-1]
+        rewards: Floats = np.tanh(hidden @ matrix + bias)[..., 0].astype(np.float64)
+        return rewards.reshape(self.size, *leading)
+
+    def tensors(self) -> dict[str, Array]:
+        """See RewardModel."""
+        named = {"offset": self.offset, "scale": self.scale}
+        for index, (matrix, bias) in enumerate(self.layers):
+            named[f"matrix_{index}"], named[f"bias_{index}"] = matrix, bias
+        return {name: np.ascontiguousarray(array, np.float32) for name, array in named.items()}
+
+    @property
+    def size(self) -> int:
+        """See RewardModel."""
+        return len(self.layers[0][0])
+
+    def with_normalisation(self, normalisation: Normalisation) -> Self:
+        """See RewardModel."""
+        return replace(self, normalisation=normalisation)
+
+
+def load_reward_model(stored: bytes) -> RewardModel:
+    """Read what to_bytes() wrote. Raises ValueError for a file that is something else."""
+    config = stored_config(stored)
+    tensors = load(stored)
+    normalisation = Normalisation(float(config["offset"]), float(config["scale"]))
+    if config.get("kind") == StructuredReward.kind:
+        return StructuredReward(tensors["weights"].astype(np.float64), normalisation)
+    if config.get("kind") == MlpReward.kind:
+        count = sum(name.startswith("matrix_") for name in tensors)
+        layers = tuple((tensors[f"matrix_{index}"], tensors[f"bias_{index}"]) for index in range(count))
+        return MlpReward(layers, tensors["offset"], tensors["scale"], normalisation)
+    raise ValueError(f"Not a reward model: {config!r}.")
+
+
+def stored_config(stored: bytes) -> dict[str, Any]:
+    """The 'config' in the metadata of a safetensors file held in memory. Raises ValueError when there is none."""
+    header_size = int.from_bytes(stored[:8], "little")
+    if len(stored) < 8 + header_size:
+        raise ValueError("Not a safetensors file: it ends within its own header.")
+    header: dict[str, Any] = json.loads(stored[8 : 8 + header_size])
+    if "config" not in header.get("__metadata__", {}):
+        raise ValueError("This safetensors file does not say what it is (no config in its metadata).")
+    config: dict[str, Any] = json.loads(header["__metadata__"]["config"])
+    return config
+
+
+def named_weights(values: Floats) -> dict[str, float]:
+    """(S,) -> one value per signal, by name."""
+    return {name: float(value) for name, value in zip(SIGNALS, values, strict=True)}

@@ -1,0 +1,90 @@
+"""Scripted teachers: simulated participants with known tastes, for rehearsals, tests and measurements.
+
+A teacher sees the preference reward r^H of every step (the paper's Eq. 8; worker.sim.costs.preference_rewards computes
+it for an omega) and names the segment with the larger sum. How it errs follows B-Pref (Lee et al. 2021), with every
+threshold in units of the spread of returns, so that a setting means the same for every taste.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Literal, Self
+
+import numpy as np
+import numpy.typing as npt
+
+Floats = npt.NDArray[np.float64]
+Answer = Literal["left", "right", "equal", "skip"]
+"""The words the database stores."""
+
+
+class User(StrEnum):
+    """The paper's three types of users."""
+
+    NEUTRAL = "neutral"
+    CAUTIOUS = "cautious"
+    IMPATIENT = "impatient"
+
+
+OMEGA: Mapping[User, tuple[float, ...]] = {
+    User.NEUTRAL: (1.0, 1.0, 1.0, 1.0, 1.0, 1.0),
+    User.CAUTIOUS: (1.0, 2.0, 1.5, 2.5, 3.0, 2.0),
+    User.IMPATIENT: (2.0, 0.5, 0.75, 0.5, 1.5, 0.5),
+}
+"""The paper's omega, in the order of COSTS."""
+
+
+@dataclass(frozen=True)
+class Manner:
+    """How a teacher answers. The defaults are those of the measurements in docs/results."""
+
+    rationality: float | None = None
+    """beta: P(right) = sigmoid(beta * difference / spread); None always names the better one"""
+    myopia: float = 1.0
+    """gamma: step t of T counts gamma^(T - t), so that below 1 the end of a clip weighs more"""
+    mistakes: float = 0.05
+    """epsilon: share of answers that say the opposite"""
+    equal_share: float = 0.10
+    """share of pairs, those that differ least, that are called equal"""
+    skip_share: float = 0.0
+    """share of pairs on which the teacher cannot tell"""
+
+
+@dataclass(frozen=True)
+class ScriptedTeacher:
+    """Answers pairs of segments. ``spread`` and ``equal_below`` are in units of returns; see calibrated()."""
+
+    manner: Manner
+    spread: float
+    equal_below: float
+
+    @classmethod
+    def calibrated(cls, manner: Manner, pool_rewards: npt.ArrayLike) -> Self:
+        """A teacher whose thresholds fit pairs like these: preference rewards (N, 2, T)."""
+        returns = segment_returns(np.asarray(pool_rewards, np.float64), manner.myopia)
+        differences = returns[:, 1] - returns[:, 0]
+        spread = max(float(np.sqrt((differences**2).mean())), 1e-9)
+        return cls(manner, spread, float(np.quantile(np.abs(differences), manner.equal_share)))
+
+    def answer(self, left_rewards: npt.ArrayLike, right_rewards: npt.ArrayLike, rng: np.random.Generator) -> Answer:
+        """What this teacher says about one pair, from the preference rewards (T,) of the shown steps."""
+        skips, errs, decides = rng.random(3)  # always three draws: one answer does not shift the next one's luck
+        if skips < self.manner.skip_share:
+            return "skip"
+        left, right = segment_returns(np.array([left_rewards, right_rewards], np.float64), self.manner.myopia)
+        difference = float(right - left)
+        if self.manner.equal_share > 0.0 and abs(difference) <= self.equal_below:
+            return "equal"
+        names_right = difference > 0.0
+        if self.manner.rationality is not None:
+            odds = np.clip(self.manner.rationality * difference / self.spread, -50.0, 50.0)
+            names_right = bool(decides < 1.0 / (1.0 + np.exp(-odds)))
+        if errs < self.manner.mistakes:
+            names_right = not names_right
+        return "right" if names_right else "left"
+
+
+def segment_returns(rewards: Floats, myopia: float = 1.0) -> Floats:
+    """(..., T) -> (...): summed rewards, later steps counting more when myopia < 1."""
+    returns: Floats = rewards @ myopia ** np.arange(rewards.shape[-1] - 1, -1, -1)
+    return returns
