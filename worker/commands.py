@@ -1,9 +1,15 @@
-"""Tools of the worker that need no database: training the reference policy, exploring the modes."""
+"""Tools of the worker: training the reference policy, exploring the modes, rehearsing a study."""
 
 import argparse
+import sys
+import tempfile
 from pathlib import Path
 
-from worker import laboratory
+from app.db import Database
+from app.domain.studies import Method, RewardKind, Strategy, StudySettings
+from app.storage import ArtefactStore
+from worker import laboratory, rehearsal
+from worker.ml.teachers import Manner, User
 
 
 def add_to(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
@@ -12,3 +18,53 @@ def add_to(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> N
     pretrain.add_argument("--seed", type=int, default=0)
     pretrain.add_argument("--directory", type=Path, default=laboratory.CHECKPOINTS, help="where the policy goes")
     pretrain.set_defaults(act=lambda options: laboratory.pretrain(options.seed, options.directory))
+
+    rehearse = commands.add_parser("rehearse", help=_rehearse.__doc__)
+    rehearse.add_argument("--users", nargs="+", type=User, choices=list(User), default=list(User))
+    rehearse.add_argument("--labels", type=int, default=200, help="labels per participant")
+    rehearse.add_argument("--retrain-every", type=int, default=10)
+    rehearse.add_argument("--clip-scenarios", type=int, help="size of the pool; default: just enough pairs")
+    rehearse.add_argument("--method", type=Method, choices=list(Method), default=Method.STUDIO)
+    rehearse.add_argument("--reward", type=RewardKind, choices=list(RewardKind), default=RewardKind.STRUCTURED)
+    rehearse.add_argument("--strategy", type=Strategy, choices=list(Strategy), default=Strategy.UNIFORM)
+    rehearse.add_argument("--mistakes", type=float, default=0.05, help="share of answers that say the opposite")
+    rehearse.add_argument("--equal", type=float, default=0.10, help="share of pairs that are called equal")
+    rehearse.add_argument("--skip", type=float, default=0.02, help="share of pairs called can't tell")
+    rehearse.add_argument("--pace", type=float, default=0.0, help="seconds of thought per pair")
+    rehearse.add_argument("--seed", type=int, default=0)
+    rehearse.add_argument("--directory", type=Path, help="keep everything here; default: a temporary directory")
+    rehearse.set_defaults(act=_rehearse)
+
+
+def _rehearse(options: argparse.Namespace) -> int:
+    """Send scripted participants through the real pages and print what came out."""
+    with tempfile.TemporaryDirectory(prefix="rehearsal-") as temporary:
+        directory = options.directory or Path(temporary)
+        with rehearsal.own_studio(directory) as settings:
+            database = Database(settings.sqlalchemy_url)
+            studio = rehearsal.Rehearsal(
+                database, ArtefactStore(directory / "artefacts"), settings.base_url, options.pace
+            )
+            manner = Manner(mistakes=options.mistakes, equal_share=options.equal, skip_share=options.skip)
+            outcomes = studio.run(options.users, _settings(options), manner, options.seed)
+            database.dispose()
+        for each in outcomes:
+            target = directory / f"{each.code}-{each.user}.zip"
+            target.write_bytes(each.bundle)
+        sys.stdout.write(rehearsal.summary(outcomes) + "\n")
+        if options.directory:
+            sys.stdout.write(f"Bundles and logs are in {directory}\n")
+    return 0
+
+
+def _settings(options: argparse.Namespace) -> StudySettings:
+    behaviours = StudySettings.model_fields["behaviours_per_scenario"].default
+    pairs_per_scenario = behaviours * (behaviours - 1) // 2
+    return StudySettings(
+        labels_per_participant=options.labels,
+        retrain_every_labels=options.retrain_every,
+        pool_scenarios=options.clip_scenarios or -(-options.labels // pairs_per_scenario),
+        method=options.method,
+        reward_kind=options.reward,
+        strategy=options.strategy,
+    )

@@ -78,7 +78,7 @@ def load_preferences(session: Session, store: ArtefactStore, participant_id: int
 def segment_pairs(store: ArtefactStore, pairs: Sequence[tuple[Clip, Clip]]) -> SegmentPairs:
     """The segments shown by one or more pairs of clips, left first. All clips of a study are equally long."""
     first, count = pairs[0][0].first_step, pairs[0][0].step_count
-    return SegmentPairs.cut([(_shown(store, left), _shown(store, right)) for left, right in pairs], first, count)
+    return SegmentPairs.cut([(shown(store, left), shown(store, right)) for left, right in pairs], first, count)
 
 
 def pool_clips(session: Session, study_id: int) -> Sequence[Clip]:
@@ -92,7 +92,8 @@ def pool_clips(session: Session, study_id: int) -> Sequence[Clip]:
     ).all()
 
 
-def _shown(store: ArtefactStore, clip: Clip) -> Trajectory:
+def shown(store: ArtefactStore, clip: Clip) -> Trajectory:
+    """The whole trajectory that a clip shows a stretch of."""
     return _trajectory(store.path(clip.rollout.trajectory_sha256))
 
 

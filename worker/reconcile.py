@@ -34,7 +34,7 @@ def findings(session: Session) -> Iterator[tuple[Task, int]]:
 
 
 def abandoned(session: Session) -> list[str]:
-    """Names under which somebody began to work and has not been heard of since: ``finding#attempt``."""
+    """Names under which some worker began to work and has not been heard of since: ``finding#attempt``."""
     lost = select(Run).where(Run.status == RunStatus.RUNNING, Run.heartbeat_at < now() - LEASE)
     return [workflow_name(run.workflow_id, run.attempt) for run in session.scalars(lost)]
 
@@ -83,8 +83,8 @@ def _missing_clips(session: Session, study: Study) -> list[Task]:
 
 
 def scenario_seed(study_seed: int, index: int) -> int:
-    """The scenario at one place of a study's pool; below 10^9, where the evaluation scenarios begin."""
-    return study_seed % 1_000_000 * 1_000 + index
+    """The scenario at one place of a study's pool; far from those that filters are trained and evaluated on."""
+    return 10_000_000 + study_seed % 90_000 * 1_000 + index
 
 
 def _stale_models(session: Session, study: Study) -> list[Task]:
