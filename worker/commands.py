@@ -1,6 +1,7 @@
 """Tools of the worker: training the reference policy, exploring the modes, rehearsing a study."""
 
 import argparse
+import json
 import sys
 import tempfile
 from pathlib import Path
@@ -8,7 +9,7 @@ from pathlib import Path
 from app.db import Database
 from app.domain.studies import Method, RewardKind, Strategy, StudySettings
 from app.storage import ArtefactStore
-from worker import laboratory, rehearsal
+from worker import exploration, laboratory, rehearsal
 from worker.ml.teachers import Manner, User
 
 
@@ -18,6 +19,11 @@ def add_to(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> N
     pretrain.add_argument("--seed", type=int, default=0)
     pretrain.add_argument("--directory", type=Path, default=laboratory.CHECKPOINTS, help="where the policy goes")
     pretrain.set_defaults(act=lambda options: laboratory.pretrain(options.seed, options.directory))
+
+    explore = commands.add_parser("explore", help=exploration.explore.__doc__)
+    explore.add_argument("--work-directory", type=Path, default=Path("data/explore"), help="finished blocks")
+    explore.add_argument("--processes", type=int, default=2)
+    explore.set_defaults(act=_explore)
 
     rehearse = commands.add_parser("rehearse", help=_rehearse.__doc__)
     rehearse.add_argument("--users", nargs="+", type=User, choices=list(User), default=list(User))
@@ -34,6 +40,12 @@ def add_to(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> N
     rehearse.add_argument("--seed", type=int, default=0)
     rehearse.add_argument("--directory", type=Path, help="keep everything here; default: a temporary directory")
     rehearse.set_defaults(act=_rehearse)
+
+
+def _explore(options: argparse.Namespace) -> int:
+    record = exploration.explore(options.work_directory, options.processes)
+    sys.stdout.write(json.dumps(record, indent=2) + "\n")
+    return 0
 
 
 def _rehearse(options: argparse.Namespace) -> int:
