@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from worker.ml.adapter import ResidualAdapter
 from worker.ml.pbarl_printed import PrintedEncoder
-from worker.ml.policies import ACTION_STD_FLOOR, GaussianPolicy
+from worker.ml.policies import GaussianPolicy
 from worker.ml.policy_module import FrozenPolicy
 from worker.ml.reward_models import stored_config
 from worker.modes import FEEDING_AXES, perceived, speed_factor
@@ -83,8 +83,8 @@ class ModeTransform(nn.Module):
     def base(self, observation: Tensor) -> tuple[Tensor, Tensor]:
         """The mode's action and the policy's deviation where the mode looks, (B, 7) each."""
         action, log_std = self.policy(perceived(observation, self.mode, torch))
-        deviation = (log_std.exp() * (1.0 - action**2)).clamp_min(ACTION_STD_FLOOR)
-        return (speed_factor(observation, self.mode, torch) * action).clamp(-1.0, 1.0), deviation
+        quicker = speed_factor(observation, self.mode, torch) * action
+        return quicker.clamp(-1.0, 1.0), self.policy.action_std(action, log_std)
 
     def forward(self, observation: Tensor, policy_mean: Tensor) -> Tensor:
         """(B, D), (B, 7) -> (B, 7). The policy is asked where the mode looks; policy_mean is not needed."""

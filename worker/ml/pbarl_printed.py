@@ -13,7 +13,8 @@ import torch
 from torch import Tensor, nn
 
 from worker.ml.adapter import kl_divergence
-from worker.ml.policies import ACTION_STD_FLOOR, GaussianPolicy
+from worker.ml.policies import GaussianPolicy
+from worker.ml.policy_module import FrozenPolicy
 from worker.ml.reward_models import MlpReward
 from worker.ml.value import Transitions
 
@@ -136,7 +137,7 @@ def train(
     generator = torch.Generator().manual_seed(seed)
     with torch.random.fork_rng():
         torch.manual_seed(seed)
-        frozen = policy.as_module()
+        frozen = FrozenPolicy(policy.weights)
         encoder = PrintedEncoder(torch.from_numpy(policy.offset), torch.from_numpy(policy.scale))
         dynamics = _three_layers(policy.action_size, 128, len(policy.offset))
     ranker = torch_ranker(reward)
@@ -158,18 +159,18 @@ def train(
     return encoder, {**losses, "seconds": time.perf_counter() - started}
 
 
-def sample_ranked_list(frozen: nn.Module, states: Tensor, count: int, generator: torch.Generator) -> Tensor:
+def sample_ranked_list(frozen: FrozenPolicy, states: Tensor, count: int, generator: torch.Generator) -> Tensor:
     """n actions of pi(a | s), the most probable first, (B, n, 7).
 
-    Ranked by the Gaussian's density around the policy's action; whether the paper ranks by the density before or after
+    Ranked by the density of the Gaussian before the tanh; whether the paper ranks by the density before or after
     the tanh is not said.
     """
-    centre, log_std = frozen(states)
-    deviation = (log_std.exp() * (1.0 - centre**2)).clamp_min(ACTION_STD_FLOOR)
+    action, log_std = frozen(states)
+    centre = (action / frozen.action_limit).clamp(-0.99999, 0.99999).atanh()
     noise = torch.randn(len(states), count, centre.shape[-1], generator=generator)
     order = (noise**2).sum(-1).argsort(dim=1)
     noise = noise.gather(1, order[..., None].expand_as(noise))
-    actions: Tensor = (centre[:, None] + deviation[:, None] * noise).clamp(-1.0, 1.0)
+    actions: Tensor = frozen.action_limit * (centre[:, None] + log_std.exp()[:, None] * noise).tanh()
     return actions
 
 

@@ -1,6 +1,7 @@
 """The frozen reference policy: a small Gaussian network, in NumPy for control loops and as a torch module for training.
 
-pi(a | s) is tanh of a Gaussian with state-dependent mean and standard deviation (soft actor-critic's policy).
+pi(a | s) is tanh of a Gaussian with state-dependent mean and standard deviation (soft actor-critic's policy), times a
+limit below 1: trained at the arm's full speed, it is run more slowly, so that a person may also want it quicker.
 """
 
 from pathlib import Path
@@ -25,15 +26,11 @@ class GaussianPolicy:
     """Inference without torch. Every method takes observations (..., D) and works on any leading axes."""
 
     def __init__(self, weights: dict[str, Array]) -> None:
-        """``weights``: offset (D,), scale (D,), and per layer i weight_i (in, out) and bias_i (out,)."""
+        """``weights``: offset (D,), scale (D,), and per layer i weight_i (in, out) and bias_i (out,); action_limit (1,)
+        when actions are to be smaller than the tanh gives."""
         self.weights = {name: np.ascontiguousarray(array, np.float32) for name, array in weights.items()}
-        # The input scaling is folded into the first layer: two operations less per control step.
-        first = self.weights["scale"][:, None] * self.weights["weight_0"]
-        self._matrices = [first, *(self.weights[f"weight_{index}"] for index in range(1, LAYERS))]
-        self._biases = [
-            self.weights["bias_0"] - self.weights["offset"] @ first,
-            *(self.weights[f"bias_{index}"] for index in range(1, LAYERS)),
-        ]
+        self._layers = [(self.weights[f"weight_{index}"], self.weights[f"bias_{index}"]) for index in range(LAYERS)]
+        self._limit = np.float32(self.action_limit)
         self.action_size = len(self.weights[f"bias_{LAYERS - 1}"]) // 2
 
     @classmethod
@@ -55,15 +52,20 @@ class GaussianPolicy:
         """(D,) multiplies what is left."""
         return self.weights["scale"]
 
+    @property
+    def action_limit(self) -> float:
+        """Largest absolute action, in (0, 1]."""
+        return float(self.weights["action_limit"][0]) if "action_limit" in self.weights else 1.0
+
     def mean(self, observations: Array) -> Array:
-        """The deterministic action tanh(mu), (..., 7) in [-1, 1]."""
-        action: Array = np.tanh(self._raw(observations)[..., : self.action_size])
+        """The deterministic action limit * tanh(mu), (..., 7)."""
+        action: Array = self._limit * np.tanh(self._raw(observations)[..., : self.action_size])
         return action
 
     def mean_and_std(self, observations: Array) -> tuple[Array, Array]:
         """Deterministic action after the tanh and standard deviation before it, (..., 7) each."""
         raw = self._raw(observations)
-        return np.tanh(raw[..., : self.action_size]), np.exp(self._log_std(raw))
+        return self._limit * np.tanh(raw[..., : self.action_size]), np.exp(self._log_std(raw))
 
     def action_std(self, observations: Array) -> Array:
         """How far actions spread around the deterministic one, in action units, (..., 7).
@@ -71,7 +73,8 @@ class GaussianPolicy:
         The Gaussian's deviation times the slope of the tanh at its mean, at least ACTION_STD_FLOOR.
         """
         action, deviation = self.mean_and_std(observations)
-        spread: Array = np.maximum(deviation * (1 - action**2), ACTION_STD_FLOOR)
+        slope = self._limit * (1 - (action / self._limit) ** 2)
+        spread: Array = np.maximum(deviation * slope, ACTION_STD_FLOOR)
         return spread
 
     def sample(self, observations: Array, rng: np.random.Generator) -> Array:
@@ -79,7 +82,7 @@ class GaussianPolicy:
         raw = self._raw(observations)
         centre = raw[..., : self.action_size]
         noise = rng.standard_normal(centre.shape, np.float32)
-        action: Array = np.tanh(centre + np.exp(self._log_std(raw)) * noise)
+        action: Array = self._limit * np.tanh(centre + np.exp(self._log_std(raw)) * noise)
         return action
 
     def as_module(self) -> "nn.Module":
@@ -93,8 +96,8 @@ class GaussianPolicy:
         return np.asarray(LOG_STD_LOW + (LOG_STD_HIGH - LOG_STD_LOW) * share, np.float32)
 
     def _raw(self, observations: Array) -> Array:
-        hidden = np.asarray(observations, np.float32)
-        for matrix, bias in zip(self._matrices[:-1], self._biases[:-1], strict=True):
+        hidden = (np.asarray(observations, np.float32) - self.offset) * self.scale
+        for matrix, bias in self._layers[:-1]:
             hidden = np.maximum(hidden @ matrix + bias, 0.0)
-        output: Array = hidden @ self._matrices[-1] + self._biases[-1]
-        return output
+        matrix, bias = self._layers[-1]
+        return np.asarray(hidden @ matrix + bias, np.float32)

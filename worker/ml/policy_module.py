@@ -7,7 +7,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
-from worker.ml.policies import LAYERS, LOG_STD_HIGH, LOG_STD_LOW
+from worker.ml.policies import ACTION_STD_FLOOR, LAYERS, LOG_STD_HIGH, LOG_STD_LOW
 
 
 class FrozenPolicy(nn.Module):
@@ -15,9 +15,11 @@ class FrozenPolicy(nn.Module):
 
     offset: Tensor
     scale: Tensor
+    action_limit: Tensor
 
     def __init__(self, weights: Mapping[str, npt.NDArray[np.float32]]) -> None:
         super().__init__()
+        self.register_buffer("action_limit", torch.ones(1))
         for name, array in weights.items():
             self.register_buffer(name, torch.from_numpy(np.array(array)))
 
@@ -30,4 +32,10 @@ class FrozenPolicy(nn.Module):
         raw = hidden @ self.get_buffer(f"weight_{last}") + self.get_buffer(f"bias_{last}")
         centre, spread = raw.chunk(2, -1)
         log_std = LOG_STD_LOW + (LOG_STD_HIGH - LOG_STD_LOW) * 0.5 * (spread.tanh() + 1)
-        return centre.tanh(), log_std
+        return self.action_limit * centre.tanh(), log_std
+
+    def action_std(self, actions: Tensor, log_std: Tensor) -> Tensor:
+        """How far actions spread around the deterministic ones, in action units; see GaussianPolicy.action_std()."""
+        slope = self.action_limit * (1.0 - (actions / self.action_limit) ** 2)
+        spread: Tensor = (log_std.exp() * slope).clamp_min(ACTION_STD_FLOOR)
+        return spread

@@ -61,6 +61,8 @@ class SacConfig:
     evaluation_episodes: int = 50
     test_episodes: int = 500
     save_every_s: float = 180.0
+    action_limit: float = 0.7
+    """share of the arm's largest step that the exported policy uses; the rest is left for people who want it quicker"""
     observation: Space = field(default=FEEDING_OBSERVATION, repr=False)
 
 
@@ -96,9 +98,10 @@ class Actor(nn.Module):
         log_probability = -0.5 * noise**2 - log_std - 0.5 * math.log(2 * math.pi) - squash
         return raw.tanh(), log_probability.sum(-1)
 
-    def policy(self) -> GaussianPolicy:
+    def policy(self, action_limit: float = 1.0) -> GaussianPolicy:
         """The same policy for NumPy."""
         weights: dict[str, Array] = {"offset": self.offset.numpy(), "scale": self.scale.numpy()}
+        weights["action_limit"] = np.array([action_limit], np.float32)
         for index in range(len(self.layers)):
             weights[f"weight_{index}"] = self.get_parameter(f"layers.{index}.weight").detach().numpy().T.copy()
             weights[f"bias_{index}"] = self.get_parameter(f"layers.{index}.bias").detach().numpy().copy()
@@ -325,7 +328,7 @@ class _Run:
         """Measure the averaged actor on unseen scenarios and keep it if it is the best so far."""
         if self.learner is None:
             return {}
-        policy = self.learner.average.policy()
+        policy = self.learner.average.policy(self.config.action_limit)
         outcome = evaluate(self.test_env, policy.mean, EVALUATION_SEED, self.config.evaluation_episodes)
         temperature = float(self.learner.log_temperature.detach().exp())
         self.curve.append({"steps": self.steps, "cpu_s": round(self.cpu_s, 1), "alpha": temperature, **outcome})

@@ -107,8 +107,8 @@ class FilterDraft:
         return replace(self, seconds={**self.seconds, stage: round(spent, 3)})
 
 
-SCENARIO_BLOCKS = {"gate": 1_000_000, "residual": 2_000_000, "evaluation": 3_000_000, "recording": 4_000_000}
-"""First scenario of each purpose; clips and the response surface use scenarios below a million."""
+SCENARIO_BLOCKS = {"gate": 2_000_000, "residual": 3_000_000, "evaluation": 4_000_000, "recording": 5_000_000}
+"""First scenario of each purpose. Elsewhere: exploration 100_000, test of the policy 1_000_000, clips from 10_000_000."""
 
 
 def scenarios_for(purpose: str, count: int, skip: int = 0) -> range:
