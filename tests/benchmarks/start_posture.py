@@ -8,7 +8,7 @@ import sys
 import numpy as np
 
 from worker.sim import human, jaco
-from worker.sim.bullet import Bullet, quaternion_of_euler
+from worker.sim.bullet import Bullet
 from worker.sim.feeding import LEVEL_TOWARDS_PERSON, PERSON_PARTS, START_CENTRE_M, add_person, in_base_frame
 
 RESTARTS = 4000
@@ -19,7 +19,7 @@ def main() -> None:
     """Score random restarts by manipulability, clearance and joint margins; print the best."""
     rng = np.random.default_rng(1)
     world = Bullet()
-    world.add_urdf("arm", jaco.urdf(), jaco.ROBOT_BASE_M, quaternion_of_euler(jaco.ROBOT_BASE_RPY))
+    jaco.add_to(world)
     add_person(world)
     mouth = np.array(human.NECK_PIVOT_M) + human.MOUTH_FROM_NECK_M
     goals = in_base_frame(np.array([START_CENTRE_M, *(mouth + np.array(WAYPOINTS_M))]))

@@ -3,11 +3,10 @@
 One `Bullet` is one DIRECT client. A simulation steps it; a renderer opens further clients and only sets poses.
 """
 
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -40,16 +39,33 @@ class Contact(NamedTuple):
     normal_force_n: float
 
 
-class Picture(NamedTuple):
-    """What a camera saw."""
+@dataclass(frozen=True)
+class Link:
+    """One link of a chain; its frame is its joint's frame and the place of its centre of mass."""
 
-    rgb: npt.NDArray[np.uint8]
-    """(height, width, 3)"""
+    name: str
+    origin_m: tuple[float, float, float]
+    """in the previous link's frame"""
+    quaternion: tuple[float, float, float, float]
+    mass_kg: float
+    shapes: tuple[Shape, ...]
+    turns: bool
+    """whether it turns about its own z axis, or is fixed to the previous link"""
 
 
 def rotation_of(quaternion: Vector) -> FloatArray:
     """The (3, 3) rotation matrix of an xyzw quaternion."""
     return np.array(pybullet.getMatrixFromQuaternion(quaternion)).reshape(3, 3)
+
+
+def compose(
+    origin_m: Vector, quaternion: Vector, inner_m: Vector, inner_quaternion: Vector
+) -> tuple[tuple[float, float, float], tuple[float, float, float, float]]:
+    """A frame given in another frame, seen from outside."""
+    position, turn = pybullet.multiplyTransforms(
+        list(origin_m), list(quaternion), list(inner_m), list(inner_quaternion)
+    )
+    return tuple(position), tuple(turn)
 
 
 def quaternion_of_euler(euler_rad: Vector) -> tuple[float, float, float, float]:
@@ -74,21 +90,12 @@ def capsule_between(start_m: Vector, end_m: Vector, radius_m: float) -> Shape:
 
 
 class Bullet:
-    """A physics or render client. Bodies are known by the name they were added with."""
+    """A physics client. Bodies are known by the name they were added with."""
 
     def __init__(self, time_step_s: float = 0.02, solver_iterations: int = 10) -> None:
         self._client: int | None = pybullet.connect(pybullet.DIRECT)
-        self._bodies: dict[str, int] = {}
-        self._names: dict[int, str] = {}
-        self._links: dict[str, dict[str, int]] = {}
-        pybullet.setPhysicsEngineParameter(
-            fixedTimeStep=time_step_s,
-            numSolverIterations=solver_iterations,
-            deterministicOverlappingPairs=1,
-            enableFileCaching=0,
-            physicsClientId=self._client,
-        )
-        pybullet.setGravity(0.0, 0.0, -9.81, physicsClientId=self._client)
+        self._time_step_s, self._solver_iterations = time_step_s, solver_iterations
+        self.clear()
 
     @property
     def client(self) -> int:
@@ -105,51 +112,86 @@ class Bullet:
 
     # Building the world
 
-    def add_urdf(self, name: str, urdf: str, position_m: Vector = (0, 0, 0), quaternion: Vector = IDENTITY) -> None:
-        """Load a fixed-base robot from URDF text. Mesh file names in it must be absolute."""
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / f"{name}.urdf"
-            path.write_text(urdf)
-            body = pybullet.loadURDF(
-                str(path), list(position_m), list(quaternion), useFixedBase=True, physicsClientId=self.client
-            )
-        self._register(name, body)
+    def clear(self) -> None:
+        """Remove everything and forget all history: what is built next behaves as in a fresh process."""
+        pybullet.resetSimulation(physicsClientId=self.client)
+        pybullet.setPhysicsEngineParameter(
+            fixedTimeStep=self._time_step_s,
+            numSolverIterations=self._solver_iterations,
+            deterministicOverlappingPairs=1,
+            physicsClientId=self.client,
+        )
+        pybullet.setGravity(0.0, 0.0, -9.81, physicsClientId=self.client)
+        self._bodies: dict[str, int] = {}
+        self._names: dict[int, str] = {}
+        self._links: dict[str, dict[str, int]] = {}
+        # Without a visual the engine tessellates each collision shape, which takes longer than the rest of adding it.
+        self._unseen: int = pybullet.createVisualShape(
+            pybullet.GEOM_MESH,
+            vertices=[[0, 0, 0], [0.001, 0, 0], [0, 0.001, 0]],
+            indices=[0, 1, 2],
+            physicsClientId=self.client,
+        )
 
     def add_body(
         self,
         name: str,
-        shapes: Sequence[Shape] = (),
-        mass_kg: float = 0.0,
+        shapes: Sequence[Shape],
         position_m: Vector = (0, 0, 0),
         quaternion: Vector = IDENTITY,
-        visual: int = -1,
     ) -> None:
-        """Add a free body (static when its mass is 0) made of primitives; ``visual`` is from mesh_visual()."""
-        collision = self._collision(shapes) if shapes else -1
+        """Add an immovable body made of primitives."""
         body = pybullet.createMultiBody(
-            mass_kg, collision, visual, list(position_m), list(quaternion), physicsClientId=self.client
-        )
-        self._register(name, body)
-
-    def mesh_visual(
-        self,
-        file: Path,
-        rgba: Sequence[float] = (1, 1, 1, 1),
-        specular: Sequence[float] = (0.05, 0.05, 0.05),
-        position_m: Vector = (0, 0, 0),
-        quaternion: Vector = IDENTITY,
-    ) -> int:
-        """A drawable mesh from an OBJ file in metres, for add_body()."""
-        shape: int = pybullet.createVisualShape(
-            pybullet.GEOM_MESH,
-            fileName=str(file),
-            rgbaColor=list(rgba),
-            specularColor=list(specular),
-            visualFramePosition=list(position_m),
-            visualFrameOrientation=list(quaternion),
+            0.0,
+            self._collision(shapes),
+            self._unseen,
+            list(position_m),
+            list(quaternion),
             physicsClientId=self.client,
         )
-        return shape
+        self._register(name, body, ())
+
+    def add_balls(self, names: Sequence[str], radius_m: float, mass_kg: float, positions_m: FloatArray) -> None:
+        """Add equal free balls, one per row of positions (N, 3)."""
+        bodies = pybullet.createMultiBody(
+            mass_kg,
+            self._collision([Shape("sphere", radius_m)]),
+            self._unseen,
+            batchPositions=np.asarray(positions_m, float).tolist(),
+            physicsClientId=self.client,
+        )
+        for name, body in zip(names, bodies, strict=True):
+            self._register(name, body, ())
+
+    def add_chain(
+        self,
+        name: str,
+        base: Sequence[Shape],
+        links: Sequence[Link],
+        position_m: Vector = (0, 0, 0),
+        quaternion: Vector = IDENTITY,
+    ) -> None:
+        """Add a robot on a fixed base: each link hangs on the one before it."""
+        count = len(links)
+        body = pybullet.createMultiBody(
+            0.0,
+            self._collision(base),
+            self._unseen,
+            list(position_m),
+            list(quaternion),
+            linkMasses=[link.mass_kg for link in links],
+            linkCollisionShapeIndices=[self._collision(link.shapes) for link in links],
+            linkVisualShapeIndices=[self._unseen] * count,
+            linkPositions=[list(link.origin_m) for link in links],
+            linkOrientations=[list(link.quaternion) for link in links],
+            linkInertialFramePositions=[[0, 0, 0]] * count,
+            linkInertialFrameOrientations=[list(IDENTITY)] * count,
+            linkParentIndices=list(range(count)),
+            linkJointTypes=[pybullet.JOINT_REVOLUTE if link.turns else pybullet.JOINT_FIXED for link in links],
+            linkJointAxis=[[0, 0, 1]] * count,
+            physicsClientId=self.client,
+        )
+        self._register(name, body, [link.name for link in links])
 
     def set_material(self, name: str, link: str | None = None, friction: float = 0.6, restitution: float = 0.0) -> None:
         """Friction and bounciness of a body's base or of one link."""
@@ -171,12 +213,6 @@ class Bullet:
                 angularDamping=angular,
                 physicsClientId=self.client,
             )
-
-    def set_colour(self, name: str, link: str | None, rgba: Sequence[float]) -> None:
-        """Recolour every visual of a body's base or of one link."""
-        pybullet.changeVisualShape(
-            self._bodies[name], self._link(name, link), rgbaColor=list(rgba), physicsClientId=self.client
-        )
 
     # Poses and joints
 
@@ -243,24 +279,6 @@ class Bullet:
         """Advance by one physics step."""
         pybullet.stepSimulation(physicsClientId=self.client)
 
-    def save(self) -> int:
-        """Remember the whole physical state in memory."""
-        state: int = pybullet.saveState(physicsClientId=self.client)
-        return state
-
-    def restore(self, state: int) -> None:
-        """Go back to a remembered state."""
-        pybullet.restoreState(state, physicsClientId=self.client)
-
-    def set_group(self, name: str, group: int, meets: int) -> None:
-        """Put a body and its links into a collision group (one bit) that only meets the groups in ``meets``.
-
-        This also makes the engine enter the body afresh and so forget at once whom it was near; left alone it drops
-        stale neighbours only gradually, which makes the order of contacts depend on what happened before.
-        """
-        for link in range(-1, len(self._links[name])):
-            pybullet.setCollisionFilterGroupMask(self._bodies[name], link, group, meets, physicsClientId=self.client)
-
     def contacts(self, name: str) -> list[Contact]:
         """Everything that presses on a body since the last step, with the contact points on that body."""
         points = pybullet.getContactPoints(self._bodies[name], physicsClientId=self.client)
@@ -275,44 +293,13 @@ class Bullet:
         )
         return min((point[8] for point in points if point[3] not in skipped), default=within_m)
 
-    # Pictures
-
-    def load_plugin(self, library: Path, suffix: str) -> bool:
-        """Load a native plugin such as the EGL renderer; False when the machine cannot."""
-        return bool(pybullet.loadPlugin(str(library), suffix, physicsClientId=self.client) >= 0)
-
-    def picture(
-        self,
-        width: int,
-        height: int,
-        view: Sequence[float],
-        projection: Sequence[float],
-        hardware: bool = False,
-        **lighting: Any,
-    ) -> Picture:
-        """Render one frame. ``view`` and ``projection`` are from view_matrix() and projection_matrix()."""
-        renderer = pybullet.ER_BULLET_HARDWARE_OPENGL if hardware else pybullet.ER_TINY_RENDERER
-        _, _, rgba, _, _ = pybullet.getCameraImage(
-            width,
-            height,
-            view,
-            projection,
-            renderer=renderer,
-            flags=pybullet.ER_NO_SEGMENTATION_MASK,
-            physicsClientId=self.client,
-            **lighting,
-        )
-        return Picture(np.asarray(rgba, np.uint8).reshape(height, width, 4)[..., :3])
-
     # Private
 
-    def _register(self, name: str, body: int) -> None:
+    def _register(self, name: str, body: int, links: Sequence[str]) -> None:
         if name in self._bodies:
             raise ValueError(f"There already is a body named {name!r}.")
         self._bodies[name], self._names[body] = body, name
-        count = pybullet.getNumJoints(body, physicsClientId=self.client)
-        infos = (pybullet.getJointInfo(body, joint, physicsClientId=self.client) for joint in range(count))
-        self._links[name] = {info[12].decode(): info[0] for info in infos}
+        self._links[name] = {link: index for index, link in enumerate(links)}
 
     def _link(self, name: str, link: str | None) -> int:
         return -1 if link is None else self._links[name][link]
@@ -328,16 +315,6 @@ class Bullet:
             physicsClientId=self.client,
         )
         return collision
-
-
-def view_matrix(eye_m: Vector, target_m: Vector, up: Vector = (0, 0, 1)) -> tuple[float, ...]:
-    """Camera pose for picture()."""
-    return tuple(pybullet.computeViewMatrix(list(eye_m), list(target_m), list(up)))
-
-
-def projection_matrix(field_of_view_deg: float, aspect: float, near_m: float, far_m: float) -> tuple[float, ...]:
-    """Lens for picture(); the field of view is vertical."""
-    return tuple(pybullet.computeProjectionMatrixFOV(field_of_view_deg, aspect, near_m, far_m))
 
 
 class Drawing(NamedTuple):

@@ -3,6 +3,7 @@
 World frame: see human.py. Observations are in the robot base frame, see worker/spaces.py.
 """
 
+from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 from functools import cache
@@ -14,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from worker.sim import human, jaco
-from worker.sim.bullet import Bullet, Shape, capsule_between, quaternion_of_euler, rotation_of
+from worker.sim.bullet import IDENTITY, Bullet, Shape, capsule_between, quaternion_of_euler, rotation_of
 from worker.sim.measures import StepMeasures, TaskReward
 from worker.spaces import CONTROL_STEP_S, FEEDING_OBSERVATION, JOINT_ACTION, Space
 from worker.trajectory import COSTS, SIGNALS
@@ -24,6 +25,7 @@ FloatArray = npt.NDArray[np.float64]
 
 EPISODE_STEPS = 100
 SUBSTEPS = 5
+SETTLING_SUBSTEPS = 50
 ACTION_UNIT_RAD = 0.05
 LEAD_RAD = 0.15
 """The commanded target never runs further ahead of the measured joints than this."""
@@ -48,8 +50,6 @@ BASE_ROTATION = jaco.rotation(jaco.ROBOT_BASE_RPY)
 LEVEL_TOWARDS_PERSON = BASE_ROTATION.T @ np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 """Spoon orientation (3, 3) in the base frame: tip towards the person (+y of the world), bowl level."""
 
-
-_FOOD, _PERSON, _ARM = 1, 2, 4
 PERSON_PARTS = ("body", "legs", "head")
 
 
@@ -59,12 +59,18 @@ def in_base_frame(points_m: FloatArray) -> FloatArray:
     return seen
 
 
-def add_person(world: Bullet) -> None:
-    """Add the seated person's collision shapes as static bodies, PERSON_PARTS."""
-    for name, limbs in (("body", human.BODY), ("legs", human.LEGS)):
-        world.add_body(name, [capsule_between(*limb[1:]) for limb in limbs])
-    head = [Shape("sphere", ball.radius_m, position_m=ball.centre_m) for ball in human.HEAD]
-    world.add_body("head", head, position_m=human.NECK_PIVOT_M)
+def add_person(world: Bullet, head_quaternion: Sequence[float] = IDENTITY) -> None:
+    """Add the seated person's collision shapes as immovable bodies, PERSON_PARTS."""
+    body, legs, head = _person_shapes()
+    world.add_body("body", body)
+    world.add_body("legs", legs)
+    world.add_body("head", head, human.NECK_PIVOT_M, head_quaternion)
+
+
+@cache
+def _person_shapes() -> tuple[list[Shape], list[Shape], list[Shape]]:
+    body, legs = ([capsule_between(*limb[1:]) for limb in limbs] for limbs in (human.BODY, human.LEGS))
+    return body, legs, [Shape("sphere", ball.radius_m, position_m=ball.centre_m) for ball in human.HEAD]
 
 
 def _box(space: Space) -> gymnasium.spaces.Box:
@@ -79,28 +85,18 @@ _OBSERVATIONS, _ACTIONS = _box(FEEDING_OBSERVATION), _box(JOINT_ACTION)
 class _Portion:
     """Eight balls of food and what has become of them."""
 
-    def __init__(self, world: Bullet) -> None:
+    names = tuple(f"ball_{index}" for index in range(BALLS))
+
+    def __init__(self, world: Bullet, positions_m: FloatArray) -> None:
         self._world = world
-        self.names = tuple(f"ball_{index}" for index in range(BALLS))
+        world.add_balls(self.names, BALL_RADIUS_M, BALL_MASS_KG, positions_m)
         for name in self.names:
-            world.add_body(name, [Shape("sphere", BALL_RADIUS_M)], BALL_MASS_KG)
             world.set_material(name)
             world.set_damping(name, linear=0.04, angular=0.1)
-        self.park_all()
-
-    def park_all(self) -> None:
-        """Put every ball far away and forget what happened to it."""
-        for name in self.names:
-            self._park(name)
         self.on_spoon = set(self.names)
         self.present = set(self.names)
         self.touched: set[str] = set()
         self.eaten = self.spilled = 0
-
-    def place(self, origin: FloatArray, rotation: FloatArray, places_m: FloatArray) -> None:
-        """Put the balls at places (8, 3) in the spoon's frame."""
-        for name, place in zip(self.names, origin + places_m @ rotation.T, strict=True):
-            self._world.set_pose(name, place)
 
     def positions(self) -> FloatArray:
         """(8, 3) in the world; NaN for balls that were eaten or fell to the floor."""
@@ -132,9 +128,6 @@ class _Portion:
     def _remove(self, name: str) -> None:
         self.on_spoon.discard(name)
         self.present.discard(name)
-        self._park(name)
-
-    def _park(self, name: str) -> None:
         self._world.set_pose(name, (5.0 + 0.1 * self.names.index(name), 5.0, 5.0))
 
 
@@ -177,14 +170,6 @@ class FeedingEnv(gymnasium.Env[Any, Any]):
         self.action_space = deepcopy(_ACTIONS)
         self.reward = reward or TaskReward()
         self._world = Bullet()
-        self._world.add_urdf("arm", jaco.urdf(), jaco.ROBOT_BASE_M, quaternion_of_euler(jaco.ROBOT_BASE_RPY))
-        self._world.set_damping("arm", 0.0, 0.0)
-        self._world.set_material("arm", jaco.SPOON_LINK)
-        add_person(self._world)
-        self._portion = _Portion(self._world)
-        self._starts = start_postures()
-        self._resting_places_m = self._settle_food()
-        self._at_rest = self._world.save()
         self._scenario: int | None = None
         self._history: list[Array] = []
 
@@ -265,28 +250,21 @@ class FeedingEnv(gymnasium.Env[Any, Any]):
     # Private
 
     def _begin(self, scenario: int) -> None:
+        """Build the world anew: an engine with a past replays an episode only almost identically."""
         rng = np.random.default_rng(scenario)
         limit = np.radians(human.HEAD_RANGE_DEG)
-        world = self._world
-        world.restore(self._at_rest)
-        # Replays are bit-identical only from one fixed motor state and an empty contact cache: one step at rest in
-        # which nothing is near anything.
-        self._command = self._starts[0]
-        self._drive()
-        self._portion.park_all()
-        self._set_groups()
-        world.step()
         self._head_quaternion = quaternion_of_euler(rng.uniform(-limit, limit, 3))
         head = rotation_of(self._head_quaternion)
-        world.set_pose("head", human.NECK_PIVOT_M, self._head_quaternion)
         self._neck_to_mouth = head @ human.MOUTH_FROM_NECK_M
         self._mouth = np.array(human.NECK_PIVOT_M) + self._neck_to_mouth
         self._face = head @ human.FACE_IN_HEAD
-        self._command = self._starts[rng.integers(len(self._starts))].copy()
-        world.set_joints("arm", self._command)
-        self._drive()
+        self._command = start_postures()[rng.integers(START_COUNT)].copy()
+        self._world.clear()
+        add_person(self._world, self._head_quaternion)
+        _add_arm(self._world, self._command)
         self._read_arm()
-        self._portion.place(self._spoon, self._spoon_rotation, self._resting_places_m)
+        places = self._spoon + resting_places_m() @ self._spoon_rotation.T
+        self._portion = _Portion(self._world, places)
         self._scenario = scenario
         self._history = []
         self._previous_action = np.zeros(len(jaco.JOINTS))
@@ -297,7 +275,7 @@ class FeedingEnv(gymnasium.Env[Any, Any]):
         action = executed.astype(np.float64)
         target = np.clip(self._command + action * ACTION_UNIT_RAD, self._joints - LEAD_RAD, self._joints + LEAD_RAD)
         self._command = np.clip(target, jaco.LOWER_RAD, jaco.UPPER_RAD)
-        self._drive()
+        _drive(self._world, self._command)
         spoon_before = self._spoon
         motion = self._simulate()
         self._read_arm()
@@ -373,32 +351,35 @@ class FeedingEnv(gymnasium.Env[Any, Any]):
     def _drive(self) -> None:
         self._world.drive_joints("arm", self._command, POSITION_GAIN, MOTOR_FORCE_NM)
 
-    def _set_groups(self) -> None:
-        """Food meets everything, the arm meets not itself, the parts of the person not each other."""
-        for name in self._portion.names:
-            self._world.set_group(name, _FOOD, _FOOD | _PERSON | _ARM)
-        for name in PERSON_PARTS:
-            self._world.set_group(name, _PERSON, _FOOD | _ARM)
-        self._world.set_group("arm", _ARM, _FOOD | _PERSON)
 
-    def _settle_food(self) -> FloatArray:
-        """Let the balls come to rest on the spoon once; (8, 3) places in the spoon's frame."""
-        self._command = self._starts[0].copy()
-        self._world.set_joints("arm", self._command)
-        self._drive()
-        self._read_arm()
-        pitch = 2.05 * BALL_RADIUS_M
-        grid = [
-            ((column - 1.5) * pitch, (row - 0.5) * pitch, BALL_RADIUS_M + 0.002)
-            for row in (0, 1)
-            for column in range(4)
-        ]
-        self._portion.place(self._spoon, self._spoon_rotation, np.array(grid))
-        for _ in range(50):
-            self._world.step()
-        self._read_arm()
-        places: FloatArray = (self._portion.positions() - self._spoon) @ self._spoon_rotation
-        return places
+def _drive(world: Bullet, command_rad: FloatArray) -> None:
+    world.drive_joints("arm", command_rad, POSITION_GAIN, MOTOR_FORCE_NM)
+
+
+def _add_arm(world: Bullet, posture_rad: FloatArray) -> None:
+    jaco.add_to(world)
+    world.set_damping("arm", 0.0, 0.0)
+    world.set_material("arm", jaco.SPOON_LINK)
+    world.set_joints("arm", posture_rad)
+    _drive(world, posture_rad)
+
+
+@cache
+def resting_places_m() -> FloatArray:
+    """(8, 3) in the spoon's frame: where the balls come to rest on a level spoon."""
+    world = Bullet()
+    _add_arm(world, start_postures()[0])
+    spoon, quaternion = world.link_pose("arm", jaco.SPOON_LINK)
+    rotation = rotation_of(quaternion)
+    pitch, height = 2.05 * BALL_RADIUS_M, BALL_RADIUS_M + 0.002
+    grid = np.array([((column - 1.5) * pitch, (row - 0.5) * pitch, height) for row in (0, 1) for column in range(4)])
+    portion = _Portion(world, spoon + grid @ rotation.T)
+    for _ in range(SETTLING_SUBSTEPS):
+        world.step()
+    places: FloatArray = (portion.positions() - spoon) @ rotation
+    world.close()
+    places.flags.writeable = False
+    return places
 
 
 @cache

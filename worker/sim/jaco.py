@@ -1,16 +1,18 @@
-"""The Jaco arm (j2s7s300: seven joints, spherical wrist) with a spoon, as data, kinematics and URDF text.
+"""The Jaco arm (j2s7s300: seven joints, spherical wrist) with a spoon, as data, kinematics and collision shapes.
 
 Frames and joint limits follow the published j2s7s300 description; link shapes are our own capsules and boxes.
 The spoon is rigidly held: its frame has its origin at the centre of the bowl, x towards the tip, z up out of the bowl.
 """
 
 import math
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Sequence
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+
+from worker.sim.bullet import IDENTITY, Bullet, Link, Shape, capsule_between, compose, quaternion_of_euler
 
 FloatArray = npt.NDArray[np.float64]
 Point = tuple[float, float, float]
@@ -66,13 +68,6 @@ SPOON_MASS_KG = 0.03
 ROBOT_BASE_M: Point = (-0.45, -0.55, 0.45)
 ROBOT_BASE_RPY: Point = (0.0, 0.0, -PI / 2)
 """Where the arm is mounted beside the person's right knee, in the world frame."""
-
-
-class Mesh(NamedTuple):
-    """A drawn surface in a link's frame."""
-
-    file: Path
-    rgba: tuple[float, float, float, float]
 
 
 def rotation(rpy: Sequence[float]) -> FloatArray:
@@ -134,23 +129,30 @@ def solve_spoon_pose(
     return angles, np.linalg.norm(error[:, :3], axis=1) + np.linalg.norm(error[:, 3:], axis=1)
 
 
-def urdf(meshes: Mapping[str, Sequence[Mesh]] | None = None) -> str:
-    """URDF text of arm and spoon. ``meshes`` maps link names to what is drawn; without it nothing is."""
-    drawn = meshes or {}
-    base = _cylinder((0, 0, BASE_HEIGHT_M / 2), BASE_RADIUS_M, BASE_HEIGHT_M)
-    parts = ['<?xml version="1.0"?>', '<robot name="jaco">', _link(BASE_LINK, 0.5, (0, 0, 0.08), [base], drawn)]
-    parent = BASE_LINK
-    for number, joint in enumerate(JOINTS, start=1):
-        centre = (joint.end_m[0] / 2, joint.end_m[1] / 2, joint.end_m[2] / 2)
-        parts.append(_link(joint.link, joint.mass_kg, centre, [_capsule(joint.end_m, joint.radius_m)], drawn))
-        parts.append(_revolute(f"joint_{number}", parent, joint))
-        parent = joint.link
-    parts.append(_link(HAND_LINK, 0.001, (0, 0, 0), [], drawn))
-    parts.append(_fixed("hand_mount", parent, HAND_LINK, HAND_ORIGIN_M, HAND_RPY))
-    parts.append(_link(SPOON_LINK, SPOON_MASS_KG, (0, 0, 0), _spoon_boxes(), drawn))
-    parts.append(_fixed("spoon_grip", HAND_LINK, SPOON_LINK, SPOON_ORIGIN_M, SPOON_RPY))
-    # One element per line: the engine's XML reader refuses very long lines.
-    return "\n".join([*parts, "</robot>"]).replace("><", ">\n<") + "\n"
+def add_to(world: Bullet, name: str = "arm", at_home: bool = True) -> None:
+    """Add arm and spoon to a world, beside the person or, for tests, at its origin."""
+    base = [capsule_between((0, 0, 0), (0, 0, BASE_HEIGHT_M), BASE_RADIUS_M)]
+    place, turn = (ROBOT_BASE_M, quaternion_of_euler(ROBOT_BASE_RPY)) if at_home else ((0, 0, 0), IDENTITY)
+    world.add_chain(name, base, _links(), place, turn)
+
+
+@cache
+def _links() -> tuple[Link, ...]:
+    moving = [
+        Link(
+            joint.link,
+            joint.origin_m,
+            quaternion_of_euler(joint.origin_rpy),
+            joint.mass_kg,
+            (capsule_between((0, 0, 0), joint.end_m, joint.radius_m),),
+            turns=True,
+        )
+        for joint in JOINTS
+    ]
+    origin, quaternion = compose(
+        HAND_ORIGIN_M, quaternion_of_euler(HAND_RPY), SPOON_ORIGIN_M, quaternion_of_euler(SPOON_RPY)
+    )
+    return (*moving, Link(SPOON_LINK, origin, quaternion, SPOON_MASS_KG, _spoon_boxes(), turns=False))
 
 
 def _transform(origin_m: Point, rpy: Point) -> FloatArray:
@@ -159,68 +161,19 @@ def _transform(origin_m: Point, rpy: Point) -> FloatArray:
     return matrix
 
 
-def _numbers(values: Sequence[float]) -> str:
-    return " ".join(f"{value:.6f}" for value in values)
+def _box(centre: Point, size: Point) -> Shape:
+    return Shape("box", half_extents_m=(size[0] / 2, size[1] / 2, size[2] / 2), position_m=centre)
 
 
-def _origin(xyz: Sequence[float], rpy: Sequence[float] = (0, 0, 0)) -> str:
-    return f'<origin xyz="{_numbers(xyz)}" rpy="{_numbers(rpy)}"/>'
-
-
-def _cylinder(centre: Point, radius: float, length: float) -> str:
-    return f'{_origin(centre)}<geometry><cylinder radius="{radius}" length="{length}"/></geometry>'
-
-
-def _capsule(end: Point, radius: float) -> str:
-    length = math.hypot(*end)
-    turn = (0.0, math.acos(end[2] / length), math.atan2(end[1], end[0]))
-    middle = [value / 2 for value in end]
-    return f'{_origin(middle, turn)}<geometry><capsule radius="{radius}" length="{length:.5f}"/></geometry>'
-
-
-def _box(centre: Point, size: Point) -> str:
-    return f'{_origin(centre)}<geometry><box size="{_numbers(size)}"/></geometry>'
-
-
-def _spoon_boxes() -> list[str]:
+def _spoon_boxes() -> tuple[Shape, ...]:
     length, width, depth, wall = SPOON_LENGTH_M, SPOON_WIDTH_M, SPOON_DEPTH_M, SPOON_WALL_M
     rim = depth / 2 - wall / 2
     handle = (-length / 2 - HANDLE_LENGTH_M / 2, 0.0, depth / 2)
-    return [
+    return (
         _box((0, 0, -wall / 2), (length, width, wall)),
         _box((length / 2, 0, rim), (wall, width, depth)),
         _box((-length / 2, 0, rim), (wall, width, depth)),
         _box((0, width / 2, rim), (length, wall, depth)),
         _box((0, -width / 2, rim), (length, wall, depth)),
         _box(handle, (HANDLE_LENGTH_M, HANDLE_WIDTH_M, HANDLE_HEIGHT_M)),
-    ]
-
-
-def _link(name: str, mass: float, centre: Point, collisions: Sequence[str], drawn: Mapping[str, Sequence[Mesh]]) -> str:
-    inertia = mass * 0.003 + 1e-5
-    solid = "".join(f"<collision>{shape}</collision>" for shape in collisions)
-    surfaces = "".join(
-        f'<visual><geometry><mesh filename="{mesh.file.absolute()}"/></geometry>'
-        f'<material name="{name}_{index}"><color rgba="{_numbers(mesh.rgba)}"/></material></visual>'
-        for index, mesh in enumerate(drawn.get(name, ()))
-    )
-    return (
-        f'<link name="{name}"><inertial>{_origin(centre)}<mass value="{mass}"/>'
-        f'<inertia ixx="{inertia}" iyy="{inertia}" izz="{inertia}" ixy="0" ixz="0" iyz="0"/></inertial>'
-        f"{surfaces}{solid}</link>"
-    )
-
-
-def _revolute(name: str, parent: str, joint: Joint) -> str:
-    return (
-        f'<joint name="{name}" type="revolute"><parent link="{parent}"/><child link="{joint.link}"/>'
-        f'{_origin(joint.origin_m, joint.origin_rpy)}<axis xyz="0 0 1"/>'
-        f'<limit lower="{joint.lower_rad}" upper="{joint.upper_rad}" effort="2000" velocity="1"/></joint>'
-    )
-
-
-def _fixed(name: str, parent: str, child: str, origin: Point, rpy: Point) -> str:
-    return (
-        f'<joint name="{name}" type="fixed"><parent link="{parent}"/><child link="{child}"/>'
-        f"{_origin(origin, rpy)}</joint>"
     )
