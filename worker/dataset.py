@@ -17,6 +17,7 @@ from sqlalchemy.orm import Session, contains_eager, joinedload
 from app.domain.clips import Clip, Rollout
 from app.domain.preferences import Label, Query, Response, current_labels
 from app.storage import ArtefactStore
+from worker.ml import acquisition
 from worker.ml.segments import SegmentPairs
 from worker.trajectory import Array, Trajectory
 
@@ -90,6 +91,17 @@ def pool_clips(session: Session, study_id: int) -> Sequence[Clip]:
         .order_by(Clip.id)
         .options(contains_eager(Clip.rollout))
     ).all()
+
+
+def matched_pairs(clips: Sequence[Clip]) -> list[tuple[Clip, Clip]]:
+    """Every pair of clips of the same scenario, with their rollouts loaded."""
+    rows = acquisition.matched_pairs([clip.rollout.scenario for clip in clips])
+    return [(clips[first], clips[second]) for first, second in rows]
+
+
+def pool_pairs(session: Session, store: ArtefactStore, study_id: int) -> SegmentPairs:
+    """The segments of every pair that the study's pool can offer."""
+    return segment_pairs(store, matched_pairs(pool_clips(session, study_id)))
 
 
 def shown(store: ArtefactStore, clip: Clip) -> Trajectory:

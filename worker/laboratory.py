@@ -19,6 +19,7 @@ from worker.ml import reward_training, sac
 from worker.ml.policies import GaussianPolicy
 from worker.ml.reward_models import RewardModel, load_reward_model
 from worker.ml.segments import SegmentPairs
+from worker.ml.studio_filter import Act, noisy
 from worker.modes import FEEDING_AXES, perceived, sample_modes, speed_factor
 from worker.sim.feeding import FeedingEnv
 from worker.sim.render import ClipRenderer, RenderedClip
@@ -108,11 +109,21 @@ def reference_rollouts(first: int = REFERENCE_SCENARIOS, count: int = REFERENCE_
     return tuple(rollout(environment(), policy.mean, scenario) for scenario in range(first, first + count))
 
 
+def run_scenarios(act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
+    """One rollout per scenario, with Gaussian noise of this deviation on every action."""
+    return [
+        rollout(environment(), noisy(act, noise, seed, scenario), scenario, reference_policy().mean)
+        for scenario in scenarios
+    ]
+
+
 def fit_reward(
-    kind: reward_training.Kind, pairs: SegmentPairs, targets: Array, seed: int
+    kind: str, pairs: SegmentPairs, targets: Array, pool: SegmentPairs, seed: int
 ) -> tuple[bytes, dict[str, Any]]:
-    """The stored reward model and its metrics."""
-    fitted = reward_training.fit(pairs, targets, kind, seed, reference=reference_rollouts())
+    """The stored reward model and its metrics. ``pool``: pairs like those that are asked, for the scale of signals."""
+    spread = reward_training.signal_spread(pool)
+    named: reward_training.Kind = "mlp" if kind == "mlp" else "structured"
+    fitted = reward_training.fit(pairs, targets, named, seed, spread=spread, reference=reference_rollouts())
     return fitted.model.to_bytes(), fitted.metrics
 
 

@@ -4,7 +4,7 @@ Nothing here is remembered between two rounds, so a lost message, a killed worke
 anything undone or do it twice: each finding has one name, and work is started under that name at most once.
 """
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from datetime import datetime, timedelta
 
 from sqlalchemy import func, select
@@ -33,10 +33,15 @@ def findings(session: Session) -> Iterator[tuple[Task, int]]:
                 yield task, attempt
 
 
-def abandoned(session: Session) -> list[str]:
-    """Names under which some worker began to work and has not been heard of since: ``finding#attempt``."""
+def abandoned(session: Session, in_hand: Collection[str]) -> list[str]:
+    """Names under which some worker began to work and has not been heard of since: ``finding#attempt``.
+
+    ``in_hand``: findings that this worker is busy with itself; a machine under load may be late with a sign of life.
+    """
     lost = select(Run).where(Run.status == RunStatus.RUNNING, Run.heartbeat_at < now() - LEASE)
-    return [workflow_name(run.workflow_id, run.attempt) for run in session.scalars(lost)]
+    return [
+        workflow_name(run.workflow_id, run.attempt) for run in session.scalars(lost) if run.workflow_id not in in_hand
+    ]
 
 
 def workflow_name(finding: str, attempt: int) -> str:

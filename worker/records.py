@@ -120,6 +120,22 @@ def save_model(session: Session, run_id: int, kind: ModelKind, artefact_sha256: 
     return model
 
 
+@dataclass(frozen=True)
+class Provenance:
+    """Which labels a run has seen."""
+
+    label_count: int
+    label_hash: str
+
+
+def provenance(session: Session, run_id: int) -> Provenance:
+    """What set_labels() noted. Raises ValueError when nothing was."""
+    run = session.get_one(Run, run_id)
+    if run.label_count is None or run.label_hash is None:
+        raise ValueError(f"{run.workflow_id} has seen no labels yet.")
+    return Provenance(run.label_count, run.label_hash)
+
+
 def next_version(session: Session, participant_id: int) -> int:
     """The version the participant's next bundle will have."""
     newest = session.scalar(select(func.max(Bundle.version)).where(Bundle.participant_id == participant_id))

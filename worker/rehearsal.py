@@ -200,12 +200,7 @@ class _Teacher:
 
     def _calibrated(self, session: Session) -> ScriptedTeacher:
         clips = dataset.pool_clips(session, self._study_id)
-        pairs = [
-            (first, second)
-            for first in clips
-            for second in clips
-            if first.id < second.id and first.rollout.scenario == second.rollout.scenario
-        ]
+        pairs = dataset.matched_pairs(clips)
         rewards = [[self._rewards(clip) for clip in pair] for pair in pairs[:CALIBRATION_PAIRS]]
         return ScriptedTeacher.calibrated(self._manner, np.array(rewards))
 

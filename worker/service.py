@@ -18,10 +18,11 @@ from app.domain.models import RunKind
 from app.errors import AppError
 from app.settings import Settings
 from app.storage import ArtefactStore
-from worker import laboratory, reconcile, records
+from worker import laboratory, querying, reconcile, records
 from worker.compute import Compute, Lane
 from worker.records import Task
 from worker.workflows import Workshop, as_arguments
+from worker.workplace import Workplace
 
 log = logging.getLogger("worker")
 
@@ -48,7 +49,7 @@ def run(settings: Settings) -> int:
         database = Database(settings.sqlalchemy_url)
         compute = Compute(settings.compute_processes)
         compute.warm_up(Lane.CLIPS, laboratory.warm_up)
-        workshop = Workshop(database, ArtefactStore(settings.data_dir / "artefacts"), compute)
+        workshop = Workshop(Workplace(database, ArtefactStore(settings.data_dir / "artefacts"), compute))
         _launch_engine(settings)
         log.info("worker %s is ready", settings.worker_name)
         try:
@@ -111,16 +112,16 @@ def _rounds(settings: Settings, workshop: Workshop, stop: threading.Event) -> No
 
 def _one_round(settings: Settings, workshop: Workshop, started: set[str]) -> None:
     """``started`` only saves the engine from being told again what it already knows."""
-    with workshop.database.writing() as session:
+    with workshop.place.database.writing() as session:
         records.sign_presence(session, settings.worker_name)
-    with workshop.database.reading() as session:
+    with workshop.place.database.reading() as session:
         due = list(reconcile.findings(session))
         hungry = reconcile.short_of_queries(session)
-        lost = reconcile.abandoned(session)
+        lost = reconcile.abandoned(session, workshop.in_hand)
     for task, attempt in due:
         _start(workshop, task, reconcile.workflow_name(task.finding, attempt), started)
     for participant_id in hungry:
-        workshop.refill_queries(participant_id)
+        querying.refill_queries(workshop.place, participant_id)
     for name in lost:
         log.warning("%s was left behind by another worker; taking it over", name)
         DBOS.resume_workflow(name)

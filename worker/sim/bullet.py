@@ -10,7 +10,11 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-import pybullet
+
+from worker.sim.quiet import silenced_stderr
+
+with silenced_stderr():  # the engine greets with its build time, in every process
+    import pybullet
 
 FloatArray = npt.NDArray[np.float64]
 Vector = Sequence[float] | FloatArray

@@ -1,0 +1,114 @@
+"""Filters: from the participant's reward model to an evaluated, published bundle."""
+
+from app.domain.models import ModelKind
+from app.domain.studies import Method, Participant, RewardKind, Study, StudySettings
+from app.errors import AppError
+from worker import dataset, laboratory, personalisation, records
+from worker.compute import Lane
+from worker.ml.studio_filter import FilterDraft
+from worker.personalisation import Fitting
+from worker.records import Task
+from worker.workplace import Step, Workplace
+
+STAGES = {Method.STUDIO: ("mode", "residual", "gate"), Method.PRINTED: ("printed",)}
+
+
+class NothingToLearnFrom(AppError):
+    """Every answer so far was "can't tell", so there is no reward model and no filter can be trained."""
+
+
+def train_filter(place: Workplace, task: Task, run_id: int, step: Step) -> None:
+    """Train, evaluate and publish; every stage is a step, so that a killed worker loses one stage at most."""
+    reward = step("reward", _choose_reward, place, run_id, task)
+    with place.database.reading() as session:
+        settings = session.get_one(Study, task.study_id).settings
+    draft = ""
+    for stage in STAGES[settings.method]:
+        draft = step(stage, _stage, place, run_id, task, reward, draft, stage)
+    step("publish", _publish, place, run_id, task, reward, draft)
+
+
+def _choose_reward(place: Workplace, run_id: int, task: Task) -> str:
+    """The artefact of the reward model to follow: the newest. The printed method needs one on states and actions."""
+    with place.database.writing() as session:
+        settings = session.get_one(Study, task.study_id).settings
+        model = records.newest_model(session, task.participant, ModelKind.REWARD)
+        if model is None:
+            raise NothingToLearnFrom
+        records.set_labels(session, run_id, model.label_count, model.label_hash)
+    if settings.method is Method.STUDIO or settings.reward_kind is RewardKind.MLP:
+        return model.artefact_sha256
+    place.report(run_id, "learning a reward model on states and actions", 0.05)
+    with place.database.reading() as session:
+        preferences = dataset.load_preferences(session, place.store, task.participant)
+        pool = dataset.pool_pairs(session, place.store, task.study_id)
+    if preferences.pairs is None:
+        raise NothingToLearnFrom
+    stored, _ = place.compute.run(
+        Lane.LEARNING,
+        place.beat(run_id),
+        laboratory.fit_reward,
+        RewardKind.MLP.value,
+        preferences.pairs,
+        preferences.targets,
+        pool,
+        model.seed,
+    )
+    return place.store.put(stored)
+
+
+def _stage(place: Workplace, run_id: int, task: Task, reward: str, draft: str, stage: str) -> str:
+    """One stage of the fit: the artefact of a draft in, the artefact of a better one out."""
+    fitting = _fitting(place, run_id, task, reward)
+    if stage in {"mode", "printed"}:
+        with place.database.reading() as session:
+            clips = dataset.pool_clips(session, task.study_id)
+        pool = [dataset.shown(place.store, clip) for clip in clips]
+        result = fitting.find_mode(pool) if stage == "mode" else fitting.fit_printed()
+    else:
+        before = _draft(place, draft)
+        result = fitting.train_residual(before) if stage == "residual" else fitting.gate_residual(before)
+    return place.store.put(personalisation.draft_to_bytes(result))
+
+
+def _publish(place: Workplace, run_id: int, task: Task, reward: str, draft: str) -> None:
+    """Evaluate on unseen scenarios, write the bundle, and only then let anybody see it."""
+    fitting = _fitting(place, run_id, task, reward)
+    with place.database.reading() as session:
+        participant = session.get_one(Participant, task.participant)
+        study = session.get_one(Study, task.study_id)
+        model = records.newest_model(session, task.participant, ModelKind.REWARD)
+        version = records.next_version(session, task.participant)
+        run = records.provenance(session, run_id)
+    finished = fitting.finish(
+        _draft(place, draft),
+        participant=participant.code,
+        study=study.name,
+        version=version,
+        label_count=run.label_count,
+        label_hash=run.label_hash,
+        weights=model.metrics.get("weights") if model else None,
+    )
+    model_artefact, bundle_artefact = place.store.put(finished.filter_weights), place.store.put(finished.bundle)
+    with place.database.writing() as session:
+        saved = records.save_model(session, run_id, ModelKind.FILTER, model_artefact, finished.metrics)
+        records.save_bundle(session, saved, version, bundle_artefact, len(finished.bundle))
+
+
+def _draft(place: Workplace, artefact: str) -> FilterDraft:
+    return personalisation.draft_from_bytes(place.store.read(artefact))
+
+
+def _fitting(place: Workplace, run_id: int, task: Task, reward: str) -> Fitting:
+    with place.database.reading() as session:
+        settings: StudySettings = session.get_one(Study, task.study_id).settings
+        seed = session.get_one(Participant, task.participant).seed
+    return Fitting(
+        compute=place.compute,
+        beat=place.beat(run_id),
+        reward=place.store.read(reward),
+        seed=seed,
+        settings=settings,
+        progress=lambda stage, share: place.report(run_id, stage, share),
+        references=place.references,
+    )

@@ -1,0 +1,111 @@
+"""From a reward model to a published filter, stage by stage, with the rollouts spread over the compute processes.
+
+Between two stages everything is in one stored draft, so that a worker killed in the middle loses one stage at most.
+"""
+
+import io
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from app.domain.studies import StudySettings
+from worker import laboratory
+from worker.analysis.evaluation import evaluate
+from worker.compute import Compute, Lane
+from worker.exploration import SURFACE
+from worker.ml import studio_filter
+from worker.ml.action_filter import FilterWeights
+from worker.ml.response_surface import ResponseSurface
+from worker.ml.reward_models import load_reward_model
+from worker.ml.studio_filter import Act, FilterAct, FilterConfig, FilterDraft, FilterProblem, Progress, Trial
+from worker.trajectory import Trajectory
+
+CHUNK = 10
+"""Scenarios per call of a compute process: small enough to spread evenly, large enough not to matter."""
+
+
+@dataclass(frozen=True)
+class Fitting:
+    """One filter in the making."""
+
+    compute: Compute
+    beat: Callable[[], None]
+    reward: bytes
+    seed: int
+    settings: StudySettings
+    progress: Progress
+    references: dict[range, list[Trajectory]]
+    """rollouts of the frozen policy that other fittings have already made"""
+
+    @property
+    def problem(self) -> FilterProblem:
+        """What is to be fitted, in the words of the learning code."""
+        config = FilterConfig(
+            success_tolerance=self.settings.success_tolerance,
+            evaluation_scenarios=self.settings.evaluation_scenarios,
+        )
+        return FilterProblem(laboratory.reference_policy(), load_reward_model(self.reward), self.seed, config)
+
+    def find_mode(self, pool: Sequence[Trajectory]) -> FilterDraft:
+        """The person's execution mode, as far as held-out scenarios allow it."""
+        draft = studio_filter.choose_mode(self.problem, ResponseSurface.load(SURFACE), pool)
+        return studio_filter.gate_mode(self.problem, draft, self._gate_reference(), self.collect, self.progress)
+
+    def train_residual(self, draft: FilterDraft) -> FilterDraft:
+        """The residual action encoder around the mode."""
+        return studio_filter.train_residual(self.problem, draft, self.collect, self.progress)
+
+    def gate_residual(self, draft: FilterDraft) -> FilterDraft:
+        """As much of the residual as held-out scenarios allow."""
+        reference = self._gate_reference()
+        return studio_filter.gate_residual(self.problem, draft, reference, self.collect, self.progress)
+
+    def evaluate(self, act: FilterAct) -> tuple[dict[str, Any], list[Trajectory]]:
+        """The exported filter against the reference policy on scenarios nothing else uses; and its rollouts."""
+        scenarios = studio_filter.scenarios_for("evaluation", self.settings.evaluation_scenarios)
+        self.progress("driving the filter through unseen scenarios", 0.9)
+        filtered = self.collect(act, scenarios, 0.0, self.seed)
+        reference = self._reference(scenarios)
+        reward = self.problem.reward
+        returns = reward.returns(reference), reward.returns(filtered)
+        return evaluate(reference, filtered, *returns, self.seed), filtered
+
+    def collect(self, act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
+        """One rollout per scenario, in order; the same whatever the number of processes."""
+        chunks = [list(scenarios[first : first + CHUNK]) for first in range(0, len(scenarios), CHUNK)]
+        arguments = [(act, chunk, noise, seed) for chunk in chunks]
+        parts = self.compute.run_all(Lane.LEARNING, self.beat, laboratory.run_scenarios, arguments)
+        return [trajectory for part in parts for trajectory in part]
+
+    def _gate_reference(self) -> Sequence[Trajectory]:
+        return self._reference(studio_filter.scenarios_for("gate", self.problem.config.gate_scenarios))
+
+    def _reference(self, scenarios: range) -> Sequence[Trajectory]:
+        """The frozen policy's rollouts: the same for everybody, so they are made once per worker."""
+        if scenarios not in self.references:
+            self.references[scenarios] = self.collect(laboratory.reference_policy().mean, scenarios, 0.0, 0)
+        return self.references[scenarios]
+
+
+def draft_to_bytes(draft: FilterDraft) -> bytes:
+    """A draft as one .npz file of plain arrays."""
+    record = {"trials": [asdict(trial) for trial in draft.trials], "notes": draft.notes, "seconds": dict(draft.seconds)}
+    arrays: dict[str, Any] = {f"value/{name}": array for name, array in draft.value.items()}
+    arrays["weights"] = np.frombuffer(draft.weights.to_bytes(), np.uint8)
+    arrays["record"] = np.array(json.dumps(record))
+    target = io.BytesIO()
+    np.savez(target, **arrays)
+    return target.getvalue()
+
+
+def draft_from_bytes(stored: bytes) -> FilterDraft:
+    """Read what draft_to_bytes() wrote."""
+    with np.load(io.BytesIO(stored), allow_pickle=False) as arrays:
+        record = json.loads(str(arrays["record"]))
+        value = {name.removeprefix("value/"): arrays[name] for name in arrays.files if name.startswith("value/")}
+        weights = FilterWeights.from_bytes(arrays["weights"].tobytes())
+    trials = tuple(Trial(**each) for each in record["trials"])
+    return FilterDraft(weights, value, trials, tuple(record["notes"]), record["seconds"])

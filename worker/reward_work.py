@@ -1,0 +1,51 @@
+"""Reward models: learn from everything one participant has said, then choose and predict what comes next."""
+
+from app.domain.models import ModelKind
+from app.domain.studies import Participant, Strategy, Study
+from worker import dataset, laboratory, querying, records
+from worker.compute import Lane
+from worker.records import Task
+from worker.workplace import Step, Workplace
+
+KEPT_QUERIES = 3
+"""Queries ahead that stay when a new model chooses: the page may already be loading them."""
+
+
+def train_reward(place: Workplace, task: Task, run_id: int, step: Step) -> None:
+    """Fit the participant's reward model and let it look ahead."""
+    step("fit", _fit, place, run_id, task.participant)
+    step("look-ahead", _look_ahead, place, task.participant)
+
+
+def _fit(place: Workplace, run_id: int, participant_id: int) -> None:
+    with place.database.reading() as session:
+        participant = session.get_one(Participant, participant_id)
+        kind = session.get_one(Study, participant.study_id).settings.reward_kind
+        preferences = dataset.load_preferences(session, place.store, participant_id)
+        pool = dataset.pool_pairs(session, place.store, participant.study_id)
+    if preferences.pairs is None:
+        return  # nothing but "can't tell" so far: there is nothing to learn from
+    place.report(run_id, f"learning from {preferences.label_count} labels", 0.2)
+    stored, metrics = place.compute.run(
+        Lane.LEARNING,
+        place.beat(run_id),
+        laboratory.fit_reward,
+        kind.value,
+        preferences.pairs,
+        preferences.targets,
+        pool,
+        participant.seed,
+    )
+    artefact = place.store.put(stored)
+    with place.database.writing() as session:
+        records.set_labels(session, run_id, preferences.label_count, preferences.label_hash)
+        records.save_model(session, run_id, ModelKind.REWARD, artefact, metrics)
+
+
+def _look_ahead(place: Workplace, participant_id: int) -> None:
+    with place.database.writing() as session:
+        participant = session.get_one(Participant, participant_id)
+        if session.get_one(Study, participant.study_id).settings.strategy is not Strategy.UNIFORM:
+            records.drop_unseen_queries(session, participant_id, keep=KEPT_QUERIES)
+    querying.refill_queries(place, participant_id)
+    querying.predict_waiting(place, participant_id)

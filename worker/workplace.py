@@ -1,0 +1,47 @@
+"""What every kind of work needs: the database, the artefacts, the processes, and a way to say how far it is."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+from app.db import Database
+from app.storage import ArtefactStore
+from worker import records
+from worker.compute import Compute
+from worker.trajectory import Trajectory
+
+
+class Step(Protocol):
+    """Runs a function as a durable step: once it has returned, it is never run again for the same workflow.
+
+    Its result is stored by the engine, so it is None, a string, a number, or a plain structure of them.
+    """
+
+    def __call__(self, name: str, function: Callable[..., Any], *arguments: Any) -> Any:
+        """The function's result, now or from an earlier life of this workflow."""
+        ...
+
+
+@dataclass(frozen=True)
+class Workplace:
+    """One worker's means."""
+
+    database: Database
+    store: ArtefactStore
+    compute: Compute
+    references: dict[range, list[Trajectory]] = field(default_factory=dict)
+    """rollouts of the frozen policy by scenarios: the same for everybody, so each worker makes them once"""
+
+    def report(self, run_id: int, stage: str, progress: float) -> None:
+        """Say in a few words, and as a share between 0 and 1, where a run is."""
+        with self.database.writing() as session:
+            records.report(session, run_id, stage, progress)
+
+    def beat(self, run_id: int) -> Callable[[], None]:
+        """A function that says that the run is still being worked on."""
+
+        def beat() -> None:
+            with self.database.writing() as session:
+                records.beat(session, run_id)
+
+        return beat
