@@ -28,7 +28,7 @@ FEEDING_AXES = (
     Axis("speed_far", -0.8, 0.4, "log of the speed factor while the spoon is far from the mouth"),
     Axis("speed_near", -0.8, 0.5, "log of the speed factor close to the mouth"),
     Axis("from_below", -1.0, 1.0, "how far below (+) or above (-) the mouth the approach passes"),
-    Axis("to_side", -0.7, 1.0, "how far to the person's left (+) or right (-) the approach swings"),
+    Axis("to_side", -0.7, 0.8, "how far to the person's left (+) or right (-) the approach swings"),
     Axis("press", -1.0, 1.0, "how deep the spoon goes into the mouth: gentle (-) or pressing (+)"),
 )
 
@@ -37,7 +37,7 @@ _NECK_TO_MOUTH = FEEDING_OBSERVATION.slice_of("neck_to_mouth_m")
 _FACE = FEEDING_OBSERVATION.slice_of("face_direction")
 _UP = FEEDING_OBSERVATION.slice_of("spoon_up")
 
-_DETOUR_M = 0.12
+_DETOUR_M = 0.14
 _PRESS_M = 0.07
 _LEVEL_RAD = 0.65
 _LEVEL_FADE_RAD = 0.15
