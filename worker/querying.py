@@ -81,6 +81,6 @@ def _unused_pairs(session: Session, participant: Participant) -> list[tuple[Clip
         frozenset(pair)
         for pair in session.execute(
             select(Query.left_clip_id, Query.right_clip_id).where(Query.participant_id == participant.id)
-        ).tuples()
+        )
     }
     return [pair for pair in dataset.matched_pairs(clips) if frozenset(clip.id for clip in pair) not in used]

@@ -78,9 +78,7 @@ def _missing_clips(session: Session, study: Study) -> list[Task]:
             .join(Clip)
             .where(Rollout.study_id == study.id, Clip.step_count == settings.clip_steps)
             .group_by(Rollout.scenario)
-        )
-        .tuples()
-        .all()
+        ).all()
     )
     wanted = [scenario_seed(study.seed, index) for index in range(settings.pool_scenarios)]
     missing = [seed for seed in wanted if made.get(seed, 0) < settings.behaviours_per_scenario]

@@ -1,0 +1,114 @@
+"""Heavy work runs in processes that may die, and must die with their worker."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from worker.compute import Compute, ComputeLost, Interrupted, Lane
+
+
+def nothing() -> None:
+    """No sign of life needed."""
+
+
+def square(number: int) -> int:
+    return number * number
+
+
+def own_pid() -> int:
+    return os.getpid()
+
+
+def die() -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def wait_forever(started: Path) -> None:
+    started.touch()
+    threading.Event().wait()
+
+
+@pytest.fixture
+def compute() -> Iterator[Compute]:
+    compute = Compute(2)
+    yield compute
+    compute.close()
+
+
+def test_results_come_in_the_order_of_the_arguments(compute: Compute) -> None:
+    assert compute.run_all(Lane.LEARNING, nothing, square, [(number,) for number in range(7)]) == [
+        0,
+        1,
+        4,
+        9,
+        16,
+        25,
+        36,
+    ]
+
+
+def test_a_killed_process_is_reported_and_replaced(compute: Compute) -> None:
+    with pytest.raises(ComputeLost, match="memory"):
+        compute.run(Lane.CLIPS, nothing, die)
+    assert compute.run(Lane.CLIPS, nothing, square, 3) == 9
+
+
+def test_stopping_interrupts_whoever_waits_with_nothing_that_could_be_recorded_as_an_outcome(tmp_path: Path) -> None:
+    compute = Compute(1)
+    started = tmp_path / "started"
+    raised: list[BaseException] = []
+
+    def work() -> None:
+        try:
+            compute.run(Lane.LEARNING, stop_when_started, wait_forever, started)
+        except BaseException as error:
+            raised.append(error)
+
+    def stop_when_started() -> None:
+        while not started.exists():
+            threading.Event().wait(0.01)
+        compute.close()
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join(timeout=60)
+    assert [type(error) for error in raised] == [Interrupted]
+    assert not isinstance(raised[0], Exception)
+
+
+def test_compute_processes_die_with_a_worker_that_is_killed() -> None:
+    program = (
+        "import os, sys\n"
+        "from tests.worker.test_compute import nothing, own_pid\n"
+        "from worker.compute import Compute, Lane\n"
+        "if __name__ == '__main__':\n"
+        "    print(Compute(1).run(Lane.LEARNING, nothing, own_pid), flush=True)\n"
+        "    sys.stdin.read()\n"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as parent:
+        assert parent.stdout is not None
+        child = int(parent.stdout.readline())
+        parent.kill()
+        parent.wait()
+        assert gone_within(child, seconds=10)
+
+
+def gone_within(pid: int, seconds: float) -> bool:
+    """Whether the process ends; a zombie whose parent has not asked counts as ended."""
+    for _ in range(int(seconds * 50)):
+        try:
+            status = Path(f"/proc/{pid}/stat").read_text()
+        except FileNotFoundError:
+            return True
+        if status.rsplit(")", 1)[1].split()[0] == "Z":
+            return True
+        threading.Event().wait(0.02)
+    return False

@@ -1,0 +1,107 @@
+"""From rows to arrays: polarity, ties, undone answers, fingerprints."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from app.db import Database
+from app.domain.clips import Clip
+from app.domain.preferences import LabelEvent, Query, Response
+from app.domain.studies import Participant
+from app.storage import ArtefactStore
+from tests.worker.conftest import STEPS, make_trajectory
+from worker import dataset
+
+AddClips = Callable[..., list[Clip]]
+Answer = Callable[[Clip, Clip, Response], Query]
+
+
+@pytest.mark.parametrize(
+    ("response", "target"),
+    [(Response.LEFT, 0.0), (Response.RIGHT, 1.0), (Response.EQUAL, 0.5), (Response.SKIP, None)],
+)
+def test_the_target_is_the_probability_that_right_is_preferred(response: Response, target: float | None) -> None:
+    assert dataset.target_of(response) == target
+
+
+def test_every_response_has_a_target_rule() -> None:
+    assert all(dataset.target_of(response) in (0.0, 0.5, 1.0, None) for response in Response)
+
+
+def test_left_and_right_keep_their_places_and_cant_tell_is_left_out(
+    database: Database, store: ArtefactStore, participant: Participant, add_clips: AddClips, answer: Answer
+) -> None:
+    first, second, third, _ = add_clips(7)
+    answer(second, first, Response.RIGHT)
+    answer(first, third, Response.SKIP)
+    answer(third, first, Response.EQUAL)
+    with database.reading() as session:
+        preferences = dataset.load_preferences(session, store, participant.id)
+    assert preferences.pairs is not None
+    assert preferences.targets.tolist() == [1.0, 0.5]
+    assert preferences.label_count == 3
+    np.testing.assert_array_equal(preferences.pairs.signals[0, 0], make_trajectory(7, 1).signals)
+    np.testing.assert_array_equal(preferences.pairs.signals[0, 1], make_trajectory(7, 0).signals)
+    assert preferences.pairs.actions.shape == (2, 2, STEPS, 7)
+
+
+def test_only_cant_tell_means_nothing_to_learn_from(
+    database: Database, store: ArtefactStore, participant: Participant, add_clips: AddClips, answer: Answer
+) -> None:
+    first, second, *_ = add_clips(7)
+    answer(first, second, Response.SKIP)
+    with database.reading() as session:
+        assert dataset.load_preferences(session, store, participant.id).pairs is None
+
+
+def test_an_undone_answer_does_not_count(
+    database: Database, store: ArtefactStore, participant: Participant, add_clips: AddClips, answer: Answer
+) -> None:
+    first, second, third, _ = add_clips(7)
+    answer(first, second, Response.LEFT)
+    undone = answer(first, third, Response.LEFT)
+    with database.writing() as session:
+        session.add(LabelEvent(query_id=undone.id, revision=2, response=None, client_uuid="undo"))
+    with database.reading() as session:
+        assert dataset.load_preferences(session, store, participant.id).label_count == 1
+    with database.writing() as session:
+        session.add(LabelEvent(query_id=undone.id, revision=3, response=Response.RIGHT, client_uuid="again"))
+    with database.reading() as session:
+        assert dataset.load_preferences(session, store, participant.id).targets.tolist() == [0.0, 1.0]
+
+
+def test_the_fingerprint_depends_on_what_was_shown_and_said_and_on_nothing_else(
+    database: Database, store: ArtefactStore, participant: Participant, add_clips: AddClips, answer: Answer
+) -> None:
+    first, second, third, _ = add_clips(7)
+    answer(first, second, Response.LEFT)
+
+    def fingerprint() -> str:
+        with database.reading() as session:
+            return dataset.load_preferences(session, store, participant.id).label_hash
+
+    before = fingerprint()
+    query = answer(first, third, Response.LEFT)
+    after = fingerprint()
+    with database.writing() as session:
+        session.add(LabelEvent(query_id=query.id, revision=2, response=None, client_uuid="undo"))
+    assert fingerprint() == before != after
+    with database.writing() as session:
+        session.add(LabelEvent(query_id=query.id, revision=3, response=Response.LEFT, client_uuid="same again"))
+    assert fingerprint() == after
+    with database.writing() as session:
+        session.add(LabelEvent(query_id=query.id, revision=4, response=Response.RIGHT, client_uuid="changed"))
+    assert fingerprint() not in (before, after)
+
+
+def test_pairs_of_the_pool_share_their_scenario(
+    database: Database, store: ArtefactStore, participant: Participant, add_clips: AddClips
+) -> None:
+    add_clips(7)
+    add_clips(8, 2)
+    with database.reading() as session:
+        clips = dataset.pool_clips(session, participant.study_id)
+        pairs = dataset.matched_pairs(clips)
+    assert len(pairs) == 6 + 1
+    assert all(left.rollout.scenario == right.rollout.scenario for left, right in pairs)

@@ -1,0 +1,160 @@
+"""What is missing or stale is found from the rows alone."""
+
+from collections.abc import Callable
+from datetime import timedelta
+
+import pytest
+
+from app.db import Database, now
+from app.domain.clips import Clip
+from app.domain.models import Run, RunKind, RunStatus
+from app.domain.preferences import LabelEvent, Query, Response
+from app.domain.studies import Participant, Study, StudySettings
+from worker import reconcile, records
+
+AddClips = Callable[..., list[Clip]]
+Answer = Callable[[Clip, Clip, Response], Query]
+
+
+@pytest.fixture
+def found(database: Database) -> Callable[[], dict[str, int]]:
+    def look() -> dict[str, int]:
+        with database.reading() as session:
+            return {task.finding: attempt for task, attempt in reconcile.findings(session)}
+
+    return look
+
+
+@pytest.fixture
+def labels(add_clips: AddClips, answer: Answer, study: Study) -> Callable[[int], list[Query]]:
+    """Fill the pool, then give so many answers."""
+
+    def give(count: int) -> list[Query]:
+        clips = [add_clips(reconcile.scenario_seed(study.seed, index)) for index in range(4)]
+        pairs = [(four[i], four[j]) for four in clips for i in range(4) for j in range(i)]
+        return [answer(*pairs[index], Response.LEFT) for index in range(count)]
+
+    return give
+
+
+def succeed(database: Database, finding: str) -> None:
+    with database.writing() as session:
+        session.add(Run(workflow_id=finding, kind="reward", study_id=1, status=RunStatus.SUCCEEDED))
+
+
+def test_a_new_study_needs_clips_a_few_scenarios_at_a_time(study: Study, found: Callable[[], dict[str, int]]) -> None:
+    first, second = (reconcile.scenario_seed(study.seed, index) for index in (0, 1))
+    assert found() == {f"clips/study-1/scenario-{first}": 1, f"clips/study-1/scenario-{second}": 1}
+
+
+def test_a_scenario_with_some_of_its_clips_still_needs_the_rest(
+    study: Study, add_clips: AddClips, found: Callable[[], dict[str, int]]
+) -> None:
+    add_clips(reconcile.scenario_seed(study.seed, 0), 3)
+    assert f"clips/study-1/scenario-{reconcile.scenario_seed(study.seed, 0)}" in found()
+    add_clips(reconcile.scenario_seed(study.seed, 1), 4)
+    assert f"clips/study-1/scenario-{reconcile.scenario_seed(study.seed, 1)}" not in found()
+
+
+def test_the_reward_model_is_due_at_every_tenth_label(
+    labels: Callable[[int], list[Query]], found: Callable[[], dict[str, int]]
+) -> None:
+    labels(9)
+    assert found() == {}
+
+
+def test_the_tenth_label_asks_for_a_reward_model_and_then_for_the_milestones_filter(
+    database: Database, labels: Callable[[int], list[Query]], found: Callable[[], dict[str, int]]
+) -> None:
+    labels(10)
+    assert found() == {"reward/participant-1/labels-10": 1}
+    succeed(database, "reward/participant-1/labels-10")
+    assert found() == {"filter/participant-1/labels-10": 1}
+    succeed(database, "filter/participant-1/labels-10")
+    assert found() == {}
+
+
+def test_a_last_answer_that_is_changed_makes_the_last_models_stale(
+    database: Database, labels: Callable[[int], list[Query]], found: Callable[[], dict[str, int]]
+) -> None:
+    queries = labels(20)
+    (first,) = found()
+    succeed(database, first)
+    (second,) = found()
+    succeed(database, second)
+    assert found() == {}
+    with database.writing() as session:
+        session.add(LabelEvent(query_id=queries[-1].id, revision=2, response=None, client_uuid="undo"))
+        session.add(LabelEvent(query_id=queries[-1].id, revision=3, response=Response.RIGHT, client_uuid="other"))
+    (third,) = found()
+    assert third.startswith("reward/participant-1/labels-20")
+    assert third != first
+
+
+def test_a_running_run_is_left_alone_until_nobody_has_heard_of_it_for_a_minute(
+    database: Database, labels: Callable[[int], list[Query]], found: Callable[[], dict[str, int]]
+) -> None:
+    labels(10)
+    task = records.Task("reward/participant-1/labels-10", RunKind.REWARD, 1, 1, 10)
+    with database.writing() as session:
+        run_id = records.begin_run(session, task, seed=5)
+    assert found() == {}
+    with database.reading() as session:
+        assert reconcile.abandoned(session, ()) == []
+    with database.writing() as session:
+        session.get_one(Run, run_id).heartbeat_at = now() - timedelta(seconds=61)
+    with database.reading() as session:
+        assert reconcile.abandoned(session, ()) == ["reward/participant-1/labels-10#1"]
+        assert reconcile.abandoned(session, {"reward/participant-1/labels-10"}) == []
+
+
+def test_a_failed_run_is_tried_again_a_few_times_and_then_only_when_somebody_asks(
+    database: Database, labels: Callable[[int], list[Query]], found: Callable[[], dict[str, int]]
+) -> None:
+    labels(10)
+    task = records.Task("reward/participant-1/labels-10", RunKind.REWARD, 1, 1, 10)
+    for attempt in range(1, records.ATTEMPTS + 1):
+        assert found() == {task.finding: attempt}
+        with database.writing() as session:
+            run_id = records.begin_run(session, task, seed=5)
+            records.fail_run(session, task.finding, "it broke")
+        assert found() == {}, "a failed run waits before it is tried again"
+        with database.writing() as session:
+            session.get_one(Run, run_id).finished_at = now() - timedelta(hours=1)
+    assert found() == {}
+    with database.writing() as session:
+        session.get_one(Run, run_id).status = RunStatus.RETRY
+    assert found() == {task.finding: records.ATTEMPTS + 1}
+
+
+def test_milestones_that_were_passed_in_the_meantime_are_skipped() -> None:
+    settings = StudySettings(filter_milestones=(50, 100))
+    assert [reconcile.filter_due(settings, count) for count in (49, 50, 99, 130, 199, 200)] == [
+        0,
+        50,
+        50,
+        100,
+        100,
+        200,
+    ]
+
+
+def test_the_end_is_a_retraining_even_when_the_cadence_does_not_divide_it() -> None:
+    settings = StudySettings(labels_per_participant=25, retrain_every_labels=10)
+    assert [reconcile.reward_due(settings, count) for count in (9, 10, 24, 25)] == [0, 10, 20, 25]
+
+
+def test_queries_are_made_ahead_but_never_more_than_planned(
+    database: Database, study: Study, participant: Participant, labels: Callable[[int], list[Query]]
+) -> None:
+    with database.reading() as session:
+        assert records.next_queries(session, participant.id, study.settings) == (1, records.QUERIES_AHEAD)
+    labels(15)
+    with database.reading() as session:
+        assert records.next_queries(session, participant.id, study.settings) == (16, 5)
+
+
+def test_pool_scenarios_never_meet_the_ones_filters_are_evaluated_on() -> None:
+    from worker.ml.studio_filter import SCENARIO_BLOCKS
+
+    assert max(SCENARIO_BLOCKS.values()) + 1_000_000 <= reconcile.scenario_seed(0, 0)
