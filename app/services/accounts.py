@@ -66,18 +66,26 @@ def verify(session: Session, name: str, password: str) -> Experimenter:
     return experimenter
 
 
-def change_password(session: Session, experimenter: Experimenter, *, current: str, new: str) -> None:
-    """Replace the password and end every login, the present one included: the caller opens a new one.
+def hash_of_new(experimenter: Experimenter, *, current: str, new: str) -> str:
+    """The hash to store for a new password. Takes most of a second, so it is made outside of any writing transaction.
 
-    Raises WrongNameOrPassword and PasswordUnacceptable.
+    Raises WrongNameOrPassword when the present password is not right, and PasswordUnacceptable.
     """
-    verify(session, experimenter.name, current)
+    try:
+        _hasher().verify(experimenter.password_hash, current)
+    except VerificationError as error:
+        raise WrongNameOrPassword("The present password is not right.") from error
     if not MIN_PASSWORD_LENGTH <= len(new) <= MAX_PASSWORD_LENGTH:
         raise PasswordUnacceptable(f"A password has {MIN_PASSWORD_LENGTH} to {MAX_PASSWORD_LENGTH} characters.")
     if new == current:
         raise PasswordUnacceptable("The new password is the same as the present one. Choose another.")
+    return _hasher().hash(new)
+
+
+def set_password(session: Session, experimenter: Experimenter, password_hash: str) -> None:
+    """Replace the password and end every login, the present one included: the caller opens a new one."""
     account = session.get_one(Experimenter, experimenter.id)
-    account.password_hash = _hasher().hash(new)
+    account.password_hash = password_hash
     account.must_change_password = False
     _end_logins(session, account)
     audit.record(session, account.name, "password changed", account.name)

@@ -1,0 +1,61 @@
+"""Puts the web server together: settings, database, guard, routes, error pages."""
+
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from http import HTTPStatus
+
+from fastapi import FastAPI
+from fastapi.responses import PlainTextResponse, RedirectResponse
+from fastapi.staticfiles import StaticFiles
+
+from app.db import Database
+from app.settings import Settings
+from app.storage import ArtefactStore
+from app.web import experimenter, live, login, media, participant
+from app.web.deps import Studio
+from app.web.error_pages import add_error_pages, error_page
+from app.web.guard import Guard
+from app.web.login_attempts import LoginAttempts
+from app.web.templating import ROOT, make_environment
+
+MAX_BODY_BYTES = 256 * 1024
+
+
+def create_app(settings: Settings | None = None) -> FastAPI:
+    """The web server for these settings, by default those of the environment. Migrates nothing."""
+    settings = settings or Settings()
+    studio = Studio(
+        settings=settings,
+        database=Database(settings.sqlalchemy_url),
+        store=ArtefactStore(settings.data_dir / "artefacts"),
+        login_attempts=LoginAttempts(settings.login_attempts_per_minute),
+    )
+
+    @asynccontextmanager
+    async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
+        with live.closing_on_signals(studio.closing):
+            yield
+        studio.database.dispose()
+
+    app = FastAPI(
+        title="PbARL Studio", openapi_url=None, lifespan=lifespan, max_body_size=MAX_BODY_BYTES, redirect_slashes=False
+    )
+    app.state.studio = studio
+    app.state.templates = make_environment()
+    app.add_middleware(Guard, https=settings.secure_cookies, refuse=error_page)
+    add_error_pages(app)
+    for part in (login, experimenter, participant, media):
+        app.include_router(part.router)
+    app.mount("/static", StaticFiles(directory=ROOT / "static"), name="static")
+
+    @app.get("/", name="show_start")
+    def show_start() -> RedirectResponse:
+        """Participants come by their links; whoever comes here is an experimenter."""
+        return RedirectResponse(app.url_path_for("show_studies"), HTTPStatus.SEE_OTHER)
+
+    @app.get("/health", name="show_health")
+    def show_health() -> PlainTextResponse:
+        """Whether the server answers."""
+        return PlainTextResponse("ok")
+
+    return app

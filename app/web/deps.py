@@ -1,0 +1,144 @@
+"""What a route may ask for: settings, sessions on the database, and the person who is asking."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from datetime import timedelta
+from http import HTTPStatus
+from threading import Event
+from typing import Annotated
+
+from fastapi import Depends, Path, Request, Response
+from sqlalchemy.orm import Session
+
+from app.db import Database
+from app.domain.people import Experimenter
+from app.domain.studies import Participant
+from app.errors import AppError
+from app.services import browser_sessions
+from app.settings import Settings
+from app.storage import ArtefactStore
+from app.web.link_desk import LinkDesk
+from app.web.login_attempts import LoginAttempts
+
+PARTICIPANT_COOKIE = "studio_participant"
+EXPERIMENTER_COOKIE = "studio_experimenter"
+
+
+class LinkNeeded(AppError):
+    """We cannot tell who you are. Please open your personal link again: you go on exactly where you were."""
+
+    status = HTTPStatus.UNAUTHORIZED
+
+
+class LoginNeeded(AppError):
+    """Please log in."""
+
+    status = HTTPStatus.UNAUTHORIZED
+
+
+class PasswordChangeDue(AppError):
+    """Please choose a password of your own first."""
+
+    status = HTTPStatus.FORBIDDEN
+
+
+@dataclass(frozen=True)
+class Studio:
+    """The parts that every request shares."""
+
+    settings: Settings
+    database: Database
+    store: ArtefactStore
+    login_attempts: LoginAttempts
+    link_desk: LinkDesk = field(default_factory=LinkDesk)
+    closing: Event = field(default_factory=Event)
+    """Set when the server is asked to stop, so that open event streams end by themselves."""
+
+
+def studio_of(request: Request) -> Studio:
+    """The parts as create_app made them."""
+    studio: Studio = request.app.state.studio
+    return studio
+
+
+StudioDep = Annotated[Studio, Depends(studio_of)]
+
+
+def _reading_session(studio: StudioDep) -> Iterator[Session]:
+    with studio.database.reading() as session:
+        yield session
+
+
+def _writing_session(studio: StudioDep) -> Iterator[Session]:
+    with studio.database.writing() as session:
+        yield session
+
+
+# scope="function": the transaction ends before the response leaves. With the default scope a commit that fails
+# would come after a response that says "saved".
+ReadingSession = Annotated[Session, Depends(_reading_session, scope="function")]
+WritingSession = Annotated[Session, Depends(_writing_session, scope="function")]
+
+
+def participant_asking(request: Request, session: Session) -> Participant:
+    """The participant whose browser this is, study loaded. Raises LinkNeeded."""
+    cookie = request.cookies.get(PARTICIPANT_COOKIE)
+    participant = browser_sessions.participant_of(session, cookie) if cookie else None
+    if participant is None:
+        raise LinkNeeded
+    return participant
+
+
+def experimenter_asking(request: Request, session: Session) -> Experimenter:
+    """The experimenter who is logged in, password changed. Raises LoginNeeded and PasswordChangeDue."""
+    experimenter = experimenter_logged_in(request, session)
+    if experimenter.must_change_password:
+        raise PasswordChangeDue
+    return experimenter
+
+
+def experimenter_logged_in(request: Request, session: Session) -> Experimenter:
+    """The experimenter who is logged in, perhaps with a one-time password. Raises LoginNeeded."""
+    cookie = request.cookies.get(EXPERIMENTER_COOKIE)
+    experimenter = browser_sessions.experimenter_of(session, cookie) if cookie else None
+    if experimenter is None:
+        raise LoginNeeded
+    return experimenter
+
+
+def _participant(request: Request, session: WritingSession) -> Participant:
+    return participant_asking(request, session)
+
+
+def _experimenter(request: Request, session: ReadingSession) -> Experimenter:
+    return experimenter_asking(request, session)
+
+
+def _acting_experimenter(request: Request, session: WritingSession) -> Experimenter:
+    return experimenter_asking(request, session)
+
+
+CurrentParticipant = Annotated[Participant, Depends(_participant, scope="function")]
+"""In the request's writing session: whatever a participant does leaves a trace, if only that they were here."""
+CurrentExperimenter = Annotated[Experimenter, Depends(_experimenter, scope="function")]
+ActingExperimenter = Annotated[Experimenter, Depends(_acting_experimenter, scope="function")]
+"""Like CurrentExperimenter, in the request's writing session."""
+
+RowId = Annotated[int, Path(ge=1, le=2**31 - 1)]
+Slug = Annotated[str, Path(pattern=r"^[a-z0-9-]{1,80}$")]
+Code = Annotated[str, Path(pattern=r"^P[0-9]{2,8}$")]
+Sha256 = Annotated[str, Path(pattern=r"^[0-9a-f]{64}$")]
+Token = Annotated[str, Path(pattern=r"^[A-Za-z0-9_-]{20,100}$")]
+
+
+def set_cookie(response: Response, settings: Settings, name: str, cookie: str, lifetime: timedelta) -> None:
+    """Set a cookie that is out of reach of scripts and not sent along by other sites' forms."""
+    response.set_cookie(
+        name,
+        cookie,
+        max_age=int(lifetime.total_seconds()),
+        httponly=True,
+        samesite="lax",
+        secure=settings.secure_cookies,
+        path="/",
+    )

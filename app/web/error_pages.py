@@ -1,0 +1,103 @@
+"""Every error as a page a person can do something with, or as a problem (RFC 9457) for scripts."""
+
+import logging
+from collections.abc import Mapping
+from http import HTTPStatus
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse, RedirectResponse, Response
+from sqlalchemy.exc import OperationalError
+from starlette.exceptions import HTTPException
+
+from app.errors import AppError
+from app.web.deps import LoginNeeded, PasswordChangeDue
+from app.web.guard import HEADERS
+from app.web.templating import page
+
+log = logging.getLogger("app.web")
+
+_TITLES = {
+    HTTPStatus.UNAUTHORIZED: "Who are you?",
+    HTTPStatus.FORBIDDEN: "That is not allowed",
+    HTTPStatus.NOT_FOUND: "Nothing here",
+    HTTPStatus.CONFLICT: "That no longer fits",
+    HTTPStatus.TOO_MANY_REQUESTS: "A moment, please",
+    HTTPStatus.SERVICE_UNAVAILABLE: "A moment, please",
+    HTTPStatus.INTERNAL_SERVER_ERROR: "Something broke",
+}
+_MESSAGES = {
+    HTTPStatus.NOT_FOUND: "There is no page at this address.",
+    HTTPStatus.METHOD_NOT_ALLOWED: "This address cannot be used in that way.",
+    HTTPStatus.REQUEST_ENTITY_TOO_LARGE: "That was more than we accept at once.",
+}
+
+
+def wants_json(request: Request) -> bool:
+    """Whether the answer goes to a script rather than to a person."""
+    accepted = request.headers.get("accept", "")
+    return "json" in accepted and "text/html" not in accepted
+
+
+def error_page(request: Request, error: AppError) -> Response:
+    """The page or problem for an error of ours."""
+    return _answer(request, error.status, error.message)
+
+
+def add_error_pages(app: FastAPI) -> None:
+    """Give every kind of failure its page."""
+
+    @app.exception_handler(AppError)
+    def ours(request: Request, error: AppError) -> Response:
+        return error_page(request, error)
+
+    @app.exception_handler(LoginNeeded)
+    def login_needed(request: Request, error: LoginNeeded) -> Response:
+        if wants_json(request) or request.method != "GET":
+            return error_page(request, error)
+        target = request.app.url_path_for("show_login")
+        return RedirectResponse(f"{target}?next={request.url.path}", HTTPStatus.SEE_OTHER)
+
+    @app.exception_handler(PasswordChangeDue)
+    def password_change_due(request: Request, error: PasswordChangeDue) -> Response:
+        if wants_json(request):
+            return error_page(request, error)
+        return RedirectResponse(request.app.url_path_for("show_password"), HTTPStatus.SEE_OTHER)
+
+    @app.exception_handler(HTTPException)
+    def of_the_framework(request: Request, error: HTTPException) -> Response:
+        status = HTTPStatus(error.status_code)
+        return _answer(request, status, _MESSAGES.get(status, "This request could not be understood."), error.headers)
+
+    @app.exception_handler(RequestValidationError)
+    def not_valid(request: Request, error: RequestValidationError) -> Response:
+        places = {str(each["loc"][0]) for each in error.errors() if each["loc"]}
+        if "path" in places:
+            return _answer(request, HTTPStatus.NOT_FOUND, _MESSAGES[HTTPStatus.NOT_FOUND])
+        fields = sorted({str(each["loc"][-1]) for each in error.errors() if each["loc"]})
+        message = f"Something in this form is missing or not valid: {', '.join(fields)}. Please go back and check it."
+        return _answer(request, HTTPStatus.UNPROCESSABLE_ENTITY, message)
+
+    @app.exception_handler(OperationalError)
+    def database_busy(request: Request, error: OperationalError) -> Response:
+        log.error("the database did not answer: %s", error.orig)
+        message = "The database is busy or not ready. Nothing was saved; please try again in a moment."
+        return _answer(request, HTTPStatus.SERVICE_UNAVAILABLE, message, {"retry-after": "2"})
+
+    @app.exception_handler(Exception)
+    def unforeseen(request: Request, _error: Exception) -> Response:
+        # The server logs the traceback; this tells the person that nothing they did was lost silently.
+        message = "This is our fault, and it is in the log. Nothing was saved by this step; please try again."
+        return _answer(request, HTTPStatus.INTERNAL_SERVER_ERROR, message, HEADERS)  # made outside of the guard
+
+
+def _answer(request: Request, status: HTTPStatus, message: str, headers: Mapping[str, str] | None = None) -> Response:
+    title = _TITLES.get(status, "That did not work")
+    answer: Response
+    if wants_json(request):
+        problem = {"title": title, "status": status, "detail": message}
+        answer = JSONResponse(problem, status, media_type="application/problem+json")
+    else:
+        answer = page(request, "error.html", {"title": title, "message": message, "status": int(status)}, status)
+    answer.headers.update(headers or {})
+    return answer

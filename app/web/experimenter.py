@@ -1,0 +1,259 @@
+"""The experimenter's pages: studies, one study, one participant. Each is whole without script."""
+
+from collections.abc import AsyncIterator, Mapping
+from http import HTTPStatus
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Depends, Form, Path, Request
+from fastapi.responses import FileResponse, RedirectResponse, Response
+from fastapi.sse import EventSourceResponse, ServerSentEvent
+from sqlalchemy.orm import Session
+
+from app.services import audit, dashboard, enrolment, publishing, studies
+from app.web import charts, live, study_form
+from app.web.deps import (
+    ActingExperimenter,
+    Code,
+    CurrentExperimenter,
+    ReadingSession,
+    RowId,
+    Slug,
+    Studio,
+    StudioDep,
+    WritingSession,
+    experimenter_asking,
+)
+from app.web.link_desk import Link
+from app.web.templating import fragment, page
+
+router = APIRouter(prefix="/studies")
+
+LIST_PARTS = ("machine", "study_list")
+STUDY_PARTS = ("machine", "pool", "participants")
+PARTICIPANT_PARTS = ("machine", "participant_summary", "accuracy", "filters", "weights", "runs")
+
+MAX_NEW_PARTICIPANTS = 50
+
+
+def _may_stream(request: Request, studio: StudioDep) -> None:
+    """Checks the login before a stream begins, and holds no session while it lasts."""
+    with studio.database.reading() as session:
+        experimenter_asking(request, session)
+
+
+MayStream = Annotated[None, Depends(_may_stream)]
+
+
+@router.get("", name="show_studies")
+def show_studies(
+    request: Request, experimenter: CurrentExperimenter, session: ReadingSession, studio: StudioDep
+) -> Response:
+    """Every study."""
+    context = _list_context(session, studio) | {"experimenter": experimenter, "parts": LIST_PARTS}
+    return page(request, "experimenter/studies.html", context)
+
+
+@router.get("/live", name="stream_studies", response_class=EventSourceResponse)
+async def stream_studies(request: Request, studio: StudioDep, _allowed: MayStream) -> AsyncIterator[ServerSentEvent]:
+    """The list of studies as it changes."""
+
+    def draw(session: Session) -> Mapping[str, str]:
+        return _draw(request, LIST_PARTS, _list_context(session, studio))
+
+    async for event in live.redrawn_parts(request, studio, draw):
+        yield event
+
+
+@router.get("/new", name="show_new_study")
+def show_new_study(request: Request, experimenter: CurrentExperimenter) -> Response:
+    """The form, filled in with what usually works."""
+    context = {"experimenter": experimenter, "form": study_form.form_with_defaults(), "errors": {}}
+    return page(request, "experimenter/new_study.html", context)
+
+
+@router.post("/new", name="create_study")
+def create_study(
+    request: Request, form: study_form.TypedStudy, experimenter: ActingExperimenter, session: WritingSession
+) -> Response:
+    """Open the study, or show the form again with what is wrong with it."""
+    try:
+        name, settings = study_form.settings_of(form)
+    except study_form.FormInvalid as invalid:
+        context = {"experimenter": experimenter, "form": form, "errors": invalid.errors}
+        return page(request, "experimenter/new_study.html", context, HTTPStatus.UNPROCESSABLE_ENTITY)
+    study = studies.create_study(session, name, settings, actor=experimenter.name)
+    return _see(request, "show_study", slug=study.slug)
+
+
+@router.get("/{slug}", name="show_study")
+def show_study(
+    request: Request, slug: Slug, experimenter: CurrentExperimenter, session: ReadingSession, studio: StudioDep
+) -> Response:
+    """One study: its pool and everybody in it."""
+    context = _study_context(session, studio, slug) | {"experimenter": experimenter, "parts": STUDY_PARTS}
+    return page(request, "experimenter/study.html", context)
+
+
+@router.get("/{slug}/live", name="stream_study", response_class=EventSourceResponse)
+async def stream_study(
+    request: Request, slug: Slug, studio: StudioDep, _allowed: MayStream
+) -> AsyncIterator[ServerSentEvent]:
+    """One study as it changes."""
+
+    def draw(session: Session) -> Mapping[str, str]:
+        return _draw(request, STUDY_PARTS, _study_context(session, studio, slug))
+
+    async for event in live.redrawn_parts(request, studio, draw):
+        yield event
+
+
+@router.post("/{slug}/participants", name="add_participants")
+def add_participants(
+    request: Request,
+    slug: Slug,
+    count: Annotated[int, Form(ge=1, le=MAX_NEW_PARTICIPANTS)],
+    experimenter: ActingExperimenter,
+    session: WritingSession,
+    studio: StudioDep,
+) -> Response:
+    """Add people to the study and lead to their links."""
+    study = studies.find_study(session, slug)
+    added = [enrolment.add_participant(session, study, experimenter.name) for _ in range(count)]
+    links = [Link(participant.code, _link(request, studio, token)) for participant, token in added]
+    return _see(request, "show_links", slug=slug, key=studio.link_desk.leave(experimenter.id, links))
+
+
+@router.post("/{slug}/participants/{code}/link", name="renew_link")
+def renew_link(
+    request: Request,
+    slug: Slug,
+    code: Code,
+    experimenter: ActingExperimenter,
+    session: WritingSession,
+    studio: StudioDep,
+) -> Response:
+    """Replace a participant's link; the old one stops working."""
+    study = studies.find_study(session, slug)
+    participant = enrolment.find_by_code(session, study, code)
+    token = enrolment.renew_link(session, study, participant, experimenter.name)
+    links = [Link(participant.code, _link(request, studio, token))]
+    return _see(request, "show_links", slug=slug, key=studio.link_desk.leave(experimenter.id, links))
+
+
+@router.get("/{slug}/links/{key}", name="show_links")
+def show_links(
+    request: Request,
+    slug: Slug,
+    key: Annotated[str, Path(pattern=r"^[A-Za-z0-9_-]{10,40}$")],
+    experimenter: CurrentExperimenter,
+    session: ReadingSession,
+    studio: StudioDep,
+) -> Response:
+    """New links, for as long as the desk keeps them."""
+    context = {
+        "study": studies.find_study(session, slug),
+        "experimenter": experimenter,
+        "links": studio.link_desk.pick_up(experimenter.id, key),
+    }
+    return page(request, "experimenter/links.html", context)
+
+
+@router.post("/{slug}/runs/{run_id}/retry", name="retry_run")
+def retry_run(
+    request: Request, slug: Slug, run_id: RowId, experimenter: ActingExperimenter, session: WritingSession
+) -> Response:
+    """Ask for another attempt at a failed run."""
+    study = studies.find_study(session, slug)
+    publishing.retry_run(session, study, run_id, experimenter.name)
+    return _see(request, "show_study", slug=slug)
+
+
+@router.get("/{slug}/participants/{code}", name="show_participant")
+def show_participant(
+    request: Request,
+    slug: Slug,
+    code: Code,
+    experimenter: CurrentExperimenter,
+    session: ReadingSession,
+    studio: StudioDep,
+) -> Response:
+    """One participant: what they said, what was learned, and what it changes."""
+    context = _participant_context(session, studio, slug, code)
+    context |= {"experimenter": experimenter, "parts": PARTICIPANT_PARTS}
+    return page(request, "experimenter/participant.html", context)
+
+
+@router.get("/{slug}/participants/{code}/live", name="stream_participant", response_class=EventSourceResponse)
+async def stream_participant(
+    request: Request, slug: Slug, code: Code, studio: StudioDep, _allowed: MayStream
+) -> AsyncIterator[ServerSentEvent]:
+    """One participant as it changes."""
+
+    def draw(session: Session) -> Mapping[str, str]:
+        return _draw(request, PARTICIPANT_PARTS, _participant_context(session, studio, slug, code))
+
+    async for event in live.redrawn_parts(request, studio, draw):
+        yield event
+
+
+@router.get("/{slug}/participants/{code}/bundles/{version}.zip", name="download_bundle")
+def download_bundle(
+    slug: Slug,
+    code: Code,
+    version: RowId,
+    experimenter: ActingExperimenter,
+    session: WritingSession,
+    studio: StudioDep,
+) -> Response:
+    """The participant's filter as a zip file that runs without this project."""
+    study = studies.find_study(session, slug)
+    participant = enrolment.find_by_code(session, study, code)
+    bundle = publishing.find_bundle(session, studio.store, participant, version)
+    audit.record(session, experimenter.name, "bundle downloaded", f"{slug}/{code}/{version}")
+    filename = f"{slug}-{code}-v{version}.zip"
+    return FileResponse(studio.store.path(bundle.artefact_sha256), media_type="application/zip", filename=filename)
+
+
+def _list_context(session: Session, studio: Studio) -> dict[str, Any]:
+    return {
+        "machine": dashboard.machine(session, studio.settings.data_dir),
+        "lines": dashboard.study_lines(session),
+    }
+
+
+def _study_context(session: Session, studio: Studio, slug: str) -> dict[str, Any]:
+    study = studies.find_study(session, slug)
+    return {
+        "study": study,
+        "settings": study.settings,
+        "overview": dashboard.study_overview(session, study),
+        "machine": dashboard.machine(session, studio.settings.data_dir),
+        "sparkline": charts.sparkline,
+    }
+
+
+def _participant_context(session: Session, studio: Studio, slug: str, code: str) -> dict[str, Any]:
+    study = studies.find_study(session, slug)
+    detail = dashboard.participant_detail(session, study, enrolment.find_by_code(session, study, code))
+    return {
+        "study": study,
+        "settings": study.settings,
+        "detail": detail,
+        "machine": dashboard.machine(session, studio.settings.data_dir),
+        "chart": charts.accuracy_chart(detail.row.curve, study.settings.labels_per_participant),
+        "interval": charts.interval,
+    }
+
+
+def _draw(request: Request, parts: tuple[str, ...], context: Mapping[str, Any]) -> Mapping[str, str]:
+    return {name: fragment(request, f"experimenter/_{name}.html", context) for name in parts}
+
+
+def _link(request: Request, studio: Studio, token: str) -> str:
+    """The link to send: under the public address if one is set, else under the one the experimenter uses."""
+    base = studio.settings.public_url or str(request.base_url)
+    return f"{base.rstrip('/')}{request.app.url_path_for('open_link', token=token)}"
+
+
+def _see(request: Request, name: str, **parameters: str) -> RedirectResponse:
+    return RedirectResponse(request.app.url_path_for(name, **parameters), HTTPStatus.SEE_OTHER)

@@ -1,0 +1,69 @@
+"""Clips and posters, under the hash of their content: once loaded, a browser never has to ask again."""
+
+from http import HTTPStatus
+from pathlib import Path
+from typing import Annotated
+
+from fastapi import APIRouter, Depends, Request
+from fastapi.responses import FileResponse, Response
+from sqlalchemy import or_, select
+from sqlalchemy.orm import Session
+
+from app.domain.clips import Clip, Rollout
+from app.errors import AppError
+from app.services import browser_sessions
+from app.web.deps import EXPERIMENTER_COOKIE, PARTICIPANT_COOKIE, ReadingSession, Sha256, StudioDep
+
+router = APIRouter()
+
+_FOREVER = "private, max-age=31536000, immutable"
+
+
+class ClipNotFound(AppError):
+    """There is no such clip."""
+
+    status = HTTPStatus.NOT_FOUND
+
+
+def _may_watch(request: Request, session: ReadingSession, sha256: Sha256) -> None:
+    """A participant may watch the clips of their own study, an experimenter all. Raises ClipNotFound."""
+    clips = select(Clip.id).join(Rollout).where(or_(Clip.video_sha256 == sha256, Clip.poster_sha256 == sha256))
+    if not _experimenter_asks(request, session):
+        cookie = request.cookies.get(PARTICIPANT_COOKIE)
+        participant = browser_sessions.participant_of(session, cookie) if cookie else None
+        if participant is None:
+            raise ClipNotFound
+        clips = clips.where(Rollout.study_id == participant.study_id)
+    if session.scalar(clips.limit(1)) is None:
+        raise ClipNotFound
+
+
+MayWatch = Annotated[None, Depends(_may_watch, scope="function")]
+
+
+@router.api_route("/media/{sha256}.mp4", methods=["GET", "HEAD"], name="show_video")
+def show_video(request: Request, sha256: Sha256, studio: StudioDep, _allowed: MayWatch) -> Response:
+    """The video of a clip; answers ranges."""
+    return _artefact(request, studio.store.path(sha256), sha256, "video/mp4")
+
+
+@router.api_route("/media/{sha256}.jpg", methods=["GET", "HEAD"], name="show_poster")
+def show_poster(request: Request, sha256: Sha256, studio: StudioDep, _allowed: MayWatch) -> Response:
+    """The first picture of a clip."""
+    return _artefact(request, studio.store.path(sha256), sha256, "image/jpeg")
+
+
+def _experimenter_asks(request: Request, session: Session) -> bool:
+    cookie = request.cookies.get(EXPERIMENTER_COOKIE)
+    experimenter = browser_sessions.experimenter_of(session, cookie) if cookie else None
+    return experimenter is not None and not experimenter.must_change_password
+
+
+def _artefact(request: Request, path: Path, sha256: str, media_type: str) -> Response:
+    if not path.is_file():
+        raise ClipNotFound
+    headers = {"etag": f'"{sha256}"', "cache-control": _FOREVER}
+    known = request.headers.get("if-none-match", "")
+    if known == "*" or sha256 in known:
+        return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=headers)
+    return FileResponse(path, headers=headers, media_type=media_type, stat_result=path.stat())

@@ -1,0 +1,126 @@
+"""Pages from templates: one Jinja environment, strict about what is missing, and the words for numbers and times."""
+
+from collections.abc import Mapping
+from datetime import datetime
+from math import floor, log10
+from pathlib import Path
+from typing import Any
+
+from fastapi import Request
+from fastapi.responses import HTMLResponse
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from starlette.datastructures import URLPath
+
+from app.db import now
+
+ROOT = Path(__file__).resolve().parents[2]
+_MINUTE_S, _HOUR_S, _DAY_S = 60, 3600, 86400
+
+
+def percent(share: float) -> str:
+    """A share as whole percent."""
+    return f"{share * 100:.0f} %"
+
+
+def signed_points(difference: float) -> str:
+    """A difference of shares in percentage points, with its sign."""
+    return f"{_minus(f'{difference * 100:+.1f}')}"
+
+
+def quantity(value: float | None) -> str:
+    """A number with three significant digits."""
+    return "\N{EN DASH}" if value is None else _minus(_three_digits(value))
+
+
+def signed(value: float) -> str:
+    """A difference with its sign and three significant digits."""
+    return _minus(("+" if value > 0 else "") + _three_digits(value))
+
+
+def ago(moment: datetime | None) -> str:
+    """How long ago, coarse enough not to change while one looks at it."""
+    if moment is None:
+        return "never"
+    seconds = (now() - moment).total_seconds()
+    if seconds < _MINUTE_S:
+        return "just now"
+    if seconds < _HOUR_S:
+        return f"{seconds // _MINUTE_S:.0f} min ago"
+    if seconds < 2 * _DAY_S:
+        return f"{seconds // _HOUR_S:.0f} h ago"
+    return f"{seconds // _DAY_S:.0f} days ago"
+
+
+def time_left(seconds: int) -> str:
+    """A remaining time, rounded as roughly as it is known."""
+    if seconds < 90:
+        return "about a minute"
+    minutes = round(seconds / _MINUTE_S)
+    return f"about {minutes} min" if minutes < 90 else f"about {seconds / _HOUR_S:.1f} h"
+
+
+def moment(value: datetime) -> str:
+    """A time as people write it, in UTC."""
+    return value.strftime("%Y-%m-%d %H:%M UTC")
+
+
+def seconds(value_ms: int) -> str:
+    """A time in milliseconds as seconds."""
+    return f"{value_ms / 1000:.1f} s"
+
+
+def bytes_in_words(count: int) -> str:
+    """A number of bytes in the unit that suits it."""
+    size = float(count)
+    for unit in ("B", "kB", "MB"):
+        if size < 1000:
+            return f"{size:.0f} {unit}"
+        size /= 1000
+    return f"{size:.1f} GB"
+
+
+def in_words(name: str) -> str:
+    """An identifier as words: near_speed becomes "near speed"."""
+    return name.replace("_", " ")
+
+
+def page(request: Request, template: str, context: Mapping[str, Any], status: int = 200) -> HTMLResponse:
+    """A whole page."""
+    return HTMLResponse(fragment(request, template, context), status)
+
+
+def fragment(request: Request, template: str, context: Mapping[str, Any]) -> str:
+    """The text of one template."""
+    environment: Environment = request.app.state.templates
+
+    def path_for(name: str, **parameters: Any) -> URLPath:
+        path: URLPath = request.app.url_path_for(name, **parameters)
+        return path
+
+    return environment.get_template(template).render(request=request, path_for=path_for, **context)
+
+
+def make_environment() -> Environment:
+    """The environment of every template: escapes everything, and refuses names that were not given."""
+    environment = Environment(
+        loader=FileSystemLoader(ROOT / "templates"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    words = (percent, signed_points, quantity, signed, ago, time_left, moment, seconds, bytes_in_words, in_words)
+    environment.filters.update({word.__name__: word for word in words})
+    return environment
+
+
+def _three_digits(value: float) -> str:
+    if value == 0:
+        return "0"
+    decimals = max(0, 2 - floor(log10(abs(value))))
+    return f"{value:.{min(decimals, 4)}f}"
+
+
+def _minus(text: str) -> str:
+    """A typographic minus lines up with plus."""
+    return text.replace("-", "\N{MINUS SIGN}")

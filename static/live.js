@@ -1,0 +1,24 @@
+// Keeps an experimenter's page up to date: the server sends the parts that changed.
+
+import { morph } from "./morph.js";
+
+const path = document.querySelector("[data-live]").dataset.live;
+const state = document.querySelector("[data-live-state]");
+const events = new EventSource(path);
+
+events.addEventListener("open", () => show("live", "live"));
+events.addEventListener("fragment", (event) => {
+  const { name, html } = JSON.parse(event.data);
+  const part = document.querySelector(`[data-fragment="${CSS.escape(name)}"]`);
+  if (part) morph(part, html);
+});
+events.addEventListener("gone", () => location.reload());
+events.addEventListener("error", () => {
+  show("lost", "reconnecting …");
+  if (events.readyState === EventSource.CLOSED) setTimeout(() => location.reload(), 5000);
+});
+
+function show(name, text) {
+  state.dataset.state = name;
+  state.textContent = text;
+}
