@@ -143,8 +143,8 @@ class _Programs:
         self._falls: dict[str, list[float]] = {}
 
     def run(self, programs: dict[str, list[str]]) -> int:
-        for name in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(name, self._on_signal)
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._on_signal)
         for name, arguments in programs.items():
             self._children[name] = self._start(name, arguments)
         _say(self._greeting)
