@@ -15,7 +15,7 @@ class Detail:
     """The palette and how many sides round things have."""
 
     palette: Palette
-    sides: int = 22
+    sides: int = 16
 
     @property
     def finger_sides(self) -> int:
@@ -89,7 +89,7 @@ def spoon(detail: Detail) -> Mesh:
             (-0.165, 0, -0.0030),
             (-0.195, 0, -0.0035),
         ],
-        22,
+        max(9, detail.sides + 2),
     )
     place = np.linspace(0, 1, len(line))
     grip = place > 0.36
@@ -98,16 +98,16 @@ def spoon(detail: Detail) -> Mesh:
     thickness = np.where(grip, width * 0.78, 0.0022)
     metal, soft = detail.at("spoon", 0.2), detail.at("grip")
     colours = np.where(grip[1:], soft, metal)
-    return joined(bowl, tube(line, np.column_stack([width, thickness]), 10, colours))
+    return joined(bowl, tube(line, np.column_stack([width, thickness]), max(6, detail.sides // 2), colours))
 
 
 def _bowl(detail: Detail) -> Mesh:
     """An egg-shaped bowl, drawn on both sides; the collision shape is a box of the same size."""
-    rings, sides = 8, 26
+    rings, sides = max(3, detail.sides // 3), max(10, detail.sides + 4)
     depth, rim = 0.0105, 0.0085
     angle = np.linspace(0, 2 * np.pi, sides, endpoint=False)
     shares = np.linspace(0.0, 1.0, rings + 1)
-    outline_x = 0.0285 * np.cos(angle) + 0.0015
+    outline_x = 0.0270 * np.cos(angle) + 0.0008
     outline_y = 0.0205 * np.sin(angle) * (1.0 - 0.16 * np.cos(angle))
     grid = np.stack(
         [

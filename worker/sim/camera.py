@@ -77,7 +77,7 @@ def flat(matrix: Array) -> Sequence[float]:
 
 
 EYE_M = (0.86, -1.02, 1.50)
-TARGET_M = (-0.20, -0.26, 1.09)
+TARGET_M = (-0.20, -0.26, 1.115)
 
 
 def scene_camera(width: int, height: int) -> Camera:

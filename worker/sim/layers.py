@@ -1,34 +1,35 @@
 """One view of the scene, composed in layers: a still picture, soft moving shadows, and the moving parts on top.
 
-The still picture is drawn twice as large once per clip. Per frame only the rectangles that hold moving parts are
-drawn, with an off-centre frustum, and merged by depth; the shadow they cast comes from a small depth map seen from
-the lamp, looked up through a table made once per clip. TinyRenderer's own shadows are wrong for cropped frusta.
+The still picture is drawn once, and the head in it once per clip. Per frame only the rectangles that hold moving
+parts are drawn, with an off-centre frustum, and merged by depth; the shadow they cast comes from a small depth map
+seen from the lamp, looked up through a table made once per clip. TinyRenderer's own shadows are wrong for cropped frusta.
 """
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
-from PIL import Image, ImageFilter
+from PIL import Image, ImageChops, ImageFilter
 
 from worker.sim.camera import Camera, Rectangle, lamp
-from worker.sim.rectangles import Pixels, cover, even
-from worker.sim.scene import TOWARDS_FILL_LIGHT, TOWARDS_KEY_LIGHT, Layer, Lighting, Stage
+from worker.sim.rectangles import Pixels, cover, on_grid
+from worker.sim.scene import TOWARDS_KEY_LIGHT, Lighting, Stage
 from worker.sim.solids import Array
 
-STILL_SCALE = 2
-STILL_LAMP_SIZE, MOVING_LAMP_SIZE = 640, 192
+STILL_LAMP_SIZE, MOVING_LAMP_SIZE = 640, 168
 SHADOW_BIAS = 0.0035
 """How much nearer to the lamp something must be to cast a shadow, as a share of the lamp's depth range."""
 
-AMBIENT, KEY, FILL = 0.60, 0.46, 0.16
+AMBIENT, KEY = 0.72, 0.43
 SHADOW_KEY = 0.34
 """Share of the key light that is left in full shadow."""
 
-MOVING_LIGHT = Lighting(TOWARDS_KEY_LIGHT, AMBIENT + 0.06, KEY, 0.30)
+MOVING_LIGHT = Lighting(TOWARDS_KEY_LIGHT, AMBIENT, KEY, 0.30)
 DEPTH_ONLY = Lighting(TOWARDS_KEY_LIGHT, 1.0, 0.0)
 
 Colours = npt.NDArray[np.float32]
+Number = TypeVar("Number", np.float32, np.bool_)
 
 
 class Shot(NamedTuple):
@@ -40,17 +41,12 @@ class Shot(NamedTuple):
 
 
 def photograph(stage: Stage, camera: Camera, rectangle: Rectangle, width: int, height: int) -> Shot:
-    """Draw a stage under ambient, key and fill light, with and without the key light's full strength."""
+    """Draw a stage with and without the key light's full strength."""
     ambient = stage.draw(camera, rectangle, width, height, Lighting(TOWARDS_KEY_LIGHT, 1.0, 0.0))
-    key = _lit(stage.draw(camera, rectangle, width, height, Lighting(TOWARDS_KEY_LIGHT, 0.0, 1.0, 0.06)), ambient)
-    fill = _lit(stage.draw(camera, rectangle, width, height, Lighting(TOWARDS_FILL_LIGHT, 0.0, 1.0)), ambient)
-    base = ambient.rgb * np.float32(AMBIENT) + fill * np.float32(FILL)
-    return Shot(base + key * np.float32(KEY), base + key * np.float32(KEY * SHADOW_KEY), ambient.depth)
-
-
-def _lit(light: Layer, ambient: Layer) -> Colours:
-    """The colours of one light; the background keeps its own colour under every light and must not count twice."""
-    return np.where((ambient.depth < 0.9999)[..., None], light.rgb, 0).astype(np.float32)
+    key = stage.draw(camera, rectangle, width, height, Lighting(TOWARDS_KEY_LIGHT, 0.0, 1.0, 0.06))
+    base = ambient.rgb * np.float32(AMBIENT)
+    light = key.rgb * np.float32(KEY)
+    return Shot(base + light, base + light * np.float32(SHADOW_KEY), ambient.depth)
 
 
 class View:
@@ -63,31 +59,43 @@ class View:
         self._camera, self._rectangle = camera, rectangle
         self.width, self.height, self._supersampling = width, height, supersampling
         self._zoom = float(width / (rectangle[2] - rectangle[0]))
-        self._room = photograph(still, camera, rectangle, width * STILL_SCALE, height * STILL_SCALE)
+        self._room = photograph(still, camera, rectangle, self._fine(width), self._fine(height))
 
     def start(self, head: Stage, head_box: Pixels, lamp_depth: npt.NDArray[np.float32]) -> None:
         """Prepare a clip: add the head, cast the still shadows, and make the tables for the moving ones."""
-        lit, shadowed, depth, on_head = self._with_head(head, head_box)
-        scale = STILL_SCALE
+        lit, shadowed, self._depth, on_head = self._with_head(head, head_box)
+        depth = _resampled(self._depth, self.height, self.width)
         texel, distance = self._seen_from_lamp(depth, STILL_LAMP_SIZE)
+        dark = (lamp_depth.ravel()[texel] < distance).reshape(depth.shape)
         # The head receives no still shadow: that of brows and hair would only make the face look dirty.
-        dark = (lamp_depth.ravel()[texel] < distance).reshape(depth.shape) & ~on_head
-        mask = Image.fromarray(dark.view(np.uint8) * np.uint8(255)).filter(ImageFilter.BoxBlur(2)).reduce(scale)
-        share = np.asarray(mask.filter(ImageFilter.BoxBlur(1)), np.float32)[..., None] / 255
-        lit, shadowed = _halved(lit), _halved(shadowed)
-        background: Colours = (lit + (shadowed - lit) * share).astype(np.float32)
-        self._background = _picture(background)
-        self._background_shadowed = _picture(np.minimum(shadowed, background))
-        self._depth = _resampled(depth, int(self.height * self._supersampling), int(self.width * self._supersampling))
-        coarse = depth[:: 2 * scale, :: 2 * scale]
+        dark &= ~_resampled(on_head, self.height, self.width)
+        mask = _mask(dark).filter(ImageFilter.BoxBlur(max(1.0, 0.7 * self._zoom)))
+        self._background = self._reduced(lit)
+        dim = self._reduced(shadowed)
+        self._background.paste(dim, (0, 0), mask)
+        self._background_shadowed = ImageChops.darker(dim, self._background)
+        coarse = _resampled(self._depth, self.height // 2, self.width // 2)
         self._texel, self._distance = self._seen_from_lamp(coarse, MOVING_LAMP_SIZE)
 
-    def frame(self, moving: Stage, boxes: Array, lamp_depth: npt.NDArray[np.float32]) -> Image.Image:
-        """One picture. boxes (K, 4) hold the moving parts, in pixels of the camera's whole picture."""
+    def _fine(self, pixels: float) -> int:
+        """A length on the supersampled grid."""
+        return round(pixels * self._supersampling)
+
+    def _reduced(self, colours: Colours) -> Image.Image:
+        """Supersampled colours as a picture of this view's size."""
+        fine = Image.fromarray(colours.round().clip(0, 255).astype(np.uint8))
+        return fine.resize((self.width, self.height), Image.Resampling.HAMMING)
+
+    def frame(self, moving: Sequence[tuple[Stage, Array]], lamp_depth: npt.NDArray[np.float32]) -> Image.Image:
+        """One picture. Each moving stage comes with boxes (K, 4) that hold it, in pixels of the whole picture."""
         picture = self._background.copy()
         self._cast_shadows(picture, lamp_depth)
-        for pixels in cover(self._own_pixels(boxes), self.width, self.height):
-            self._draw_moving(picture, moving, pixels)
+        covered = []
+        for stage, boxes in moving:
+            for pixels in cover(self._own_pixels(boxes), self.width, self.height):
+                covered.append((pixels, self._draw_moving(picture, stage, pixels)))
+        for pixels, before in reversed(covered):
+            self._depth[self._place(pixels)] = before
         return picture
 
     def _own_pixels(self, boxes: Array) -> Array:
@@ -107,12 +115,11 @@ class View:
         lit, shadowed, depth = self._room.lit.copy(), self._room.shadowed.copy(), self._room.depth.copy()
         on_head: npt.NDArray[np.bool_] = np.zeros(depth.shape, dtype=np.bool_)
         own = self._own_pixels(np.array([head_box], dtype=float))[0]
-        box = even((own[0], own[1], own[2], own[3]), self.width, self.height)
-        scale = STILL_SCALE
-        width, height = (box[2] - box[0]) * scale, (box[3] - box[1]) * scale
-        if width > 0 and height > 0:
-            shot = photograph(head, self._camera, self._part(box), width, height)
-            place = np.s_[box[1] * scale : box[3] * scale, box[0] * scale : box[2] * scale]
+        box = on_grid(own, self.width, self.height)
+        left, top, right, bottom = (self._fine(value) for value in box)
+        if right > left and bottom > top:
+            shot = photograph(head, self._camera, self._part(box), right - left, bottom - top)
+            place = np.s_[top:bottom, left:right]
             nearer = shot.depth < depth[place]
             lit[place][nearer], shadowed[place][nearer] = shot.lit[nearer], shot.shadowed[nearer]
             on_head[place] = nearer
@@ -143,7 +150,7 @@ class View:
 
     def _cast_shadows(self, picture: Image.Image, lamp_depth: npt.NDArray[np.float32]) -> None:
         dark = lamp_depth.ravel()[self._texel] < self._distance
-        mask = Image.fromarray((dark.view(np.uint8) * np.uint8(255)).reshape(self.height // 2, self.width // 2))
+        mask = _mask(dark.reshape(self.height // 2, self.width // 2))
         found = mask.getbbox()
         if found is None:
             return
@@ -155,31 +162,34 @@ class View:
         soft = soft.resize((full[2] - full[0], full[3] - full[1]), Image.Resampling.BILINEAR)
         picture.paste(self._background_shadowed.crop(full), full[:2], soft)
 
-    def _draw_moving(self, picture: Image.Image, moving: Stage, pixels: Pixels) -> None:
-        scale = self._supersampling
-        width, height = round((pixels[2] - pixels[0]) * scale), round((pixels[3] - pixels[1]) * scale)
-        left, top = round(pixels[0] * scale), round(pixels[1] * scale)
+    def _place(self, pixels: Pixels) -> tuple[slice, slice]:
+        """A rectangle of this view on the supersampled grid."""
+        left, top, right, bottom = (self._fine(value) for value in pixels)
+        return slice(top, bottom), slice(left, right)
+
+    def _draw_moving(self, picture: Image.Image, moving: Stage, pixels: Pixels) -> npt.NDArray[np.float32]:
+        """Draw a stage where it is nearer than what is there, and return the depth that was there before."""
+        place = self._place(pixels)
+        before = self._depth[place].copy()
+        height, width = before.shape
         rgba, depth = moving.draw_raw(self._camera, self._part(pixels), width, height, MOVING_LIGHT)
-        visible = depth < self._depth[top : top + height, left : left + width]
+        visible = depth < before
+        self._depth[place] = np.minimum(depth, before)
         # Premultiplied alpha, so that resizing does not bleed hidden colours into the edges.
         colour = (rgba.view(np.uint32)[..., 0] | np.uint32(0xFF000000)) * visible.view(np.uint8)
-        layer = Image.frombuffer("RGBa", (width, height), colour.tobytes(), "raw", "RGBa", 0, 1)
+        layer = Image.frombuffer("RGBa", (width, height), colour, "raw", "RGBa", 0, 1)
         size = (pixels[2] - pixels[0], pixels[3] - pixels[1])
         layer = layer.resize(size, Image.Resampling.HAMMING).convert("RGBA")
         picture.paste(layer, pixels[:2], layer)
+        return before
 
 
-def _halved(colours: Colours) -> Colours:
-    height, width = colours.shape[:2]
-    grid = colours.reshape(height // STILL_SCALE, STILL_SCALE, width // STILL_SCALE, STILL_SCALE, 3)
-    return np.asarray(grid.mean(axis=(1, 3)))
+def _mask(chosen: npt.NDArray[np.bool_]) -> Image.Image:
+    return Image.fromarray(chosen.view(np.uint8) * np.uint8(255))
 
 
-def _picture(colours: Colours) -> Image.Image:
-    return Image.fromarray(colours.round().clip(0, 255).astype(np.uint8))
-
-
-def _resampled(depth: npt.NDArray[np.floating], height: int, width: int) -> npt.NDArray[np.float32]:
-    rows = ((np.arange(height) + 0.5) * depth.shape[0] / height).astype(int)
-    columns = ((np.arange(width) + 0.5) * depth.shape[1] / width).astype(int)
-    return np.ascontiguousarray(depth[rows][:, columns], dtype=np.float32)
+def _resampled(values: npt.NDArray[Number], height: int, width: int) -> npt.NDArray[Number]:
+    """The nearest of values (h, w) on a coarser grid."""
+    rows = ((np.arange(height) + 0.5) * values.shape[0] / height).astype(int)
+    columns = ((np.arange(width) + 0.5) * values.shape[1] / width).astype(int)
+    return np.ascontiguousarray(values[rows][:, columns])

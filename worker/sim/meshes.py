@@ -66,16 +66,14 @@ def surface(
 ) -> Mesh:
     """The zero surface of a distance field inside a box, by naive surface nets (Gibson 1998).
 
-    One vertex per crossed grid cell, pulled onto the surface by two Newton steps; normals are the field's gradient.
+    One vertex per crossed grid cell, pulled onto the surface by a Newton step; normals are the field's gradient.
     """
     values = _sampled(field, np.asarray(lower, dtype=float), np.asarray(upper, dtype=float), cell_m)
     inside = values < 0.0
     vertices, number = _cell_vertices(values, inside)
     faces = _crossed_quads(inside, number)
     vertices = np.asarray(lower, dtype=float) + vertices * cell_m
-    for _ in range(2):
-        normals = gradient(field, vertices)
-        vertices = vertices - np.clip(field(vertices), -cell_m, cell_m)[:, None] * normals
+    vertices = vertices - np.clip(field(vertices), -cell_m, cell_m)[:, None] * gradient(field, vertices)
     colours = colour(vertices) if callable(colour) else np.full(len(vertices), colour)
     return Mesh(vertices, gradient(field, vertices), np.column_stack([colours, np.ones(len(vertices))]), faces)
 
@@ -101,6 +99,15 @@ def openness(field: Field, mesh: Mesh, reach_m: float, strength: float) -> Array
         free = field(mesh.vertices + mesh.normals * walked)
         missing += np.clip(walked - free, 0.0, walked) / walked / 4.0
     return np.asarray(np.clip(1.0 - strength * missing, 0.0, 1.0))
+
+
+SKY = np.array([-0.55, -0.45, 0.70])
+
+
+def softly_lit(field: Field, mesh: Mesh, reach_m: float, strength: float = 0.75) -> Mesh:
+    """The mesh with baked ambient light: less in folds, a little more where it faces a bright sky."""
+    towards_sky = 0.5 + 0.5 * (mesh.normals @ (SKY / np.linalg.norm(SKY)))
+    return mesh.shaded(openness(field, mesh, reach_m, strength) * (0.80 + 0.20 * towards_sky))
 
 
 def tube(path: Array, radii: Array, sides: int, colours: Array, closed_ends: bool = True) -> Mesh:

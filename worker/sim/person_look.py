@@ -6,7 +6,7 @@ import numpy as np
 
 from worker.sim.colours import Palette
 from worker.sim.human import MOUTH_FROM_NECK_M
-from worker.sim.meshes import Mesh, curve, gradient, joined, openness, surface, tube, turned
+from worker.sim.meshes import Mesh, curve, gradient, joined, softly_lit, surface, tube, turned
 from worker.sim.solids import (
     Array,
     Field,
@@ -25,11 +25,11 @@ from worker.sim.solids import (
 )
 
 MOUTH = np.asarray(MOUTH_FROM_NECK_M)
-LIPS = MOUTH + np.array([0.0, 0.0035, 0.0])
-LIP_RADII = (0.0245, 0.0150)
+LIPS = MOUTH + np.array([0.0, -0.0005, 0.0])
+LIP_RADII = (0.0260, 0.0155)
 
-EYE = np.array([0.0310, -0.0765, 0.1165])
-EYE_RADIUS = 0.0145
+EYE = np.array([0.0325, -0.0735, 0.1155])
+EYE_RADIUS = 0.0165
 GAZE = np.array([-0.16, -1.0, -0.16])
 
 
@@ -62,29 +62,52 @@ def face() -> Field:
     """The skin of the head with nose, ears, lips and an open mouth."""
     solid = union(
         skull(),
-        sphere((0, -0.0700, 0.0015), 0.0205),
-        mirrored(ellipsoid((0.0360, -0.0660, 0.0740), (0.024, 0.022, 0.024))),
-        blend=0.030,
+        sphere((0, -0.0715, 0.0020), 0.0180),
+        mirrored(ellipsoid((0.0370, -0.0640, 0.0740), (0.024, 0.0225, 0.024))),
+        blend=0.032,
     )
-    solid = union(solid, mirrored(cone((0.010, -0.0900, 0.1330), (0.046, -0.0690, 0.1320), 0.0075, 0.006)), blend=0.022)
-    solid = carve(solid, mirrored(ellipsoid((0.0325, -0.1010, 0.1160), (0.0200, 0.0150, 0.0135))), blend=0.020)
+    solid = carve(solid, mirrored(ellipsoid((0.0335, -0.1045, 0.1150), (0.0220, 0.0165, 0.0150))), blend=0.026)
     solid = union(solid, _nose(), blend=0.012)
-    solid = union(solid, cone((0, 0.012, -0.060), (0, 0.004, 0.070), 0.053, 0.050), blend=0.018)
+    solid = union(solid, cone((0, 0.006, -0.004), (0, 0.006, 0.070), 0.0465, 0.050), blend=0.022)
     solid = union(solid, mirrored(_ear()), blend=0.007)
-    solid = union(solid, torus((LIPS[0], LIPS[1], LIPS[2]), LIP_RADII, 0.0068), blend=0.010)
-    return carve(solid, mouth_cavity(), blend=0.005)
+    solid = union(solid, _lips(), blend=0.009)
+    return carve(solid, mouth_cavity(), blend=0.004)
 
 
 def mouth_cavity() -> Field:
     x, y, z = LIPS
-    return ellipsoid((x, y + 0.022, z), (LIP_RADII[0] - 0.0025, 0.050, LIP_RADII[1] - 0.0020))
+    return _smiling(ellipsoid((x, y + 0.022, z), (LIP_RADII[0] - 0.0022, 0.050, LIP_RADII[1] - 0.0020)))
+
+
+def _lips() -> Field:
+    """The upper lip dips in the middle and is thinner than the lower one."""
+    ring = torus((LIPS[0], LIPS[1], LIPS[2]), LIP_RADII, 0.0)
+
+    def distance(points: Array) -> Array:
+        height = points[:, 2] - LIPS[2]
+        dip = np.exp(-((points[:, 0] / 0.0045) ** 2)) * smooth_step(height, 0.0, 0.012)
+        thickness = 0.0074 - 0.0012 * smooth_step(height, -0.008, 0.008) - 0.0012 * dip
+        corner = smooth_step(np.abs(points[:, 0]), 0.014, LIP_RADII[0])
+        return np.asarray(ring(points) - thickness * (1 - 0.35 * corner))
+
+    return _smiling(distance)
+
+
+def _smiling(field: Field) -> Field:
+    """The same with the corners of the mouth lifted and drawn back around the face."""
+
+    def distance(points: Array) -> Array:
+        bend = points[:, 0] ** 2
+        return field(points - np.column_stack([0 * bend, 4.5 * bend, 5.0 * bend]))
+
+    return distance
 
 
 def _nose() -> Field:
     return union(
-        chain([(0, -0.0860, 0.1250), (0, -0.0990, 0.1000), (0, -0.1090, 0.0850)], [0.0060, 0.0075, 0.0110]),
-        mirrored(sphere((0.0105, -0.0970, 0.0810), 0.0078)),
-        blend=0.010,
+        chain([(0, -0.0870, 0.1230), (0, -0.0985, 0.1000), (0, -0.1075, 0.0865)], [0.0055, 0.0072, 0.0102]),
+        mirrored(sphere((0.0098, -0.0965, 0.0825), 0.0072)),
+        blend=0.011,
     )
 
 
@@ -95,40 +118,45 @@ def _ear() -> Field:
 
 
 def hair() -> Field:
-    """Short hair with a side parting, brushed back from the forehead."""
+    """Short hair with a side parting, swept over the forehead."""
     shell = union(
-        ellipsoid((0, 0.018, 0.1480), (0.0860, 0.1020, 0.0880)),
-        ellipsoid((0, 0.048, 0.0950), (0.0740, 0.0660, 0.0760)),
+        ellipsoid((0, 0.018, 0.1480), (0.0825, 0.1005, 0.0870)),
+        ellipsoid((0, 0.048, 0.0960), (0.0690, 0.0620, 0.0720)),
         blend=0.03,
     )
-    shell = carve(shell, ellipsoid((0.004, -0.1020, 0.0980), (0.0700, 0.0700, 0.0830)), blend=0.014)
-    shell = carve(shell, mirrored(ellipsoid((0.0880, -0.0100, 0.0830), (0.0320, 0.0420, 0.0480))), blend=0.012)
-    shell = common(shell, half_space((0, 0.06, 0.040), (0, 0.25, -1)), blend=0.012)
-    fringe = union(
-        chain([(0.040, -0.050, 0.206), (0.005, -0.074, 0.207), (-0.040, -0.066, 0.190)], [0.012, 0.019, 0.010]),
-        chain([(0.040, -0.030, 0.222), (0.000, -0.050, 0.222), (-0.052, -0.040, 0.200)], [0.010, 0.017, 0.010]),
-        blend=0.012,
+    shell = carve(shell, ellipsoid((0.0, -0.1080, 0.0940), (0.0760, 0.0790, 0.0850)), blend=0.008)
+    shell = carve(shell, mirrored(ellipsoid((0.0930, -0.0080, 0.0760), (0.0300, 0.0340, 0.0480))), blend=0.008)
+    shell = common(shell, half_space((0, 0.06, 0.030), (0, 0.42, -1)), blend=0.016)
+    sweep = union(
+        chain(
+            [(0.050, -0.040, 0.202), (0.022, -0.066, 0.208), (-0.018, -0.074, 0.200), (-0.058, -0.050, 0.174)],
+            [0.010, 0.019, 0.020, 0.009],
+        ),
+        chain(
+            [(0.046, -0.010, 0.216), (0.015, -0.036, 0.225), (-0.026, -0.040, 0.217), (-0.064, -0.020, 0.186)],
+            [0.012, 0.020, 0.021, 0.012],
+        ),
+        blend=0.030,
     )
-    return _combed(union(shell, fringe, blend=0.016))
+    return _combed(union(shell, sweep, blend=0.026))
 
 
 def _combed(field: Field) -> Field:
-    """Shallow grooves from the crown outwards."""
+    """Shallow grooves along the strands."""
 
     def distance(points: Array) -> Array:
-        return field(points) + 0.0010 * _strands(points)
+        return np.asarray(field(points) + 0.0009 * _strands(points))
 
     return distance
 
 
 def _strands(points: Array) -> Array:
-    """A smooth wave in [-1, 1] (N,) that is constant along hairs running out from the parting."""
-    side = points[:, 0] + 0.45 * (points[:, 1] + 0.03) - 0.02
-    ahead = points[:, 1] + 0.15 - 0.4 * points[:, 0]
-    angle = np.arctan2(side, ahead)
-    return np.asarray(
-        0.55 * np.sin(31 * angle + 14 * points[:, 2]) + 0.3 * np.sin(67 * angle + 1.0) + 0.15 * np.sin(113 * angle)
-    )
+    """A smooth wave in [-1, 1] (N,) that is constant along hairs: across the head in front, downwards behind."""
+    crown = np.array([0.030, 0.035, 0.235])
+    way = points - crown
+    angle = np.arctan2(way[:, 1] + 0.25 * way[:, 0], way[:, 0] - 0.02)
+    wave = angle + 2.0 * way[:, 2]
+    return np.asarray(0.66 * np.sin(19 * wave) + 0.34 * np.sin(41 * wave + 1.0))
 
 
 def head_meshes(palette: Palette) -> Mesh:
@@ -136,13 +164,14 @@ def head_meshes(palette: Palette) -> Mesh:
     skin_field, hair_field = face(), hair()
     whole = union(skin_field, hair_field)
     skin = _surface(skin_field, HEAD_REGION, lambda points: palette.along("skin", _complexion(points)))
-    skin = skin.shaded(_cavity_light(skin.vertices) * openness(whole, skin, 0.020, 0.75))
+    skin = softly_lit(whole, skin, 0.020)
+    skin = skin.shaded(_cavity_light(skin.vertices) * skin.paint[:, 1])
     locks = _surface(
         hair_field,
         HEAD_REGION,
-        lambda points: palette.along("hair", 0.34 + 0.20 * _strands(points) + 1.2 * (points[:, 2] - 0.15)),
+        lambda points: palette.along("hair", 0.40 + 0.16 * _strands(points) + 1.6 * (points[:, 2] - 0.15)),
     )
-    locks = locks.shaded(openness(whole, locks, 0.02, 0.6))
+    locks = softly_lit(whole, locks, 0.02)
     parts = [skin, locks, *_eyes(palette), *_brows(palette), *_inside_mouth(palette)]
     return joined(*parts)
 
@@ -153,22 +182,24 @@ def _surface(field: Field, region: Region, colour: object) -> Mesh:
 
 def _complexion(points: Array) -> Array:
     """Where each point of the skin lies on the ramp from skin over blush and lips to the inside of the mouth (N,)."""
-    ring = torus((LIPS[0], LIPS[1] - 0.001, LIPS[2]), LIP_RADII, 0.0)(points)
-    lips = 0.66 * (1.0 - smooth_step(ring, 0.0072, 0.0098))
-    inside = smooth_step(-mouth_cavity()(points), -0.0015, 0.0015) * smooth_step(
-        points[:, 1], LIPS[1] - 0.001, LIPS[1] + 0.006
-    )
-    cheek = np.exp(-((np.linalg.norm((points - [0.0, 0, 0]) * [0, 1, 1] - [0, -0.070, 0.076], axis=1) / 0.022) ** 2))
-    cheek = cheek * np.exp(-(((np.abs(points[:, 0]) - 0.040) / 0.017) ** 2))
-    nose = np.exp(-((np.linalg.norm(points - [0, -0.114, 0.084], axis=1) / 0.014) ** 2))
+    lips = 0.66 * (1.0 - smooth_step(_lips()(points), 0.0012, 0.0032))
+    depth = points[:, 1] - LIPS[1] - 4.5 * points[:, 0] ** 2
+    inside = smooth_step(-mouth_cavity()(points), -0.0018, 0.0) * smooth_step(depth, -0.003, 0.003)
+    cheek = _spot(np.abs(points) * [1, -1, 1], (0.041, -0.068, 0.074), 0.024)
+    nose = _spot(points, (0, -0.114, 0.086), 0.014)
     ear = smooth_step(np.abs(points[:, 0]), 0.076, 0.088)
-    blush = 0.30 * np.clip(cheek + 0.6 * nose + 0.6 * ear, 0, 1)
+    blush = 0.34 * np.clip(cheek + 0.5 * nose + 0.6 * ear, 0, 1)
     return np.asarray(np.maximum(np.maximum(blush, lips), inside))
+
+
+def _spot(points: Array, centre: tuple[float, float, float], radius: float) -> Array:
+    """A soft round spot (N,)."""
+    return np.asarray(np.exp(-(((points - np.array(centre)) ** 2).sum(axis=1)) / radius**2))
 
 
 def _cavity_light(points: Array) -> Array:
     """The mouth gets dark with depth (N,)."""
-    depth = smooth_step(points[:, 1], LIPS[1] + 0.002, LIPS[1] + 0.030)
+    depth = smooth_step(points[:, 1], LIPS[1] - 0.001, LIPS[1] + 0.022)
     return np.where(mouth_cavity()(points) < 0.004, 1.0 - 0.8 * depth, 1.0)
 
 
@@ -194,7 +225,7 @@ def _eyes(palette: Palette) -> list[Mesh]:
     for side in (-1.0, 1.0):
         centre = EYE * [side, 1, 1]
         gaze = GAZE + np.array([-0.05 * side, 0, 0])
-        meshes += [_eyeball(palette, centre, gaze / np.linalg.norm(gaze)), *_lids(palette, centre)]
+        meshes += [_eyeball(palette, centre, gaze / np.linalg.norm(gaze)), *_lid(palette, centre)]
     return meshes
 
 
@@ -211,28 +242,31 @@ def _eyeball(palette: Palette, centre: Array, gaze: Array) -> Mesh:
     return joined(ball.shaded(0.55 + 0.45 * upper), dot)
 
 
-def _lids(palette: Palette, centre: Array) -> list[Mesh]:
-    """Upper and lower lid as caps of a slightly larger ball, and the line of the lashes."""
-    cover = sphere(tuple(centre), EYE_RADIUS + 0.0016)
-    tilt = 0.35 * np.sign(centre[0])
-    upper = common(cover, half_space(tuple(centre + [0, 0, 0.0058]), (0.10 * np.sign(tilt), 0.42, -1.0)), blend=0.0012)
-    lower = common(cover, half_space(tuple(centre - [0, 0, 0.0078]), (0, 0.35, 1.0)), blend=0.0012)
-    margin = EYE_RADIUS + 0.004
-    box_ = (tuple(centre - margin), tuple(centre + margin))
-    skin = palette.at("skin", 0.10)
-    lids = [surface(part, box_[0], box_[1], 0.0014, skin) for part in (upper, lower)]
-    normal = _unit(np.array([0.10 * np.sign(tilt), 0.42, -1.0]))
-    middle = centre + [0, 0, 0.0058]
-    offset = float((middle - centre) @ normal)
-    ring_radius = np.sqrt((EYE_RADIUS + 0.0016) ** 2 - offset**2)
+UPPER_LID = (np.array([0.0, 0.34, -1.0]), 0.0062)
+"""Outward normal of the plane that ends the lid, and how far above the middle of the eye's front it lies."""
+
+
+def _lid(palette: Palette, centre: Array) -> list[Mesh]:
+    """The upper lid as a cap of a slightly larger ball, and the line of the lashes along its edge."""
+    direction, height = UPPER_LID
+    normal, radius = _unit(direction), EYE_RADIUS + 0.0015
+    front = centre + np.array([0.0, -radius, height])
+    margin = radius + 0.003
+    lid = common(sphere(tuple(centre), radius), half_space(tuple(front), tuple(normal)), blend=0.003)
+    cap = surface(lid, tuple(centre - margin), tuple(centre + margin), 0.0016, palette.at("skin", 0.18))
+    cap = cap.shaded(np.full(len(cap.vertices), 0.86))
+    return [cap, _lashes(palette, centre, normal, float((front - centre) @ normal) - 0.0006, radius)]
+
+
+def _lashes(palette: Palette, centre: Array, normal: Array, offset: float, radius: float) -> Mesh:
+    """A dark line along the circle in which a plane cuts the eye."""
     across = _unit(np.cross(normal, [0, 1.0, 0]))
     front = _unit(np.cross(across, normal))
     front = front if front[1] < 0 else -front
-    sweep = np.linspace(-1.15, 1.15, 15)
-    line = centre + normal * offset + ring_radius * (np.sin(sweep)[:, None] * across + np.cos(sweep)[:, None] * front)
-    width = 0.00135 * np.cos(sweep * 0.9) + 0.0004
-    lash = tube(line, width, 6, np.full(len(line), palette.at("hair", 0.0)))
-    return [*lids, lash]
+    sweep = np.linspace(-1.25, 1.25, 17)
+    circle = np.sin(sweep)[:, None] * across + np.cos(sweep)[:, None] * front
+    line = centre + normal * offset + np.sqrt(radius**2 - offset**2) * circle
+    return tube(line, 0.0013 * np.cos(sweep) + 0.0005, 6, np.full(len(line), palette.at("hair", 0.0)))
 
 
 def _brows(palette: Palette) -> list[Mesh]:
@@ -242,12 +276,12 @@ def _brows(palette: Palette) -> list[Mesh]:
         points = curve(
             [
                 (side * x, -0.095, z)
-                for x, z in ((0.0150, 0.1405), (0.0270, 0.1455), (0.0390, 0.1450), (0.0505, 0.1385))
+                for x, z in ((0.0165, 0.1425), (0.0290, 0.1475), (0.0420, 0.1475), (0.0545, 0.1410))
             ],
             14,
         )
         points = _onto(field, points)
-        width = np.interp(np.linspace(0, 1, 14), [0, 0.2, 0.6, 1], [0.0022, 0.0034, 0.0030, 0.0009])
+        width = np.interp(np.linspace(0, 1, 14), [0, 0.2, 0.6, 1], [0.0026, 0.0036, 0.0032, 0.0010])
         # Thick along the skin, thin out of it.
         meshes.append(tube(points, np.column_stack([width * 0.62, width]), 8, np.full(14, palette.at("hair", 0.25))))
     return meshes
@@ -270,33 +304,33 @@ NECKLINE = np.array([0.0, 0.046, 1.092])
 
 def shirt() -> Field:
     torso = union(
-        ellipsoid((0, 0.058, 0.930), (0.160, 0.104, 0.150)),
-        ellipsoid((0, 0.045, 0.740), (0.150, 0.118, 0.170)),
+        ellipsoid((0, 0.058, 0.930), (0.158, 0.102, 0.150)),
+        ellipsoid((0, 0.052, 0.730), (0.140, 0.104, 0.170)),
         mirrored(cone((0.02, 0.064, 1.040), (0.145, 0.062, 1.006), 0.056, 0.058)),
         blend=0.075,
     )
-    sleeve = cone((0.166, 0.060, 1.002), (0.212, 0.050, 0.795), 0.058, 0.055)
+    sleeve = cone((0.166, 0.060, 1.002), (0.213, 0.050, 0.795), 0.058, 0.057)
     sleeve = common(sleeve, half_space((0.21, 0.050, 0.838), (0.22, -0.05, -1)), blend=0.012)
     solid = union(torso, mirrored(sleeve), blend=0.028)
-    collar_hole = cone((0, 0.050, 1.060), (0, 0.030, 1.20), 0.052, 0.075)
+    collar_hole = cone((0, 0.052, 1.075), (0, 0.030, 1.20), 0.048, 0.075)
     return carve(solid, collar_hole, blend=0.006)
 
 
 def collar() -> Field:
     turn = turned((1, 0, 0), np.pi / 2 + 0.30)
-    return torus(tuple(NECKLINE), (0.0600, 0.0590), 0.0075, turn)
+    return torus(tuple(NECKLINE), (0.0605, 0.0610), 0.0095, turn)
 
 
 def arms() -> Field:
     arm = chain(
         [
-            (0.211, 0.052, 0.900),
+            (0.2105, 0.051, 0.825),
             (0.211, 0.050, 0.765),
             (0.207, 0.020, 0.733),
             (0.201, -0.085, 0.728),
             (0.197, -0.195, 0.724),
         ],
-        [0.043, 0.040, 0.040, 0.039, 0.0265],
+        [0.0405, 0.0400, 0.0400, 0.0385, 0.0265],
     )
     return mirrored(union(_softened(arm), hand(), blend=0.022))
 
@@ -324,7 +358,7 @@ def hand() -> Field:
 
 
 def neck() -> Field:
-    return cone((0, 0.062, 1.030), (0, 0.034, 1.172), 0.060, 0.0515)
+    return cone((0, 0.062, 1.030), (0, 0.036, 1.143), 0.060, 0.0525)
 
 
 def trousers() -> Field:
@@ -348,18 +382,25 @@ def body_meshes(palette: Palette, around: Field) -> Mesh:
     """Everything of the person but the head, as one mesh; `around` is what else keeps light away (the chair)."""
     whole = union(shirt(), arms(), neck(), trousers(), collar(), around)
     parts = [
-        (shirt(), Region((-0.29, -0.09, 0.56), (0.29, 0.20, 1.13), 0.009), "shirt", 0.5),
+        (shirt(), Region((-0.29, -0.09, 0.56), (0.29, 0.20, 1.13), 0.011), "shirt", 0.5),
         (collar(), Region((-0.08, -0.04, 1.04), (0.08, 0.13, 1.14), 0.0045), "shirt_trim", 0.0),
-        (neck(), Region((-0.075, -0.04, 1.06), (0.075, 0.14, 1.235), 0.006), "skin", 0.0),
-        (arms(), Region((-0.26, -0.345, 0.67), (0.26, 0.11, 0.92), 0.0058), "skin", 0.02),
-        (trousers(), Region((-0.22, -0.56, 0.04), (0.22, 0.24, 0.68), 0.014), "trousers", 0.0),
-        (shoes(), Region((-0.18, -0.66, 0.0), (0.18, -0.40, 0.20), 0.012), "shoe", 0.0),
+        (arms(), Region((-0.26, -0.345, 0.67), (0.26, 0.11, 0.86), 0.0062), "skin", 0.02),
+        (trousers(), Region((-0.22, -0.56, 0.04), (0.22, 0.24, 0.68), 0.019), "trousers", 0.0),
+        (shoes(), Region((-0.18, -0.66, 0.0), (0.18, -0.40, 0.20), 0.017), "shoe", 0.0),
     ]
     meshes = []
     for field, region, name, share in parts:
         mesh = surface(field, region.lower, region.upper, region.cell_m, palette.at(name, share))
-        meshes.append(mesh.shaded(openness(whole, mesh, 0.07, 0.75)))
+        meshes.append(softly_lit(whole, mesh, 0.07))
     return joined(*meshes)
+
+
+def neck_mesh(palette: Palette) -> Mesh:
+    """The neck, which stands still but is drawn with the head so that no shadow edge lies between the two."""
+    chin = sphere((0, -0.030, 1.165), 0.055)
+    whole = union(neck(), chin, collar())
+    mesh = surface(neck(), (-0.075, -0.04, 1.05), (0.075, 0.14, 1.235), 0.006, palette.at("skin", 0.02))
+    return softly_lit(whole, mesh, 0.06, 0.9)
 
 
 def chair() -> Field:
@@ -373,9 +414,9 @@ def chair() -> Field:
 def chair_meshes(palette: Palette, around: Field) -> Mesh:
     """The chair as one mesh; `around` is the person who sits in it."""
     whole = union(chair(), around)
-    region = Region((-0.27, -0.28, 0.36), (0.27, 0.33, 1.17), 0.012)
+    region = Region((-0.27, -0.28, 0.36), (0.27, 0.33, 1.17), 0.014)
     padding = surface(chair(), region.lower, region.upper, region.cell_m, palette.at("cushion"))
-    padding = padding.shaded(openness(whole, padding, 0.08, 0.8))
+    padding = softly_lit(whole, padding, 0.08)
     metal = palette.at("chair")
     parts = [padding]
     for side in (-1.0, 1.0):

@@ -7,21 +7,21 @@ from worker.sim.solids import Array
 Pixels = tuple[int, int, int, int]
 """left, top, right, bottom"""
 
-CALL_COST_PX = 6000
+CALL_COST_PX = 3000
 """A second drawing call costs about as much as this many pixels."""
 
 _CUTS = 22
 
 
-def even(box: tuple[float, float, float, float], width: int, height: int) -> Pixels:
-    """The smallest box with even sides around this one, cut to the picture."""
-    left, top, right, bottom = box
-    return (
-        min(max(0, int(left // 2) * 2), width),
-        min(max(0, int(top // 2) * 2), height),
-        max(0, min(width, int(-(-right // 2)) * 2)),
-        max(0, min(height, int(-(-bottom // 2)) * 2)),
-    )
+GRID_PX = 4
+"""Rectangles start and end on this grid, so that they also fall on whole pixels of a 1.25 or 1.5 times finer one."""
+
+
+def on_grid(box: Array, width: int, height: int) -> Pixels:
+    """The smallest rectangle on the grid around a box (4,), cut to the picture (whose sides are on the grid)."""
+    left, top = (np.floor(box[:2] / GRID_PX) * GRID_PX).clip(0, [width, height]).astype(int).tolist()
+    right, bottom = (np.ceil(box[2:] / GRID_PX) * GRID_PX).clip(0, [width, height]).astype(int).tolist()
+    return left, top, right, bottom
 
 
 def cover(boxes: Array, width: int, height: int) -> list[Pixels]:
@@ -36,7 +36,7 @@ def cover(boxes: Array, width: int, height: int) -> list[Pixels]:
         cost, pair = _best_cut(boxes, axis)
         if cost < best_cost:
             best, best_cost = pair, cost
-    found = [even((float(b[0]), float(b[1]), float(b[2]), float(b[3])), width, height) for b in best]
+    found = [on_grid(box, width, height) for box in best]
     return [pixels for pixels in found if pixels[2] > pixels[0] and pixels[3] > pixels[1]]
 
 
@@ -44,7 +44,7 @@ def _best_cut(boxes: Array, axis: int) -> tuple[float, list[Array]]:
     """The cut across one axis with the fewest pixels: their number, and the rectangles on both sides."""
     low, high = boxes[:, axis], boxes[:, axis + 2]
     side_low, side_high = boxes[:, 1 - axis], boxes[:, 3 - axis]
-    cuts = (np.linspace(low.min(), high.max(), _CUTS)[1:-1] // 2 * 2)[:, None]
+    cuts = (np.linspace(low.min(), high.max(), _CUTS)[1:-1] // GRID_PX * GRID_PX)[:, None]
     before, after = low < cuts, high > cuts
     if not (before.any(axis=1) & after.any(axis=1)).all():
         return np.inf, []

@@ -14,12 +14,12 @@ from worker.sim.human import MOUTH_FROM_NECK_M, NECK_PIVOT_M
 from worker.sim.layers import DEPTH_ONLY, MOVING_LAMP_SIZE, STILL_LAMP_SIZE, View
 from worker.sim.motion import Motion, clip_motion, quaternions
 from worker.sim.rectangles import Pixels
-from worker.sim.scene import GONE_M, HAND_PARTS, Scene, food_name
+from worker.sim.scene import GONE_M, HAND_PARTS, UPPER_ARM, Scene, Stage, food_name
 from worker.sim.solids import Array
 from worker.trajectory import Trajectory
 
 FOOD_RADIUS_M = 0.006
-HEAD_EXTENT_M = np.array([[x, y, z] for x in (-0.15, 0.15) for y in (-0.16, 0.16) for z in (-0.08, 0.27)])
+HEAD_EXTENT_M = np.array([[x, y, z] for x in (-0.15, 0.15) for y in (-0.16, 0.16) for z in (-0.12, 0.27)])
 """Corners of a box that holds the head however it is turned, around the neck pivot."""
 
 
@@ -30,11 +30,11 @@ class RenderStyle:
     fps: int = 15
     width: int = 640
     height: int = 480
-    supersampling: float = 1.5
+    supersampling: float = 1.25
     inset: bool = True
-    inset_width: int = 216
-    inset_height: int = 162
-    inset_zoom: float = 2.6
+    inset_width: int = 208
+    inset_height: int = 156
+    inset_zoom: float = 2.3
     highlight_pressing: bool = True
     food_scale: float = 1.3
     food_count: int = 8
@@ -101,13 +101,12 @@ class ClipRenderer:
             shadows = scene.casters.draw_raw(
                 lamp(MOVING_LAMP_SIZE), None, MOVING_LAMP_SIZE, MOVING_LAMP_SIZE, DEPTH_ONLY
             )[1]
-            picture = self._main.frame(scene.moving, boxes[index], shadows)
+            picture = self._main.frame(self._reaching(boxes[index]), shadows)
             if style.highlight_pressing:
                 highlight.draw(picture, index)
             if inset is not None:
-                near = boxes[index, self._near_mouth]
                 border = highlight.border(index) if style.highlight_pressing else highlight.CALM
-                _paste_inset(picture, inset.frame(scene.hand, near, shadows), border)
+                _paste_inset(picture, inset.frame([(scene.hand, boxes[index, self._near_mouth])], shadows), border)
             yield picture
 
     def _lamp_depth(self, stage: str) -> npt.NDArray[np.float32]:
@@ -138,6 +137,11 @@ class ClipRenderer:
         view.start(self._scene.head, head_box, lamp_depth)
         return view
 
+    def _reaching(self, boxes: Array) -> list[tuple[Stage, Array]]:
+        """The moving stages with the boxes (K, 4) of what is in them."""
+        upper = len(UPPER_ARM)
+        return [(self._scene.upper_arm, boxes[:upper]), (self._scene.forearm, boxes[upper:])]
+
     @property
     def _near_mouth(self) -> list[int]:
         hand = [self._parts.index(name) for name in HAND_PARTS]
@@ -158,17 +162,17 @@ class ClipRenderer:
         scene = self._scene
         for part, name in enumerate(self._parts):
             place, turn = motion.frames[index, part, :3, 3].tolist(), turns[index, part].tolist()
-            for stage in (scene.moving, scene.casters):
-                stage.place(name, place, turn)
+            (scene.upper_arm if name in UPPER_ARM else scene.forearm).place(name, place, turn)
+            scene.casters.place(name, place, turn)
             if name in HAND_PARTS:
                 scene.hand.place(name, place, turn)
         for food, place_m in enumerate(motion.food_m[index, : self.style.food_count]):
             where = GONE_M if np.isnan(place_m).any() else place_m.tolist()
-            scene.moving.place(food_name(food), where, (0, 0, 0, 1))
+            scene.forearm.place(food_name(food), where, (0, 0, 0, 1))
             scene.hand.place(food_name(food), where, (0, 0, 0, 1))
 
 
-INSET_CORNER_PX = (12, 12)
+INSET_CORNER_PX = (11, 11)
 INSET_BORDER_PX = 3
 
 
@@ -182,8 +186,8 @@ def _paste_inset(picture: Image.Image, inset: Image.Image, border: tuple[int, in
 def _around(camera: Camera, mouth_m: Array, width: float, height: float) -> Rectangle:
     """A part of the picture with the mouth right of its middle, for the spoon comes from the left."""
     x, y = camera.pixels(mouth_m).tolist()
-    left = min(max(0.0, x - 0.62 * width), camera.width - width)
-    top = min(max(0.0, y - 0.52 * height), camera.height - height)
+    left = min(max(0.0, x - 0.68 * width), camera.width - width)
+    top = min(max(0.0, y - 0.46 * height), camera.height - height)
     return left, top, left + width, top + height
 
 

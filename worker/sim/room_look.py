@@ -1,7 +1,7 @@
 """A calm, light room: nothing behind the path of the spoon that draws the eye."""
 
 from worker.sim.colours import Palette
-from worker.sim.meshes import Mesh, joined, openness, panel
+from worker.sim.meshes import Mesh, joined, panel, softly_lit
 from worker.sim.solids import Array, Field, cone, smooth_step, union
 
 LEFT, RIGHT, FRONT, BACK, CEILING = -2.2, 1.6, -1.6, 1.5, 3.0
@@ -17,10 +17,10 @@ def room_meshes(palette: Palette, furniture: Field) -> dict[str, Mesh]:
         return palette.along("side_wall", smooth_step(points[:, 2], 1.9, 0.2))
 
     floor = panel(
-        [(LEFT, FRONT, 0), (RIGHT, FRONT, 0), (RIGHT, BACK, 0), (LEFT, BACK, 0)], 56, 46, palette.at("floor", 0.2)
+        [(LEFT, FRONT, 0), (RIGHT, FRONT, 0), (RIGHT, BACK, 0), (LEFT, BACK, 0)], 36, 30, palette.at("floor", 0.2)
     )
     stand = cone((-0.45, -0.55, 0.0), (-0.45, -0.55, 0.4), 0.12, 0.04)
-    floor = floor.shaded(openness(union(furniture, stand), floor, 0.55, 0.9))
+    floor = softly_lit(union(furniture, stand), floor, 0.5, 0.8)
     back = panel([(LEFT, BACK, 0), (RIGHT, BACK, 0), (RIGHT, BACK, CEILING), (LEFT, BACK, CEILING)], 20, 24, wall)
     side = panel([(LEFT, FRONT, 0), (LEFT, BACK, 0), (LEFT, BACK, CEILING), (LEFT, FRONT, CEILING)], 20, 24, side_wall)
     return {"floor": floor, "walls": joined(back, side), "skirting": _skirting(palette)}

@@ -21,8 +21,8 @@ GONE_M = (0.0, 0.0, -5.0)
 """Where food that was eaten or lost is kept, out of sight."""
 
 TOWARDS_KEY_LIGHT = (0.60, -1.20, 2.20)
-TOWARDS_FILL_LIGHT = (-1.0, -0.55, 0.25)
 
+UPPER_ARM = ("link_1", "link_2", "link_3")
 HAND_PARTS = ("link_6", "link_7", "spoon")
 """What of the arm can come near the mouth and is drawn in the inset."""
 
@@ -82,7 +82,7 @@ class Scene:
 
     def __init__(self, food_count: int, food_radius_m: float) -> None:
         palette = Palette()
-        arm = arm_look.arm_meshes(arm_look.Detail(palette))
+        arm = arm_look.arm_meshes(arm_look.Detail(palette, sides=14))
         foods = {
             food_name(index): arm_look.food_mesh(arm_look.Detail(palette), FOOD[index % len(FOOD)], food_radius_m)
             for index in range(food_count)
@@ -91,15 +91,18 @@ class Scene:
             texture = Path(folder) / "palette.png"
             Image.fromarray(palette.texture()).save(texture)
             self.still = Stage(_still_meshes(palette), palette, texture)
-            self.head = Stage({"head": person_look.head_meshes(palette)}, palette, texture)
-            self.moving = Stage(arm | foods, palette, texture)
-            self.hand = Stage({name: arm[name] for name in HAND_PARTS} | foods, palette, texture)
-            self.casters = Stage(arm_look.arm_meshes(arm_look.Detail(palette, sides=8)), palette, texture)
+            head = {"head": person_look.head_meshes(palette), "neck": person_look.neck_mesh(palette)}
+            self.head = Stage(head, palette, texture)
+            self.upper_arm = Stage({name: arm[name] for name in UPPER_ARM}, palette, texture)
+            self.forearm = Stage({name: arm[name] for name in arm if name not in UPPER_ARM} | foods, palette, texture)
+            fine = arm_look.arm_meshes(arm_look.Detail(palette, sides=18))
+            self.hand = Stage({name: fine[name] for name in HAND_PARTS} | foods, palette, texture)
+            self.casters = Stage(arm_look.arm_meshes(arm_look.Detail(palette, sides=6)), palette, texture)
         self.boxes = _boxes(arm)
 
     def close(self) -> None:
         """Free every client."""
-        for stage in (self.still, self.head, self.moving, self.hand, self.casters):
+        for stage in (self.still, self.head, self.upper_arm, self.forearm, self.hand, self.casters):
             stage.close()
 
     def turn_head(self, quaternion: Sequence[float] | Array) -> None:

@@ -148,7 +148,7 @@ def smooth_minimum(first: Array, second: Array, blend: float) -> Array:
     if blend <= 0.0:
         return np.minimum(first, second)
     overlap = np.maximum(blend - np.abs(first - second), 0.0) / blend
-    return np.minimum(first, second) - overlap * overlap * blend / 4.0
+    return np.asarray(np.minimum(first, second) - overlap * overlap * blend / 4.0)
 
 
 def smooth_step(values: Array, start: float, end: float) -> Array:

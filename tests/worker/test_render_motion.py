@@ -1,0 +1,112 @@
+"""Poses between control steps, the cameras, and which rectangles are drawn."""
+
+import numpy as np
+import pytest
+
+from tests.worker.waving import waving_trajectory
+from worker.sim import jaco
+from worker.sim.camera import lamp, scene_camera
+from worker.sim.motion import clip_motion, quaternions, smoothly
+from worker.sim.rectangles import GRID_PX, cover, on_grid
+
+
+def test_a_clip_has_one_and_a_half_frames_per_control_step_at_fifteen_frames_per_second() -> None:
+    assert len(clip_motion(waving_trajectory(20), 4, 10, 15)) == 15
+
+
+def test_frames_at_control_steps_show_exactly_the_recorded_joints() -> None:
+    trajectory = waving_trajectory(20)
+    motion = clip_motion(trajectory, 2, 10, 20)
+    recorded = jaco.link_frames(trajectory.joint_positions[2:12].astype(float))
+    base = jaco.rotation(jaco.ROBOT_BASE_RPY)
+    assert motion.frames[::2, :, :3, 3] == pytest.approx(recorded[:, :, :3, 3] @ base.T + jaco.ROBOT_BASE_M)
+
+
+def test_velocity_has_no_kinks_at_control_steps() -> None:
+    values = np.sin(np.arange(12) * 0.7)[:, None]
+    place = 5.0 + np.array([-2e-4, -1e-4, 1e-4, 2e-4])
+    before, _, after = np.diff(smoothly(values, place)[:, 0])
+    assert before == pytest.approx(after, rel=1e-2)
+
+
+def test_steady_motion_stays_steady() -> None:
+    values = np.arange(10.0)[:, None]
+    place = np.linspace(1, 8, 57)
+    assert smoothly(values, place)[:, 0] == pytest.approx(place)
+
+
+def test_food_that_was_eaten_disappears_within_one_control_step() -> None:
+    trajectory = waving_trajectory(20)
+    trajectory.particles[10:, 3] = np.nan
+    gone = np.isnan(clip_motion(trajectory, 0, 20, 15).food_m[:, 3, 0])
+    assert not gone[: int(9 * 1.5)].any()
+    assert gone[int(10 * 1.5) :].all()
+
+
+@pytest.mark.parametrize(("first", "count"), [(-1, 5), (0, 0), (15, 6)])
+def test_steps_outside_the_trajectory_are_refused(first: int, count: int) -> None:
+    with pytest.raises(ValueError, match="not within a trajectory of 20 steps"):
+        clip_motion(waving_trajectory(20), first, count, 15)
+
+
+def test_quaternions_turn_vectors_like_their_matrices() -> None:
+    rng = np.random.default_rng(1)
+    turns = np.linalg.qr(rng.normal(size=(200, 3, 3)))[0]
+    turns *= np.sign(np.linalg.det(turns))[:, None, None]
+    x, y, z, w = quaternions(turns).T
+    vector = rng.normal(size=3)
+    pure = np.stack([x, y, z], axis=-1)
+    doubled = 2 * np.cross(pure, vector)
+    assert vector + w[:, None] * doubled + np.cross(pure, doubled) == pytest.approx(turns @ vector)
+
+
+def test_a_cropped_picture_shows_the_same_points_as_the_whole() -> None:
+    camera = scene_camera(640, 480)
+    rectangle = (100.0, 60.0, 260.0, 180.0)
+    point = np.array([0.0, -0.07, 1.2, 1.0])
+    device = camera.projection(rectangle) @ camera.view @ point
+    inside = (device[:2] / device[3] * [1, -1] + 1) / 2 * [160, 120]
+    assert inside + [100, 60] == pytest.approx(camera.pixels(point[:3]))
+
+
+def test_the_person_and_the_spoons_whole_path_are_in_the_picture() -> None:
+    camera = scene_camera(640, 480)
+    pixels = camera.pixels(np.array([[-0.23, -0.55, 1.0], [-0.13, -0.45, 1.10], [0.0, -0.07, 1.2], [0.0, 0.05, 1.38]]))
+    assert (pixels > 0).all()
+    assert (pixels < [640, 480]).all()
+
+
+def test_the_lamp_sees_the_head_and_the_floor_below_the_arm() -> None:
+    pixels = lamp(100).pixels(np.array([[0.0, 0.0, 1.35], [-0.45, -0.55, 0.0], [-0.45, -0.55, 1.2]]))
+    assert (pixels > 0).all()
+    assert (pixels < 100).all()
+
+
+def test_rectangles_hold_every_box_and_lie_on_the_grid() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        corner, size = rng.uniform(-20, 640, (6, 2)), rng.uniform(4, 120, (6, 2))
+        boxes = np.clip(np.concatenate([corner, corner + size], axis=1), 0, [640, 480, 640, 480])
+        boxes = boxes[((boxes[:, 2:] - boxes[:, :2]) > 1).all(axis=1)]
+        rectangles = cover(boxes, 640, 480)
+        assert len(rectangles) <= 2
+        assert all(value % GRID_PX == 0 for rectangle in rectangles for value in rectangle)
+        canvas = np.zeros((480, 640), dtype=bool)
+        for left, top, right, bottom in rectangles:
+            canvas[top:bottom, left:right] = True
+        for left, top, right, bottom in boxes.astype(int):
+            assert canvas[top:bottom, left:right].all()
+
+
+def test_far_apart_boxes_are_drawn_apart() -> None:
+    boxes = np.array([[0.0, 0.0, 40.0, 40.0], [600.0, 440.0, 640.0, 480.0]])
+    drawn = sum((r - left) * (b - t) for left, t, r, b in cover(boxes, 640, 480))
+    assert drawn == 2 * 40 * 40
+
+
+def test_nothing_moving_in_the_picture_means_nothing_to_draw() -> None:
+    assert cover(np.array([[-50.0, -50.0, -10.0, -10.0]]), 640, 480) == []
+
+
+def test_a_box_on_the_grid_is_the_smallest_one() -> None:
+    assert on_grid(np.array([5.0, 4.0, 8.0, 9.0]), 640, 480) == (4, 4, 8, 12)
