@@ -1,0 +1,48 @@
+"""Which weight of the calibrated speed cost makes the reference person content with the policy's own speed.
+
+All actions are scaled by one factor; the weight is chosen so that the mean preference return of omega = 1 does not
+change to first order at factor 1. Run: python -m tests.benchmarks.speed_cost_weight    (about a minute)
+"""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+import worker
+from worker.ml.policies import GaussianPolicy
+from worker.sim.costs import BASE_WEIGHTS, cost_items
+from worker.sim.feeding import FeedingEnv
+from worker.sim.rollout import rollout
+from worker.trajectory import COSTS
+
+FACTORS = (0.8, 0.9, 1.0, 1.1, 1.2)
+SCENARIOS = range(3_000_000, 3_000_200)
+POLICY = Path(worker.__file__).parent / "checkpoints" / "feeding" / "policy.safetensors"
+
+
+def main() -> None:
+    """Print each item's mean sum per factor, its slope over the logarithm of the factor, and the weight."""
+    policy, env = GaussianPolicy.load(POLICY), FeedingEnv()
+    sums = np.zeros((len(FACTORS), len(COSTS)))
+    for row, factor in enumerate(FACTORS):
+        successes = 0
+        for scenario in SCENARIOS:
+            episode = rollout(env, lambda seen, scale=factor: scale * policy.mean(seen), scenario)  # type: ignore[misc]
+            sums[row] += cost_items(episode.costs, episode.signals, "calibrated").sum(0) / len(SCENARIOS)
+            successes += episode.success
+        items = "  ".join(f"{name} {value:7.3f}" for name, value in zip(COSTS, sums[row], strict=True))
+        sys.stdout.write(f"x{factor:.1f}  success {successes / len(SCENARIOS):.3f}  {items}\n")
+    slopes = np.polyfit(np.log(FACTORS), sums, 1)[0]
+    speed = COSTS.index("C_v")
+    others = sum(BASE_WEIGHTS[name] * slope for name, slope in zip(COSTS, slopes, strict=True) if name != "C_v")
+    distance_only = slopes[COSTS.index("C_d")]
+    sys.stdout.write("slopes  " + "  ".join(f"{name} {slope:7.3f}" for name, slope in zip(COSTS, slopes, strict=True)))
+    sys.stdout.write(
+        f"\nweight  {-others / slopes[speed]:.3f}  ({-distance_only / slopes[speed]:.3f} from distance alone)\n"
+    )
+    env.close()
+
+
+if __name__ == "__main__":
+    main()
