@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import onnx
 import onnxruntime
 import torch
 
@@ -59,7 +60,7 @@ class OnnxFilter:
     """A rollout's callable made from the bytes of filter.onnx. Can be sent to another process."""
 
     def __init__(self, stored: bytes) -> None:
-        self._stored = stored
+        self.stored = stored
         self._session = _session(stored)
 
     def __call__(self, observation: Array, policy_mean: Array) -> Array:
@@ -73,8 +74,14 @@ class OnnxFilter:
         actions: Array = self._session.run([OUTPUT], feed)[0]
         return actions
 
+    @property
+    def opset(self) -> int:
+        """Version of the ONNX operator set the file uses."""
+        opsets = onnx.load_from_string(self.stored).opset_import
+        return max(int(each.version) for each in opsets if each.domain == "")
+
     def __reduce__(self) -> tuple[Any, ...]:
-        return OnnxFilter, (self._stored,)
+        return OnnxFilter, (self.stored,)
 
 
 def _float32(array: npt.ArrayLike) -> Array:

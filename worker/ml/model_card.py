@@ -1,0 +1,116 @@
+"""The model card of a bundle: what the filter is, what was measured, and what must not be concluded from it."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from worker.modes import FEEDING_AXES
+
+_COSTS = {
+    "C_d": "distance from the mouth, m",
+    "C_v": "speed of the spoon, m/s",
+    "C_f": "force away from the mouth, N",
+    "C_hf": "high force near the mouth, N",
+    "C_fd": "food spilled on the person, pieces",
+    "C_fdv": "speed of food entering the mouth, m/s",
+}
+_METHODS = {
+    "studio": "the studio's: a personal execution mode with a residual action encoder around it, each kept only as far "
+    "as it kept the task on held-out scenarios",
+    "printed": "PbARL as printed in the paper, with the readings stated in the project's docs/method.md; not gated",
+}
+
+_USE = """## Use
+
+```
+python -m pip install numpy onnxruntime
+python run_filter.py
+```
+
+The second command checks every file, runs the filter over `recorded/` and compares its actions with the recorded ones.
+Your own recording: `python run_filter.py --observations o.npy --policy-means m.npy --output a.npy`.
+In a control loop call `filter.onnx` at every control step with the observation and the reference policy's mean action.
+`manifest.json` lists every number with its unit and range; all are SI units in the robot's base frame."""
+
+_LIMITS = """## Limits
+
+* Measured in simulation, with a model of one arm and one seated person. Nothing here was run on a robot.
+* The intervals cover the choice of scenarios. They do not cover a second training, other labels, or other bodies.
+* "Preference" is the return of a model learned from this person's own labels, not their satisfaction.
+* The largest speeds and forces are what happened in these simulated scenarios. They are not guaranteed bounds: keep the
+  robot's own limits on speed and force, and an emergency stop within reach.
+* The filter belongs to one reference policy (`policy.sha256` in the manifest) and one person."""
+
+
+def model_card(manifest: Mapping[str, Any]) -> str:
+    """Markdown, from the manifest."""
+    sections = [_what(manifest), _way(manifest), _measured(manifest.get("evaluation")), _notes(manifest), _USE, _LIMITS]
+    return "\n\n".join(section for section in sections if section) + "\n"
+
+
+def _what(manifest: Mapping[str, Any]) -> str:
+    labels = manifest["labels"]
+    return (
+        f"# Personal action filter: {manifest['participant']}, version {manifest['version']}\n\n"
+        f"What runs after the frozen {manifest['task']} policy so that the robot does the task the way this person"
+        f" prefers."
+        f" Learned from {labels['count']} comparisons of two clips (study {manifest['study']}, seed {manifest['seed']},"
+        f" labels sha256 `{labels['sha256'][:12]}`), exported {manifest['created_at']}.\n\n"
+        f"Method: {_METHODS[manifest['method']]}. Reward model: {manifest['reward_kind']}."
+        f" Control rate: {manifest['control_rate_hz']:g} Hz."
+    )
+
+
+def _way(manifest: Mapping[str, Any]) -> str:
+    """The person's mode in words."""
+    if manifest["method"] != "studio":
+        return ""
+    meanings = {axis.name: axis for axis in FEEDING_AXES}
+    rows = [
+        f"| {name} | {value:+.2f} | {meanings[name].low:g} to {meanings[name].high:g} | {meanings[name].meaning} |"
+        for name, value in manifest["mode"].items()
+    ]
+    heading = f"## This person's way\n\nGate {manifest['gate']:.0%}, residual {manifest['residual_share']:.0%}."
+    return "\n".join([heading, "", "| axis | value | range | meaning |", "|---|---|---|---|", *rows])
+
+
+def _measured(evaluation: Mapping[str, Any] | None) -> str:
+    if not evaluation:
+        return "## Measured\n\nNothing has been measured about this filter."
+    success, preference, safety = evaluation["success"], evaluation["preference"], evaluation.get("safety")
+    lines = [
+        "## Measured",
+        "",
+        f"On {evaluation['scenarios']} unseen scenarios, against the reference policy in the same scenarios;"
+        " differences with 95 % intervals over scenarios.",
+        "",
+        f"* Success: {success['filter']:.1%} (reference {success['reference']:.1%}), difference"
+        f" {100 * success['delta']:+.1f} points [{100 * success['low']:+.1f}, {100 * success['high']:+.1f}].",
+        f"* Learned preference: {_interval(preference)} standard deviations of the reference's returns per episode.",
+        "",
+        "| cost, summed over an episode | reference | filter | difference |",
+        "|---|---|---|---|",
+    ]
+    for name, cost in evaluation["costs"].items():
+        row = f"| {name}: {_COSTS.get(name, '')} | {cost['reference']:.3g} | {cost['filter']:.3g} | {_interval(cost)} |"
+        lines.append(row)
+    if safety:
+        lines += ["", "### Largest speeds and forces seen", "", "| | reference | filter |", "|---|---|---|"]
+        words = {
+            "max_speed_m_s": "largest speed, m/s",
+            "p95_max_speed_m_s": "95 % of episodes stay below, m/s",
+            "max_force_n": "largest force on the person, N",
+            "p95_max_force_n": "95 % of episodes stay below, N",
+        }
+        for key, word in words.items():
+            lines.append(f"| {word} | {safety['reference'][key]:.3g} | {safety['filter'][key]:.3g} |")
+    return "\n".join(lines)
+
+
+def _notes(manifest: Mapping[str, Any]) -> str:
+    if not manifest["notes"]:
+        return ""
+    return "## Notes\n\n" + "\n".join(f"* {note}" for note in manifest["notes"])
+
+
+def _interval(change: Mapping[str, float]) -> str:
+    return f"{change['delta']:+.3g} [{change['low']:+.3g}, {change['high']:+.3g}]"

@@ -1,0 +1,185 @@
+"""Run a personal action filter without the project it was made with. Needs only numpy and onnxruntime.
+
+    python run_filter.py
+        Check every file of this directory against the manifest, run the filter over the recording in recorded/, and
+        compare its actions with the recorded ones.
+
+    python run_filter.py --observations observations.npy --policy-means policy_means.npy --output actions.npy
+        Filter your own recording: (N, D) observations and the (N, A) mean actions of the reference policy in them.
+
+In a control loop, load the filter once and call it at every step:
+
+    import numpy, onnxruntime
+    session = onnxruntime.InferenceSession("filter.onnx")
+    action = session.run(["action"], {"observation": observation[None], "policy_mean": policy_mean[None]})[0][0]
+
+Units, ranges and order of the numbers are in manifest.json.
+"""
+
+import argparse
+import hashlib
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+try:
+    import numpy as np
+    import onnxruntime
+except ImportError as missing:
+    sys.stderr.write(f"{missing}. Install what this script needs with: python -m pip install numpy onnxruntime\n")
+    sys.exit(1)
+
+TOLERANCE = 1e-4
+"""Largest accepted difference from the recorded actions: other processors round differently."""
+TIMED_STEPS = 300
+
+
+class Problem(Exception):
+    """Something about the files or the input; the message says what and what to do."""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Return the exit code: 0 when everything is as it should be, else 1."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n", maxsplit=1)[0])
+    parser.add_argument("--observations", type=Path, help="(N, D) .npy file of observations to filter")
+    parser.add_argument("--policy-means", type=Path, help="(N, A) .npy file of the policy's mean actions in them")
+    parser.add_argument("--output", type=Path, help="where to write the (N, A) filtered actions, as .npy")
+    options = parser.parse_args(arguments)
+    directory = Path(__file__).resolve().parent
+    try:
+        own = [options.observations, options.policy_means, options.output]
+        if any(own) and not all(own):
+            raise Problem("--observations, --policy-means and --output belong together; give all three or none.")
+        manifest = verified_manifest(directory)
+        session = load_filter(directory / "filter.onnx")
+        if all(own):
+            filter_files(manifest, session, *own)
+        else:
+            compare_with_recording(manifest, session, directory / "recorded")
+    except Problem as problem:
+        sys.stderr.write(f"FAILED: {problem}\n")
+        return 1
+    return 0
+
+
+def verified_manifest(directory: Path) -> dict[str, Any]:
+    """The manifest, after checking size and sha256 of every file it lists."""
+    try:
+        manifest: dict[str, Any] = json.loads((directory / "manifest.json").read_text(encoding="utf-8"))
+        listed = manifest["files"]
+    except FileNotFoundError:
+        raise Problem(f"There is no manifest.json in {directory}; unzip the whole bundle into one directory.") from None
+    except (ValueError, KeyError):
+        raise Problem("manifest.json cannot be read; unzip the bundle again.") from None
+    for name, expected in listed.items():
+        path = directory / name
+        if not path.is_file():
+            raise Problem(f"{name} is missing; unzip the bundle again.")
+        stored = path.read_bytes()
+        if len(stored) != expected["bytes"] or hashlib.sha256(stored).hexdigest() != expected["sha256"]:
+            raise Problem(f"{name} is not the file that was exported (its sha256 differs); unzip the bundle again.")
+    sys.stdout.write(f"{len(listed)} files match the manifest.\n")
+    return manifest
+
+
+def load_filter(path: Path) -> Any:
+    """A session that runs on one thread: a control loop has no use for more."""
+    settings = onnxruntime.SessionOptions()
+    settings.intra_op_num_threads = settings.inter_op_num_threads = 1
+    try:
+        return onnxruntime.InferenceSession(str(path), settings, providers=["CPUExecutionProvider"])
+    except Exception as error:  # onnxruntime raises many types, none of them documented
+        raise Problem(f"onnxruntime {onnxruntime.__version__} cannot load filter.onnx: {error}") from None
+
+
+def run(session: Any, observations: Any, policy_means: Any) -> Any:
+    """(N, D), (N, A) -> (N, A)"""
+    return session.run(["action"], {"observation": observations, "policy_mean": policy_means})[0]
+
+
+def compare_with_recording(manifest: dict[str, Any], session: Any, directory: Path) -> None:
+    """Run the filter over the recording that came with it."""
+    observations, policy_means = read_inputs(manifest, directory / "observations.npy", directory / "policy_means.npy")
+    recorded = read_array(directory / "actions.npy", manifest["action"]["size"])
+    started = time.perf_counter()
+    actions = run(session, observations, policy_means)
+    all_at_once_ms = 1000 * (time.perf_counter() - started)
+    difference = float(np.abs(actions - recorded).max())
+    sys.stdout.write(
+        f"{len(actions)} recorded steps in {all_at_once_ms:.1f} ms; {one_by_one_us(session, observations, policy_means)}"
+        f" us per step when called one by one (median).\n"
+    )
+    if not difference <= TOLERANCE:
+        raise Problem(
+            f"The actions differ from the recorded ones by up to {difference:.2e} (accepted: {TOLERANCE:.0e})."
+        )
+    sys.stdout.write(f"OK: the filter reproduces its recorded actions (largest difference {difference:.1e}).\n")
+
+
+def one_by_one_us(session: Any, observations: Any, policy_means: Any) -> int:
+    """Median duration of a call with one step."""
+    durations = []
+    for row in range(min(TIMED_STEPS, len(observations))):
+        started = time.perf_counter()
+        run(session, observations[row : row + 1], policy_means[row : row + 1])
+        durations.append(time.perf_counter() - started)
+    return round(1e6 * sorted(durations)[len(durations) // 2])
+
+
+def filter_files(manifest: dict[str, Any], session: Any, observed: Path, means: Path, output: Path) -> None:
+    """Run the filter over somebody's own recording."""
+    observations, policy_means = read_inputs(manifest, observed, means)
+    for line in unusual(manifest["observation"], observations):
+        sys.stdout.write(f"Note: {line}\n")
+    actions = run(session, observations, policy_means)
+    try:
+        with output.open("wb") as target:
+            np.save(target, actions, allow_pickle=False)
+    except OSError as error:
+        raise Problem(f"Cannot write {output}: {error.strerror}.") from None
+    sys.stdout.write(f"OK: {len(actions)} actions written to {output}.\n")
+
+
+def read_inputs(manifest: dict[str, Any], observed: Path, means: Path) -> tuple[Any, Any]:
+    """Both arrays, checked against the manifest and each other."""
+    observations = read_array(observed, manifest["observation"]["size"])
+    policy_means = read_array(means, manifest["action"]["size"])
+    if len(observations) != len(policy_means):
+        raise Problem(f"{observed} has {len(observations)} rows but {means} has {len(policy_means)}.")
+    return observations, policy_means
+
+
+def read_array(path: Path, width: int) -> Any:
+    """(N, width) finite float32."""
+    try:
+        array = np.load(path, allow_pickle=False)
+    except FileNotFoundError:
+        raise Problem(f"There is no file {path}.") from None
+    except (ValueError, EOFError, OSError):
+        raise Problem(f"{path} is not a plain .npy array (save it with numpy.save, without pickled objects).") from None
+    if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
+        raise Problem(f"{path} must hold one array of numbers.")
+    if array.ndim != 2 or array.shape[1] != width or not len(array):
+        raise Problem(f"{path} has shape {array.shape}; expected (N, {width}) with at least one row.")
+    if not np.isfinite(array).all():
+        row = int(np.argwhere(~np.isfinite(array))[0][0])
+        raise Problem(f"{path} holds a NaN or an infinity, first in row {row}. The filter needs numbers everywhere.")
+    return np.ascontiguousarray(array, np.float32)
+
+
+def unusual(space: dict[str, Any], observations: Any) -> list[str]:
+    """Which fields leave the range in which the filter was trained."""
+    lines = []
+    for field in space["fields"]:
+        values = observations[:, field["first"] : field["first"] + field["size"]]
+        rows = int(((values < field["low"]) | (values > field["high"])).any(axis=1).sum())
+        if rows:
+            span = f"[{field['low']:g}, {field['high']:g}] {field['unit']}"
+            lines.append(f"{field['name']} is outside {span} in {rows} of {len(values)} rows.")
+    return lines
+
+
+if __name__ == "__main__":
+    sys.exit(main())
