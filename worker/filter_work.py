@@ -5,6 +5,7 @@ from app.domain.studies import Method, Participant, RewardKind, Study, StudySett
 from app.errors import AppError
 from worker import dataset, laboratory, personalisation, records
 from worker.compute import Lane
+from worker.ml.bundle import Provenance
 from worker.ml.studio_filter import FilterDraft
 from worker.personalisation import Fitting
 from worker.records import Task
@@ -79,16 +80,18 @@ def _publish(place: Workplace, run_id: int, task: Task, reward: str, draft: str)
         study = session.get_one(Study, task.study_id)
         model = records.newest_model(session, task.participant, ModelKind.REWARD)
         version = records.next_version(session, task.participant)
-        run = records.provenance(session, run_id)
-    finished = fitting.finish(
-        _draft(place, draft),
-        participant=participant.code,
+        run = records.seen_labels(session, run_id)
+    provenance = Provenance(
         study=study.name,
+        participant=participant.code,
         version=version,
         label_count=run.label_count,
         label_hash=run.label_hash,
-        weights=model.metrics.get("weights") if model else None,
+        seed=participant.seed,
+        created_at=run.started_at.isoformat(timespec="seconds"),
+        task=study.task,
     )
+    finished = fitting.finish(_draft(place, draft), provenance, model.metrics.get("weights") if model else None)
     model_artefact, bundle_artefact = place.store.put(finished.filter_weights), place.store.put(finished.bundle)
     with place.database.writing() as session:
         saved = records.save_model(session, run_id, ModelKind.FILTER, model_artefact, finished.metrics)

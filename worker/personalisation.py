@@ -5,6 +5,7 @@ Between two stages everything is in one stored draft, so that a worker killed in
 
 import io
 import json
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -16,8 +17,9 @@ from worker import laboratory
 from worker.analysis.evaluation import evaluate
 from worker.compute import Compute, Lane
 from worker.exploration import SURFACE
-from worker.ml import studio_filter
+from worker.ml import bundle, printed_filter, studio_filter
 from worker.ml.action_filter import FilterWeights
+from worker.ml.bundle import BundleContents, Provenance, Recording
 from worker.ml.response_surface import ResponseSurface
 from worker.ml.reward_models import load_reward_model
 from worker.ml.studio_filter import Act, FilterAct, FilterConfig, FilterDraft, FilterProblem, Progress, Trial
@@ -25,6 +27,22 @@ from worker.trajectory import Trajectory
 
 CHUNK = 10
 """Scenarios per call of a compute process: small enough to spread evenly, large enough not to matter."""
+
+
+PRINTED_ROLLOUTS = 100
+"""Episodes of the frozen policy whose transitions the printed method is trained on."""
+
+RECORDED_EPISODES = 2
+"""How much of the evaluation goes into the bundle for checking the filter elsewhere."""
+
+
+@dataclass(frozen=True)
+class Finished:
+    """A filter ready to be published."""
+
+    filter_weights: bytes
+    bundle: bytes
+    metrics: dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -63,15 +81,44 @@ class Fitting:
         reference = self._gate_reference()
         return studio_filter.gate_residual(self.problem, draft, reference, self.collect, self.progress)
 
-    def evaluate(self, act: FilterAct) -> tuple[dict[str, Any], list[Trajectory]]:
-        """The exported filter against the reference policy on scenarios nothing else uses; and its rollouts."""
+    def fit_printed(self) -> FilterDraft:
+        """The paper's PbARL as printed, on transitions of the frozen policy. Not gated: it is what it is."""
+        transitions = self._reference(studio_filter.scenarios_for("residual", PRINTED_ROLLOUTS))
+        return printed_filter.fit_printed(self.problem, transitions, progress=self.progress)
+
+    def finish(self, draft: FilterDraft, provenance: Provenance, weights: dict[str, Any] | None) -> Finished:
+        """Export, drive through unseen scenarios, pack. ``weights``: the reward model's own, shown on the dashboard."""
+        started = time.perf_counter()
+        self.progress("driving the filter through unseen scenarios", 0.88)
+        act = studio_filter.act_of(self.problem.policy, draft.weights)
+        evaluation, filtered = self._evaluate(act)
+        metrics: dict[str, Any] = {
+            "evaluation": evaluation,
+            "gate": draft.weights.gate,
+            "residual_share": draft.weights.residual_share if draft.weights.encoder else 0.0,
+            "mode": draft.weights.named_mode(),
+            "method": draft.weights.method,
+            "notes": list(draft.notes),
+            "trials": [asdict(trial) for trial in draft.trials],
+            "seconds": {**draft.seconds, "evaluation": round(time.perf_counter() - started, 1)},
+            "weights": weights,
+        }
+        contents = BundleContents(
+            filter_onnx=act.exported.stored,
+            weights=draft.weights,
+            reward=self.problem.reward,
+            policy=self.problem.policy,
+            recording=Recording.of(filtered[:RECORDED_EPISODES]),
+            metrics=metrics,
+            provenance=provenance,
+        )
+        return Finished(draft.weights.to_bytes(), bundle.write(contents), metrics)
+
+    def _evaluate(self, act: FilterAct) -> tuple[dict[str, Any], list[Trajectory]]:
         scenarios = studio_filter.scenarios_for("evaluation", self.settings.evaluation_scenarios)
-        self.progress("driving the filter through unseen scenarios", 0.9)
         filtered = self.collect(act, scenarios, 0.0, self.seed)
-        reference = self._reference(scenarios)
-        reward = self.problem.reward
-        returns = reward.returns(reference), reward.returns(filtered)
-        return evaluate(reference, filtered, *returns, self.seed), filtered
+        reference, reward = self._reference(scenarios), self.problem.reward
+        return evaluate(reference, filtered, reward.returns(reference), reward.returns(filtered), self.seed), filtered
 
     def collect(self, act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
         """One rollout per scenario, in order; the same whatever the number of processes."""

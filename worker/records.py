@@ -5,7 +5,7 @@ Every function is one short step inside a transaction of its caller; none comput
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import timedelta
+from datetime import datetime, timedelta
 from typing import Any
 
 from sqlalchemy import func, select
@@ -121,19 +121,20 @@ def save_model(session: Session, run_id: int, kind: ModelKind, artefact_sha256: 
 
 
 @dataclass(frozen=True)
-class Provenance:
+class SeenLabels:
     """Which labels a run has seen."""
 
     label_count: int
     label_hash: str
+    started_at: datetime
 
 
-def provenance(session: Session, run_id: int) -> Provenance:
+def seen_labels(session: Session, run_id: int) -> SeenLabels:
     """What set_labels() noted. Raises ValueError when nothing was."""
     run = session.get_one(Run, run_id)
     if run.label_count is None or run.label_hash is None:
         raise ValueError(f"{run.workflow_id} has seen no labels yet.")
-    return Provenance(run.label_count, run.label_hash)
+    return SeenLabels(run.label_count, run.label_hash, run.started_at)
 
 
 def next_version(session: Session, participant_id: int) -> int:
