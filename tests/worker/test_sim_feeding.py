@@ -17,7 +17,6 @@ from worker.ml.policies import GaussianPolicy
 from worker.sim import FEEDING, human, jaco
 from worker.sim.bullet import Bullet, rotation_of
 from worker.sim.feeding import (
-    BALLS,
     BASE_ROTATION,
     EPISODE_STEPS,
     PERSON_PARTS,
@@ -27,6 +26,7 @@ from worker.sim.feeding import (
     add_person,
     start_postures,
 )
+from worker.sim.food import BALLS
 from worker.spaces import FEEDING_OBSERVATION
 from worker.trajectory import SIGNALS
 

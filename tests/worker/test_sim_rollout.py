@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from worker.sim.feeding import BALLS, EPISODE_STEPS, FeedingEnv
+from worker.sim.feeding import EPISODE_STEPS, FeedingEnv
+from worker.sim.food import BALLS
 from worker.sim.rollout import rollout
 from worker.trajectory import Trajectory
 

@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from worker.sim import human, jaco
 from worker.sim.bullet import IDENTITY, Bullet, Shape, capsule_between, quaternion_of_euler, rotation_of
+from worker.sim.food import BALL_RADIUS_M, BALLS, PORTION_NEEDED, Portion
 from worker.sim.measures import StepMeasures, TaskReward
 from worker.spaces import CONTROL_STEP_S, FEEDING_OBSERVATION, JOINT_ACTION, Space
 from worker.trajectory import COSTS, SIGNALS
@@ -31,19 +32,13 @@ LEAD_RAD = 0.15
 """The commanded target never runs further ahead of the measured joints than this."""
 POSITION_GAIN, MOTOR_FORCE_NM = 0.5, 200.0
 
-BALLS = 8
-BALL_RADIUS_M, BALL_MASS_KG = 0.006, 0.001
-EATEN_WITHIN_M = 0.03
-SPILLED_BEYOND_M = 0.06
-PORTION_NEEDED = 0.75
-FLOOR_M = 0.0
 AT_TARGET_WITHIN_M = 0.06
 """Contacts this close to the mouth press on the target; all others press elsewhere on the person."""
 
 START_CENTRE_M = (-0.18, -0.50, 1.05)
 START_RANGE_M = 0.05
 START_POSTURE_RAD = (-3.0969, 4.2217, 0.0, 5.3567, 1.5520, 1.6114, 0.4361)
-"""Found by tests/benchmarks/start_posture.py."""
+"""Found by tests/benchmarks/start_posture.py, with joint 3 turned back by one whole turn."""
 START_COUNT = 256
 
 BASE_ROTATION = jaco.rotation(jaco.ROBOT_BASE_RPY)
@@ -80,62 +75,6 @@ def _box(space: Space) -> gymnasium.spaces.Box:
 
 
 _OBSERVATIONS, _ACTIONS = _box(FEEDING_OBSERVATION), _box(JOINT_ACTION)
-
-
-class _Portion:
-    """Eight balls of food and what has become of them."""
-
-    names = tuple(f"ball_{index}" for index in range(BALLS))
-
-    def __init__(self, world: Bullet, positions_m: FloatArray) -> None:
-        self._world = world
-        world.add_balls(self.names, BALL_RADIUS_M, BALL_MASS_KG, positions_m)
-        for name in self.names:
-            world.set_material(name)
-            world.set_damping(name, linear=0.04, angular=0.1)
-        self.on_spoon = set(self.names)
-        self.present = set(self.names)
-        self.touched: set[str] = set()
-        self.eaten = self.spilled = 0
-
-    def positions(self) -> FloatArray:
-        """(8, 3) in the world; NaN for balls that were eaten or fell to the floor."""
-        nowhere = (np.nan, np.nan, np.nan)
-        return np.array([self._world.position(name) if name in self.present else nowhere for name in self.names])
-
-    def update(self, spoon_m: FloatArray, mouth_m: FloatArray, touching: set[str]) -> "_PortionChange":
-        """Count what was eaten, spilled or fell on the person during the last control step."""
-        newly_touching = touching - self.touched
-        self.touched |= newly_touching
-        eaten, spilled, intake = 0, 0, 0.0
-        for name in self.names:
-            if name not in self.present:
-                continue
-            place = np.array(self._world.position(name))
-            if name in self.on_spoon and _length(place - mouth_m) < EATEN_WITHIN_M:
-                eaten += 1
-                intake += _length(np.array(self._world.velocity(name)))
-                self._remove(name)
-            elif name in self.on_spoon and _length(place - spoon_m) > SPILLED_BEYOND_M:
-                spilled += 1
-                self.on_spoon.discard(name)
-            elif place[2] < FLOOR_M:
-                self._remove(name)
-        self.eaten += eaten
-        self.spilled += spilled
-        return _PortionChange(eaten, intake, spilled, len(newly_touching))
-
-    def _remove(self, name: str) -> None:
-        self.on_spoon.discard(name)
-        self.present.discard(name)
-        self._world.set_pose(name, (5.0 + 0.1 * self.names.index(name), 5.0, 5.0))
-
-
-class _PortionChange(NamedTuple):
-    eaten: int
-    intake_speed_m_s: float
-    spilled: int
-    on_person: int
 
 
 class _Motion(NamedTuple):
@@ -264,7 +203,7 @@ class FeedingEnv(gymnasium.Env[Any, Any]):
         _add_arm(self._world, self._command)
         self._read_arm()
         places = self._spoon + resting_places_m() @ self._spoon_rotation.T
-        self._portion = _Portion(self._world, places)
+        self._portion = Portion(self._world, places)
         self._scenario = scenario
         self._history = []
         self._previous_action = np.zeros(len(jaco.JOINTS))
@@ -373,7 +312,7 @@ def resting_places_m() -> FloatArray:
     rotation = rotation_of(quaternion)
     pitch, height = 2.05 * BALL_RADIUS_M, BALL_RADIUS_M + 0.002
     grid = np.array([((column - 1.5) * pitch, (row - 0.5) * pitch, height) for row in (0, 1) for column in range(4)])
-    portion = _Portion(world, spoon + grid @ rotation.T)
+    portion = Portion(world, spoon + grid @ rotation.T)
     for _ in range(SETTLING_SUBSTEPS):
         world.step()
     places: FloatArray = (portion.positions() - spoon) @ rotation
@@ -394,7 +333,3 @@ def start_postures() -> FloatArray:
         raise RuntimeError(f"A start posture misses its goal by {errors.max():.4f}.")
     postures.flags.writeable = False
     return postures
-
-
-def _length(vector: FloatArray) -> float:
-    return float(np.sqrt(vector @ vector))

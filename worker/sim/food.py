@@ -1,0 +1,79 @@
+"""The portion of food: eight balls on a spoon, each on it, eaten, fallen, or resting on the person."""
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from worker.sim.bullet import Bullet
+
+FloatArray = npt.NDArray[np.float64]
+
+BALLS = 8
+BALL_RADIUS_M, BALL_MASS_KG = 0.006, 0.001
+EATEN_WITHIN_M = 0.03
+SPILLED_BEYOND_M = 0.06
+PORTION_NEEDED = 0.75
+FLOOR_M = 0.0
+
+
+class PortionChange(NamedTuple):
+    """What happened to the food during one control step: balls, and for those eaten their summed speed."""
+
+    eaten: int
+    intake_speed_m_s: float
+    spilled: int
+    on_person: int
+
+
+class Portion:
+    """Eight balls of food and what has become of them."""
+
+    names = tuple(f"ball_{index}" for index in range(BALLS))
+
+    def __init__(self, world: Bullet, positions_m: FloatArray) -> None:
+        self._world = world
+        world.add_balls(self.names, BALL_RADIUS_M, BALL_MASS_KG, positions_m)
+        for name in self.names:
+            world.set_material(name)
+            world.set_damping(name, linear=0.04, angular=0.1)
+        self.on_spoon = set(self.names)
+        self.present = set(self.names)
+        self.touched: set[str] = set()
+        self.eaten = self.spilled = 0
+
+    def positions(self) -> FloatArray:
+        """(8, 3) in the world; NaN for balls that were eaten or fell to the floor."""
+        nowhere = (np.nan, np.nan, np.nan)
+        return np.array([self._world.position(name) if name in self.present else nowhere for name in self.names])
+
+    def update(self, spoon_m: FloatArray, mouth_m: FloatArray, touching: set[str]) -> PortionChange:
+        """Count what was eaten, spilled or fell on the person during the last control step."""
+        newly_touching = touching - self.touched
+        self.touched |= newly_touching
+        eaten, spilled, intake = 0, 0, 0.0
+        for name in self.names:
+            if name not in self.present:
+                continue
+            place = np.array(self._world.position(name))
+            if name in self.on_spoon and _length(place - mouth_m) < EATEN_WITHIN_M:
+                eaten += 1
+                intake += _length(np.array(self._world.velocity(name)))
+                self._remove(name)
+            elif name in self.on_spoon and _length(place - spoon_m) > SPILLED_BEYOND_M:
+                spilled += 1
+                self.on_spoon.discard(name)
+            elif place[2] < FLOOR_M:
+                self._remove(name)
+        self.eaten += eaten
+        self.spilled += spilled
+        return PortionChange(eaten, intake, spilled, len(newly_touching))
+
+    def _remove(self, name: str) -> None:
+        self.on_spoon.discard(name)
+        self.present.discard(name)
+        self._world.set_pose(name, (5.0 + 0.1 * self.names.index(name), 5.0, 5.0))
+
+
+def _length(vector: FloatArray) -> float:
+    return float(np.sqrt(vector @ vector))
