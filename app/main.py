@@ -41,7 +41,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         title="PbARL Studio", openapi_url=None, lifespan=lifespan, max_body_size=MAX_BODY_BYTES, redirect_slashes=False
     )
     app.state.studio = studio
-    app.state.templates = make_environment()
+    app.state.templates = make_environment(app.url_path_for)
     app.add_middleware(Guard, https=settings.secure_cookies, refuse=error_page)
     add_error_pages(app)
     for part in (login, experimenter, participant, media):

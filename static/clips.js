@@ -1,10 +1,11 @@
 // Loads clips ahead of time, whole and into memory: phones ignore preload hints.
 
+const PATIENCE_MS = 20000;
 const held = new Map(); // path -> promise of an object URL
 
 export function preload(path) {
   if (!held.has(path)) {
-    const loading = fetch(path)
+    const loading = fetch(path, { signal: AbortSignal.timeout(PATIENCE_MS) })
       .then((response) => (response.ok ? response.blob() : Promise.reject(new Error(`status ${response.status}`))))
       .then((blob) => URL.createObjectURL(blob));
     loading.catch(() => held.delete(path));

@@ -8,10 +8,10 @@ export function morph(element, html) {
 }
 
 function matchChildren(element, fresh) {
-  const keyed = new Map([...element.children].filter((child) => child.dataset?.key).map((child) => [child.dataset.key, child]));
+  const keyed = new Map([...element.children].filter((child) => child.dataset?.row).map((child) => [child.dataset.row, child]));
   let place = element.firstChild;
   for (const wanted of [...fresh.childNodes]) {
-    const same = wanted.dataset?.key ? keyed.get(wanted.dataset.key) : place;
+    const same = wanted.dataset?.row ? keyed.get(wanted.dataset.row) : place;
     if (same && alike(same, wanted)) {
       if (same !== place) element.insertBefore(same, place);
       else place = place.nextSibling;
@@ -28,7 +28,7 @@ function matchChildren(element, fresh) {
 }
 
 function alike(one, other) {
-  return one.nodeName === other.nodeName && one.dataset?.key === other.dataset?.key;
+  return one.nodeName === other.nodeName && one.dataset?.row === other.dataset?.row;
 }
 
 function matchNode(element, wanted) {

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from app.services.accuracy import Curve
 
-LEFT, RIGHT, TOP, BOTTOM = 44.0, 12.0, 12.0, 34.0
+LEFT, RIGHT, TOP, BOTTOM = 44.0, 14.0, 12.0, 44.0
 """Margins around the plot, in SVG units."""
 
 
@@ -45,7 +45,7 @@ class Interval:
     high: float
 
 
-def accuracy_chart(curve: Curve, wanted: int, width: float = 760.0, height: float = 280.0) -> AccuracyChart:
+def accuracy_chart(curve: Curve, wanted: int, width: float = 760.0, height: float = 260.0) -> AccuracyChart:
     """The running accuracy from 0 to 100 % against the number of scored answers; ``wanted`` is the right end."""
     right_end = max(wanted, curve.points[-1].scored if curve.points else 0)
 

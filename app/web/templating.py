@@ -1,6 +1,6 @@
 """Pages from templates: one Jinja environment, strict about what is missing, and the words for numbers and times."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from datetime import datetime
 from math import floor, log10
 from pathlib import Path
@@ -14,12 +14,13 @@ from starlette.datastructures import URLPath
 from app.db import now
 
 ROOT = Path(__file__).resolve().parents[2]
+_UNITS = {"_m2_s2": "m²/s²", "_m2_s4": "m²/s⁴", "_m_s": "m/s", "_m": "m", "_n": "N", "_rad": "rad"}
 _MINUTE_S, _HOUR_S, _DAY_S = 60, 3600, 86400
 
 
 def percent(share: float) -> str:
     """A share as whole percent."""
-    return f"{share * 100:.0f} %"
+    return f"{share * 100:.0f}\N{NO-BREAK SPACE}%"
 
 
 def signed_points(difference: float) -> str:
@@ -29,12 +30,12 @@ def signed_points(difference: float) -> str:
 
 def quantity(value: float | None) -> str:
     """A number with three significant digits."""
-    return "\N{EN DASH}" if value is None else _minus(_three_digits(value))
+    return "\N{EN DASH}" if value is None else _minus(_rounded(value, 3))
 
 
 def signed(value: float) -> str:
-    """A difference with its sign and three significant digits."""
-    return _minus(("+" if value > 0 else "") + _three_digits(value))
+    """A difference with its sign and two significant digits."""
+    return _minus(("+" if value > 0 else "") + _rounded(value, 2))
 
 
 def ago(moment: datetime | None) -> str:
@@ -80,7 +81,10 @@ def bytes_in_words(count: int) -> str:
 
 
 def in_words(name: str) -> str:
-    """An identifier as words: near_speed becomes "near speed"."""
+    """An identifier as words: speed_squared_m2_s2 becomes "speed squared (m²/s²)"."""
+    for suffix, unit in _UNITS.items():
+        if name.endswith(suffix):
+            return f"{name.removesuffix(suffix).replace('_', ' ')} ({unit})"
     return name.replace("_", " ")
 
 
@@ -92,16 +96,14 @@ def page(request: Request, template: str, context: Mapping[str, Any], status: in
 def fragment(request: Request, template: str, context: Mapping[str, Any]) -> str:
     """The text of one template."""
     environment: Environment = request.app.state.templates
-
-    def path_for(name: str, **parameters: Any) -> URLPath:
-        path: URLPath = request.app.url_path_for(name, **parameters)
-        return path
-
-    return environment.get_template(template).render(request=request, path_for=path_for, **context)
+    return environment.get_template(template).render(context)
 
 
-def make_environment() -> Environment:
-    """The environment of every template: escapes everything, and refuses names that were not given."""
+def make_environment(path_for: Callable[..., URLPath]) -> Environment:
+    """The environment of every template: escapes everything, and refuses names that were not given.
+
+    ``path_for`` gives the path of a route by its name.
+    """
     environment = Environment(
         loader=FileSystemLoader(ROOT / "templates"),
         autoescape=True,
@@ -111,13 +113,14 @@ def make_environment() -> Environment:
     )
     words = (percent, signed_points, quantity, signed, ago, time_left, moment, seconds, bytes_in_words, in_words)
     environment.filters.update({word.__name__: word for word in words})
+    environment.globals["path_for"] = path_for
     return environment
 
 
-def _three_digits(value: float) -> str:
+def _rounded(value: float, significant_digits: int) -> str:
     if value == 0:
         return "0"
-    decimals = max(0, 2 - floor(log10(abs(value))))
+    decimals = max(0, significant_digits - 1 - floor(log10(abs(value))))
     return f"{value:.{min(decimals, 4)}f}"
 
 

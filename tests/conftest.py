@@ -1,0 +1,113 @@
+"""What the tests of the web half share: a studio in a temporary directory, with and without a real server."""
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
+
+import pytest
+import uvicorn
+from fastapi import FastAPI
+from fastapi.testclient import TestClient
+
+import app.domain.clips
+import app.domain.models
+import app.domain.people
+import app.domain.preferences
+import app.domain.studies  # noqa: F401  (all five fill Base.metadata)
+from app.db import Base, Database
+from app.main import create_app
+from app.services import accounts
+from app.settings import Settings
+from app.storage import ArtefactStore
+
+PASSWORD = "a password of my own"
+
+
+@pytest.fixture
+def settings(tmp_path: Path) -> Settings:
+    """Settings of a studio that lives in a temporary directory."""
+    return Settings(_env_file=None, data_dir=tmp_path, public_url=None)
+
+
+@pytest.fixture
+def studio_app(settings: Settings) -> FastAPI:
+    """The web server, on an empty database of the newest schema."""
+    application = create_app(settings)
+    Base.metadata.create_all(application.state.studio.database.writer)
+    return application
+
+
+@pytest.fixture
+def database(studio_app: FastAPI) -> Iterator[Database]:
+    """The server's database."""
+    database: Database = studio_app.state.studio.database
+    yield database
+    database.dispose()
+
+
+@pytest.fixture
+def store(studio_app: FastAPI) -> ArtefactStore:
+    """The server's artefacts."""
+    store: ArtefactStore = studio_app.state.studio.store
+    return store
+
+
+@pytest.fixture
+def new_browser(studio_app: FastAPI, database: Database) -> Callable[[], TestClient]:
+    """Makes browsers without cookies; none follows redirects by itself."""
+    return lambda: TestClient(studio_app, follow_redirects=False)
+
+
+@pytest.fixture
+def client(new_browser: Callable[[], TestClient]) -> TestClient:
+    """A browser without cookies."""
+    return new_browser()
+
+
+@pytest.fixture
+def password(database: Database) -> str:
+    """The password of an experimenter who has already chosen it."""
+    with database.writing() as session:
+        one_time = accounts.create_first_experimenter(session)
+        assert one_time is not None
+    with database.writing() as session:
+        experimenter = accounts.verify(session, accounts.FIRST_EXPERIMENTER, one_time)
+        new = accounts.hash_of_new(experimenter, current=one_time, new=PASSWORD)
+        accounts.set_password(session, experimenter, new)
+    return PASSWORD
+
+
+@pytest.fixture
+def experimenter(client: TestClient, password: str) -> TestClient:
+    """A browser whose experimenter is logged in."""
+    answer = client.post("/login", data={"name": accounts.FIRST_EXPERIMENTER, "password": password})
+    assert answer.status_code == 303
+    return client
+
+
+@contextmanager
+def serving(application: FastAPI) -> Iterator[str]:
+    """Runs a real server on a free port; gives its address."""
+    server = uvicorn.Server(uvicorn.Config(application, port=0, log_level="warning", timeout_graceful_shutdown=3))
+    thread = threading.Thread(target=server.run)
+    thread.start()
+    while not server.started:
+        threading.Event().wait(0.01)
+    port = server.servers[0].sockets[0].getsockname()[1]
+    try:
+        yield f"http://127.0.0.1:{port}"
+    finally:
+        application.state.studio.closing.set()
+        server.should_exit = True
+        thread.join()
+
+
+@pytest.fixture
+def address(studio_app: FastAPI, database: Database) -> Iterator[str]:
+    """The address of a real server."""
+    with serving(studio_app) as url:
+        yield url
+
+
+Serving = Callable[[FastAPI], AbstractContextManager[str]]
