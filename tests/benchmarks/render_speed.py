@@ -22,12 +22,8 @@ def main() -> None:
     trajectory = waving_trajectory(STEPS)
     start = time.process_time()
     clip = renderer.render_clip(trajectory, 0, STEPS)
-    log.info(
-        "clip of %.1f s          %.2f s, %.0f KiB",
-        clip.duration_ms / 1000,
-        time.process_time() - start,
-        len(clip.video) / 1024,
-    )
+    log.info("clip of %.1f s          %.2f s", clip.duration_ms / 1000, time.process_time() - start)
+    log.info("its size               %.0f KiB", len(clip.video) / 1024)
     motion = clip_motion(trajectory, 0, STEPS, renderer.style.fps)
     start = time.process_time()
     frames = sum(1 for _ in renderer.pictures(trajectory, motion))

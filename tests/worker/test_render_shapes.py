@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from worker.sim import arm_look, person_look
+from worker.sim import arm_look, head_look
 from worker.sim.colours import RAMPS, Palette
 from worker.sim.meshes import Mesh, curve, gradient, joined, openness, panel, surface, tube
 from worker.sim.solids import Field, box, carve, cone, cylinder, ellipsoid, sphere, torus, union
@@ -112,9 +112,9 @@ def test_full_light_is_not_wrapped_around_to_darkness() -> None:
 
 
 def test_the_mouth_is_open_wide_enough_for_the_spoon() -> None:
-    mouth = person_look.MOUTH
+    mouth = head_look.MOUTH
     bowl_edges = mouth + np.array([[0.019, -0.005, 0.0], [-0.019, -0.005, 0.0], [0, 0.02, 0.008], [0, 0.02, -0.004]])
-    assert (person_look.face()(bowl_edges) > 0).all()
+    assert (head_look.face()(bowl_edges) > 0).all()
 
 
 def test_the_fingers_touch_the_handle_without_cutting_through_it() -> None:
@@ -136,7 +136,7 @@ def _finger_gap(detail: arm_look.Detail) -> tuple[float, float]:
 
 
 def test_the_same_code_always_makes_the_same_head() -> None:
-    first, second = person_look.head_meshes(Palette()), person_look.head_meshes(Palette())
+    first, second = head_look.head_mesh(Palette()), head_look.head_mesh(Palette())
     assert (first.vertices == second.vertices).all()
     assert (first.faces == second.faces).all()
     assert np.isfinite(first.vertices).all()

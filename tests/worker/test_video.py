@@ -31,17 +31,18 @@ def test_the_index_comes_before_the_pictures(video: bytes) -> None:
 
 
 def test_the_stream_is_h264_in_yuv420p_with_every_frame(video: bytes) -> None:
-    with av.open(io.BytesIO(video)) as container:
+    with av.open(io.BytesIO(video), "r") as container:
         stream = container.streams.video[0]
         decoded = list(container.decode(stream))
         assert stream.codec_context.name == "h264"
         assert stream.codec_context.pix_fmt == "yuv420p"
-        assert (stream.width, stream.height, stream.average_rate) == (128, 96, 15)
+        assert (stream.width, stream.height) == (128, 96)
+        assert stream.average_rate == 15
     assert len(decoded) == 12
 
 
 def test_colours_survive(video: bytes) -> None:
-    with av.open(io.BytesIO(video)) as container:
+    with av.open(io.BytesIO(video), "r") as container:
         last = list(container.decode(video=0))[-1].to_ndarray(format="rgb24")
     assert last[40, 54].astype(int) == pytest.approx(np.array([200, 40, 40]), abs=14)
     assert last[5, 5].astype(int) == pytest.approx(np.array([180, 180, 180]), abs=4)

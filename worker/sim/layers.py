@@ -2,7 +2,7 @@
 
 The still picture is drawn once, and the head in it once per clip. Per frame only the rectangles that hold moving
 parts are drawn, with an off-centre frustum, and merged by depth; the shadow they cast comes from a small depth map
-seen from the lamp, looked up through a table made once per clip. TinyRenderer's own shadows are wrong for cropped frusta.
+seen from the lamp, looked up through a table made once per clip (TinyRenderer's own shadows are wrong when cropped).
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from worker.sim.rectangles import Pixels, cover, on_grid
 from worker.sim.scene import TOWARDS_KEY_LIGHT, Lighting, Stage
 from worker.sim.solids import Array
 
-STILL_LAMP_SIZE, MOVING_LAMP_SIZE = 640, 168
+STILL_LAMP_SIZE, MOVING_LAMP_SIZE = 640, 176
 SHADOW_BIAS = 0.0035
 """How much nearer to the lamp something must be to cast a shadow, as a share of the lamp's depth range."""
 
@@ -154,10 +154,10 @@ class View:
         found = mask.getbbox()
         if found is None:
             return
-        margin = 6
+        margin = 8
         x0, y0 = max(0, found[0] - margin), max(0, found[1] - margin)
         x1, y1 = min(self.width // 2, found[2] + margin), min(self.height // 2, found[3] + margin)
-        soft = mask.crop((x0, y0, x1, y1)).filter(ImageFilter.BoxBlur(max(1.5, 1.0 * self._zoom)))
+        soft = mask.crop((x0, y0, x1, y1)).filter(ImageFilter.BoxBlur(max(2.0, 1.4 * self._zoom)))
         full = (2 * x0, 2 * y0, 2 * x1, 2 * y1)
         soft = soft.resize((full[2] - full[0], full[3] - full[1]), Image.Resampling.BILINEAR)
         picture.paste(self._background_shadowed.crop(full), full[:2], soft)

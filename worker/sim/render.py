@@ -18,7 +18,7 @@ from worker.sim.scene import GONE_M, HAND_PARTS, UPPER_ARM, Scene, Stage, food_n
 from worker.sim.solids import Array
 from worker.trajectory import Trajectory
 
-FOOD_RADIUS_M = 0.006
+FOOD_COUNT, FOOD_RADIUS_M = 8, 0.006
 HEAD_EXTENT_M = np.array([[x, y, z] for x in (-0.15, 0.15) for y in (-0.16, 0.16) for z in (-0.12, 0.27)])
 """Corners of a box that holds the head however it is turned, around the neck pivot."""
 
@@ -37,7 +37,6 @@ class RenderStyle:
     inset_zoom: float = 2.3
     highlight_pressing: bool = True
     food_scale: float = 1.3
-    food_count: int = 8
 
 
 @dataclass(frozen=True)
@@ -61,11 +60,12 @@ class ClipRenderer:
     def __init__(self, style: RenderStyle = RenderStyle()) -> None:
         self.style = style
         self._camera = scene_camera(style.width, style.height)
-        self._scene = Scene(style.food_count, FOOD_RADIUS_M * style.food_scale)
+        self._scene = Scene(FOOD_COUNT, FOOD_RADIUS_M * style.food_scale)
         whole = (0.0, 0.0, float(style.width), float(style.height))
         self._main = View(self._camera, whole, style.width, style.height, style.supersampling, self._scene.still)
-        self._still_lamp_depth = self._lamp_depth("still")
+        self._still_lamp_depth = self._lamp_depth(self._scene.still)
         self._parts = self._scene.boxes.names
+        self._hand = [self._parts.index(name) for name in HAND_PARTS]
 
     def close(self) -> None:
         """Free the drawing clients."""
@@ -90,28 +90,30 @@ class ClipRenderer:
         """The frames of a motion, one after the other."""
         style, scene = self.style, self._scene
         mouth_m = self._turn_head(trajectory.head_quaternion)
-        head_box, lamp_depth = self._head_box(), np.minimum(self._still_lamp_depth, self._lamp_depth("head"))
+        head_box, lamp_depth = self._head_box(), np.minimum(self._still_lamp_depth, self._lamp_depth(scene.head))
         self._main.start(scene.head, head_box, lamp_depth)
         inset = self._inset(mouth_m, head_box, lamp_depth) if style.inset else None
-        boxes = self._moving_boxes(motion)
+        boxes, first_food = self._moving_boxes(motion), len(self._parts)
         turns = quaternions(motion.frames[..., :3, :3])
-        highlight = Highlight(self._camera, motion.force_n, motion.frames[:, -1], mouth_m)
+        force_n = motion.force_n if style.highlight_pressing else np.zeros(len(motion))
+        highlight = Highlight(self._camera, force_n, motion.frames[:, -1], mouth_m)
         for index in range(len(motion)):
             self._pose(motion, turns, index)
-            shadows = scene.casters.draw_raw(
-                lamp(MOVING_LAMP_SIZE), None, MOVING_LAMP_SIZE, MOVING_LAMP_SIZE, DEPTH_ONLY
-            )[1]
+            shadows = self._moving_lamp_depth()
             picture = self._main.frame(self._reaching(boxes[index]), shadows)
-            if style.highlight_pressing:
-                highlight.draw(picture, index)
+            highlight.draw(picture, index)
             if inset is not None:
-                border = highlight.border(index) if style.highlight_pressing else highlight.CALM
-                _paste_inset(picture, inset.frame([(scene.hand, boxes[index, self._near_mouth])], shadows), border)
+                near_mouth = np.concatenate([boxes[index, self._hand], boxes[index, first_food:]])
+                _paste_inset(picture, inset.frame([(scene.hand, near_mouth)], shadows), highlight.border(index))
             yield picture
 
-    def _lamp_depth(self, stage: str) -> npt.NDArray[np.float32]:
-        drawn = {"still": self._scene.still, "head": self._scene.head}[stage]
-        return drawn.draw(lamp(STILL_LAMP_SIZE), None, STILL_LAMP_SIZE, STILL_LAMP_SIZE, DEPTH_ONLY).depth
+    def _moving_lamp_depth(self) -> npt.NDArray[np.float32]:
+        size = MOVING_LAMP_SIZE
+        return self._scene.casters.draw_raw(lamp(size), None, size, size, DEPTH_ONLY)[1]
+
+    def _lamp_depth(self, stage: Stage) -> npt.NDArray[np.float32]:
+        """Depth of a still stage as the lamp sees it."""
+        return stage.draw(lamp(STILL_LAMP_SIZE), None, STILL_LAMP_SIZE, STILL_LAMP_SIZE, DEPTH_ONLY).depth
 
     def _turn_head(self, quaternion: npt.NDArray[np.float32]) -> Array:
         """Turn the head and say where the mouth is."""
@@ -142,11 +144,6 @@ class ClipRenderer:
         upper = len(UPPER_ARM)
         return [(self._scene.upper_arm, boxes[:upper]), (self._scene.forearm, boxes[upper:])]
 
-    @property
-    def _near_mouth(self) -> list[int]:
-        hand = [self._parts.index(name) for name in HAND_PARTS]
-        return hand + list(range(len(self._parts), len(self._parts) + self.style.food_count))
-
     def _moving_boxes(self, motion: Motion) -> Array:
         """Where every link and piece of food is in every frame (N, L + P, 4), in pixels."""
         corners = np.einsum("nlij,lcj->nlci", motion.frames[..., :3, :3], self._scene.boxes.corners_m)
@@ -166,7 +163,7 @@ class ClipRenderer:
             scene.casters.place(name, place, turn)
             if name in HAND_PARTS:
                 scene.hand.place(name, place, turn)
-        for food, place_m in enumerate(motion.food_m[index, : self.style.food_count]):
+        for food, place_m in enumerate(motion.food_m[index, :FOOD_COUNT]):
             where = GONE_M if np.isnan(place_m).any() else place_m.tolist()
             scene.forearm.place(food_name(food), where, (0, 0, 0, 1))
             scene.hand.place(food_name(food), where, (0, 0, 0, 1))

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from worker.sim import arm_look, jaco, person_look, room_look
+from worker.sim import arm_look, body_look, chair_look, head_look, jaco, room_look
 from worker.sim.bullet import DrawingClient
 from worker.sim.camera import Camera, Rectangle, flat
 from worker.sim.colours import FOOD, Palette
@@ -91,7 +91,7 @@ class Scene:
             texture = Path(folder) / "palette.png"
             Image.fromarray(palette.texture()).save(texture)
             self.still = Stage(_still_meshes(palette), palette, texture)
-            head = {"head": person_look.head_meshes(palette), "neck": person_look.neck_mesh(palette)}
+            head = {"head": head_look.head_mesh(palette), "neck": body_look.neck_mesh(palette)}
             self.head = Stage(head, palette, texture)
             self.upper_arm = Stage({name: arm[name] for name in UPPER_ARM}, palette, texture)
             self.forearm = Stage({name: arm[name] for name in arm if name not in UPPER_ARM} | foods, palette, texture)
@@ -114,12 +114,12 @@ def food_name(index: int) -> str:
 
 
 def _still_meshes(palette: Palette) -> dict[str, Mesh]:
-    person = union(person_look.shirt(), person_look.arms(), person_look.trousers())
-    chair = person_look.chair()
+    person = union(body_look.shirt(), body_look.arms(), body_look.trousers())
+    chair = chair_look.chair()
     base = arm_look.base_mesh(arm_look.Detail(palette)).moved(arm_look.base_turn(), jaco.ROBOT_BASE_M)
     return {
-        "body": person_look.body_meshes(palette, chair),
-        "chair": person_look.chair_meshes(palette, person),
+        "body": body_look.body_mesh(palette, chair),
+        "chair": chair_look.chair_mesh(palette, person),
         "base": base,
         **room_look.room_meshes(palette, union(person, chair)),
     }

@@ -158,4 +158,4 @@ def smooth_step(values: Array, start: float, end: float) -> Array:
 
 
 def _length(vectors: Array) -> Array:
-    return np.sqrt(np.einsum("ij,ij->i", vectors, vectors))
+    return np.asarray(np.sqrt(np.einsum("ij,ij->i", vectors, vectors)))

@@ -1,6 +1,7 @@
-"""How the person looks: a sculpted head with an open mouth, and a relaxed seated body. Landmarks come from human.py."""
+"""How the person's head looks: short hair, a friendly face and an open mouth. Landmarks come from human.py.
 
-from dataclasses import dataclass
+Head frame: origin at the neck pivot, z up, the face looks along -y.
+"""
 
 import numpy as np
 
@@ -10,7 +11,6 @@ from worker.sim.meshes import Mesh, curve, gradient, joined, softly_lit, surface
 from worker.sim.solids import (
     Array,
     Field,
-    box,
     carve,
     chain,
     common,
@@ -33,19 +33,8 @@ EYE_RADIUS = 0.0165
 GAZE = np.array([-0.16, -1.0, -0.16])
 
 
-@dataclass(frozen=True)
-class Region:
-    """The box in which a surface is looked for, and how finely."""
-
-    lower: tuple[float, float, float]
-    upper: tuple[float, float, float]
-    cell_m: float
-
-
-HEAD_REGION = Region((-0.105, -0.135, -0.065), (0.105, 0.135, 0.245), 0.0044)
-
-
-# The head, in the head's frame: origin at the neck pivot, face towards -y.
+LOWER, UPPER, CELL_M = (-0.105, -0.135, -0.065), (0.105, 0.135, 0.245), 0.0044
+"""The box that holds the head, and how finely its surface is drawn."""
 
 
 def skull() -> Field:
@@ -159,25 +148,23 @@ def _strands(points: Array) -> Array:
     return np.asarray(0.66 * np.sin(19 * wave) + 0.34 * np.sin(41 * wave + 1.0))
 
 
-def head_meshes(palette: Palette) -> Mesh:
+def head_mesh(palette: Palette) -> Mesh:
     """The whole head as one mesh."""
     skin_field, hair_field = face(), hair()
     whole = union(skin_field, hair_field)
-    skin = _surface(skin_field, HEAD_REGION, lambda points: palette.along("skin", _complexion(points)))
+    skin = surface(skin_field, LOWER, UPPER, CELL_M, lambda points: palette.along("skin", _complexion(points)))
     skin = softly_lit(whole, skin, 0.020)
     skin = skin.shaded(_cavity_light(skin.vertices) * skin.paint[:, 1])
-    locks = _surface(
+    locks = surface(
         hair_field,
-        HEAD_REGION,
+        LOWER,
+        UPPER,
+        CELL_M,
         lambda points: palette.along("hair", 0.40 + 0.16 * _strands(points) + 1.6 * (points[:, 2] - 0.15)),
     )
     locks = softly_lit(whole, locks, 0.02)
     parts = [skin, locks, *_eyes(palette), *_brows(palette), *_inside_mouth(palette)]
     return joined(*parts)
-
-
-def _surface(field: Field, region: Region, colour: object) -> Mesh:
-    return surface(field, region.lower, region.upper, region.cell_m, colour)  # type: ignore[arg-type]
 
 
 def _complexion(points: Array) -> Array:
@@ -206,9 +193,9 @@ def _cavity_light(points: Array) -> Array:
 def _inside_mouth(palette: Palette) -> list[Mesh]:
     """Upper teeth and tongue."""
     x, y, z = LIPS
-    arch = [(x + 0.0195 * np.sin(a), y + 0.022 - 0.0175 * np.cos(a), z + 0.0112) for a in np.linspace(-1.25, 1.25, 13)]
+    arch = [(x + 0.0195 * np.sin(a), y + 0.022 - 0.0175 * np.cos(a), z + 0.0124) for a in np.linspace(-1.25, 1.25, 13)]
     path = np.array(arch)
-    teeth = tube(path, np.full(len(path), 0.0040), 8, np.full(len(path), palette.at("teeth")))
+    teeth = tube(path, np.full(len(path), 0.0034), 8, np.full(len(path), palette.at("teeth")))
     tongue = surface(
         ellipsoid((x, y + 0.026, z - 0.0135), (0.0165, 0.024, 0.0075)),
         (-0.03, y - 0.01, z - 0.03),
@@ -295,157 +282,3 @@ def _onto(field: Field, points: Array) -> Array:
 
 def _unit(vector: Array) -> Array:
     return np.asarray(vector / np.linalg.norm(vector))
-
-
-# The body, in the world frame.
-
-NECKLINE = np.array([0.0, 0.046, 1.092])
-
-
-def shirt() -> Field:
-    torso = union(
-        ellipsoid((0, 0.058, 0.930), (0.158, 0.102, 0.150)),
-        ellipsoid((0, 0.052, 0.730), (0.140, 0.104, 0.170)),
-        mirrored(cone((0.02, 0.064, 1.040), (0.145, 0.062, 1.006), 0.056, 0.058)),
-        blend=0.075,
-    )
-    sleeve = cone((0.166, 0.060, 1.002), (0.213, 0.050, 0.795), 0.058, 0.057)
-    sleeve = common(sleeve, half_space((0.21, 0.050, 0.838), (0.22, -0.05, -1)), blend=0.012)
-    solid = union(torso, mirrored(sleeve), blend=0.028)
-    collar_hole = cone((0, 0.052, 1.075), (0, 0.030, 1.20), 0.048, 0.075)
-    return carve(solid, collar_hole, blend=0.006)
-
-
-def collar() -> Field:
-    turn = turned((1, 0, 0), np.pi / 2 + 0.30)
-    return torus(tuple(NECKLINE), (0.0605, 0.0610), 0.0095, turn)
-
-
-def arms() -> Field:
-    arm = chain(
-        [
-            (0.2105, 0.051, 0.825),
-            (0.211, 0.050, 0.765),
-            (0.207, 0.020, 0.733),
-            (0.201, -0.085, 0.728),
-            (0.197, -0.195, 0.724),
-        ],
-        [0.0405, 0.0400, 0.0400, 0.0385, 0.0265],
-    )
-    return mirrored(union(_softened(arm), hand(), blend=0.022))
-
-
-def _softened(field: Field) -> Field:
-    return lambda points: field(points) - 0.001
-
-
-def hand() -> Field:
-    """The left hand, lying relaxed over the end of the armrest."""
-    palm = union(
-        ellipsoid((0.196, -0.238, 0.7230), (0.038, 0.047, 0.0165)),
-        cone((0.196, -0.195, 0.7230), (0.196, -0.240, 0.7240), 0.024, 0.021),
-        blend=0.02,
-    )
-    solid = palm
-    for offset, length in ((0.027, 0.90), (0.0090, 1.03), (-0.0095, 1.0), (-0.0275, 0.80)):
-        x = 0.195 - offset
-        start = (x, -0.268, 0.7240)
-        middle = (x - offset * 0.18, -0.268 - 0.034 * length, 0.7170)
-        end = (x - offset * 0.25, -0.268 - 0.052 * length, 0.7000 - 0.006 * length)
-        solid = union(solid, chain([start, middle, end], [0.0096, 0.0089, 0.0078]), blend=0.006)
-    thumb = chain([(0.168, -0.212, 0.720), (0.151, -0.245, 0.716), (0.150, -0.270, 0.710)], [0.0125, 0.0108, 0.0088])
-    return union(solid, thumb, blend=0.012)
-
-
-def neck() -> Field:
-    return cone((0, 0.062, 1.030), (0, 0.036, 1.143), 0.060, 0.0525)
-
-
-def trousers() -> Field:
-    leg = chain(
-        [(0.080, 0.080, 0.550), (0.112, -0.390, 0.545), (0.112, -0.450, 0.500), (0.112, -0.470, 0.100)],
-        [0.098, 0.076, 0.072, 0.052],
-    )
-    return union(mirrored(leg), ellipsoid((0, 0.08, 0.57), (0.165, 0.14, 0.10)), blend=0.03)
-
-
-def shoes() -> Field:
-    shoe = union(
-        ellipsoid((0.115, -0.535, 0.060), (0.044, 0.105, 0.042)),
-        cone((0.112, -0.475, 0.07), (0.112, -0.475, 0.13), 0.045),
-        blend=0.03,
-    )
-    return mirrored(common(shoe, half_space((0, 0, 0.02), (0, 0, -1)), blend=0.01))
-
-
-def body_meshes(palette: Palette, around: Field) -> Mesh:
-    """Everything of the person but the head, as one mesh; `around` is what else keeps light away (the chair)."""
-    whole = union(shirt(), arms(), neck(), trousers(), collar(), around)
-    parts = [
-        (shirt(), Region((-0.29, -0.09, 0.56), (0.29, 0.20, 1.13), 0.011), "shirt", 0.5),
-        (collar(), Region((-0.08, -0.04, 1.04), (0.08, 0.13, 1.14), 0.0045), "shirt_trim", 0.0),
-        (arms(), Region((-0.26, -0.345, 0.67), (0.26, 0.11, 0.86), 0.0062), "skin", 0.02),
-        (trousers(), Region((-0.22, -0.56, 0.04), (0.22, 0.24, 0.68), 0.019), "trousers", 0.0),
-        (shoes(), Region((-0.18, -0.66, 0.0), (0.18, -0.40, 0.20), 0.017), "shoe", 0.0),
-    ]
-    meshes = []
-    for field, region, name, share in parts:
-        mesh = surface(field, region.lower, region.upper, region.cell_m, palette.at(name, share))
-        meshes.append(softly_lit(whole, mesh, 0.07))
-    return joined(*meshes)
-
-
-def neck_mesh(palette: Palette) -> Mesh:
-    """The neck, which stands still but is drawn with the head so that no shadow edge lies between the two."""
-    chin = sphere((0, -0.030, 1.165), 0.055)
-    whole = union(neck(), chin, collar())
-    mesh = surface(neck(), (-0.075, -0.04, 1.05), (0.075, 0.14, 1.235), 0.006, palette.at("skin", 0.02))
-    return softly_lit(whole, mesh, 0.06, 0.9)
-
-
-def chair() -> Field:
-    """Seat, back and armrests of the wheelchair, without its wheels."""
-    seat = box((0, 0.02, 0.425), (0.23, 0.25, 0.035), 0.02)
-    back = box((0, 0.235, 0.80), (0.215, 0.035, 0.33), 0.030, turned((1, 0, 0), 0.10))
-    rest = mirrored(box((0.215, -0.02, 0.668), (0.034, 0.235, 0.018), 0.016))
-    return union(seat, back, rest)
-
-
-def chair_meshes(palette: Palette, around: Field) -> Mesh:
-    """The chair as one mesh; `around` is the person who sits in it."""
-    whole = union(chair(), around)
-    region = Region((-0.27, -0.28, 0.36), (0.27, 0.33, 1.17), 0.014)
-    padding = surface(chair(), region.lower, region.upper, region.cell_m, palette.at("cushion"))
-    padding = softly_lit(whole, padding, 0.08)
-    metal = palette.at("chair")
-    parts = [padding]
-    for side in (-1.0, 1.0):
-        for start, end in (
-            ((0.235, 0.19, 0.45), (0.225, 0.19, 0.66)),
-            ((0.235, -0.17, 0.45), (0.225, -0.17, 0.66)),
-            ((0.235, -0.20, 0.42), (0.235, 0.22, 0.42)),
-            ((0.200, 0.27, 0.60), (0.195, 0.30, 1.06)),
-        ):
-            path = np.array([start, end]) * [side, 1, 1]
-            parts.append(tube(path, np.array([0.013, 0.013]), 12, np.array([metal, metal])))
-        parts += _wheel(palette, side)
-    return joined(*parts)
-
-
-def _wheel(palette: Palette, side: float) -> list[Mesh]:
-    centre, radius = np.array([side * 0.315, 0.15, 0.29]), 0.275
-    angle = np.linspace(0, 2 * np.pi, 33)
-    circle = np.stack([0 * angle, np.cos(angle), np.sin(angle)], axis=1)
-    tyre = tube(centre + radius * circle, np.full(33, 0.014), 8, np.full(33, palette.at("tyre")), closed_ends=False)
-    hand_rim = tube(
-        centre + [side * 0.02, 0, 0] + 0.235 * circle,
-        np.full(33, 0.007),
-        7,
-        np.full(33, palette.at("metal", 0.6)),
-        closed_ends=False,
-    )
-    spokes = [
-        tube(np.stack([centre, centre + radius * point]), np.full(2, 0.003), 5, np.full(2, palette.at("metal", 0.2)))
-        for point in circle[:-1:3]
-    ]
-    return [tyre, hand_rim, *spokes]
