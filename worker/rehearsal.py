@@ -224,18 +224,17 @@ class Visitor:
     def come_in(self) -> None:
         """Go through consent and instructions to the first pair."""
         for _ in range(5):
-            if self._page.address.endswith("/p/next") or _QUERY.search(self._page.text):
+            if self._page.address.endswith("/p/next") or self._page.form_to(_QUERY):
                 return
-            self._send(self._page.first_form(), dict(self._page.fields))
+            self._send_first({})
         raise RehearsalFailed(f"The way from the personal link to the first pair ended at {self._page.address}.")
 
     def log_in(self, name: str, password: str) -> None:
         """As an experimenter, choosing a new password on the way when asked to."""
-        self._send(self._page.first_form(), {**self._page.fields, "name": name, "password": password})
+        self._send_first({"name": name, "password": password})
         chosen = secrets.token_urlsafe(16)
         if "/password" in self._page.address:
-            fields = {"current": password, "new": chosen, "repeated": chosen}
-            self._send(self._page.first_form(), {**self._page.fields, **fields})
+            self._send_first({"current": password, "new": chosen, "again": chosen})
 
     def download(self, path: str) -> bytes:
         """The bytes behind an address."""
@@ -247,17 +246,24 @@ class Visitor:
     def query_id(self) -> int | None:
         """The query on the page, after loading the page anew; None while there is none."""
         self._open("/p/next")
-        found = _QUERY.search(self._page.text)
-        return int(found.group(1)) if found else None
+        form = self._page.form_to(_QUERY)
+        return None if form is None else int(form.target.group(1))
 
     def answer(self, response: str) -> float:
         """Press a button; returns the seconds until the next page was there."""
-        started = time.perf_counter()
-        found = _QUERY.search(self._page.text)
-        if found is None:
+        form = self._page.form_to(_QUERY)
+        if form is None:
             raise RehearsalFailed(f"There is no pair on {self._page.address}.")
-        self._send(found.group(0), {**self._page.fields_of(found.group(0)), "response": response})
+        started = time.perf_counter()
+        self._send(form.target.group(0), {**form.fields, "response": response})
         return time.perf_counter() - started
+
+    def _send_first(self, filled_in: dict[str, str]) -> None:
+        """Send the page's first form with these fields filled in, the others as they are."""
+        if not self._page.forms:
+            raise RehearsalFailed(f"There is nothing to press on {self._page.address}.")
+        action, fields = self._page.forms[0]
+        self._send(action, {**fields, **filled_in})
 
     def _open(self, path: str) -> None:
         self._arrive(self._client.get(path))
@@ -271,37 +277,37 @@ class Visitor:
         self._page = _Page(str(response.url), response.text)
 
 
+@dataclass(frozen=True)
+class _Form:
+    """A form whose address has been recognised."""
+
+    target: re.Match[str]
+    fields: dict[str, str]
+
+
 class _Page(HTMLParser):
     """The forms of a page with the fields a person would leave as they are; boxes are ticked."""
 
     def __init__(self, address: str, text: str) -> None:
         super().__init__()
-        self.address, self.text = address, text
-        self._forms: list[tuple[str, dict[str, str]]] = []
+        self.address = address
+        self.forms: list[tuple[str, dict[str, str]]] = []
         self.feed(text)
 
-    @property
-    def fields(self) -> dict[str, str]:
-        """Of the first form."""
-        return self._forms[0][1] if self._forms else {}
-
-    def first_form(self) -> str:
-        """Where the first form goes."""
-        if not self._forms:
-            raise RehearsalFailed(f"There is nothing to press on {self.address}.")
-        return self._forms[0][0]
-
-    def fields_of(self, action: str) -> dict[str, str]:
-        """Of the form that goes there."""
-        return next((fields for target, fields in self._forms if target.endswith(action)), {})
+    def form_to(self, address: re.Pattern[str]) -> _Form | None:
+        """The first form that is sent to such an address."""
+        for action, fields in self.forms:
+            if found := address.search(action):
+                return _Form(found, fields)
+        return None
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         """Collect forms and their input fields."""
         named = {name: value or "" for name, value in attrs}
         if tag == "form" and named.get("method", "").lower() == "post":
-            self._forms.append((named.get("action", ""), {}))
-        elif tag in {"input", "button"} and self._forms and named.get("name"):
-            self._forms[-1][1].setdefault(named["name"], named.get("value", "on"))
+            self.forms.append((named.get("action", ""), {}))
+        elif tag in {"input", "button"} and self.forms and named.get("name"):
+            self.forms[-1][1].setdefault(named["name"], named.get("value", "on"))
 
 
 def _until(patience_s: float, missing: str, look: Callable[[], Found | None]) -> Found:
