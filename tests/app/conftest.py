@@ -1,0 +1,62 @@
+"""A participant in the middle of a study, as most tests of pages need one."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from uuid import UUID, uuid4
+
+import pytest
+from fastapi.testclient import TestClient
+from httpx2 import Response as Answer
+from sqlalchemy import select
+
+from app.db import Database
+from app.domain.preferences import LabelEvent, Query
+from app.domain.studies import Participant, Study
+from app.storage import ArtefactStore
+from tests import factories
+
+JSON = {"Accept": "application/json"}
+
+
+@dataclass
+class TakingPart:
+    """A participant, their browser, and the queries waiting for them."""
+
+    browser: TestClient
+    participant: Participant
+    token: str
+    study: Study
+    queries: Sequence[Query]
+    database: Database
+
+    def answer(self, query: Query, response: str = "left", uuid: UUID | None = None, **fields: object) -> Answer:
+        """Send an answer as the page's script does."""
+        form = {"response": response, "client_uuid": str(uuid or uuid4()), **fields}
+        return self.browser.post(f"/p/queries/{query.id}/label", data=form, headers=JSON)
+
+    def undo(self, query: Query, uuid: UUID | None = None) -> Answer:
+        """Take an answer back as the page's script does."""
+        form = {"client_uuid": str(uuid or uuid4())}
+        return self.browser.post(f"/p/queries/{query.id}/undo", data=form, headers=JSON)
+
+    def turn(self) -> Answer:
+        """Ask for what is to be shown now."""
+        return self.browser.get("/p/next", headers=JSON)
+
+    def events(self, query: Query) -> Sequence[LabelEvent]:
+        """What the database holds about a query, oldest first."""
+        of_query = select(LabelEvent).where(LabelEvent.query_id == query.id).order_by(LabelEvent.revision)
+        with self.database.reading() as session:
+            return session.scalars(of_query).all()
+
+
+@pytest.fixture
+def taking_part(database: Database, store: ArtefactStore, new_browser: Callable[[], TestClient]) -> TakingPart:
+    """A participant who has read the instructions, opened the link, and has twelve queries waiting."""
+    with database.writing() as session:
+        study = factories.make_study(session)
+        participant, token = factories.make_participant(session, study)
+        queries = factories.make_queries(session, store, participant, 12)
+    browser = new_browser()
+    browser.get(f"/p/{token}")
+    return TakingPart(browser, participant, token, study, queries, database)
