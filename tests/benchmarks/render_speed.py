@@ -26,7 +26,7 @@ def main() -> None:
     log.info("its size               %.0f KiB", len(clip.video) / 1024)
     motion = clip_motion(trajectory, 0, STEPS, renderer.style.fps)
     start = time.process_time()
-    frames = sum(1 for _ in renderer.pictures(trajectory, motion))
+    frames = sum(1 for _ in renderer.pictures(motion))
     log.info("frame without encoding %.1f ms", (time.process_time() - start) / frames * 1000)
 
 

@@ -28,7 +28,7 @@ def pictures(renderer: ClipRenderer, force_n: float = 0.0, steps: int = 4, food:
     if not food:
         trajectory.particles[:] = np.nan
     motion = clip_motion(trajectory, 0, steps, renderer.style.fps)
-    return [np.asarray(picture).copy() for picture in renderer.pictures(trajectory, motion)]
+    return [np.asarray(picture).copy() for picture in renderer.pictures(motion)]
 
 
 def test_a_clip_reports_what_it_holds(renderer: ClipRenderer) -> None:
@@ -77,7 +77,7 @@ def test_turning_the_head_moves_the_face_and_leaves_the_arm(renderer: ClipRender
     seen = []
     for trajectory in (ahead, aside):
         motion = clip_motion(trajectory, 0, 1, 15)
-        seen.append(np.asarray(next(iter(renderer.pictures(trajectory, motion)))).astype(int))
+        seen.append(np.asarray(next(iter(renderer.pictures(motion)))).astype(int))
     different = np.abs(seen[0] - seen[1]).max(axis=2) > 8
     x, y = scene_camera(640, 480).pixels(np.asarray(NECK_PIVOT_M) + MOUTH_FROM_NECK_M).astype(int)
     assert different[y - 30 : y + 30, x - 30 : x + 30].mean() > 0.2

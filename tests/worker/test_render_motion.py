@@ -6,6 +6,7 @@ import pytest
 from tests.worker.waving import waving_trajectory
 from worker.sim import jaco
 from worker.sim.camera import lamp, scene_camera
+from worker.sim.human import MOUTH_FROM_NECK_M, NECK_PIVOT_M
 from worker.sim.motion import clip_motion, quaternions, smoothly
 from worker.sim.rectangles import GRID_PX, cover, on_grid
 
@@ -35,12 +36,25 @@ def test_steady_motion_stays_steady() -> None:
     assert smoothly(values, place)[:, 0] == pytest.approx(place)
 
 
-def test_food_that_was_eaten_disappears_within_one_control_step() -> None:
+def test_food_that_was_eaten_goes_on_into_the_mouth_and_is_gone() -> None:
+    trajectory = waving_trajectory(20)
+    mouth = np.asarray(NECK_PIVOT_M) + MOUTH_FROM_NECK_M
+    trajectory.particles[:10, 3] = mouth + np.array([0.0, -0.03, 0.0])
+    trajectory.particles[10:, 3] = np.nan
+    food = clip_motion(trajectory, 0, 20, 15).food_m[:, 3]
+    depth = food[:, 1] - mouth[1]
+    assert depth[:14] == pytest.approx(-0.03)
+    assert depth[14:16].tolist() == sorted(depth[14:16])
+    assert depth[16] > 0.01
+    assert np.isnan(depth[18:]).all()
+
+
+def test_food_lost_far_from_the_mouth_just_disappears() -> None:
     trajectory = waving_trajectory(20)
     trajectory.particles[10:, 3] = np.nan
     gone = np.isnan(clip_motion(trajectory, 0, 20, 15).food_m[:, 3, 0])
-    assert not gone[: int(9 * 1.5)].any()
-    assert gone[int(10 * 1.5) :].all()
+    assert not gone[:14].any()
+    assert gone[14:].all()
 
 
 @pytest.mark.parametrize(("first", "count"), [(-1, 5), (0, 0), (15, 6)])

@@ -5,9 +5,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from worker.sim import jaco
-from worker.sim.solids import Array
+from worker.sim.human import FACE_IN_HEAD, MOUTH_FROM_NECK_M, NECK_PIVOT_M
+from worker.sim.solids import Array, smooth_step
 from worker.spaces import CONTROL_STEP_S
 from worker.trajectory import Trajectory
+
+SWALLOWING_S = 0.22
+SWALLOWED_WITHIN_M = 0.06
+THROAT_DEPTH_M = 0.035
 
 
 @dataclass(frozen=True)
@@ -20,6 +25,10 @@ class Motion:
     """(N, P, 3); NaN when gone"""
     force_n: Array
     """(N,)"""
+    head_quaternion: Array
+    """(4,) xyzw"""
+    mouth_m: Array
+    """(3,)"""
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -40,11 +49,16 @@ def clip_motion(trajectory: Trajectory, first_step: int, n_steps: int, fps: int)
     in_base = jaco.link_frames(joints)
     base = np.eye(4)
     base[:3, :3], base[:3, 3] = jaco.rotation(jaco.ROBOT_BASE_RPY), jaco.ROBOT_BASE_M
+    turn = rotation_of(np.asarray(trajectory.head_quaternion, dtype=float))
+    mouth: Array = np.asarray(NECK_PIVOT_M) + turn @ np.asarray(MOUTH_FROM_NECK_M)
+    throat = mouth - THROAT_DEPTH_M * turn @ np.asarray(FACE_IN_HEAD)
     force = np.concatenate([[0.0], np.asarray(trajectory.contact_force_n, dtype=float)])
     return Motion(
         frames=np.asarray(base @ in_base),
-        food_m=_food(np.asarray(trajectory.particles, dtype=float), place),
+        food_m=_food(np.asarray(trajectory.particles, dtype=float), place, mouth, throat),
         force_n=np.interp(place, np.arange(len(force)), force),
+        head_quaternion=np.asarray(trajectory.head_quaternion, dtype=float),
+        mouth_m=mouth,
     )
 
 
@@ -59,14 +73,37 @@ def smoothly(values: Array, place: Array) -> Array:
     )
 
 
-def _food(positions: Array, place: Array) -> Array:
-    """Food (T, P, 3) at fractional indices (N, P, 3): in straight lines; gone half a step after it was last seen."""
+def _food(positions: Array, place: Array, mouth_m: Array, throat_m: Array) -> Array:
+    """Food (T, P, 3) at fractional indices (N, P, 3), in straight lines between control steps.
+
+    The simulation takes food away as soon as it is close to the mouth; here it then goes on into the mouth.
+    """
     last = len(positions) - 1
     index = np.clip(np.floor(place).astype(int), 0, max(last - 1, 0))
     share = np.clip(place - index, 0.0, 1.0)[:, None, None]
-    before, after = positions[index], positions[np.minimum(index + 1, last)]
-    held = np.where(share < 0.5, before, np.nan)
-    return np.where(np.isnan(after), held, before + share * (after - before))
+    food: Array = positions[index] + share * (positions[np.minimum(index + 1, last)] - positions[index])
+    for piece in range(positions.shape[1]):
+        seen = np.flatnonzero(~np.isnan(positions[:, piece, 0]))
+        if not len(seen) or seen[-1] == last:
+            continue
+        final = positions[seen[-1], piece]
+        if np.linalg.norm(final - mouth_m) < SWALLOWED_WITHIN_M:
+            progress = (place - seen[-1]) * CONTROL_STEP_S / SWALLOWING_S
+            going = (progress >= 0.0) & (progress < 1.0)
+            food[going, piece] = final + smooth_step(progress[going], 0.0, 1.0)[:, None] * (throat_m - final)
+    return food
+
+
+def rotation_of(quaternion: Array) -> Array:
+    """The rotation matrix (3, 3) of an xyzw quaternion (4,)."""
+    x, y, z, w = quaternion / np.linalg.norm(quaternion)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
 
 
 def quaternions(rotations: Array) -> Array:

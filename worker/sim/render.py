@@ -9,8 +9,9 @@ from PIL import Image
 
 from worker.sim import video
 from worker.sim.camera import Camera, Rectangle, lamp, scene_camera
+from worker.sim.food import BALL_RADIUS_M, BALLS
 from worker.sim.highlight import Highlight
-from worker.sim.human import MOUTH_FROM_NECK_M, NECK_PIVOT_M
+from worker.sim.human import NECK_PIVOT_M
 from worker.sim.layers import DEPTH_ONLY, MOVING_LAMP_SIZE, STILL_LAMP_SIZE, View
 from worker.sim.motion import Motion, clip_motion, quaternions
 from worker.sim.rectangles import Pixels
@@ -18,7 +19,6 @@ from worker.sim.scene import GONE_M, HAND_PARTS, UPPER_ARM, Scene, Stage, food_n
 from worker.sim.solids import Array
 from worker.trajectory import Trajectory
 
-FOOD_COUNT, FOOD_RADIUS_M = 8, 0.006
 HEAD_EXTENT_M = np.array([[x, y, z] for x in (-0.15, 0.15) for y in (-0.16, 0.16) for z in (-0.12, 0.27)])
 """Corners of a box that holds the head however it is turned, around the neck pivot."""
 
@@ -60,7 +60,7 @@ class ClipRenderer:
     def __init__(self, style: RenderStyle = RenderStyle()) -> None:
         self.style = style
         self._camera = scene_camera(style.width, style.height)
-        self._scene = Scene(FOOD_COUNT, FOOD_RADIUS_M * style.food_scale)
+        self._scene = Scene(BALLS, BALL_RADIUS_M * style.food_scale)
         whole = (0.0, 0.0, float(style.width), float(style.height))
         self._main = View(self._camera, whole, style.width, style.height, style.supersampling, self._scene.still)
         self._still_lamp_depth = self._lamp_depth(self._scene.still)
@@ -75,7 +75,7 @@ class ClipRenderer:
         """The video of steps first_step to first_step + n_steps. Raises ValueError when they do not exist."""
         style = self.style
         motion = clip_motion(trajectory, first_step, n_steps, style.fps)
-        frames = [np.asarray(picture) for picture in self.pictures(trajectory, motion)]
+        frames = [np.asarray(picture) for picture in self.pictures(motion)]
         return RenderedClip(
             video=video.encode_mp4(frames, style.width, style.height, style.fps),
             poster=video.encode_poster(frames[0]),
@@ -86,17 +86,17 @@ class ClipRenderer:
             duration_ms=round(1000 * len(frames) / style.fps),
         )
 
-    def pictures(self, trajectory: Trajectory, motion: Motion) -> Iterator[Image.Image]:
+    def pictures(self, motion: Motion) -> Iterator[Image.Image]:
         """The frames of a motion, one after the other."""
         style, scene = self.style, self._scene
-        mouth_m = self._turn_head(trajectory.head_quaternion)
+        scene.turn_head(motion.head_quaternion.tolist())
         head_box, lamp_depth = self._head_box(), np.minimum(self._still_lamp_depth, self._lamp_depth(scene.head))
         self._main.start(scene.head, head_box, lamp_depth)
-        inset = self._inset(mouth_m, head_box, lamp_depth) if style.inset else None
+        inset = self._inset(motion.mouth_m, head_box, lamp_depth) if style.inset else None
         boxes, first_food = self._moving_boxes(motion), len(self._parts)
         turns = quaternions(motion.frames[..., :3, :3])
         force_n = motion.force_n if style.highlight_pressing else np.zeros(len(motion))
-        highlight = Highlight(self._camera, force_n, motion.frames[:, -1], mouth_m)
+        highlight = Highlight(self._camera, force_n, motion.frames[:, -1], motion.mouth_m)
         for index in range(len(motion)):
             self._pose(motion, turns, index)
             shadows = self._moving_lamp_depth()
@@ -114,13 +114,6 @@ class ClipRenderer:
     def _lamp_depth(self, stage: Stage) -> npt.NDArray[np.float32]:
         """Depth of a still stage as the lamp sees it."""
         return stage.draw(lamp(STILL_LAMP_SIZE), None, STILL_LAMP_SIZE, STILL_LAMP_SIZE, DEPTH_ONLY).depth
-
-    def _turn_head(self, quaternion: npt.NDArray[np.float32]) -> Array:
-        """Turn the head and say where the mouth is."""
-        turn = np.asarray(quaternion, dtype=float)
-        self._scene.turn_head(turn.tolist())
-        mouth: Array = np.asarray(NECK_PIVOT_M) + _rotation(turn) @ np.asarray(MOUTH_FROM_NECK_M)
-        return mouth
 
     def _head_box(self) -> Pixels:
         corners = self._camera.pixels(np.asarray(NECK_PIVOT_M) + HEAD_EXTENT_M)
@@ -163,7 +156,7 @@ class ClipRenderer:
             scene.casters.place(name, place, turn)
             if name in HAND_PARTS:
                 scene.hand.place(name, place, turn)
-        for food, place_m in enumerate(motion.food_m[index, :FOOD_COUNT]):
+        for food, place_m in enumerate(motion.food_m[index, :BALLS]):
             where = GONE_M if np.isnan(place_m).any() else place_m.tolist()
             scene.forearm.place(food_name(food), where, (0, 0, 0, 1))
             scene.hand.place(food_name(food), where, (0, 0, 0, 1))
@@ -186,14 +179,3 @@ def _around(camera: Camera, mouth_m: Array, width: float, height: float) -> Rect
     left = min(max(0.0, x - 0.68 * width), camera.width - width)
     top = min(max(0.0, y - 0.46 * height), camera.height - height)
     return left, top, left + width, top + height
-
-
-def _rotation(quaternion: Array) -> Array:
-    x, y, z, w = quaternion / np.linalg.norm(quaternion)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
