@@ -52,13 +52,12 @@ def _rehearse(options: argparse.Namespace) -> int:
     """Send scripted participants through the real pages and print what came out."""
     with tempfile.TemporaryDirectory(prefix="rehearsal-") as temporary:
         directory = options.directory or Path(temporary)
-        with rehearsal.own_studio(directory) as settings:
-            database = Database(settings.sqlalchemy_url)
-            studio = rehearsal.Rehearsal(
-                database, ArtefactStore(directory / "artefacts"), settings.base_url, options.pace
-            )
+        with rehearsal.OwnStudio(directory) as studio:
+            database = Database(studio.settings.sqlalchemy_url)
+            store = ArtefactStore(directory / "artefacts")
+            rehearsed = rehearsal.Rehearsal(database, store, studio.settings.base_url, options.pace)
             manner = Manner(mistakes=options.mistakes, equal_share=options.equal, skip_share=options.skip)
-            outcomes = studio.run(options.users, _settings(options), manner, options.seed)
+            outcomes = rehearsed.run(options.users, _settings(options), manner, options.seed)
             database.dispose()
         for each in outcomes:
             target = directory / f"{each.code}-{each.user}.zip"

@@ -11,12 +11,11 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from html.parser import HTMLParser
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar
 from urllib.parse import urljoin
 
 import httpx2
@@ -85,29 +84,56 @@ def summary(outcomes: Sequence[Outcome]) -> str:
     return "\n".join(lines)
 
 
-@contextmanager
-def own_studio(directory: Path) -> Iterator[Settings]:
-    """Web server and worker of a studio of our own in this directory, stopped at the end."""
-    settings = Settings(data_dir=directory, port=_free_port())
-    environment = {**os.environ, "DATA_DIR": str(directory), "PORT": str(settings.port), "HOST": settings.host}
-    environment.pop("DATABASE_URL", None)
-    directory.mkdir(parents=True, exist_ok=True)
-    subprocess.run([sys.executable, "-m", "app", "migrate"], check=True, env=environment)
-    web = ["-m", "uvicorn", "app.main:create_app", "--factory", "--no-access-log", "--log-level", "warning"]
-    address = ["--host", settings.host, "--port", str(settings.port)]
-    with (directory / "rehearsal.log").open("ab") as log_file:
-        programs = [
-            subprocess.Popen([sys.executable, *program], env=environment, stdout=log_file, stderr=subprocess.STDOUT)
-            for program in ([*web, *address], ["-m", "worker", "run"])
-        ]
-        try:
-            _until(PATIENCE_S, "no web server", lambda: _answers(settings.base_url) or None)
-            yield settings
-        finally:
-            for each in programs:
-                each.terminate()
-            for each in programs:
-                each.wait()
+class OwnStudio:
+    """Web server and worker of a studio of our own in a directory; a context that stops both at its end."""
+
+    def __init__(self, directory: Path) -> None:
+        directory.mkdir(parents=True, exist_ok=True)
+        self.settings = Settings(data_dir=directory, port=_free_port(), database_url=None)
+        self.log = directory / "rehearsal.log"
+        self._environment = {
+            **{name: value for name, value in os.environ.items() if name != "DATABASE_URL"},
+            "DATA_DIR": str(directory),
+            "HOST": self.settings.host,
+            "PORT": str(self.settings.port),
+        }
+        self._programs: dict[str, subprocess.Popen[bytes]] = {}
+
+    def __enter__(self) -> Self:
+        subprocess.run([sys.executable, "-m", "app", "migrate"], check=True, env=self._environment)
+        self.start_web()
+        self.start_worker()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        for program in self._programs.values():
+            program.terminate()
+        for program in self._programs.values():
+            program.wait()
+
+    def start_web(self) -> None:
+        """Start the web server and wait until it answers."""
+        address = ["--host", self.settings.host, "--port", str(self.settings.port)]
+        self._start("web", "uvicorn", "app.main:create_app", "--factory", "--no-access-log", *address)
+        _until(PATIENCE_S, "no web server", lambda: _answers(self.settings.base_url) or None)
+
+    def start_worker(self) -> None:
+        """Start the worker; whatever an earlier one has left undone is its to finish."""
+        self._start("worker", "worker", "run")
+
+    def kill(self, name: str) -> None:
+        """SIGKILL to "web" or "worker": no chance to clean up."""
+        self._programs[name].kill()
+        self._programs[name].wait()
+
+    def _start(self, name: str, module: str, *arguments: str) -> None:
+        with self.log.open("ab") as stream:
+            self._programs[name] = subprocess.Popen(
+                [sys.executable, "-m", module, *arguments],
+                env=self._environment,
+                stdout=stream,
+                stderr=subprocess.STDOUT,
+            )
 
 
 @dataclass(frozen=True)
