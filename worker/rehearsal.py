@@ -20,13 +20,13 @@ from urllib.parse import urljoin
 
 import httpx2
 import numpy as np
-from sqlalchemy import select
+from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 from tqdm import tqdm
 
 from app.db import Database
 from app.domain.clips import Clip
-from app.domain.models import Bundle, Model
+from app.domain.models import Bundle, Model, Run, RunKind, RunStatus
 from app.domain.preferences import Query
 from app.domain.studies import Study, StudySettings
 from app.errors import AppError
@@ -177,6 +177,21 @@ class Rehearsal:
                 outcome.save_seconds.append(visitor.answer(teacher.answer(query_id)))
                 outcome.labels += 1
                 bar.update()
+                if outcome.labels % settings.retrain_every_labels == 0:
+                    _until(PATIENCE_S, "no reward model", lambda: self._has_learned(outcome) or None)
+
+    def _has_learned(self, outcome: Outcome) -> bool:
+        """People are slower than a retraining; whoever answers at once would never meet a model's prediction."""
+        with self.database.reading() as session:
+            trained = session.scalar(
+                select(func.count(Run.id)).where(
+                    Run.participant_id == outcome.participant_id,
+                    Run.kind == RunKind.REWARD,
+                    Run.status == RunStatus.SUCCEEDED,
+                    Run.workflow_id.contains(f"labels-{outcome.labels}"),
+                )
+            )
+        return bool(trained)
 
     def _await_bundle(self, outcome: Outcome, study: Study, experimenter: "Visitor") -> None:
         def finished() -> tuple[Model, Bundle] | None:
