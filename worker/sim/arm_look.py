@@ -102,18 +102,20 @@ def spoon(detail: Detail) -> Mesh:
 
 
 def _bowl(detail: Detail) -> Mesh:
-    """An egg-shaped bowl, drawn on both sides; the collision shape is a box of the same size."""
+    """A roomy bowl, drawn on both sides; the collision shape is a box of the same size."""
     rings, sides = max(3, detail.sides // 3), max(10, detail.sides + 4)
     depth, rim = 0.0105, 0.0085
     angle = np.linspace(0, 2 * np.pi, sides, endpoint=False)
     shares = np.linspace(0.0, 1.0, rings + 1)
-    outline_x = 0.0270 * np.cos(angle) + 0.0008
-    outline_y = 0.0205 * np.sin(angle) * (1.0 - 0.16 * np.cos(angle))
+    # A superellipse: nearly as roomy as the box that holds the food in the simulation.
+    cosine, sine = np.cos(angle), np.sin(angle)
+    outline_x = 0.0278 * np.sign(cosine) * np.abs(cosine) ** 0.66 + 0.0005
+    outline_y = 0.0212 * np.sign(sine) * np.abs(sine) ** 0.66 * (1.0 - 0.05 * cosine)
     grid = np.stack(
         [
             shares[:, None] * outline_x,
             shares[:, None] * outline_y,
-            np.broadcast_to((rim - depth * (1 - shares[:, None] ** 2.4)), (rings + 1, sides)),
+            np.broadcast_to((rim - depth * (1 - shares[:, None] ** 3.0)), (rings + 1, sides)),
         ],
         axis=-1,
     )

@@ -197,7 +197,7 @@ def _inside_mouth(palette: Palette) -> list[Mesh]:
     path = np.array(arch)
     teeth = tube(path, np.full(len(path), 0.0034), 8, np.full(len(path), palette.at("teeth")))
     tongue = surface(
-        ellipsoid((x, y + 0.026, z - 0.0135), (0.0165, 0.024, 0.0075)),
+        ellipsoid((x, y + 0.029, z - 0.0165), (0.0160, 0.023, 0.0068)),
         (-0.03, y - 0.01, z - 0.03),
         (0.03, y + 0.06, z + 0.01),
         0.003,

@@ -12,7 +12,7 @@ from PIL import Image
 
 Frame = npt.NDArray[np.uint8]
 
-CONSTANT_RATE_FACTOR = 24
+CONSTANT_RATE_FACTOR = 26
 PRESET = "veryfast"
 CHROMA_OFFSET = -6
 """Tiny coloured food keeps its colour."""
