@@ -5,13 +5,14 @@ import numpy as np
 from worker.sim import jaco
 from worker.trajectory import COSTS, SIGNALS, Trajectory
 
-POSTURE_RAD = np.array([0.0, 3.0, 0.0, 2.0, 0.0, 3.0, 0.0])
+POSTURE_RAD = np.array([-3.01, 3.73, 0.0, 4.89, 1.43, 1.76, 0.41])
+"""The spoon is level between its start and the mouth."""
 
 
 def waving_trajectory(steps: int, force_n: float = 0.0) -> Trajectory:
     """The joints swing smoothly around one posture; eight pieces of food stay on the spoon."""
     time = np.arange(steps + 1)[:, None] * 0.1
-    joints = POSTURE_RAD + 0.15 * np.sin(time + np.arange(7))
+    joints = POSTURE_RAD + 0.06 * np.sin(time + np.arange(7))
     spoon = jaco.link_frames(joints)[:, -1]
     seats = np.array([[x, y, 0.006] for x in (-0.015, -0.005, 0.005, 0.015) for y in (-0.006, 0.006)])
     in_base = np.einsum("tij,pj->tpi", spoon[:, :3, :3], seats) + spoon[:, None, :3, 3]

@@ -104,7 +104,7 @@ def spoon(detail: Detail) -> Mesh:
 def _bowl(detail: Detail) -> Mesh:
     """A roomy bowl, drawn on both sides; the collision shape is a box of the same size."""
     rings, sides = max(3, detail.sides // 3), max(10, detail.sides + 4)
-    depth, rim = 0.0105, 0.0085
+    depth, rim = 0.0125, 0.0085
     angle = np.linspace(0, 2 * np.pi, sides, endpoint=False)
     shares = np.linspace(0.0, 1.0, rings + 1)
     # A superellipse: nearly as roomy as the box that holds the food in the simulation.
