@@ -118,7 +118,7 @@ class Fitting:
         scenarios = studio_filter.scenarios_for("evaluation", self.settings.evaluation_scenarios)
         filtered = self.collect(act, scenarios, 0.0, self.seed)
         reference, reward = self._reference(scenarios), self.problem.reward
-        return evaluate(reference, filtered, reward.returns(reference), reward.returns(filtered), self.seed), filtered
+        return evaluate(reference, filtered, reward.returns(reference), reward.returns(filtered)), filtered
 
     def collect(self, act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
         """One rollout per scenario, in order; the same whatever the number of processes."""

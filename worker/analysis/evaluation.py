@@ -1,9 +1,8 @@
 """A filter against the reference policy on the same unseen scenarios: differences with 95 % intervals.
 
 Every difference is paired by scenario, so that easy and hard scenarios cancel. Intervals of means of costs and
-preference use the normal approximation (hundreds of scenarios); success is 0 or 1 and its change is often 0 in almost
-every scenario, where that approximation claims too much, so it gets a percentile bootstrap over scenarios, widened to
-the exact binomial bound when no scenario changed.
+preference use the normal approximation (hundreds of scenarios). Success is 0 or 1 and changes in few scenarios or none,
+where that approximation (and the bootstrap) claims too much: it gets Newcombe's score interval for paired proportions.
 """
 
 from collections.abc import Sequence
@@ -17,15 +16,12 @@ from worker.trajectory import COSTS, SIGNALS, Trajectory
 
 Floats = npt.NDArray[np.float64]
 
-RESAMPLES = 2000
-
 
 def evaluate(
     reference: Sequence[Trajectory],
     filtered: Sequence[Trajectory],
     reference_returns: npt.ArrayLike,
     filtered_returns: npt.ArrayLike,
-    seed: int,
 ) -> dict[str, Any]:
     """Everything the dashboard and the model card show, as plain values.
 
@@ -39,7 +35,7 @@ def evaluate(
     unit = max(float(before.std()), 1e-9)
     return {
         "scenarios": len(reference),
-        "success": success_change(_successes(reference), _successes(filtered), np.random.default_rng(seed)),
+        "success": success_change(_successes(reference), _successes(filtered)),
         "preference": _with_interval((after - before) / unit),
         "costs": {
             name: mean_change(_summed(reference, column), _summed(filtered, column))
@@ -54,21 +50,34 @@ def mean_change(before: Floats, after: Floats) -> dict[str, float]:
     return {"reference": float(before.mean()), "filter": float(after.mean()), **_with_interval(after - before)}
 
 
-def success_change(before: Floats, after: Floats, rng: np.random.Generator) -> dict[str, float]:
-    """Success rates and their paired difference with a bootstrap interval. (N,) of 0 and 1."""
-    change = after - before
-    draws = rng.integers(len(change), size=(RESAMPLES, len(change)))
-    low, high = np.quantile(change[draws].mean(axis=1), [0.025, 0.975])
-    if not change.any():
-        high = wilson_interval(0, len(change))[1]
-        low = -high
-    return {
-        "reference": float(before.mean()),
-        "filter": float(after.mean()),
-        "delta": float(change.mean()),
-        "low": float(low),
-        "high": float(high),
-    }
+def success_change(before: Floats, after: Floats) -> dict[str, float]:
+    """Success rates and their paired difference with its interval. (N,) of 0 and 1.
+
+    Method 10 of Newcombe (1998), Statistics in Medicine 17, 2635-2650: Wilson's intervals of the two rates, squared
+    and added, with their correlation.
+    """
+    count, rates = len(before), (float(before.mean()), float(after.mean()))
+    (low_before, high_before), (low_after, high_after) = (
+        wilson_interval(int(values.sum()), count) for values in (before, after)
+    )
+    delta, phi = rates[1] - rates[0], _correlation(before, after)
+    down, up = rates[1] - low_after, high_after - rates[1]
+    before_down, before_up = rates[0] - low_before, high_before - rates[0]
+    low = delta - float(np.sqrt(max(down**2 - 2 * phi * down * before_up + before_up**2, 0.0)))
+    high = delta + float(np.sqrt(max(up**2 - 2 * phi * up * before_down + before_down**2, 0.0)))
+    return {"reference": rates[0], "filter": rates[1], "delta": delta, "low": low, "high": high}
+
+
+def _correlation(before: Floats, after: Floats) -> float:
+    """Newcombe's phi: corrected for continuity when positive, 0 when one of the rates is 0 or 1."""
+    both, neither = float((before * after).sum()), float(((1 - before) * (1 - after)).sum())
+    lost, won = float((before * (1 - after)).sum()), float(((1 - before) * after).sum())
+    margins = (both + lost) * (won + neither) * (both + won) * (lost + neither)
+    if margins == 0.0:
+        return 0.0
+    excess = both * neither - lost * won
+    corrected = max(excess - len(before) / 2, 0.0) if excess > 0 else excess
+    return float(corrected / np.sqrt(margins))
 
 
 def envelope(trajectories: Sequence[Trajectory]) -> dict[str, float]:

@@ -88,8 +88,8 @@ def balanced_sides(count: int, rng: np.random.Generator) -> npt.NDArray[np.bool_
 
 def _standardised(scores: Floats) -> Floats:
     spread = float(np.std(scores))
-    centred: Floats = scores - np.mean(scores)
-    return centred / spread if spread > 0.0 else centred
+    standardised: Floats = (scores - np.mean(scores)) / (spread if spread > 0.0 else 1.0)
+    return standardised
 
 
 def _mixture(preference: Floats, remaining: npt.NDArray[np.bool_], random_share: float) -> Floats:
@@ -97,4 +97,5 @@ def _mixture(preference: Floats, remaining: npt.NDArray[np.bool_], random_share:
     pull = np.where(remaining, SHARPNESS * preference, -np.inf)
     sharp = np.exp(pull - pull.max())
     mixture: Floats = random_share * uniform + (1 - random_share) * sharp / sharp.sum()
-    return mixture / mixture.sum()
+    normalised: Floats = mixture / mixture.sum()  # rng.choice insists on a sum of exactly 1
+    return normalised

@@ -24,7 +24,7 @@ RIDGE = 1.0
 OUTLIER_SHARE = 0.005
 """Share at either end of every column that is cut to the quantile: a few crashes must not bend the surface."""
 
-SUCCESS_TOLERANCE = 0.03
+SUCCESS_TOLERANCE = 0.015
 SUCCESS_PENALTY = 20.0
 """Standard deviations of predicted return per unit of success lost beyond the tolerance."""
 DRAWS = 20_000

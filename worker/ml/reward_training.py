@@ -140,10 +140,11 @@ def posterior(features: Floats, answers: Floats) -> tuple[Floats, Floats]:
     weights: Floats = np.zeros(features.shape[1])
     for _ in range(NEWTON_STEPS):
         gradient, hessian = _gradient_and_hessian(features, answers, weights)
-        step = np.linalg.solve(hessian, gradient)
-        weights = weights - step * min(1.0, LONGEST_NEWTON_STEP / max(float(np.linalg.norm(step)), 1e-12))
-    covariance: Floats = np.linalg.inv(_gradient_and_hessian(features, answers, weights)[1])
-    return weights, covariance
+        step = np.asarray(np.linalg.solve(hessian, gradient), np.float64)
+        length = max(float(np.linalg.norm(step)), 1e-12)
+        weights = weights - min(1.0, LONGEST_NEWTON_STEP / length) * step
+    hessian = _gradient_and_hessian(features, answers, weights)[1]
+    return weights, np.asarray(np.linalg.inv(hessian), np.float64)
 
 
 def _gradient_and_hessian(features: Floats, answers: Floats, weights: Floats) -> tuple[Floats, Floats]:

@@ -55,6 +55,8 @@ class FilterConfig:
     gate_scenarios: int = 80
     success_tolerance: float = 0.035
     """largest accepted loss of success on the gate's scenarios, as a share of episodes"""
+    force_limit_n: float = 10.0
+    """largest accepted force on the person: 95 of 100 episodes must stay below it (or below the reference's own)"""
     round_rollouts: tuple[int, ...] = (100, 60)
     """rollouts of the current filter before each round of residual learning; () leaves the residual out"""
     round_noise: tuple[float, ...] = (0.25, 0.18)
@@ -88,6 +90,8 @@ class Trial:
     """mean change of the learned return, in standard deviations of the reference's returns"""
     success_change: float
     """share of episodes"""
+    p95_force_n: float
+    """95 % of the episodes stay below this force on the person"""
 
 
 @dataclass(frozen=True)
@@ -108,7 +112,7 @@ class FilterDraft:
 
 
 SCENARIO_BLOCKS = {"gate": 2_000_000, "residual": 3_000_000, "evaluation": 4_000_000, "recording": 5_000_000}
-"""First scenario of each purpose. Elsewhere: exploration 100_000, test of the policy 1_000_000, clips from 10_000_000."""
+"""First scenario of each purpose. Others: exploration 100_000, test of the policy 1_000_000, clips from 10_000_000."""
 
 
 def scenarios_for(purpose: str, count: int, skip: int = 0) -> range:
@@ -194,11 +198,15 @@ def gate_mode(
     for gate in problem.config.gates:
         progress(f"checking the mode at {gate:.0%} on held-out scenarios", 0.05 + 0.1 * len(trials))
         trials.append(_try(problem, replace(act, gate=gate), gate, 0.0, reference, collect))
-        if _acceptable(problem, trials[-1]):
+        if _acceptable(problem, trials[-1], reference):
             break  # the gain grows with the gate, so a smaller one cannot be better
-    chosen = trials[-1] if _acceptable(problem, trials[-1]) else None
+    chosen = trials[-1] if _acceptable(problem, trials[-1], reference) else None
     weights = draft.weights.changed(gate=chosen.gate) if chosen else FilterWeights()
-    notes = draft.notes if chosen else (*draft.notes, "No mode was better without costing success; the mode is off.")
+    notes = (
+        draft.notes
+        if chosen
+        else (*draft.notes, "No mode was better while keeping the task and the forces; the mode is off.")
+    )
     return replace(draft, weights=weights, trials=(*draft.trials, *trials), notes=notes).timed("gate_mode", started)
 
 
@@ -270,7 +278,7 @@ def gate_residual(
         weights = draft.weights.changed(residual_share=share)
         trials.append(_try(problem, act_of(problem.policy, weights), weights.gate, share, reference, collect))
     without = [trial for trial in draft.trials if trial.gate == draft.weights.gate and trial.residual_share == 0.0]
-    acceptable = [trial for trial in (*trials, *without) if _acceptable(problem, trial)]
+    acceptable = [trial for trial in (*trials, *without) if _acceptable(problem, trial, reference)]
     share = max(acceptable, key=lambda trial: trial.preference).residual_share if acceptable else 0.0
     weights = draft.weights.changed(residual_share=share)
     notes = draft.notes
@@ -295,11 +303,17 @@ def _try(
     before, after = problem.reward.returns(reference), problem.reward.returns(filtered)
     unit = max(float(before.std()), 1e-9)
     success = float(np.mean([each.success for each in filtered]) - np.mean([each.success for each in reference]))
-    return Trial(gate, residual_share, float((after - before).mean()) / unit, success)
+    return Trial(gate, residual_share, float((after - before).mean()) / unit, success, _p95_force_n(filtered))
 
 
-def _acceptable(problem: FilterProblem, trial: Trial) -> bool:
-    return trial.preference > 0.0 and trial.success_change >= -problem.config.success_tolerance
+def _acceptable(problem: FilterProblem, trial: Trial, reference: Sequence[Trajectory]) -> bool:
+    config = problem.config
+    gentle = trial.p95_force_n <= max(config.force_limit_n, _p95_force_n(reference))
+    return trial.preference > 0.0 and trial.success_change >= -config.success_tolerance and gentle
+
+
+def _p95_force_n(trajectories: Sequence[Trajectory]) -> float:
+    return float(np.quantile([each.contact_force_n.max() for each in trajectories], 0.95))
 
 
 def _flat(rounds: Sequence[Sequence[Trajectory]]) -> list[Trajectory]:

@@ -1,0 +1,75 @@
+"""Invented trajectories and policies for tests of the learning code: the right shapes, no physics."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from worker.ml.policies import GaussianPolicy
+from worker.ml.segments import SegmentPairs
+from worker.spaces import FEEDING_OBSERVATION
+from worker.trajectory import COSTS, SIGNALS, Trajectory
+
+D, A, S = FEEDING_OBSERVATION.size, 7, len(SIGNALS)
+
+
+def small_policy(seed: int = 0, hidden: int = 16) -> GaussianPolicy:
+    """A reference policy with random weights."""
+    rng = np.random.default_rng(seed)
+    sizes = [D, hidden, hidden, 2 * A]
+    weights = {"offset": np.zeros(D), "scale": np.full(D, 2.0), "action_limit": np.array([0.7])}
+    for index in range(3):
+        weights[f"weight_{index}"] = rng.standard_normal((sizes[index], sizes[index + 1])) / sizes[index] ** 0.5
+        weights[f"bias_{index}"] = 0.1 * rng.standard_normal(sizes[index + 1])
+    return GaussianPolicy({name: array.astype(np.float32) for name, array in weights.items()})
+
+
+def observations(count: int, rng: np.random.Generator) -> npt.NDArray[np.float32]:
+    """(count, D) with unit vectors where unit vectors belong."""
+    seen = rng.uniform(-0.3, 0.3, (count, D))
+    for name in ("spoon_forward", "spoon_up", "face_direction"):
+        place = FEEDING_OBSERVATION.slice_of(name)
+        vector = rng.standard_normal((count, 3))
+        seen[:, place] = vector / np.linalg.norm(vector, axis=1, keepdims=True)
+    return seen.astype(np.float32)
+
+
+def trajectory(
+    rng: np.random.Generator,
+    *,
+    steps: int = 20,
+    scenario: int = 0,
+    success: bool = True,
+    signals: npt.NDArray[np.floating] | None = None,
+    actions: npt.NDArray[np.floating] | None = None,
+    costs: npt.NDArray[np.floating] | None = None,
+) -> Trajectory:
+    """One episode of noise, with the given arrays where they matter; the speed is the first joint's action."""
+    drawn = rng.uniform(-1, 1, (steps, A)) + rng.uniform(-0.5, 0.5, A) if actions is None else actions
+    measured = rng.standard_normal((steps, S))
+    measured[:, SIGNALS.index("speed_m_s")] = np.asarray(drawn)[:, 0]
+    return Trajectory(
+        observations=observations(steps + 1, rng),
+        actions=np.asarray(drawn, np.float32),
+        reference_actions=np.asarray(drawn, np.float32),
+        signals=np.asarray(measured if signals is None else signals, np.float32),
+        costs=np.asarray(rng.random((steps, len(COSTS))) if costs is None else costs, np.float32),
+        task_rewards=np.zeros(steps, np.float32),
+        joint_positions=np.zeros((steps + 1, 7), np.float32),
+        particles=np.zeros((steps + 1, 8, 3), np.float32),
+        head_quaternion=np.array([0, 0, 0, 1], np.float32),
+        contact_force_n=np.zeros(steps, np.float32),
+        success=success,
+        scenario=scenario,
+        task="feeding",
+    )
+
+
+def pairs(count: int, rng: np.random.Generator, steps: int = 20) -> SegmentPairs:
+    """Pairs of episodes of noise."""
+    return SegmentPairs.cut([(trajectory(rng, steps=steps), trajectory(rng, steps=steps)) for _ in range(count)])
+
+
+def answers_of(values: SegmentPairs, weights: Sequence[float] | npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
+    """Targets of somebody whose reward is linear in the signals and who never errs."""
+    return (values.signal_differences() @ np.asarray(weights) > 0).astype(np.float64)

@@ -1,0 +1,113 @@
+"""Numbers about a filter: paired differences, their intervals, and the accuracy of predictions."""
+
+import json
+
+import numpy as np
+import pytest
+
+from tests.worker import invented
+from worker.analysis.agreement import prequential, wilson_interval
+from worker.analysis.evaluation import evaluate, mean_change, success_change
+from worker.trajectory import COSTS, Trajectory
+
+
+def test_wilson_s_interval_matches_published_values() -> None:
+    """Newcombe (1998), Statistics in Medicine 17, table I, method 3: 81/263 and 0/20."""
+    assert wilson_interval(81, 263) == pytest.approx((0.2553, 0.3662), abs=1e-4)
+    assert wilson_interval(0, 20) == pytest.approx((0.0, 0.1611), abs=1e-4)
+
+
+@pytest.mark.parametrize(("correct", "scored"), [(0, 0), (3, 2), (-1, 5)])
+def test_a_proportion_of_nothing_is_refused(correct: int, scored: int) -> None:
+    with pytest.raises(ValueError, match="not a proportion"):
+        wilson_interval(correct, scored)
+
+
+def test_prequential_accuracy_scores_decided_answers_that_were_predicted() -> None:
+    found = prequential([np.nan, 0.9, 0.2, 0.7, 0.6], [1.0, 1.0, 1.0, 0.5, 1.0])
+    assert (found["overall"]["correct"], found["overall"]["scored"]) == (2, 3)
+    assert found["overall"]["low"] < 2 / 3 < found["overall"]["high"]
+
+
+def test_prequential_accuracy_is_unknown_before_anything_was_scored() -> None:
+    assert prequential([np.nan], [1.0])["overall"]["accuracy"] is None
+
+
+def test_the_window_looks_at_the_newest_labels_only() -> None:
+    found = prequential([0.1] * 30 + [0.9] * 30, [1.0] * 60, window=30)
+    assert found["recent"]["accuracy"] == 1.0
+    assert found["overall"]["accuracy"] == 0.5
+
+
+def episodes(count: int, rng: np.random.Generator, cost: float = 0.0, success: bool = True) -> list[Trajectory]:
+    """One episode per scenario; scenarios differ much more than filters do."""
+    return [
+        invented.trajectory(
+            np.random.default_rng(scenario),
+            scenario=scenario,
+            success=success,
+            costs=np.full((20, len(COSTS)), 1.0 + scenario + cost) + 0.01 * rng.standard_normal((20, len(COSTS))),
+        )
+        for scenario in range(count)
+    ]
+
+
+def test_pairing_by_scenario_finds_a_small_difference_among_large_ones() -> None:
+    rng = np.random.default_rng(0)
+    found = evaluate(episodes(50, rng), episodes(50, rng, cost=0.1), np.arange(50), np.arange(50) + 1.0)
+    change = found["costs"]["C_v"]
+    assert change["delta"] == pytest.approx(2.0, abs=0.1)
+    assert change["low"] > 1.9
+    assert change["high"] < 2.1
+
+
+def test_preference_is_in_standard_deviations_of_the_reference_s_returns() -> None:
+    rng = np.random.default_rng(0)
+    before = rng.standard_normal(50) * 40
+    found = evaluate(episodes(50, rng), episodes(50, rng), before, before + 80)
+    assert found["preference"]["delta"] == pytest.approx(80 / before.std())
+
+
+def test_the_result_is_plain_and_complete() -> None:
+    rng = np.random.default_rng(0)
+    found = json.loads(json.dumps(evaluate(episodes(5, rng), episodes(5, rng), np.zeros(5), np.zeros(5))))
+    assert found["scenarios"] == 5
+    assert set(found["costs"]) == set(COSTS)
+    assert set(found["success"]) == {"reference", "filter", "delta", "low", "high"}
+
+
+def test_different_scenarios_cannot_be_compared() -> None:
+    rng = np.random.default_rng(0)
+    with pytest.raises(ValueError, match="same scenarios"):
+        evaluate(episodes(5, rng), episodes(5, rng)[::-1], np.zeros(5), np.zeros(5))
+
+
+def test_the_success_interval_covers_the_truth_about_as_often_as_it_says() -> None:
+    rng = np.random.default_rng(0)
+    covered = 0
+    for _ in range(200):
+        before = (rng.random(150) < 0.95).astype(float)
+        after = np.where(rng.random(150) < 0.06, 0.0, before)
+        found = success_change(before, after)
+        covered += found["low"] <= -0.06 * 0.95 <= found["high"]
+    assert 0.92 * 200 < covered
+
+
+def test_the_success_interval_matches_a_published_example() -> None:
+    """Newcombe (1998), table III, method 10: 2 x 2 counts 36, 12, 2, 0 give 0.2 with 0.0569 to 0.3404."""
+    before = np.repeat([1.0, 0.0, 1.0, 0.0], [36, 12, 2, 0])
+    after = np.repeat([1.0, 1.0, 0.0, 0.0], [36, 12, 2, 0])
+    found = success_change(before, after)
+    assert (found["delta"], found["low"], found["high"]) == pytest.approx((0.2, 0.0569, 0.3404), abs=2e-4)
+
+
+def test_success_that_never_changed_is_still_uncertain() -> None:
+    found = success_change(np.ones(80), np.ones(80))
+    assert found["delta"] == 0.0
+    assert found["low"] < 0.0 < found["high"]
+
+
+def test_a_difference_of_means_has_the_normal_interval() -> None:
+    change = np.random.default_rng(1).standard_normal(400)
+    found = mean_change(np.zeros(400), change)
+    assert found["high"] - found["delta"] == pytest.approx(1.96 * change.std(ddof=1) / 20, rel=1e-3)

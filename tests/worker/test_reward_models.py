@@ -1,0 +1,192 @@
+"""Reward models: the right form of Eq. (2), both kinds, normalisation, storage."""
+
+import numpy as np
+import pytest
+import torch
+
+from tests.worker import invented
+from worker.ml import bradley_terry, reward_training
+from worker.ml.reward_models import CLIP, RewardModel, StructuredReward, load_reward_model, stored_config
+from worker.ml.reward_training import MlpTraining, fit, posterior, signal_spread
+from worker.ml.segments import SegmentPairs
+from worker.trajectory import SIGNALS
+
+KINDS: tuple[reward_training.Kind, ...] = ("structured", "mlp")
+QUICK = MlpTraining(steps=100, members=3, hidden=16, learning_rate=5e-3)
+DISLIKES_SPEED = np.array([-1.0 if name == "speed_m_s" else 0.0 for name in SIGNALS])
+
+
+@pytest.fixture(scope="module")
+def labelled() -> tuple[SegmentPairs, np.ndarray]:
+    """A hundred pairs labelled by somebody who minds speed only."""
+    shown = invented.pairs(100, np.random.default_rng(1))
+    return shown, invented.answers_of(shown, DISLIKES_SPEED)
+
+
+@pytest.fixture(scope="module", params=KINDS)
+def model(request: pytest.FixtureRequest, labelled: tuple[SegmentPairs, np.ndarray]) -> RewardModel:
+    """Both kinds, fitted."""
+    return fit(*labelled, request.param, 3, mlp=QUICK).model
+
+
+@pytest.mark.parametrize(("left", "right"), [(1.0, 0.0), (0.0, 1.0), (0.3, 0.3), (-700.0, 700.0)])
+def test_swapping_the_sides_flips_the_preference(left: float, right: float) -> None:
+    there = bradley_terry.probability_right(np.array(bradley_terry.preference_logits(left, right)))
+    back = bradley_terry.probability_right(np.array(bradley_terry.preference_logits(right, left)))
+    assert there + back == pytest.approx(1.0)
+    assert bool(there > 0.5) == (right > left)
+
+
+def test_the_probability_is_the_softmax_of_the_returns_as_in_equation_1() -> None:
+    left, right = 0.4, 1.1
+    expected = np.exp(right) / (np.exp(left) + np.exp(right))
+    logits = bradley_terry.preference_logits(left, right)
+    assert bradley_terry.probability_right(np.array(logits)) == pytest.approx(expected)
+
+
+def test_an_equal_answer_is_served_best_by_equal_returns() -> None:
+    target = torch.tensor([0.5])
+    losses = [float(bradley_terry.preference_loss(torch.tensor([logit]), target)) for logit in (-1.0, 0.0, 1.0)]
+    assert losses[1] < losses[0] == pytest.approx(losses[2])
+
+
+def test_equation_2_as_printed_learns_the_reversed_preference() -> None:
+    """y = 1 means right was preferred: the right form raises the return of right, the printed one that of left."""
+    learned = []
+    for loss in (bradley_terry.preference_loss, bradley_terry.preference_loss_as_printed):
+        logit = torch.zeros(1, requires_grad=True)
+        loss(logit, torch.ones(1)).backward()  # type: ignore[no-untyped-call]
+        assert logit.grad is not None
+        learned.append(-float(logit.grad))
+    right_form, as_printed = learned
+    assert right_form > 0 > as_printed
+
+
+def test_the_structured_fit_minimises_the_right_form_of_equation_2_with_a_normal_prior(
+    labelled: tuple[SegmentPairs, np.ndarray],
+) -> None:
+    shown, targets = labelled
+    features = shown.signal_differences() / signal_spread(shown)
+    mean, covariance = posterior(features, targets)
+    weights = torch.tensor(mean, requires_grad=True)
+    logits = torch.tensor(features) @ weights
+    loss = bradley_terry.preference_loss(logits, torch.tensor(targets)) * len(targets) + 0.5 * (weights**2).sum()
+    loss.backward()  # type: ignore[no-untyped-call]
+    assert weights.grad is not None
+    assert float(weights.grad.abs().max()) < 1e-6
+    assert np.linalg.eigvalsh(covariance).min() > 0
+
+
+def test_both_kinds_rank_what_they_were_told(model: RewardModel, labelled: tuple[SegmentPairs, np.ndarray]) -> None:
+    shown, targets = labelled
+    right = (model.probability_right(shown) > 0.5) == (targets > 0.5)
+    assert right.mean() > 0.85
+
+
+def test_the_structured_kind_generalises_from_a_hundred_labels(labelled: tuple[SegmentPairs, np.ndarray]) -> None:
+    unseen = invented.pairs(300, np.random.default_rng(2))
+    model = fit(*labelled, "structured", 0).model
+    agrees = (model.probability_right(unseen) > 0.5) == (invented.answers_of(unseen, DISLIKES_SPEED) > 0.5)
+    assert agrees.mean() > 0.85
+
+
+def test_learned_weights_come_with_intervals_and_find_the_one_that_matters(
+    labelled: tuple[SegmentPairs, np.ndarray],
+) -> None:
+    weights = fit(*labelled, "structured", 0).metrics["weights"]
+    assert set(weights) == set(SIGNALS)
+    assert weights["speed_m_s"]["high"] < 0
+    assert all(each["low"] < each["mean"] < each["high"] for each in weights.values())
+    others = [abs(each["mean"]) for name, each in weights.items() if name != "speed_m_s"]
+    assert max(others) < abs(weights["speed_m_s"]["mean"]) / 2
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_same_seed_gives_the_same_model_and_another_seed_another(
+    kind: reward_training.Kind, labelled: tuple[SegmentPairs, np.ndarray]
+) -> None:
+    first, again, other = (fit(*labelled, kind, seed, mlp=QUICK).model.to_bytes() for seed in (5, 5, 6))
+    assert first == again
+    assert first != other
+
+
+def test_swapped_pairs_with_flipped_targets_give_the_same_weights(labelled: tuple[SegmentPairs, np.ndarray]) -> None:
+    shown, targets = labelled
+    model = fit(shown, targets, "structured", 0).model
+    mirrored = fit(shown.swapped(), 1 - targets, "structured", 0).model
+    assert isinstance(model, StructuredReward)
+    assert isinstance(mirrored, StructuredReward)
+    np.testing.assert_allclose(model.weights, mirrored.weights, atol=1e-9)
+
+
+def test_the_probability_is_the_mean_over_members(
+    model: RewardModel, labelled: tuple[SegmentPairs, np.ndarray]
+) -> None:
+    members = model.member_probabilities(labelled[0])
+    assert members.shape == (model.size, 100)
+    assert members.std(axis=0).max() > 0
+    np.testing.assert_allclose(model.probability_right(labelled[0]), members.mean(axis=0))
+
+
+def test_rewards_have_mean_0_and_deviation_1_over_the_reference_rollouts(model: RewardModel) -> None:
+    reference = [invented.trajectory(np.random.default_rng(seed)) for seed in range(20)]
+    rewards = np.concatenate([model.normalised_over(reference).rewards_of(each) for each in reference])
+    assert rewards.mean() == pytest.approx(0, abs=1e-6)
+    assert rewards.std() == pytest.approx(1, abs=1e-6)
+
+
+def test_one_broken_step_cannot_decide_an_episode() -> None:
+    signals = np.zeros((20, len(SIGNALS)))
+    signals[3] = 1e6
+    broken = invented.trajectory(np.random.default_rng(0), signals=signals)
+    model = StructuredReward(np.ones((8, len(SIGNALS))))
+    assert model.rewards_of(broken).max() == CLIP
+    assert model.returns([broken])[0] == pytest.approx(CLIP)
+
+
+def test_a_model_survives_storage(model: RewardModel) -> None:
+    stored = model.to_bytes()
+    episode = invented.trajectory(np.random.default_rng(8))
+    np.testing.assert_allclose(load_reward_model(stored).rewards_of(episode), model.rewards_of(episode), atol=1e-4)
+    assert stored_config(stored)["kind"] == model.kind
+
+
+def test_a_file_of_something_else_is_refused() -> None:
+    with pytest.raises(ValueError, match="safetensors"):
+        load_reward_model(b"\xff" * 20)
+
+
+@pytest.mark.parametrize(("targets", "problem"), [([0.0], "as many targets"), ([0.3] * 100, "0, 1/2 or 1")])
+def test_targets_that_mean_nothing_are_refused(
+    targets: list[float], problem: str, labelled: tuple[SegmentPairs, np.ndarray]
+) -> None:
+    with pytest.raises(ValueError, match=problem):
+        fit(labelled[0], targets, "structured", 0)
+
+
+def test_weights_on_signals_are_exact_for_the_structured_kind_and_close_for_networks(model: RewardModel) -> None:
+    rng = np.random.default_rng(4)
+    pool = [invented.trajectory(rng) for _ in range(60)]
+    predicted = np.array([each.signals.sum(0) for each in pool]) @ model.signal_weights(pool)
+    if model.kind == "structured":
+        differences = np.diff(predicted) - np.diff(model.returns(pool))
+        assert np.abs(differences).max() < 0.05 * np.abs(np.diff(predicted)).max()
+    else:
+        assert np.isfinite(predicted).all()
+
+
+def test_a_handful_of_one_sided_labels_does_not_break_the_fit() -> None:
+    few = invented.pairs(2, np.random.default_rng(0))
+    for kind in KINDS:
+        model = fit(few, [1.0, 1.0], kind, 0, mlp=QUICK).model
+        assert np.isfinite(model.probability_right(few)).all()
+
+
+def test_segments_are_cut_at_the_same_steps_on_both_sides() -> None:
+    rng = np.random.default_rng(0)
+    left, right = invented.trajectory(rng), invented.trajectory(rng)
+    cut = SegmentPairs.cut([(left, right)], first_step=5, step_count=10)
+    np.testing.assert_array_equal(cut.signals[0, 1], right.signals[5:15])
+    np.testing.assert_array_equal(cut.observations[0, 0], left.observations[5:15])
+    with pytest.raises(ValueError, match="only 20"):
+        SegmentPairs.cut([(left, right)], first_step=15, step_count=10)
