@@ -3,12 +3,15 @@
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from datetime import timedelta
 from pathlib import Path
 
 import pytest
 import uvicorn
+from argon2 import PasswordHasher
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
+from sqlalchemy import select
 
 import app.domain.clips
 import app.domain.models
@@ -16,8 +19,9 @@ import app.domain.people
 import app.domain.preferences
 import app.domain.studies  # noqa: F401  (all five fill Base.metadata)
 from app.db import Base, Database
+from app.domain.people import Experimenter
 from app.main import create_app
-from app.services import accounts
+from app.services import accounts, browser_sessions
 from app.settings import Settings
 from app.storage import ArtefactStore
 
@@ -65,24 +69,35 @@ def client(new_browser: Callable[[], TestClient]) -> TestClient:
     return new_browser()
 
 
+@pytest.fixture(scope="session")
+def password_hash() -> str:
+    """Hashing is slow on purpose, so the tests do it once."""
+    return PasswordHasher().hash(PASSWORD)
+
+
 @pytest.fixture
-def password(database: Database) -> str:
+def password(database: Database, password_hash: str) -> str:
     """The password of an experimenter who has already chosen it."""
     with database.writing() as session:
-        one_time = accounts.create_first_experimenter(session)
-        assert one_time is not None
-    with database.writing() as session:
-        experimenter = accounts.verify(session, accounts.FIRST_EXPERIMENTER, one_time)
-        new = accounts.hash_of_new(experimenter, current=one_time, new=PASSWORD)
-        accounts.set_password(session, experimenter, new)
+        account = Experimenter(
+            name=accounts.FIRST_EXPERIMENTER, password_hash=password_hash, must_change_password=False
+        )
+        session.add(account)
     return PASSWORD
 
 
 @pytest.fixture
-def experimenter(client: TestClient, password: str) -> TestClient:
+def experimenter_cookie(database: Database, password: str) -> str:
+    """The cookie of an experimenter who is logged in."""
+    with database.writing() as session:
+        account = session.scalars(select(Experimenter)).one()
+        return browser_sessions.open_for_experimenter(session, account, timedelta(hours=1))
+
+
+@pytest.fixture
+def experimenter(client: TestClient, experimenter_cookie: str) -> TestClient:
     """A browser whose experimenter is logged in."""
-    answer = client.post("/login", data={"name": accounts.FIRST_EXPERIMENTER, "password": password})
-    assert answer.status_code == 303
+    client.cookies["studio_experimenter"] = experimenter_cookie
     return client
 
 
