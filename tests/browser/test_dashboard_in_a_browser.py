@@ -1,0 +1,109 @@
+"""The experimenter's pages in a real browser: they update themselves, and everybody can use them."""
+
+from collections.abc import Iterator
+
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+from playwright.sync_api import Browser, Page, expect
+
+from app.db import Database
+from app.domain.models import ModelKind, RunStatus
+from app.domain.preferences import Response
+from app.domain.studies import Study
+from app.services import enrolment
+from app.storage import ArtefactStore
+from tests import factories
+from tests.conftest import PASSWORD
+
+pytestmark = pytest.mark.browser
+
+
+@pytest.fixture
+def study(database: Database, store: ArtefactStore, password: str) -> Study:
+    """A study with something of everything."""
+    with database.writing() as session:
+        study = factories.make_study(session, "Pilot")
+        participant, _ = factories.make_participant(session, study)
+        left, right = (factories.make_clip(session, store, study) for _ in range(2))
+        for number in range(8):
+            query = factories.make_query(session, participant, left, right, 0.2 + 0.1 * number)
+            factories.make_label(session, query, Response.RIGHT, response_time_ms=3000)
+        factories.make_model(session, study, participant, ModelKind.REWARD, factories.reward_metrics())
+        model = factories.make_model(session, study, participant, ModelKind.FILTER, factories.filter_metrics())
+        factories.make_bundle(session, store, model)
+        factories.make_run(session, study, participant, status=RunStatus.FAILED, error="It ran out of memory.")
+        return study
+
+
+@pytest.fixture
+def page(chromium: Browser, address: str, study: Study) -> Iterator[Page]:
+    """Logged in, by typing."""
+    errors: list[str] = []
+    context = chromium.new_context(base_url=address, viewport={"width": 1366, "height": 768})
+    page = context.new_page()
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    page.goto("/studies")
+    page.get_by_label("Name").fill("experimenter")
+    page.get_by_label("Password").fill(PASSWORD)
+    page.get_by_role("button", name="Log in").click()
+    expect(page.get_by_role("heading", name="Studies")).to_be_visible()
+    yield page
+    context.close()
+    assert errors == []
+
+
+def test_an_open_page_updates_itself_and_keeps_what_the_person_does(
+    page: Page, study: Study, database: Database
+) -> None:
+    page.goto("/studies/pilot")
+    expect(page.locator("[data-live-state]")).to_have_text("live")
+    page.get_by_label("How many participants to add").fill("7")
+    link = page.get_by_role("link", name="P01")
+    link.focus()
+    with database.writing() as session:
+        factories.make_participant(session, study)
+    expect(page.get_by_role("link", name="P02")).to_be_visible()
+    expect(link).to_be_focused()
+    expect(page.get_by_label("How many participants to add")).to_have_value("7")
+
+
+def test_what_was_folded_stays_folded_when_the_page_updates(page: Page, study: Study, database: Database) -> None:
+    page.goto("/studies/pilot/participants/P01")
+    expect(page.locator("[data-live-state]")).to_have_text("live")
+    page.locator("details.version > summary").click()
+    expect(page.get_by_text("Speed of the spoon")).to_be_hidden()
+    with database.writing() as session:
+        participant = enrolment.find_by_code(session, study, "P01")
+        metrics = factories.filter_metrics(scenarios=77)
+        factories.make_model(session, study, participant, ModelKind.FILTER, metrics, labels=5)
+    older = page.locator("details.version").nth(1)
+    older.locator("summary").click()
+    expect(older.get_by_text("77 scenarios")).to_be_visible()
+    expect(page.locator("details.version").first.get_by_text("Speed of the spoon")).to_be_hidden()
+
+
+def test_links_can_be_made_and_copied(page: Page) -> None:
+    page.context.grant_permissions(["clipboard-read", "clipboard-write"])
+    page.goto("/studies/pilot")
+    page.get_by_label("How many participants to add").fill("2")
+    page.get_by_role("button", name="Add participants").click()
+    page.get_by_role("button", name="Copy the link of P02").click()
+    expect(page.get_by_text("Copied.")).to_be_visible()
+    assert page.evaluate("navigator.clipboard.readText()") == page.get_by_label("P02", exact=True).input_value()
+    page.get_by_role("button", name="Copy all").click()
+    expect(page.get_by_text("All links copied.")).to_be_visible()
+    assert len(page.evaluate("navigator.clipboard.readText()").splitlines()) == 2
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize(
+    "path", ["/studies", "/studies/new", "/studies/pilot", "/studies/pilot/participants/P01", "/password", "/nowhere"]
+)
+def test_no_page_shuts_anybody_out(page: Page, path: str, scheme: str) -> None:
+    page.emulate_media(color_scheme="dark" if scheme == "dark" else "light")
+    page.goto(path)
+    for size in ((1366, 768), (390, 844)):
+        page.set_viewport_size({"width": size[0], "height": size[1]})
+        violations = Axe().run(page).response["violations"]
+        assert [(each["id"], each["nodes"][0]["html"]) for each in violations] == []
+        assert page.evaluate("document.documentElement.scrollWidth - innerWidth") <= 0

@@ -1,0 +1,382 @@
+"""A participant labels in a real browser, from the personal link to the thanks; the experimenter looks on."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+from playwright.sync_api import Browser, BrowserContext, Page, Route, expect
+from sqlalchemy import select
+
+from app.db import Database
+from app.domain.preferences import LabelEvent, current_labels
+from app.domain.studies import Participant, Study
+from app.storage import ArtefactStore
+from tests import factories
+
+pytestmark = pytest.mark.browser
+
+KEYS = {"left": "ArrowLeft", "right": "ArrowRight", "equal": "ArrowDown", "skip": "s"}
+NewPage = Callable[..., Page]
+
+
+@dataclass
+class Invited:
+    """A participant with a link, and queries waiting."""
+
+    address: str
+    token: str
+    participant: Participant
+    study: Study
+    database: Database
+
+    @property
+    def link(self) -> str:
+        """The personal link."""
+        return f"{self.address}/p/{self.token}"
+
+    def events(self) -> list[LabelEvent]:
+        """Everything stored about this participant's answers, in its order."""
+        with self.database.reading() as session:
+            return list(session.scalars(select(LabelEvent).order_by(LabelEvent.id)))
+
+    def responses(self) -> list[str]:
+        """The answers that count."""
+        with self.database.reading() as session:
+            return [label.response.value for label in current_labels(session, self.participant.id)]
+
+
+@pytest.fixture
+def invited(database: Database, store: ArtefactStore, address: str, request: pytest.FixtureRequest) -> Invited:
+    """Ready to compare unless the test is marked otherwise by ``indirect`` parametrisation."""
+    ready = getattr(request, "param", True)
+    with database.writing() as session:
+        study = factories.make_study(session)
+        participant, token = factories.make_participant(session, study, ready=ready)
+        factories.make_queries(session, store, participant, 12)
+    return Invited(address, token, participant, study, database)
+
+
+@pytest.fixture
+def new_page(chromium: Browser) -> Iterator[NewPage]:
+    """Opens a fresh browser profile; fails the test on any error its scripts raise."""
+    contexts: list[BrowserContext] = []
+    errors: list[str] = []
+
+    def open_page(**options: object) -> Page:
+        context = chromium.new_context(**{"viewport": {"width": 1366, "height": 768}, **options})  # type: ignore[arg-type]
+        contexts.append(context)
+        page = context.new_page()
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.on("console", lambda message: errors.append(message.text) if "Content Security" in message.text else None)
+        return page
+
+    yield open_page
+    for context in contexts:
+        context.close()
+    assert errors == []
+
+
+def wait_ready(page: Page, answered: int) -> None:
+    """Until this many answers are given and the next pair plays."""
+    expect(page.locator("[data-count]")).to_have_text(f"{answered} of 10")
+    expect(page.locator("[data-phase=ready]")).to_be_visible(timeout=15_000)
+
+
+def serious_findings(page: Page) -> list[str]:
+    """What axe finds wrong for people who use assistive technology."""
+    violations = Axe().run(page).response["violations"]
+    return [
+        f"{each['id']}: {each['nodes'][0]['html']}" for each in violations if each["impact"] in ("serious", "critical")
+    ]
+
+
+@pytest.mark.parametrize("invited", [False], indirect=True)
+def test_from_the_link_to_the_tenth_answer_and_on_the_dashboard(
+    invited: Invited, new_page: NewPage, experimenter_cookie: str
+) -> None:
+    page = new_page()
+    page.goto(invited.link)
+    assert invited.token not in page.url
+    assert serious_findings(page) == []
+    page.get_by_role("button", name="I agree to take part").click()
+    assert serious_findings(page) == []
+    page.get_by_role("button", name="Start comparing").click()
+    given = ["left", "right", "equal", "skip", "left", "right", "left", "equal", "left", "right"]
+    for number, response in enumerate(given):
+        wait_ready(page, number)
+        if number == 0:
+            assert serious_findings(page) == []
+        page.keyboard.press(KEYS[response])
+    expect(page.get_by_role("heading", name="Thank you")).to_be_visible()
+    assert serious_findings(page) == []
+    assert invited.responses() == given
+    first = invited.events()[0]
+    assert first.response_time_ms is not None
+    assert first.response_time_ms > 100
+    assert (first.replay_count, first.play_error_count) == (0, 0)
+
+    dashboard = new_page()
+    dashboard.context.add_cookies(
+        [{"name": "studio_experimenter", "value": experimenter_cookie, "url": invited.address}]
+    )
+    dashboard.goto(f"{invited.address}/studies/{invited.study.slug}")
+    row = dashboard.get_by_role("row").filter(has_text="P01")
+    expect(row).to_contain_text("finished")
+    expect(row).to_contain_text("10 of 10")
+    assert serious_findings(dashboard) == []
+    dashboard.get_by_role("link", name="P01").click()
+    expect(dashboard.get_by_label("Answers by kind")).to_contain_text("Can\u2019t tell")
+    assert serious_findings(dashboard) == []
+
+
+def test_both_clips_start_together_stay_within_a_frame_and_loop(invited: Invited, new_page: NewPage) -> None:
+    page = new_page()
+    page.goto(invited.link)
+    wait_ready(page, 0)
+    drifts = page.evaluate(
+        """async () => {
+            const [left, right] = document.querySelectorAll('video');
+            const drifts = [], times = [];
+            right.currentTime = Math.max(0, right.currentTime - 0.2);  // as if it had stalled
+            const until = performance.now() + 4500;
+            while (performance.now() < until) {
+                await new Promise(requestAnimationFrame);
+                drifts.push(Math.abs(left.currentTime - right.currentTime));
+                times.push(left.currentTime);
+            }
+            const rounds = times.filter((time, i) => i && time < times[i - 1] - 0.5).length;
+            return { settled: drifts.slice(Math.floor(drifts.length * 0.6)), rounds };
+        }"""
+    )
+    assert drifts["rounds"] >= 1
+    within = sorted(drifts["settled"])[int(len(drifts["settled"]) * 0.95)]
+    assert within <= 1 / factories.FPS
+
+
+def test_the_next_pair_is_already_loaded(invited: Invited, new_page: NewPage) -> None:
+    page = new_page()
+    page.goto(invited.link)
+    wait_ready(page, 0)
+    page.wait_for_load_state("networkidle")
+    fetched: list[str] = []
+    page.on("request", lambda request: fetched.append(request.url))
+    page.keyboard.press("ArrowLeft")
+    wait_ready(page, 1)
+    sources = page.eval_on_selector_all("video", "videos => videos.map(video => video.src)")
+    assert all(source.startswith("blob:") for source in sources)
+    assert fetched[0].endswith("/label")
+
+
+def test_a_held_key_and_a_double_press_answer_one_pair(invited: Invited, new_page: NewPage) -> None:
+    page = new_page()
+    page.goto(invited.link)
+    wait_ready(page, 0)
+    for _ in range(10):  # playwright sends repeats for a key that is already down
+        page.keyboard.down("ArrowLeft")
+    page.keyboard.up("ArrowLeft")
+    wait_ready(page, 1)
+    page.keyboard.press("ArrowRight")
+    page.keyboard.press("ArrowRight")
+    wait_ready(page, 2)
+    assert invited.responses() == ["left", "right"]
+
+
+def test_undo_shows_the_pair_again(invited: Invited, new_page: NewPage) -> None:
+    page = new_page()
+    page.goto(invited.link)
+    wait_ready(page, 0)
+    expect(page.get_by_role("button", name="Undo")).to_be_hidden()
+    page.keyboard.press("ArrowLeft")
+    wait_ready(page, 1)
+    page.keyboard.press("z")
+    wait_ready(page, 0)
+    page.get_by_role("button", name="Right").click()
+    wait_ready(page, 1)
+    assert invited.responses() == ["right"]
+    assert [event.response for event in invited.events()] == ["left", None, "right"]
+
+
+def test_replays_are_counted(invited: Invited, new_page: NewPage) -> None:
+    page = new_page()
+    page.goto(invited.link)
+    wait_ready(page, 0)
+    page.keyboard.press("r")
+    page.get_by_role("button", name="Replay").click()
+    page.keyboard.press("ArrowLeft")
+    wait_ready(page, 1)
+    assert invited.events()[0].replay_count == 2
+
+
+def test_without_network_the_answer_is_kept_and_sent_again_with_the_same_uuid(
+    invited: Invited, new_page: NewPage
+) -> None:
+    page = new_page()
+    page.goto(invited.link)
+    wait_ready(page, 0)
+    sent: list[str] = []
+    page.on("request", lambda request: sent.append(request.post_data or "") if request.method == "POST" else None)
+    page.context.set_offline(True)
+    page.keyboard.press("ArrowRight")
+    expect(page.get_by_role("status")).to_contain_text("Not saved yet. Trying again")
+    expect(page.locator("[data-count]")).to_have_text("0 of 10")
+    page.keyboard.press("ArrowLeft")  # changes nothing: the answer was given
+    page.context.set_offline(False)
+    wait_ready(page, 1)
+    assert invited.responses() == ["right"]
+    assert len(set(sent)) == 1
+    assert page.evaluate("Object.keys(localStorage).length") == 0
+
+
+def test_a_lost_response_does_not_double_the_answer(invited: Invited, new_page: NewPage) -> None:
+    page = new_page()
+    lost: list[int] = []
+
+    def lose_the_first(route: Route) -> None:
+        if lost:
+            route.continue_()
+        else:
+            lost.append(route.fetch().status)  # it reached the server
+            route.abort()
+
+    page.route("**/label", lose_the_first)
+    page.goto(invited.link)
+    wait_ready(page, 0)
+    page.keyboard.press("ArrowLeft")
+    wait_ready(page, 1)
+    assert lost == [200]
+    assert [event.response for event in invited.events()] == ["left"]
+
+
+def test_an_answer_that_was_not_saved_survives_closing_the_page(invited: Invited, new_page: NewPage) -> None:
+    page = new_page()
+    page.goto(invited.link)
+    wait_ready(page, 0)
+    page.route("**/label", lambda route: route.abort())
+    page.keyboard.press("ArrowDown")
+    expect(page.get_by_role("status")).to_contain_text("Not saved yet")
+    again = page.context.new_page()
+    page.close()
+    again.goto(invited.link)
+    wait_ready(again, 1)
+    assert invited.responses() == ["equal"]
+
+
+def test_the_back_button_neither_loses_nor_doubles(invited: Invited, new_page: NewPage) -> None:
+    page = new_page()
+    page.goto(f"{invited.address}/login")
+    page.goto(invited.link)
+    wait_ready(page, 0)
+    page.keyboard.press("ArrowLeft")
+    wait_ready(page, 1)
+    page.go_back()
+    page.go_forward()
+    wait_ready(page, 1)
+    page.reload()
+    wait_ready(page, 1)
+    page.keyboard.press("ArrowRight")
+    wait_ready(page, 2)
+    assert invited.responses() == ["left", "right"]
+
+
+def test_clips_that_cannot_be_loaded_can_be_loaded_again_and_are_counted(invited: Invited, new_page: NewPage) -> None:
+    page = new_page()
+    page.route("**/media/*.mp4", lambda route: route.abort())
+    page.goto(invited.link)
+    expect(page.get_by_text("These clips could not be loaded.")).to_be_visible()
+    page.keyboard.press("ArrowLeft")  # nobody can prefer what they have not seen
+    assert invited.responses() == []
+    page.unroute("**/media/*.mp4")
+    page.get_by_role("button", name="Load them again").click()
+    wait_ready(page, 0)
+    page.keyboard.press("ArrowLeft")
+    wait_ready(page, 1)
+    assert invited.events()[0].play_error_count == 1
+
+
+def test_clips_that_never_load_can_be_passed_over(invited: Invited, new_page: NewPage) -> None:
+    page = new_page()
+    page.route("**/media/*.mp4", lambda route: route.abort())
+    page.goto(invited.link)
+    expect(page.get_by_text("These clips could not be loaded.")).to_be_visible()
+    page.keyboard.press("s")
+    expect(page.locator("[data-count]")).to_have_text("1 of 10")
+    assert invited.responses() == ["skip"]
+    assert invited.events()[0].response_time_ms is None
+
+
+def test_whoever_prefers_stillness_plays_on_demand(invited: Invited, new_page: NewPage) -> None:
+    page = new_page(reduced_motion="reduce")
+    page.goto(invited.link)
+    play = page.get_by_role("button", name="Play both")
+    expect(play).to_be_visible()
+    assert page.eval_on_selector_all("video", "videos => videos.every(video => video.paused)")
+    page.keyboard.press("ArrowLeft")
+    assert invited.responses() == []
+    play.click()
+    wait_ready(page, 0)
+    expect(page.get_by_role("button", name="Play again")).to_be_visible(timeout=10_000)
+    page.keyboard.press("ArrowLeft")
+    expect(page.locator("[data-count]")).to_have_text("1 of 10")
+
+
+def test_everything_works_without_script(invited: Invited, new_page: NewPage) -> None:
+    page = new_page(java_script_enabled=False)
+    page.goto(invited.link)
+    page.get_by_role("button", name="Left").click()
+    page.get_by_role("button", name="Right").click()
+    page.get_by_role("button", name="Undo").click()
+    page.get_by_role("button", name="Can\u2019t tell").click()
+    assert invited.responses() == ["left", "skip"]
+
+
+@pytest.mark.parametrize(
+    ("width", "height"), [(1366, 768), (1366, 650), (390, 844), (390, 664), (360, 640), (844, 390)]
+)
+def test_nothing_scrolls_and_everything_is_in_reach(
+    invited: Invited, new_page: NewPage, width: int, height: int
+) -> None:
+    page = new_page(viewport={"width": width, "height": height}, has_touch=width < 900, is_mobile=width < 900)
+    page.goto(invited.link)
+    wait_ready(page, 0)
+    overflow = page.evaluate(
+        "[document.documentElement.scrollWidth - innerWidth, document.documentElement.scrollHeight - innerHeight]"
+    )
+    assert overflow == [0, 0]
+    for box in [each.bounding_box() for each in page.locator("video, button:visible").all()]:
+        assert box is not None
+        assert box["x"] >= 0
+        assert box["y"] >= 0
+        assert box["x"] + box["width"] <= width
+        assert box["y"] + box["height"] <= height
+    for button in page.locator(".answer").all():
+        size = button.bounding_box()
+        assert size is not None
+        assert size["height"] >= 44
+    clips = [each.bounding_box() for each in page.locator("video").all()]
+    assert all(clip is not None and clip["width"] >= 150 for clip in clips)
+
+
+def test_a_phone_answers_by_touch_and_names_the_clips_by_where_they_are(invited: Invited, new_page: NewPage) -> None:
+    page = new_page(viewport={"width": 390, "height": 844}, has_touch=True, is_mobile=True)
+    page.goto(invited.link)
+    wait_ready(page, 0)
+    page.get_by_role("button", name="Top").tap()
+    wait_ready(page, 1)
+    page.get_by_role("button", name="Bottom").tap()
+    wait_ready(page, 2)
+    assert invited.responses() == ["left", "right"]
+
+
+def test_waiting_goes_on_by_itself_when_a_pair_is_ready(
+    invited: Invited, new_page: NewPage, store: ArtefactStore
+) -> None:
+    with invited.database.writing() as session:
+        participant, token = factories.make_participant(session, invited.study)
+    page = new_page()
+    page.goto(f"{invited.address}/p/{token}")
+    expect(page.get_by_role("heading", name="being prepared")).to_be_visible()
+    assert serious_findings(page) == []
+    with invited.database.writing() as session:
+        factories.make_queries(session, store, participant, 2)
+    wait_ready(page, 0)
