@@ -1,30 +1,54 @@
-"""Tools of the worker: training the reference policy, exploring the modes, rehearsing a study."""
+"""What the worker can be told to do: serve, train the reference policy, explore the modes, rehearse a study."""
 
 import argparse
 import json
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TypeAlias
 
 from app.db import Database
 from app.domain.studies import Method, RewardKind, Strategy, StudySettings
+from app.settings import Settings
 from app.storage import ArtefactStore
-from worker import exploration, laboratory, rehearsal
+from worker import exploration, laboratory, pretraining, rehearsal, service
 from worker.ml.teachers import Manner, User
 
 
-def add_to(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Register every tool."""
-    pretrain = commands.add_parser("pretrain", help=laboratory.pretrain.__doc__)
+def run(arguments: Sequence[str] | None) -> int:
+    """Parse the command line and do what it says; returns the exit code."""
+    parser = argparse.ArgumentParser(prog="python -m worker", description="The worker of PbARL Studio and its tools.")
+    commands = parser.add_subparsers(dest="command", required=True)
+    _add_service(commands)
+    _add_training(commands)
+    _add_rehearsal(commands)
+    options = parser.parse_args(arguments)
+    result: int = options.act(options)
+    return result
+
+
+_Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
+
+
+def _add_service(commands: _Commands) -> None:
+    serve = commands.add_parser("run", help=service.run.__doc__)
+    serve.set_defaults(act=lambda _options: service.run(Settings()))
+
+
+def _add_training(commands: _Commands) -> None:
+    pretrain = commands.add_parser("pretrain", help=pretraining.pretrain.__doc__)
     pretrain.add_argument("--seed", type=int, default=0)
     pretrain.add_argument("--directory", type=Path, default=laboratory.CHECKPOINTS, help="where the policy goes")
-    pretrain.set_defaults(act=lambda options: laboratory.pretrain(options.seed, options.directory))
+    pretrain.set_defaults(act=lambda options: pretraining.pretrain(options.seed, options.directory))
 
     explore = commands.add_parser("explore", help=exploration.explore.__doc__)
     explore.add_argument("--work-directory", type=Path, default=Path("data/explore"), help="finished blocks")
     explore.add_argument("--processes", type=int, default=2)
     explore.set_defaults(act=_explore)
 
+
+def _add_rehearsal(commands: _Commands) -> None:
     rehearse = commands.add_parser("rehearse", help=_rehearse.__doc__)
     rehearse.add_argument("--users", nargs="+", type=User, choices=list(User), default=list(User))
     rehearse.add_argument("--labels", type=int, default=200, help="labels per participant")

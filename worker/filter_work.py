@@ -3,7 +3,7 @@
 from app.domain.models import ModelKind
 from app.domain.studies import Method, Participant, RewardKind, Study, StudySettings
 from app.errors import AppError
-from worker import dataset, laboratory, personalisation, records
+from worker import dataset, lessons, personalisation, records
 from worker.compute import Lane
 from worker.ml.bundle import Provenance
 from worker.ml.studio_filter import FilterDraft
@@ -48,7 +48,7 @@ def _choose_reward(place: Workplace, run_id: int, task: Task) -> str:
     stored, _ = place.compute.run(
         Lane.LEARNING,
         place.beat(run_id),
-        laboratory.fit_reward,
+        lessons.fit_reward,
         RewardKind.MLP.value,
         preferences.pairs,
         preferences.targets,

@@ -1,7 +1,8 @@
 """Where simulation meets learning: what the compute processes do, with no database in sight.
 
 Every function takes and returns plain arrays and bytes, so that it can run in another process, in a command, or in a
-notebook. Environments and renderers are kept from call to call: building them costs more than using them.
+notebook. Environments and renderers are kept from call to call: building them costs more than using them. Nothing here
+loads torch, so that the processes that film start quickly and stay small.
 """
 
 import io
@@ -13,13 +14,8 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from tqdm import tqdm
 
-from worker.ml import reward_training, sac
 from worker.ml.policies import GaussianPolicy
-from worker.ml.reward_models import RewardModel, load_reward_model
-from worker.ml.segments import SegmentPairs
-from worker.ml.studio_filter import Act, noisy
 from worker.modes import FEEDING_AXES, perceived, sample_modes, speed_factor
 from worker.sim.feeding import FeedingEnv
 from worker.sim.render import ClipRenderer, RenderedClip
@@ -107,49 +103,3 @@ def reference_rollouts(first: int = REFERENCE_SCENARIOS, count: int = REFERENCE_
     """Rollouts of the frozen policy's mean action in consecutive scenarios."""
     policy = reference_policy()
     return tuple(rollout(environment(), policy.mean, scenario) for scenario in range(first, first + count))
-
-
-def run_scenarios(act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
-    """One rollout per scenario, with Gaussian noise of this deviation on every action."""
-    return [
-        rollout(environment(), noisy(act, noise, seed, scenario), scenario, reference_policy().mean)
-        for scenario in scenarios
-    ]
-
-
-def fit_reward(
-    kind: str, pairs: SegmentPairs, targets: Array, pool: SegmentPairs, seed: int
-) -> tuple[bytes, dict[str, Any]]:
-    """The stored reward model and its metrics. ``pool``: pairs like those that are asked, for the scale of signals."""
-    spread = reward_training.signal_spread(pool)
-    named: reward_training.Kind = "mlp" if kind == "mlp" else "structured"
-    fitted = reward_training.fit(pairs, targets, named, seed, spread=spread, reference=reference_rollouts())
-    return fitted.model.to_bytes(), fitted.metrics
-
-
-def probability_right(stored_model: bytes, pairs: SegmentPairs) -> list[float]:
-    """P(right preferred) of each pair, the mean over the ensemble."""
-    return [float(value) for value in _model(stored_model).probability_right(pairs)]
-
-
-def member_probabilities(stored_model: bytes, pairs: SegmentPairs) -> npt.NDArray[np.float64]:
-    """P(right preferred) of each pair under every member, (E, N)."""
-    return _model(stored_model).member_probabilities(pairs)
-
-
-@lru_cache(maxsize=16)
-def _model(stored: bytes) -> RewardModel:
-    return load_reward_model(stored)
-
-
-def pretrain(seed: int, directory: Path) -> int:
-    """Train the reference policy for Feeding by SAC, or resume a training that was interrupted (about ten minutes)."""
-    config = sac.SacConfig(seed=seed)
-    with tqdm(total=config.total_steps, unit="step", smoothing=0.05) as bar:
-
-        def progress(steps: int, figures: dict[str, Any]) -> None:
-            bar.update(steps - bar.n)
-            bar.set_postfix({name: f"{value:.3g}" for name, value in figures.items()})
-
-        sac.pretrain(FeedingEnv, config, directory, progress, f"python -m worker pretrain --seed {seed}")
-    return 0

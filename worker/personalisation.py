@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from app.domain.studies import StudySettings
-from worker import laboratory
+from worker import laboratory, lessons
 from worker.analysis.evaluation import evaluate
 from worker.compute import Compute, Lane
 from worker.exploration import SURFACE
@@ -124,7 +124,7 @@ class Fitting:
         """One rollout per scenario, in order; the same whatever the number of processes."""
         chunks = [list(scenarios[first : first + CHUNK]) for first in range(0, len(scenarios), CHUNK)]
         arguments = [(act, chunk, noise, seed) for chunk in chunks]
-        parts = self.compute.run_all(Lane.LEARNING, self.beat, laboratory.run_scenarios, arguments)
+        parts = self.compute.run_all(Lane.LEARNING, self.beat, lessons.run_scenarios, arguments)
         return [trajectory for part in parts for trajectory in part]
 
     def _gate_reference(self) -> Sequence[Trajectory]:

@@ -8,7 +8,7 @@ from app.domain.clips import Clip
 from app.domain.models import ModelKind
 from app.domain.preferences import Query
 from app.domain.studies import Participant, Strategy, Study
-from worker import dataset, laboratory, records
+from worker import dataset, lessons, records
 from worker.ml import acquisition
 from worker.workplace import Workplace
 
@@ -57,7 +57,7 @@ def predict_waiting(place: Workplace, participant_id: int) -> None:
             return
         pairs = dataset.segment_pairs(place.store, [(query.left_clip, query.right_clip) for query in queries])
         ids = [query.id for query in queries]
-    probabilities = laboratory.probability_right(place.store.read(model.artefact_sha256), pairs)
+    probabilities = lessons.probability_right(place.store.read(model.artefact_sha256), pairs)
     with place.database.writing() as session:
         records.save_predictions(session, model.id, dict(zip(ids, probabilities, strict=True)))
 
@@ -70,7 +70,7 @@ def _scores(
     if strategy is Strategy.UNIFORM or model is None:
         return None
     segments = dataset.segment_pairs(place.store, pairs)
-    members = laboratory.member_probabilities(place.store.read(model.artefact_sha256), segments)
+    members = lessons.member_probabilities(place.store.read(model.artefact_sha256), segments)
     return acquisition.disagreement(members)
 
 

@@ -2,7 +2,7 @@
 
 from app.domain.models import ModelKind
 from app.domain.studies import Participant, Strategy, Study
-from worker import dataset, laboratory, querying, records
+from worker import dataset, lessons, querying, records
 from worker.compute import Lane
 from worker.records import Task
 from worker.workplace import Step, Workplace
@@ -29,7 +29,7 @@ def _fit(place: Workplace, run_id: int, participant_id: int) -> None:
     stored, metrics = place.compute.run(
         Lane.LEARNING,
         place.beat(run_id),
-        laboratory.fit_reward,
+        lessons.fit_reward,
         kind.value,
         preferences.pairs,
         preferences.targets,

@@ -1,0 +1,34 @@
+"""What the filming processes do, and what they must not load to do it."""
+
+import io
+import subprocess
+import sys
+
+import numpy as np
+
+from worker import laboratory
+from worker.trajectory import Trajectory
+
+
+def test_filming_loads_neither_torch_nor_the_engine_nor_the_database() -> None:
+    heavy = "{'torch', 'dbos', 'sqlalchemy', 'onnxruntime'}"
+    program = f"import sys, worker.__main__, worker.laboratory; sys.exit(str({heavy} & sys.modules.keys() or ''))"
+    ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert ran.stderr.strip() == ""
+
+
+def test_a_recorded_clip_shows_the_scenario_and_mode_it_was_asked_for() -> None:
+    mode = laboratory.behaviours(10_000_001, 2)[1]
+    recorded = laboratory.record_clip(10_000_001, mode.tolist(), 0, 20)
+    trajectory = Trajectory.load(io.BytesIO(recorded.trajectory))
+    assert trajectory.scenario == 10_000_001
+    assert recorded.success == trajectory.success
+    assert recorded.clip.n_frames == 30
+    act = laboratory.act_in_mode(mode)
+    np.testing.assert_allclose(trajectory.actions[0], act(trajectory.observations[0]), atol=1e-6)
+
+
+def test_the_reference_rollouts_are_the_frozen_policys_own() -> None:
+    (rollout,) = laboratory.reference_rollouts(10_000_002, 1)
+    expected = laboratory.reference_policy().mean(rollout.observations[:-1])
+    np.testing.assert_allclose(rollout.actions, expected, atol=1e-5)

@@ -1,0 +1,49 @@
+"""What the learning processes do: fit reward models, ask them, and drive filters through scenarios."""
+
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from worker.laboratory import environment, reference_policy, reference_rollouts
+from worker.ml import reward_training
+from worker.ml.reward_models import RewardModel, load_reward_model
+from worker.ml.segments import SegmentPairs
+from worker.ml.studio_filter import Act, noisy
+from worker.sim.rollout import rollout
+from worker.trajectory import Array, Trajectory
+
+
+def run_scenarios(act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
+    """One rollout per scenario, with Gaussian noise of this deviation on every action."""
+    return [
+        rollout(environment(), noisy(act, noise, seed, scenario), scenario, reference_policy().mean)
+        for scenario in scenarios
+    ]
+
+
+def fit_reward(
+    kind: str, pairs: SegmentPairs, targets: Array, pool: SegmentPairs, seed: int
+) -> tuple[bytes, dict[str, Any]]:
+    """The stored reward model and its metrics. ``pool``: pairs like those that are asked, for the scale of signals."""
+    spread = reward_training.signal_spread(pool)
+    named: reward_training.Kind = "mlp" if kind == "mlp" else "structured"
+    fitted = reward_training.fit(pairs, targets, named, seed, spread=spread, reference=reference_rollouts())
+    return fitted.model.to_bytes(), fitted.metrics
+
+
+def probability_right(stored_model: bytes, pairs: SegmentPairs) -> list[float]:
+    """P(right preferred) of each pair, the mean over the ensemble."""
+    return [float(value) for value in _model(stored_model).probability_right(pairs)]
+
+
+def member_probabilities(stored_model: bytes, pairs: SegmentPairs) -> npt.NDArray[np.float64]:
+    """P(right preferred) of each pair under every member, (E, N)."""
+    return _model(stored_model).member_probabilities(pairs)
+
+
+@lru_cache(maxsize=16)
+def _model(stored: bytes) -> RewardModel:
+    return load_reward_model(stored)
