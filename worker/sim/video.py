@@ -6,9 +6,9 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import av
+import imageio.v3 as iio
 import numpy as np
 import numpy.typing as npt
-from PIL import Image
 
 Frame = npt.NDArray[np.uint8]
 
@@ -46,6 +46,5 @@ def _write(target: Path, frames: Iterable[Frame], width: int, height: int, fps: 
 
 def encode_poster(frame: Frame) -> bytes:
     """One RGB frame (height, width, 3) as JPEG."""
-    target = io.BytesIO()
-    Image.fromarray(frame).save(target, "JPEG", quality=84, optimize=True)
-    return target.getvalue()
+    poster: bytes = iio.imwrite("<bytes>", frame, extension=".jpg", quality=84, optimize=True)
+    return poster
