@@ -1,6 +1,5 @@
 """Frames to an MP4 that every browser plays: H.264, yuv420p, index before the pictures."""
 
-import io
 import tempfile
 from collections.abc import Iterable
 from pathlib import Path
