@@ -130,28 +130,42 @@ def test_from_the_link_to_the_tenth_answer_and_on_the_dashboard(
     assert serious_findings(dashboard) == []
 
 
-def test_both_clips_start_together_stay_within_a_frame_and_loop(invited: Invited, new_page: NewPage) -> None:
+def test_both_clips_start_together_and_loop_together(invited: Invited, new_page: NewPage) -> None:
     page = new_page()
     page.goto(invited.link)
     wait_ready(page, 0)
-    drifts = page.evaluate(
+    seen = page.evaluate(
         """async () => {
             const [left, right] = document.querySelectorAll('video');
-            const drifts = [], times = [];
-            right.currentTime = Math.max(0, right.currentTime - 0.2);  // as if it had stalled
-            const until = performance.now() + 4500;
-            while (performance.now() < until) {
+            const starts = [];
+            let before = 0;
+            while (starts.length < 2) {
                 await new Promise(requestAnimationFrame);
-                drifts.push(Math.abs(left.currentTime - right.currentTime));
-                times.push(left.currentTime);
+                if (left.currentTime < before - 0.5) starts.push(Math.abs(left.currentTime - right.currentTime));
+                before = left.currentTime;
             }
-            const rounds = times.filter((time, i) => i && time < times[i - 1] - 0.5).length;
-            return { settled: drifts.slice(Math.floor(drifts.length * 0.6)), rounds };
+            return starts;
         }"""
     )
-    assert drifts["rounds"] >= 1
-    within = sorted(drifts["settled"])[int(len(drifts["settled"]) * 0.95)]
-    assert within <= 1 / factories.FPS
+    assert max(seen) <= 1 / factories.FPS
+
+
+def test_a_clip_that_plays_too_slowly_catches_up_within_the_round(invited: Invited, new_page: NewPage) -> None:
+    page = new_page()
+    page.goto(invited.link)
+    wait_ready(page, 0)
+    drift = page.evaluate(
+        """async () => {
+            const [left, right] = document.querySelectorAll('video');
+            const until = async (holds) => { while (!holds()) await new Promise(requestAnimationFrame); };
+            await until(() => left.currentTime > 1);
+            await until(() => left.currentTime < 0.3 && !left.paused);
+            right.playbackRate = 0.85;  // a decoder that cannot keep up; 0.18 s at the end of the round
+            await until(() => left.currentTime > 1.5);
+            return Math.abs(left.currentTime - right.currentTime);
+        }"""
+    )
+    assert drift <= 1 / factories.FPS
 
 
 def test_the_next_pair_is_already_loaded(invited: Invited, new_page: NewPage) -> None:
@@ -172,10 +186,11 @@ def test_a_held_key_and_a_double_press_answer_one_pair(invited: Invited, new_pag
     page = new_page()
     page.goto(invited.link)
     wait_ready(page, 0)
-    for _ in range(10):  # playwright sends repeats for a key that is already down
-        page.keyboard.down("ArrowLeft")
-    page.keyboard.up("ArrowLeft")
+    page.keyboard.down("ArrowLeft")
     wait_ready(page, 1)
+    for _ in range(5):
+        page.keyboard.down("ArrowLeft")  # a key that is already down repeats
+    page.keyboard.up("ArrowLeft")
     page.keyboard.press("ArrowRight")
     page.keyboard.press("ArrowRight")
     wait_ready(page, 2)
