@@ -52,8 +52,8 @@ browser: ## Chromium for the browser tests (Debian package)
 	  echo "The browser tests need Chromium: install your system's package 'chromium'."; exit 1; }
 
 benchmark: $(VENV)/dev.stamp ## Print speed and quality figures (minutes; see tests/benchmarks)
-	@$(PY) tests/benchmarks/sim_speed.py
-	@$(PY) tests/benchmarks/render_speed.py
+	@OMP_NUM_THREADS=1 $(PY) -m tests.benchmarks.sim_speed
+	@OMP_NUM_THREADS=1 $(PY) -m tests.benchmarks.render_speed
 
 clean: ## Remove the virtual environment and caches; the data directory stays
 	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .import_linter_cache
