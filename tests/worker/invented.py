@@ -25,11 +25,11 @@ def small_policy(seed: int = 0, hidden: int = 16) -> GaussianPolicy:
 
 
 def observations(count: int, rng: np.random.Generator) -> npt.NDArray[np.float32]:
-    """(count, D) with unit vectors where unit vectors belong."""
+    """(count, D) with unit vectors where unit vectors belong, and the spoon almost level."""
     seen = rng.uniform(-0.3, 0.3, (count, D))
     for name in ("spoon_forward", "spoon_up", "face_direction"):
         place = FEEDING_OBSERVATION.slice_of(name)
-        vector = rng.standard_normal((count, 3))
+        vector = rng.standard_normal((count, 3)) + ((0.0, 0.0, 12.0) if name == "spoon_up" else (0.0, 0.0, 0.0))
         seen[:, place] = vector / np.linalg.norm(vector, axis=1, keepdims=True)
     return seen.astype(np.float32)
 
@@ -72,4 +72,5 @@ def pairs(count: int, rng: np.random.Generator, steps: int = 20) -> SegmentPairs
 
 def answers_of(values: SegmentPairs, weights: Sequence[float] | npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
     """Targets of somebody whose reward is linear in the signals and who never errs."""
-    return (values.signal_differences() @ np.asarray(weights) > 0).astype(np.float64)
+    likes_right: npt.NDArray[np.bool_] = values.signal_differences() @ np.asarray(weights) > 0
+    return likes_right.astype(np.float64)

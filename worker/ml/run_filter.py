@@ -174,7 +174,8 @@ def unusual(space: dict[str, Any], observations: Any) -> list[str]:
         values = observations[:, field["first"] : field["first"] + field["size"]]
         rows = int(((values < field["low"]) | (values > field["high"])).any(axis=1).sum())
         if rows:
-            span = f"[{field['low']:g}, {field['high']:g}] {field['unit']}"
+            unit = "" if field["unit"] == "1" else " " + field["unit"]
+            span = f"[{field['low']:g}, {field['high']:g}]{unit}"
             lines.append(f"{field['name']} is outside {span} in {rows} of {len(values)} rows.")
     return lines
 

@@ -1,0 +1,244 @@
+"""The published bundle: complete, deterministic, verifiable, and able to run itself."""
+
+import io
+import json
+import shutil
+import subprocess
+import sys
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.worker import invented
+from worker.analysis.evaluation import evaluate
+from worker.ml import bundle
+from worker.ml.action_filter import FilterWeights, build
+from worker.ml.bundle import BundleContents, BundleDamaged, Provenance, Recording
+from worker.ml.onnx_export import to_onnx
+from worker.ml.reward_models import StructuredReward, load_reward_model
+from worker.spaces import FEEDING_OBSERVATION
+from worker.trajectory import SIGNALS
+
+POLICY = invented.small_policy()
+
+
+@pytest.fixture(scope="module")
+def contents() -> BundleContents:
+    """A small filter with everything that belongs to it."""
+    rng = np.random.default_rng(0)
+    weights = FilterWeights(mode=(-0.5, 0.2, 0.6, -0.4, 0.8), gate=0.7)
+    episodes = [invented.trajectory(np.random.default_rng(each), scenario=each) for each in range(4)]
+    episodes = [replace(each, reference_actions=POLICY.mean(each.observations[:-1])) for each in episodes]
+    recording = Recording.of(episodes[:2])
+    return BundleContents(
+        filter_onnx=to_onnx(build(POLICY, weights), recording.observations, recording.policy_means),
+        weights=weights,
+        reward=StructuredReward(rng.standard_normal((8, len(SIGNALS)))),
+        policy=POLICY,
+        recording=recording,
+        metrics={"evaluation": evaluate(episodes, episodes, np.arange(4), np.arange(4) + 1.0), "notes": ["A note."]},
+        provenance=Provenance("demo", "P07", 3, 200, "ab" * 32, 11, "2026-01-02T03:04:05Z"),
+    )
+
+
+@pytest.fixture(scope="module")
+def written(contents: BundleContents) -> bytes:
+    return bundle.write(contents)
+
+
+@pytest.fixture
+def unzipped(written: bytes, tmp_path: Path) -> Path:
+    """A clean directory with nothing but the bundle in it."""
+    with zipfile.ZipFile(io.BytesIO(written)) as archive:
+        archive.extractall(tmp_path)
+    return tmp_path
+
+
+def run(directory: Path, *arguments: str | Path) -> "subprocess.CompletedProcess[str]":
+    """As somebody without this project would."""
+    command = [sys.executable, "-I", "run_filter.py", *map(str, arguments)]
+    return subprocess.run(command, cwd=directory, capture_output=True, text=True, check=False, timeout=120)
+
+
+def test_the_same_contents_give_the_same_bytes(contents: BundleContents, written: bytes) -> None:
+    assert bundle.write(contents) == written
+
+
+def test_everything_promised_is_inside_and_nothing_else(written: bytes) -> None:
+    with zipfile.ZipFile(io.BytesIO(written)) as archive:
+        assert archive.namelist() == sorted(
+            [
+                "MODEL_CARD.md",
+                "action_encoder.safetensors",
+                "filter.onnx",
+                "manifest.json",
+                "recorded/actions.npy",
+                "recorded/observations.npy",
+                "recorded/policy_means.npy",
+                "reward_model.safetensors",
+                "run_filter.py",
+            ]
+        )
+
+
+def test_an_undamaged_bundle_gives_its_manifest(written: bytes) -> None:
+    manifest = bundle.verify(written)
+    assert manifest["labels"] == {"count": 200, "sha256": "ab" * 32}
+    assert [field["name"] for field in manifest["observation"]["fields"]] == [
+        field.name for field in FEEDING_OBSERVATION.fields
+    ]
+    assert manifest["onnx"]["inputs"][0] == {"name": "observation", "type": "float32", "shape": ["batch", 28]}
+    assert manifest["control_rate_hz"] == 10
+    assert {"python", "torch", "onnx", "pbarl-studio"} <= set(manifest["versions"])
+    assert set(manifest["files"]) | {"manifest.json"} == set(_names(written))
+
+
+def test_the_stored_parts_can_be_read_again(contents: BundleContents, unzipped: Path) -> None:
+    reward = load_reward_model((unzipped / "reward_model.safetensors").read_bytes())
+    assert reward.normalisation == contents.reward.normalisation
+    assert FilterWeights.from_bytes((unzipped / "action_encoder.safetensors").read_bytes()).gate == 0.7
+
+
+def test_nothing_in_the_bundle_is_pickled(unzipped: Path) -> None:
+    for path in (unzipped / "recorded").iterdir():
+        assert np.load(path, allow_pickle=False).dtype == np.float32
+
+
+@pytest.mark.parametrize("name", ["filter.onnx", "MODEL_CARD.md", "recorded/actions.npy"])
+def test_a_changed_file_is_found(written: bytes, name: str) -> None:
+    with pytest.raises(BundleDamaged, match=name):
+        bundle.verify(_rewritten(written, {name: b"something else"}))
+
+
+def test_a_missing_or_added_file_is_found(written: bytes) -> None:
+    with pytest.raises(BundleDamaged, match=r"run_filter\.py"):
+        bundle.verify(_rewritten(written, {"run_filter.py": None}))
+    with pytest.raises(BundleDamaged, match="surprise"):
+        bundle.verify(_rewritten(written, {"surprise.txt": b"hello"}))
+    with pytest.raises(BundleDamaged):
+        bundle.verify(written[:-100])
+
+
+def test_the_card_states_numbers_with_intervals_limits_and_use(unzipped: Path) -> None:
+    card = (unzipped / "MODEL_CARD.md").read_text()
+    for expected in (
+        "P07, version 3",
+        "200 comparisons",
+        "On 4 unseen scenarios",
+        "Success: 100.0%",
+        "C_fdv",
+        "A note.",
+    ):
+        assert expected in card
+    for expected in ("python run_filter.py", "## Limits", "largest force on the person", "speed_near", "Gate 70%"):
+        assert expected in card
+
+
+def test_the_bundle_runs_on_its_own_and_confirms_itself(unzipped: Path) -> None:
+    finished = run(unzipped)
+    assert finished.returncode == 0, finished.stderr
+    assert "9 files" not in finished.stdout
+    assert "8 files match" in finished.stdout
+    assert "OK: the filter reproduces its recorded actions" in finished.stdout
+
+
+def test_the_script_needs_only_numpy_and_onnxruntime() -> None:
+    code = (
+        "import sys, runpy; sys.argv=['run_filter.py', '--help']\n"
+        "try: runpy.run_path('worker/ml/run_filter.py', run_name='__main__')\n"
+        "except SystemExit: pass\n"
+        "print([name for name in ('torch', 'safetensors', 'onnx', 'worker', 'app') if name in sys.modules])"
+    )
+    root = Path(bundle.__file__).parents[2]
+    finished = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=True)
+    assert finished.stdout.strip().endswith("[]")
+
+
+def test_a_damaged_file_is_noticed_before_anything_runs(unzipped: Path) -> None:
+    (unzipped / "filter.onnx").write_bytes(b"not an onnx file")
+    finished = run(unzipped)
+    assert finished.returncode == 1
+    assert "filter.onnx is not the file that was exported" in finished.stderr
+
+
+def test_other_actions_than_recorded_are_a_failure(written: bytes, tmp_path: Path) -> None:
+    target = io.BytesIO()
+    np.save(target, np.zeros((40, 7), np.float32), allow_pickle=False)
+    with zipfile.ZipFile(
+        io.BytesIO(_rewritten(written, {"recorded/actions.npy": target.getvalue()}, relist=True))
+    ) as new:
+        new.extractall(tmp_path)
+    finished = run(tmp_path)
+    assert finished.returncode == 1
+    assert "differ from the recorded ones" in finished.stderr
+
+
+def test_somebody_s_own_recording_is_filtered(unzipped: Path, contents: BundleContents) -> None:
+    np.save(unzipped / "o.npy", contents.recording.observations[:5].astype(np.float64))
+    np.save(unzipped / "m.npy", contents.recording.policy_means[:5])
+    finished = run(unzipped, "--observations", "o.npy", "--policy-means", "m.npy", "--output", "a.npy")
+    assert finished.returncode == 0, finished.stderr
+    recorded = np.load(unzipped / "recorded/actions.npy")[:5]
+    np.testing.assert_allclose(np.load(unzipped / "a.npy"), recorded, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        (lambda o: o[:, :20], "expected (N, 28)"),
+        (lambda o: o[0], "expected (N, 28)"),
+        (lambda o: np.where(np.arange(len(o))[:, None] == 2, np.nan, o), "NaN or an infinity, first in row 2"),
+        (lambda o: o[:3], "rows"),
+        (lambda o: o.astype(str), "numbers"),
+        (lambda o: None, "There is no file"),
+    ],
+)
+def test_input_that_cannot_be_filtered_is_explained(
+    change: "object", complaint: str, unzipped: Path, contents: BundleContents
+) -> None:
+    changed = change(contents.recording.observations[:5])  # type: ignore[operator]
+    if changed is not None:
+        np.save(unzipped / "o.npy", changed)
+    np.save(unzipped / "m.npy", contents.recording.policy_means[:5])
+    finished = run(unzipped, "--observations", "o.npy", "--policy-means", "m.npy", "--output", "a.npy")
+    assert finished.returncode == 1
+    assert complaint in finished.stderr
+    assert "Traceback" not in finished.stderr
+
+
+def test_values_outside_the_trained_range_are_mentioned(unzipped: Path, contents: BundleContents) -> None:
+    seen = np.abs(contents.recording.observations[:5])
+    seen[1, FEEDING_OBSERVATION.slice_of("force_on_person_n")] = 90.0
+    np.save(unzipped / "o.npy", seen)
+    np.save(unzipped / "m.npy", contents.recording.policy_means[:5])
+    finished = run(unzipped, "--observations", "o.npy", "--policy-means", "m.npy", "--output", "a.npy")
+    assert "force_on_person_n is outside [0, 50] N in 1 of 5 rows" in finished.stdout
+
+
+def test_half_a_command_and_half_a_bundle_are_explained(unzipped: Path) -> None:
+    assert "belong together" in run(unzipped, "--observations", "o.npy").stderr
+    shutil.rmtree(unzipped / "recorded")
+    assert "recorded/actions.npy is missing" in run(unzipped).stderr
+    (unzipped / "manifest.json").unlink()
+    assert "no manifest.json" in run(unzipped).stderr
+
+
+def _names(written: bytes) -> list[str]:
+    with zipfile.ZipFile(io.BytesIO(written)) as archive:
+        return archive.namelist()
+
+
+def _rewritten(written: bytes, changes: dict[str, bytes | None], *, relist: bool = False) -> bytes:
+    """The bundle with files replaced, added or (None) removed; ``relist`` also changes the manifest to match."""
+    with zipfile.ZipFile(io.BytesIO(written)) as archive:
+        files: dict[str, bytes | None] = {name: archive.read(name) for name in archive.namelist()}
+    files.update(changes)
+    if relist:
+        manifest = json.loads(files["manifest.json"] or b"")
+        for name, stored in changes.items():
+            manifest["files"][name] = {"bytes": len(stored or b""), "sha256": bundle._sha256(stored or b"")}
+        files["manifest.json"] = json.dumps(manifest).encode()
+    return bundle._zipped({name: stored for name, stored in files.items() if stored is not None})

@@ -1,0 +1,128 @@
+"""The action filter: identity where it must be, the same in NumPy, torch and ONNX, and learned within bounds."""
+
+import pickle
+
+import numpy as np
+import pytest
+import torch
+
+from tests.worker import invented
+from worker.ml.action_filter import FilterWeights, build, state_of
+from worker.ml.adapter import REACH, ResidualAdapter
+from worker.ml.onnx_export import ExportDiffers, OnnxFilter, largest_difference, to_onnx
+from worker.ml.policy_module import FrozenPolicy
+from worker.modes import perceived, sample_modes, speed_factor
+
+POLICY = invented.small_policy()
+SEEN = invented.observations(40, np.random.default_rng(0))
+MEANS = POLICY.mean(SEEN)
+MODE = (-0.5, 0.2, 0.6, -0.4, 0.8)
+
+
+def adapter_state(seed: int = 0, *, untrained: bool = False) -> dict[str, np.ndarray]:
+    """A residual adapter, its last layer random unless untrained."""
+    torch.manual_seed(seed)
+    adapter = ResidualAdapter(torch.from_numpy(POLICY.offset), torch.from_numpy(POLICY.scale))
+    if not untrained:
+        torch.nn.init.normal_(next(adapter.decoder[-1].parameters()))
+    return state_of(adapter)
+
+
+def filtered(weights: FilterWeights, means: np.ndarray = MEANS) -> np.ndarray:
+    """What the torch module says."""
+    with torch.no_grad():
+        actions: np.ndarray = build(POLICY, weights)(torch.from_numpy(SEEN), torch.from_numpy(means)).numpy()
+    return actions
+
+
+def test_a_closed_gate_leaves_the_policy_untouched() -> None:
+    weights = FilterWeights(mode=MODE, gate=0.0, encoder=adapter_state())
+    np.testing.assert_array_equal(filtered(weights), MEANS)
+
+
+def test_the_gate_blends_between_policy_and_person() -> None:
+    open_gate, half = (filtered(FilterWeights(mode=MODE, gate=gate, encoder=adapter_state())) for gate in (1.0, 0.5))
+    np.testing.assert_allclose(half, 0.5 * (open_gate + MEANS), atol=1e-6)
+    assert np.abs(open_gate - MEANS).max() > 0.05
+
+
+def test_the_mode_zero_is_the_policy_itself() -> None:
+    np.testing.assert_allclose(filtered(FilterWeights()), MEANS, atol=1e-6)
+
+
+def test_an_untrained_adapter_changes_nothing() -> None:
+    alone = filtered(FilterWeights(mode=MODE))
+    with_adapter = filtered(FilterWeights(mode=MODE, encoder=adapter_state(untrained=True)))
+    np.testing.assert_array_equal(with_adapter, alone)
+
+
+def test_the_residual_share_scales_the_residual() -> None:
+    none, half, full = (
+        filtered(FilterWeights(mode=MODE, residual_share=share, encoder=adapter_state())) for share in (0.0, 0.5, 1.0)
+    )
+    np.testing.assert_allclose(half, 0.5 * (none + full), atol=1e-6)
+    assert np.abs(full - none).max() > 0.05
+
+
+def test_the_residual_stays_within_the_policy_s_own_uncertainty() -> None:
+    moved = filtered(FilterWeights(encoder=adapter_state()))
+    assert (np.abs(moved - MEANS) <= REACH * POLICY.action_std(SEEN) + 1e-5).all()
+
+
+def test_actions_stay_in_their_range_whatever_comes_in() -> None:
+    rude = np.full_like(MEANS, 3.0)
+    assert np.abs(filtered(FilterWeights(mode=MODE, gate=0.3, encoder=adapter_state()), rude)).max() <= 1.0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_modes_in_torch_and_in_the_simulator_are_the_same(seed: int) -> None:
+    mode = sample_modes(1, np.random.default_rng(seed))[0].astype(np.float32)
+    expected = np.clip(speed_factor(SEEN, mode) * POLICY.mean(perceived(SEEN, mode)), -1, 1)
+    np.testing.assert_allclose(filtered(FilterWeights(mode=tuple(mode.tolist()))), expected, atol=1e-5)
+
+
+@pytest.fixture(scope="module")
+def exported() -> bytes:
+    return to_onnx(build(POLICY, FilterWeights(mode=MODE, gate=0.7, encoder=adapter_state())), SEEN, MEANS)
+
+
+def test_the_exported_filter_computes_the_same(exported: bytes) -> None:
+    module = build(POLICY, FilterWeights(mode=MODE, gate=0.7, encoder=adapter_state()))
+    assert largest_difference(exported, module, SEEN, MEANS) <= 1e-5
+
+
+@pytest.mark.parametrize("batch", [1, 2, 33])
+def test_the_exported_filter_takes_any_batch(exported: bytes, batch: int) -> None:
+    actions = OnnxFilter(exported).batch(SEEN[:batch], MEANS[:batch])
+    np.testing.assert_allclose(actions, OnnxFilter(exported).batch(SEEN, MEANS)[:batch], atol=1e-6)
+    assert actions.dtype == np.float32
+
+
+def test_the_export_is_the_same_every_time(exported: bytes) -> None:
+    module = build(POLICY, FilterWeights(mode=MODE, gate=0.7, encoder=adapter_state()))
+    assert to_onnx(module, SEEN, MEANS) == exported
+
+
+def test_an_export_that_differs_is_not_published(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("worker.ml.onnx_export.LARGEST_DIFFERENCE", -1.0)
+    with pytest.raises(ExportDiffers, match="largest difference"):
+        to_onnx(build(POLICY, FilterWeights(mode=MODE)), SEEN, MEANS)
+
+
+def test_the_exported_filter_can_be_sent_to_another_process(exported: bytes) -> None:
+    copy = pickle.loads(pickle.dumps(OnnxFilter(exported)))  # noqa: S301
+    np.testing.assert_array_equal(copy(SEEN[0], MEANS[0]), OnnxFilter(exported)(SEEN[0], MEANS[0]))
+
+
+@pytest.mark.parametrize("encoder", [{}, adapter_state()])
+def test_weights_survive_storage(encoder: dict[str, np.ndarray]) -> None:
+    weights = FilterWeights(mode=MODE, gate=0.4, residual_share=0.5, encoder=encoder)
+    loaded = FilterWeights.from_bytes(weights.to_bytes())
+    assert loaded.named_mode() == pytest.approx(weights.named_mode())
+    np.testing.assert_array_equal(filtered(loaded), filtered(weights))
+
+
+def test_the_frozen_policy_stays_frozen_inside_the_filter() -> None:
+    module = build(POLICY, FilterWeights(mode=MODE, encoder=adapter_state()))
+    assert not any(parameter.requires_grad for parameter in module.parameters())
+    assert isinstance(module.transform.policy, FrozenPolicy)

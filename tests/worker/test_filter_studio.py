@@ -1,0 +1,176 @@
+"""The stages of the studio's filter on an invented world in which speed is the size of the actions."""
+
+import pickle
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from tests.worker import invented
+from worker.ml import response_surface, studio_filter
+from worker.ml.action_filter import FilterWeights
+from worker.ml.response_surface import ResponseSurface
+from worker.ml.reward_models import StructuredReward
+from worker.ml.studio_filter import FilterConfig, FilterDraft, FilterProblem, act_of, learn_round, noisy
+from worker.modes import sample_modes
+from worker.trajectory import SIGNALS, Trajectory
+
+POLICY = invented.small_policy()
+SPEED = SIGNALS.index("speed_m_s")
+STEPS = 15
+CONFIG = FilterConfig(
+    gate_scenarios=6, round_rollouts=(6,), round_noise=(0.3,), value_steps=150, adapter_steps=100, gates=(1.0, 0.4)
+)
+
+
+class World:
+    """Observations are noise; an episode fails when ``fails`` says so of its mean speed."""
+
+    def __init__(self, slowest: float = -np.inf) -> None:
+        self.slowest = slowest
+        self.asked: list[int] = []
+
+    def collect(self, act: studio_filter.Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
+        """See studio_filter.Collect."""
+        self.asked.append(len(scenarios))
+        return [self._episode(noisy(act, noise, seed, scenario), scenario) for scenario in scenarios]
+
+    def _episode(self, act: studio_filter.Act, scenario: int) -> Trajectory:
+        rng = np.random.default_rng(scenario)
+        seen = invented.observations(STEPS + 1, rng)
+        actions = np.clip([act(each) for each in seen[:-1]], -1, 1).astype(np.float32)
+        signals = np.zeros((STEPS, len(SIGNALS)), np.float32)
+        signals[:, SPEED] = (actions**2).mean(axis=1)
+        episode = invented.trajectory(rng, steps=STEPS, scenario=scenario, signals=signals, actions=actions)
+        return replace(episode, observations=seen, success=bool(signals[:, SPEED].mean() >= self.slowest))
+
+
+def reward(weight: float) -> StructuredReward:
+    """Somebody who likes (+) or dislikes (-) speed."""
+    weights = np.zeros((8, len(SIGNALS)))
+    weights[:, SPEED] = weight
+    return StructuredReward(weights)
+
+
+@pytest.fixture(scope="module")
+def reference() -> list[Trajectory]:
+    return World().collect(POLICY.mean, studio_filter.scenarios_for("gate", 6), 0.0, 0)
+
+
+@pytest.fixture(scope="module")
+def surface() -> ResponseSurface:
+    """Fitted to this world: what each mode does to the speed."""
+    modes = sample_modes(60, np.random.default_rng(0))
+    world, deltas = World(), []
+    plain = world.collect(POLICY.mean, [0], 0.0, 0)[0].signals.sum(axis=0)
+    for mode in modes:
+        act = _mode_act(mode)
+        deltas.append(world.collect(act, [0], 0.0, 0)[0].signals.sum(axis=0) - plain)
+    return response_surface.fit(modes, np.array(deltas), np.zeros(60))
+
+
+def _mode_act(mode: np.ndarray) -> studio_filter.Act:
+    from worker.modes import perceived, speed_factor
+
+    values = mode.astype(np.float32)
+
+    def act(observation: np.ndarray) -> np.ndarray:
+        action: np.ndarray = speed_factor(observation, values) * POLICY.mean(perceived(observation, values))
+        return action
+
+    return act
+
+
+def problem(weight: float, reference: list[Trajectory], **config: object) -> FilterProblem:
+    """Fit a filter for somebody."""
+    return FilterProblem(POLICY, reward(weight).normalised_over(reference), 0, replace(CONFIG, **config))  # type: ignore[arg-type]
+
+
+def speed_of(draft: FilterDraft) -> float:
+    """Mean speed of a finished filter."""
+    episodes = World().collect(act_of(POLICY, draft.weights), range(20), 0.0, 0)
+    return float(np.mean([each.signals[:, SPEED].mean() for each in episodes]))
+
+
+@pytest.mark.parametrize(("weight", "direction"), [(-1.0, -1), (1.0, 1)])
+def test_the_whole_fit_moves_the_robot_where_the_person_wants_it(
+    weight: float, direction: int, reference: list[Trajectory], surface: ResponseSurface
+) -> None:
+    torch.set_num_threads(1)
+    told: list[tuple[str, float]] = []
+    world = World()
+    draft = studio_filter.fit_studio(
+        problem(weight, reference),
+        surface,
+        [],
+        reference,
+        world.collect,
+        lambda stage, share: told.append((stage, share)),
+    )
+    plain = float(np.mean([each.signals[:, SPEED].mean() for each in World().collect(POLICY.mean, range(20), 0.0, 0)]))
+    assert direction * (speed_of(draft) - plain) > 0.1 * plain
+    assert draft.weights.gate == 1.0
+    shares = [share for _, share in told]
+    assert shares == sorted(shares)
+    assert set(draft.seconds) == {"mode", "gate_mode", "residual_rollouts", "residual_learning", "gate_residual"}
+    assert pickle.loads(pickle.dumps(draft)).weights.mode == draft.weights.mode  # noqa: S301
+
+
+def test_a_mode_that_fails_the_task_is_turned_off(reference: list[Trajectory], surface: ResponseSurface) -> None:
+    plain = min(each.signals[:, SPEED].mean() for each in reference)
+    draft = studio_filter.choose_mode(problem(-1.0, reference), surface, [])
+    gated = studio_filter.gate_mode(problem(-1.0, reference), draft, reference, World(slowest=0.99 * plain).collect)
+    assert gated.weights == FilterWeights()
+    assert [trial.gate for trial in gated.trials] == [1.0, 0.4]
+    assert "off" in gated.notes[0]
+
+
+def test_a_filter_that_presses_too_hard_is_turned_off(reference: list[Trajectory], surface: ResponseSurface) -> None:
+    def pressing(act: studio_filter.Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
+        episodes = World().collect(act, scenarios, noise, seed)
+        return [replace(each, contact_force_n=np.full(STEPS, 30.0, np.float32)) for each in episodes]
+
+    draft = studio_filter.choose_mode(problem(-1.0, reference), surface, [])
+    assert studio_filter.gate_mode(problem(-1.0, reference), draft, reference, pressing).weights == FilterWeights()
+
+
+def test_the_first_acceptable_gate_ends_the_search(reference: list[Trajectory], surface: ResponseSurface) -> None:
+    world = World()
+    draft = studio_filter.choose_mode(problem(-1.0, reference), surface, [])
+    studio_filter.gate_mode(problem(-1.0, reference), draft, reference, world.collect)
+    assert world.asked == [6]
+
+
+def test_a_residual_that_does_not_help_is_left_out_and_said_so(reference: list[Trajectory]) -> None:
+    """An adapter trained for somebody who wants the opposite."""
+    wrong = learn_round(
+        problem(1.0, reference), FilterDraft(FilterWeights()), [World().collect(POLICY.mean, range(6), 0.3, 0)]
+    )
+    gated = studio_filter.gate_residual(problem(-1.0, reference), wrong, reference, World().collect)
+    assert gated.weights.residual_share == 0.0
+    assert "residual" in gated.notes[0]
+
+
+def test_learning_is_repeatable_and_later_rounds_go_on_from_earlier_ones(reference: list[Trajectory]) -> None:
+    rollouts = World().collect(POLICY.mean, range(6), 0.3, 0)
+    start = FilterDraft(FilterWeights(mode=(-0.2, 0.0, 0.0, 0.0, 0.0), gate=0.7))
+    first, again = (learn_round(problem(-1.0, reference), start, [rollouts]) for _ in range(2))
+    assert first.weights.to_bytes() == again.weights.to_bytes()
+    assert first.weights.gate == 0.7
+    second = learn_round(problem(-1.0, reference), first, [rollouts, rollouts])
+    assert second.weights.to_bytes() != first.weights.to_bytes()
+    assert set(second.value) == set(first.value) != set()
+
+
+def test_noise_belongs_to_the_scenario_and_not_to_the_order() -> None:
+    together = World().collect(POLICY.mean, [1, 2], 0.2, 5)
+    alone = World().collect(POLICY.mean, [2], 0.2, 5)
+    np.testing.assert_array_equal(together[1].actions, alone[0].actions)
+    assert (together[0].actions != World().collect(POLICY.mean, [1], 0.2, 6)[0].actions).any()
+
+
+def test_no_two_purposes_share_a_scenario() -> None:
+    blocks = [set(studio_filter.scenarios_for(purpose, 1000)) for purpose in studio_filter.SCENARIO_BLOCKS]
+    assert len(set.union(*blocks)) == 1000 * len(blocks)
