@@ -2,9 +2,11 @@
 
 import fcntl
 import logging
+import math
 import os
 import signal
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -27,6 +29,7 @@ from worker.workplace import Workplace
 log = logging.getLogger("worker")
 
 ROUND_S = 0.5
+PRESENCE_S = 5.0
 ENGINE_VERSION = "1"
 """Raised when the steps of a workflow change so that a half-finished one could not be resumed."""
 
@@ -102,18 +105,20 @@ def _launch_engine(settings: Settings) -> None:
 
 
 def _rounds(settings: Settings, workshop: Workshop, stop: threading.Event) -> None:
-    started: set[str] = set()
+    started: set[str] = set()  # only saves the engine from being told again what it already knows
+    signed_at = -math.inf
     while not stop.wait(ROUND_S):
         try:
-            _one_round(settings, workshop, started)
+            if time.monotonic() - signed_at >= PRESENCE_S:
+                with workshop.place.database.writing() as session:
+                    records.sign_presence(session, settings.worker_name)
+                signed_at = time.monotonic()
+            _one_round(workshop, started)
         except OperationalError as error:
             log.warning("the database could not be reached, trying again: %s", error.orig)
 
 
-def _one_round(settings: Settings, workshop: Workshop, started: set[str]) -> None:
-    """``started`` only saves the engine from being told again what it already knows."""
-    with workshop.place.database.writing() as session:
-        records.sign_presence(session, settings.worker_name)
+def _one_round(workshop: Workshop, started: set[str]) -> None:
     with workshop.place.database.reading() as session:
         due = list(reconcile.findings(session))
         hungry = reconcile.short_of_queries(session)
