@@ -5,6 +5,7 @@ one; every step may therefore run twice, and leaves the same rows and files when
 """
 
 import logging
+import time
 from collections.abc import Callable
 from dataclasses import asdict
 from typing import Any
@@ -45,10 +46,12 @@ class Workshop(DBOSConfiguredInstance):
         """Do one task; what goes wrong is kept with the run and in the log, never raised."""
         task = Task(**arguments)
         self.in_hand.add(task.finding)
+        started = time.monotonic()
         try:
             run_id = _step("begin", self._begin, arguments)
             _BODIES[RunKind(task.kind)](self.place, task, run_id, _step)
             _step("finish", self._finish, run_id)
+            log.info("%s done in %.1f s", task.finding, time.monotonic() - started)
         except Exception as error:  # the worker's edge: one failed task must not stop the others
             log.exception("%s failed", task.finding)
             _step("fail", self._fail, task.finding, f"{type(error).__name__}: {error}")
