@@ -74,7 +74,7 @@ class Fitting:
 
     def train_residual(self, draft: FilterDraft) -> FilterDraft:
         """The residual action encoder around the mode."""
-        return studio_filter.train_residual(self.problem, draft, self.collect, self.progress)
+        return studio_filter.train_residual(self.problem, draft, self.collect, self.progress, self._learn)
 
     def gate_residual(self, draft: FilterDraft) -> FilterDraft:
         """As much of the residual as held-out scenarios allow."""
@@ -84,7 +84,8 @@ class Fitting:
     def fit_printed(self) -> FilterDraft:
         """The paper's PbARL as printed, on transitions of the frozen policy. Not gated: it is what it is."""
         transitions = self._reference(studio_filter.scenarios_for("residual", PRINTED_ROLLOUTS))
-        return printed_filter.fit_printed(self.problem, transitions, progress=self.progress)
+        self.progress("training the printed action encoder", 0.1)
+        return self.compute.run(Lane.LEARNING, self.beat, printed_filter.fit_printed, self.problem, transitions)
 
     def finish(self, draft: FilterDraft, provenance: Provenance, weights: dict[str, Any] | None) -> Finished:
         """Export, drive through unseen scenarios, pack. ``weights``: the reward model's own, shown on the dashboard."""
@@ -126,6 +127,9 @@ class Fitting:
         arguments = [(act, chunk, noise, seed) for chunk in chunks]
         parts = self.compute.run_all(Lane.LEARNING, self.beat, lessons.run_scenarios, arguments)
         return [trajectory for part in parts for trajectory in part]
+
+    def _learn(self, problem: FilterProblem, draft: FilterDraft, rounds: Sequence[Sequence[Trajectory]]) -> FilterDraft:
+        return self.compute.run(Lane.LEARNING, self.beat, studio_filter.learn_round, problem, draft, rounds)
 
     def _gate_reference(self) -> Sequence[Trajectory]:
         return self._reference(studio_filter.scenarios_for("gate", self.problem.config.gate_scenarios))

@@ -111,6 +111,9 @@ class FilterDraft:
         return replace(self, seconds={**self.seconds, stage: round(spent, 3)})
 
 
+Learn = Callable[[FilterProblem, FilterDraft, Sequence[Sequence[Trajectory]]], FilterDraft]
+"""One round of residual learning from all rollouts so far."""
+
 SCENARIO_BLOCKS = {"gate": 2_000_000, "residual": 3_000_000, "evaluation": 4_000_000, "recording": 5_000_000}
 """First scenario of each purpose. Others: exploration 100_000, test of the policy 1_000_000, clips from 10_000_000."""
 
@@ -215,8 +218,12 @@ def train_residual(
     draft: FilterDraft,
     collect: Collect,
     progress: Progress = lambda stage, share: None,
+    learn: Learn | None = None,
 ) -> FilterDraft:
-    """Rounds of: roll out the current filter with noise, learn its value, move its actions up that value."""
+    """Rounds of: roll out the current filter with noise, learn its value, move its actions up that value.
+
+    ``learn``: learn_round(), or something that calls it in another process.
+    """
     rounds: list[list[Trajectory]] = []
     for number in range(len(problem.config.round_rollouts)):
         share = 0.35 + 0.35 * number / len(problem.config.round_rollouts)
@@ -225,7 +232,7 @@ def train_residual(
         rounds.append(collect(*residual_rollouts(problem, draft, number)))
         draft = draft.timed("residual_rollouts", started)
         progress(f"training the action encoder, round {number + 1}", share + 0.1)
-        draft = learn_round(problem, draft, rounds)
+        draft = (learn or learn_round)(problem, draft, rounds)
     return draft
 
 
