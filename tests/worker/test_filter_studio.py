@@ -136,6 +136,17 @@ def test_a_filter_that_presses_too_hard_is_turned_off(reference: list[Trajectory
     assert studio_filter.gate_mode(problem(-1.0, reference), draft, reference, pressing).weights == FilterWeights()
 
 
+def test_somebody_who_has_said_nothing_yet_costs_no_rollouts(
+    reference: list[Trajectory], surface: ResponseSurface
+) -> None:
+    world = World()
+    draft = studio_filter.choose_mode(problem(0.0, reference), surface, [])
+    gated = studio_filter.gate_mode(problem(0.0, reference), draft, reference, world.collect)
+    assert gated.weights == FilterWeights()
+    assert "do not yet say" in gated.notes[0]
+    assert world.asked == []
+
+
 def test_the_first_acceptable_gate_ends_the_search(reference: list[Trajectory], surface: ResponseSurface) -> None:
     world = World()
     draft = studio_filter.choose_mode(problem(-1.0, reference), surface, [])

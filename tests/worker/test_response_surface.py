@@ -64,9 +64,17 @@ def test_modes_stay_in_their_ranges_and_are_repeatable(surface: ResponseSurface)
     np.testing.assert_array_equal(chosen, best_mode(surface, likes(speed_m_s=-1.0, height_above_target_m=-2.0), seed=3))
 
 
-def test_somebody_who_cares_about_nothing_keeps_the_task(surface: ResponseSurface) -> None:
-    chosen = best_mode(surface, likes(), seed=0)
-    assert surface.predict(chosen)[1] > -0.05
+def test_somebody_who_cares_about_nothing_keeps_the_reference_policy(surface: ResponseSurface) -> None:
+    assert best_mode(surface, likes(), seed=0).tolist() == [0.0] * len(FEEDING_AXES)
+
+
+def test_what_the_members_disagree_about_is_not_gambled_on(surface: ResponseSurface) -> None:
+    """Sure about the height, undecided about the speed."""
+    members = np.array([likes(height_above_target_m=-1.0, speed_m_s=speed) for speed in (-3.0, 3.2)])
+    chosen = best_mode(surface, members, seed=0)
+    bold = best_mode(surface, members.mean(axis=0), seed=0)
+    assert chosen[2] > 0.8
+    assert abs(surface.predict(chosen)[0][SPEED]) < 0.1 < 0.5 < surface.predict(bold)[0][SPEED]
 
 
 def test_one_crash_does_not_bend_the_surface() -> None:

@@ -28,6 +28,8 @@ SUCCESS_TOLERANCE = 0.015
 SUCCESS_PENALTY = 20.0
 """Standard deviations of predicted return per unit of success lost beyond the tolerance."""
 DRAWS = 20_000
+CAUTION = 1.0
+"""Standard deviations over the reward model's members that are subtracted from a mode's predicted return."""
 
 
 @dataclass(frozen=True)
@@ -110,25 +112,28 @@ def best_mode(
     tolerance: float = SUCCESS_TOLERANCE,
     penalty: float = SUCCESS_PENALTY,
 ) -> Floats:
-    """(A,) the mode with the best predicted return for these weights on the signals (S,).
+    """(A,) the mode with the best predicted return for these weights on the signals, (S,) or (E, S) for E members.
 
-    Random search with two local refinements; the mode 0 is always among the candidates, so that somebody for whom
-    nothing is better keeps the reference policy.
+    With members the return counts as their mean less their standard deviation: what few labels leave open is then not
+    gambled on (docs/method.md has what this gains). Random search with two local refinements; the mode 0 is always
+    among the candidates and wins ties, so that somebody for whom nothing is better keeps the reference policy.
     """
     rng = np.random.default_rng(seed)
     width = surface.high - surface.low
-    candidates = rng.uniform(surface.low, surface.high, (DRAWS, len(width)))
-    candidates[0] = 0.0
-    unit = max(float((surface.predict(candidates)[0] @ weights).std()), 1e-9)
+    members = np.atleast_2d(weights)
+    reference = np.zeros((1, len(width)))
+    candidates = np.concatenate([reference, rng.uniform(surface.low, surface.high, (DRAWS, len(width)))])
+    unit = max(float((surface.predict(candidates)[0] @ members.mean(axis=0)).std()), 1e-9)
 
     def value(modes: Floats) -> Floats:
         signals, success = surface.predict(modes)
-        worth: Floats = signals @ weights / unit - penalty * np.maximum(-success - tolerance, 0.0)
-        return worth
+        returns = signals @ members.T / unit
+        worth: Floats = returns.mean(axis=-1) - CAUTION * returns.std(axis=-1)
+        return worth - penalty * np.maximum(-success - tolerance, 0.0)
 
     for spread in (0.2, 0.05):
         best = candidates[np.argsort(value(candidates))[-40:]]
         around = np.repeat(best, 100, axis=0) + spread * width * rng.standard_normal((4000, len(width)))
-        candidates = np.concatenate([best, np.clip(around, surface.low, surface.high)])
+        candidates = np.concatenate([reference, best, np.clip(around, surface.low, surface.high)])
     winner: Floats = candidates[np.argmax(value(candidates))]
     return winner

@@ -96,18 +96,25 @@ class RewardModel(ABC):
         return self.with_normalisation(Normalisation.over(np.concatenate(raw, axis=1)))
 
     def signal_weights(self, reference: Sequence[Trajectory]) -> Floats:
-        """(S,) reward per unit of each signal: what the response surface of modes is searched with.
+        """(E, S) every member's reward per unit of each signal: what the response surface of modes is searched with.
 
-        For a model that is not linear in the signals: the ridge regression of its episode returns on the episodes'
-        summed signals.
+        For a model that is not linear in the signals: the ridge regression of each member's episode returns on the
+        episodes' summed signals.
         """
         sums = np.array([each.signals.sum(axis=0, dtype=np.float64) for each in reference])
         scale = np.maximum(sums.std(axis=0), 1e-9)
         features = (sums - sums.mean(axis=0)) / scale
-        returns = self.returns(reference)
+        returns = np.array([self._member_returns(each) for each in reference])
         gram = features.T @ features + np.eye(features.shape[1])
-        weights: Floats = np.linalg.solve(gram, features.T @ (returns - returns.mean())) / scale
+        weights: Floats = np.linalg.solve(gram, features.T @ (returns - returns.mean(axis=0))).T / scale
         return np.where(sums.std(axis=0) > 1e-9, weights, 0.0)
+
+    def _member_returns(self, trajectory: Trajectory) -> Floats:
+        """(E,)"""
+        steps = len(trajectory)
+        rewards = self.step_rewards(trajectory.signals, trajectory.observations[:steps], trajectory.actions)
+        returns: Floats = rewards.sum(axis=-1)
+        return returns
 
     @property
     @abstractmethod
@@ -144,9 +151,8 @@ class StructuredReward(RewardModel):
         return {"weights": self.weights.astype(np.float32)}
 
     def signal_weights(self, reference: Sequence[Trajectory] = ()) -> Floats:
-        """(S,) normalised reward per unit of each signal, the mean over members; exact for this kind."""
-        mean: Floats = self.weights.mean(axis=0) / self.normalisation.scale
-        return mean
+        """(E, S) normalised reward per unit of each signal; exact for this kind."""
+        return self.weights / self.normalisation.scale
 
     @property
     def size(self) -> int:

@@ -196,6 +196,9 @@ def gate_mode(
 ) -> FilterDraft:
     """Use as much of the mode as the task allows; when none is acceptable, go back to the reference policy."""
     started = time.perf_counter()
+    if not any(draft.weights.mode):
+        notes = (*draft.notes, "The labels do not yet say clearly what to change; the mode is off.")
+        return replace(draft, weights=FilterWeights(), notes=notes)
     act = act_of(problem.policy, draft.weights.changed(gate=1.0))
     trials: list[Trial] = []
     for gate in problem.config.gates:
