@@ -156,13 +156,14 @@ class Rehearsal:
         for (participant, token), user in zip(enrolled, users, strict=True):
             teacher = _Teacher(self.database, self.store, study.id, user, manner, seed + participant.number)
             outcome = Outcome(participant.id, participant.code, user)
-            self._answer_everything(Visitor(self.base_url, f"/p/{token}"), teacher, outcome, settings)
+            with Visitor(self.base_url, f"/p/{token}") as visitor:
+                self._answer_everything(visitor, teacher, outcome, settings)
             outcome.finished_at = time.monotonic()
             outcomes.append(outcome)
-        experimenter = Visitor(self.base_url, "/login")
-        experimenter.log_in(accounts.FIRST_EXPERIMENTER, password or "")
-        for outcome in outcomes:
-            self._await_bundle(outcome, study, experimenter)
+        with Visitor(self.base_url, "/login") as experimenter:
+            experimenter.log_in(accounts.FIRST_EXPERIMENTER, password or "")
+            for outcome in outcomes:
+                self._await_bundle(outcome, study, experimenter)
         return outcomes
 
     def _answer_everything(
@@ -260,7 +261,14 @@ class Visitor:
             base_url=base_url, follow_redirects=True, timeout=60.0, headers={"Origin": base_url}
         )
         self._page = _Page("", "")
-        self._open(path)
+        self._first = path
+
+    def __enter__(self) -> Self:
+        self._open(self._first)
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._client.close()
 
     def come_in(self) -> None:
         """Go through consent and instructions to the first pair."""
