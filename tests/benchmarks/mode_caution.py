@@ -1,0 +1,83 @@
+"""What caution about the labels' uncertainty is worth when a mode is chosen: python -m tests.benchmarks.mode_caution
+
+For 10 to 200 scripted labels (5 % mistakes, 10 % equal), three users and six seeds: the true return that the response
+surface predicts for the chosen mode, in % of the mean absolute return of the pool's clips. No filter is trained.
+About two minutes.
+"""
+
+import sys
+from unittest.mock import patch
+
+import numpy as np
+
+from worker import laboratory
+from worker.ml import acquisition, response_surface, reward_training
+from worker.ml.response_surface import ResponseSurface
+from worker.ml.segments import SegmentPairs
+from worker.ml.teachers import OMEGA, Manner, ScriptedTeacher, User
+from worker.sim.costs import SPEED_SCALE_M_S, base_weights, preference_rewards
+from worker.sim.rollout import rollout
+from worker.trajectory import COSTS, SIGNALS
+
+CLIP_STEPS, SEEDS, SCENARIOS = 70, 6, 36
+TARGETS = {"left": 0.0, "right": 1.0, "equal": 0.5}
+SIGNAL_OF = dict(
+    zip(
+        COSTS,
+        (
+            "distance_m",
+            "speed_squared_m2_s2",
+            "force_away_n",
+            "high_force_n",
+            "spilled_on_person",
+            "intake_speed_m_s",
+        ),
+        strict=True,
+    )
+)
+
+
+def main() -> None:
+    """Print mean and worst gain per number of labels and caution."""
+    clips = [
+        rollout(laboratory.environment(), laboratory.act_in_mode(mode), scenario)
+        for scenario in range(10_000_000, 10_000_000 + SCENARIOS)
+        for mode in laboratory.behaviours(scenario, 4)
+    ]
+    surface = ResponseSurface.load(laboratory.CHECKPOINTS / "response_surface.safetensors")
+    rows = acquisition.matched_pairs([clip.scenario for clip in clips])
+    shown = SegmentPairs.cut([(clips[left], clips[right]) for left, right in rows], 0, CLIP_STEPS)
+    spread = reward_training.signal_spread(shown)
+    rewards = {
+        user: np.array([preference_rewards(clip.costs, clip.signals, OMEGA[user]) for clip in clips]) for user in User
+    }
+    for count in (10, 30, 100, 200):
+        gains: dict[float, list[float]] = {0.0: [], 0.5: [], 1.0: [], 2.0: []}
+        for seed in range(SEEDS):
+            for user in User:
+                sides = rewards[user][rows][:, :, :CLIP_STEPS]
+                rng = np.random.default_rng([seed, 7])
+                teacher = ScriptedTeacher.calibrated(Manner(), sides)
+                chosen = rng.permutation(len(rows))[:count]
+                targets = [TARGETS[teacher.answer(left, right, rng)] for left, right in sides[chosen]]
+                model = reward_training.fit(shown.take(chosen), targets, "structured", seed, spread=spread).model
+                unit = abs(rewards[user].sum(axis=1).mean()) / 100
+                for caution, found in gains.items():
+                    with patch.object(response_surface, "CAUTION", caution):
+                        mode = response_surface.best_mode(surface, model.signal_weights([]), seed)
+                    found.append(float(surface.predict(mode)[0] @ true_weights(user)) / unit)
+        cells = (f"{caution:g}: {np.mean(each):+.1f} (worst {min(each):+.1f})" for caution, each in gains.items())
+        sys.stdout.write(f"{count:4d} labels  " + "   ".join(cells) + "\n")
+
+
+def true_weights(user: User) -> np.ndarray:
+    """(S,) the user's preference reward per unit of each signal."""
+    weights = np.zeros(len(SIGNALS))
+    for name, weight, omega in zip(COSTS, base_weights("calibrated"), OMEGA[user], strict=True):
+        unit = SPEED_SCALE_M_S if name == "C_v" else 1.0
+        weights[SIGNALS.index(SIGNAL_OF[name])] -= weight * omega / unit
+    return weights
+
+
+if __name__ == "__main__":
+    main()
