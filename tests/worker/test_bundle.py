@@ -39,7 +39,14 @@ def contents() -> BundleContents:
         reward=StructuredReward(rng.standard_normal((8, len(SIGNALS)))),
         policy=POLICY,
         recording=recording,
-        metrics={"evaluation": evaluate(episodes, episodes, np.arange(4), np.arange(4) + 1.0), "notes": ["A note."]},
+        metrics={
+            "evaluation": evaluate(episodes, episodes, np.arange(4), np.arange(4) + 1.0),
+            "notes": ["A note."],
+            "weights": {
+                "speed_m_s": {"mean": -1.5, "low": -2.1, "high": -0.9},
+                "tilt_rad": {"mean": 0.1, "low": -0.4, "high": 0.6},
+            },
+        },
         provenance=Provenance("demo", "P07", 3, 200, "ab" * 32, 11, "2026-01-02T03:04:05Z"),
     )
 
@@ -135,6 +142,12 @@ def test_the_card_states_numbers_with_intervals_limits_and_use(unzipped: Path) -
         assert expected in card
     for expected in ("python run_filter.py", "## Limits", "largest force on the person", "speed_near", "Gate 70%"):
         assert expected in card
+
+
+def test_the_card_names_what_the_labels_are_sure_about_and_nothing_else(unzipped: Path) -> None:
+    card = (unzipped / "MODEL_CARD.md").read_text()
+    assert "| speed_m_s | -1.50 [-2.10, -0.90] |" in card
+    assert "tilt_rad" not in card
 
 
 def test_the_bundle_runs_on_its_own_and_confirms_itself(unzipped: Path) -> None:

@@ -82,7 +82,7 @@ class BundleContents:
     policy: GaussianPolicy
     recording: Recording
     metrics: Mapping[str, Any]
-    """Model.metrics of the filter: evaluation, gate, mode, method, seconds, notes"""
+    """Model.metrics of the filter; evaluation, notes and the reward model's weights are published"""
     provenance: Provenance
 
 
@@ -159,6 +159,7 @@ def _manifest(contents: BundleContents) -> dict[str, Any]:
         "residual_share": weights.residual_share if weights.encoder else 0.0,
         "reward_kind": contents.reward.kind,
         "signals": list(SIGNALS),
+        "learned_weights": contents.metrics.get("weights"),
         "evaluation": contents.metrics.get("evaluation"),
         "notes": list(contents.metrics.get("notes", ())),
         "versions": {

@@ -43,7 +43,15 @@ _LIMITS = """## Limits
 
 def model_card(manifest: Mapping[str, Any]) -> str:
     """Markdown, from the manifest."""
-    sections = [_what(manifest), _way(manifest), _measured(manifest.get("evaluation")), _notes(manifest), _USE, _LIMITS]
+    sections = [
+        _what(manifest),
+        _way(manifest),
+        _matters(manifest.get("learned_weights")),
+        _measured(manifest.get("evaluation")),
+        _notes(manifest),
+        _USE,
+        _LIMITS,
+    ]
     return "\n\n".join(section for section in sections if section) + "\n"
 
 
@@ -71,6 +79,22 @@ def _way(manifest: Mapping[str, Any]) -> str:
     ]
     heading = f"## This person's way\n\nGate {manifest['gate']:.0%}, residual {manifest['residual_share']:.0%}."
     return "\n".join([heading, "", "| axis | value | range | meaning |", "|---|---|---|---|", *rows])
+
+
+def _matters(weights: Mapping[str, Mapping[str, float]] | None) -> str:
+    """Which measured signals the labels say something about."""
+    if not weights:
+        return ""
+    clear = {name: each for name, each in weights.items() if each["low"] > 0.0 or each["high"] < 0.0}
+    heading = (
+        "## What matters to this person\n\nLog odds of being preferred per standard deviation between two clips, with"
+        " 95 % intervals; signals about which the labels are undecided are left out."
+    )
+    if not clear:
+        return f"{heading}\n\nSo far the labels are undecided about every signal."
+    ordered = sorted(clear.items(), key=lambda item: -abs(item[1]["mean"]))
+    rows = [f"| {name} | {each['mean']:+.2f} [{each['low']:+.2f}, {each['high']:+.2f}] |" for name, each in ordered]
+    return "\n".join([heading, "", "| signal | weight |", "|---|---|", *rows])
 
 
 def _measured(evaluation: Mapping[str, Any] | None) -> str:
