@@ -115,7 +115,7 @@ class OwnStudio:
         """Start the web server and wait until it answers."""
         address = ["--host", self.settings.host, "--port", str(self.settings.port)]
         self._start("web", "uvicorn", "app.main:create_app", "--factory", "--no-access-log", *address)
-        _until(PATIENCE_S, "no web server", lambda: _answers(self.settings.base_url) or None)
+        _until(PATIENCE_S, "no web server", self._answers)
 
     def start_worker(self) -> None:
         """Start the worker; whatever an earlier one has left undone is its to finish."""
@@ -125,6 +125,14 @@ class OwnStudio:
         """SIGKILL to "web" or "worker": no chance to clean up."""
         self._programs[name].kill()
         self._programs[name].wait()
+
+    def _answers(self) -> bool | None:
+        if self._programs["web"].poll() is not None:
+            raise RehearsalFailed(f"The web server stopped by itself; {self.log} says why.")
+        try:
+            return httpx2.get(f"{self.settings.base_url}/login", timeout=5.0).is_success or None
+        except httpx2.TransportError:
+            return None
 
     def _start(self, name: str, module: str, *arguments: str) -> None:
         with self.log.open("ab") as stream:
@@ -366,13 +374,6 @@ def _until(patience_s: float, missing: str, look: Callable[[], Found | None]) ->
             raise RehearsalFailed(f"There was {missing} for {patience_s:.0f} s; rehearsal.log says what went on.")
         time.sleep(POLL_S)
     return found
-
-
-def _answers(base_url: str) -> bool:
-    try:
-        return httpx2.get(f"{base_url}/login", timeout=5.0).is_success
-    except httpx2.TransportError:
-        return False
 
 
 def _free_port() -> int:
