@@ -17,6 +17,7 @@ from app.web.error_pages import add_error_pages, error_page
 from app.web.guard import Guard
 from app.web.login_attempts import LoginAttempts
 from app.web.templating import ROOT, make_environment
+from app.web.turns import Turns
 
 MAX_BODY_BYTES = 256 * 1024
 
@@ -24,10 +25,12 @@ MAX_BODY_BYTES = 256 * 1024
 def create_app(settings: Settings | None = None) -> FastAPI:
     """The web server for these settings, by default those of the environment. Migrates nothing."""
     settings = settings or Settings()
+    database = Database(settings.sqlalchemy_url)
     studio = Studio(
         settings=settings,
-        database=Database(settings.sqlalchemy_url),
+        database=database,
         store=ArtefactStore(settings.data_dir / "artefacts"),
+        turns=Turns(database),
         login_attempts=LoginAttempts(settings.login_attempts_per_minute),
     )
 
@@ -35,7 +38,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
         with live.closing_on_signals(studio.closing):
             yield
-        studio.database.dispose()
+        database.dispose()
 
     app = FastAPI(
         title="PbARL Studio", openapi_url=None, lifespan=lifespan, max_body_size=MAX_BODY_BYTES, redirect_slashes=False

@@ -9,7 +9,7 @@ from sqlalchemy import select
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
-from app.domain.preferences import LabelEvent, Query, Response, current_labels
+from app.domain.preferences import LabelEvent, Query, Response
 from app.domain.studies import Participant
 from app.errors import AppError
 from app.services import querying
@@ -85,8 +85,7 @@ def undo_label(session: Session, participant: Participant, query_id: int, client
     events = _events(session, query)
     if _earlier(session, events, client_uuid) is not None or not events or events[-1].response is None:
         return
-    newest = querying.newest_answered(current_labels(session, participant.id))
-    if newest is None or newest.query.id != query.id:
+    if querying.answers_given(session, participant).newest_query_id != query.id:
         raise UndoTooLate
     _append(session, query, LabelEvent(query_id=query.id, revision=len(events) + 1, client_uuid=str(client_uuid)))
 

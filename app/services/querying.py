@@ -3,15 +3,15 @@
 import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from datetime import timedelta
+from datetime import datetime, timedelta
 from itertools import islice, pairwise
 from statistics import median
 
-from sqlalchemy import select
-from sqlalchemy.orm import Session, joinedload
+from sqlalchemy import func, select
+from sqlalchemy.orm import Session, aliased, joinedload
 
 from app.db import now
-from app.domain.preferences import Label, LabelEvent, Query, current_labels
+from app.domain.preferences import LabelEvent, Query
 from app.domain.studies import Participant
 from app.storage import ArtefactStore
 
@@ -23,6 +23,16 @@ LONGEST_PAUSE = timedelta(minutes=2)
 """A longer time between two answers was a break and says nothing about the pace."""
 
 SEEN_EVERY = timedelta(seconds=10)
+
+
+@dataclass(frozen=True)
+class Given:
+    """The answers that count, in short."""
+
+    count: int
+    newest_query_id: int | None
+    times: Sequence[datetime]
+    """When the newest ones were given, in their order."""
 
 
 @dataclass(frozen=True)
@@ -49,8 +59,8 @@ class Turn:
     """None while no pair is ready, and when all are answered."""
     following: Query | None
     """The pair after it, so that the page can load it ahead."""
-    undoable: Query | None
-    """The query answered last, whose answer can be taken back."""
+    undoable_id: int | None
+    """The id of the query answered last, whose answer can be taken back."""
 
 
 def next_turn(session: Session, store: ArtefactStore, participant: Participant) -> Turn:
@@ -58,28 +68,39 @@ def next_turn(session: Session, store: ArtefactStore, participant: Participant) 
 
     Marks the pair as served. A pair whose files are not all stored is passed over.
     """
-    labels = current_labels(session, participant.id)
-    progress = progress_of(participant, labels)
+    given = answers_given(session, participant)
+    progress = progress_of(participant, given)
     ready = [] if progress.finished else list(islice(_ready(session, store, participant), 2))
     query = ready[0] if ready else None
     following = ready[1] if len(ready) > 1 and progress.answered + 1 < progress.wanted else None
     if query is not None and query.served_at is None:
         query.served_at = now()
-    newest = newest_answered(labels)
-    return Turn(progress, query, following, newest.query if newest else None)
+    return Turn(progress, query, following, given.newest_query_id)
 
 
-def progress_of(participant: Participant, labels: Sequence[Label]) -> Progress:
+def answers_given(session: Session, participant: Participant) -> Given:
+    """How many answers count, and the newest of them. Counted by the database: this is asked for with every answer."""
+    newer = aliased(LabelEvent)
+    superseded = select(newer.id).where(newer.query_id == LabelEvent.query_id, newer.revision > LabelEvent.revision)
+    counting = (
+        select(LabelEvent.query_id, LabelEvent.created_at)
+        .join(Query, Query.id == LabelEvent.query_id)
+        .where(Query.participant_id == participant.id, LabelEvent.response.is_not(None), ~superseded.exists())
+    )
+    newest = session.execute(counting.order_by(LabelEvent.id.desc()).limit(RECENT_ANSWERS + 1)).all()
+    return Given(
+        count=session.scalar(select(func.count()).select_from(counting.subquery())) or 0,
+        newest_query_id=newest[0].query_id if newest else None,
+        times=[row.created_at for row in reversed(newest)],
+    )
+
+
+def progress_of(participant: Participant, given: Given) -> Progress:
     """Answered and wanted labels, and the time the rest will take."""
     wanted = participant.study.settings.labels_per_participant
-    pace_s = _pace_s(labels)
-    left = max(0, wanted - len(labels))
-    return Progress(len(labels), wanted, None if pace_s is None else round(pace_s * left))
-
-
-def newest_answered(labels: Sequence[Label]) -> Label | None:
-    """The label given last; None before the first."""
-    return max(labels, key=lambda label: label.event.id, default=None)
+    pace_s = _pace_s(given.times)
+    left = max(0, wanted - given.count)
+    return Progress(given.count, wanted, None if pace_s is None else round(pace_s * left))
 
 
 def seen(participant: Participant) -> None:
@@ -101,6 +122,7 @@ def _ready(session: Session, store: ArtefactStore, participant: Participant) -> 
         .where(Query.participant_id == participant.id, newest_response.is_(None))
         .options(joinedload(Query.left_clip), joinedload(Query.right_clip))
         .order_by(Query.ordinal)
+        .execution_options(yield_per=2)  # the rest of the list is of no interest
     )
     for query in session.scalars(waiting):
         clips = (query.left_clip, query.right_clip)
@@ -110,9 +132,8 @@ def _ready(session: Session, store: ArtefactStore, participant: Participant) -> 
             log.warning("query %d of participant %d has lost its files and is passed over", query.id, participant.id)
 
 
-def _pace_s(labels: Sequence[Label]) -> float | None:
+def _pace_s(times: Sequence[datetime]) -> float | None:
     """Median time from one answer to the next, which includes watching, answering, saving and loading."""
-    times = sorted(label.event.created_at for label in labels)[-RECENT_ANSWERS - 1 :]
     paces = [later - earlier for earlier, later in pairwise(times) if later - earlier < LONGEST_PAUSE]
     if len(paces) < MIN_KNOWN_PACES:
         return None

@@ -1,6 +1,6 @@
 """What a route may ask for: settings, sessions on the database, and the person who is asking."""
 
-from collections.abc import Iterator
+from collections.abc import AsyncIterator
 from dataclasses import dataclass, field
 from datetime import timedelta
 from http import HTTPStatus
@@ -19,6 +19,7 @@ from app.settings import Settings
 from app.storage import ArtefactStore
 from app.web.link_desk import LinkDesk
 from app.web.login_attempts import LoginAttempts
+from app.web.turns import Turns
 
 PARTICIPANT_COOKIE = "studio_participant"
 EXPERIMENTER_COOKIE = "studio_experimenter"
@@ -49,14 +50,15 @@ class Studio:
     settings: Settings
     database: Database
     store: ArtefactStore
+    turns: Turns
     login_attempts: LoginAttempts
     link_desk: LinkDesk = field(default_factory=LinkDesk)
     closing: Event = field(default_factory=Event)
     """Set when the server is asked to stop, so that open event streams end by themselves."""
 
 
-def studio_of(request: Request) -> Studio:
-    """The parts as create_app made them."""
+async def studio_of(request: Request) -> Studio:
+    """The parts as create_app made them. Async, because a plain function would take a thread for this."""
     studio: Studio = request.app.state.studio
     return studio
 
@@ -64,13 +66,13 @@ def studio_of(request: Request) -> Studio:
 StudioDep = Annotated[Studio, Depends(studio_of)]
 
 
-def _reading_session(studio: StudioDep) -> Iterator[Session]:
-    with studio.database.reading() as session:
+async def _reading_session(studio: StudioDep) -> AsyncIterator[Session]:
+    async with studio.turns.reading() as session:
         yield session
 
 
-def _writing_session(studio: StudioDep) -> Iterator[Session]:
-    with studio.database.writing() as session:
+async def _writing_session(studio: StudioDep) -> AsyncIterator[Session]:
+    async with studio.turns.writing() as session:
         yield session
 
 

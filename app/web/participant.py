@@ -194,8 +194,8 @@ def _turn_for_script(request: Request, turn: querying.Turn) -> dict[str, Any]:
         "pair": None if turn.query is None else vars(_pair(request, turn.query)),
         "following": None if turn.following is None else vars(_pair(request, turn.following)),
         "undo_path": None
-        if turn.undoable is None
-        else request.app.url_path_for("undo_label", query_id=turn.undoable.id),
+        if turn.undoable_id is None
+        else request.app.url_path_for("undo_label", query_id=turn.undoable_id),
     }
 
 
