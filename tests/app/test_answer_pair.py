@@ -9,7 +9,7 @@ import httpx2
 import pytest
 from fastapi.testclient import TestClient
 
-from app.db import Database
+from app.db import Database, now
 from app.domain.preferences import LabelEvent
 from app.storage import ArtefactStore
 from tests import factories
@@ -184,3 +184,30 @@ def test_of_twenty_racing_copies_of_one_answer_exactly_one_is_kept(taking_part: 
     with ThreadPoolExecutor(20) as pool:
         assert list(pool.map(race, range(20))) == [200] * 20
     assert len(taking_part.events(taking_part.queries[0])) == 1
+
+
+def test_sixty_people_who_answer_at_once_all_get_through(
+    database: Database, store: ArtefactStore, address: str
+) -> None:
+    """More than the server has threads: whoever waits for the write lock must not wait inside one of them."""
+    people = 60
+    with database.writing() as session:
+        study = factories.make_study(session)
+        clips = [factories.make_clip(session, store, study) for _ in range(2)]
+        tokens, queries = [], []
+        for _ in range(people):
+            participant, token = factories.make_participant(session, study)
+            queries.append(factories.make_query(session, participant, clips[0], clips[1]))
+            queries[-1].served_at = now()
+            tokens.append(token)
+    together = Barrier(people)
+
+    def answer(number: int) -> int:
+        with httpx2.Client(base_url=address, timeout=60) as browser:
+            browser.get(f"/p/{tokens[number]}")
+            form = {"response": "left", "client_uuid": str(uuid4())}
+            together.wait()
+            return browser.post(f"/p/queries/{queries[number].id}/label", data=form, headers=JSON).status_code
+
+    with ThreadPoolExecutor(people) as pool:
+        assert list(pool.map(answer, range(people))) == [200] * people
