@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import onnxruntime
 import pytest
 
 from tests.worker import invented
@@ -18,6 +19,8 @@ from worker.ml import bundle
 from worker.ml.action_filter import FilterWeights, build
 from worker.ml.bundle import BundleContents, BundleDamaged, Provenance, Recording
 from worker.ml.onnx_export import to_onnx
+from worker.ml.policies import GaussianPolicy
+from worker.ml.policy_onnx import policy_to_onnx
 from worker.ml.reward_models import StructuredReward, load_reward_model
 from worker.spaces import FEEDING_OBSERVATION
 from worker.trajectory import SIGNALS
@@ -82,6 +85,7 @@ def test_everything_promised_is_inside_and_nothing_else(written: bytes) -> None:
                 "action_encoder.safetensors",
                 "filter.onnx",
                 "manifest.json",
+                "policy.onnx",
                 "recorded/actions.npy",
                 "recorded/observations.npy",
                 "recorded/policy_means.npy",
@@ -153,9 +157,8 @@ def test_the_card_names_what_the_labels_are_sure_about_and_nothing_else(unzipped
 def test_the_bundle_runs_on_its_own_and_confirms_itself(unzipped: Path) -> None:
     finished = run(unzipped)
     assert finished.returncode == 0, finished.stderr
-    assert "9 files" not in finished.stdout
-    assert "8 files match" in finished.stdout
-    assert "OK: the filter reproduces its recorded actions" in finished.stdout
+    assert "9 files match" in finished.stdout
+    assert "OK: policy and filter reproduce their recorded actions" in finished.stdout
 
 
 def test_the_script_needs_only_numpy_and_onnxruntime() -> None:
@@ -196,6 +199,22 @@ def test_somebody_s_own_recording_is_filtered(unzipped: Path, contents: BundleCo
     assert finished.returncode == 0, finished.stderr
     recorded = np.load(unzipped / "recorded/actions.npy")[:5]
     np.testing.assert_allclose(np.load(unzipped / "a.npy"), recorded, atol=1e-5)
+
+
+def test_without_policy_means_the_bundle_asks_its_own_policy(unzipped: Path, contents: BundleContents) -> None:
+    np.save(unzipped / "o.npy", contents.recording.observations[:5])
+    finished = run(unzipped, "--observations", "o.npy", "--output", "a.npy")
+    assert finished.returncode == 0, finished.stderr
+    recorded = np.load(unzipped / "recorded/actions.npy")[:5]
+    np.testing.assert_allclose(np.load(unzipped / "a.npy"), recorded, atol=1e-5)
+
+
+def test_the_exported_policy_is_the_shipped_one() -> None:
+    policy = GaussianPolicy.load(Path("worker/checkpoints/feeding/policy.safetensors"))
+    observations = np.random.default_rng(0).standard_normal((50, len(policy.offset))).astype(np.float32)
+    session = onnxruntime.InferenceSession(policy_to_onnx(policy))
+    (means,) = session.run(["policy_mean"], {"observation": observations})
+    np.testing.assert_allclose(means, policy.mean(observations), atol=1e-6)
 
 
 @pytest.mark.parametrize(

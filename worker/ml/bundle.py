@@ -23,6 +23,7 @@ from worker.ml.action_filter import FilterWeights
 from worker.ml.model_card import model_card
 from worker.ml.onnx_export import INPUTS, OUTPUT, OnnxFilter
 from worker.ml.policies import GaussianPolicy
+from worker.ml.policy_onnx import policy_to_onnx
 from worker.ml.reward_models import CLIP, RewardModel
 from worker.spaces import CONTROL_STEP_S, FEEDING_OBSERVATION, JOINT_ACTION, Space
 from worker.trajectory import SIGNALS, Trajectory
@@ -92,6 +93,7 @@ def write(contents: BundleContents) -> bytes:
     recording = contents.recording
     files = {
         "filter.onnx": contents.filter_onnx,
+        "policy.onnx": policy_to_onnx(contents.policy),
         "reward_model.safetensors": contents.reward.to_bytes(),
         "action_encoder.safetensors": contents.weights.to_bytes(),
         "run_filter.py": Path(run_filter.__file__).read_bytes(),
@@ -152,7 +154,11 @@ def _manifest(contents: BundleContents) -> dict[str, Any]:
             "reward_scale": contents.reward.normalisation.scale,
             "reward_clip": CLIP,
         },
-        "policy": {"sha256": _sha256(save(contents.policy.weights)), "action_limit": contents.policy.action_limit},
+        "policy": {
+            "file": "policy.onnx",
+            "weights_sha256": _sha256(save(contents.policy.weights)),
+            "action_limit": contents.policy.action_limit,
+        },
         "method": weights.method,
         "mode": weights.named_mode(),
         "gate": weights.gate,

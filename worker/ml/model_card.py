@@ -27,8 +27,9 @@ python run_filter.py
 ```
 
 The second command checks every file, runs the filter over `recorded/` and compares its actions with the recorded ones.
-Your own recording: `python run_filter.py --observations o.npy --policy-means m.npy --output a.npy`.
-In a control loop call `filter.onnx` at every control step with the observation and the reference policy's mean action.
+Your own recording: `python run_filter.py --observations o.npy --output a.npy`.
+In a control loop, at every control step: `policy.onnx` turns the observation into the reference policy's mean action,
+and `filter.onnx` turns both into the action to execute.
 `manifest.json` lists every number with its unit and range; all are SI units in the robot's base frame."""
 
 _LIMITS = """## Limits
@@ -38,7 +39,7 @@ _LIMITS = """## Limits
 * "Preference" is the return of a model learned from this person's own labels, not their satisfaction.
 * The largest speeds and forces are what happened in these simulated scenarios. They are not guaranteed bounds: keep the
   robot's own limits on speed and force, and an emergency stop within reach.
-* The filter belongs to one reference policy (`policy.sha256` in the manifest) and one person."""
+* The filter belongs to one reference policy (`policy` in the manifest) and one person."""
 
 
 def model_card(manifest: Mapping[str, Any]) -> str:

@@ -4,14 +4,16 @@
         Check every file of this directory against the manifest, run the filter over the recording in recorded/, and
         compare its actions with the recorded ones.
 
-    python run_filter.py --observations observations.npy --policy-means policy_means.npy --output actions.npy
-        Filter your own recording: (N, D) observations and the (N, A) mean actions of the reference policy in them.
+    python run_filter.py --observations observations.npy --output actions.npy
+        Filter your own recording of (N, D) observations. The reference policy's mean actions in them come from
+        policy.onnx, or from an (N, A) file of your own with --policy-means policy_means.npy.
 
 In a control loop, load the filter once and call it at every step:
 
     import numpy, onnxruntime
-    session = onnxruntime.InferenceSession("filter.onnx")
-    action = session.run(["action"], {"observation": observation[None], "policy_mean": policy_mean[None]})[0][0]
+    policy, session = (onnxruntime.InferenceSession(name) for name in ("policy.onnx", "filter.onnx"))
+    (policy_mean,) = policy.run(["policy_mean"], {"observation": observation[None]})
+    action = session.run(["action"], {"observation": observation[None], "policy_mean": policy_mean})[0][0]
 
 Units, ranges and order of the numbers are in manifest.json.
 """
@@ -44,20 +46,20 @@ def main(arguments: list[str] | None = None) -> int:
     """Return the exit code: 0 when everything is as it should be, else 1."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n", maxsplit=1)[0])
     parser.add_argument("--observations", type=Path, help="(N, D) .npy file of observations to filter")
-    parser.add_argument("--policy-means", type=Path, help="(N, A) .npy file of the policy's mean actions in them")
+    parser.add_argument("--policy-means", type=Path, help="(N, A) .npy file of another policy's mean actions")
     parser.add_argument("--output", type=Path, help="where to write the (N, A) filtered actions, as .npy")
     options = parser.parse_args(arguments)
     directory = Path(__file__).resolve().parent
     try:
-        own = [options.observations, options.policy_means, options.output]
-        if any(own) and not all(own):
-            raise Problem("--observations, --policy-means and --output belong together; give all three or none.")
+        if bool(options.observations) != bool(options.output) or (options.policy_means and not options.output):
+            raise Problem("--observations and --output belong together; give both, or neither and no --policy-means.")
         manifest = verified_manifest(directory)
-        session = load_filter(directory / "filter.onnx")
-        if all(own):
-            filter_files(manifest, session, *own)
+        session, policy = load(directory / "filter.onnx"), load(directory / "policy.onnx")
+        if options.output:
+            means = options.policy_means or policy
+            filter_files(manifest, session, options.observations, means, options.output)
         else:
-            compare_with_recording(manifest, session, directory / "recorded")
+            compare_with_recording(manifest, session, policy, directory / "recorded")
     except Problem as problem:
         sys.stderr.write(f"FAILED: {problem}\n")
         return 1
@@ -84,14 +86,14 @@ def verified_manifest(directory: Path) -> dict[str, Any]:
     return manifest
 
 
-def load_filter(path: Path) -> Any:
+def load(path: Path) -> Any:
     """A session that runs on one thread: a control loop has no use for more."""
     settings = onnxruntime.SessionOptions()
     settings.intra_op_num_threads = settings.inter_op_num_threads = 1
     try:
         return onnxruntime.InferenceSession(str(path), settings, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime raises many types, none of them documented
-        raise Problem(f"onnxruntime {onnxruntime.__version__} cannot load filter.onnx: {error}") from None
+        raise Problem(f"onnxruntime {onnxruntime.__version__} cannot load {path.name}: {error}") from None
 
 
 def run(session: Any, observations: Any, policy_means: Any) -> Any:
@@ -99,21 +101,29 @@ def run(session: Any, observations: Any, policy_means: Any) -> Any:
     return session.run(["action"], {"observation": observations, "policy_mean": policy_means})[0]
 
 
-def compare_with_recording(manifest: dict[str, Any], session: Any, directory: Path) -> None:
-    """Run the filter over the recording that came with it."""
+def means_of(policy: Any, observations: Any) -> Any:
+    """(N, D) -> (N, A)"""
+    return policy.run(["policy_mean"], {"observation": observations})[0]
+
+
+def compare_with_recording(manifest: dict[str, Any], session: Any, policy: Any, directory: Path) -> None:
+    """Run the filter, and the policy it belongs to, over the recording that came with it."""
     observations, policy_means = read_inputs(manifest, directory / "observations.npy", directory / "policy_means.npy")
     recorded = read_array(directory / "actions.npy", manifest["action"]["size"])
     started = time.perf_counter()
     actions = run(session, observations, policy_means)
     all_at_once_ms = 1000 * (time.perf_counter() - started)
-    difference = float(np.abs(actions - recorded).max())
+    difference = max(
+        float(np.abs(actions - recorded).max()),
+        float(np.abs(means_of(policy, observations) - policy_means).max()),
+    )
     single_us = one_by_one_us(session, observations, policy_means)
     sys.stdout.write(f"{len(actions)} recorded steps in {all_at_once_ms:.1f} ms; one by one {single_us} us (median).\n")
     if not difference <= TOLERANCE:
         raise Problem(
             f"The actions differ from the recorded ones by up to {difference:.2e} (accepted: {TOLERANCE:.0e})."
         )
-    sys.stdout.write(f"OK: the filter reproduces its recorded actions (largest difference {difference:.1e}).\n")
+    sys.stdout.write(f"OK: policy and filter reproduce their recorded actions (largest difference {difference:.1e}).\n")
 
 
 def one_by_one_us(session: Any, observations: Any, policy_means: Any) -> int:
@@ -126,9 +136,13 @@ def one_by_one_us(session: Any, observations: Any, policy_means: Any) -> int:
     return round(1e6 * sorted(durations)[len(durations) // 2])
 
 
-def filter_files(manifest: dict[str, Any], session: Any, observed: Path, means: Path, output: Path) -> None:
-    """Run the filter over somebody's own recording."""
-    observations, policy_means = read_inputs(manifest, observed, means)
+def filter_files(manifest: dict[str, Any], session: Any, observed: Path, means: Any, output: Path) -> None:
+    """Run the filter over somebody's own recording; ``means`` is a file, or the session of the policy to ask."""
+    if isinstance(means, Path):
+        observations, policy_means = read_inputs(manifest, observed, means)
+    else:
+        observations = read_array(observed, manifest["observation"]["size"])
+        policy_means = means_of(means, observations)
     for line in unusual(manifest["observation"], observations):
         sys.stdout.write(f"Note: {line}\n")
     actions = run(session, observations, policy_means)
