@@ -99,7 +99,7 @@ class Fitting:
             "residual_share": draft.weights.residual_share if draft.weights.encoder else 0.0,
             "mode": draft.weights.named_mode(),
             "method": draft.weights.method,
-            "notes": list(draft.notes),
+            "notes": [*draft.notes, *_warnings(evaluation, self.settings.success_tolerance)],
             "trials": [asdict(trial) for trial in draft.trials],
             "seconds": {**draft.seconds, "evaluation": round(time.perf_counter() - started, 1)},
             "weights": weights,
@@ -139,6 +139,17 @@ class Fitting:
         if scenarios not in self.references:
             self.references[scenarios] = self.collect(laboratory.reference_policy().mean, scenarios, 0.0, 0)
         return self.references[scenarios]
+
+
+def _warnings(evaluation: dict[str, Any], tolerance: float) -> list[str]:
+    """What must not be overlooked: the printed method is not gated, and a gate can be wrong on other scenarios."""
+    delta = evaluation["success"]["delta"]
+    if delta >= -tolerance:
+        return []
+    return [
+        f"Success fell by {-100 * delta:.0f} points on unseen scenarios, more than the study's tolerance of "
+        f"{100 * tolerance:.1f}. Do not run this filter on a person."
+    ]
 
 
 def draft_to_bytes(draft: FilterDraft) -> bytes:
