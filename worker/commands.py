@@ -14,6 +14,7 @@ from app.settings import Settings
 from app.storage import ArtefactStore
 from worker import exploration, laboratory, pretraining, rehearsal, service
 from worker.ml.teachers import Manner, User
+from worker.own_studio import OwnStudio
 
 
 def run(arguments: Sequence[str] | None) -> int:
@@ -76,7 +77,7 @@ def _rehearse(options: argparse.Namespace) -> int:
     """Send scripted participants through the real pages and print what came out."""
     with tempfile.TemporaryDirectory(prefix="rehearsal-") as temporary:
         directory = options.directory or Path(temporary)
-        with rehearsal.OwnStudio(directory) as studio:
+        with OwnStudio(directory) as studio:
             database = Database(studio.settings.sqlalchemy_url)
             store = ArtefactStore(directory / "artefacts")
             rehearsed = rehearsal.Rehearsal(database, store, studio.settings.base_url, options.pace)

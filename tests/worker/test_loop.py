@@ -22,7 +22,8 @@ from app.storage import ArtefactStore
 from worker import dataset
 from worker.ml import bundle
 from worker.ml.teachers import Manner, User
-from worker.rehearsal import Outcome, OwnStudio, Rehearsal
+from worker.own_studio import OwnStudio
+from worker.rehearsal import Outcome, Rehearsal
 
 LABELS = 12
 PATIENCE_S = 300.0

@@ -1,0 +1,101 @@
+"""A studio of our own, started for a rehearsal or a test and stopped at its end."""
+
+import os
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Self, TypeVar
+
+import httpx2
+
+from app.errors import AppError
+from app.settings import Settings
+
+Found = TypeVar("Found")
+
+PATIENCE_S = 900.0
+POLL_S = 0.25
+
+
+class StandsStill(AppError):
+    """The studio did not get any further."""
+
+
+class OwnStudio:
+    """Web server and worker of a studio of our own in a directory; a context that stops both at its end."""
+
+    def __init__(self, directory: Path) -> None:
+        directory.mkdir(parents=True, exist_ok=True)
+        self.settings = Settings(data_dir=directory, port=_free_port(), database_url=None)
+        self.log = directory / "rehearsal.log"
+        self._environment = {
+            **{name: value for name, value in os.environ.items() if name != "DATABASE_URL"},
+            "DATA_DIR": str(directory),
+            "HOST": self.settings.host,
+            "PORT": str(self.settings.port),
+        }
+        self._programs: dict[str, subprocess.Popen[bytes]] = {}
+
+    def __enter__(self) -> Self:
+        subprocess.run([sys.executable, "-m", "app", "migrate"], check=True, env=self._environment)
+        self.start_web()
+        self.start_worker()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        for program in self._programs.values():
+            program.terminate()
+        for program in self._programs.values():
+            program.wait()
+
+    def start_web(self) -> None:
+        """Start the web server and wait until it answers."""
+        address = ["--host", self.settings.host, "--port", str(self.settings.port)]
+        self._start("web", "uvicorn", "app.main:create_app", "--factory", "--no-access-log", *address)
+        wait_until(PATIENCE_S, "no web server", self._answers)
+
+    def start_worker(self) -> None:
+        """Start the worker; whatever an earlier one has left undone is its to finish."""
+        self._start("worker", "worker", "run")
+
+    def kill(self, name: str) -> None:
+        """SIGKILL to "web" or "worker": no chance to clean up."""
+        self._programs[name].kill()
+        self._programs[name].wait()
+
+    def _answers(self) -> bool | None:
+        if self._programs["web"].poll() is not None:
+            raise StandsStill(f"The web server stopped by itself; {self.log} says why.")
+        try:
+            return httpx2.get(f"{self.settings.base_url}/login", timeout=5.0).is_success or None
+        except httpx2.TransportError:
+            return None
+
+    def _start(self, name: str, module: str, *arguments: str) -> None:
+        with self.log.open("ab") as stream:
+            self._programs[name] = subprocess.Popen(
+                [sys.executable, "-m", module, *arguments],
+                env=self._environment,
+                stdout=stream,
+                stderr=subprocess.STDOUT,
+            )
+
+
+def wait_until(patience_s: float, missing: str, look: Callable[[], Found | None]) -> Found:
+    """What ``look`` finds in the end. Raises StandsStill when it has found nothing for too long."""
+    deadline = time.monotonic() + patience_s
+    while (found := look()) is None:
+        if time.monotonic() > deadline:
+            raise StandsStill(f"There was {missing} for {patience_s:.0f} s; rehearsal.log says what went on.")
+        time.sleep(POLL_S)
+    return found
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port

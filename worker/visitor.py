@@ -1,0 +1,125 @@
+"""A browser without scripts, as far as a rehearsal needs one: follows redirects, fills in forms, presses buttons."""
+
+import re
+import secrets
+import time
+from dataclasses import dataclass
+from html.parser import HTMLParser
+from typing import Self
+from urllib.parse import urljoin
+
+import httpx2
+
+from app.errors import AppError
+
+_QUERY = re.compile(r"/p/queries/(\d+)/label")
+
+
+class WentAstray(AppError):
+    """A page was not what a visitor expects."""
+
+
+class Visitor:
+    """One visitor with cookies of their own; a context that closes the connection at its end."""
+
+    def __init__(self, base_url: str, path: str) -> None:
+        self._client = httpx2.Client(
+            base_url=base_url, follow_redirects=True, timeout=60.0, headers={"Origin": base_url}
+        )
+        self._page = _Page("", "")
+        self._first = path
+
+    def __enter__(self) -> Self:
+        self._open(self._first)
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._client.close()
+
+    def come_in(self) -> None:
+        """Go through consent and instructions to the first pair."""
+        for _ in range(5):
+            if self._page.address.endswith("/p/next") or self._page.form_to(_QUERY):
+                return
+            self._send_first({})
+        raise WentAstray(f"The way from the personal link to the first pair ended at {self._page.address}.")
+
+    def log_in(self, name: str, password: str) -> None:
+        """As an experimenter, choosing a new password on the way when asked to."""
+        self._send_first({"name": name, "password": password})
+        chosen = secrets.token_urlsafe(16)
+        if "/password" in self._page.address:
+            self._send_first({"current": password, "new": chosen, "again": chosen})
+
+    def download(self, path: str) -> bytes:
+        """The bytes behind an address."""
+        response = self._client.get(path)
+        if response.is_error:
+            raise WentAstray(f"GET {path} answered {response.status_code}.")
+        return response.content
+
+    def query_id(self) -> int | None:
+        """The query on the page, after loading the page anew; None while there is none."""
+        self._open("/p/next")
+        form = self._page.form_to(_QUERY)
+        return None if form is None else int(form.target.group(1))
+
+    def answer(self, response: str) -> float:
+        """Press a button; returns the seconds until the next page was there."""
+        form = self._page.form_to(_QUERY)
+        if form is None:
+            raise WentAstray(f"There is no pair on {self._page.address}.")
+        started = time.perf_counter()
+        self._send(form.target.group(0), {**form.fields, "response": response})
+        return time.perf_counter() - started
+
+    def _send_first(self, filled_in: dict[str, str]) -> None:
+        """Send the page's first form with these fields filled in, the others as they are."""
+        if not self._page.forms:
+            raise WentAstray(f"There is nothing to press on {self._page.address}.")
+        action, fields = self._page.forms[0]
+        self._send(action, {**fields, **filled_in})
+
+    def _open(self, path: str) -> None:
+        self._arrive(self._client.get(path))
+
+    def _send(self, path: str, fields: dict[str, str]) -> None:
+        self._arrive(self._client.post(urljoin(self._page.address or "/", path), data=fields))
+
+    def _arrive(self, response: httpx2.Response) -> None:
+        if response.is_error:
+            raise WentAstray(f"{response.request.method} {response.url.path} answered {response.status_code}.")
+        self._page = _Page(str(response.url), response.text)
+
+
+@dataclass(frozen=True)
+class _Form:
+    """A form whose address has been recognised."""
+
+    target: re.Match[str]
+    fields: dict[str, str]
+
+
+class _Page(HTMLParser):
+    """The forms of a page with the fields a person would leave as they are; boxes are ticked."""
+
+    def __init__(self, address: str, text: str) -> None:
+        super().__init__()
+        self.address = address
+        self.forms: list[tuple[str, dict[str, str]]] = []
+        self.feed(text)
+
+    def form_to(self, address: re.Pattern[str]) -> _Form | None:
+        """The first form that is sent to such an address."""
+        for action, fields in self.forms:
+            if found := address.search(action):
+                return _Form(found, fields)
+        return None
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        """Collect forms and their input fields."""
+        named = {name: value or "" for name, value in attrs}
+        if tag == "form" and named.get("method", "").lower() == "post":
+            self.forms.append((named.get("action", ""), {}))
+        elif tag in {"input", "button"} and self.forms and named.get("name"):
+            self.forms[-1][1].setdefault(named["name"], named.get("value", "on"))
