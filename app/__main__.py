@@ -1,6 +1,7 @@
 """The command line of the studio: ``python -m app up`` starts everything, the rest is upkeep."""
 
 import argparse
+import ctypes
 import logging
 import os
 import signal
@@ -28,6 +29,8 @@ from app.settings import Settings
 GRACE_S = 20.0
 FALLS_ALLOWED = 3
 FALLS_WITHIN_S = 60.0
+_PR_SET_PDEATHSIG = 1
+_LIBC = ctypes.CDLL(None) if sys.platform == "linux" else None  # loaded here: a forked child must not load libraries
 _COLOURS = {"web": "\033[36m", "worker": "\033[35m"}
 _RESET = "\033[0m"
 
@@ -180,6 +183,7 @@ class _Programs:
             bufsize=1,
             env={**os.environ, "PYTHONUNBUFFERED": "1"},
             start_new_session=True,
+            preexec_fn=_end_with_parent,
         )
         if child.stdout is not None:
             threading.Thread(target=_forward, args=(name, child.stdout), daemon=True).start()
@@ -198,6 +202,12 @@ class _Programs:
                 child.wait(max(0.1, deadline - time.monotonic()))
             except subprocess.TimeoutExpired:
                 child.kill()
+
+
+def _end_with_parent() -> None:
+    """Run in a new child: when the supervisor is killed outright, Linux asks the child to stop as Ctrl-C would have."""
+    if _LIBC is not None:
+        _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
 def _forward(name: str, stream: IO[str]) -> None:

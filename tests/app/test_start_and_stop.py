@@ -1,0 +1,155 @@
+"""``make run``: one supervisor for web server and worker, from the greeting to Ctrl-C."""
+
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from urllib.request import urlopen
+
+import pytest
+
+PATIENCE_S = 60.0
+
+Start = Callable[[], "Studio"]
+
+
+class Studio:
+    """``python -m app up`` with what it has said so far."""
+
+    def __init__(self, directory: Path, port: int) -> None:
+        self.address = f"http://127.0.0.1:{port}"
+        environment = {name: value for name, value in os.environ.items() if name != "DATABASE_URL"}
+        environment.update(DATA_DIR=str(directory), PORT=str(port), HOST="127.0.0.1", COMPUTE_PROCESSES="1")
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "app", "up"],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            env=environment,
+        )
+        self.lines: list[str] = []
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        self.lines.extend(iter(self.process.stdout.readline, ""))
+
+    @property
+    def said(self) -> str:
+        return "".join(self.lines)
+
+    def child(self, program: str) -> int:
+        """The process id of the web server or the worker."""
+        children = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children").read_text().split()
+        return next(int(pid) for pid in children if program in Path(f"/proc/{pid}/cmdline").read_text())
+
+    def stop(self, number: int = signal.SIGINT) -> int:
+        self.process.send_signal(number)
+        return self.ended()
+
+    def ended(self) -> int:
+        """Wait for the end; returns the exit code."""
+        self.process.wait(timeout=PATIENCE_S)
+        self._reader.join(timeout=PATIENCE_S)
+        assert self.process.stdout is not None
+        self.process.stdout.close()
+        return self.process.returncode
+
+
+@pytest.fixture
+def start(tmp_path: Path) -> Iterator[Start]:
+    studios: list[Studio] = []
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+
+    def begin() -> Studio:
+        studios.append(Studio(tmp_path, port))
+        return studios[-1]
+
+    yield begin
+    for studio in studios:
+        if studio.process.poll() is None:
+            studio.stop(signal.SIGTERM)
+
+
+def within_patience(true: Callable[[], bool]) -> bool:
+    deadline = time.monotonic() + PATIENCE_S
+    while time.monotonic() < deadline:
+        if true():
+            return True
+        threading.Event().wait(0.05)
+    return False
+
+
+def answers(address: str) -> bool:
+    try:
+        with urlopen(f"{address}/login", timeout=5) as response:  # noqa: S310  (our own server)
+            return bool(response.status == 200)
+    except OSError:
+        return False
+
+
+def gone(pid: int) -> bool:
+    try:
+        status = Path(f"/proc/{pid}/stat").read_text()
+    except FileNotFoundError:
+        return True
+    return status.rsplit(")", 1)[1].split()[0] == "Z"
+
+
+def test_the_first_start_prints_all_that_is_needed_and_ctrl_c_stops_both_programs(start: Start) -> None:
+    studio = start()
+    assert within_patience(lambda: "worker-1 is ready" in studio.said and answers(studio.address))
+    link = re.search(r"Participant link\s+(\S+)", studio.said)
+    assert link is not None
+    assert link[1].startswith(f"{studio.address}/p/")
+    assert re.search(r"One-time password \S{12,}", studio.said)
+    assert f"{studio.address}/studies" in studio.said
+    programs = [studio.child("uvicorn"), studio.child("worker")]
+    assert studio.stop() == 0
+    assert "Stopped." in studio.said
+    assert "Traceback" not in studio.said
+    assert all(gone(pid) for pid in programs)
+
+
+def test_a_second_start_makes_no_second_demo_study_and_no_new_password(start: Start) -> None:
+    first = start()
+    assert within_patience(lambda: "Participant link" in first.said)
+    first.stop()
+    second = start()
+    assert within_patience(lambda: "nothing is lost" in second.said)
+    assert "One-time password" not in second.said
+    assert "/p/" not in second.said
+
+
+def test_a_worker_that_is_killed_is_started_again(start: Start) -> None:
+    studio = start()
+    assert within_patience(lambda: "worker-1 is ready" in studio.said)
+    os.kill(studio.child("worker"), signal.SIGKILL)
+    assert within_patience(lambda: studio.said.count("worker-1 is ready") == 2)
+    assert "The worker stopped by itself (exit code -9); starting it again." in studio.said
+
+
+def test_killing_the_supervisor_leaves_nothing_running(start: Start) -> None:
+    studio = start()
+    assert within_patience(lambda: "worker-1 is ready" in studio.said and answers(studio.address))
+    programs = [studio.child("uvicorn"), studio.child("worker")]
+    studio.stop(signal.SIGKILL)
+    assert within_patience(lambda: all(gone(pid) for pid in programs))
+
+
+def test_a_port_in_use_is_explained(start: Start) -> None:
+    first = start()
+    assert within_patience(lambda: answers(first.address))
+    second = start()
+    assert second.ended() == 1
+    assert "choose another: PORT=8001 make run" in second.said
+    assert "Traceback" not in second.said
