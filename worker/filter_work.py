@@ -21,6 +21,8 @@ class NothingToLearnFrom(AppError):
 def train_filter(place: Workplace, task: Task, run_id: int, step: Step) -> None:
     """Train, evaluate and publish; every stage is a step, so that a killed worker loses one stage at most."""
     reward = step("reward", _choose_reward, place, run_id, task)
+    if not reward:
+        return
     with place.database.reading() as session:
         settings = session.get_one(Study, task.study_id).settings
     draft = ""
@@ -30,13 +32,20 @@ def train_filter(place: Workplace, task: Task, run_id: int, step: Step) -> None:
 
 
 def _choose_reward(place: Workplace, run_id: int, task: Task) -> str:
-    """The artefact of the reward model to follow: the newest. The printed method needs one on states and actions."""
+    """The artefact of the reward model to follow: the newest. The printed method needs one on states and actions.
+
+    Empty when the newest filter has already seen the same labels: somebody who answers faster than filters are trained
+    passes several milestones at once.
+    """
     with place.database.writing() as session:
         settings = session.get_one(Study, task.study_id).settings
         model = records.newest_model(session, task.participant, ModelKind.REWARD)
         if model is None:
             raise NothingToLearnFrom
         records.set_labels(session, run_id, model.label_count, model.label_hash)
+        newest = records.newest_model(session, task.participant, ModelKind.FILTER)
+        if newest is not None and newest.label_hash == model.label_hash:
+            return ""
     if settings.method is Method.STUDIO or settings.reward_kind is RewardKind.MLP:
         return model.artefact_sha256
     place.report(run_id, "learning a reward model on states and actions", 0.05)

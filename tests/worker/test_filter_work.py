@@ -1,0 +1,61 @@
+"""When a filter is trained, and when not."""
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from sqlalchemy import func, select
+
+from app.db import Database
+from app.domain.models import Model, ModelKind, RunKind
+from app.domain.studies import Participant
+from app.storage import ArtefactStore
+from worker import records
+from worker.compute import Compute
+from worker.filter_work import NothingToLearnFrom, train_filter
+from worker.records import Task
+from worker.workplace import Workplace
+
+
+@pytest.fixture
+def place(database: Database, store: ArtefactStore) -> Workplace:
+    return Workplace(database, store, Compute(1))
+
+
+def at_once(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
+    """A step of a workflow that nobody interrupts."""
+    return function(*arguments)
+
+
+def begin(place: Workplace, participant: Participant, kind: RunKind, name: str) -> tuple[Task, int]:
+    task = Task(name, kind, participant.study_id, participant.id, 10)
+    with place.database.writing() as session:
+        return task, records.begin_run(session, task, seed=1)
+
+
+def save_model(place: Workplace, participant: Participant, kind: ModelKind, label_hash: str) -> None:
+    _, run_id = begin(place, participant, RunKind(kind.value), f"{kind}/{label_hash}")
+    with place.database.writing() as session:
+        records.set_labels(session, run_id, 10, label_hash)
+        records.save_model(session, run_id, kind, "0" * 64, {})
+
+
+def count_filters(place: Workplace) -> int:
+    with place.database.reading() as session:
+        return session.scalar(select(func.count(Model.id)).where(Model.kind == ModelKind.FILTER)) or 0
+
+
+def test_a_filter_that_has_seen_the_same_labels_is_not_trained_again(
+    place: Workplace, participant: Participant
+) -> None:
+    save_model(place, participant, ModelKind.REWARD, "same labels")
+    save_model(place, participant, ModelKind.FILTER, "same labels")
+    task, run_id = begin(place, participant, RunKind.FILTER, "filter/participant-1/labels-10")
+    train_filter(place, task, run_id, at_once)
+    assert count_filters(place) == 1
+
+
+def test_without_a_reward_model_the_run_says_why_there_is_no_filter(place: Workplace, participant: Participant) -> None:
+    task, run_id = begin(place, participant, RunKind.FILTER, "filter/participant-1/labels-10")
+    with pytest.raises(NothingToLearnFrom, match="can't tell"):
+        train_filter(place, task, run_id, at_once)
