@@ -16,6 +16,11 @@ from worker.sim.rollout import rollout
 from worker.trajectory import Array, Trajectory
 
 
+def warm_up() -> None:
+    """Make the rollouts that every reward model is normalised over, so that the first retraining is a quick one."""
+    reference_rollouts()
+
+
 def run_scenarios(act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
     """One rollout per scenario, with Gaussian noise of this deviation on every action."""
     return [

@@ -49,6 +49,11 @@ def workflow_name(finding: str, attempt: int) -> str:
     return f"{finding}#{attempt}"
 
 
+def somebody_has_answered(session: Session) -> bool:
+    """Whether there is anything to learn from yet: the first retraining then is not far."""
+    return session.scalar(select(LabelEvent.id).limit(1)) is not None
+
+
 def short_of_queries(session: Session) -> list[int]:
     """Participants who could soon run out of queries."""
     return [

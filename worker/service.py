@@ -20,7 +20,7 @@ from app.domain.models import RunKind
 from app.errors import AppError
 from app.settings import Settings
 from app.storage import ArtefactStore
-from worker import laboratory, querying, reconcile, records
+from worker import laboratory, lessons, querying, reconcile, records
 from worker.compute import Compute, Lane
 from worker.records import Task
 from worker.workflows import Workshop, as_arguments
@@ -56,7 +56,7 @@ def run(settings: Settings) -> int:
         _launch_engine(settings)
         log.info("worker %s is ready", settings.worker_name)
         try:
-            _rounds(settings, workshop, stop)
+            _Rounds(settings, workshop).until(stop)
         finally:
             compute.close()
             DBOS.destroy()
@@ -104,36 +104,51 @@ def _launch_engine(settings: Settings) -> None:
         DBOS.register_queue(kind.value, worker_concurrency=count, polling_interval_sec=0.2)
 
 
-def _rounds(settings: Settings, workshop: Workshop, stop: threading.Event) -> None:
-    started: set[str] = set()  # only saves the engine from being told again what it already knows
-    signed_at = -math.inf
-    while not stop.wait(ROUND_S):
-        try:
-            if time.monotonic() - signed_at >= PRESENCE_S:
-                with workshop.place.database.writing() as session:
-                    records.sign_presence(session, settings.worker_name)
-                signed_at = time.monotonic()
-            _one_round(workshop, started)
-        except OperationalError as error:
-            log.warning("the database could not be reached, trying again: %s", error.orig)
+class _Rounds:
+    """Asks the database again and again; remembers only what spares work, nothing that work depends on."""
 
+    def __init__(self, settings: Settings, workshop: Workshop) -> None:
+        self._worker_name = settings.worker_name
+        self._workshop = workshop
+        self._place = workshop.place
+        self._started: set[str] = set()  # what the engine has been told already
+        self._signed_at = -math.inf
+        self._learners_are_warm = False
 
-def _one_round(workshop: Workshop, started: set[str]) -> None:
-    with workshop.place.database.reading() as session:
-        due = list(reconcile.findings(session))
-        hungry = reconcile.short_of_queries(session)
-        lost = reconcile.abandoned(session, workshop.in_hand)
-    for task, attempt in due:
-        _start(workshop, task, reconcile.workflow_name(task.finding, attempt), started)
-    for participant_id in hungry:
-        querying.refill_queries(workshop.place, participant_id)
-    for name in lost:
-        log.warning("%s was left behind by another worker; taking it over", name)
-        DBOS.resume_workflow(name)
+    def until(self, stop: threading.Event) -> None:
+        """One round after the other; a database that is away for a while is waited for."""
+        while not stop.wait(ROUND_S):
+            try:
+                self._sign()
+                self._round()
+            except OperationalError as error:
+                log.warning("the database could not be reached, trying again: %s", error.orig)
 
+    def _sign(self) -> None:
+        if time.monotonic() - self._signed_at >= PRESENCE_S:
+            with self._place.database.writing() as session:
+                records.sign_presence(session, self._worker_name)
+            self._signed_at = time.monotonic()
 
-def _start(workshop: Workshop, task: Task, name: str, started: set[str]) -> None:
-    if name not in started:
-        with SetWorkflowID(name):
-            DBOS.enqueue_workflow(task.kind, workshop.work, as_arguments(task))
-        started.add(name)
+    def _round(self) -> None:
+        with self._place.database.reading() as session:
+            due = list(reconcile.findings(session))
+            hungry = reconcile.short_of_queries(session)
+            lost = reconcile.abandoned(session, self._workshop.in_hand)
+            learning_ahead = self._learners_are_warm or reconcile.somebody_has_answered(session)
+        for task, attempt in due:
+            self._start(task, reconcile.workflow_name(task.finding, attempt))
+        for participant_id in hungry:
+            querying.refill_queries(self._place, participant_id)
+        for name in lost:
+            log.warning("%s was left behind by another worker; taking it over", name)
+            DBOS.resume_workflow(name)
+        if learning_ahead and not self._learners_are_warm:
+            self._place.compute.warm_up(Lane.LEARNING, lessons.warm_up)
+            self._learners_are_warm = True
+
+    def _start(self, task: Task, name: str) -> None:
+        if name not in self._started:
+            with SetWorkflowID(name):
+                DBOS.enqueue_workflow(task.kind, self._workshop.work, as_arguments(task))
+            self._started.add(name)

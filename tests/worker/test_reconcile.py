@@ -63,6 +63,14 @@ def test_the_reward_model_is_due_at_every_tenth_label(
     assert found() == {}
 
 
+def test_the_first_answer_is_noticed(database: Database, labels: Callable[[int], list[Query]]) -> None:
+    with database.reading() as session:
+        assert not reconcile.somebody_has_answered(session)
+    labels(1)
+    with database.reading() as session:
+        assert reconcile.somebody_has_answered(session)
+
+
 def test_the_tenth_label_asks_for_a_reward_model_and_then_for_the_milestones_filter(
     database: Database, labels: Callable[[int], list[Query]], found: Callable[[], dict[str, int]]
 ) -> None:
