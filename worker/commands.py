@@ -44,7 +44,7 @@ def _add_training(commands: _Commands) -> None:
     pretrain.set_defaults(act=lambda options: pretraining.pretrain(options.seed, options.directory))
 
     explore = commands.add_parser("explore", help=exploration.explore.__doc__)
-    explore.add_argument("--work-directory", type=Path, default=Path("data/explore"), help="finished blocks")
+    explore.add_argument("--work-directory", type=Path, help="finished blocks; default: explore/ in the data directory")
     explore.add_argument("--processes", type=int, default=2)
     explore.set_defaults(act=_explore)
 
@@ -68,7 +68,7 @@ def _add_rehearsal(commands: _Commands) -> None:
 
 
 def _explore(options: argparse.Namespace) -> int:
-    record = exploration.explore(options.work_directory, options.processes)
+    record = exploration.explore(options.work_directory or Settings().data_dir / "explore", options.processes)
     sys.stdout.write(json.dumps(record, indent=2) + "\n")
     return 0
 
