@@ -15,6 +15,7 @@ from sqlalchemy.orm import Session
 
 from app.domain.models import RunKind
 from app.domain.studies import Participant, Study
+from app.errors import AppError
 from worker import records
 from worker.clip_work import build_clips
 from worker.filter_work import train_filter
@@ -52,6 +53,9 @@ class Workshop(DBOSConfiguredInstance):
             _BODIES[RunKind(task.kind)](self.place, task, run_id, _step)
             _step("finish", self._finish, run_id)
             log.info("%s done in %.1f s", task.finding, time.monotonic() - started)
+        except AppError as refusal:  # foreseen, and already in words for people
+            log.warning("%s: %s", task.finding, refusal.message)
+            _step("fail", self._fail, task.finding, refusal.message)
         except Exception as error:  # the worker's edge: one failed task must not stop the others
             log.exception("%s failed", task.finding)
             _step("fail", self._fail, task.finding, f"{type(error).__name__}: {error}")
