@@ -83,10 +83,6 @@ class Study(Base):
     seed: Mapped[int]
     created_at: Mapped[datetime] = mapped_column(default=now)
 
-    participants: Mapped[list["Participant"]] = relationship(
-        back_populates="study", order_by="Participant.number", lazy="raise"
-    )
-
     @property
     def settings(self) -> StudySettings:
         """The settings, validated."""
@@ -110,7 +106,7 @@ class Participant(Base):
     consent_version: Mapped[str | None] = mapped_column(String(40))
     instructed_at: Mapped[datetime | None]
 
-    study: Mapped[Study] = relationship(back_populates="participants", lazy="raise")
+    study: Mapped[Study] = relationship(lazy="raise")
 
     @property
     def code(self) -> str:

@@ -17,7 +17,7 @@ from safetensors.numpy import load, save
 
 from worker.ml.bradley_terry import preference_logits, probability_right
 from worker.ml.segments import LEFT, RIGHT, SegmentPairs
-from worker.trajectory import SIGNALS, Trajectory
+from worker.trajectory import Trajectory
 
 Array = npt.NDArray[np.float32]
 Floats = npt.NDArray[np.float64]
@@ -231,8 +231,3 @@ def stored_config(stored: bytes) -> dict[str, Any]:
         raise ValueError("This safetensors file does not say what it is (no config in its metadata).")
     config: dict[str, Any] = json.loads(header["__metadata__"]["config"])
     return config
-
-
-def named_weights(values: Floats) -> dict[str, float]:
-    """(S,) -> one value per signal, by name."""
-    return {name: float(value) for name, value in zip(SIGNALS, values, strict=True)}

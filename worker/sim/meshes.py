@@ -41,10 +41,6 @@ class Mesh:
             normals=self.normals @ rotation.T,
         )
 
-    def painted(self, colour: float) -> "Mesh":
-        """The same mesh in one palette colour, its light kept."""
-        return replace(self, paint=np.column_stack([np.full(len(self.vertices), colour), self.paint[:, 1]]))
-
     def shaded(self, light: Array) -> "Mesh":
         """The same mesh with light (V,) in [0, 1] reaching its vertices."""
         return replace(self, paint=np.column_stack([self.paint[:, 0], light]))

@@ -133,11 +133,6 @@ def common(first: Field, second: Field, blend: float = 0.0) -> Field:
     return lambda points: -smooth_minimum(-first(points), -second(points), blend)
 
 
-def grown(field: Field, thickness: float) -> Field:
-    """The solid with every surface moved outwards."""
-    return lambda points: field(points) - thickness
-
-
 def mirrored(field: Field) -> Field:
     """The solid and its mirror image in the plane x = 0."""
     return lambda points: field(np.column_stack([np.abs(points[:, 0]), points[:, 1], points[:, 2]]))
