@@ -12,7 +12,6 @@ import hashlib
 import json
 import multiprocessing
 import os
-import pickle
 import sys
 import time
 from collections.abc import Sequence
@@ -210,13 +209,15 @@ class Bench:
     def _cached(self, key: tuple[Any, ...], make: Any) -> list[Trajectory]:
         policy = hashlib.sha256(b"".join(array.tobytes() for array in self.policy.weights.values())).hexdigest()
         name = hashlib.sha256(repr((key, policy, laboratory.behaviours(1, 2).tolist())).encode()).hexdigest()[:16]
-        path = self.options.cache / f"{name}.pickle"
-        if path.exists():
-            loaded: list[Trajectory] = pickle.loads(path.read_bytes())  # noqa: S301 (our own cache)
-            return loaded
+        directory = self.options.cache / name
+        if directory.exists():
+            return [Trajectory.load(path) for path in sorted(directory.iterdir())]
         made: list[Trajectory] = make()
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(pickle.dumps(made))
+        partial_directory = directory.with_suffix(".partial")
+        partial_directory.mkdir(parents=True, exist_ok=True)
+        for number, trajectory in enumerate(made):
+            trajectory.save(partial_directory / f"{number:05}.npz")
+        partial_directory.rename(directory)
         return made
 
     # -- users
@@ -292,7 +293,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--no-residual", action="store_true")
     parser.add_argument("--preference-weight", type=float, default=0.3)
     parser.add_argument("--processes", type=int, default=2)
-    parser.add_argument("--cache", type=Path, default=Path("/tmp/pbarl-benchmark-cache"))  # noqa: S108
+    parser.add_argument("--cache", type=Path, default=Path("data/benchmark"))
     parser.add_argument("--output", type=Path)
     return parser.parse_args()
 
