@@ -49,20 +49,17 @@ class Space:
 
 CONTROL_STEP_S = 0.1
 
-FEEDING_OBSERVATION = Space(
-    (
-        Field("spoon_position_m", 3, "m", -1.5, 1.5, "centre of the spoon's bowl, in the robot base frame"),
-        Field("spoon_forward", 3, "1", -1.0, 1.0, "unit vector along the spoon towards its tip, base frame"),
-        Field("spoon_up", 3, "1", -1.0, 1.0, "unit vector out of the spoon's bowl, base frame"),
-        Field("spoon_to_mouth_m", 3, "m", -1.5, 1.5, "mouth centre minus spoon position, base frame"),
-        Field("joint_positions_rad", 7, "rad", -6.2832, 6.2832, "angles of joints 1 to 7"),
-        Field("neck_to_mouth_m", 3, "m", -0.3, 0.3, "mouth centre minus the pivot of the neck, base frame"),
-        Field("face_direction", 3, "1", -1.0, 1.0, "unit vector out of the face, base frame"),
-        Field("force_on_person_n", 1, "N", 0.0, 50.0, "summed normal force of arm and spoon on the person"),
-        Field("food_on_spoon", 1, "1", 0.0, 1.0, "share of the portion still on the spoon"),
-        Field("food_eaten", 1, "1", 0.0, 1.0, "share of the portion eaten"),
-    )
+SHARED_FIELDS = (
+    Field("tool_position_m", 3, "m", -1.5, 1.5, "working point of the tool, in the robot base frame"),
+    Field("tool_forward", 3, "1", -1.0, 1.0, "unit vector of the tool's x axis, base frame"),
+    Field("tool_up", 3, "1", -1.0, 1.0, "unit vector of the tool's z axis, base frame"),
+    Field("tool_to_target_m", 3, "m", -1.5, 1.5, "target minus tool position, base frame"),
+    Field("joint_positions_rad", 7, "rad", -6.2832, 6.2832, "angles of joints 1 to 7"),
+    Field("body_to_target_m", 3, "m", -0.5, 0.5, "target minus the joint of the body that carries it, base frame"),
+    Field("target_outward", 3, "1", -1.0, 1.0, "unit vector out of the person at the target, base frame"),
+    Field("force_on_person_n", 1, "N", 0.0, 50.0, "summed normal force of arm and tool on the person"),
 )
+"""What every task observes first, in this order; a task's own fields follow."""
 
 JOINT_ACTION = Space(
     (

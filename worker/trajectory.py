@@ -29,8 +29,18 @@ SIGNALS = (
     "tilt_rad",
     "undelivered",
     "action_change_squared",
+    "force_squared_n2",
+    "turn_speed_squared_rad2_s2",
+    "strokes",
 )
-"""What a robot can measure about one control step; the structured reward model is linear in these columns."""
+"""What a robot can measure about one control step; the structured reward model is linear in these columns.
+
+Every task has all of them; a column that means nothing in a task is 0."""
+
+BODIES = ("broad", "slim")
+"""The two shapes of the person's body."""
+SKIN_TONES = 6
+"""Skin tones are numbered from 0, the lightest, to 5, the darkest."""
 
 
 @dataclass(frozen=True)
@@ -56,13 +66,20 @@ class Trajectory:
     """(T + 1, 7) rad"""
     particles: Array
     """(T + 1, P, 3) m in the world frame; NaN once a particle has been eaten or lost"""
-    head_quaternion: Array
-    """(4,) xyzw in the world frame"""
+    head_quaternions: Array
+    """(T + 1, 4) xyzw in the world frame"""
+    arm_positions_rad: Array
+    """(T + 1, 2, 4) the person's right and left arm: shoulder flexion, abduction, rotation, and elbow flexion"""
+    target_m: Array
+    """(T + 1, 3) mouth or itch in the world frame"""
     contact_force_n: Array
     """(T,) summed normal force on the person"""
     success: bool
     scenario: int
     task: str
+    body: str
+    """one of BODIES"""
+    skin_tone: int
 
     def __post_init__(self) -> None:
         steps = len(self.actions)
@@ -75,7 +92,9 @@ class Trajectory:
             "task_rewards": (steps,),
             "joint_positions": (steps + 1, 7),
             "particles": (steps + 1, None, 3),
-            "head_quaternion": (4,),
+            "head_quaternions": (steps + 1, 4),
+            "arm_positions_rad": (steps + 1, 2, 4),
+            "target_m": (steps + 1, 3),
             "contact_force_n": (steps,),
         }
         for name, shape in expected.items():
@@ -93,8 +112,14 @@ class Trajectory:
     def load(cls, source: Path | IO[bytes]) -> Self:
         """Read what save() wrote. Raises ValueError for a file that holds anything but plain arrays."""
         with np.load(source, allow_pickle=False) as stored:
+            missing = [field.name for field in fields(cls) if field.name not in stored]
+            if missing:
+                raise ValueError(
+                    f"This trajectory lacks {', '.join(missing)}: an older version of the studio recorded it. "
+                    "Run its scenario again."
+                )
             values = {field.name: stored[field.name] for field in fields(cls)}
-        plain = {"success": bool, "scenario": int, "task": str}
+        plain = {"success": bool, "scenario": int, "task": str, "body": str, "skin_tone": int}
         return cls(**{name: plain[name](value) if name in plain else value for name, value in values.items()})
 
 

@@ -1,4 +1,4 @@
-"""The simulated robot, person and food. Importing this package registers its environments with Gymnasium."""
+"""The simulated robot, people and tasks. Importing this package registers its environments with Gymnasium."""
 
 import gymnasium
 

@@ -34,6 +34,11 @@ class Shape:
     position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     quaternion: tuple[float, float, float, float] = IDENTITY
 
+    @classmethod
+    def box(cls, centre_m: tuple[float, float, float], size_m: tuple[float, float, float]) -> "Shape":
+        """A box by its whole edge lengths."""
+        return cls("box", half_extents_m=(size_m[0] / 2, size_m[1] / 2, size_m[2] / 2), position_m=centre_m)
+
 
 class Contact(NamedTuple):
     """One contact point between a queried body and another one."""

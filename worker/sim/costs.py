@@ -13,6 +13,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
+from worker.tasks import Task
 from worker.trajectory import COSTS, SIGNALS
 
 Array = npt.NDArray[np.float32]
@@ -20,9 +21,6 @@ FloatArray = npt.NDArray[np.float64]
 CostForm = Literal["paper", "calibrated"]
 
 BASE_WEIGHTS = {"C_d": 1.0, "C_v": 0.25, "C_f": 0.01, "C_hf": 0.05, "C_fd": 1.0, "C_fdv": 1.0}
-CALIBRATED_SPEED_WEIGHT = 1.20
-"""Scaling all actions of the shipped policy by a factor near 1 leaves the reference person's return unchanged to first
-order (200 scenarios, factors .8 to 1.2). Measured by tests/benchmarks/speed_cost_weight.py; repeat for a new policy."""
 SPEED_SCALE_M_S = 0.2
 """At this speed the calibrated item equals the paper's."""
 
@@ -30,11 +28,11 @@ _SPEED = COSTS.index("C_v")
 _SPEED_SQUARED = SIGNALS.index("speed_squared_m2_s2")
 
 
-def base_weights(form: CostForm = "calibrated") -> FloatArray:
+def base_weights(task: Task, form: CostForm = "calibrated") -> FloatArray:
     """(6,) weights of the six items for a person with omega = 1."""
     weights = np.array([BASE_WEIGHTS[name] for name in COSTS])
     if form == "calibrated":
-        weights[_SPEED] = CALIBRATED_SPEED_WEIGHT
+        weights[_SPEED] = task.calibrated_speed_weight
     return weights
 
 
@@ -47,9 +45,9 @@ def cost_items(costs: Array, signals: Array, form: CostForm = "calibrated") -> F
 
 
 def preference_rewards(
-    costs: Array, signals: Array, omega: npt.ArrayLike = 1.0, form: CostForm = "calibrated"
+    task: Task, costs: Array, signals: Array, omega: npt.ArrayLike = 1.0, form: CostForm = "calibrated"
 ) -> FloatArray:
     """r^H of every step, (...,): zero or negative. ``omega`` is (6,) in the order of COSTS, or one number."""
-    weights = base_weights(form) * np.asarray(omega, np.float64)
+    weights = base_weights(task, form) * np.asarray(omega, np.float64)
     rewards: FloatArray = -(cost_items(costs, signals, form) @ weights)
     return rewards

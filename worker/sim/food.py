@@ -1,11 +1,10 @@
 """The portion of food: eight balls on a spoon, each on it, eaten, fallen, or resting on the person."""
 
-from typing import NamedTuple
-
 import numpy as np
 import numpy.typing as npt
 
 from worker.sim.bullet import Bullet
+from worker.sim.measures import Outcome
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -17,15 +16,6 @@ PORTION_NEEDED = 0.75
 FLOOR_M = 0.0
 
 
-class PortionChange(NamedTuple):
-    """What happened to the food during one control step: balls, and for those eaten their summed speed."""
-
-    eaten: int
-    intake_speed_m_s: float
-    spilled: int
-    on_person: int
-
-
 class Portion:
     """Eight balls of food and what has become of them."""
 
@@ -34,9 +24,6 @@ class Portion:
     def __init__(self, world: Bullet, positions_m: FloatArray) -> None:
         self._world = world
         world.add_balls(self.names, BALL_RADIUS_M, BALL_MASS_KG, positions_m)
-        for name in self.names:
-            world.set_material(name)
-            world.set_damping(name, linear=0.04, angular=0.1)
         self.on_spoon = set(self.names)
         self.present = set(self.names)
         self.touched: set[str] = set()
@@ -47,7 +34,7 @@ class Portion:
         nowhere = (np.nan, np.nan, np.nan)
         return np.array([self._world.position(name) if name in self.present else nowhere for name in self.names])
 
-    def update(self, spoon_m: FloatArray, mouth_m: FloatArray, touching: set[str]) -> PortionChange:
+    def update(self, spoon_m: FloatArray, mouth_m: FloatArray, touching: set[str]) -> Outcome:
         """Count what was eaten, spilled or fell on the person during the last control step."""
         newly_touching = touching - self.touched
         self.touched |= newly_touching
@@ -67,7 +54,7 @@ class Portion:
                 self._remove(name)
         self.eaten += eaten
         self.spilled += spilled
-        return PortionChange(eaten, intake, spilled, len(newly_touching))
+        return Outcome(eaten, intake, spilled, len(newly_touching))
 
     def _remove(self, name: str) -> None:
         self.on_spoon.discard(name)

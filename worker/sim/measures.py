@@ -1,7 +1,8 @@
-"""What one control step is worth: measurements -> the columns of SIGNALS and COSTS and the task's reward."""
+"""What one control step was like, in every task: measurements -> the columns of SIGNALS and COSTS."""
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -14,12 +15,27 @@ Array = npt.NDArray[np.float32]
 NEAR_M = 0.20
 """Closer than this the speed counts as speed near the person."""
 SIDE_VIEW_M = 0.30
-"""Closer than this a sideways offset from the mouth's axis counts."""
+"""Closer than this a sideways offset from the target's axis counts."""
 APPROACHING_M = 0.08
-"""Further than this the height above the mouth counts ..."""
+"""Further than this the height above the target counts ..."""
 LOW_ENTRY_M = 0.08
-"""... and it counts from this far below the mouth upwards."""
+"""... and it counts from this far below the target upwards."""
 HIGH_FORCE_N = 10.0
+
+
+class Outcome(NamedTuple):
+    """What happened to the task's objects during one control step. Counts are of this step alone."""
+
+    delivered: int = 0
+    """pieces of food or water that entered the mouth"""
+    intake_speed_m_s: float = 0.0
+    """their speeds, summed"""
+    spilled: int = 0
+    """pieces that left the tool and were not delivered"""
+    on_person: int = 0
+    """pieces that touched the person for the first time"""
+    strokes: int = 0
+    """strokes of the scratcher over the itch"""
 
 
 @dataclass(frozen=True)
@@ -29,35 +45,35 @@ class StepMeasures:
     Forces and speeds are averages over the physics sub-steps, not snapshots of the last one.
     """
 
-    spoon_m: FloatArray
-    spoon_up: FloatArray
-    mouth_m: FloatArray
-    face: FloatArray
+    tool_m: FloatArray
+    """working point of the tool"""
+    tool_up: FloatArray
+    target_m: FloatArray
+    """mouth or itch"""
+    outward: FloatArray
+    """unit vector out of the person at the target"""
     speed_m_s: float
     speed_squared_m2_s2: float
     acceleration_m_s2: FloatArray
     """(3,) change of the step's mean velocity over 0.1 s"""
+    turn_speed_rad_s: float
+    """of the tool, about any axis"""
     force_at_target_n: float
-    """summed normal force of arm and spoon on the person within 6 cm of the mouth"""
+    """summed normal force of arm and tool on the person near the target"""
+    force_squared_n2: float
+    """mean square of the same"""
     force_away_n: float
-    """the same, everywhere else"""
+    """summed normal force everywhere else"""
     action: FloatArray
     previous_action: FloatArray
-    eaten: int
-    """balls that entered the mouth in this step"""
-    intake_speed_m_s: float
-    """their speeds, summed"""
-    spilled: int
-    """balls that left the spoon in this step and were not eaten"""
-    on_person: int
-    """balls that touched the person for the first time in this step"""
+    outcome: Outcome
     undelivered: bool
-    """whether less than three quarters of the portion has been eaten so far"""
+    """whether the task has not succeeded so far"""
 
     @property
     def distance_m(self) -> float:
-        """From the centre of the spoon's bowl to the centre of the mouth."""
-        return float(np.linalg.norm(self.mouth_m - self.spoon_m))
+        """From the tool's working point to the target."""
+        return float(np.linalg.norm(self.target_m - self.tool_m))
 
     @property
     def high_force_n(self) -> float:
@@ -66,23 +82,23 @@ class StepMeasures:
 
     @property
     def height_above_target_m(self) -> float:
-        """How far the spoon is above a line 8 cm below the mouth while it is still approaching; 0 at the mouth."""
+        """How far the tool is above a line 8 cm below the target while it is still approaching; 0 at the target."""
         if self.distance_m <= APPROACHING_M:
             return 0.0
-        return max(0.0, float(self.spoon_m[2] - self.mouth_m[2]) + LOW_ENTRY_M)
+        return max(0.0, float(self.tool_m[2] - self.target_m[2]) + LOW_ENTRY_M)
 
     @property
     def lateral_offset_m(self) -> float:
-        """Distance of the spoon from the axis that leaves the mouth along the face direction, when near."""
+        """Distance of the tool from the axis that leaves the person at the target, when near."""
         if self.distance_m >= SIDE_VIEW_M:
             return 0.0
-        offset = self.spoon_m - self.mouth_m
-        return float(np.linalg.norm(offset - (offset @ self.face) * self.face))
+        offset = self.tool_m - self.target_m
+        return float(np.linalg.norm(offset - (offset @ self.outward) * self.outward))
 
     @property
     def tilt_rad(self) -> float:
-        """Angle between the spoon's up axis and the vertical."""
-        return math.acos(min(1.0, max(-1.0, float(self.spoon_up[2]))))
+        """Angle between the tool's up axis and the vertical."""
+        return math.acos(min(1.0, max(-1.0, float(self.tool_up[2]))))
 
     def signals(self) -> Array:
         """(S,) one value per column of SIGNALS."""
@@ -95,14 +111,17 @@ class StepMeasures:
             "force_at_target_n": self.force_at_target_n,
             "force_away_n": self.force_away_n,
             "high_force_n": self.high_force_n,
-            "spilled_on_person": self.on_person,
-            "spilled": self.spilled,
-            "intake_speed_m_s": self.intake_speed_m_s,
+            "spilled_on_person": self.outcome.on_person,
+            "spilled": self.outcome.spilled,
+            "intake_speed_m_s": self.outcome.intake_speed_m_s,
             "height_above_target_m": self.height_above_target_m,
             "lateral_offset_m": self.lateral_offset_m,
             "tilt_rad": self.tilt_rad,
             "undelivered": float(self.undelivered),
             "action_change_squared": float(np.mean((self.action - self.previous_action) ** 2)),
+            "force_squared_n2": self.force_squared_n2,
+            "turn_speed_squared_rad2_s2": self.turn_speed_rad_s**2,
+            "strokes": self.outcome.strokes,
         }
         return np.array([values[name] for name in SIGNALS], np.float32)
 
@@ -113,33 +132,36 @@ class StepMeasures:
             "C_v": self.speed_m_s,
             "C_f": self.force_away_n,
             "C_hf": self.high_force_n,
-            "C_fd": self.on_person,
-            "C_fdv": self.intake_speed_m_s,
+            "C_fd": self.outcome.on_person,
+            "C_fdv": self.outcome.intake_speed_m_s,
         }
         return np.array([values[name] for name in COSTS], np.float32)
 
 
 @dataclass(frozen=True)
 class TaskReward:
-    """What the reference policy is trained for. It knows nothing of anybody's preferences."""
+    """What a reference policy is trained for. It knows nothing of anybody's preferences."""
 
     distance_per_m: float = -1.0
     action: float = -0.01
-    per_eaten: float = 2.0
-    per_spilled: float = -1.0
+    per_delivered: float = 0.0
+    per_spilled: float = 0.0
+    per_stroke: float = 0.0
     speed_per_m_s: float = -0.05
     force_per_n: float = -0.03
-    tilt: float = -0.3
+    tilt: float = 0.0
+    """times 1 - cos(tilt)"""
 
-    def of(self, step: StepMeasures) -> float:
+    def __call__(self, step: StepMeasures) -> float:
         """The reward of one control step."""
         force = step.force_at_target_n + step.force_away_n
         return float(
             self.distance_per_m * step.distance_m
             + self.action * np.linalg.norm(step.action)
-            + self.per_eaten * step.eaten
-            + self.per_spilled * step.spilled
+            + self.per_delivered * step.outcome.delivered
+            + self.per_spilled * step.outcome.spilled
+            + self.per_stroke * step.outcome.strokes
             + self.speed_per_m_s * step.speed_m_s
             + self.force_per_n * force
-            + self.tilt * (1.0 - step.spoon_up[2])
+            + self.tilt * (1.0 - step.tool_up[2])
         )

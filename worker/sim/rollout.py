@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 
-from worker.sim.feeding import FeedingEnv
+from worker.sim.assistive import AssistiveEnv
 from worker.trajectory import COSTS, SIGNALS, Trajectory
 
 Array = npt.NDArray[np.float32]
@@ -13,13 +13,14 @@ Act = Callable[[Array], Array]
 """observation (D,) -> action (7,)"""
 
 
-def rollout(env: FeedingEnv, act: Act, scenario: int, reference: Act | None = None) -> Trajectory:
-    """One whole episode of 100 steps. Whoever draws actions at random brings its own generator inside ``act``.
+def rollout(env: AssistiveEnv, act: Act, scenario: int, reference: Act | None = None) -> Trajectory:
+    """One whole episode. Whoever draws actions at random brings its own generator inside ``act``.
 
     ``reference`` gives the frozen policy's mean in the same states; without it the executed actions stand in.
     """
     observation, _ = env.reset(seed=scenario)
     observations, joints, particles = [observation], [env.joint_positions], [env.particles]
+    heads, arms, targets = [env.head_quaternion], [env.arm_positions_rad], [env.target_m]
     actions, references, signals, costs, rewards, forces = [], [], [], [], [], []
     over = False
     while not over:
@@ -31,6 +32,9 @@ def rollout(env: FeedingEnv, act: Act, scenario: int, reference: Act | None = No
         observations.append(observation)
         joints.append(env.joint_positions)
         particles.append(env.particles)
+        heads.append(env.head_quaternion)
+        arms.append(env.arm_positions_rad)
+        targets.append(env.target_m)
         signals.append([info["signals"][name] for name in SIGNALS])
         costs.append([info["costs"][name] for name in COSTS])
         rewards.append(reward)
@@ -44,9 +48,13 @@ def rollout(env: FeedingEnv, act: Act, scenario: int, reference: Act | None = No
         task_rewards=np.array(rewards, np.float32),
         joint_positions=np.array(joints, np.float32),
         particles=np.array(particles, np.float32),
-        head_quaternion=np.array(env.head_quaternion, np.float32),
+        head_quaternions=np.array(heads, np.float32),
+        arm_positions_rad=np.array(arms, np.float32),
+        target_m=np.array(targets, np.float32),
         contact_force_n=np.array(forces, np.float32),
         success=env.success,
         scenario=scenario,
-        task="feeding",
+        task=env.task.name,
+        body=env.person.body.name,
+        skin_tone=env.person.skin_tone,
     )
