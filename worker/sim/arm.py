@@ -163,14 +163,13 @@ def _links(robot: Robot, tool: Tool) -> tuple[Link, ...]:
             quaternion_of_euler(joint.origin_rpy),
             joint.mass_kg,
             (capsule_between((0, 0, 0), joint.end_m, joint.radius_m),),
-            turns=True,
         )
         for joint in robot.joints
     ]
     origin, quaternion = compose(
         robot.hand_origin_m, quaternion_of_euler(robot.hand_rpy), tool.origin_m, quaternion_of_euler(tool.rpy)
     )
-    return (*moving, Link(tool.name, origin, quaternion, tool.mass_kg, tool.shapes, turns=False))
+    return (*moving, Link(tool.name, origin, quaternion, tool.mass_kg, tool.shapes, "fixed"))
 
 
 @dataclass(frozen=True)

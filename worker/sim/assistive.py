@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from worker.sim import human
 from worker.sim.arm import Robot, Start, Tool, start_postures
-from worker.sim.bullet import Bullet, Contact, Shape, capsule_between, rotation_of
+from worker.sim.bullet import IDENTITY, Bullet, Contact, Link, Shape, capsule_between, rotation_of
 from worker.sim.human import Impairment, Person
 from worker.sim.jaco import JACO
 from worker.sim.measures import Outcome, StepMeasures, TaskReward
@@ -35,7 +35,7 @@ POSITION_GAIN, MOTOR_FORCE_NM = 0.5, 200.0
 TREMOR_RESPONSE = 0.3
 """Share of the way to the tremor's other side that a heavy head covers in one control step."""
 
-ARM = "arm"
+ARM, PERSON, HEAD = "arm", "person", "head"
 
 
 class Motion(NamedTuple):
@@ -79,7 +79,8 @@ class AssistiveEnv(gymnasium.Env[Any, Any]):
     substeps: ClassVar[int] = 5
     robot_parts: ClassVar[frozenset[str]] = frozenset({ARM})
     """bodies whose pressing on the person counts as force"""
-    person_parts: ClassVar[tuple[str, ...]] = ("body", "head")
+    person_parts: ClassVar[tuple[str, ...]] = (PERSON,)
+    """the person's bodies, on which forces are measured"""
 
     person: Person
     _head_quaternion: tuple[float, float, float, float]
@@ -147,7 +148,7 @@ class AssistiveEnv(gymnasium.Env[Any, Any]):
         if self.person.impairment == "tremor":
             tremor = self._tremor_before + share * (self._tremor - self._tremor_before)
             self._head_quaternion = human.head_quaternion(self.person, tremor)
-            self._world.set_pose("head", self.person.body.neck_pivot_m, self._head_quaternion)
+            self._world.set_ball_joint(PERSON, HEAD, self._head_quaternion)
             self._read_target()
 
     # Gymnasium
@@ -353,31 +354,28 @@ class AssistiveEnv(gymnasium.Env[Any, Any]):
         self._world.drive_joints(ARM, self._command, POSITION_GAIN, MOTOR_FORCE_NM)
 
 
-def add_person(world: Bullet, person: Person) -> None:
-    """Add the seated person as the immovable bodies "body" (trunk, arms, legs) and "head"."""
-    world.add_body("body", [*_still_shapes(person.body), *arm_shapes(person, human.RIGHT, human.LEFT)])
-    world.add_body("head", head_shapes(person.body), person.body.neck_pivot_m, human.head_quaternion(person))
+def add_person(world: Bullet, person: Person, *arms: int) -> None:
+    """Add the seated person as one immovable body whose head can be turned, with the arms named (both by default)."""
+    still = (*_STILL_SHAPES[person.body.name], *arm_shapes(person, *(arms or (human.RIGHT, human.LEFT))))
+    pivot = person.body.neck_pivot_m
+    world.add_chain(PERSON, still, [Link(HEAD, pivot, IDENTITY, 0.0, _HEAD_SHAPES[person.body.name], "ball")])
+    world.set_ball_joint(PERSON, HEAD, human.head_quaternion(person))
 
 
-def arm_shapes(person: Person, *sides: int) -> list[Shape]:
+def arm_shapes(person: Person, *sides: int) -> tuple[Shape, ...]:
     """Collision shapes of the person's arms at rest, in the world."""
     limbs = (limb for side in sides for limb in human.arm_limbs(person.body, person.arms_rad[side], side))
-    return [capsule_between(*limb[1:]) for limb in limbs]
-
-
-def head_shapes(body: human.BodyShape) -> list[Shape]:
-    """Collision shapes of the head, in the head's frame."""
-    return [Shape("sphere", ball.radius_m, position_m=ball.centre_m) for ball in body.head]
+    return tuple(capsule_between(*limb[1:]) for limb in limbs)
 
 
 _STILL_SHAPES = {
     body.name: tuple(capsule_between(*limb[1:]) for limb in (*body.trunk, *body.legs))
     for body in human.BODY_SHAPES.values()
 }
-
-
-def _still_shapes(body: human.BodyShape) -> tuple[Shape, ...]:
-    return _STILL_SHAPES[body.name]
+_HEAD_SHAPES = {
+    body.name: tuple(Shape("sphere", ball.radius_m, position_m=ball.centre_m) for ball in body.head)
+    for body in human.BODY_SHAPES.values()
+}
 
 
 def _box(space: Space) -> gymnasium.spaces.Box:

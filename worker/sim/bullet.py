@@ -3,10 +3,12 @@
 One `Bullet` is one DIRECT client. A simulation steps it; a renderer opens further clients and only sets poses.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +23,7 @@ Vector = Sequence[float] | FloatArray
 IDENTITY = (0.0, 0.0, 0.0, 1.0)
 
 _SHAPES = {"sphere": pybullet.GEOM_SPHERE, "capsule": pybullet.GEOM_CAPSULE, "box": pybullet.GEOM_BOX}
+_JOINTS = {"revolute": pybullet.JOINT_REVOLUTE, "ball": pybullet.JOINT_SPHERICAL, "fixed": pybullet.JOINT_FIXED}
 
 
 @dataclass(frozen=True)
@@ -58,8 +61,8 @@ class Link:
     quaternion: tuple[float, float, float, float]
     mass_kg: float
     shapes: tuple[Shape, ...]
-    turns: bool
-    """whether it turns about its own z axis, or is fixed to the previous link"""
+    joint: Literal["revolute", "ball", "fixed"] = "revolute"
+    """how it hangs on the previous link: turning about its own z axis, in any direction, or not at all"""
 
 
 def rotation_of(quaternion: Vector) -> FloatArray:
@@ -84,17 +87,18 @@ def quaternion_of_euler(euler_rad: Vector) -> tuple[float, float, float, float]:
 
 def capsule_between(start_m: Vector, end_m: Vector, radius_m: float) -> Shape:
     """A capsule whose axis runs from start to end, both in the body's frame."""
-    start, end = np.asarray(start_m, float), np.asarray(end_m, float)
-    axis = end - start
-    length = float(np.linalg.norm(axis))
-    pitch, yaw = float(np.arccos(axis[2] / length)), float(np.arctan2(axis[1], axis[0]))
-    middle = (start + end) / 2
+    (x0, y0, z0), (x1, y1, z1) = start_m, end_m
+    x, y, z = x1 - x0, y1 - y0, z1 - z0
+    length = math.sqrt(x * x + y * y + z * z)
+    # The shortest turn that takes the z axis to the capsule's; for one that points straight down any half turn will do.
+    turn = (-y, x, 0.0, length + z) if length + z > 1e-9 * length else (1.0, 0.0, 0.0, 0.0)
+    norm = math.sqrt(sum(part * part for part in turn))
     return Shape(
         "capsule",
         radius_m,
         length,
-        position_m=(float(middle[0]), float(middle[1]), float(middle[2])),
-        quaternion=quaternion_of_euler((0.0, pitch, yaw)),
+        position_m=((x0 + x1) / 2, (y0 + y1) / 2, (z0 + z1) / 2),
+        quaternion=(turn[0] / norm, turn[1] / norm, turn[2] / norm, turn[3] / norm),
     )
 
 
@@ -145,7 +149,7 @@ class Bullet:
     def add_body(
         self,
         name: str,
-        shapes: Sequence[Shape],
+        shapes: tuple[Shape, ...],
         position_m: Vector = (0, 0, 0),
         quaternion: Vector = IDENTITY,
     ) -> None:
@@ -164,7 +168,7 @@ class Bullet:
         """Add equal free balls, one per row of positions (N, 3)."""
         bodies = pybullet.createMultiBody(
             mass_kg,
-            self._collision([Shape("sphere", radius_m)]),
+            self._collision((Shape("sphere", radius_m),)),
             self._unseen,
             batchPositions=np.asarray(positions_m, float).tolist(),
             physicsClientId=self.client,
@@ -175,12 +179,12 @@ class Bullet:
     def add_chain(
         self,
         name: str,
-        base: Sequence[Shape],
+        base: tuple[Shape, ...],
         links: Sequence[Link],
         position_m: Vector = (0, 0, 0),
         quaternion: Vector = IDENTITY,
     ) -> None:
-        """Add a robot on a fixed base: each link hangs on the one before it."""
+        """Add a chain on a fixed base: each link hangs on the one before it."""
         count = len(links)
         body = pybullet.createMultiBody(
             0.0,
@@ -196,7 +200,7 @@ class Bullet:
             linkInertialFramePositions=[[0, 0, 0]] * count,
             linkInertialFrameOrientations=[list(IDENTITY)] * count,
             linkParentIndices=list(range(count)),
-            linkJointTypes=[pybullet.JOINT_REVOLUTE if link.turns else pybullet.JOINT_FIXED for link in links],
+            linkJointTypes=[_JOINTS[link.joint] for link in links],
             linkJointAxis=[[0, 0, 1]] * count,
             physicsClientId=self.client,
         )
@@ -245,9 +249,19 @@ class Bullet:
 
     def set_joints(self, name: str, angles_rad: Vector) -> None:
         """Put the first joints of a robot at these angles, at rest."""
-        body, client = self._bodies[name], self.client
-        for joint, angle in enumerate(angles_rad):
-            pybullet.resetJointState(body, joint, angle, 0.0, physicsClientId=client)
+        pybullet.resetJointStatesMultiDof(
+            self._bodies[name],
+            range(len(angles_rad)),
+            [[angle] for angle in angles_rad],
+            [[0.0]] * len(angles_rad),
+            physicsClientId=self.client,
+        )
+
+    def set_ball_joint(self, name: str, link: str, quaternion: Vector) -> None:
+        """Put one ball joint at this orientation, at rest."""
+        pybullet.resetJointStateMultiDof(
+            self._bodies[name], self._link(name, link), quaternion, [0.0, 0.0, 0.0], physicsClientId=self.client
+        )
 
     def joints(self, name: str, count: int) -> FloatArray:
         """Angles of the first ``count`` joints in rad."""
@@ -313,17 +327,22 @@ class Bullet:
     def _link(self, name: str, link: str | None) -> int:
         return -1 if link is None else self._links[name][link]
 
-    def _collision(self, shapes: Sequence[Shape]) -> int:
-        collision: int = pybullet.createCollisionShapeArray(
-            shapeTypes=[_SHAPES[shape.kind] for shape in shapes],
-            radii=[shape.radius_m for shape in shapes],
-            lengths=[shape.length_m for shape in shapes],
-            halfExtents=[list(shape.half_extents_m) for shape in shapes],
-            collisionFramePositions=[list(shape.position_m) for shape in shapes],
-            collisionFrameOrientations=[list(shape.quaternion) for shape in shapes],
-            physicsClientId=self.client,
-        )
+    def _collision(self, shapes: tuple[Shape, ...]) -> int:
+        collision: int = pybullet.createCollisionShapeArray(**_as_arrays(shapes), physicsClientId=self.client)
         return collision
+
+
+@lru_cache(maxsize=256)
+def _as_arrays(shapes: tuple[Shape, ...]) -> dict[str, Any]:
+    """Shapes as the engine wants them, remembered because every reset builds the same links again."""
+    return {
+        "shapeTypes": [_SHAPES[shape.kind] for shape in shapes],
+        "radii": [shape.radius_m for shape in shapes],
+        "lengths": [shape.length_m for shape in shapes],
+        "halfExtents": [list(shape.half_extents_m) for shape in shapes],
+        "collisionFramePositions": [list(shape.position_m) for shape in shapes],
+        "collisionFrameOrientations": [list(shape.quaternion) for shape in shapes],
+    }
 
 
 class Drawing(NamedTuple):

@@ -5,6 +5,7 @@ floor is z = 0. Sizes follow the benchmark's male and female adults (facts sheet
 capsules and spheres.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
@@ -211,21 +212,44 @@ def forearm_rotation(arm_rad: FloatArray, side: int) -> FloatArray:
 
 def arm_points_m(body: BodyShape, arm_rad: FloatArray, side: int) -> FloatArray:
     """(4, 3) shoulder, elbow, wrist and middle of the hand in the world."""
-    shoulder = np.array(body.shoulder_m) * ((-1.0, 1.0, 1.0) if side == RIGHT else (1.0, 1.0, 1.0))
-    elbow = shoulder - body.upper_arm_length_m * upper_arm_rotation(arm_rad, side)[:, 2]
-    along = -forearm_rotation(arm_rad, side)[:, 2]
-    wrist = elbow + body.forearm_length_m * along
-    return np.array([shoulder, elbow, wrist, wrist + body.hand_length_m * along])
+    return np.array(_arm_points(body, arm_rad, side))
 
 
 def arm_limbs(body: BodyShape, arm_rad: FloatArray, side: int) -> tuple[Limb, Limb, Limb]:
     """Upper arm, forearm and hand as capsules in the world."""
-    shoulder, elbow, wrist, hand = (_three(point) for point in arm_points_m(body, arm_rad, side))
+    shoulder, elbow, wrist, hand = _arm_points(body, arm_rad, side)
     name = ("right", "left")[side]
     return (
         Limb(f"{name}_upper_arm", shoulder, elbow, body.upper_arm_radius_m),
         Limb(f"{name}_forearm", elbow, wrist, body.forearm_radius_m),
         Limb(f"{name}_hand", wrist, hand, body.hand_radius_m),
+    )
+
+
+def _arm_points(body: BodyShape, arm_rad: FloatArray, side: int) -> tuple[Point, Point, Point, Point]:
+    """Written out for speed: minus the third columns of upper_arm_rotation and forearm_rotation are the bones."""
+    flexion, abduction, rotation, elbow_flexion = arm_rad.tolist()
+    right = side == RIGHT
+    sin_f, cos_f = math.sin(flexion), math.cos(flexion)
+    sin_a, cos_a = math.sin(abduction if right else -abduction), math.cos(abduction)
+    sin_r, cos_r = math.sin(rotation if right else -rotation), math.cos(rotation)
+    sin_e, cos_e = math.sin(elbow_flexion), math.cos(elbow_flexion)
+    upper = (-cos_f * sin_a, -sin_f, -cos_f * cos_a)
+    # The forearm before the shoulder's abduction ...
+    x, y, z = sin_r * sin_e, -cos_r * sin_e * cos_f - cos_e * sin_f, cos_r * sin_e * sin_f - cos_e * cos_f
+    # ... and after it.
+    forearm = (cos_a * x + sin_a * z, y, -sin_a * x + cos_a * z)
+    shoulder = (-body.shoulder_m[0] if right else body.shoulder_m[0], body.shoulder_m[1], body.shoulder_m[2])
+    elbow = _further(shoulder, upper, body.upper_arm_length_m)
+    wrist = _further(elbow, forearm, body.forearm_length_m)
+    return shoulder, elbow, wrist, _further(wrist, forearm, body.hand_length_m)
+
+
+def _further(start_m: Point, direction: Point, length_m: float) -> Point:
+    return (
+        start_m[0] + length_m * direction[0],
+        start_m[1] + length_m * direction[1],
+        start_m[2] + length_m * direction[2],
     )
 
 
