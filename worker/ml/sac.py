@@ -25,7 +25,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from worker.ml.policies import LOG_STD_HIGH, LOG_STD_LOW, GaussianPolicy
-from worker.spaces import FEEDING_OBSERVATION, Space
+from worker.spaces import Space
 
 Array = npt.NDArray[np.float32]
 Env = gymnasium.Env[Any, Any]
@@ -43,6 +43,7 @@ REPLAY_FILE, STATE_FILE, PROGRESS_FILE = "replay.npy", "state.safetensors", "sta
 class SacConfig:
     """Everything that decides the outcome of a training, apart from the environment."""
 
+    observation: Space = field(repr=False)
     seed: int = 0
     total_steps: int = 260_000
     random_steps: int = 4_000
@@ -63,7 +64,6 @@ class SacConfig:
     save_every_s: float = 180.0
     action_limit: float = 0.7
     """share of the arm's largest step that the exported policy uses; the rest is left for people who want it quicker"""
-    observation: Space = field(default=FEEDING_OBSERVATION, repr=False)
 
 
 class Actor(nn.Module):
