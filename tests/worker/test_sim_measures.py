@@ -6,15 +6,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from worker.sim.costs import CALIBRATED_SPEED_WEIGHT, base_weights, cost_items, preference_rewards
-from worker.sim.measures import StepMeasures, TaskReward
+from worker.sim.costs import base_weights, cost_items, preference_rewards
+from worker.sim.feeding import FEEDING
+from worker.sim.measures import Outcome, StepMeasures, TaskReward
 from worker.trajectory import COSTS, SIGNALS
 
 STILL = StepMeasures(
-    spoon_m=np.array([0.0, -0.4, 1.2]),
-    spoon_up=np.array([0.0, 0.0, 1.0]),
-    mouth_m=np.array([0.0, 0.0, 1.2]),
-    face=np.array([0.0, -1.0, 0.0]),
+    tool_m=np.array([0.0, -0.4, 1.2]),
+    tool_up=np.array([0.0, 0.0, 1.0]),
+    target_m=np.array([0.0, 0.0, 1.2]),
+    outward=np.array([0.0, -1.0, 0.0]),
     speed_m_s=0.0,
     speed_squared_m2_s2=0.0,
     acceleration_m_s2=np.zeros(3),
@@ -22,10 +23,9 @@ STILL = StepMeasures(
     force_away_n=0.0,
     action=np.zeros(7),
     previous_action=np.zeros(7),
-    eaten=0,
-    intake_speed_m_s=0.0,
-    spilled=0,
-    on_person=0,
+    turn_speed_rad_s=0.0,
+    force_squared_n2=0.0,
+    outcome=Outcome(),
     undelivered=True,
 )
 
@@ -42,7 +42,7 @@ def place(*position: float) -> np.ndarray:
     return np.array(position)
 
 
-def test_distance_is_from_the_spoons_bowl_to_the_mouth() -> None:
+def test_distance_is_from_the_tool_to_the_target() -> None:
     assert cost("C_d") == signal("distance_m") == pytest.approx(0.4)
 
 
@@ -52,7 +52,7 @@ def test_speed_is_a_cost_as_measured() -> None:
 
 @pytest.mark.parametrize(("distance", "expected"), [(0.21, 0.0), (0.19, 0.09)])
 def test_speed_counts_as_near_within_twenty_centimetres(distance: float, expected: float) -> None:
-    near = signal("near_speed_squared_m2_s2", spoon_m=place(0, -distance, 1.2), speed_squared_m2_s2=0.09)
+    near = signal("near_speed_squared_m2_s2", tool_m=place(0, -distance, 1.2), speed_squared_m2_s2=0.09)
     assert near == pytest.approx(expected)
 
 
@@ -66,33 +66,33 @@ def test_force_away_from_the_target_is_the_force_cost() -> None:
 
 
 def test_food_on_the_person_and_intake_speed_are_costs() -> None:
-    assert cost("C_fd", on_person=2) == 2.0
-    assert cost("C_fdv", intake_speed_m_s=0.5) == 0.5
+    assert cost("C_fd", outcome=Outcome(on_person=2)) == 2.0
+    assert cost("C_fdv", outcome=Outcome(delivered=1, intake_speed_m_s=0.5)) == 0.5
 
 
 @pytest.mark.parametrize(
     ("position", "expected"),
     [((0, -0.3, 1.2), 0.08), ((0, -0.3, 1.3), 0.18), ((0, -0.3, 1.1), 0.0), ((0, -0.05, 1.22), 0.0)],
 )
-def test_height_counts_from_eight_centimetres_below_the_mouth_until_close(
+def test_height_counts_from_eight_centimetres_below_the_target_until_close(
     position: tuple[float, ...], expected: float
 ) -> None:
-    assert signal("height_above_target_m", spoon_m=place(*position)) == pytest.approx(expected, abs=1e-6)
+    assert signal("height_above_target_m", tool_m=place(*position)) == pytest.approx(expected, abs=1e-6)
 
 
 @pytest.mark.parametrize(
     ("position", "expected"), [((0, -0.2, 1.2), 0.0), ((0.1, -0.2, 1.2), 0.1), ((0.1, -0.4, 1.2), 0.0)]
 )
-def test_sideways_offset_is_from_the_axis_out_of_the_mouth_and_only_near(
+def test_sideways_offset_is_from_the_axis_out_of_the_target_and_only_near(
     position: tuple[float, ...], expected: float
 ) -> None:
-    assert signal("lateral_offset_m", spoon_m=place(*position)) == pytest.approx(expected, abs=1e-6)
+    assert signal("lateral_offset_m", tool_m=place(*position)) == pytest.approx(expected, abs=1e-6)
 
 
 def test_tilt_is_the_angle_from_level() -> None:
     assert signal("tilt_rad") == 0.0
     half = math.sqrt(0.5)
-    assert signal("tilt_rad", spoon_up=place(half, 0, half)) == pytest.approx(math.pi / 4)
+    assert signal("tilt_rad", tool_up=place(half, 0, half)) == pytest.approx(math.pi / 4)
 
 
 def test_acceleration_and_action_change_are_squared() -> None:
@@ -101,7 +101,13 @@ def test_acceleration_and_action_change_are_squared() -> None:
     assert change == pytest.approx(1.0)
 
 
-def test_undelivered_is_one_until_the_portion_is_eaten() -> None:
+def test_turning_strokes_and_the_square_of_the_force_are_signals() -> None:
+    assert signal("turn_speed_squared_rad2_s2", turn_speed_rad_s=3.0) == 9.0
+    assert signal("strokes", outcome=Outcome(strokes=2)) == 2.0
+    assert signal("force_squared_n2", force_at_target_n=2.0, force_squared_n2=5.0) == 5.0
+
+
+def test_undelivered_is_one_until_the_task_has_succeeded() -> None:
     assert (signal("undelivered"), signal("undelivered", undelivered=False)) == (1.0, 0.0)
 
 
@@ -109,16 +115,16 @@ def test_the_task_reward_adds_up() -> None:
     half = math.sqrt(0.5)
     step = replace(
         STILL,
-        spoon_up=place(half, 0, half),
+        tool_up=place(half, 0, half),
         speed_m_s=0.2,
         force_at_target_n=1.0,
         force_away_n=3.0,
         action=np.array([0.6, 0.8, 0, 0, 0, 0, 0]),
-        eaten=3,
-        spilled=2,
+        outcome=Outcome(delivered=3, spilled=2, strokes=4),
     )
-    by_hand = -0.4 - 0.01 + 6.0 - 2.0 - 0.05 * 0.2 - 0.03 * 4.0 - 0.3 * (1 - half)
-    assert TaskReward().of(step) == pytest.approx(by_hand)
+    by_hand = -0.4 - 0.01 + 6.0 - 2.0 + 2.0 - 0.05 * 0.2 - 0.03 * 4.0 - 0.3 * (1 - half)
+    reward = TaskReward(per_delivered=2.0, per_spilled=-1.0, per_stroke=0.5, tilt=-0.3)
+    assert reward(step) == pytest.approx(by_hand)
 
 
 def one_step(**values: float) -> tuple[np.ndarray, np.ndarray]:
@@ -134,13 +140,13 @@ def one_step(**values: float) -> tuple[np.ndarray, np.ndarray]:
 def test_the_papers_preference_reward_is_the_benchmarks_weighted_sum() -> None:
     costs, signals = one_step(C_d=0.4, C_v=0.2, C_f=10.0, C_hf=20.0, C_fd=2.0, C_fdv=0.5)
     by_hand = -(0.4 + 0.25 * 0.2 + 0.01 * 10 + 0.05 * 20 + 2.0 + 0.5)
-    assert preference_rewards(costs, signals, form="paper")[0] == pytest.approx(by_hand)
+    assert preference_rewards(FEEDING, costs, signals, form="paper")[0] == pytest.approx(by_hand)
 
 
 def test_the_calibrated_form_charges_speed_squared() -> None:
     costs, signals = one_step(C_v=0.4, speed_squared_m2_s2=0.16)
     assert cost_items(costs, signals, "calibrated")[0, 1] == pytest.approx(0.8)
-    assert preference_rewards(costs, signals)[0] == pytest.approx(-CALIBRATED_SPEED_WEIGHT * 0.8)
+    assert preference_rewards(FEEDING, costs, signals)[0] == pytest.approx(-FEEDING.calibrated_speed_weight * 0.8)
 
 
 def test_both_forms_differ_only_in_speed() -> None:
@@ -149,10 +155,10 @@ def test_both_forms_differ_only_in_speed() -> None:
     paper, calibrated = (cost_items(costs, signals, form) for form in ("paper", "calibrated"))  # type: ignore[arg-type]
     others = [index for index, name in enumerate(COSTS) if name != "C_v"]
     np.testing.assert_array_equal(paper[:, others], calibrated[:, others])
-    assert (base_weights("paper")[others] == base_weights("calibrated")[others]).all()
+    assert (base_weights(FEEDING, "paper")[others] == base_weights(FEEDING, "calibrated")[others]).all()
 
 
 def test_omega_scales_one_items_share() -> None:
     costs, signals = one_step(C_d=0.4, C_fd=1.0)
     omega = [1, 1, 1, 1, 5, 1]
-    assert preference_rewards(costs, signals, omega, "paper")[0] == pytest.approx(-5.4)
+    assert preference_rewards(FEEDING, costs, signals, omega, "paper")[0] == pytest.approx(-5.4)

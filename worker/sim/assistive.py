@@ -79,8 +79,8 @@ class AssistiveEnv(gymnasium.Env[Any, Any]):
     substeps: ClassVar[int] = 5
     robot_parts: ClassVar[frozenset[str]] = frozenset({ARM})
     """bodies whose pressing on the person counts as force"""
-    person_parts: ClassVar[tuple[str, ...]] = (PERSON,)
-    """the person's bodies, on which forces are measured"""
+    person_parts: ClassVar[tuple[str, ...]] = (PERSON, HEAD)
+    """the person's bodies, as far as they exist, on which forces are measured"""
 
     person: Person
     _head_quaternion: tuple[float, float, float, float]
@@ -148,7 +148,7 @@ class AssistiveEnv(gymnasium.Env[Any, Any]):
         if self.person.impairment == "tremor":
             tremor = self._tremor_before + share * (self._tremor - self._tremor_before)
             self._head_quaternion = human.head_quaternion(self.person, tremor)
-            self._world.set_ball_joint(PERSON, HEAD, self._head_quaternion)
+            self._world.set_pose(HEAD, self.person.body.neck_pivot_m, self._head_quaternion)
             self._read_target()
 
     # Gymnasium
@@ -241,6 +241,7 @@ class AssistiveEnv(gymnasium.Env[Any, Any]):
         self._force = 0.0
         self._world.clear()
         self._add_person()
+        self._touchable = [part for part in self.person_parts if self._world.has(part)]
         self.robot.add_to(self._world, self.tool)
         self._world.set_joints(ARM, self._command)
         self._drive()
@@ -311,7 +312,7 @@ class AssistiveEnv(gymnasium.Env[Any, Any]):
         at_target = away = 0.0
         target_x, target_y, target_z = self._target.tolist()
         limit = self.at_target_within_m**2
-        for part in self.person_parts:
+        for part in self._touchable:
             for contact in self._world.contacts(part):
                 if contact.other not in self.robot_parts:
                     touching.add(contact.other)
@@ -355,11 +356,17 @@ class AssistiveEnv(gymnasium.Env[Any, Any]):
 
 
 def add_person(world: Bullet, person: Person, *arms: int) -> None:
-    """Add the seated person as one immovable body whose head can be turned, with the arms named (both by default)."""
+    """Add the seated person with the arms named (both by default) as an immovable body.
+
+    The head is a link of it, for one body less makes a faster reset, unless it trembles: then it is a body of its own.
+    """
     still = (*_STILL_SHAPES[person.body.name], *arm_shapes(person, *(arms or (human.RIGHT, human.LEFT))))
-    pivot = person.body.neck_pivot_m
-    world.add_chain(PERSON, still, [Link(HEAD, pivot, IDENTITY, 0.0, _HEAD_SHAPES[person.body.name], "ball")])
-    world.set_ball_joint(PERSON, HEAD, human.head_quaternion(person))
+    pivot, turn, head = person.body.neck_pivot_m, human.head_quaternion(person), _HEAD_SHAPES[person.body.name]
+    if person.impairment == "tremor":
+        world.add_body(PERSON, still)
+        world.add_body(HEAD, head, pivot, turn)
+    else:
+        world.add_chain(PERSON, still, [Link(HEAD, pivot, turn, 0.0, head, "fixed")])
 
 
 def arm_shapes(person: Person, *sides: int) -> tuple[Shape, ...]:

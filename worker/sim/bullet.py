@@ -23,7 +23,7 @@ Vector = Sequence[float] | FloatArray
 IDENTITY = (0.0, 0.0, 0.0, 1.0)
 
 _SHAPES = {"sphere": pybullet.GEOM_SPHERE, "capsule": pybullet.GEOM_CAPSULE, "box": pybullet.GEOM_BOX}
-_JOINTS = {"revolute": pybullet.JOINT_REVOLUTE, "ball": pybullet.JOINT_SPHERICAL, "fixed": pybullet.JOINT_FIXED}
+_JOINTS = {"revolute": pybullet.JOINT_REVOLUTE, "fixed": pybullet.JOINT_FIXED}
 
 
 @dataclass(frozen=True)
@@ -61,8 +61,8 @@ class Link:
     quaternion: tuple[float, float, float, float]
     mass_kg: float
     shapes: tuple[Shape, ...]
-    joint: Literal["revolute", "ball", "fixed"] = "revolute"
-    """how it hangs on the previous link: turning about its own z axis, in any direction, or not at all"""
+    joint: Literal["revolute", "fixed"] = "revolute"
+    """how it hangs on the previous link: turning about its own z axis, or not at all"""
 
 
 def rotation_of(quaternion: Vector) -> FloatArray:
@@ -235,6 +235,10 @@ class Bullet:
         pybullet.resetBasePositionAndOrientation(body, position_m, quaternion, physicsClientId=self.client)
         pybullet.resetBaseVelocity(body, (0, 0, 0), (0, 0, 0), physicsClientId=self.client)
 
+    def has(self, name: str) -> bool:
+        """Whether there is a body of this name."""
+        return name in self._bodies
+
     def position(self, name: str) -> tuple[float, float, float]:
         """Where a body's base is."""
         place: tuple[float, float, float] = pybullet.getBasePositionAndOrientation(
@@ -255,12 +259,6 @@ class Bullet:
             [[angle] for angle in angles_rad],
             [[0.0]] * len(angles_rad),
             physicsClientId=self.client,
-        )
-
-    def set_ball_joint(self, name: str, link: str, quaternion: Vector) -> None:
-        """Put one ball joint at this orientation, at rest."""
-        pybullet.resetJointStateMultiDof(
-            self._bodies[name], self._link(name, link), quaternion, [0.0, 0.0, 0.0], physicsClientId=self.client
         )
 
     def joints(self, name: str, count: int) -> FloatArray:
