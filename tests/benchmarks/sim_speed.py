@@ -1,50 +1,100 @@
-"""How fast the Feeding simulation is on one core, with the shipped policy.
+"""How fast the simulations are on one core, beside the benchmark's (Assistive Gym v1.0) figures.
 
-Run: python -m tests.benchmarks.sim_speed    (about five seconds)
+Run: python -m tests.benchmarks.sim_speed [--resets 10000]    (about a minute; prints a table for docs/results/simulation.md)
+
+CPU seconds of this process, random actions as in the benchmark's measurement and, below, the shipped policy's. Steps are
+timed without resets. The physics share is the time inside the engine's own stepping: the floor that no Python can beat.
 """
 
+import argparse
 import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
+
 import worker
 from worker.ml.policies import GaussianPolicy
-from worker.sim.feeding import EPISODE_STEPS, FeedingEnv
+from worker.sim.assistive import AssistiveEnv
+from worker.sim.catalogue import ENVIRONMENTS
+
+BENCHMARK_STEPS_PER_S = {"feeding": 160.0, "drinking": 21.0, "scratching": 268.0}
+BENCHMARK_RESET_S = {"feeding": 0.60, "drinking": 0.98, "scratching": 0.58}
+"""Medians in CPU seconds measured on a comparable core (facts sheet of Assistive Gym v1.0); Drinking with 64 pellets."""
+WANTED_RATIO = {"feeding": 10, "drinking": 20, "scratching": 12}
+PELLETS = (16, 32, 64)
 
 EPISODES = 20
-RESETS = 200
-POLICY = Path(worker.__file__).parent / "checkpoints" / "feeding" / "policy.safetensors"
+RESETS = 300
+CHECKPOINTS = Path(worker.__file__).parent / "checkpoints"
 
 
 def main() -> None:
-    """Print steps per second of CPU time, milliseconds per reset, and the share of the engine's own stepping."""
-    policy = GaussianPolicy.load(POLICY)
-    start = time.process_time()
-    env = FeedingEnv()
+    """Print one row per task and number of pellets, then how memory grows over many resets."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--resets", type=int, default=10_000, help="resets over which memory must not grow")
+    resets = parser.parse_args().resets
+    sys.stdout.write("| task | random steps/s | x benchmark (wanted) | physics share | policy steps/s | reset ms |\n")
+    sys.stdout.write("|---|---|---|---|---|---|\n")
+    for name, kind in ENVIRONMENTS.items():
+        if name == "drinking":
+            for pellets in PELLETS:
+                _row(f"{name}, {pellets} pellets", name, lambda kind=kind, pellets=pellets: kind(pellets=pellets))
+        else:
+            _row(name, name, kind)
+    for name, kind in ENVIRONMENTS.items():
+        sys.stdout.write(f"{name}: {_growth_kib(kind(), resets):+d} KiB over {resets} resets\n")
+
+
+def _row(label: str, name: str, make: Callable[[], AssistiveEnv]) -> None:
+    env, rng = make(), np.random.default_rng(0)
+    policy = GaussianPolicy.load(CHECKPOINTS / name / "policy.safetensors")
     env.reset(seed=0)
-    constructing = time.process_time() - start
-    resetting = _seconds(lambda: [env.reset(seed=scenario) for scenario in range(RESETS)]) / RESETS
+    reset_s = _cpu_s(lambda: [env.reset(seed=scenario) for scenario in range(RESETS)]) / RESETS
+    acting_s, physics_share = _stepping(env, lambda _: rng.uniform(-1, 1, 7).astype(np.float32))
+    policy_s, _ = _stepping(env, policy.mean)
+    ratio = 1 / acting_s / BENCHMARK_STEPS_PER_S[name]
+    sys.stdout.write(
+        f"| {label} | {1 / acting_s:.0f} | {ratio:.1f} ({WANTED_RATIO[name]}) | {100 * physics_share:.0f} % "
+        f"| {1 / policy_s:.0f} | {1e3 * reset_s:.2f} |\n"
+    )
+    sys.stdout.flush()
+    env.close()
+
+
+def _stepping(env: AssistiveEnv, act: Callable[[np.ndarray], np.ndarray]) -> tuple[float, float]:
+    """CPU seconds per environment step, and the share of it inside the engine's stepping."""
     engine = _Stopwatch(env._world.step)
     env._world.step = engine  # type: ignore[method-assign]
-    stepping = 0.0
+    spent, steps = 0.0, env.task.episode_steps
     for scenario in range(EPISODES):
         observation, _ = env.reset(seed=scenario)
+        actions_s = 0.0
         start = time.process_time()
-        for _ in range(EPISODE_STEPS):
-            observation, *_ = env.step(policy.mean(observation))
-        stepping += time.process_time() - start
-    acting = _seconds(lambda: [policy.mean(observation) for _ in range(1000)]) / 1000
-    steps = EPISODES * EPISODE_STEPS
-    lines = (
-        f"first construction and reset  {1e3 * constructing:8.1f} ms",
-        f"reset                         {1e3 * resetting:8.2f} ms",
-        f"environment and policy        {steps / stepping:8.0f} steps/s",
-        f"of that the physics engine    {100 * engine.seconds / stepping:8.0f} %",
-        f"of that the policy            {100 * acting * steps / stepping:8.1f} %",
-    )
-    sys.stdout.write("\n".join(lines) + "\n")
+        for _ in range(steps):
+            before = time.process_time()
+            action = act(observation)
+            actions_s += time.process_time() - before
+            observation, *_ = env.step(action)
+        spent += time.process_time() - start - actions_s
+    del env._world.step  # type: ignore[attr-defined]  # the class' own method again
+    return spent / (EPISODES * steps), engine.seconds / spent
+
+
+def _growth_kib(env: AssistiveEnv, resets: int) -> int:
+    for scenario in range(500):
+        env.reset(seed=scenario)
+    before = _resident_kib()
+    for scenario in range(resets):
+        env.reset(seed=scenario)
+    grown = _resident_kib() - before
     env.close()
+    return grown
+
+
+def _resident_kib() -> int:
+    return int(Path("/proc/self/statm").read_text().split()[1]) * 4
 
 
 class _Stopwatch:
@@ -58,7 +108,7 @@ class _Stopwatch:
         self.seconds += time.process_time() - start
 
 
-def _seconds(act: Callable[[], object]) -> float:
+def _cpu_s(act: Callable[[], object]) -> float:
     start = time.process_time()
     act()
     return time.process_time() - start

@@ -138,12 +138,10 @@ class Bullet:
         self._bodies: dict[str, int] = {}
         self._names: dict[int, str] = {}
         self._links: dict[str, dict[str, int]] = {}
-        # Without a visual the engine tessellates each collision shape, which takes longer than the rest of adding it.
+        # Without a visual the engine tessellates each collision shape, which takes longer than the rest of adding it. A
+        # triangle would be a little quicker than a box, but the engine never frees a mesh that was given as numbers.
         self._unseen: int = pybullet.createVisualShape(
-            pybullet.GEOM_MESH,
-            vertices=[[0, 0, 0], [0.001, 0, 0], [0, 0.001, 0]],
-            indices=[0, 1, 2],
-            physicsClientId=self.client,
+            pybullet.GEOM_BOX, halfExtents=[0.001, 0.001, 0.001], physicsClientId=self.client
         )
 
     def add_body(
