@@ -30,12 +30,17 @@ STILL = StepMeasures(
 )
 
 
+def test_every_column_has_its_place() -> None:
+    assert tuple(STILL.signals()) == SIGNALS
+    assert tuple(STILL.costs()) == COSTS
+
+
 def signal(name: str, **changes: object) -> float:
-    return float(replace(STILL, **changes).signals()[SIGNALS.index(name)])  # type: ignore[arg-type]
+    return replace(STILL, **changes).signals()[name]  # type: ignore[arg-type]
 
 
 def cost(name: str, **changes: object) -> float:
-    return float(replace(STILL, **changes).costs()[COSTS.index(name)])  # type: ignore[arg-type]
+    return replace(STILL, **changes).costs()[name]  # type: ignore[arg-type]
 
 
 def place(*position: float) -> np.ndarray:

@@ -21,7 +21,7 @@ from worker.sim.jaco import JACO
 from worker.sim.measures import Outcome, StepMeasures, TaskReward
 from worker.spaces import CONTROL_STEP_S, JOINT_ACTION, Space
 from worker.tasks import Task
-from worker.trajectory import BODIES, COSTS, SIGNALS
+from worker.trajectory import BODIES
 
 Array = npt.NDArray[np.float32]
 FloatArray = npt.NDArray[np.float64]
@@ -168,8 +168,8 @@ class AssistiveEnv(gymnasium.Env[Any, Any]):
         measures = self._advance(executed)
         self._history.append(executed)
         info = {
-            "costs": dict(zip(COSTS, measures.costs().tolist(), strict=True)),
-            "signals": dict(zip(SIGNALS, measures.signals().tolist(), strict=True)),
+            "costs": measures.costs(),
+            "signals": measures.signals(),
             "success": self.success,
             "delivered": self._delivered,
             "spilled": self._spilled,

@@ -2,15 +2,13 @@
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from worker.trajectory import COSTS, SIGNALS
-
 FloatArray = npt.NDArray[np.float64]
-Array = npt.NDArray[np.float32]
 
 NEAR_M = 0.20
 """Closer than this the speed counts as speed near the person."""
@@ -70,10 +68,10 @@ class StepMeasures:
     undelivered: bool
     """whether the task has not succeeded so far"""
 
-    @property
+    @cached_property
     def distance_m(self) -> float:
         """From the tool's working point to the target."""
-        return float(np.linalg.norm(self.target_m - self.tool_m))
+        return math.dist(self.tool_m.tolist(), self.target_m.tolist())
 
     @property
     def high_force_n(self) -> float:
@@ -93,16 +91,18 @@ class StepMeasures:
         if self.distance_m >= SIDE_VIEW_M:
             return 0.0
         offset = self.tool_m - self.target_m
-        return float(np.linalg.norm(offset - (offset @ self.outward) * self.outward))
+        along = float(offset @ self.outward)
+        return math.sqrt(max(0.0, float(offset @ offset) - along * along))
 
     @property
     def tilt_rad(self) -> float:
         """Angle between the tool's up axis and the vertical."""
         return math.acos(min(1.0, max(-1.0, float(self.tool_up[2]))))
 
-    def signals(self) -> Array:
-        """(S,) one value per column of SIGNALS."""
-        values = {
+    def signals(self) -> dict[str, float]:
+        """One value per column of SIGNALS, in that order."""
+        change = self.action - self.previous_action
+        return {
             "distance_m": self.distance_m,
             "speed_m_s": self.speed_m_s,
             "speed_squared_m2_s2": self.speed_squared_m2_s2,
@@ -118,16 +118,15 @@ class StepMeasures:
             "lateral_offset_m": self.lateral_offset_m,
             "tilt_rad": self.tilt_rad,
             "undelivered": float(self.undelivered),
-            "action_change_squared": float(np.mean((self.action - self.previous_action) ** 2)),
+            "action_change_squared": float(change @ change) / len(change),
             "force_squared_n2": self.force_squared_n2,
             "turn_speed_squared_rad2_s2": self.turn_speed_rad_s**2,
             "strokes": self.outcome.strokes,
         }
-        return np.array([values[name] for name in SIGNALS], np.float32)
 
-    def costs(self) -> Array:
-        """(6,) the paper's preference items, unweighted, one value per column of COSTS."""
-        values = {
+    def costs(self) -> dict[str, float]:
+        """The paper's preference items, unweighted, one per column of COSTS and in that order."""
+        return {
             "C_d": self.distance_m,
             "C_v": self.speed_m_s,
             "C_f": self.force_away_n,
@@ -135,7 +134,6 @@ class StepMeasures:
             "C_fd": self.outcome.on_person,
             "C_fdv": self.outcome.intake_speed_m_s,
         }
-        return np.array([values[name] for name in COSTS], np.float32)
 
 
 @dataclass(frozen=True)
@@ -157,7 +155,7 @@ class TaskReward:
         force = step.force_at_target_n + step.force_away_n
         return float(
             self.distance_per_m * step.distance_m
-            + self.action * np.linalg.norm(step.action)
+            + self.action * math.sqrt(float(step.action @ step.action))
             + self.per_delivered * step.outcome.delivered
             + self.per_spilled * step.outcome.spilled
             + self.per_stroke * step.outcome.strokes
