@@ -1,8 +1,8 @@
 """docs/new_task.md: the task it shows works as it stands."""
 
+import importlib
 import re
 import sys
-import types
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,12 +19,13 @@ PAGE = Path(__file__).parents[2] / "docs" / "new_task.md"
 
 
 @pytest.fixture
-def env(monkeypatch: pytest.MonkeyPatch) -> Iterator[AssistiveEnv]:
+def env(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[AssistiveEnv]:
     found = re.search(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
     assert found
-    module = types.ModuleType("dabbing")
-    monkeypatch.setitem(sys.modules, "dabbing", module)
-    exec(compile(found[1], str(PAGE), "exec"), module.__dict__)
+    (tmp_path / "dabbing.py").write_text(found[1])
+    monkeypatch.syspath_prepend(tmp_path)
+    module = importlib.import_module("dabbing")
+    monkeypatch.delitem(sys.modules, "dabbing")
     gymnasium.register("Dabbing-v0", entry_point=module.DabbingEnv)
     environment = gymnasium.make("Dabbing-v0").unwrapped
     assert isinstance(environment, AssistiveEnv)
