@@ -1,59 +1,77 @@
-"""Search for the arm's start posture: which elbow configuration keeps clear of the person all the way to the mouth.
+"""Search for a task's start posture: which elbow configuration keeps clear of the person all the way to the target.
 
-Run: python -m tests.benchmarks.start_posture    (about ten seconds; prints the numbers kept in worker/sim/feeding.py)
+Run: python -m tests.benchmarks.start_posture [--task feeding]    (seconds; prints candidates for the task's Start)
 """
 
+import argparse
 import sys
 
 import numpy as np
+import numpy.typing as npt
 
-from worker.sim import human, jaco
-from worker.sim.bullet import Bullet
-from worker.sim.feeding import LEVEL_TOWARDS_PERSON, PERSON_PARTS, START_CENTRE_M, add_person, in_base_frame
+from worker.sim.arm import tool_jacobian
+from worker.sim.assistive import ARM, PERSON, AssistiveEnv
+from worker.sim.catalogue import ENVIRONMENTS
+
+FloatArray = npt.NDArray[np.float64]
 
 RESTARTS = 4000
-WAYPOINTS_M = ((-0.05, -0.10, 0.0), (0.05, -0.10, 0.0), (-0.05, 0.0, 0.0), (0.05, 0.0, 0.0), (0.0, 0.0, 0.04))
+SCENARIOS = 4
+"""Targets of so many scenarios lie on the way."""
+LIMITED_JOINTS = [1, 3, 5]
 
 
 def main() -> None:
     """Score random restarts by manipulability, clearance and joint margins; print the best."""
-    rng = np.random.default_rng(1)
-    world = Bullet()
-    jaco.add_to(world)
-    add_person(world)
-    mouth = np.array(human.NECK_PIVOT_M) + human.MOUTH_FROM_NECK_M
-    goals = in_base_frame(np.array([START_CENTRE_M, *(mouth + np.array(WAYPOINTS_M))]))
-    seeds = rng.uniform(np.maximum(jaco.LOWER_RAD, -np.pi), np.minimum(jaco.UPPER_RAD, 1.5 * np.pi), (RESTARTS, 7))
-    chain: list[jaco.FloatArray] = []
-    errors: list[jaco.FloatArray] = []
-    for goal in goals:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--task", choices=ENVIRONMENTS, default="feeding")
+    kind = ENVIRONMENTS[parser.parse_args().task]
+    rng, robot = np.random.default_rng(1), kind.robot
+    orientation = robot.mount_rotation.T @ np.array(kind.start.tool_axes).T
+    low, high = np.maximum(robot.lower_rad, -np.pi), np.minimum(robot.upper_rad, 1.5 * np.pi)
+    seeds = rng.uniform(low, high, (RESTARTS, len(robot.joints)))
+    chain: list[FloatArray] = []
+    errors: list[FloatArray] = []
+    for goal in robot.in_base_frame(np.array([kind.start.centre_m, *_targets(kind)])):
         start = chain[0] if chain else seeds
-        solved, error = jaco.solve_spoon_pose(start, np.tile(goal, (RESTARTS, 1)), LEVEL_TOWARDS_PERSON, 100)
+        solved, error = robot.solve_pose(start, np.tile(goal, (RESTARTS, 1)), orientation, kind.tool, 100)
         chain.append(solved)
         errors.append(error)
+    env = kind()
+    env.reset(seed=0)
     usable = np.flatnonzero(np.max(errors, axis=0) < 5e-3)
-    scored = sorted(((_score(world, [step[index] for step in chain]), index) for index in usable), reverse=True)
-    for score, index in scored[:5]:
+    ways = {index: [step[index] for step in chain] for index in usable}
+    for index in sorted(usable, key=lambda index: -_score(env, ways[index]))[:5]:
         angles = ", ".join(f"{angle:.4f}" for angle in chain[0][index])
-        sys.stdout.write(f"{score:.3f}  {_clearance(world, [step[index] for step in chain]):.3f} m  ({angles})\n")
+        sys.stdout.write(f"{_score(env, ways[index]):.3f}  {_clearance_m(env, ways[index]):.3f} m  ({angles})\n")
+    env.close()
 
 
-def _clearance(world: Bullet, postures: list[jaco.FloatArray]) -> float:
+def _targets(kind: type[AssistiveEnv]) -> list[FloatArray]:
+    env, targets = kind(), []
+    for scenario in range(SCENARIOS):
+        env.reset(seed=scenario)
+        targets.append(env.target_m + 0.02 * env._outward)
+    env.close()
+    return targets
+
+
+def _clearance_m(env: AssistiveEnv, postures: list[FloatArray]) -> float:
+    """Smallest gap between the arm without its tool and the person, at most 0.3 m."""
     gaps = []
     for posture in postures:
-        world.set_joints("arm", posture)
-        gaps += [world.clearance_m("arm", part, 0.3, (jaco.SPOON_LINK,)) for part in PERSON_PARTS]
+        env._world.set_joints(ARM, posture)
+        gaps.append(env._world.clearance_m(ARM, PERSON, 0.3, (env.tool.name,)))
     return min(gaps)
 
 
-def _score(world: Bullet, postures: list[jaco.FloatArray]) -> float:
-    stack = np.array(postures)
-    jacobians = jaco.spoon_jacobian(jaco.link_frames(stack))
+def _score(env: AssistiveEnv, postures: list[FloatArray]) -> float:
+    robot, stack = env.robot, np.array(postures)
+    jacobians = tool_jacobian(robot.link_frames(stack, env.tool))
     manipulability = np.sqrt(np.linalg.det(jacobians @ jacobians.swapaxes(1, 2))).min()
-    limited = [1, 3, 5]
-    margin = np.minimum(stack - jaco.LOWER_RAD, jaco.UPPER_RAD - stack)[:, limited].min()
+    margin = np.minimum(stack - robot.lower_rad, robot.upper_rad - stack)[:, LIMITED_JOINTS].min()
     travel = np.abs(stack[1:] - stack[0]).sum(1).max()
-    clearance = _clearance(world, postures)
+    clearance = _clearance_m(env, postures)
     return float(10 * min(manipulability, 0.06) + 2 * min(clearance, 0.10) + 0.5 * min(margin, 0.5) - 0.05 * travel)
 
 
