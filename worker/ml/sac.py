@@ -61,6 +61,8 @@ class SacConfig:
     evaluate_every_steps: int = 20_000
     evaluation_episodes: int = 50
     test_episodes: int = 500
+    early_success: tuple[float, ...] = (0.4, 0.7)
+    """The first policies to succeed this often are kept under early/: clumsier behaviours for pools of clips."""
     save_every_s: float = 180.0
     action_limit: float = 0.7
     """share of the arm's largest step that the exported policy uses; the rest is left for people who want it quicker"""
@@ -332,6 +334,12 @@ class _Run:
         outcome = evaluate(self.test_env, policy.mean, EVALUATION_SEED, self.config.evaluation_episodes)
         temperature = float(self.learner.log_temperature.detach().exp())
         self.curve.append({"steps": self.steps, "cpu_s": round(self.cpu_s, 1), "alpha": temperature, **outcome})
+        for share in self.config.early_success:
+            early = self.folder / "early" / f"success_{round(100 * share)}.safetensors"
+            if share <= outcome["success"] < 1.0 and not early.exists():
+                early.parent.mkdir(exist_ok=True)
+                _replace(early, policy.save)
+                break
         if (outcome["success"], outcome["return"]) > self.best:
             self.best = (outcome["success"], outcome["return"])
             _replace(self.folder / "policy.safetensors", policy.save)
