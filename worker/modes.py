@@ -104,6 +104,18 @@ class ApproachModes(ModeFamily):
     """beyond this tilt the arm is not slowed: it would stretch a spill. None: tilt does not matter"""
     hesitation_m: float = 0.12
     """hesitate slows the arm around this distance from the target"""
+    same_speed_share: float = 0.6
+    """Share of the random modes that are as quick near the person as far away: people disagree most about plain speed"""
+
+    def sample(self, count: int, rng: np.random.Generator) -> npt.NDArray[np.float64]:
+        """As for every family, but many modes are equally quick all the way."""
+        modes = super().sample(count, rng)
+        same = rng.random(count) < self.same_speed_share
+        if "speed_far" in self.names and "speed_near" in self.names:
+            far, near = self.names.index("speed_far"), self.names.index("speed_near")
+            same &= modes[:, far] != 0.0
+            modes[same, near] = np.clip(modes[same, far], self.axes[near].low, self.axes[near].high)
+        return modes
 
     def perceived(self, observation: Any, mode: Any, xp: Any = np) -> Any:
         """The target moved to where this mode wants the tool to go."""

@@ -30,14 +30,14 @@ FEEDING = Task(
     modes=ApproachModes(
         OBSERVATION,
         (
-            Axis("speed_far", -0.8, 0.4, "log of the speed factor while the spoon is far from the mouth"),
-            Axis("speed_near", -0.8, 0.5, "log of the speed factor close to the mouth"),
-            Axis("from_below", -1.0, 1.0, "how far below (+) or above (-) the mouth the approach passes"),
-            Axis("to_side", -0.7, 0.8, "how far to the person's left (+) or right (-) the approach swings"),
-            Axis("press", -1.0, 1.0, "how deep the spoon goes into the mouth: gentle (-) or pressing (+)"),
+            Axis("speed_far", -0.5, 0.45, "log of the speed factor while the spoon is far from the mouth"),
+            Axis("speed_near", -0.6, 0.5, "log of the speed factor close to the mouth"),
+            Axis("from_below", -0.6, 0.5, "how far below (+) or above (-) the mouth the approach passes"),
+            Axis("to_side", -0.6, 0.6, "how far to the person's left (+) or right (-) the approach swings"),
+            Axis("press", -0.4, 0.4, "how deep the spoon goes into the mouth: gentle (-) or pressing (+)"),
         ),
     ),
-    calibrated_speed_weight=1.20,
+    calibrated_speed_weight=1.14,
 )
 
 SPOON_LENGTH_M, SPOON_WIDTH_M, SPOON_DEPTH_M, SPOON_WALL_M = 0.050, 0.038, 0.011, 0.003
