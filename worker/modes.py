@@ -105,7 +105,7 @@ class ApproachModes(ModeFamily):
     hesitation_m: float = 0.12
     """hesitate slows the arm around this distance from the target"""
     same_speed_share: float = 0.6
-    """Share of the random modes that are as quick near the person as far away: people disagree most about plain speed"""
+    """share of random modes that are as quick near the person as far away: people disagree most about plain speed"""
 
     def sample(self, count: int, rng: np.random.Generator) -> npt.NDArray[np.float64]:
         """As for every family, but many modes are equally quick all the way."""
