@@ -261,3 +261,16 @@ def test_only_the_bodies_and_impairments_asked_for_are_drawn(kind: type[Assistiv
 def test_unknown_people_are_refused_by_name(kind: type[AssistiveEnv], option: str, value: tuple[str, ...]) -> None:
     with pytest.raises(ValueError, match=f"{option} must name"):
         kind(**{option: value})
+
+
+def test_many_resets_do_not_grow_memory(kind: type[AssistiveEnv]) -> None:
+    environment = kind()
+
+    def resident_kib_after(resets: int) -> int:
+        for scenario in range(resets):
+            environment.reset(seed=scenario)
+        return int(Path("/proc/self/statm").read_text().split()[1]) * 4
+
+    before = resident_kib_after(500)
+    assert resident_kib_after(2000) - before < 600
+    environment.close()
