@@ -21,6 +21,11 @@ with silenced_stderr():  # the engine greets with its build time, in every proce
 FloatArray = npt.NDArray[np.float64]
 Vector = Sequence[float] | FloatArray
 IDENTITY = (0.0, 0.0, 0.0, 1.0)
+GRAVITY_M_S2 = 9.81
+CONTACT_MARGIN_M = 0.001
+"""Boxes of bodies that are further apart are not compared. The engine's own 2 cm would pair every pellet in a cup with
+every other; and because it is one number for the whole process, all worlds must agree on it."""
+CARRIER_MASS_KG = 1000.0
 
 _SHAPES = {"sphere": pybullet.GEOM_SPHERE, "capsule": pybullet.GEOM_CAPSULE, "box": pybullet.GEOM_BOX}
 _JOINTS = {"revolute": pybullet.JOINT_REVOLUTE, "fixed": pybullet.JOINT_FIXED}
@@ -53,7 +58,7 @@ class Contact(NamedTuple):
 
 @dataclass(frozen=True)
 class Link:
-    """One link of a chain; its frame is its joint's frame and the place of its centre of mass."""
+    """One link of a chain; its frame is its joint's frame."""
 
     name: str
     origin_m: tuple[float, float, float]
@@ -62,7 +67,10 @@ class Link:
     mass_kg: float
     shapes: tuple[Shape, ...]
     joint: Literal["revolute", "fixed"] = "revolute"
-    """how it hangs on the previous link: turning about its own z axis, or not at all"""
+    """how it hangs on the previous link: turning about its axis, or not at all"""
+    axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    """of the joint, in its own frame"""
+    centre_of_mass_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 def rotation_of(quaternion: Vector) -> FloatArray:
@@ -105,9 +113,12 @@ def capsule_between(start_m: Vector, end_m: Vector, radius_m: float) -> Shape:
 class Bullet:
     """A physics client. Bodies are known by the name they were added with."""
 
-    def __init__(self, time_step_s: float = 0.02, solver_iterations: int = 10) -> None:
+    def __init__(
+        self, time_step_s: float = 0.02, solver_iterations: int = 10, gravity_m_s2: float = GRAVITY_M_S2
+    ) -> None:
         self._client: int | None = pybullet.connect(pybullet.DIRECT)
         self._time_step_s, self._solver_iterations = time_step_s, solver_iterations
+        self._gravity_m_s2 = gravity_m_s2
         self.clear()
 
     @property
@@ -132,9 +143,10 @@ class Bullet:
             fixedTimeStep=self._time_step_s,
             numSolverIterations=self._solver_iterations,
             deterministicOverlappingPairs=1,
+            contactBreakingThreshold=CONTACT_MARGIN_M,
             physicsClientId=self.client,
         )
-        pybullet.setGravity(0.0, 0.0, -9.81, physicsClientId=self.client)
+        pybullet.setGravity(0.0, 0.0, -self._gravity_m_s2, physicsClientId=self.client)
         self._bodies: dict[str, int] = {}
         self._names: dict[int, str] = {}
         self._links: dict[str, dict[str, int]] = {}
@@ -162,17 +174,43 @@ class Bullet:
         )
         self._register(name, body, ())
 
-    def add_balls(self, names: Sequence[str], radius_m: float, mass_kg: float, positions_m: FloatArray) -> None:
-        """Add equal free balls, one per row of positions (N, 3)."""
+    def add_balls(
+        self, names: Sequence[str], radius_m: float, mass_kg: float, positions_m: FloatArray, plain: bool = False
+    ) -> None:
+        """Add equal free balls, one per row of positions (N, 3).
+
+        Contacts of plain bodies with each other cost a third of those with chains, where each contact solves for the
+        whole chain. Put what they lie in on a carrier.
+        """
         bodies = pybullet.createMultiBody(
             mass_kg,
             self._collision((Shape("sphere", radius_m),)),
             self._unseen,
             batchPositions=np.asarray(positions_m, float).tolist(),
+            useMaximalCoordinates=plain,
             physicsClientId=self.client,
         )
         for name, body in zip(names, bodies, strict=True):
             self._register(name, body, ())
+
+    def add_carrier(self, name: str, shapes: tuple[Shape, ...], position_m: Vector, quaternion: Vector) -> None:
+        """Add a plain body so heavy that nothing it carries moves it; lead it along with carry()."""
+        body = pybullet.createMultiBody(
+            CARRIER_MASS_KG,
+            self._collision(shapes),
+            self._unseen,
+            list(position_m),
+            list(quaternion),
+            useMaximalCoordinates=True,
+            physicsClientId=self.client,
+        )
+        self._register(name, body, ())
+
+    def remove(self, name: str) -> None:
+        """Take a body out of the world; whoever asks where it is gets a KeyError."""
+        body = self._bodies.pop(name)
+        pybullet.removeBody(body, physicsClientId=self.client)
+        del self._names[body], self._links[name]
 
     def add_chain(
         self,
@@ -195,11 +233,11 @@ class Bullet:
             linkVisualShapeIndices=[self._unseen] * count,
             linkPositions=[list(link.origin_m) for link in links],
             linkOrientations=[list(link.quaternion) for link in links],
-            linkInertialFramePositions=[[0, 0, 0]] * count,
+            linkInertialFramePositions=[list(link.centre_of_mass_m) for link in links],
             linkInertialFrameOrientations=[list(IDENTITY)] * count,
             linkParentIndices=list(range(count)),
             linkJointTypes=[_JOINTS[link.joint] for link in links],
-            linkJointAxis=[[0, 0, 1]] * count,
+            linkJointAxis=[list(link.axis) for link in links],
             physicsClientId=self.client,
         )
         self._register(name, body, [link.name for link in links])
@@ -211,6 +249,25 @@ class Bullet:
             self._link(name, link),
             lateralFriction=friction,
             restitution=restitution,
+            physicsClientId=self.client,
+        )
+
+    def set_layer(self, name: str, link: str | None, own: int, meets: int) -> None:
+        """Let a body's base or one link collide only where the one's ``meets`` has a bit of the other's ``own``.
+
+        Either of two suffices. Without this call the immovable are 2 and meet all but 2, the others are 1 and meet all.
+        """
+        pybullet.setCollisionFilterGroupMask(
+            self._bodies[name], self._link(name, link), own, meets, physicsClientId=self.client
+        )
+
+    def soften(self, name: str, link: str | None, stiffness_n_m: float, damping_n_s_m: float) -> None:
+        """Let others sink into a body's base or one link, as into skin."""
+        pybullet.changeDynamics(
+            self._bodies[name],
+            self._link(name, link),
+            contactStiffness=stiffness_n_m,
+            contactDamping=damping_n_s_m,
             physicsClientId=self.client,
         )
 
@@ -236,6 +293,31 @@ class Bullet:
     def has(self, name: str) -> bool:
         """Whether there is a body of this name."""
         return name in self._bodies
+
+    def carry(self, carrier: str, name: str, link: str) -> tuple[FloatArray, FloatArray]:
+        """Put a carrier where a link is and let it move on as the link does, against its own weight.
+
+        Answers like link_pose().
+        """
+        state = pybullet.getLinkState(
+            self._bodies[name],
+            self._link(name, link),
+            computeLinkVelocity=1,
+            computeForwardKinematics=1,
+            physicsClientId=self.client,
+        )
+        body, (x, y, z) = self._bodies[carrier], state[6]
+        pybullet.resetBasePositionAndOrientation(body, state[4], state[5], physicsClientId=self.client)
+        upwards = z + self._gravity_m_s2 * self._time_step_s
+        pybullet.resetBaseVelocity(body, (x, y, upwards), state[7], physicsClientId=self.client)
+        return np.array(state[4]), np.array(state[5])
+
+    def near(self, point_m: Vector, within_m: float) -> set[str]:
+        """Bodies whose bounding boxes reach into the cube of this half edge about a point."""
+        x, y, z = point_m
+        low, high = (x - within_m, y - within_m, z - within_m), (x + within_m, y + within_m, z + within_m)
+        found = pybullet.getOverlappingObjects(low, high, physicsClientId=self.client)
+        return {self._names[body] for body, _ in found or ()}
 
     def position(self, name: str) -> tuple[float, float, float]:
         """Where a body's base is."""
@@ -324,6 +406,8 @@ class Bullet:
         return -1 if link is None else self._links[name][link]
 
     def _collision(self, shapes: tuple[Shape, ...]) -> int:
+        if not shapes:
+            return -1
         collision: int = pybullet.createCollisionShapeArray(**_as_arrays(shapes), physicsClientId=self.client)
         return collision
 
