@@ -24,6 +24,7 @@ import torch.nn.functional as F
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
+from worker.ml.demonstrations import Demonstrate, Demonstrations, collect, imitate, imitation_loss
 from worker.ml.policies import LOG_STD_HIGH, LOG_STD_LOW, GaussianPolicy
 from worker.spaces import Space
 
@@ -47,6 +48,7 @@ class SacConfig:
     seed: int = 0
     total_steps: int = 260_000
     random_steps: int = 4_000
+    """before learning starts; with demonstrations the imitating actor makes them"""
     environments: int = 4
     hidden: int = 128
     batch: int = 128
@@ -66,6 +68,18 @@ class SacConfig:
     save_every_s: float = 180.0
     action_limit: float = 0.7
     """share of the arm's largest step that the exported policy uses; the rest is left for people who want it quicker"""
+    training_limit: float = 1.0
+    """the same share while training"""
+    demonstrations: int = 0
+    """episodes of a scripted controller to begin with, if one is given; the actor begins by imitating them"""
+    demonstration_share: float = 0.25
+    """of every batch"""
+    imitation_steps: int = 4_000
+    imitation_weight: float = 0.5
+    """of the imitation loss beside the actor's own, fading to 0 over imitation_updates"""
+    imitation_updates: int = 40_000
+    critic_first_updates: int = 3_000
+    """of the critics alone, after the imitation"""
 
 
 class Actor(nn.Module):
@@ -154,7 +168,10 @@ class Replay:
 
     def sample(self, batch: int) -> tuple[Tensor, ...]:
         """Random transitions, split into their five parts."""
-        rows = self.rows[torch.randint(self.count, (batch,))]
+        return self.split(self.rows[torch.randint(self.count, (batch,))])
+
+    def split(self, rows: Tensor) -> tuple[Tensor, ...]:
+        """Whole transitions (B, ...) as their five parts."""
         return torch.split(rows, self.splits, 1)
 
 
@@ -186,15 +203,26 @@ class Learner:
         for optimiser in self.optimisers.values():
             optimiser.param_groups[0]["lr"] = rate
 
-    def update(self, replay: Replay) -> None:
+    def update(self, replay: Replay, shown: Demonstrations | None = None, actor: bool = True) -> None:
         """One step for the critics, every second time one for actor and temperature, then the slow copies."""
-        states, actions, rewards, goes_on, next_states = replay.sample(self.config.batch)
+        states, actions, rewards, goes_on, next_states, wanted = self._batch(replay, shown)
         self._update_critics(states, actions, rewards[:, 0], goes_on[:, 0], next_states)
-        self.updates += 1
-        if self.updates % 2 == 0:
-            self._update_actor(states)
-            _move_towards(self.average, self.actor, self.config.average_rate)
+        if actor:
+            self.updates += 1
+            if self.updates % 2 == 0:
+                self._update_actor(states, wanted)
+                _move_towards(self.average, self.actor, self.config.average_rate)
         _move_towards(self.targets, self.critics, self.config.target_rate)
+
+    def _batch(self, replay: Replay, shown: Demonstrations | None) -> tuple[Tensor, ...]:
+        """Transitions, the demonstrated ones last, and what the demonstrator wanted in those (empty without any)."""
+        if shown is None:
+            return (*replay.sample(self.config.batch), torch.empty(0))
+        count = round(self.config.demonstration_share * self.config.batch)
+        demonstrated, wanted = shown.sample(count)
+        own = replay.sample(self.config.batch - count)
+        both = zip(own, replay.split(demonstrated), strict=True)
+        return (*(torch.cat(parts) for parts in both), wanted)
 
     def _update_critics(
         self, states: Tensor, actions: Tensor, rewards: Tensor, goes_on: Tensor, next_states: Tensor
@@ -207,11 +235,15 @@ class Learner:
         loss = 2 * F.mse_loss(self.critics(states, actions), wanted.expand(2, -1))
         self._descend("critics", loss)
 
-    def _update_actor(self, states: Tensor) -> None:
+    def _update_actor(self, states: Tensor, wanted: Tensor) -> None:
         self.critics.requires_grad_(False)
         actions, log_probability = self.actor.sample(states)
         temperature = self.log_temperature.detach().exp()
-        self._descend("actor", (temperature * log_probability - self.critics(states, actions).amin(0)).mean())
+        loss = (temperature * log_probability - self.critics(states, actions).amin(0)).mean()
+        weight = self.config.imitation_weight * (1 - self.updates / self.config.imitation_updates)
+        if len(wanted) and weight > 0:
+            loss = loss + weight * imitation_loss(self.actor(states[-len(wanted) :])[0], wanted)
+        self._descend("actor", loss)
         self.critics.requires_grad_(True)
         surplus = log_probability.detach().mean() + self.config.target_entropy
         self._descend("temperature", -self.log_temperature * surplus)
@@ -254,14 +286,16 @@ def pretrain(
     checkpoint_dir: Path,
     progress: Progress | None = None,
     command: str = "",
+    demonstrate: Demonstrate | None = None,
 ) -> dict[str, Any]:
     """Train a reference policy, or resume a training, in ``checkpoint_dir``; returns the record it also writes.
 
     Writes policy.safetensors (the best so far), training.json and, under resume/, what a restart needs. The
-    environment must report ``success`` in its info and take its scenario as the seed of reset().
+    environment must report ``success`` in its info and take its scenario as the seed of reset(). With ``demonstrate``,
+    a scripted controller, the actor begins by imitating config.demonstrations of its episodes.
     """
     torch.set_num_threads(1)
-    run = _Run(make_env, config, checkpoint_dir, command)
+    run = _Run(make_env, config, checkpoint_dir, command, demonstrate)
     run.resume()
     while run.steps < config.total_steps:
         run.advance()
@@ -280,7 +314,14 @@ def pretrain(
 class _Run:
     """One training in progress: environments, learner, replay, curve."""
 
-    def __init__(self, make_env: Callable[[], Env], config: SacConfig, folder: Path, command: str) -> None:
+    def __init__(
+        self,
+        make_env: Callable[[], Env],
+        config: SacConfig,
+        folder: Path,
+        command: str,
+        demonstrate: Demonstrate | None = None,
+    ) -> None:
         self.config, self.folder, self.command = config, folder, command
         (folder / "resume").mkdir(parents=True, exist_ok=True)
         torch.manual_seed(config.seed)
@@ -291,6 +332,10 @@ class _Run:
         self.actions = int(np.prod(self.envs[0].action_space.shape or ()))
         self.replay = Replay(config.total_steps + config.environments, config.observation.size, self.actions)
         self.learner: Learner | None = None
+        self.shown: Demonstrations | None = None
+        if demonstrate and config.demonstrations:
+            rng = np.random.default_rng([config.seed, 1])
+            self.shown = collect(self.test_env, demonstrate, config, rng, TEST_SEED)
         self.steps = 0
         self.owed_updates = 0.0
         self.best = (-1.0, -math.inf)
@@ -308,7 +353,7 @@ class _Run:
         actions = self._actions()
         next_states, rewards, goes_on, fresh = [], [], [], []
         for env, action in zip(self.envs, actions, strict=True):
-            state, reward, terminated, truncated, _ = env.step(action)
+            state, reward, terminated, truncated, _ = env.step(self.config.training_limit * action)
             next_states.append(state)
             rewards.append(float(reward))
             goes_on.append(float(not terminated))
@@ -319,11 +364,14 @@ class _Run:
         if self.steps < self.config.random_steps:
             return
         if self.learner is None:
-            self.learner = self._new_learner()
+            self.learner = self._new_learner(self.replay.rows[: self.replay.count])
+        if self.shown and not self.learner.updates:
+            for _ in range(self.config.critic_first_updates):
+                self.learner.update(self.replay, self.shown, actor=False)
         self.learner.set_learning_rate(self.steps / self.config.total_steps)
         self.owed_updates += self.config.updates_per_step * len(self.envs)
         while self.owed_updates >= 1:
-            self.learner.update(self.replay)
+            self.learner.update(self.replay, self.shown)
             self.owed_updates -= 1
 
     def evaluate(self) -> dict[str, float]:
@@ -393,6 +441,7 @@ class _Run:
         """Continue a killed training; the episodes that were in flight start anew."""
         folder = self.folder / "resume"
         if not (folder / PROGRESS_FILE).exists():
+            self._imitate()
             return
         counts = json.loads((folder / PROGRESS_FILE).read_text())
         tensors = load_file(folder / STATE_FILE)
@@ -416,8 +465,14 @@ class _Run:
     def _scenario(self) -> int:
         return int(self.rng.integers(TEST_SEED))
 
-    def _new_learner(self) -> Learner:
-        offset = self.replay.rows[: self.replay.count, : self.config.observation.size].mean(0)
+    def _imitate(self) -> None:
+        if self.shown:
+            self.learner = self._new_learner(self.shown.rows)
+            imitate(self.learner.actor, self.shown, self.config.imitation_steps)
+            self.learner.average.load_state_dict(self.learner.actor.state_dict())
+
+    def _new_learner(self, rows: Tensor) -> Learner:
+        offset = rows[:, : self.config.observation.size].mean(0)
         scale = torch.cat([torch.full((part.size,), INPUT_SCALE[part.unit]) for part in self.config.observation.fields])
         return Learner(self.config, offset, scale, self.actions)
 

@@ -1,0 +1,153 @@
+"""The water: round pellets in a conical cup, each of them in the cup, in flight, drunk, or spilled."""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from worker.sim.bullet import Bullet, Shape, quaternion_of_euler
+from worker.sim.measures import Outcome
+
+FloatArray = npt.NDArray[np.float64]
+
+PELLET_MASS_KG = 0.001
+DRUNK_WITHIN_M = 0.03
+SPILLED_BEYOND_M = 0.10
+FLOOR_M = 0.0
+
+IMMOVABLE_LAYER, CUP_LAYER, WATER_LAYER = 2, 4, 64
+"""Water meets water, the cup's inner walls and the person; the cup that the hand holds meets the person alone."""
+
+
+class Cup(NamedTuple):
+    """A conical cup. Its frame's origin is the point of the rim that one drinks from, z is its axis, x points out."""
+
+    base_radius_m: float
+    rim_radius_m: float
+    height_m: float
+
+    def walls(self, thickness_m: float, sides: int) -> tuple[Shape, ...]:
+        """A floor and a ring of boxes about the inside of the cup."""
+        slope = math.atan2(self.rim_radius_m - self.base_radius_m, self.height_m)
+        middle = (self.base_radius_m + self.rim_radius_m) / 2 + thickness_m / 2
+        width = (self.rim_radius_m + thickness_m) * math.tan(math.pi / sides)
+        half = (thickness_m / 2, width, self.height_m / math.cos(slope) / 2)
+        across = 2 * (self.base_radius_m + thickness_m)
+        floor = Shape.box((-self.rim_radius_m, 0.0, -self.height_m - thickness_m / 2), (across, across, thickness_m))
+        angles = [2 * math.pi * side / sides for side in range(sides)]
+        ring = [
+            Shape(
+                "box",
+                half_extents_m=half,
+                position_m=(
+                    middle * math.cos(angle) - self.rim_radius_m,
+                    middle * math.sin(angle),
+                    -self.height_m / 2,
+                ),
+                quaternion=quaternion_of_euler((0.0, slope, angle)),
+            )
+            for angle in angles
+        ]
+        return (floor, *ring)
+
+    def contains(self, local_m: FloatArray) -> npt.NDArray[np.bool_]:
+        """Which points (..., 3) in the cup's frame are below its rim and within its cone, give or take a wall."""
+        height = local_m[..., 2] + self.height_m
+        growth = (self.rim_radius_m - self.base_radius_m) / self.height_m
+        radius = np.hypot(local_m[..., 0] + self.rim_radius_m, local_m[..., 1])
+        inside: npt.NDArray[np.bool_] = (
+            (height > -0.005) & (height < self.height_m) & (radius < self.base_radius_m + growth * height + 0.005)
+        )
+        return inside
+
+    def distance_m(self, local_m: FloatArray) -> FloatArray:
+        """How far points (N, 3) in the cup's frame are from the cup, taken for a cylinder with round ends, (N,)."""
+        along = np.clip(local_m[:, 2], -self.height_m, 0.0)
+        axis = np.stack([np.full(len(local_m), -self.rim_radius_m), np.zeros(len(local_m)), along], 1)
+        distance: FloatArray = np.linalg.norm(local_m - axis, axis=1) - self.rim_radius_m
+        return distance
+
+
+class Water:
+    """P pellets and what has become of them. A cup's frame is given as its origin (3,) and rotation (3, 3)."""
+
+    def __init__(self, world: Bullet, cup: Cup, radius_m: float, positions_m: FloatArray) -> None:
+        self._world, self._cup = world, cup
+        self.names = tuple(f"pellet_{index}" for index in range(len(positions_m)))
+        world.add_balls(self.names, radius_m, PELLET_MASS_KG, positions_m, plain=True)
+        for name in self.names:
+            world.set_layer(name, None, WATER_LAYER, WATER_LAYER | IMMOVABLE_LAYER)
+        self._positions = np.array(positions_m)
+        self._present = dict.fromkeys(self.names)
+        self._to_drink = dict.fromkeys(self.names)
+        """neither drunk nor spilled so far, in their order"""
+        self._touched: set[str] = set()
+        self._newly_drunk, self._intake_speed = 0, 0.0
+        self.in_cup, self.drunk, self.spilled = len(self.names), 0, 0
+
+    @property
+    def positions(self) -> FloatArray:
+        """(P, 3) m in the world after the last control step; NaN for pellets that were drunk or fell to the floor."""
+        return self._positions.copy()
+
+    def drink(self, mouth_m: FloatArray, cup_m: FloatArray, rotation: FloatArray) -> None:
+        """Take what is at the mouth and outside the cup. To be called after every physics step: pellets are quick."""
+        reached = self._world.near(mouth_m.tolist(), DRUNK_WITHIN_M)
+        for name in [name for name in self._to_drink if name in reached]:
+            place = np.array(self._world.position(name))
+            if math.dist(place, mouth_m) < DRUNK_WITHIN_M and not self._cup.contains((place - cup_m) @ rotation):
+                self._newly_drunk += 1
+                self._intake_speed += math.hypot(*self._world.velocity(name))
+                del self._to_drink[name]
+                self._remove(name)
+
+    def update(self, cup_m: FloatArray, rotation: FloatArray, touching: set[str]) -> Outcome:
+        """Count what was drunk, spilled or fell on the person during the last control step."""
+        newly_touching = (touching - self._touched) & set(self.names)
+        self._touched |= newly_touching
+        spilled = self._look(cup_m, rotation)
+        outcome = Outcome(self._newly_drunk, self._intake_speed, spilled, len(newly_touching))
+        self.drunk += self._newly_drunk
+        self.spilled += spilled
+        self._newly_drunk, self._intake_speed = 0, 0.0
+        return outcome
+
+    def _look(self, cup_m: FloatArray, rotation: FloatArray) -> int:
+        """Read where every pellet is; returns how many have left the cup for good."""
+        self._positions = np.full((len(self.names), 3), np.nan)
+        for index, name in enumerate(self.names):
+            if name in self._present:
+                self._positions[index] = self._world.position(name)
+        for index in np.flatnonzero(self._positions[:, 2] < FLOOR_M).tolist():
+            self._remove(self.names[index])
+        local = (self._positions - cup_m) @ rotation
+        lost = [self.names[index] for index in np.flatnonzero(self._cup.distance_m(local) > SPILLED_BEYOND_M).tolist()]
+        lost = [name for name in lost if name in self._to_drink]
+        for name in lost:
+            del self._to_drink[name]
+        self.in_cup = int(self._cup.contains(local).sum())
+        return len(lost)
+
+    def _remove(self, name: str) -> None:
+        del self._present[name]
+        self._positions[self.names.index(name)] = np.nan
+        self._world.remove(name)
+
+
+def heap(cup: Cup, count: int, radius_m: float) -> FloatArray:
+    """(count, 3) in the cup's frame: pellets in loose layers from the floor up, not touching each other."""
+    places: list[Sequence[float]] = []
+    height = 0.001
+    while len(places) < count:
+        room = cup.base_radius_m - radius_m - 0.001
+        turn = 37.0 * height
+        rings = [room] if room < 3 * radius_m else [room - 2.1 * radius_m, room]
+        for ring in rings:
+            fitting = max(1, int(math.pi / math.asin(min(1.0, 1.03 * radius_m / ring))))
+            for each in range(fitting):
+                angle = 2 * math.pi * each / fitting + turn
+                places.append((ring * math.cos(angle), ring * math.sin(angle), height + radius_m))
+        height += 2.05 * radius_m
+    return np.array(places[:count]) - (cup.rim_radius_m, 0.0, cup.height_m)
