@@ -3,36 +3,36 @@
 from app.domain.studies import Study
 from worker import laboratory, records
 from worker.compute import Lane
-from worker.modes import FEEDING_AXES
-from worker.records import Task
+from worker.records import Job
 from worker.workplace import Step, Workplace
 
 AT_A_TIME = 2
 """Two clips already make a pair that can be labelled."""
 
 
-def build_clips(place: Workplace, task: Task, run_id: int, step: Step) -> None:
-    """Film what is still missing of the scenario that the task names."""
-    scenario = int(task.finding.rsplit("-", 1)[1])
+def build_clips(place: Workplace, job: Job, run_id: int, step: Step) -> None:
+    """Film what is still missing of the scenario that the job names."""
+    scenario = int(job.finding.rsplit("-", 1)[1])
     with place.database.reading() as session:
-        count = session.get_one(Study, task.study_id).settings.behaviours_per_scenario
+        count = session.get_one(Study, job.study_id).settings.behaviours_per_scenario
     for first in range(0, count, AT_A_TIME):
         which = list(range(first, min(first + AT_A_TIME, count)))
         place.report(run_id, f"filming behaviours {which[0] + 1} to {which[-1] + 1} of {count}", first / count)
-        step(f"film-{first}", _film, place, run_id, task.study_id, scenario, which)
+        step(f"film-{first}", _film, place, run_id, job.study_id, scenario, which)
 
 
 def _film(place: Workplace, run_id: int, study_id: int, scenario: int, which: list[int]) -> None:
     with place.database.reading() as session:
-        settings = session.get_one(Study, study_id).settings
-    modes = laboratory.behaviours(scenario, settings.behaviours_per_scenario)
-    shots = [(scenario, modes[index].tolist(), 0, settings.clip_steps) for index in which]
+        study = session.get_one(Study, study_id)
+        task, settings = study.task, study.settings
+    behaviours = laboratory.behaviours(task, scenario, settings.behaviours_per_scenario)
+    shots = [(task, scenario, behaviours[index], 0, settings.clip_steps) for index in which]
     recorded = place.compute.run_all(Lane.CLIPS, place.beat(run_id), laboratory.record_clip, shots)
     for index, each in zip(which, recorded, strict=True):
         rollout = {
             "scenario": scenario,
             "behaviour": index,
-            "mode": dict(zip((axis.name for axis in FEEDING_AXES), modes[index].tolist(), strict=True)),
+            "mode": behaviours[index].described(),
             "trajectory_sha256": place.store.put(each.trajectory),
             "success": each.success,
         }

@@ -15,6 +15,7 @@ from app.storage import ArtefactStore
 from worker import exploration, laboratory, pretraining, rehearsal, service
 from worker.ml.teachers import Manner, User
 from worker.own_studio import OwnStudio
+from worker.sim.catalogue import ENVIRONMENTS
 
 
 def run(arguments: Sequence[str] | None) -> int:
@@ -39,11 +40,13 @@ def _add_service(commands: _Commands) -> None:
 
 def _add_training(commands: _Commands) -> None:
     pretrain = commands.add_parser("pretrain", help=pretraining.pretrain.__doc__)
+    _add_task(pretrain)
     pretrain.add_argument("--seed", type=int, default=0)
-    pretrain.add_argument("--directory", type=Path, default=laboratory.CHECKPOINTS, help="where the policy goes")
-    pretrain.set_defaults(act=lambda options: pretraining.pretrain(options.seed, options.directory))
+    pretrain.add_argument("--directory", type=Path, help="where the policy goes; default: where the studio keeps it")
+    pretrain.set_defaults(act=_pretrain)
 
     explore = commands.add_parser("explore", help=exploration.explore.__doc__)
+    _add_task(explore)
     explore.add_argument("--work-directory", type=Path, help="finished blocks; default: explore/ in the data directory")
     explore.add_argument("--processes", type=int, default=2)
     explore.set_defaults(act=_explore)
@@ -51,6 +54,7 @@ def _add_training(commands: _Commands) -> None:
 
 def _add_rehearsal(commands: _Commands) -> None:
     rehearse = commands.add_parser("rehearse", help=_rehearse.__doc__)
+    _add_task(rehearse)
     rehearse.add_argument("--users", nargs="+", type=User, choices=list(User), default=list(User))
     rehearse.add_argument("--labels", type=int, default=200, help="labels per participant")
     rehearse.add_argument("--retrain-every", type=int, default=10)
@@ -67,8 +71,18 @@ def _add_rehearsal(commands: _Commands) -> None:
     rehearse.set_defaults(act=_rehearse)
 
 
+def _add_task(command: argparse.ArgumentParser) -> None:
+    command.add_argument("--task", choices=list(ENVIRONMENTS), default="feeding")
+
+
+def _pretrain(options: argparse.Namespace) -> int:
+    return pretraining.pretrain(options.task, options.seed, options.directory or laboratory.checkpoints(options.task))
+
+
 def _explore(options: argparse.Namespace) -> int:
-    record = exploration.explore(options.work_directory or Settings().data_dir / "explore", options.processes)
+    record = exploration.explore(
+        options.task, options.work_directory or Settings().data_dir / "explore" / options.task, options.processes
+    )
     sys.stdout.write(json.dumps(record, indent=2) + "\n")
     return 0
 
@@ -82,7 +96,7 @@ def _rehearse(options: argparse.Namespace) -> int:
             store = ArtefactStore(directory / "artefacts")
             rehearsed = rehearsal.Rehearsal(database, store, studio.settings.base_url, options.pace)
             manner = Manner(mistakes=options.mistakes, equal_share=options.equal, skip_share=options.skip)
-            outcomes = rehearsed.run(options.users, _settings(options), manner, options.seed)
+            outcomes = rehearsed.run(options.task, options.users, _settings(options), manner, options.seed)
             database.dispose()
         for each in outcomes:
             target = directory / f"{each.code}-{each.user}.zip"

@@ -16,10 +16,16 @@ from sqlalchemy.orm import Session, contains_eager, joinedload
 
 from app.domain.clips import Clip, Rollout
 from app.domain.preferences import Label, Query, Response, current_labels
+from app.errors import AppError
 from app.storage import ArtefactStore
 from worker.ml import acquisition
 from worker.ml.segments import SegmentPairs
-from worker.trajectory import Array, Trajectory
+from worker.trajectory import Array, OutdatedTrajectory, Trajectory
+
+
+class RecordedByAnOlderVersion(AppError):
+    """This study's clips were recorded by an older version in another simulation. Make a new study to go on."""
+
 
 _TARGETS = {Response.LEFT: 0.0, Response.EQUAL: 0.5, Response.RIGHT: 1.0, Response.SKIP: None}
 
@@ -111,4 +117,7 @@ def shown(store: ArtefactStore, clip: Clip) -> Trajectory:
 
 @lru_cache(maxsize=1024)
 def _trajectory(path: Path) -> Trajectory:
-    return Trajectory.load(io.BytesIO(path.read_bytes()))
+    try:
+        return Trajectory.load(io.BytesIO(path.read_bytes()))
+    except OutdatedTrajectory as error:
+        raise RecordedByAnOlderVersion from error

@@ -1,4 +1,4 @@
-"""Explores once, for everybody, what the execution modes change: ``python -m worker explore``.
+"""Explores once, for everybody, what a task's execution modes change: ``python -m worker explore --task feeding``.
 
 Every scenario is executed by the reference policy and in random modes; the differences are fitted by a response
 surface, which ships with the studio. Finished blocks are kept, so an interrupted exploration goes on where it was.
@@ -17,7 +17,6 @@ from tqdm import tqdm
 from worker import laboratory
 from worker.compute import Compute, Lane
 from worker.ml import response_surface
-from worker.modes import FEEDING_AXES, sample_modes
 from worker.sim.rollout import rollout
 from worker.trajectory import SIGNALS, Trajectory
 
@@ -25,8 +24,11 @@ FIRST_SCENARIO = 100_000
 SCENARIOS = 200
 MODES_PER_SCENARIO = 12
 BLOCK = 10
-SURFACE = laboratory.CHECKPOINTS / "response_surface.safetensors"
-RECORD = laboratory.CHECKPOINTS / "response_surface.json"
+
+
+def surface_file(task: str) -> Path:
+    """Where a task's response surface is kept; its record lies beside it."""
+    return laboratory.checkpoints(task) / "response_surface.safetensors"
 
 
 @dataclass(frozen=True)
@@ -43,12 +45,12 @@ class Differences:
     """(scenarios,)"""
 
 
-def explore(work_directory: Path, processes: int) -> dict[str, Any]:
+def explore(task: str, work_directory: Path, processes: int) -> dict[str, Any]:
     """Run what is missing, fit the response surface, write it and its record; returns the record."""
     work_directory.mkdir(parents=True, exist_ok=True)
     starts = list(range(FIRST_SCENARIO, FIRST_SCENARIO + SCENARIOS, BLOCK))
     files = [work_directory / f"differences-{start}.npz" for start in starts]
-    missing = [(start, file) for start, file in zip(starts, files, strict=True) if not file.exists()]
+    missing = [(task, start, file) for start, file in zip(starts, files, strict=True) if not file.exists()]
     compute = Compute(processes)
     with tqdm(total=len(files), initial=len(files) - len(missing), unit="block") as bar:
         for first in range(0, len(missing), processes):
@@ -56,18 +58,18 @@ def explore(work_directory: Path, processes: int) -> dict[str, Any]:
             compute.run_all(Lane.LEARNING, lambda: None, compare_block, batch)
             bar.update(len(batch))
     compute.close()
-    return _fit(_joined(files))
+    return _fit(task, _joined(files))
 
 
-def compare_block(first: int, target: Path) -> None:
+def compare_block(task: str, first: int, target: Path) -> None:
     """Differences of one block of scenarios, written to a file that is either complete or absent."""
-    policy, environment = laboratory.reference_policy(), laboratory.environment()
+    policy, environment = laboratory.reference_policy(task), laboratory.environment(task)
     modes, signals, success, reference_success = [], [], [], []
     for scenario in range(first, first + BLOCK):
         reference = rollout(environment, policy.mean, scenario)
         reference_success.append(reference.success)
-        for mode in sample_modes(MODES_PER_SCENARIO, np.random.default_rng([scenario, 2])):
-            changed = rollout(environment, laboratory.act_in_mode(mode), scenario)
+        for mode in laboratory.task(task).modes.sample(MODES_PER_SCENARIO, np.random.default_rng([scenario, 2])):
+            changed = rollout(environment, laboratory.act_in_mode(task, mode), scenario)
             modes.append(mode)
             signals.append(
                 changed.signals.sum(axis=0, dtype=np.float64) - reference.signals.sum(axis=0, dtype=np.float64)
@@ -84,25 +86,28 @@ def _joined(files: list[Path]) -> Differences:
     return Differences(*(np.concatenate([each[name] for each in loaded]).astype(np.float64) for name in names))
 
 
-def _fit(found: Differences) -> dict[str, Any]:
-    surface = response_surface.fit(found.modes, found.signals, found.success)
-    surface.save(SURFACE)
+def _fit(task: str, found: Differences) -> dict[str, Any]:
+    family = laboratory.task(task).modes
+    surface = response_surface.fit(family, found.modes, found.signals, found.success)
+    surface.save(surface_file(task))
     predicted, _ = surface.predict(found.modes)
     residual = ((found.signals - predicted) ** 2).mean(axis=0)
     spread = np.maximum((found.signals**2).mean(axis=0), 1e-12)
     record = {
-        "command": "python -m worker explore",
+        "command": f"python -m worker explore --task {task}",
         "scenarios": [FIRST_SCENARIO, FIRST_SCENARIO + SCENARIOS - 1],
         "modes_per_scenario": MODES_PER_SCENARIO,
-        "axes": {axis.name: [axis.low, axis.high] for axis in FEEDING_AXES},
+        "axes": {axis.name: [axis.low, axis.high] for axis in family.axes},
         "reference_success": float(found.reference_success.mean()),
         "mode_success": float(found.reference_success.repeat(MODES_PER_SCENARIO).mean() + found.success.mean()),
         "explained_share": {
-            name: round(float(1 - residual[column] / spread[column]), 3) for column, name in enumerate(SIGNALS)
+            name: round(float(1 - residual[column] / spread[column]), 3)
+            for column, name in enumerate(SIGNALS)
+            if spread[column] > 1e-9
         },
         "versions": {"python": platform.python_version(), "numpy": np.__version__},
     }
-    RECORD.write_text(json.dumps(record, indent=2) + "\n")
+    surface_file(task).with_suffix(".json").write_text(json.dumps(record, indent=2) + "\n")
     return record
 
 

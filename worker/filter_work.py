@@ -1,14 +1,14 @@
 """Filters: from the participant's reward model to an evaluated, published bundle."""
 
 from app.domain.models import ModelKind
-from app.domain.studies import Method, Participant, RewardKind, Study, StudySettings
+from app.domain.studies import Method, Participant, RewardKind, Study
 from app.errors import AppError
 from worker import dataset, lessons, personalisation, records
 from worker.compute import Lane
 from worker.ml.bundle import Provenance
 from worker.ml.studio_filter import FilterDraft
 from worker.personalisation import Fitting
-from worker.records import Task
+from worker.records import Job
 from worker.workplace import Step, Workplace
 
 STAGES = {Method.STUDIO: ("mode", "residual", "gate"), Method.PRINTED: ("printed",)}
@@ -18,46 +18,48 @@ class NothingToLearnFrom(AppError):
     """Every answer so far was "can't tell", so there is no reward model and no filter can be trained."""
 
 
-def train_filter(place: Workplace, task: Task, run_id: int, step: Step) -> None:
+def train_filter(place: Workplace, job: Job, run_id: int, step: Step) -> None:
     """Train, evaluate and publish; every stage is a step, so that a killed worker loses one stage at most."""
-    reward = step("reward", _choose_reward, place, run_id, task)
+    reward = step("reward", _choose_reward, place, run_id, job)
     if not reward:
         return
     with place.database.reading() as session:
-        settings = session.get_one(Study, task.study_id).settings
+        settings = session.get_one(Study, job.study_id).settings
     draft = ""
     for stage in STAGES[settings.method]:
-        draft = step(stage, _stage, place, run_id, task, reward, draft, stage)
-    step("publish", _publish, place, run_id, task, reward, draft)
+        draft = step(stage, _stage, place, run_id, job, reward, draft, stage)
+    step("publish", _publish, place, run_id, job, reward, draft)
 
 
-def _choose_reward(place: Workplace, run_id: int, task: Task) -> str:
+def _choose_reward(place: Workplace, run_id: int, job: Job) -> str:
     """The artefact of the reward model to follow: the newest. The printed method needs one on states and actions.
 
     Empty when the newest filter has already seen the same labels: somebody who answers faster than filters are trained
     passes several milestones at once.
     """
     with place.database.writing() as session:
-        settings = session.get_one(Study, task.study_id).settings
-        model = records.newest_model(session, task.participant, ModelKind.REWARD)
+        study = session.get_one(Study, job.study_id)
+        task, settings = study.task, study.settings
+        model = records.newest_model(session, job.participant, ModelKind.REWARD)
         if model is None:
             raise NothingToLearnFrom
         records.set_labels(session, run_id, model.label_count, model.label_hash)
-        newest = records.newest_model(session, task.participant, ModelKind.FILTER)
+        newest = records.newest_model(session, job.participant, ModelKind.FILTER)
         if newest is not None and newest.label_hash == model.label_hash:
             return ""
     if settings.method is Method.STUDIO or settings.reward_kind is RewardKind.MLP:
         return model.artefact_sha256
     place.report(run_id, "learning a reward model on states and actions", 0.05)
     with place.database.reading() as session:
-        preferences = dataset.load_preferences(session, place.store, task.participant)
-        pool = dataset.pool_pairs(session, place.store, task.study_id)
+        preferences = dataset.load_preferences(session, place.store, job.participant)
+        pool = dataset.pool_pairs(session, place.store, job.study_id)
     if preferences.pairs is None:
         raise NothingToLearnFrom
     stored, _ = place.compute.run(
         Lane.LEARNING,
         place.beat(run_id),
         lessons.fit_reward,
+        task,
         RewardKind.MLP.value,
         preferences.pairs,
         preferences.targets,
@@ -67,12 +69,12 @@ def _choose_reward(place: Workplace, run_id: int, task: Task) -> str:
     return place.store.put(stored)
 
 
-def _stage(place: Workplace, run_id: int, task: Task, reward: str, draft: str, stage: str) -> str:
+def _stage(place: Workplace, run_id: int, job: Job, reward: str, draft: str, stage: str) -> str:
     """One stage of the fit: the artefact of a draft in, the artefact of a better one out."""
-    fitting = _fitting(place, run_id, task, reward)
+    fitting = _fitting(place, run_id, job, reward)
     if stage in {"mode", "printed"}:
         with place.database.reading() as session:
-            clips = dataset.pool_clips(session, task.study_id)
+            clips = dataset.pool_clips(session, job.study_id)
         pool = [dataset.shown(place.store, clip) for clip in clips]
         result = fitting.find_mode(pool) if stage == "mode" else fitting.fit_printed()
     else:
@@ -81,14 +83,14 @@ def _stage(place: Workplace, run_id: int, task: Task, reward: str, draft: str, s
     return place.store.put(personalisation.draft_to_bytes(result))
 
 
-def _publish(place: Workplace, run_id: int, task: Task, reward: str, draft: str) -> None:
+def _publish(place: Workplace, run_id: int, job: Job, reward: str, draft: str) -> None:
     """Evaluate on unseen scenarios, write the bundle, and only then let anybody see it."""
-    fitting = _fitting(place, run_id, task, reward)
+    fitting = _fitting(place, run_id, job, reward)
     with place.database.reading() as session:
-        participant = session.get_one(Participant, task.participant)
-        study = session.get_one(Study, task.study_id)
-        model = records.newest_model(session, task.participant, ModelKind.REWARD)
-        version = records.next_version(session, task.participant)
+        participant = session.get_one(Participant, job.participant)
+        study = session.get_one(Study, job.study_id)
+        model = records.newest_model(session, job.participant, ModelKind.REWARD)
+        version = records.next_version(session, job.participant)
         run = records.seen_labels(session, run_id)
     provenance = Provenance(
         study=study.name,
@@ -98,7 +100,6 @@ def _publish(place: Workplace, run_id: int, task: Task, reward: str, draft: str)
         label_hash=run.label_hash,
         seed=participant.seed,
         created_at=run.started_at.isoformat(timespec="seconds"),
-        task=study.task,
     )
     finished = fitting.finish(_draft(place, draft), provenance, model.metrics.get("weights") if model else None)
     model_artefact, bundle_artefact = place.store.put(finished.filter_weights), place.store.put(finished.bundle)
@@ -111,11 +112,13 @@ def _draft(place: Workplace, artefact: str) -> FilterDraft:
     return personalisation.draft_from_bytes(place.store.read(artefact))
 
 
-def _fitting(place: Workplace, run_id: int, task: Task, reward: str) -> Fitting:
+def _fitting(place: Workplace, run_id: int, job: Job, reward: str) -> Fitting:
     with place.database.reading() as session:
-        settings: StudySettings = session.get_one(Study, task.study_id).settings
-        seed = session.get_one(Participant, task.participant).seed
+        study = session.get_one(Study, job.study_id)
+        task, settings = study.task, study.settings
+        seed = session.get_one(Participant, job.participant).seed
     return Fitting(
+        task=task,
         compute=place.compute,
         beat=place.beat(run_id),
         reward=place.store.read(reward),

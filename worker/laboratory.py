@@ -2,34 +2,42 @@
 
 Every function takes and returns plain arrays and bytes, so that it can run in another process, in a command, or in a
 notebook. Environments and renderers are kept from call to call: building them costs more than using them. Nothing here
-loads torch, so that the processes that film start quickly and stay small.
+loads torch, so that the processes that film start quickly and stay small. Tasks go by their names.
 """
 
 import io
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from worker.behaviours import Behaviour, SlowWaves, draw_behaviours
 from worker.ml.policies import GaussianPolicy
-from worker.modes import FEEDING_AXES, perceived, sample_modes, speed_factor
-from worker.sim.feeding import FeedingEnv
+from worker.sim.assistive import AssistiveEnv
+from worker.sim.catalogue import ENVIRONMENTS
 from worker.sim.render import ClipRenderer, RenderedClip
 from worker.sim.rollout import rollout
+from worker.tasks import Task
 from worker.trajectory import Array, Trajectory
 
-CHECKPOINTS = Path(__file__).resolve().parent / "checkpoints" / "feeding"
+CHECKPOINTS = Path(__file__).resolve().parent / "checkpoints"
 
 REFERENCE_SCENARIOS = 2_000_000_000
 """First of the scenarios over which reward models are normalised."""
 REFERENCE_COUNT = 40
 
-_DIFFERENT_ENOUGH = 0.45
-"""Two behaviours of one scenario differ by at least this share of some axis' range, so that a person can see it."""
+Act = Callable[[Array], Array]
+"""observation (D,) -> action (7,)"""
+
+
+class UnknownTask(ValueError):
+    """This installation cannot simulate the task."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(f"There is no task named {name!r}; this installation knows {', '.join(ENVIRONMENTS)}.")
 
 
 @dataclass(frozen=True)
@@ -43,14 +51,26 @@ class RecordedClip:
 
 def warm_up() -> None:
     """Import and build what making clips needs, so that the first clip comes quickly."""
-    environment()
+    environment("feeding")
     renderer()
 
 
+def environment_class(name: str) -> type[AssistiveEnv]:
+    """The environment of a task. Raises UnknownTask."""
+    if name not in ENVIRONMENTS:
+        raise UnknownTask(name)
+    return ENVIRONMENTS[name]
+
+
+def task(name: str) -> Task:
+    """The description of a task. Raises UnknownTask."""
+    return environment_class(name).task
+
+
 @cache
-def environment() -> FeedingEnv:
-    """This process' environment."""
-    return FeedingEnv()
+def environment(name: str) -> AssistiveEnv:
+    """This process' environment of a task."""
+    return environment_class(name)()
 
 
 @cache
@@ -59,38 +79,61 @@ def renderer() -> ClipRenderer:
     return ClipRenderer()
 
 
+def checkpoints(name: str) -> Path:
+    """The folder with the task's trained policy and response surface."""
+    return CHECKPOINTS / environment_class(name).task.name
+
+
 @cache
-def reference_policy() -> GaussianPolicy:
-    """The frozen policy that ships with the studio."""
-    return GaussianPolicy.load(CHECKPOINTS / "policy.safetensors")
+def reference_policy(name: str, early: str = "") -> GaussianPolicy:
+    """The frozen policy of a task that ships with the studio, or one from an early stage of its training."""
+    return GaussianPolicy.load(checkpoints(name) / (f"early/{early}.safetensors" if early else "policy.safetensors"))
 
 
-def behaviours(scenario: int, count: int) -> npt.NDArray[np.float64]:
-    """The modes in which a pool executes a scenario, (count, A): random, but no two of them alike."""
-    rng = np.random.default_rng([scenario, 1])
-    width = np.array([axis.high - axis.low for axis in FEEDING_AXES])
-    chosen: list[npt.NDArray[np.float64]] = []
-    while len(chosen) < count:
-        mode = sample_modes(1, rng)[0]
-        if all((np.abs(mode - other) / width).max() >= _DIFFERENT_ENOUGH for other in chosen):
-            chosen.append(mode)
-    return np.array(chosen)
+def early_policies(name: str) -> list[str]:
+    """Names of the early policies that ship with a task."""
+    return sorted(path.stem for path in (checkpoints(name) / "early").glob("*.safetensors"))
 
 
-def act_in_mode(mode: npt.NDArray[np.float64]) -> Any:
-    """The frozen policy executed in a mode: observation (D,) -> action (7,)."""
-    policy, values = reference_policy(), mode.astype(np.float32)
+def behaviours(name: str, scenario: int, count: int) -> list[Behaviour]:
+    """The ways in which a pool executes a scenario of a task."""
+    return draw_behaviours(task(name), scenario, count, early_policies(name))
 
+
+def act_in_mode(name: str, mode: npt.ArrayLike) -> Act:
+    """The frozen policy executed in a mode (A,)."""
+    return _in_mode(task(name), reference_policy(name).mean, np.asarray(mode, np.float32))
+
+
+def act_as(name: str, behaviour: Behaviour) -> Act:
+    """The behaviour as a policy for one episode."""
+    policy = reference_policy(name, behaviour.checkpoint)
+    rng = np.random.default_rng(behaviour.seed)
+    base: Act = policy.mean
+    if behaviour.temperature:
+
+        def base(observation: Array) -> Array:
+            return policy.sample(observation, rng, behaviour.temperature)
+
+    family = task(name).modes
+    moved = _in_mode(task(name), base, np.array(family.vector(behaviour.mode), np.float32))
+    if not behaviour.disturbance:
+        return moved
+    waves = SlowWaves(behaviour.disturbance, rng)
+    return lambda observation: moved(observation) + waves()
+
+
+def _in_mode(of: Task, base: Act, mode: Array) -> Act:
     def act(observation: Array) -> Array:
-        action: Array = speed_factor(observation, values) * policy.mean(perceived(observation, values))
+        action: Array = of.modes.speed_factor(observation, mode) * base(of.modes.perceived(observation, mode))
         return action
 
     return act
 
 
-def record_clip(scenario: int, mode: Sequence[float], first_step: int, step_count: int) -> RecordedClip:
-    """Run the scenario in a mode and render the stretch of it that participants will see."""
-    trajectory = rollout(environment(), act_in_mode(np.array(mode)), scenario, reference_policy().mean)
+def record_clip(name: str, scenario: int, behaviour: Behaviour, first_step: int, step_count: int) -> RecordedClip:
+    """Run the scenario in some behaviour and render the stretch of it that participants will see."""
+    trajectory = rollout(environment(name), act_as(name, behaviour), scenario, reference_policy(name).mean)
     target = io.BytesIO()
     trajectory.save(target)
     return RecordedClip(
@@ -99,7 +142,9 @@ def record_clip(scenario: int, mode: Sequence[float], first_step: int, step_coun
 
 
 @lru_cache(maxsize=4)
-def reference_rollouts(first: int = REFERENCE_SCENARIOS, count: int = REFERENCE_COUNT) -> tuple[Trajectory, ...]:
+def reference_rollouts(
+    name: str, first: int = REFERENCE_SCENARIOS, count: int = REFERENCE_COUNT
+) -> tuple[Trajectory, ...]:
     """Rollouts of the frozen policy's mean action in consecutive scenarios."""
-    policy = reference_policy()
-    return tuple(rollout(environment(), policy.mean, scenario) for scenario in range(first, first + count))
+    policy = reference_policy(name)
+    return tuple(rollout(environment(name), policy.mean, scenario) for scenario in range(first, first + count))

@@ -16,26 +16,26 @@ from worker.sim.rollout import rollout
 from worker.trajectory import Array, Trajectory
 
 
-def warm_up() -> None:
-    """Make the rollouts that every reward model is normalised over, so that the first retraining is a quick one."""
-    reference_rollouts()
+def warm_up(task: str) -> None:
+    """Make the rollouts that a task's reward models are normalised over: the first retraining is then a quick one."""
+    reference_rollouts(task)
 
 
-def run_scenarios(act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
+def run_scenarios(task: str, act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
     """One rollout per scenario, with Gaussian noise of this deviation on every action."""
     return [
-        rollout(environment(), noisy(act, noise, seed, scenario), scenario, reference_policy().mean)
+        rollout(environment(task), noisy(act, noise, seed, scenario), scenario, reference_policy(task).mean)
         for scenario in scenarios
     ]
 
 
 def fit_reward(
-    kind: str, pairs: SegmentPairs, targets: Array, pool: SegmentPairs, seed: int
+    task: str, kind: str, pairs: SegmentPairs, targets: Array, pool: SegmentPairs, seed: int
 ) -> tuple[bytes, dict[str, Any]]:
     """The stored reward model and its metrics. ``pool``: pairs like those that are asked, for the scale of signals."""
     spread = reward_training.signal_spread(pool)
     named: reward_training.Kind = "mlp" if kind == "mlp" else "structured"
-    fitted = reward_training.fit(pairs, targets, named, seed, spread=spread, reference=reference_rollouts())
+    fitted = reward_training.fit(pairs, targets, named, seed, spread=spread, reference=reference_rollouts(task))
     return fitted.model.to_bytes(), fitted.metrics
 
 

@@ -6,6 +6,7 @@ mode has moved, and its action is scaled. The same functions serve the simulator
 filter (torch, a batch), so that what is trained is what is shipped.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
@@ -54,6 +55,20 @@ class ModeFamily:
     def names(self) -> tuple[str, ...]:
         """The axes' names, in order."""
         return tuple(axis.name for axis in self.axes)
+
+    def vector(self, mode: Mapping[str, float]) -> list[float]:
+        """A mode by the names of its axes -> its A coordinates; axes that are not named are 0.
+
+        Raises ValueError for a name that is none of this family's axes.
+        """
+        unknown = sorted(set(mode) - set(self.names))
+        if unknown:
+            raise ValueError(f"This task has no mode axis {', '.join(unknown)}; it has {', '.join(self.names)}.")
+        return [float(mode.get(name, 0.0)) for name in self.names]
+
+    def named(self, mode: npt.ArrayLike) -> dict[str, float]:
+        """The A coordinates of a mode by the names of their axes."""
+        return dict(zip(self.names, np.asarray(mode, float).tolist(), strict=True))
 
     def sample(self, count: int, rng: np.random.Generator) -> npt.NDArray[np.float64]:
         """Random modes, (count, A): uniform in each axis' range, each axis left at 0 with probability 1/4."""

@@ -16,7 +16,7 @@ from app.domain.studies import StudySettings
 from worker import laboratory, lessons
 from worker.analysis.evaluation import evaluate
 from worker.compute import Compute, Lane
-from worker.exploration import SURFACE
+from worker.exploration import surface_file
 from worker.ml import bundle, printed_filter, studio_filter
 from worker.ml.action_filter import FilterWeights
 from worker.ml.bundle import BundleContents, Provenance, Recording
@@ -49,13 +49,14 @@ class Finished:
 class Fitting:
     """One filter in the making."""
 
+    task: str
     compute: Compute
     beat: Callable[[], None]
     reward: bytes
     seed: int
     settings: StudySettings
     progress: Progress
-    references: dict[range, list[Trajectory]]
+    references: dict[tuple[str, range], list[Trajectory]]
     """rollouts of the frozen policy that other fittings have already made"""
 
     @property
@@ -65,11 +66,13 @@ class Fitting:
             success_tolerance=self.settings.success_tolerance,
             evaluation_scenarios=self.settings.evaluation_scenarios,
         )
-        return FilterProblem(laboratory.reference_policy(), load_reward_model(self.reward), self.seed, config)
+        policy = laboratory.reference_policy(self.task)
+        return FilterProblem(laboratory.task(self.task), policy, load_reward_model(self.reward), self.seed, config)
 
     def find_mode(self, pool: Sequence[Trajectory]) -> FilterDraft:
         """The person's execution mode, as far as held-out scenarios allow it."""
-        draft = studio_filter.choose_mode(self.problem, ResponseSurface.load(SURFACE), pool)
+        surface = ResponseSurface.load(surface_file(self.task), self.problem.task.modes)
+        draft = studio_filter.choose_mode(self.problem, surface, pool)
         return studio_filter.gate_mode(self.problem, draft, self._gate_reference(), self.collect, self.progress)
 
     def train_residual(self, draft: FilterDraft) -> FilterDraft:
@@ -91,13 +94,13 @@ class Fitting:
         """Export, drive through unseen scenarios, pack. ``weights``: the reward model's own, shown on the dashboard."""
         started = time.perf_counter()
         self.progress("driving the filter through unseen scenarios", 0.88)
-        act = studio_filter.act_of(self.problem.policy, draft.weights)
+        act = studio_filter.act_of(self.problem.task.modes, self.problem.policy, draft.weights)
         evaluation, filtered = self._evaluate(act)
         metrics: dict[str, Any] = {
             "evaluation": evaluation,
             "gate": draft.weights.gate,
             "residual_share": draft.weights.residual_share if draft.weights.encoder else 0.0,
-            "mode": draft.weights.named_mode(),
+            "mode": dict(draft.weights.mode),
             "method": draft.weights.method,
             "notes": [*draft.notes, *_warnings(evaluation, self.settings.success_tolerance)],
             "trials": [asdict(trial) for trial in draft.trials],
@@ -105,6 +108,7 @@ class Fitting:
             "weights": weights,
         }
         contents = BundleContents(
+            task=self.problem.task,
             filter_onnx=act.exported.stored,
             weights=draft.weights,
             reward=self.problem.reward,
@@ -124,7 +128,7 @@ class Fitting:
     def collect(self, act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
         """One rollout per scenario, in order; the same whatever the number of processes."""
         chunks = [list(scenarios[first : first + CHUNK]) for first in range(0, len(scenarios), CHUNK)]
-        arguments = [(act, chunk, noise, seed) for chunk in chunks]
+        arguments = [(self.task, act, chunk, noise, seed) for chunk in chunks]
         parts = self.compute.run_all(Lane.LEARNING, self.beat, lessons.run_scenarios, arguments)
         return [trajectory for part in parts for trajectory in part]
 
@@ -136,9 +140,10 @@ class Fitting:
 
     def _reference(self, scenarios: range) -> Sequence[Trajectory]:
         """The frozen policy's rollouts: the same for everybody, so they are made once per worker."""
-        if scenarios not in self.references:
-            self.references[scenarios] = self.collect(laboratory.reference_policy().mean, scenarios, 0.0, 0)
-        return self.references[scenarios]
+        key = (self.task, scenarios)
+        if key not in self.references:
+            self.references[key] = self.collect(laboratory.reference_policy(self.task).mean, scenarios, 0.0, 0)
+        return self.references[key]
 
 
 def _warnings(evaluation: dict[str, Any], tolerance: float) -> list[str]:

@@ -15,7 +15,7 @@ from app.domain.clips import Clip, Rollout
 from app.domain.models import Run, RunKind, RunStatus
 from app.domain.preferences import LabelEvent, Query, current_labels
 from app.domain.studies import Participant, Study, StudySettings
-from worker.records import ATTEMPTS, LEASE, Task, next_queries
+from worker.records import ATTEMPTS, LEASE, Job, next_queries
 
 CLIPS_AHEAD = 2
 """Scenarios per study in the making at a time: enough to keep busy, few enough that studies share fairly."""
@@ -23,14 +23,14 @@ CLIPS_AHEAD = 2
 RETRY_AFTER = timedelta(seconds=10)
 
 
-def findings(session: Session) -> Iterator[tuple[Task, int]]:
+def findings(session: Session) -> Iterator[tuple[Job, int]]:
     """Every run that should exist and does not, or must be tried again, with the number of its attempt."""
     runs = {run.workflow_id: run for run in session.scalars(select(Run))}
     for study in session.scalars(select(Study).order_by(Study.id)).all():
-        for task in (*_missing_clips(session, study), *_stale_models(session, study)):
-            attempt = _attempt_due(runs.get(task.finding), now())
+        for job in (*_missing_clips(session, study), *_stale_models(session, study)):
+            attempt = _attempt_due(runs.get(job.finding), now())
             if attempt is not None:
-                yield task, attempt
+                yield job, attempt
 
 
 def abandoned(session: Session, in_hand: Collection[str]) -> list[str]:
@@ -49,9 +49,10 @@ def workflow_name(finding: str, attempt: int) -> str:
     return f"{finding}#{attempt}"
 
 
-def somebody_has_answered(session: Session) -> bool:
-    """Whether there is anything to learn from yet: the first retraining then is not far."""
-    return session.scalar(select(LabelEvent.id).limit(1)) is not None
+def tasks_with_answers(session: Session) -> set[str]:
+    """The tasks of studies in which somebody has answered: their first retraining is not far."""
+    answered = select(Study.task).join(Participant).join(Query).join(LabelEvent).distinct()
+    return set(session.scalars(answered))
 
 
 def short_of_queries(session: Session) -> list[int]:
@@ -75,7 +76,7 @@ def _attempt_due(run: Run | None, moment: datetime) -> int | None:
     return None
 
 
-def _missing_clips(session: Session, study: Study) -> list[Task]:
+def _missing_clips(session: Session, study: Study) -> list[Job]:
     settings = study.settings
     made = dict(
         session.execute(
@@ -87,7 +88,7 @@ def _missing_clips(session: Session, study: Study) -> list[Task]:
     )
     wanted = [scenario_seed(study.seed, index) for index in range(settings.pool_scenarios)]
     missing = [seed for seed in wanted if made.get(seed, 0) < settings.behaviours_per_scenario]
-    return [Task(f"clips/study-{study.id}/scenario-{seed}", RunKind.CLIPS, study.id) for seed in missing[:CLIPS_AHEAD]]
+    return [Job(f"clips/study-{study.id}/scenario-{seed}", RunKind.CLIPS, study.id) for seed in missing[:CLIPS_AHEAD]]
 
 
 def scenario_seed(study_seed: int, index: int) -> int:
@@ -95,8 +96,8 @@ def scenario_seed(study_seed: int, index: int) -> int:
     return 10_000_000 + study_seed % 90_000 * 1_000 + index
 
 
-def _stale_models(session: Session, study: Study) -> list[Task]:
-    tasks = []
+def _stale_models(session: Session, study: Study) -> list[Job]:
+    jobs = []
     for participant in session.scalars(select(Participant).where(Participant.study_id == study.id)).all():
         count = len(current_labels(session, participant.id))
         if count == 0:
@@ -105,13 +106,13 @@ def _stale_models(session: Session, study: Study) -> list[Task]:
         reward = reward_due(study.settings, count)
         if reward:
             name = f"reward/participant-{participant.id}/labels-{reward}{suffix}"
-            tasks.append(Task(name, RunKind.REWARD, study.id, participant.id, reward))
+            jobs.append(Job(name, RunKind.REWARD, study.id, participant.id, reward))
             milestone = filter_due(study.settings, count)
             if milestone and _succeeded(session, name):
                 ending = suffix if milestone == study.settings.labels_per_participant else ""
                 name = f"filter/participant-{participant.id}/labels-{milestone}{ending}"
-                tasks.append(Task(name, RunKind.FILTER, study.id, participant.id, milestone))
-    return tasks
+                jobs.append(Job(name, RunKind.FILTER, study.id, participant.id, milestone))
+    return jobs
 
 
 def reward_due(settings: StudySettings, answered: int) -> int:

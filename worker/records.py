@@ -29,7 +29,7 @@ LEASE = timedelta(seconds=60)
 
 
 @dataclass(frozen=True)
-class Task:
+class Job:
     """What one run is about; travels through the durable engine as plain values."""
 
     finding: str
@@ -47,14 +47,14 @@ class Task:
         return self.participant_id
 
 
-def begin_run(session: Session, task: Task, seed: int) -> int:
+def begin_run(session: Session, job: Job, seed: int) -> int:
     """The id of the run for this finding: a new one, or the earlier one set to running again."""
-    run = session.scalar(select(Run).where(Run.workflow_id == task.finding))
+    run = session.scalar(select(Run).where(Run.workflow_id == job.finding))
     if run is None:
-        run = Run(workflow_id=task.finding, kind=task.kind, study_id=task.study_id)
+        run = Run(workflow_id=job.finding, kind=job.kind, study_id=job.study_id)
         session.add(run)
-    run.participant_id = task.participant_id
-    run.label_count, run.label_hash = task.label_count, task.label_hash
+    run.participant_id = job.participant_id
+    run.label_count, run.label_hash = job.label_count, job.label_hash
     run.status, run.error, run.finished_at = RunStatus.RUNNING, None, None
     run.seed, run.heartbeat_at = seed, now()
     session.flush()

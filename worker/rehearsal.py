@@ -18,10 +18,10 @@ from app.db import Database
 from app.domain.clips import Clip
 from app.domain.models import Bundle, Model, Run, RunKind, RunStatus
 from app.domain.preferences import Query
-from app.domain.studies import Study, StudySettings
+from app.domain.studies import Study, StudySettings, TaskName
 from app.services import accounts, enrolment, studies
 from app.storage import ArtefactStore
-from worker import dataset
+from worker import dataset, laboratory
 from worker.ml.teachers import OMEGA, Manner, ScriptedTeacher, User
 from worker.own_studio import PATIENCE_S, wait_until
 from worker.sim.costs import preference_rewards
@@ -75,15 +75,17 @@ class Rehearsal:
     pace_s: float = 0.0
     """how long a scripted participant thinks about a pair"""
 
-    def run(self, users: Sequence[User], settings: StudySettings, manner: Manner, seed: int) -> list[Outcome]:
+    def run(
+        self, task: str, users: Sequence[User], settings: StudySettings, manner: Manner, seed: int
+    ) -> list[Outcome]:
         """One participant per user, one after the other; the bundles are waited for and downloaded at the end."""
         with self.database.writing() as session:
-            study = studies.create_study(session, "Rehearsal", settings, seed=seed)
+            study = studies.create_study(session, "Rehearsal", settings, seed=seed, task=TaskName(task))
             enrolled = [enrolment.add_participant(session, study) for _ in users]
             password = accounts.create_first_experimenter(session)
         outcomes = []
         for (participant, token), user in zip(enrolled, users, strict=True):
-            teacher = _Teacher(self.database, self.store, study.id, user, manner, seed + participant.number)
+            teacher = _Teacher(self.database, self.store, study, user, manner, seed + participant.number)
             outcome = Outcome(participant.id, participant.code, user)
             with Visitor(self.base_url, f"/p/{token}") as visitor:
                 self._answer_everything(visitor, teacher, outcome, settings)
@@ -151,9 +153,10 @@ class _Teacher:
     """A scripted user who knows what happened in each clip."""
 
     def __init__(
-        self, database: Database, store: ArtefactStore, study_id: int, user: User, manner: Manner, seed: int
+        self, database: Database, store: ArtefactStore, study: Study, user: User, manner: Manner, seed: int
     ) -> None:
-        self._database, self._store, self._study_id = database, store, study_id
+        self._database, self._store, self._study_id = database, store, study.id
+        self._task = laboratory.task(study.task)
         self._user, self._manner = user, manner
         self._rng = np.random.default_rng(seed)
         self._teacher: ScriptedTeacher | None = None
@@ -178,7 +181,7 @@ class _Teacher:
     def _rewards(self, clip: Clip) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
         shown = dataset.shown(self._store, clip)
         steps = slice(clip.first_step, clip.first_step + clip.step_count)
-        rewards = preference_rewards(shown.costs, shown.signals, OMEGA[self._user], form="calibrated")
+        rewards = preference_rewards(self._task, shown.costs, shown.signals, OMEGA[self._user], form="calibrated")
         return np.asarray(rewards, np.float64)[steps]
 
 

@@ -4,23 +4,24 @@ from app.domain.models import ModelKind
 from app.domain.studies import Participant, Strategy, Study
 from worker import dataset, lessons, querying, records
 from worker.compute import Lane
-from worker.records import Task
+from worker.records import Job
 from worker.workplace import Step, Workplace
 
 KEPT_QUERIES = 3
 """Queries ahead that stay when a new model chooses: the page may already be loading them."""
 
 
-def train_reward(place: Workplace, task: Task, run_id: int, step: Step) -> None:
+def train_reward(place: Workplace, job: Job, run_id: int, step: Step) -> None:
     """Fit the participant's reward model and let it look ahead."""
-    step("fit", _fit, place, run_id, task.participant)
-    step("look-ahead", _look_ahead, place, task.participant)
+    step("fit", _fit, place, run_id, job.participant)
+    step("look-ahead", _look_ahead, place, job.participant)
 
 
 def _fit(place: Workplace, run_id: int, participant_id: int) -> None:
     with place.database.reading() as session:
         participant = session.get_one(Participant, participant_id)
-        kind = session.get_one(Study, participant.study_id).settings.reward_kind
+        study = session.get_one(Study, participant.study_id)
+        task, kind = study.task, study.settings.reward_kind
         preferences = dataset.load_preferences(session, place.store, participant_id)
         pool = dataset.pool_pairs(session, place.store, participant.study_id)
     if preferences.pairs is None:
@@ -30,6 +31,7 @@ def _fit(place: Workplace, run_id: int, participant_id: int) -> None:
         Lane.LEARNING,
         place.beat(run_id),
         lessons.fit_reward,
+        task,
         kind.value,
         preferences.pairs,
         preferences.targets,

@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from types import FrameType
 
@@ -22,7 +23,8 @@ from app.settings import Settings
 from app.storage import ArtefactStore
 from worker import laboratory, lessons, querying, reconcile, records
 from worker.compute import Compute, Lane
-from worker.records import Task
+from worker.records import Job
+from worker.sim.catalogue import ENVIRONMENTS
 from worker.workflows import Workshop, as_arguments
 from worker.workplace import Workplace
 
@@ -30,11 +32,11 @@ log = logging.getLogger("worker")
 
 ROUND_S = 0.5
 PRESENCE_S = 5.0
-ENGINE_VERSION = "1"
+ENGINE_VERSION = "2"
 """Raised when the steps of a workflow change so that a half-finished one could not be resumed."""
 
 QUEUES = {RunKind.CLIPS: 2, RunKind.REWARD: 1, RunKind.FILTER: 1}
-"""How many tasks of each kind one worker does at a time."""
+"""How many jobs of each kind one worker does at a time."""
 
 
 class WorkerAlreadyRunning(AppError):
@@ -113,7 +115,8 @@ class _Rounds:
         self._place = workshop.place
         self._started: set[str] = set()  # what the engine has been told already
         self._signed_at = -math.inf
-        self._learners_are_warm = False
+        self._warm_tasks: set[str] = set()
+        self._refused: set[int] = set()
 
     def until(self, stop: threading.Event) -> None:
         """One round after the other; a database that is away for a while is waited for."""
@@ -133,22 +136,29 @@ class _Rounds:
     def _round(self) -> None:
         with self._place.database.reading() as session:
             due = list(reconcile.findings(session))
-            hungry = reconcile.short_of_queries(session)
+            hungry = set(reconcile.short_of_queries(session))
             lost = reconcile.abandoned(session, self._workshop.in_hand)
-            learning_ahead = self._learners_are_warm or reconcile.somebody_has_answered(session)
-        for task, attempt in due:
-            self._start(task, reconcile.workflow_name(task.finding, attempt))
-        for participant_id in hungry:
-            querying.refill_queries(self._place, participant_id)
+            learning_ahead = reconcile.tasks_with_answers(session) - self._warm_tasks
+        for job, attempt in due:
+            self._start(job, reconcile.workflow_name(job.finding, attempt))
+        for participant_id in hungry - self._refused:
+            self._refill(participant_id)
         for name in lost:
             log.warning("%s was left behind by another worker; taking it over", name)
             DBOS.resume_workflow(name)
-        if learning_ahead and not self._learners_are_warm:
-            self._place.compute.warm_up(Lane.LEARNING, lessons.warm_up)
-            self._learners_are_warm = True
+        for name in learning_ahead & set(ENVIRONMENTS):
+            self._place.compute.warm_up(Lane.LEARNING, partial(lessons.warm_up, name))
+        self._warm_tasks |= learning_ahead
 
-    def _start(self, task: Task, name: str) -> None:
+    def _refill(self, participant_id: int) -> None:
+        try:
+            querying.refill_queries(self._place, participant_id)
+        except AppError as refusal:  # one study that cannot go on must not stop the others
+            log.warning("participant %d gets no further pairs: %s", participant_id, refusal.message)
+            self._refused.add(participant_id)
+
+    def _start(self, job: Job, name: str) -> None:
         if name not in self._started:
             with SetWorkflowID(name):
-                DBOS.enqueue_workflow(task.kind, self._workshop.work, as_arguments(task))
+                DBOS.enqueue_workflow(job.kind, self._workshop.work, as_arguments(job))
             self._started.add(name)

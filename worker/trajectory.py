@@ -43,6 +43,10 @@ SKIN_TONES = 6
 """Skin tones are numbered from 0, the lightest, to 5, the darkest."""
 
 
+class OutdatedTrajectory(ValueError):
+    """An older version of the studio recorded this, in another simulation: there is no way to complete it."""
+
+
 @dataclass(frozen=True)
 class Trajectory:
     """One episode of T control steps with D observations, S signals and P particles.
@@ -110,11 +114,12 @@ class Trajectory:
 
     @classmethod
     def load(cls, source: Path | IO[bytes]) -> Self:
-        """Read what save() wrote. Raises ValueError for a file that holds anything but plain arrays."""
+        """Read what save() wrote. Raises ValueError for a file that holds anything but plain arrays, and
+        OutdatedTrajectory for one that an older version wrote."""
         with np.load(source, allow_pickle=False) as stored:
             missing = [field.name for field in fields(cls) if field.name not in stored]
             if missing:
-                raise ValueError(
+                raise OutdatedTrajectory(
                     f"This trajectory lacks {', '.join(missing)}: an older version of the studio recorded it. "
                     "Run its scenario again."
                 )

@@ -19,13 +19,13 @@ from app.errors import AppError
 from worker import records
 from worker.clip_work import build_clips
 from worker.filter_work import train_filter
-from worker.records import Task
+from worker.records import Job
 from worker.reward_work import train_reward
 from worker.workplace import Step, Workplace
 
 log = logging.getLogger("worker")
 
-_BODIES: dict[RunKind, Callable[[Workplace, Task, int, Step], None]] = {
+_BODIES: dict[RunKind, Callable[[Workplace, Job, int, Step], None]] = {
     RunKind.CLIPS: build_clips,
     RunKind.REWARD: train_reward,
     RunKind.FILTER: train_filter,
@@ -34,7 +34,7 @@ _BODIES: dict[RunKind, Callable[[Workplace, Task, int, Step], None]] = {
 
 @DBOS.dbos_class()
 class Workshop(DBOSConfiguredInstance):
-    """Does tasks at one workplace."""
+    """Does jobs at one workplace."""
 
     def __init__(self, place: Workplace) -> None:
         super().__init__("workshop")
@@ -44,28 +44,28 @@ class Workshop(DBOSConfiguredInstance):
 
     @DBOS.workflow()
     def work(self, arguments: dict[str, Any]) -> None:
-        """Do one task; what goes wrong is kept with the run and in the log, never raised."""
-        task = Task(**arguments)
-        self.in_hand.add(task.finding)
+        """Do one job; what goes wrong is kept with the run and in the log, never raised."""
+        job = Job(**arguments)
+        self.in_hand.add(job.finding)
         started = time.monotonic()
         try:
             run_id = _step("begin", self._begin, arguments)
-            _BODIES[RunKind(task.kind)](self.place, task, run_id, _step)
+            _BODIES[RunKind(job.kind)](self.place, job, run_id, _step)
             _step("finish", self._finish, run_id)
-            log.info("%s done in %.1f s", task.finding, time.monotonic() - started)
+            log.info("%s done in %.1f s", job.finding, time.monotonic() - started)
         except AppError as refusal:  # foreseen, and already in words for people
-            log.warning("%s: %s", task.finding, refusal.message)
-            _step("fail", self._fail, task.finding, refusal.message)
-        except Exception as error:  # the worker's edge: one failed task must not stop the others
-            log.exception("%s failed", task.finding)
-            _step("fail", self._fail, task.finding, f"{type(error).__name__}: {error}")
+            log.warning("%s: %s", job.finding, refusal.message)
+            _step("fail", self._fail, job.finding, refusal.message)
+        except Exception as error:  # the worker's edge: one failed job must not stop the others
+            log.exception("%s failed", job.finding)
+            _step("fail", self._fail, job.finding, f"{type(error).__name__}: {error}")
         finally:
-            self.in_hand.discard(task.finding)
+            self.in_hand.discard(job.finding)
 
     def _begin(self, arguments: dict[str, Any]) -> int:
-        task = Task(**arguments)
+        job = Job(**arguments)
         with self.place.database.writing() as session:
-            return records.begin_run(session, task, _seed(session, task))
+            return records.begin_run(session, job, _seed(session, job))
 
     def _finish(self, run_id: int) -> None:
         with self.place.database.writing() as session:
@@ -80,12 +80,12 @@ def _step(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
     return DBOS.run_step({"name": name}, function, *arguments)
 
 
-def _seed(session: Session, task: Task) -> int:
-    if task.participant_id is None:
-        return session.get_one(Study, task.study_id).seed
-    return session.get_one(Participant, task.participant_id).seed
+def _seed(session: Session, job: Job) -> int:
+    if job.participant_id is None:
+        return session.get_one(Study, job.study_id).seed
+    return session.get_one(Participant, job.participant_id).seed
 
 
-def as_arguments(task: Task) -> dict[str, Any]:
-    """The task as plain values, which is what the engine stores."""
-    return {name: str(value) if name == "kind" else value for name, value in asdict(task).items()}
+def as_arguments(job: Job) -> dict[str, Any]:
+    """The job as plain values, which is what the engine stores."""
+    return {name: str(value) if name == "kind" else value for name, value in asdict(job).items()}

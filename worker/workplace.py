@@ -29,7 +29,7 @@ class Workplace:
     database: Database
     store: ArtefactStore
     compute: Compute
-    references: dict[range, list[Trajectory]] = field(default_factory=dict)
+    references: dict[tuple[str, range], list[Trajectory]] = field(default_factory=dict)
     """rollouts of the frozen policy by scenarios: the same for everybody, so each worker makes them once"""
 
     def report(self, run_id: int, stage: str, progress: float) -> None:

@@ -37,11 +37,15 @@ def make_trajectory(scenario: int, behaviour: int, steps: int = STEPS) -> Trajec
         task_rewards=some(steps),
         joint_positions=some(steps + 1, 7),
         particles=some(steps + 1, 8, 3),
-        head_quaternion=np.array([0, 0, 0, 1], np.float32),
+        head_quaternions=some(steps + 1, 4),
+        arm_positions_rad=some(steps + 1, 2, 4),
+        target_m=some(steps + 1, 3),
         contact_force_n=some(steps),
         success=True,
         scenario=scenario,
         task="feeding",
+        body="slim",
+        skin_tone=behaviour % 6,
     )
 
 

@@ -7,10 +7,11 @@ import numpy.typing as npt
 
 from worker.ml.policies import GaussianPolicy
 from worker.ml.segments import SegmentPairs
-from worker.spaces import FEEDING_OBSERVATION
+from worker.sim.feeding import FEEDING
 from worker.trajectory import COSTS, SIGNALS, Trajectory
 
-D, A, S = FEEDING_OBSERVATION.size, 7, len(SIGNALS)
+TASK = FEEDING
+D, A, S = TASK.observation.size, 7, len(SIGNALS)
 
 
 def small_policy(seed: int = 0, hidden: int = 16) -> GaussianPolicy:
@@ -27,9 +28,9 @@ def small_policy(seed: int = 0, hidden: int = 16) -> GaussianPolicy:
 def observations(count: int, rng: np.random.Generator) -> npt.NDArray[np.float32]:
     """(count, D) with unit vectors where unit vectors belong, and the spoon almost level."""
     seen = rng.uniform(-0.3, 0.3, (count, D))
-    for name in ("spoon_forward", "spoon_up", "face_direction"):
-        place = FEEDING_OBSERVATION.slice_of(name)
-        vector = rng.standard_normal((count, 3)) + ((0.0, 0.0, 12.0) if name == "spoon_up" else (0.0, 0.0, 0.0))
+    for name in ("tool_forward", "tool_up", "target_outward"):
+        place = TASK.observation.slice_of(name)
+        vector = rng.standard_normal((count, 3)) + ((0.0, 0.0, 12.0) if name == "tool_up" else (0.0, 0.0, 0.0))
         seen[:, place] = vector / np.linalg.norm(vector, axis=1, keepdims=True)
     return seen.astype(np.float32)
 
@@ -57,11 +58,15 @@ def trajectory(
         task_rewards=np.zeros(steps, np.float32),
         joint_positions=np.zeros((steps + 1, 7), np.float32),
         particles=np.zeros((steps + 1, 8, 3), np.float32),
-        head_quaternion=np.array([0, 0, 0, 1], np.float32),
+        head_quaternions=np.tile(np.array([0, 0, 0, 1], np.float32), (steps + 1, 1)),
+        arm_positions_rad=np.zeros((steps + 1, 2, 4), np.float32),
+        target_m=np.zeros((steps + 1, 3), np.float32),
         contact_force_n=np.zeros(steps, np.float32),
         success=success,
         scenario=scenario,
         task="feeding",
+        body="broad",
+        skin_tone=0,
     )
 
 

@@ -22,7 +22,6 @@ from worker.ml.onnx_export import to_onnx
 from worker.ml.policies import GaussianPolicy
 from worker.ml.policy_onnx import policy_to_onnx
 from worker.ml.reward_models import StructuredReward, load_reward_model
-from worker.spaces import FEEDING_OBSERVATION
 from worker.trajectory import SIGNALS
 
 POLICY = invented.small_policy()
@@ -32,12 +31,15 @@ POLICY = invented.small_policy()
 def contents() -> BundleContents:
     """A small filter with everything that belongs to it."""
     rng = np.random.default_rng(0)
-    weights = FilterWeights(mode=(-0.5, 0.2, 0.6, -0.4, 0.8), gate=0.7)
+    weights = FilterWeights(mode=invented.TASK.modes.named([-0.5, 0.2, 0.6, -0.4, 0.8]), gate=0.7)
     episodes = [invented.trajectory(np.random.default_rng(each), scenario=each) for each in range(4)]
     episodes = [replace(each, reference_actions=POLICY.mean(each.observations[:-1])) for each in episodes]
     recording = Recording.of(episodes[:2])
     return BundleContents(
-        filter_onnx=to_onnx(build(POLICY, weights), recording.observations, recording.policy_means),
+        task=invented.TASK,
+        filter_onnx=to_onnx(
+            build(invented.TASK.modes, POLICY, weights), recording.observations, recording.policy_means
+        ),
         weights=weights,
         reward=StructuredReward(rng.standard_normal((8, len(SIGNALS)))),
         policy=POLICY,
@@ -99,7 +101,7 @@ def test_an_undamaged_bundle_gives_its_manifest(written: bytes) -> None:
     manifest = bundle.verify(written)
     assert manifest["labels"] == {"count": 200, "sha256": "ab" * 32}
     assert [field["name"] for field in manifest["observation"]["fields"]] == [
-        field.name for field in FEEDING_OBSERVATION.fields
+        field.name for field in invented.TASK.observation.fields
     ]
     assert manifest["onnx"]["inputs"][0] == {"name": "observation", "type": "float32", "shape": ["batch", 28]}
     assert manifest["control_rate_hz"] == 10
@@ -243,7 +245,7 @@ def test_input_that_cannot_be_filtered_is_explained(
 
 def test_values_outside_the_trained_range_are_mentioned(unzipped: Path, contents: BundleContents) -> None:
     seen = np.abs(contents.recording.observations[:5])
-    seen[1, FEEDING_OBSERVATION.slice_of("force_on_person_n")] = 90.0
+    seen[1, invented.TASK.observation.slice_of("force_on_person_n")] = 90.0
     np.save(unzipped / "o.npy", seen)
     np.save(unzipped / "m.npy", contents.recording.policy_means[:5])
     finished = run(unzipped, "--observations", "o.npy", "--policy-means", "m.npy", "--output", "a.npy")

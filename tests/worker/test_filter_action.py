@@ -11,12 +11,12 @@ from worker.ml.action_filter import FilterWeights, build, state_of
 from worker.ml.adapter import REACH, ResidualAdapter
 from worker.ml.onnx_export import ExportDiffers, OnnxFilter, largest_difference, to_onnx
 from worker.ml.policy_module import FrozenPolicy
-from worker.modes import perceived, sample_modes, speed_factor
 
 POLICY = invented.small_policy()
 SEEN = invented.observations(40, np.random.default_rng(0))
 MEANS = POLICY.mean(SEEN)
-MODE = (-0.5, 0.2, 0.6, -0.4, 0.8)
+FAMILY = invented.TASK.modes
+MODE = FAMILY.named([-0.5, 0.2, 0.6, -0.4, 0.8])
 
 
 def adapter_state(seed: int = 0, *, untrained: bool = False) -> dict[str, np.ndarray]:
@@ -31,7 +31,7 @@ def adapter_state(seed: int = 0, *, untrained: bool = False) -> dict[str, np.nda
 def filtered(weights: FilterWeights, means: np.ndarray = MEANS) -> np.ndarray:
     """What the torch module says."""
     with torch.no_grad():
-        actions: np.ndarray = build(POLICY, weights)(torch.from_numpy(SEEN), torch.from_numpy(means)).numpy()
+        actions: np.ndarray = build(FAMILY, POLICY, weights)(torch.from_numpy(SEEN), torch.from_numpy(means)).numpy()
     return actions
 
 
@@ -76,18 +76,18 @@ def test_actions_stay_in_their_range_whatever_comes_in() -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_modes_in_torch_and_in_the_simulator_are_the_same(seed: int) -> None:
-    mode = sample_modes(1, np.random.default_rng(seed))[0].astype(np.float32)
-    expected = np.clip(speed_factor(SEEN, mode) * POLICY.mean(perceived(SEEN, mode)), -1, 1)
-    np.testing.assert_allclose(filtered(FilterWeights(mode=tuple(mode.tolist()))), expected, atol=1e-5)
+    mode = FAMILY.sample(1, np.random.default_rng(seed))[0].astype(np.float32)
+    expected = np.clip(FAMILY.speed_factor(SEEN, mode) * POLICY.mean(FAMILY.perceived(SEEN, mode)), -1, 1)
+    np.testing.assert_allclose(filtered(FilterWeights(mode=FAMILY.named(mode))), expected, atol=1e-5)
 
 
 @pytest.fixture(scope="module")
 def exported() -> bytes:
-    return to_onnx(build(POLICY, FilterWeights(mode=MODE, gate=0.7, encoder=adapter_state())), SEEN, MEANS)
+    return to_onnx(build(FAMILY, POLICY, FilterWeights(mode=MODE, gate=0.7, encoder=adapter_state())), SEEN, MEANS)
 
 
 def test_the_exported_filter_computes_the_same(exported: bytes) -> None:
-    module = build(POLICY, FilterWeights(mode=MODE, gate=0.7, encoder=adapter_state()))
+    module = build(FAMILY, POLICY, FilterWeights(mode=MODE, gate=0.7, encoder=adapter_state()))
     assert largest_difference(exported, module, SEEN, MEANS) <= 1e-5
 
 
@@ -99,14 +99,14 @@ def test_the_exported_filter_takes_any_batch(exported: bytes, batch: int) -> Non
 
 
 def test_the_export_is_the_same_every_time(exported: bytes) -> None:
-    module = build(POLICY, FilterWeights(mode=MODE, gate=0.7, encoder=adapter_state()))
+    module = build(FAMILY, POLICY, FilterWeights(mode=MODE, gate=0.7, encoder=adapter_state()))
     assert to_onnx(module, SEEN, MEANS) == exported
 
 
 def test_an_export_that_differs_is_not_published(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("worker.ml.onnx_export.LARGEST_DIFFERENCE", -1.0)
     with pytest.raises(ExportDiffers, match="largest difference"):
-        to_onnx(build(POLICY, FilterWeights(mode=MODE)), SEEN, MEANS)
+        to_onnx(build(FAMILY, POLICY, FilterWeights(mode=MODE)), SEEN, MEANS)
 
 
 def test_the_exported_filter_can_be_sent_to_another_process(exported: bytes) -> None:
@@ -118,11 +118,16 @@ def test_the_exported_filter_can_be_sent_to_another_process(exported: bytes) -> 
 def test_weights_survive_storage(encoder: dict[str, np.ndarray]) -> None:
     weights = FilterWeights(mode=MODE, gate=0.4, residual_share=0.5, encoder=encoder)
     loaded = FilterWeights.from_bytes(weights.to_bytes())
-    assert loaded.named_mode() == pytest.approx(weights.named_mode())
+    assert loaded.mode == pytest.approx(weights.mode)
     np.testing.assert_array_equal(filtered(loaded), filtered(weights))
 
 
+def test_a_mode_of_another_task_is_refused_by_the_names_of_its_axes() -> None:
+    with pytest.raises(ValueError, match="no mode axis pour_haste; it has speed_far"):
+        build(FAMILY, POLICY, FilterWeights(mode={"speed_far": 0.1, "pour_haste": 0.3}))
+
+
 def test_the_frozen_policy_stays_frozen_inside_the_filter() -> None:
-    module = build(POLICY, FilterWeights(mode=MODE, encoder=adapter_state()))
+    module = build(FAMILY, POLICY, FilterWeights(mode=MODE, encoder=adapter_state()))
     assert not any(parameter.requires_grad for parameter in module.parameters())
     assert isinstance(module.transform.policy, FrozenPolicy)

@@ -14,10 +14,10 @@ from worker.ml.action_filter import FilterWeights
 from worker.ml.response_surface import ResponseSurface
 from worker.ml.reward_models import StructuredReward
 from worker.ml.studio_filter import FilterConfig, FilterDraft, FilterProblem, act_of, learn_round, noisy
-from worker.modes import sample_modes
 from worker.trajectory import SIGNALS, Trajectory
 
 POLICY = invented.small_policy()
+FAMILY = invented.TASK.modes
 SPEED = SIGNALS.index("speed_m_s")
 STEPS = 15
 CONFIG = FilterConfig(
@@ -62,22 +62,22 @@ def reference() -> list[Trajectory]:
 @pytest.fixture(scope="module")
 def surface() -> ResponseSurface:
     """Fitted to this world: what each mode does to the speed."""
-    modes = sample_modes(60, np.random.default_rng(0))
+    modes = FAMILY.sample(60, np.random.default_rng(0))
     world, deltas = World(), []
     plain = world.collect(POLICY.mean, [0], 0.0, 0)[0].signals.sum(axis=0)
     for mode in modes:
         act = _mode_act(mode)
         deltas.append(world.collect(act, [0], 0.0, 0)[0].signals.sum(axis=0) - plain)
-    return response_surface.fit(modes, np.array(deltas), np.zeros(60))
+    return response_surface.fit(FAMILY, modes, np.array(deltas), np.zeros(60))
 
 
 def _mode_act(mode: np.ndarray) -> studio_filter.Act:
-    from worker.modes import perceived, speed_factor
-
     values = mode.astype(np.float32)
 
     def act(observation: np.ndarray) -> np.ndarray:
-        action: np.ndarray = speed_factor(observation, values) * POLICY.mean(perceived(observation, values))
+        action: np.ndarray = FAMILY.speed_factor(observation, values) * POLICY.mean(
+            FAMILY.perceived(observation, values)
+        )
         return action
 
     return act
@@ -85,12 +85,13 @@ def _mode_act(mode: np.ndarray) -> studio_filter.Act:
 
 def problem(weight: float, reference: list[Trajectory], **config: object) -> FilterProblem:
     """Fit a filter for somebody."""
-    return FilterProblem(POLICY, reward(weight).normalised_over(reference), 0, replace(CONFIG, **config))  # type: ignore[arg-type]
+    settings = replace(CONFIG, **config)  # type: ignore[arg-type]
+    return FilterProblem(invented.TASK, POLICY, reward(weight).normalised_over(reference), 0, settings)
 
 
 def speed_of(draft: FilterDraft) -> float:
     """Mean speed of a finished filter."""
-    episodes = World().collect(act_of(POLICY, draft.weights), range(20), 0.0, 0)
+    episodes = World().collect(act_of(FAMILY, POLICY, draft.weights), range(20), 0.0, 0)
     return float(np.mean([each.signals[:, SPEED].mean() for each in episodes]))
 
 
@@ -166,7 +167,7 @@ def test_a_residual_that_does_not_help_is_left_out_and_said_so(reference: list[T
 
 def test_learning_is_repeatable_and_later_rounds_go_on_from_earlier_ones(reference: list[Trajectory]) -> None:
     rollouts = World().collect(POLICY.mean, range(6), 0.3, 0)
-    start = FilterDraft(FilterWeights(mode=(-0.2, 0.0, 0.0, 0.0, 0.0), gate=0.7))
+    start = FilterDraft(FilterWeights(mode={"speed_far": -0.2}, gate=0.7))
     first, again = (learn_round(problem(-1.0, reference), start, [rollouts]) for _ in range(2))
     assert first.weights.to_bytes() == again.weights.to_bytes()
     assert first.weights.gate == 0.7

@@ -13,7 +13,7 @@ from app.storage import ArtefactStore
 from worker import records
 from worker.compute import Compute
 from worker.filter_work import NothingToLearnFrom, train_filter
-from worker.records import Task
+from worker.records import Job
 from worker.workplace import Workplace
 
 
@@ -27,10 +27,10 @@ def at_once(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
     return function(*arguments)
 
 
-def begin(place: Workplace, participant: Participant, kind: RunKind, name: str) -> tuple[Task, int]:
-    task = Task(name, kind, participant.study_id, participant.id, 10)
+def begin(place: Workplace, participant: Participant, kind: RunKind, name: str) -> tuple[Job, int]:
+    job = Job(name, kind, participant.study_id, participant.id, 10)
     with place.database.writing() as session:
-        return task, records.begin_run(session, task, seed=1)
+        return job, records.begin_run(session, job, seed=1)
 
 
 def save_model(place: Workplace, participant: Participant, kind: ModelKind, label_hash: str) -> None:
@@ -50,12 +50,12 @@ def test_a_filter_that_has_seen_the_same_labels_is_not_trained_again(
 ) -> None:
     save_model(place, participant, ModelKind.REWARD, "same labels")
     save_model(place, participant, ModelKind.FILTER, "same labels")
-    task, run_id = begin(place, participant, RunKind.FILTER, "filter/participant-1/labels-10")
-    train_filter(place, task, run_id, at_once)
+    job, run_id = begin(place, participant, RunKind.FILTER, "filter/participant-1/labels-10")
+    train_filter(place, job, run_id, at_once)
     assert count_filters(place) == 1
 
 
 def test_without_a_reward_model_the_run_says_why_there_is_no_filter(place: Workplace, participant: Participant) -> None:
-    task, run_id = begin(place, participant, RunKind.FILTER, "filter/participant-1/labels-10")
+    job, run_id = begin(place, participant, RunKind.FILTER, "filter/participant-1/labels-10")
     with pytest.raises(NothingToLearnFrom, match="can't tell"):
-        train_filter(place, task, run_id, at_once)
+        train_filter(place, job, run_id, at_once)

@@ -91,7 +91,7 @@ def problem() -> FilterProblem:
     rng = np.random.default_rng(0)
     shown = invented.pairs(30, rng)
     reward = fit(shown, invented.answers_of(shown, np.eye(len(SIGNALS))[1]), "mlp", 0, mlp=MlpTraining(steps=20))
-    return FilterProblem(POLICY, reward.model, 0)
+    return FilterProblem(invented.TASK, POLICY, reward.model, 0)
 
 
 def test_training_reports_all_four_losses_is_repeatable_and_exports_like_any_filter(problem: FilterProblem) -> None:
@@ -105,13 +105,15 @@ def test_training_reports_all_four_losses_is_repeatable_and_exports_like_any_fil
     assert all(name in draft.notes[1] for name in ("rec", "pref", "kl", "dyn"))
     assert draft.weights.gate == 1.0
     seen = invented.observations(5, np.random.default_rng(1))
-    actions = build(POLICY, draft.weights)(torch.from_numpy(seen), torch.from_numpy(POLICY.mean(seen)))
+    actions = build(invented.TASK.modes, POLICY, draft.weights)(
+        torch.from_numpy(seen), torch.from_numpy(POLICY.mean(seen))
+    )
     assert actions.shape == (5, 7)
     assert float(actions.abs().max()) <= 1.0
 
 
 def test_a_reward_that_needs_measurements_cannot_rank_untried_actions() -> None:
-    structured = FilterProblem(POLICY, StructuredReward(np.ones((8, len(SIGNALS)))), 0)
+    structured = FilterProblem(invented.TASK, POLICY, StructuredReward(np.ones((8, len(SIGNALS)))), 0)
     with pytest.raises(TypeError, match="mlp"):
         fit_printed(structured, [invented.trajectory(np.random.default_rng(0))])
 

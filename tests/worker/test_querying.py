@@ -12,7 +12,7 @@ from app.domain.models import ModelKind, Run
 from app.domain.preferences import Query, Response
 from app.domain.studies import Participant
 from app.storage import ArtefactStore
-from worker import dataset, laboratory, querying, records
+from worker import dataset, querying, records
 from worker.compute import Compute
 from worker.ml import reward_training
 from worker.workplace import Workplace
@@ -126,10 +126,3 @@ def save_reward_model(place: Workplace, participant: Participant) -> int:
         records.set_labels(session, run.id, preferences.label_count, preferences.label_hash)
         artefact = place.store.put(fitted.model.to_bytes())
         return records.save_model(session, run.id, ModelKind.REWARD, artefact, fitted.metrics).id
-
-
-def test_behaviours_of_a_scenario_differ_visibly_and_repeat_from_the_seed() -> None:
-    modes = laboratory.behaviours(11, 4)
-    assert modes.shape == (4, 5)
-    assert (modes == laboratory.behaviours(11, 4)).all()
-    assert (modes != laboratory.behaviours(12, 4)).any()

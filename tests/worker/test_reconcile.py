@@ -20,7 +20,7 @@ Answer = Callable[[Clip, Clip, Response], Query]
 def found(database: Database) -> Callable[[], dict[str, int]]:
     def look() -> dict[str, int]:
         with database.reading() as session:
-            return {task.finding: attempt for task, attempt in reconcile.findings(session)}
+            return {job.finding: attempt for job, attempt in reconcile.findings(session)}
 
     return look
 
@@ -65,10 +65,10 @@ def test_the_reward_model_is_due_at_every_tenth_label(
 
 def test_the_first_answer_is_noticed(database: Database, labels: Callable[[int], list[Query]]) -> None:
     with database.reading() as session:
-        assert not reconcile.somebody_has_answered(session)
+        assert reconcile.tasks_with_answers(session) == set()
     labels(1)
     with database.reading() as session:
-        assert reconcile.somebody_has_answered(session)
+        assert reconcile.tasks_with_answers(session) == {"feeding"}
 
 
 def test_the_tenth_label_asks_for_a_reward_model_and_then_for_the_milestones_filter(
@@ -103,9 +103,9 @@ def test_a_running_run_is_left_alone_until_nobody_has_heard_of_it_for_a_minute(
     database: Database, labels: Callable[[int], list[Query]], found: Callable[[], dict[str, int]]
 ) -> None:
     labels(10)
-    task = records.Task("reward/participant-1/labels-10", RunKind.REWARD, 1, 1, 10)
+    job = records.Job("reward/participant-1/labels-10", RunKind.REWARD, 1, 1, 10)
     with database.writing() as session:
-        run_id = records.begin_run(session, task, seed=5)
+        run_id = records.begin_run(session, job, seed=5)
     assert found() == {}
     with database.reading() as session:
         assert reconcile.abandoned(session, ()) == []
@@ -120,19 +120,19 @@ def test_a_failed_run_is_tried_again_a_few_times_and_then_only_when_somebody_ask
     database: Database, labels: Callable[[int], list[Query]], found: Callable[[], dict[str, int]]
 ) -> None:
     labels(10)
-    task = records.Task("reward/participant-1/labels-10", RunKind.REWARD, 1, 1, 10)
+    job = records.Job("reward/participant-1/labels-10", RunKind.REWARD, 1, 1, 10)
     for attempt in range(1, records.ATTEMPTS + 1):
-        assert found() == {task.finding: attempt}
+        assert found() == {job.finding: attempt}
         with database.writing() as session:
-            run_id = records.begin_run(session, task, seed=5)
-            records.fail_run(session, task.finding, "it broke")
+            run_id = records.begin_run(session, job, seed=5)
+            records.fail_run(session, job.finding, "it broke")
         assert found() == {}, "a failed run waits before it is tried again"
         with database.writing() as session:
             session.get_one(Run, run_id).finished_at = now() - timedelta(hours=1)
     assert found() == {}
     with database.writing() as session:
         session.get_one(Run, run_id).status = RunStatus.RETRY
-    assert found() == {task.finding: records.ATTEMPTS + 1}
+    assert found() == {job.finding: records.ATTEMPTS + 1}
 
 
 def test_milestones_that_were_passed_in_the_meantime_are_skipped() -> None:

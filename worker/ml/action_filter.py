@@ -4,7 +4,7 @@ action = policy_mean + gate * (transform(observation, policy_mean) - policy_mean
 """
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Self
 
@@ -19,7 +19,7 @@ from worker.ml.pbarl_printed import PrintedEncoder
 from worker.ml.policies import GaussianPolicy
 from worker.ml.policy_module import FrozenPolicy
 from worker.ml.reward_models import stored_config
-from worker.modes import FEEDING_AXES, perceived, speed_factor
+from worker.modes import ModeFamily
 
 Array = npt.NDArray[np.float32]
 Method = Literal["studio", "printed"]
@@ -30,7 +30,8 @@ class FilterWeights:
     """Everything personal about a filter as plain arrays: travels between processes, is stored, builds the module."""
 
     method: Method = "studio"
-    mode: tuple[float, ...] = (0.0,) * len(FEEDING_AXES)
+    mode: Mapping[str, float] = field(default_factory=dict)
+    """the person's mode by the names of its axes; an axis that is not named is 0"""
     gate: float = 1.0
     residual_share: float = 1.0
     """share of the encoder's residual that is used; 0 means the mode alone"""
@@ -41,17 +42,13 @@ class FilterWeights:
         """The same with some values replaced."""
         return replace(self, **values)
 
-    def named_mode(self) -> dict[str, float]:
-        """The mode by the names of its axes."""
-        return {axis.name: float(value) for axis, value in zip(FEEDING_AXES, self.mode, strict=True)}
-
     def to_bytes(self) -> bytes:
         """One safetensors file."""
         config = {
             "gate": self.gate,
             "kind": "action encoder",
             "method": self.method,
-            "mode": self.named_mode(),
+            "mode": dict(self.mode),
             "residual_share": self.residual_share,
         }
         tensors = {name: np.ascontiguousarray(array) for name, array in self.encoder.items()}
@@ -61,8 +58,7 @@ class FilterWeights:
     def from_bytes(cls, stored: bytes) -> Self:
         """Read what to_bytes() wrote."""
         config = stored_config(stored)
-        mode = tuple(float(config["mode"][axis.name]) for axis in FEEDING_AXES)
-        return cls(config["method"], mode, config["gate"], config["residual_share"], load(stored))
+        return cls(config["method"], config["mode"], config["gate"], config["residual_share"], load(stored))
 
 
 class ModeTransform(nn.Module):
@@ -72,18 +68,24 @@ class ModeTransform(nn.Module):
     residual_share: Tensor
 
     def __init__(
-        self, policy: FrozenPolicy, mode: Sequence[float], adapter: ResidualAdapter | None, residual_share: float
+        self,
+        family: ModeFamily,
+        policy: FrozenPolicy,
+        mode: Mapping[str, float],
+        adapter: ResidualAdapter | None,
+        residual_share: float,
     ) -> None:
         super().__init__()
+        self.family = family
         self.policy = policy
         self.adapter = adapter
-        self.register_buffer("mode", torch.tensor(list(mode), dtype=torch.float32))
+        self.register_buffer("mode", torch.tensor(family.vector(mode), dtype=torch.float32))
         self.register_buffer("residual_share", torch.tensor(residual_share, dtype=torch.float32))
 
     def base(self, observation: Tensor) -> tuple[Tensor, Tensor]:
         """The mode's action and the policy's deviation where the mode looks, (B, 7) each."""
-        action, log_std = self.policy(perceived(observation, self.mode, torch))
-        quicker = speed_factor(observation, self.mode, torch) * action
+        action, log_std = self.policy(self.family.perceived(observation, self.mode, torch))
+        quicker = self.family.speed_factor(observation, self.mode, torch) * action
         return quicker.clamp(-1.0, 1.0), self.policy.action_std(action, log_std)
 
     def forward(self, observation: Tensor, policy_mean: Tensor) -> Tensor:
@@ -125,8 +127,11 @@ class ActionFilter(nn.Module):
         return action
 
 
-def build(policy: GaussianPolicy, weights: FilterWeights) -> ActionFilter:
-    """The module for these weights around this policy, in evaluation mode, on the CPU."""
+def build(family: ModeFamily, policy: GaussianPolicy, weights: FilterWeights) -> ActionFilter:
+    """The module for these weights around this policy, in evaluation mode, on the CPU.
+
+    Raises ValueError when the weights name an axis that the task's family of modes does not have.
+    """
     frozen = FrozenPolicy(policy.weights)
     transform: nn.Module
     if weights.method == "printed":
@@ -138,7 +143,7 @@ def build(policy: GaussianPolicy, weights: FilterWeights) -> ActionFilter:
         if weights.encoder and weights.residual_share > 0.0:
             adapter = ResidualAdapter(frozen.offset, frozen.scale)
             load_state(adapter, weights.encoder)
-        transform = ModeTransform(frozen, weights.mode, adapter, weights.residual_share)
+        transform = ModeTransform(family, frozen, weights.mode, adapter, weights.residual_share)
     return ActionFilter(transform, weights.gate).eval().requires_grad_(False)
 
 

@@ -9,7 +9,7 @@ import json
 import platform
 import zipfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Self
@@ -25,7 +25,8 @@ from worker.ml.onnx_export import INPUTS, OUTPUT, OnnxFilter
 from worker.ml.policies import GaussianPolicy
 from worker.ml.policy_onnx import policy_to_onnx
 from worker.ml.reward_models import CLIP, RewardModel
-from worker.spaces import CONTROL_STEP_S, FEEDING_OBSERVATION, JOINT_ACTION, Space
+from worker.spaces import CONTROL_STEP_S, JOINT_ACTION, Space
+from worker.tasks import Task
 from worker.trajectory import SIGNALS, Trajectory
 
 Array = npt.NDArray[np.float32]
@@ -70,13 +71,13 @@ class Provenance:
     seed: int
     created_at: str
     """ISO 8601, UTC"""
-    task: str = "feeding"
 
 
 @dataclass(frozen=True)
 class BundleContents:
     """Everything that is published."""
 
+    task: Task
     filter_onnx: bytes
     weights: FilterWeights
     reward: RewardModel
@@ -135,7 +136,7 @@ def _manifest(contents: BundleContents) -> dict[str, Any]:
     provenance, weights = contents.provenance, contents.weights
     return {
         "schema_version": SCHEMA_VERSION,
-        "task": provenance.task,
+        "task": contents.task.name,
         "study": provenance.study,
         "participant": provenance.participant,
         "version": provenance.version,
@@ -143,9 +144,9 @@ def _manifest(contents: BundleContents) -> dict[str, Any]:
         "labels": {"count": provenance.label_count, "sha256": provenance.label_hash},
         "seed": provenance.seed,
         "control_rate_hz": round(1.0 / CONTROL_STEP_S, 6),
-        "observation": _table(FEEDING_OBSERVATION),
+        "observation": _table(contents.task.observation),
         "action": _table(JOINT_ACTION),
-        "onnx": _onnx_interface(contents.filter_onnx),
+        "onnx": _onnx_interface(contents.filter_onnx, contents.task.observation.size),
         "normalisation": {
             "inside_filter": True,
             "observation_offset": contents.policy.offset.tolist(),
@@ -160,7 +161,8 @@ def _manifest(contents: BundleContents) -> dict[str, Any]:
             "action_limit": contents.policy.action_limit,
         },
         "method": weights.method,
-        "mode": weights.named_mode(),
+        "mode": dict(weights.mode),
+        "mode_axes": [asdict(axis) for axis in contents.task.modes.axes],
         "gate": weights.gate,
         "residual_share": weights.residual_share if weights.encoder else 0.0,
         "reward_kind": contents.reward.kind,
@@ -192,8 +194,8 @@ def _table(space: Space) -> dict[str, Any]:
     return {"size": space.size, "fields": fields}
 
 
-def _onnx_interface(stored: bytes) -> dict[str, Any]:
-    sizes = {INPUTS[0]: FEEDING_OBSERVATION.size, INPUTS[1]: JOINT_ACTION.size, OUTPUT: JOINT_ACTION.size}
+def _onnx_interface(stored: bytes, observation_size: int) -> dict[str, Any]:
+    sizes = {INPUTS[0]: observation_size, INPUTS[1]: JOINT_ACTION.size, OUTPUT: JOINT_ACTION.size}
 
     def described(name: str) -> dict[str, Any]:
         return {"name": name, "type": "float32", "shape": ["batch", sizes[name]]}

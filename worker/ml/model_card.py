@@ -3,15 +3,13 @@
 from collections.abc import Mapping
 from typing import Any
 
-from worker.modes import FEEDING_AXES
-
 _COSTS = {
-    "C_d": "distance from the mouth, m",
-    "C_v": "speed of the spoon, m/s",
-    "C_f": "force away from the mouth, N",
-    "C_hf": "high force near the mouth, N",
-    "C_fd": "food spilled on the person, pieces",
-    "C_fdv": "speed of food entering the mouth, m/s",
+    "C_d": "distance of the tool from its target, m",
+    "C_v": "speed of the tool, m/s",
+    "C_f": "force on the person away from the target, N",
+    "C_hf": "high force at the target, N",
+    "C_fd": "pieces of food or water spilled on the person",
+    "C_fdv": "speed of food or water entering the mouth, m/s",
 }
 _METHODS = {
     "studio": "the studio's: a personal execution mode with a residual action encoder around it, each kept only as far "
@@ -73,10 +71,10 @@ def _way(manifest: Mapping[str, Any]) -> str:
     """The person's mode in words."""
     if manifest["method"] != "studio":
         return ""
-    meanings = {axis.name: axis for axis in FEEDING_AXES}
     rows = [
-        f"| {name} | {value:+.2f} | {meanings[name].low:g} to {meanings[name].high:g} | {meanings[name].meaning} |"
-        for name, value in manifest["mode"].items()
+        f"| {axis['name']} | {manifest['mode'].get(axis['name'], 0.0):+.2f} | {axis['low']:g} to {axis['high']:g} "
+        f"| {axis['meaning']} |"
+        for axis in manifest["mode_axes"]
     ]
     heading = f"## This person's way\n\nGate {manifest['gate']:.0%}, residual {manifest['residual_share']:.0%}."
     return "\n".join([heading, "", "| axis | value | range | meaning |", "|---|---|---|---|", *rows])

@@ -28,6 +28,8 @@ BETAS: Mapping[str, tuple[float, float, float, float]] = {
     "scratching": (1.0, 1.0, 0.1, 1.0),
 }
 """beta of Rec, Pref, KL, Dyn per task (paper, Implementation Details)."""
+OTHER_TASKS_BETAS = BETAS["feeding"]
+"""For tasks that the paper does not have."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +40,7 @@ class PrintedConfig:
     """n. The paper's ablation has n = 1, but Eq. (4) is then 0/0 and a list of one cannot be re-ranked: rejected."""
     epsilon: float = 1.0
     temperature: float = 1.0  # tau: not given
-    betas: tuple[float, float, float, float] = BETAS["feeding"]
+    betas: tuple[float, float, float, float] = BETAS["feeding"]  # those of the task, see BETAS
     learning_rate: float = 1e-4
     steps: int = 3000
     """the paper trains 1.5e7 steps (days on this machine); for the web this is enough to see what the objective does"""

@@ -77,12 +77,12 @@ class GaussianPolicy:
         spread: Array = np.maximum(deviation * slope, ACTION_STD_FLOOR)
         return spread
 
-    def sample(self, observations: Array, rng: np.random.Generator) -> Array:
-        """An action drawn from the policy, (..., 7)."""
+    def sample(self, observations: Array, rng: np.random.Generator, temperature: float = 1.0) -> Array:
+        """An action drawn from the policy, (..., 7), its deviation multiplied by a temperature."""
         raw = self._raw(observations)
         centre = raw[..., : self.action_size]
         noise = rng.standard_normal(centre.shape, np.float32)
-        action: Array = self._limit * np.tanh(centre + np.exp(self._log_std(raw)) * noise)
+        action: Array = self._limit * np.tanh(centre + np.float32(temperature) * np.exp(self._log_std(raw)) * noise)
         return action
 
     def as_module(self) -> "nn.Module":

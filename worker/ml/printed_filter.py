@@ -4,7 +4,7 @@ import time
 from collections.abc import Sequence
 
 from worker.ml.action_filter import FilterWeights, state_of
-from worker.ml.pbarl_printed import PrintedConfig, train
+from worker.ml.pbarl_printed import BETAS, OTHER_TASKS_BETAS, PrintedConfig, train
 from worker.ml.reward_models import MlpReward
 from worker.ml.studio_filter import FilterDraft, FilterProblem, Progress
 from worker.ml.value import Transitions
@@ -32,7 +32,7 @@ def fit_printed(
     def report(share: float) -> None:
         progress("training the printed action encoder", share)
 
-    settings = config or PrintedConfig()
+    settings = config or PrintedConfig(betas=BETAS.get(problem.task.name, OTHER_TASKS_BETAS))
     encoder, losses = train(problem.policy, problem.reward, data, settings, problem.seed, report)
     notes = (
         f"Printed method: {settings.steps} steps (the paper: 1.5e7), n = {settings.list_length},"

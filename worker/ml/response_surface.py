@@ -15,7 +15,7 @@ import numpy.typing as npt
 from safetensors.numpy import load, save
 
 from worker.ml.reward_models import stored_config
-from worker.modes import FEEDING_AXES, Axis
+from worker.modes import ModeFamily
 from worker.trajectory import SIGNALS
 
 Floats = npt.NDArray[np.float64]
@@ -41,6 +41,7 @@ class ResponseSurface:
     low: Floats
     """(A,) range of the modes it was fitted on"""
     high: Floats
+    axes: tuple[str, ...]
 
     def predict(self, modes: npt.ArrayLike) -> tuple[Floats, Floats]:
         """(..., A) -> changes of the summed signals (..., S) and of the success probability (...)."""
@@ -49,7 +50,7 @@ class ResponseSurface:
 
     def to_bytes(self) -> bytes:
         """One safetensors file."""
-        config = {"axes": [axis.name for axis in FEEDING_AXES], "kind": "response surface", "signals": list(SIGNALS)}
+        config = {"axes": list(self.axes), "kind": "response surface", "signals": list(SIGNALS)}
         tensors = {"coefficients": self.coefficients, "low": self.low, "high": self.high}
         return save(
             {name: np.ascontiguousarray(array, np.float32) for name, array in tensors.items()},
@@ -57,24 +58,24 @@ class ResponseSurface:
         )
 
     @classmethod
-    def from_bytes(cls, stored: bytes) -> Self:
+    def from_bytes(cls, stored: bytes, family: ModeFamily) -> Self:
         """Read what to_bytes() wrote. Raises ValueError when it was fitted for other signals or axes than today's."""
         config = stored_config(stored)
-        if config.get("signals") != list(SIGNALS) or config.get("axes") != [axis.name for axis in FEEDING_AXES]:
+        if config.get("signals") != list(SIGNALS) or config.get("axes") != list(family.names):
             raise ValueError(
-                "This response surface was fitted for other signals or axes; run `python -m worker explore`."
+                "This response surface was fitted for other signals or axes; run `python -m worker explore --task ...`."
             )
         tensors = {name: array.astype(np.float64) for name, array in load(stored).items()}
-        return cls(tensors["coefficients"], tensors["low"], tensors["high"])
+        return cls(tensors["coefficients"], tensors["low"], tensors["high"], family.names)
 
     def save(self, path: Path) -> None:
         """Write to_bytes() to a file."""
         path.write_bytes(self.to_bytes())
 
     @classmethod
-    def load(cls, path: Path) -> Self:
+    def load(cls, path: Path, family: ModeFamily) -> Self:
         """Read a file written by save()."""
-        return cls.from_bytes(path.read_bytes())
+        return cls.from_bytes(path.read_bytes(), family)
 
 
 def monomials(modes: Floats) -> Floats:
@@ -84,9 +85,7 @@ def monomials(modes: Floats) -> Floats:
     return np.stack([*columns, *products, *(column**3 for column in columns)], axis=-1)
 
 
-def fit(
-    modes: Floats, signal_deltas: Floats, success_deltas: Floats, axes: tuple[Axis, ...] = FEEDING_AXES
-) -> ResponseSurface:
+def fit(family: ModeFamily, modes: Floats, signal_deltas: Floats, success_deltas: Floats) -> ResponseSurface:
     """Ridge regression of N paired rollouts.
 
     modes (N, A); signal_deltas (N, S): summed signals of the rollout with this mode minus those of the reference
@@ -99,8 +98,9 @@ def fit(
     gram = features.T @ features + RIDGE * np.eye(features.shape[1])
     return ResponseSurface(
         np.linalg.solve(gram, features.T @ outcomes),
-        np.array([axis.low for axis in axes]),
-        np.array([axis.high for axis in axes]),
+        np.array([axis.low for axis in family.axes]),
+        np.array([axis.high for axis in family.axes]),
+        family.names,
     )
 
 

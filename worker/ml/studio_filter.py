@@ -28,6 +28,8 @@ from worker.ml.policy_module import FrozenPolicy
 from worker.ml.response_surface import ResponseSurface, best_mode
 from worker.ml.reward_models import RewardModel
 from worker.ml.value import ActionValue, Transitions, evaluate_filter, spread_within_states
+from worker.modes import ModeFamily
+from worker.tasks import Task
 from worker.trajectory import Trajectory
 
 Array = npt.NDArray[np.float32]
@@ -74,6 +76,7 @@ class FilterConfig:
 class FilterProblem:
     """What a filter is fitted for."""
 
+    task: Task
     policy: GaussianPolicy
     reward: RewardModel
     seed: int
@@ -152,12 +155,14 @@ def noisy(act: Act, noise: float, seed: int, scenario: int) -> Act:
     return act_with_noise
 
 
-def act_of(policy: GaussianPolicy, weights: FilterWeights) -> FilterAct:
+def act_of(family: ModeFamily, policy: GaussianPolicy, weights: FilterWeights) -> FilterAct:
     """Export a filter for rollouts."""
     rng = np.random.default_rng(0)
     spread = 0.3 * rng.standard_normal((64, len(policy.offset)))
     observations = (policy.offset + spread).astype(np.float32)
-    return FilterAct(policy, OnnxFilter(to_onnx(build(policy, weights), observations, policy.mean(observations))))
+    return FilterAct(
+        policy, OnnxFilter(to_onnx(build(family, policy, weights), observations, policy.mean(observations)))
+    )
 
 
 # -- the stages --------------------------------------------------------------------------------------------------------
@@ -184,7 +189,7 @@ def choose_mode(problem: FilterProblem, surface: ResponseSurface, pool: Sequence
     not linear in the signals."""
     started = time.perf_counter()
     mode = best_mode(surface, problem.reward.signal_weights(pool), problem.seed)
-    return FilterDraft(FilterWeights(mode=tuple(float(value) for value in mode))).timed("mode", started)
+    return FilterDraft(FilterWeights(mode=problem.task.modes.named(mode))).timed("mode", started)
 
 
 def gate_mode(
@@ -196,10 +201,10 @@ def gate_mode(
 ) -> FilterDraft:
     """Use as much of the mode as the task allows; when none is acceptable, go back to the reference policy."""
     started = time.perf_counter()
-    if not any(draft.weights.mode):
+    if not any(draft.weights.mode.values()):
         notes = (*draft.notes, "The labels do not yet say clearly what to change; the mode is off.")
         return replace(draft, weights=FilterWeights(), notes=notes)
-    act = act_of(problem.policy, draft.weights.changed(gate=1.0))
+    act = act_of(problem.task.modes, problem.policy, draft.weights.changed(gate=1.0))
     trials: list[Trial] = []
     for gate in problem.config.gates:
         progress(f"checking the mode at {gate:.0%} on held-out scenarios", 0.05 + 0.1 * len(trials))
@@ -242,7 +247,7 @@ def train_residual(
 def residual_rollouts(problem: FilterProblem, draft: FilterDraft, number: int) -> tuple[Act, Sequence[int], float, int]:
     """What ``collect`` is asked for before round ``number``."""
     config = problem.config
-    act = act_of(problem.policy, draft.weights)
+    act = act_of(problem.task.modes, problem.policy, draft.weights)
     scenarios = scenarios_for("residual", config.round_rollouts[number], 1000 * number)
     return act, scenarios, config.round_noise[number], problem.seed + number
 
@@ -286,7 +291,9 @@ def gate_residual(
     for share in problem.config.residual_shares:
         progress(f"checking {share:.0%} of the residual on held-out scenarios", 0.75 + 0.1 * len(trials))
         weights = draft.weights.changed(residual_share=share)
-        trials.append(_try(problem, act_of(problem.policy, weights), weights.gate, share, reference, collect))
+        trials.append(
+            _try(problem, act_of(problem.task.modes, problem.policy, weights), weights.gate, share, reference, collect)
+        )
     without = [trial for trial in draft.trials if trial.gate == draft.weights.gate and trial.residual_share == 0.0]
     acceptable = [trial for trial in (*trials, *without) if _acceptable(problem, trial, reference)]
     share = max(acceptable, key=lambda trial: trial.preference).residual_share if acceptable else 0.0
@@ -366,7 +373,7 @@ class _Bases:
 
 def _networks(problem: FilterProblem, draft: FilterDraft) -> _Networks:
     """As the draft left them, or new ones."""
-    transform = ModeTransform(FrozenPolicy(problem.policy.weights), draft.weights.mode, None, 0.0)
+    transform = ModeTransform(problem.task.modes, FrozenPolicy(problem.policy.weights), draft.weights.mode, None, 0.0)
     offset, scale = torch.from_numpy(problem.policy.offset), torch.from_numpy(problem.policy.scale)
     with torch.random.fork_rng():
         torch.manual_seed(problem.seed)
