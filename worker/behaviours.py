@@ -18,10 +18,10 @@ DIFFERENT_ENOUGH = 0.45
 """Two modes of one scenario differ by at least this share of some axis' range, so that a person can see it."""
 PATIENCE = 100
 """So many random modes are tried before modes may be more alike."""
-PLAIN_SHARE = 0.7
+PLAIN_SHARE = 0.8
 """Share of the behaviours that are a mode and nothing else; the others are equally often sampled, disturbed, early."""
 TEMPERATURES = (0.5, 1.0, 1.5)
-DISTURBANCES = (0.15, 0.3)
+DISTURBANCES = (0.1, 0.2)
 """Largest deviations in action units: about the policy's own spread and twice that."""
 
 

@@ -11,6 +11,7 @@ from unittest.mock import patch
 import numpy as np
 
 from worker import laboratory
+from worker.exploration import surface_file
 from worker.ml import acquisition, response_surface, reward_training
 from worker.ml.response_surface import ResponseSurface
 from worker.ml.segments import SegmentPairs
@@ -19,7 +20,8 @@ from worker.sim.costs import SPEED_SCALE_M_S, base_weights, preference_rewards
 from worker.sim.rollout import rollout
 from worker.trajectory import COSTS, SIGNALS
 
-CLIP_STEPS, SEEDS, SCENARIOS = 70, 6, 36
+TASK = laboratory.task("feeding")
+CLIP_STEPS, SEEDS, SCENARIOS = 60, 6, 36
 TARGETS = {"left": 0.0, "right": 1.0, "equal": 0.5}
 SIGNAL_OF = dict(
     zip(
@@ -40,16 +42,17 @@ SIGNAL_OF = dict(
 def main() -> None:
     """Print mean and worst gain per number of labels and caution."""
     clips = [
-        rollout(laboratory.environment(), laboratory.act_in_mode(mode), scenario)
+        rollout(laboratory.environment(TASK.name), laboratory.act_as(TASK.name, behaviour), scenario)
         for scenario in range(10_000_000, 10_000_000 + SCENARIOS)
-        for mode in laboratory.behaviours(scenario, 4)
+        for behaviour in laboratory.behaviours(TASK.name, scenario, 4)
     ]
-    surface = ResponseSurface.load(laboratory.CHECKPOINTS / "response_surface.safetensors")
+    surface = ResponseSurface.load(surface_file(TASK.name), TASK.modes)
     rows = acquisition.matched_pairs([clip.scenario for clip in clips])
     shown = SegmentPairs.cut([(clips[left], clips[right]) for left, right in rows], 0, CLIP_STEPS)
     spread = reward_training.signal_spread(shown)
     rewards = {
-        user: np.array([preference_rewards(clip.costs, clip.signals, OMEGA[user]) for clip in clips]) for user in User
+        user: np.array([preference_rewards(TASK, clip.costs, clip.signals, OMEGA[user]) for clip in clips])
+        for user in User
     }
     for count in (10, 30, 100, 200):
         gains: dict[float, list[float]] = {0.0: [], 0.5: [], 1.0: [], 2.0: []}
@@ -73,7 +76,7 @@ def main() -> None:
 def true_weights(user: User) -> np.ndarray:
     """(S,) the user's preference reward per unit of each signal."""
     weights = np.zeros(len(SIGNALS))
-    for name, weight, omega in zip(COSTS, base_weights("calibrated"), OMEGA[user], strict=True):
+    for name, weight, omega in zip(COSTS, base_weights(TASK, "calibrated"), OMEGA[user], strict=True):
         unit = SPEED_SCALE_M_S if name == "C_v" else 1.0
         weights[SIGNALS.index(SIGNAL_OF[name])] -= weight * omega / unit
     return weights

@@ -1,9 +1,9 @@
 """How fast the simulations are on one core, beside the benchmark's (Assistive Gym v1.0) figures.
 
-Run: python -m tests.benchmarks.sim_speed [--resets 10000]    (about a minute; prints a table for docs/results/simulation.md)
+Run: python -m tests.benchmarks.sim_speed [--resets 10000]    (a minute; prints what docs/results/simulation.md shows)
 
-CPU seconds of this process, random actions as in the benchmark's measurement and, below, the shipped policy's. Steps are
-timed without resets. The physics share is the time inside the engine's own stepping: the floor that no Python can beat.
+CPU seconds of this process, with random actions as in the benchmark's measurement and with the shipped policy's. Steps
+are timed without resets. The physics share is the time inside the engine's own stepping: the floor that no Python can beat.
 """
 
 import argparse
@@ -20,8 +20,7 @@ from worker.sim.assistive import AssistiveEnv
 from worker.sim.catalogue import ENVIRONMENTS
 
 BENCHMARK_STEPS_PER_S = {"feeding": 160.0, "drinking": 21.0, "scratching": 268.0}
-BENCHMARK_RESET_S = {"feeding": 0.60, "drinking": 0.98, "scratching": 0.58}
-"""Medians in CPU seconds measured on a comparable core (facts sheet of Assistive Gym v1.0); Drinking with 64 pellets."""
+"""Medians measured on a comparable core (facts sheet of Assistive Gym v1.0); Drinking with 64 pellets."""
 WANTED_RATIO = {"feeding": 10, "drinking": 20, "scratching": 12}
 PELLETS = (16, 32, 64)
 

@@ -1,29 +1,30 @@
 """Which weight of the calibrated speed cost makes the reference person content with the policy's own speed.
 
 All actions are scaled by one factor; the weight is chosen so that the mean preference return of omega = 1 does not
-change to first order at factor 1. Run: python -m tests.benchmarks.speed_cost_weight    (about a minute)
+change to first order at factor 1. Run: python -m tests.benchmarks.speed_cost_weight --task feeding    (about a minute)
 """
 
+import argparse
 import sys
-from pathlib import Path
 
 import numpy as np
 
-import worker
-from worker.ml.policies import GaussianPolicy
+from worker import laboratory
+from worker.sim.catalogue import ENVIRONMENTS
 from worker.sim.costs import BASE_WEIGHTS, cost_items
-from worker.sim.feeding import FeedingEnv
 from worker.sim.rollout import rollout
 from worker.trajectory import COSTS
 
 FACTORS = (0.8, 0.9, 1.0, 1.1, 1.2)
 SCENARIOS = range(3_000_000, 3_000_200)
-POLICY = Path(worker.__file__).parent / "checkpoints" / "feeding" / "policy.safetensors"
 
 
 def main() -> None:
     """Print each item's mean sum per factor, its slope over the logarithm of the factor, and the weight."""
-    policy, env = GaussianPolicy.load(POLICY), FeedingEnv()
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--task", choices=ENVIRONMENTS, default="feeding")
+    task = parser.parse_args().task
+    policy, env = laboratory.reference_policy(task), laboratory.environment(task)
     sums = np.zeros((len(FACTORS), len(COSTS)))
     for row, factor in enumerate(FACTORS):
         successes = 0

@@ -30,9 +30,9 @@ def test_every_kind_of_behaviour_occurs_and_plain_modes_are_the_rule(name: str) 
     task = laboratory.task(name)
     drawn = [each for scenario in range(150) for each in draw_behaviours(task, scenario, 4, EARLY)]
     plain = [each for each in drawn if not (each.temperature or each.disturbance or each.checkpoint)]
-    assert 0.62 < len(plain) / len(drawn) < 0.78
+    assert 0.73 < len(plain) / len(drawn) < 0.87
     assert {each.temperature for each in drawn} == {0.0, 0.5, 1.0, 1.5}
-    assert {each.disturbance for each in drawn} == {0.0, 0.15, 0.3}
+    assert {each.disturbance for each in drawn} == {0.0, 0.1, 0.2}
     assert {each.checkpoint for each in drawn} == {"", *EARLY}
 
 

@@ -6,10 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from worker.sim.feeding import EPISODE_STEPS, FeedingEnv
+from worker.sim.feeding import FEEDING, FeedingEnv
 from worker.sim.food import BALLS
 from worker.sim.rollout import rollout
-from worker.trajectory import Trajectory
+from worker.trajectory import OutdatedTrajectory, Trajectory
+
+EPISODE_STEPS = FEEDING.episode_steps
 
 
 @pytest.fixture(scope="module")
@@ -57,3 +59,20 @@ def test_a_rollout_survives_being_stored(env: FeedingEnv, tmp_path: Path) -> Non
     stored = Trajectory.load(tmp_path / "episode.npz")
     np.testing.assert_array_equal(stored.observations, trajectory.observations)
     assert stored.success is trajectory.success
+
+
+def test_a_rollout_remembers_who_sat_there_and_where_everything_was(env: FeedingEnv) -> None:
+    trajectory = rollout(env, wiggle, scenario=3)
+    assert (trajectory.body, trajectory.skin_tone) == (env.person.body.name, env.person.skin_tone)
+    np.testing.assert_allclose(trajectory.arm_positions_rad[7], env.person.arms_rad, atol=1e-6)
+    np.testing.assert_allclose(trajectory.target_m[7], env.target_m, atol=1e-6)
+    assert (trajectory.head_quaternions == trajectory.head_quaternions[0]).all()
+
+
+def test_a_recording_of_an_older_version_says_what_it_lacks_and_what_to_do(env: FeedingEnv, tmp_path: Path) -> None:
+    rollout(env, wiggle, scenario=3).save(tmp_path / "episode.npz")
+    with np.load(tmp_path / "episode.npz") as stored:
+        older = {name: array for name, array in stored.items() if name != "target_m"}
+    np.savez(tmp_path / "older.npz", **older)
+    with pytest.raises(OutdatedTrajectory, match="lacks target_m: an older version"):
+        Trajectory.load(tmp_path / "older.npz")

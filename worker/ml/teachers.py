@@ -6,7 +6,7 @@ threshold in units of the spread of returns, so that a setting means the same fo
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Literal, Self
 
@@ -32,6 +32,33 @@ OMEGA: Mapping[User, tuple[float, ...]] = {
     User.IMPATIENT: (2.0, 0.5, 0.75, 0.5, 1.5, 0.5),
 }
 """The paper's omega, in the order of COSTS."""
+
+
+@dataclass(frozen=True)
+class Taste:
+    """Somebody outside the paper's types: an omega with the calibrated costs, and more costs per unit of a signal."""
+
+    name: str
+    omega: tuple[float, ...] = (1.0,) * 6
+    per_signal: Mapping[str, float] = field(default_factory=dict)
+    """per control step; below 0: likes it"""
+
+
+OPPOSED: tuple[tuple[Taste, Taste], ...] = (
+    (
+        Taste("slow", (1.0, 6.0, 1.0, 1.0, 1.0, 1.0), {"acceleration_squared_m2_s4": 0.3}),
+        Taste("quick", (2.0, 0.1, 1.0, 1.0, 1.0, 1.0), {"undelivered": 0.1}),
+    ),
+    (
+        Taste("close", per_signal={"lateral_offset_m": 8.0}),
+        Taste("wide", per_signal={"lateral_offset_m": -8.0}),
+    ),
+    (
+        Taste("gentle", (1.0, 1.0, 2.0, 2.0, 1.0, 2.0), {"near_speed_squared_m2_s2": 20.0, "force_squared_n2": 0.05}),
+        Taste("brisk", (2.0, 0.1, 0.2, 0.2, 1.0, 0.2), {"near_speed_squared_m2_s2": -8.0, "force_squared_n2": -0.01}),
+    ),
+)
+"""Users who truly differ: both of a pair care most about one thing, in opposite directions."""
 
 
 @dataclass(frozen=True)

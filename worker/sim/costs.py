@@ -8,6 +8,8 @@
   policy's own speed; omegas then pull in different directions. The other five items are unchanged.
 """
 
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
@@ -45,9 +47,19 @@ def cost_items(costs: Array, signals: Array, form: CostForm = "calibrated") -> F
 
 
 def preference_rewards(
-    task: Task, costs: Array, signals: Array, omega: npt.ArrayLike = 1.0, form: CostForm = "calibrated"
+    task: Task,
+    costs: Array,
+    signals: Array,
+    omega: npt.ArrayLike = 1.0,
+    form: CostForm = "calibrated",
+    per_signal: Mapping[str, float] = MappingProxyType({}),
 ) -> FloatArray:
-    """r^H of every step, (...,): zero or negative. ``omega`` is (6,) in the order of COSTS, or one number."""
+    """r^H of every step, (...,). ``omega`` is (6,) in the order of COSTS, or one number.
+
+    ``per_signal``: what else this person dislikes, as a cost per unit of a signal and control step; below 0: likes.
+    """
     weights = base_weights(task, form) * np.asarray(omega, np.float64)
     rewards: FloatArray = -(cost_items(costs, signals, form) @ weights)
+    for name, cost in per_signal.items():
+        rewards = rewards - cost * np.asarray(signals, np.float64)[..., SIGNALS.index(name)]
     return rewards

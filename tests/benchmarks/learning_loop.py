@@ -1,6 +1,6 @@
-"""The learning loop on the real Feeding simulation, for the paper's three users, without web or database.
+"""The learning loop on the real simulation of a task, for the paper's three users, without web or database.
 
-    python tests/benchmarks/feeding_loop.py --labels 200 --seeds 3 --output docs/results/feeding_loop.json
+    python -m tests.benchmarks.learning_loop --task feeding --labels 200 --seeds 3 --output loop.json
 
 Per user and seed: scripted labels (5 % mistakes, 10 % "equal") on matched clips of the pool's behaviours, prequential
 accuracy while the labels come in, the filter with its seconds per stage, and every filter on the same unseen scenarios
@@ -27,15 +27,17 @@ import torch
 from worker import laboratory
 from worker.analysis.agreement import prequential
 from worker.analysis.evaluation import evaluate
+from worker.behaviours import Behaviour
+from worker.exploration import surface_file
 from worker.ml import acquisition, printed_filter, reward_training, studio_filter
 from worker.ml.response_surface import ResponseSurface
 from worker.ml.segments import SegmentPairs
 from worker.ml.teachers import OMEGA, Manner, ScriptedTeacher, User
+from worker.sim.catalogue import ENVIRONMENTS
 from worker.sim.costs import CostForm, preference_rewards
 from worker.sim.rollout import rollout
 from worker.trajectory import Trajectory
 
-CLIP_STEPS = 70
 POOL_FIRST, TEST_POOL_FIRST = 10_000_000, 10_500_000
 TARGETS = {"left": 0.0, "right": 1.0, "equal": 0.5}
 Floats = npt.NDArray[np.float64]
@@ -60,8 +62,9 @@ class Bench:
     def __init__(self, pool: ProcessPoolExecutor, options: argparse.Namespace) -> None:
         self.pool, self.options = pool, options
         self.form: CostForm = options.form
-        self.policy = laboratory.reference_policy()
-        self.surface = ResponseSurface.load(laboratory.CHECKPOINTS / "response_surface.safetensors")
+        self.task = laboratory.task(options.task)
+        self.policy = laboratory.reference_policy(self.task.name)
+        self.surface = ResponseSurface.load(surface_file(self.task.name), self.task.modes)
         self.clips = self.behaviours(POOL_FIRST, options.pool_scenarios)
         self.test_clips = self.behaviours(TEST_POOL_FIRST, 60)
         self.normalising = self.collect(self.policy.mean, range(2_000_000_000, 2_000_000_040), 0.0, 0)
@@ -116,14 +119,14 @@ class Bench:
         labelled, targets, curve = self.label(user, seed)
         started = time.perf_counter()
         kind: reward_training.Kind = "mlp" if self.options.method == "printed" else self.options.reward
-        spread = reward_training.signal_spread(SegmentPairs.cut(self.pairs_of(self.clips), 0, CLIP_STEPS))
+        spread = reward_training.signal_spread(SegmentPairs.cut(self.pairs_of(self.clips), 0, self.options.clip_steps))
         reward = reward_training.fit(labelled, targets, kind, seed, spread=spread, reference=self.normalising)
-        problem = studio_filter.FilterProblem(self.policy, reward.model, seed, self.config())
+        problem = studio_filter.FilterProblem(self.task, self.policy, reward.model, seed, self.config())
         if self.options.method == "printed":
             draft = printed_filter.fit_printed(problem, self.reference)
         else:
             draft = studio_filter.fit_studio(problem, self.surface, self.clips, self.gate_reference, self.collect)
-        act = studio_filter.act_of(self.policy, draft.weights)
+        act = studio_filter.act_of(self.task.modes, self.policy, draft.weights)
         fitted_s = time.perf_counter() - started
         filtered = self.collect(act, self.unseen, 0.0, 0)
         before, after = reward.model.returns(self.reference), reward.model.returns(filtered)
@@ -134,7 +137,7 @@ class Bench:
             "test_accuracy": self.accuracy(user, reward.model),
             "fit_seconds": reward.metrics["fit_seconds"],
             "filter": {
-                "mode": {name: round(value, 2) for name, value in weights.named_mode().items()},
+                "mode": {name: round(value, 2) for name, value in weights.mode.items()},
                 "gate": weights.gate,
                 "residual_share": weights.residual_share if weights.encoder else None,
                 "trials": [vars(trial) for trial in draft.trials],
@@ -161,11 +164,15 @@ class Bench:
         chosen = [
             pairs[row][::-1] if swap else pairs[row] for row, swap in zip(choice.indices, choice.swapped, strict=True)
         ]
-        shown = SegmentPairs.cut([(self.clips[left], self.clips[right]) for left, right in chosen], 0, CLIP_STEPS)
+        shown = SegmentPairs.cut(
+            [(self.clips[left], self.clips[right]) for left, right in chosen], 0, self.options.clip_steps
+        )
         sides = self.pair_rewards(user, self.clips, np.array(chosen))
         targets = np.array([TARGETS[teacher.answer(left, right, rng)] for left, right in sides])
         predicted = np.full(len(targets), np.nan)
-        everything = reward_training.signal_spread(SegmentPairs.cut(self.pairs_of(self.clips), 0, CLIP_STEPS))
+        everything = reward_training.signal_spread(
+            SegmentPairs.cut(self.pairs_of(self.clips), 0, self.options.clip_steps)
+        )
         for seen in range(10, len(targets), 10):
             rows = np.arange(seen)
             model = reward_training.fit(shown.take(rows), targets[rows], "structured", seed, spread=everything).model
@@ -183,7 +190,7 @@ class Bench:
         """Against the user's true preference on pairs of other scenarios; all, and those on which users disagree."""
         pairs = self.pairs(self.test_clips)
         shown = SegmentPairs.cut(
-            [(self.test_clips[left], self.test_clips[right]) for left, right in pairs], 0, CLIP_STEPS
+            [(self.test_clips[left], self.test_clips[right]) for left, right in pairs], 0, self.options.clip_steps
         )
         wants = {each: np.diff(self.pair_rewards(each, self.test_clips, pairs).sum(-1))[:, 0] > 0 for each in User}
         right = (model.probability_right(shown) > 0.5) == wants[user]
@@ -195,20 +202,22 @@ class Bench:
     def behaviours(self, first: int, scenarios: int) -> list[Trajectory]:
         """Four behaviours of every scenario, as the clip pool has them."""
         jobs = [
-            (scenario, mode)
+            (self.task.name, scenario, behaviour)
             for scenario in range(first, first + scenarios)
-            for mode in laboratory.behaviours(scenario, 4)
+            for behaviour in laboratory.behaviours(self.task.name, scenario, 4)
         ]
         return self._cached(("behaviours", first, scenarios), lambda: list(self.pool.map(_behave, jobs, chunksize=8)))
 
     def collect(self, act: studio_filter.Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
         """See studio_filter.Collect."""
-        job = partial(_roll, act, noise, seed)
+        job = partial(_roll, self.task.name, act, noise, seed)
         return list(self.pool.map(job, scenarios, chunksize=max(1, len(scenarios) // (4 * self.options.processes))))
 
     def _cached(self, key: tuple[Any, ...], make: Any) -> list[Trajectory]:
         policy = hashlib.sha256(b"".join(array.tobytes() for array in self.policy.weights.values())).hexdigest()
-        name = hashlib.sha256(repr((key, policy, laboratory.behaviours(1, 2).tolist())).encode()).hexdigest()[:16]
+        name = hashlib.sha256(
+            repr((self.task, key, policy, laboratory.behaviours(self.task.name, 1, 2))).encode()
+        ).hexdigest()[:16]
         directory = self.options.cache / name
         if directory.exists():
             return [Trajectory.load(path) for path in sorted(directory.iterdir())]
@@ -232,12 +241,12 @@ class Bench:
 
     def pair_rewards(self, user: User, clips: list[Trajectory], pairs: npt.NDArray[np.int64]) -> Floats:
         """(M, 2, T) true preference rewards of what is shown."""
-        steps = np.array([self.true_rewards(user, each)[:CLIP_STEPS] for each in clips])
+        steps = np.array([self.true_rewards(user, each)[: self.options.clip_steps] for each in clips])
         return steps[pairs]
 
     def true_rewards(self, user: User, trajectory: Trajectory) -> Floats:
         """(T,)"""
-        return preference_rewards(trajectory.costs, trajectory.signals, OMEGA[user], self.form)
+        return preference_rewards(self.task, trajectory.costs, trajectory.signals, OMEGA[user], self.form)
 
     def true_returns(self, user: User, trajectories: list[Trajectory]) -> Floats:
         """(N,)"""
@@ -266,14 +275,15 @@ def _table(matrix: dict[str, Any], best: dict[str, Any]) -> str:
     return "\n".join([*rows, "own - best other " + str(best)])
 
 
-def _behave(job: tuple[int, npt.NDArray[np.float64]]) -> Trajectory:
-    scenario, mode = job
-    return rollout(laboratory.environment(), laboratory.act_in_mode(mode), scenario, laboratory.reference_policy().mean)
+def _behave(job: tuple[str, int, Behaviour]) -> Trajectory:
+    task, scenario, behaviour = job
+    act, reference = laboratory.act_as(task, behaviour), laboratory.reference_policy(task).mean
+    return rollout(laboratory.environment(task), act, scenario, reference)
 
 
-def _roll(act: studio_filter.Act, noise: float, seed: int, scenario: int) -> Trajectory:
+def _roll(task: str, act: studio_filter.Act, noise: float, seed: int, scenario: int) -> Trajectory:
     noisy = studio_filter.noisy(act, noise, seed, scenario)
-    return rollout(laboratory.environment(), noisy, scenario, laboratory.reference_policy().mean)
+    return rollout(laboratory.environment(task), noisy, scenario, laboratory.reference_policy(task).mean)
 
 
 def _settle() -> None:
@@ -283,6 +293,8 @@ def _settle() -> None:
 
 def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--task", choices=ENVIRONMENTS, default="feeding")
+    parser.add_argument("--clip-steps", type=int, default=60, help="control steps shown, from the start")
     parser.add_argument("--labels", type=int, default=200)
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--evaluation", type=int, default=200, help="unseen scenarios")
