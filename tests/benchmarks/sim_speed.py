@@ -3,7 +3,8 @@
 Run: python -m tests.benchmarks.sim_speed [--resets 10000]    (a minute; prints what docs/results/simulation.md shows)
 
 CPU seconds of this process, with random actions as in the benchmark's measurement and with the shipped policy's. Steps
-are timed without resets. The physics share is the time inside the engine's own stepping: the floor that no Python can beat.
+are timed without resets. The physics share is the time inside the engine's own stepping, the floor that no Python can
+beat.
 """
 
 import argparse
