@@ -11,6 +11,14 @@ from sqlalchemy.orm import Mapped, mapped_column, relationship
 from app.db import Base, now
 
 
+class TaskName(StrEnum):
+    """What the robot does; the worker simulates the tasks of these names."""
+
+    FEEDING = "feeding"
+    DRINKING = "drinking"
+    SCRATCHING = "scratching"
+
+
 class Method(StrEnum):
     """How the personal filter is trained."""
 
@@ -78,7 +86,7 @@ class Study(Base):
     id: Mapped[int] = mapped_column(primary_key=True)
     slug: Mapped[str] = mapped_column(String(80), unique=True)
     name: Mapped[str] = mapped_column(String(120))
-    task: Mapped[str] = mapped_column(String(40), default="feeding")
+    task: Mapped[str] = mapped_column(String(40), default=TaskName.FEEDING)
     stored_settings: Mapped[dict[str, Any]]
     seed: Mapped[int]
     created_at: Mapped[datetime] = mapped_column(default=now)

@@ -8,7 +8,7 @@ from http import HTTPStatus
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from app.domain.studies import Study, StudySettings
+from app.domain.studies import Study, StudySettings, TaskName
 from app.errors import AppError
 from app.services import audit
 
@@ -22,12 +22,18 @@ class StudyNotFound(AppError):
 
 
 def create_study(
-    session: Session, name: str, settings: StudySettings, seed: int | None = None, actor: str = audit.SYSTEM
+    session: Session,
+    name: str,
+    settings: StudySettings,
+    seed: int | None = None,
+    actor: str = audit.SYSTEM,
+    task: TaskName = TaskName.FEEDING,
 ) -> Study:
     """Open a study; the worker finds it and begins to fill its pool. Without a seed one is drawn and kept."""
     study = Study(
         slug=_free_slug(session, name),
         name=name,
+        task=task,
         stored_settings=settings.model_dump(mode="json"),
         seed=secrets.randbelow(_SEED_LIMIT) if seed is None else seed,
     )
