@@ -60,7 +60,7 @@ def outcome(studio: OwnStudio, database: Database) -> Outcome:
     store = ArtefactStore(studio.settings.data_dir / "artefacts")
     rehearsal = Rehearsal(database, store, studio.settings.base_url)
     manner = Manner(mistakes=0.1, equal_share=0.1, skip_share=0.1)
-    (outcome,) = rehearsal.run([User.CAUTIOUS], settings, manner, seed=1)
+    (outcome,) = rehearsal.run("feeding", [User.CAUTIOUS], settings, manner, seed=1)
     for killer in killers:
         killer.join()
         assert killer.killed, f"the worker was never caught in the middle of {killer.kind}"
