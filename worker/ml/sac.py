@@ -10,7 +10,7 @@ import math
 import os
 import platform
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -26,7 +26,7 @@ from torch import Tensor, nn
 
 from worker.ml.demonstrations import Demonstrate, Demonstrations, collect, imitate, imitation_loss
 from worker.ml.policies import LOG_STD_HIGH, LOG_STD_LOW, GaussianPolicy
-from worker.spaces import Space
+from worker.spaces import Field, Space
 
 Array = npt.NDArray[np.float32]
 Env = gymnasium.Env[Any, Any]
@@ -64,7 +64,9 @@ class SacConfig:
     evaluation_episodes: int = 50
     test_episodes: int = 500
     early_success: tuple[float, ...] = (0.4, 0.7)
-    """The first policies to succeed this often are kept under early/: clumsier behaviours for pools of clips."""
+    """The first policies to succeed about this often are kept under early/: clumsier behaviours for pools of clips."""
+    input_scales: Mapping[str, float] = field(default_factory=dict)
+    """INPUT_SCALE for single fields, by name, where small differences matter"""
     save_every_s: float = 180.0
     action_limit: float = 0.7
     """share of the arm's largest step that the exported policy uses; the rest is left for people who want it quicker"""
@@ -384,7 +386,7 @@ class _Run:
         self.curve.append({"steps": self.steps, "cpu_s": round(self.cpu_s, 1), "alpha": temperature, **outcome})
         for share in self.config.early_success:
             early = self.folder / "early" / f"success_{round(100 * share)}.safetensors"
-            if share <= outcome["success"] < 1.0 and not early.exists():
+            if share <= outcome["success"] < share + 0.25 and not early.exists():
                 early.parent.mkdir(exist_ok=True)
                 _replace(early, policy.save)
                 break
@@ -471,9 +473,12 @@ class _Run:
             imitate(self.learner.actor, self.shown, self.config.imitation_steps)
             self.learner.average.load_state_dict(self.learner.actor.state_dict())
 
+    def _scale(self, part: Field) -> float:
+        return self.config.input_scales.get(part.name, INPUT_SCALE[part.unit])
+
     def _new_learner(self, rows: Tensor) -> Learner:
         offset = rows[:, : self.config.observation.size].mean(0)
-        scale = torch.cat([torch.full((part.size,), INPUT_SCALE[part.unit]) for part in self.config.observation.fields])
+        scale = torch.cat([torch.full((part.size,), self._scale(part)) for part in self.config.observation.fields])
         return Learner(self.config, offset, scale, self.actions)
 
 

@@ -109,7 +109,7 @@ class AssistiveEnv(gymnasium.Env[Any, Any]):
 
     @abstractmethod
     def _lay_out(self, rng: np.random.Generator) -> None:
-        """Place whatever the task needs besides person and arm, which are already there, and read the target."""
+        """Place whatever the task needs besides person and arm, which are already there. The target is read next."""
 
     @abstractmethod
     def _outcome(self, motion: Motion) -> Outcome:
@@ -246,8 +246,8 @@ class AssistiveEnv(gymnasium.Env[Any, Any]):
         self._world.set_joints(ARM, self._command)
         self._drive()
         self._read_arm()
-        self._read_target()
         self._lay_out(rng)
+        self._read_target()
         self._scenario = scenario
 
     def _advance(self, executed: Array) -> StepMeasures:
@@ -360,8 +360,8 @@ def add_person(world: Bullet, person: Person, *arms: int) -> None:
 
     The head is a link of it, for one body less makes a faster reset, unless it trembles: then it is a body of its own.
     """
-    still = (*_STILL_SHAPES[person.body.name], *arm_shapes(person, *(arms or (human.RIGHT, human.LEFT))))
-    pivot, turn, head = person.body.neck_pivot_m, human.head_quaternion(person), _HEAD_SHAPES[person.body.name]
+    still = (*STILL_SHAPES[person.body.name], *arm_shapes(person, *(arms or (human.RIGHT, human.LEFT))))
+    pivot, turn, head = person.body.neck_pivot_m, human.head_quaternion(person), HEAD_SHAPES[person.body.name]
     if person.impairment == "tremor":
         world.add_body(PERSON, still)
         world.add_body(HEAD, head, pivot, turn)
@@ -375,11 +375,11 @@ def arm_shapes(person: Person, *sides: int) -> tuple[Shape, ...]:
     return tuple(capsule_between(*limb[1:]) for limb in limbs)
 
 
-_STILL_SHAPES = {
+STILL_SHAPES = {
     body.name: tuple(capsule_between(*limb[1:]) for limb in (*body.trunk, *body.legs))
     for body in human.BODY_SHAPES.values()
 }
-_HEAD_SHAPES = {
+HEAD_SHAPES = {
     body.name: tuple(Shape("sphere", ball.radius_m, position_m=ball.centre_m) for ball in body.head)
     for body in human.BODY_SHAPES.values()
 }

@@ -360,6 +360,33 @@ class Bullet:
             physicsClientId=self.client,
         )
 
+    def release_joints(self, name: str, count: int) -> None:
+        """Switch off the brakes that the engine puts on the first joints of a chain."""
+        pybullet.setJointMotorControlArray(
+            self._bodies[name],
+            range(count),
+            pybullet.VELOCITY_CONTROL,
+            forces=[0.0] * count,
+            physicsClientId=self.client,
+        )
+
+    def spring_joints(
+        self, name: str, angles_rad: Vector, stiffness_nm_rad: float, damping_nm_s_rad: float, torque_nm: float
+    ) -> None:
+        """Hold the first joints of a chain, once released, by damped springs; call again to move where they rest."""
+        count = len(angles_rad)
+        pybullet.setJointMotorControlArray(
+            self._bodies[name],
+            range(count),
+            pybullet.PD_CONTROL,
+            targetPositions=angles_rad,
+            targetVelocities=[0.0] * count,
+            positionGains=[stiffness_nm_rad] * count,
+            velocityGains=[damping_nm_s_rad] * count,
+            forces=[torque_nm] * count,
+            physicsClientId=self.client,
+        )
+
     def link_pose(self, name: str, link: str) -> tuple[FloatArray, FloatArray]:
         """Origin (3,) and xyzw orientation (4,) of a link's frame in the world."""
         state = pybullet.getLinkState(
