@@ -9,7 +9,7 @@ VENV := .venv
 PY := $(VENV)/bin/python
 PIP := $(PY) -m pip --disable-pip-version-check --quiet
 
-.PHONY: help run link rehearse test lint types contracts pytest browser migrate reset-password benchmark clean
+.PHONY: help run link demo rehearse test lint types contracts pytest browser migrate reset-password benchmark clean
 
 help: ## List the commands
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-16s %s\n", $$1, $$2}'
@@ -19,6 +19,9 @@ run: $(VENV)/run.stamp ## Install what is missing, then start web server and wor
 
 link: $(VENV)/run.stamp ## Add a participant to the newest study and print the personal link
 	@$(PY) -m app link
+
+demo: $(VENV)/run.stamp ## Make a demo study of a task and print a participant link (TASK=feeding, drinking or scratching)
+	@$(PY) -m app demo --task $(or $(TASK),feeding)
 
 rehearse: $(VENV)/run.stamp ## Run scripted participants through the real pages to downloaded bundles (ARGS="--help")
 	@$(PY) -m worker rehearse $(ARGS)

@@ -21,7 +21,7 @@ from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from app.db import Database
-from app.domain.studies import Study, StudySettings
+from app.domain.studies import USUAL_CLIP_STEPS, Study, StudySettings, TaskName
 from app.errors import AppError
 from app.services import accounts, enrolment, studies
 from app.settings import Settings
@@ -40,10 +40,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m app", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
     for name, act in _COMMANDS.items():
-        commands.add_parser(name, help=act.__doc__)
-    chosen = parser.parse_args(arguments)
+        commands.add_parser(name, help=act.__doc__).set_defaults(act=act)
+    demo = commands.add_parser("demo", help=demo_study.__doc__)
+    demo.add_argument("--task", type=TaskName, choices=list(TaskName), default=TaskName.FEEDING)
+    demo.set_defaults(act=demo_study)
+    chosen = vars(parser.parse_args(arguments))
+    act, _ = chosen.pop("act"), chosen.pop("command")
     try:
-        return _COMMANDS[chosen.command](Settings())
+        result: int = act(Settings(), **chosen)
+        return result
     except AppError as error:
         _say(f"Error: {error.message}")
         return 1
@@ -77,6 +82,15 @@ def participant_link(settings: Settings) -> int:
             raise AppError("There is no study yet. Start the studio once, or create a study on the dashboard.")
         _, token = enrolment.add_participant(session, study)
     _say(f"{settings.base_url}/p/{token}")
+    return 0
+
+
+def demo_study(settings: Settings, task: TaskName) -> int:
+    """Make a demo study of a task with one participant and print the personal link."""
+    migrate(settings)
+    with _database(settings).writing() as session:
+        link = _demo(session, settings, task)
+    _say(link)
     return 0
 
 
@@ -125,12 +139,18 @@ def _first_start(session: Session, settings: Settings) -> str:
             f"  One-time password {password}  (you choose your own at the first login)",
         ]
     if session.scalar(select(func.count(Study.id))) == 0:
-        study = studies.create_study(session, "Demo: feeding", StudySettings())
-        _, token = enrolment.add_participant(session, study)
-        lines.append(f"  Participant link  {settings.base_url}/p/{token}")
+        lines.append(f"  Participant link  {_demo(session, settings, TaskName.FEEDING)}")
     else:
         lines.append("  Participant links are made on the dashboard, or with: make link")
     return "\n".join([*lines, "", "  Ctrl-C stops everything; nothing is lost.", ""])
+
+
+def _demo(session: Session, settings: Settings, task: TaskName) -> str:
+    """The personal link of a new demo study's participant."""
+    usual = StudySettings(clip_steps=USUAL_CLIP_STEPS[task])
+    study = studies.create_study(session, f"Demo: {task}", usual, task=task)
+    _, token = enrolment.add_participant(session, study)
+    return f"{settings.base_url}/p/{token}"
 
 
 class _Programs:

@@ -19,6 +19,12 @@ class TaskName(StrEnum):
     SCRATCHING = "scratching"
 
 
+USUAL_CLIP_STEPS = {TaskName.FEEDING: 60, TaskName.DRINKING: 100, TaskName.SCRATCHING: 60}
+"""Control steps (10 Hz) from the start in which what matters has happened: water is poured late."""
+LONGEST_CLIP_STEPS = {TaskName.FEEDING: 100, TaskName.DRINKING: 130, TaskName.SCRATCHING: 100}
+"""A whole episode."""
+
+
 class Method(StrEnum):
     """How the personal filter is trained."""
 
@@ -48,7 +54,12 @@ class StudySettings(BaseModel):
     labels_per_participant: int = Field(default=200, ge=10, le=1000)
     retrain_every_labels: int = Field(default=10, ge=1, le=100)
     filter_milestones: tuple[int, ...] = Field(default=(50, 100), description="Label counts; the end is implied.")
-    clip_steps: int = Field(default=70, ge=20, le=100, description="Control steps shown, from the start (10 Hz).")
+    clip_steps: int = Field(
+        default=USUAL_CLIP_STEPS[TaskName.FEEDING],
+        ge=20,
+        le=max(LONGEST_CLIP_STEPS.values()),
+        description="Control steps shown, from the start (10 Hz).",
+    )
     pool_scenarios: int = Field(default=36, ge=1, le=500)
     behaviours_per_scenario: int = Field(default=4, ge=2, le=8)
     strategy: Strategy = Strategy.UNIFORM

@@ -11,10 +11,10 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from app.domain.models import Bundle, Model
 
 COST_NAMES = {
-    "C_d": "Distance from the mouth",
-    "C_v": "Speed of the spoon",
-    "C_f": "Force away from the mouth",
-    "C_hf": "High force at the mouth",
+    "C_d": "Distance from the target",
+    "C_v": "Speed of the tool",
+    "C_f": "Force away from the target",
+    "C_hf": "High force at the target",
     "C_fd": "Food spilled on the person",
     "C_fdv": "Food entering fast",
 }

@@ -8,11 +8,17 @@ from http import HTTPStatus
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from app.domain.studies import Study, StudySettings, TaskName
+from app.domain.studies import LONGEST_CLIP_STEPS, Study, StudySettings, TaskName
 from app.errors import AppError
 from app.services import audit
 
 _SEED_LIMIT = 2**31
+
+
+class ClipsTooLong(AppError):
+    """The clips of this study would be longer than an episode of its task. Choose fewer steps."""
+
+    status = HTTPStatus.UNPROCESSABLE_ENTITY
 
 
 class StudyNotFound(AppError):
@@ -29,7 +35,12 @@ def create_study(
     actor: str = audit.SYSTEM,
     task: TaskName = TaskName.FEEDING,
 ) -> Study:
-    """Open a study; the worker finds it and begins to fill its pool. Without a seed one is drawn and kept."""
+    """Open a study; the worker finds it and begins to fill its pool. Without a seed one is drawn and kept.
+
+    Raises ClipsTooLong.
+    """
+    if settings.clip_steps > LONGEST_CLIP_STEPS[task]:
+        raise ClipsTooLong
     study = Study(
         slug=_free_slug(session, name),
         name=name,

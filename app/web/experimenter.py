@@ -77,11 +77,11 @@ def create_study(
 ) -> Response:
     """Open the study, or show the form again with what is wrong with it."""
     try:
-        name, settings = study_form.settings_of(form)
+        name, task, settings = study_form.settings_of(form)
     except study_form.FormInvalid as invalid:
         context = {"experimenter": experimenter, "form": form, "errors": invalid.errors}
         return page(request, "experimenter/new_study.html", context, HTTPStatus.UNPROCESSABLE_ENTITY)
-    study = studies.create_study(session, name, settings, actor=experimenter.name)
+    study = studies.create_study(session, name, settings, actor=experimenter.name, task=task)
     return _see(request, "show_study", slug=study.slug)
 
 

@@ -6,17 +6,18 @@ from typing import Annotated, Any
 from fastapi import Form
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from app.domain.studies import StudySettings
+from app.domain.studies import LONGEST_CLIP_STEPS, USUAL_CLIP_STEPS, StudySettings, TaskName
 
 _Text = Annotated[str, Field(max_length=500)]
 
 
 class StudyForm(BaseModel):
-    """What was typed, as text; the field names are those of StudySettings, except for name and milestones."""
+    """What was typed, as text; the field names are those of StudySettings, except for name, task and milestones."""
 
     model_config = ConfigDict(extra="ignore")
 
     name: _Text = ""
+    task: _Text = ""
     question: _Text = ""
     labels_per_participant: _Text = ""
     retrain_every_labels: _Text = ""
@@ -60,18 +61,25 @@ def form_with_defaults() -> StudyForm:
     """The form as it is first shown."""
     usual = StudySettings()
     return StudyForm(
-        **{name: str(getattr(usual, name)) for name in (*_COUNTS, *_WORDS)},
+        task=TaskName.FEEDING,
+        **{name: str(getattr(usual, name)) for name in (*_COUNTS, *_WORDS) if name != "clip_steps"},
         **{name: f"{getattr(usual, name) * 100:g}" for name in _PERCENTS},
         filter_milestones=", ".join(str(count) for count in usual.filter_milestones),
     )
 
 
-def settings_of(form: StudyForm) -> tuple[str, StudySettings]:
-    """The study's name and settings. Raises FormInvalid."""
+def settings_of(form: StudyForm) -> tuple[str, TaskName, StudySettings]:
+    """The study's name, task and settings; clips without a length get the task's usual one. Raises FormInvalid."""
     errors: dict[str, str] = {}
+    task = _task(errors, form.task)
     values: dict[str, Any] = {name: getattr(form, name).strip() for name in _WORDS}
     for name in _COUNTS:
         values[name] = _number(errors, name, getattr(form, name), whole=True)
+    if not form.clip_steps.strip():
+        errors.pop("clip_steps", None)
+        values["clip_steps"] = USUAL_CLIP_STEPS[task]
+    elif values["clip_steps"] is not None and values["clip_steps"] > LONGEST_CLIP_STEPS[task]:
+        errors["clip_steps"] = f"An episode of this task has {LONGEST_CLIP_STEPS[task]} steps. Enter at most as many."
     for name in _PERCENTS:
         share = _number(errors, name, getattr(form, name), whole=False)
         values[name] = None if share is None else share / 100
@@ -91,7 +99,15 @@ def settings_of(form: StudyForm) -> tuple[str, StudySettings]:
         if len(errors) > 1:
             errors.pop("", None)  # a rule about several fields is premature while one of them is wrong
         raise FormInvalid(errors)
-    return name, settings
+    return name, task, settings
+
+
+def _task(errors: dict[str, str], typed: str) -> TaskName:
+    try:
+        return TaskName(typed.strip() or TaskName.FEEDING)
+    except ValueError:
+        errors["task"] = "Choose one of the tasks."
+        return TaskName.FEEDING
 
 
 def _number(errors: dict[str, str], name: str, typed: str, *, whole: bool) -> float | None:

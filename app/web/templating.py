@@ -14,7 +14,16 @@ from starlette.datastructures import URLPath
 from app.db import now
 
 ROOT = Path(__file__).resolve().parents[2]
-_UNITS = {"_m2_s2": "m²/s²", "_m2_s4": "m²/s⁴", "_m_s": "m/s", "_m": "m", "_n": "N", "_rad": "rad"}
+_UNITS = {
+    "_rad2_s2": "rad²/s²",
+    "_n2": "N²",
+    "_m2_s2": "m²/s²",
+    "_m2_s4": "m²/s⁴",
+    "_m_s": "m/s",
+    "_m": "m",
+    "_n": "N",
+    "_rad": "rad",
+}
 _MINUTE_S, _HOUR_S, _DAY_S = 60, 3600, 86400
 
 

@@ -13,6 +13,7 @@ from app.domain.models import ModelKind, Run, RunKind, RunStatus, WorkerPresence
 from app.domain.people import AuditEvent
 from app.domain.preferences import Response
 from app.domain.studies import Participant, Study
+from app.services import enrolment
 from app.storage import ArtefactStore
 from tests import factories
 
@@ -22,7 +23,12 @@ FORM = re.compile(r'name="(\w+)" type="text" value="([^"]*)"')
 def typed(browser: TestClient, **changes: str) -> dict[str, str]:
     """What the form for a new study sends when only these fields are changed."""
     page = browser.get("/studies/new").text
-    form = dict(FORM.findall(page)) | {"method": "studio", "reward_kind": "structured", "strategy": "uniform"}
+    form = dict(FORM.findall(page)) | {
+        "task": "feeding",
+        "method": "studio",
+        "reward_kind": "structured",
+        "strategy": "uniform",
+    }
     return form | {"name": "Pilot"} | changes
 
 
@@ -63,6 +69,8 @@ def test_two_studies_of_one_name_have_two_addresses(experimenter: TestClient) ->
         ("method", "magic", "studio"),
         ("question", "", "at least 1"),
         ("pool_scenarios", "2", "fewer than the"),
+        ("task", "dressing", "Choose one of the tasks."),
+        ("clip_steps", "120", "has 100 steps"),
     ],
 )
 def test_a_mistake_is_explained_and_what_was_typed_is_kept(
@@ -76,6 +84,23 @@ def test_a_mistake_is_explained_and_what_was_typed_is_kept(
     assert field == "name" or 'value="Kept"' in answer.text
     with database.reading() as session:
         assert session.scalars(select(Study)).all() == []
+
+
+@pytest.mark.parametrize(("task", "steps"), [("feeding", 60), ("drinking", 100), ("scratching", 60)])
+def test_each_task_has_its_usual_length_of_clips_and_its_own_instructions(
+    experimenter: TestClient, database: Database, new_browser: Callable[[], TestClient], task: str, steps: int
+) -> None:
+    experimenter.post("/studies/new", data=typed(experimenter, task=task))
+    with database.writing() as session:
+        study = session.scalars(select(Study)).one()
+        assert (study.task, study.settings.clip_steps) == (task, steps)
+        _, token = enrolment.add_participant(session, study)
+    browser = new_browser()
+    browser.get(f"/p/{token}")
+    browser.post("/p/consent", data={"version": "1"})
+    words = {"feeding": "being fed", "drinking": "cup of water", "scratching": "reddish spot"}
+    assert words[task] in browser.get("/p/instructions").text
+    assert task.capitalize() in experimenter.get("/studies").text
 
 
 @pytest.fixture
