@@ -208,7 +208,7 @@ class TestWatching:
         assert page.count('<svg class="interval ') == 8 + 5
         assert all(
             words in page
-            for words in ("Speed of the spoon", "\u22123.4", "[\u22124.2, \u22122.7]", "speed squared (m²/s²)")
+            for words in ("Speed of the tool", "\u22123.4", "[\u22124.2, \u22122.7]", "speed squared (m²/s²)")
         )
         assert 'interval-worse" viewBox' in page
         assert "bundles/1.zip" in experimenter.get("/studies/pilot").text
