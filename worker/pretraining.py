@@ -1,6 +1,6 @@
 """Trains the reference policies that ship with the studio: ``python -m worker pretrain --task feeding``."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -8,9 +8,25 @@ from tqdm import tqdm
 
 from worker import laboratory
 from worker.ml import sac
+from worker.ml.demonstrations import Demonstrate
+from worker.sim.scripted_drinking import scripted_pouring
 
-TRAINING: Mapping[str, Mapping[str, Any]] = {"feeding": {}}
+TRAINING: Mapping[str, Mapping[str, Any]] = {
+    "feeding": {},
+    "drinking": {
+        "total_steps": 200_000,
+        "random_steps": 2_000,
+        "initial_temperature": 0.02,
+        "training_limit": 0.7,
+        "demonstrations": 45,
+        "imitation_updates": 60_000,
+        "evaluation_episodes": 100,
+    },
+}
 """What a task's training does otherwise than SacConfig's defaults."""
+
+DEMONSTRATORS: Mapping[str, Callable[[], Demonstrate]] = {"drinking": scripted_pouring}
+"""Scripted controllers for tasks that are not found by trial and error."""
 
 
 def pretrain(task: str, seed: int, directory: Path) -> int:
@@ -23,5 +39,6 @@ def pretrain(task: str, seed: int, directory: Path) -> int:
             bar.set_postfix({name: f"{value:.3g}" for name, value in figures.items()})
 
         command = f"python -m worker pretrain --task {task} --seed {seed}"
-        sac.pretrain(laboratory.environment_class(task), config, directory, progress, command)
+        demonstrate = DEMONSTRATORS[task]() if task in DEMONSTRATORS else None
+        sac.pretrain(laboratory.environment_class(task), config, directory, progress, command, demonstrate)
     return 0

@@ -132,6 +132,15 @@ class AssistiveEnv(gymnasium.Env[Any, Any]):
     def _new_world(self) -> Bullet:
         return Bullet()
 
+    def _build(self) -> None:
+        """Put this scenario's person and the arm into the world.
+
+        The default builds it anew: an engine with a past replays an episode only almost identically.
+        """
+        self._world.clear()
+        self._add_person()
+        self.robot.add_to(self._world, self.tool)
+
     def _add_person(self) -> None:
         """Add the person as bodies named as in person_parts."""
         add_person(self._world, self.person)
@@ -228,7 +237,6 @@ class AssistiveEnv(gymnasium.Env[Any, Any]):
     # Private
 
     def _begin(self, scenario: int) -> None:
-        """Build the world anew: an engine with a past replays an episode only almost identically."""
         rng = np.random.default_rng(scenario)
         self.person = human.draw_person(rng, self._bodies, self._impairments, self.head_range_deg, self.right_arm)
         self._head_quaternion = human.head_quaternion(self.person)
@@ -239,10 +247,8 @@ class AssistiveEnv(gymnasium.Env[Any, Any]):
         self._previous_action = np.zeros(len(self.robot.joints))
         self._previous_velocity = np.zeros(3)
         self._force = 0.0
-        self._world.clear()
-        self._add_person()
+        self._build()
         self._touchable = [part for part in self.person_parts if self._world.has(part)]
-        self.robot.add_to(self._world, self.tool)
         self._world.set_joints(ARM, self._command)
         self._drive()
         self._read_arm()
@@ -355,14 +361,14 @@ class AssistiveEnv(gymnasium.Env[Any, Any]):
         self._world.drive_joints(ARM, self._command, POSITION_GAIN, MOTOR_FORCE_NM)
 
 
-def add_person(world: Bullet, person: Person, *arms: int) -> None:
+def add_person(world: Bullet, person: Person, *arms: int, head_apart: bool = False) -> None:
     """Add the seated person with the arms named (both by default) as an immovable body.
 
-    The head is a link of it, for one body less makes a faster reset, unless it trembles: then it is a body of its own.
+    The head is a link of it, for one body less makes a faster reset, unless it trembles or is wanted apart.
     """
     still = (*STILL_SHAPES[person.body.name], *arm_shapes(person, *(arms or (human.RIGHT, human.LEFT))))
     pivot, turn, head = person.body.neck_pivot_m, human.head_quaternion(person), HEAD_SHAPES[person.body.name]
-    if person.impairment == "tremor":
+    if head_apart or person.impairment == "tremor":
         world.add_body(PERSON, still)
         world.add_body(HEAD, head, pivot, turn)
     else:

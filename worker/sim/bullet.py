@@ -114,11 +114,20 @@ class Bullet:
     """A physics client. Bodies are known by the name they were added with."""
 
     def __init__(
-        self, time_step_s: float = 0.02, solver_iterations: int = 10, gravity_m_s2: float = GRAVITY_M_S2
+        self,
+        time_step_s: float = 0.02,
+        solver_iterations: int = 10,
+        gravity_m_s2: float = GRAVITY_M_S2,
+        forgetful: bool = False,
     ) -> None:
+        """A forgetful world finds touching bodies without the engine's search tree, whose shape depends on the past.
+
+        Once its bodies have been apart for one step, it goes on as if it were new. It takes 8 ms to clear.
+        """
         self._client: int | None = pybullet.connect(pybullet.DIRECT)
         self._time_step_s, self._solver_iterations = time_step_s, solver_iterations
         self._gravity_m_s2 = gravity_m_s2
+        self._reset_flags: int = pybullet.RESET_USE_SIMPLE_BROADPHASE if forgetful else 0
         self.clear()
 
     @property
@@ -138,7 +147,7 @@ class Bullet:
 
     def clear(self) -> None:
         """Remove everything and forget all history: what is built next behaves as in a fresh process."""
-        pybullet.resetSimulation(physicsClientId=self.client)
+        pybullet.resetSimulation(self._reset_flags, physicsClientId=self.client)
         pybullet.setPhysicsEngineParameter(
             fixedTimeStep=self._time_step_s,
             numSolverIterations=self._solver_iterations,

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
@@ -19,8 +20,9 @@ from worker.sim.assistive import (
     FloatArray,
     Motion,
     Reward,
+    add_person,
 )
-from worker.sim.bullet import Bullet, rotation_of
+from worker.sim.bullet import IDENTITY, Bullet, Vector, rotation_of
 from worker.sim.human import Impairment
 from worker.sim.jaco import JACO, PI
 from worker.sim.measures import Outcome, StepMeasures, TaskReward
@@ -37,15 +39,53 @@ OBSERVATION = Space(
     )
 )
 
+
+@dataclass(frozen=True)
+class PouringModes(ApproachModes):
+    """Ways to bring a cup and to pour. Adds the axes tip_early, pour_angle and pour_haste."""
+
+    level_rad: float | None = None
+
+    def perceived(self, observation: Any, mode: Any, xp: Any = np) -> Any:
+        """As for every approach, with the cup seen less tipped than it is by what this mode wants in addition."""
+        moved = super().perceived(observation, mode, xp)
+        at_mouth = self._at_mouth(observation, xp)
+        extra = self._of(mode, "tip_early") * (1.0 - at_mouth) + self._of(mode, "pour_angle") * at_mouth
+        forward, up = self._field(observation, "tool_forward"), self._field(observation, "tool_up")
+        joints = self._field(observation, "joint_positions_rad")
+        return self._replaced(
+            moved,
+            xp,
+            tool_forward=xp.cos(extra) * forward + xp.sin(extra) * up,
+            tool_up=xp.cos(extra) * up - xp.sin(extra) * forward,
+            joint_positions_rad=xp.concatenate([joints[..., :6], joints[..., 6:] - extra], -1),
+        )
+
+    def speed_factor(self, observation: Any, mode: Any, xp: Any = np) -> Any:
+        """As for every approach until the cup is at the mouth; there pour_haste alone says how fast it is tipped."""
+        at_mouth = self._at_mouth(observation, xp)
+        haste = xp.exp(self._of(mode, "pour_haste") * at_mouth)
+        return super().speed_factor(observation, mode, xp) ** (1.0 - at_mouth) * haste
+
+    def _at_mouth(self, observation: Any, xp: Any) -> Any:
+        return xp.clip((0.09 - self._distance(observation, xp)) / 0.05, 0.0, 1.0)
+
+
 DRINKING = Task(
     name="drinking",
     title="Drinking",
     observation=OBSERVATION,
-    modes=ApproachModes(
+    modes=PouringModes(
         OBSERVATION,
         (
-            Axis("speed_far", -0.8, 0.4, "log of the speed factor while the cup is far from the mouth"),
-            Axis("speed_near", -0.8, 0.5, "log of the speed factor close to the mouth"),
+            Axis("speed_far", -0.7, 0.4, "log of the speed factor while the cup is far from the mouth"),
+            Axis("speed_near", -0.7, 0.4, "log of the speed factor close to the mouth, before the cup is tipped"),
+            Axis("from_below", -0.8, 0.8, "how far below (+) or above (-) the mouth the approach passes"),
+            Axis("to_side", -0.6, 0.6, "how far to the person's left (+) or right (-) the approach swings"),
+            Axis("hesitate", 0.0, 1.2, "how much the cup lingers a hand's breadth before the mouth"),
+            Axis("tip_early", -0.3, 0.3, "how much further (+) or less (-) the cup is tipped on its way, in rad"),
+            Axis("pour_angle", -0.06, 0.3, "how much further (+) or less (-) the cup is tipped at the mouth, in rad"),
+            Axis("pour_haste", -0.9, 0.4, "log of the factor on how fast the cup is tipped at the mouth"),
         ),
     ),
     calibrated_speed_weight=1.0,
@@ -64,8 +104,9 @@ HELD_BEFORE_HAND_M = 0.035
 
 _CUP = Cup(CUP_BASE_RADIUS_M, CUP_RIM_RADIUS_M, CUP_HEIGHT_M)
 _SIDES, _SEEN_WALL_M, _FELT_WALL_M = 10, 0.004, 0.008
-_INSIDE = "inside"
+_INSIDE, _LINING = "inside", _CUP.walls(_FELT_WALL_M, _SIDES)
 SETTLING_SUBSTEPS = 100
+ELSEWHERE_M = (60.0, 0.0, 50.0)
 
 CUP = Tool(
     "cup",
@@ -111,6 +152,7 @@ class DrinkingEnv(AssistiveEnv):
             raise ValueError(f"pellets must be from 16 to 64; got {pellets}.")
         self._pellets = pellets
         self._driven_to = np.zeros(len(self.robot.joints))
+        self._water: Water
         super().__init__(reward or self._pouring_reward, bodies, impairments)
 
     @property
@@ -123,12 +165,30 @@ class DrinkingEnv(AssistiveEnv):
         """(P, 3) m in the world, NaN once drunk or fallen to the floor."""
         return self._water.positions
 
+    def _new_world(self) -> Bullet:
+        return Bullet(forgetful=True)
+
+    def _build(self) -> None:
+        """Arm, cup and water are built once: that takes longer than everything else a reset does."""
+        if self._world.has(PERSON):
+            self._world.remove(HEAD)
+            self._world.remove(PERSON)
+            self._water.put_away()
+            self._world.set_pose(_INSIDE, ELSEWHERE_M)
+        else:
+            self.robot.add_to(self._world, self.tool)
+            _line_cup(self._world, ELSEWHERE_M)
+            self._water = Water(self._world, _CUP, pellet_radius_m(self._pellets), self._pellets)
+        self._world.step()
+        self._add_person()
+
+    def _add_person(self) -> None:
+        # A body of its own and the last one: only so does removing it leave the order of all others as it was.
+        add_person(self._world, self.person, head_apart=True)
+
     def _lay_out(self, rng: np.random.Generator) -> None:
-        # Links are not among the immovable by themselves, and the lining must not touch the head.
-        self._world.set_layer(PERSON, HEAD, IMMOVABLE_LAYER, ~IMMOVABLE_LAYER)
-        _line_cup(self._world)
-        places = self._tool + resting_places_m(self._pellets) @ self._tool_rotation.T
-        self._water = Water(self._world, _CUP, pellet_radius_m(self._pellets), places)
+        self._world.carry(_INSIDE, ARM, CUP.name)
+        self._water.fill(self._tool + resting_places_m(self._pellets) @ self._tool_rotation.T)
         self._driven_from = self._driven_to = self._command
 
     def _drive(self) -> None:
@@ -156,29 +216,33 @@ class DrinkingEnv(AssistiveEnv):
     def _pouring_reward(self, step: StepMeasures) -> float:
         """What the reference policy is trained for. Tipping pays at the mouth only and costs away from it.
 
-        Having drunk pays as much per step as tipping a full cup does, or pouring would not be worth its end.
+        Having drunk pays more per step than tipping a full cup does, or pouring would not be worth its end; it pays
+        little more, or the policy hurries and tips the cup on its way.
         """
-        share = 16.0 / self._pellets
-        basic = TaskReward(per_delivered=share, per_spilled=-0.5 * share, force_per_n=-0.05)(step)
+        basic = TaskReward(
+            per_delivered=24.0 / self._pellets, per_spilled=-12.0 / self._pellets, speed_per_m_s=-0.2, force_per_n=-0.04
+        )(step)
         left, drunk = self._water.in_cup / self._pellets, self._water.drunk / self._pellets
         tilt = min(step.tilt_rad, 1.8)
-        tipping = 0.12 if step.distance_m < 0.035 else -0.10 if step.distance_m > 0.07 else 0.0
-        reward: float = basic + tipping * tilt * left + 0.25 * drunk
-        return reward
+        tipping = 0.0
+        if step.distance_m < 0.035:
+            tipping = 0.12 * tilt
+        elif step.distance_m > 0.06:
+            tipping = -0.10 * tilt - 0.5 * max(0.0, tilt - 0.6)
+        return float(basic + tipping * left + 0.22 * drunk)
 
 
 def pellet_radius_m(pellets: int) -> float:
     """The same amount of water in any number of pellets."""
-    return PELLET_RADIUS_M * (PELLETS / pellets) ** (1 / 3)
+    return PELLET_RADIUS_M * math.cbrt(PELLETS / pellets)
 
 
-def _line_cup(world: Bullet) -> None:
-    """Put plain walls into the cup: with plain bodies the engine resolves the water's contacts three times as fast.
+def _line_cup(world: Bullet, place_m: Vector) -> None:
+    """Add plain walls for the cup: with plain bodies the engine resolves the water's contacts three times as fast.
 
     They are thicker than the cup that is seen, so that no pellet passes them within one physics step.
     """
-    cup_m, quaternion = world.link_pose(ARM, CUP.name)
-    world.add_carrier(_INSIDE, _CUP.walls(_FELT_WALL_M, _SIDES), cup_m, quaternion)
+    world.add_carrier(_INSIDE, _LINING, place_m, IDENTITY)
     world.set_material(_INSIDE, friction=WALL_FRICTION)
     world.set_layer(_INSIDE, None, IMMOVABLE_LAYER, WATER_LAYER)
     world.set_layer(ARM, CUP.name, CUP_LAYER, 0)
@@ -194,9 +258,10 @@ def resting_places_m(pellets: int) -> FloatArray:
     world.drive_joints(ARM, posture, POSITION_GAIN, MOTOR_FORCE_NM)
     cup_m, quaternion = world.link_pose(ARM, CUP.name)
     rotation = rotation_of(quaternion)
-    _line_cup(world)
+    _line_cup(world, cup_m)
     radius = pellet_radius_m(pellets)
-    water = Water(world, _CUP, radius, cup_m + heap(_CUP, pellets, radius) @ rotation.T)
+    water = Water(world, _CUP, radius, pellets)
+    water.fill(cup_m + heap(_CUP, pellets, radius) @ rotation.T)
     for _ in range(SETTLING_SUBSTEPS):
         world.carry(_INSIDE, ARM, CUP.name)
         world.step()

@@ -9,6 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from worker.sim.arm import Robot, Tool, tool_jacobian
+from worker.sim.assistive import ACTION_UNIT_RAD
+from worker.sim.drinking import CUP, DRINKING
+from worker.sim.jaco import JACO
 from worker.spaces import Space
 
 Array = npt.NDArray[np.float32]
@@ -83,6 +86,11 @@ class ScriptedPouring:
 
     def _field(self, observation: Array, name: str) -> FloatArray:
         return np.asarray(observation[self.observation.slice_of(name)], np.float64)
+
+
+def scripted_pouring() -> ScriptedPouring:
+    """The controller for the arm and cup of DrinkingEnv."""
+    return ScriptedPouring(DRINKING.observation, JACO, CUP, ACTION_UNIT_RAD)
 
 
 def _unit(vector: FloatArray) -> FloatArray:

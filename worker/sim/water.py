@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +17,9 @@ PELLET_MASS_KG = 0.001
 DRUNK_WITHIN_M = 0.03
 SPILLED_BEYOND_M = 0.10
 FLOOR_M = 0.0
+
+_OUT_OF_THE_WAY_M, _SWALLOWED_M = np.array([50.0, 60.0, 50.0]), np.array([50.0, 40.0, 50.0])
+"""Pellets fall from here unseen."""
 
 IMMOVABLE_LAYER, CUP_LAYER, WATER_LAYER = 2, 4, 64
 """Water meets water, the cup's inner walls and the person; the cup that the hand holds meets the person alone."""
@@ -73,13 +77,24 @@ class Cup(NamedTuple):
 class Water:
     """P pellets and what has become of them. A cup's frame is given as its origin (3,) and rotation (3, 3)."""
 
-    def __init__(self, world: Bullet, cup: Cup, radius_m: float, positions_m: FloatArray) -> None:
+    def __init__(self, world: Bullet, cup: Cup, radius_m: float, pellets: int) -> None:
+        """Add the pellets to a world, out of the way; fill() brings them into the cup."""
         self._world, self._cup = world, cup
-        self.names = tuple(f"pellet_{index}" for index in range(len(positions_m)))
-        world.add_balls(self.names, radius_m, PELLET_MASS_KG, positions_m, plain=True)
+        self.names = tuple(f"pellet_{index}" for index in range(pellets))
+        world.add_balls(self.names, radius_m, PELLET_MASS_KG, _OUT_OF_THE_WAY_M + _apart(pellets), plain=True)
         for name in self.names:
             world.set_layer(name, None, WATER_LAYER, WATER_LAYER | IMMOVABLE_LAYER)
+
+    def put_away(self) -> None:
+        """Move every pellet out of the way, none near another."""
+        for name, place in zip(self.names, (_OUT_OF_THE_WAY_M + _apart(len(self.names))).tolist(), strict=True):
+            self._world.set_pose(name, place)
+
+    def fill(self, positions_m: FloatArray) -> None:
+        """Begin with the pellets at rest in these places, (P, 3) in the world."""
         self._positions = np.array(positions_m)
+        for name, place in zip(self.names, self._positions.tolist(), strict=True):
+            self._world.set_pose(name, place)
         self._present = dict.fromkeys(self.names)
         self._to_drink = dict.fromkeys(self.names)
         """neither drunk nor spilled so far, in their order"""
@@ -131,9 +146,17 @@ class Water:
         return len(lost)
 
     def _remove(self, name: str) -> None:
+        index = self.names.index(name)
         del self._present[name]
-        self._positions[self.names.index(name)] = np.nan
-        self._world.remove(name)
+        self._positions[index] = np.nan
+        self._world.set_pose(name, (_SWALLOWED_M + _apart(len(self.names))[index]).tolist())
+
+
+@cache
+def _apart(pellets: int) -> FloatArray:
+    """(pellets, 3) m: a row of places far from each other."""
+    places: FloatArray = np.arange(pellets)[:, None] * np.array([1.0, 0.0, 0.0])
+    return places
 
 
 def heap(cup: Cup, count: int, radius_m: float) -> FloatArray:
