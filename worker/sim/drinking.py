@@ -12,15 +12,12 @@ from worker.modes import ApproachModes, Axis
 from worker.sim.arm import Start, Tool, start_postures
 from worker.sim.assistive import (
     ARM,
-    HEAD,
     MOTOR_FORCE_NM,
-    PERSON,
     POSITION_GAIN,
     AssistiveEnv,
     FloatArray,
     Motion,
     Reward,
-    add_person,
 )
 from worker.sim.bullet import IDENTITY, Bullet, Vector, rotation_of
 from worker.sim.human import Impairment
@@ -78,14 +75,14 @@ DRINKING = Task(
     modes=PouringModes(
         OBSERVATION,
         (
-            Axis("speed_far", -0.7, 0.4, "log of the speed factor while the cup is far from the mouth"),
-            Axis("speed_near", -0.7, 0.4, "log of the speed factor close to the mouth, before the cup is tipped"),
+            Axis("speed_far", -1.0, 0.45, "log of the speed factor while the cup is far from the mouth"),
+            Axis("speed_near", -1.0, 0.45, "log of the speed factor close to the mouth, before the cup is tipped"),
             Axis("from_below", -0.8, 0.8, "how far below (+) or above (-) the mouth the approach passes"),
             Axis("to_side", -0.6, 0.6, "how far to the person's left (+) or right (-) the approach swings"),
             Axis("hesitate", 0.0, 1.2, "how much the cup lingers a hand's breadth before the mouth"),
-            Axis("tip_early", -0.3, 0.3, "how much further (+) or less (-) the cup is tipped on its way, in rad"),
-            Axis("pour_angle", -0.06, 0.3, "how much further (+) or less (-) the cup is tipped at the mouth, in rad"),
-            Axis("pour_haste", -0.9, 0.4, "log of the factor on how fast the cup is tipped at the mouth"),
+            Axis("tip_early", -0.3, 0.25, "how much further (+) or less (-) the cup is tipped on its way, in rad"),
+            Axis("pour_angle", -0.06, 0.12, "how much further (+) or less (-) the cup is tipped at the mouth, in rad"),
+            Axis("pour_haste", -1.1, 0.4, "log of the factor on how fast the cup is tipped at the mouth"),
         ),
     ),
     calibrated_speed_weight=1.0,
@@ -169,22 +166,15 @@ class DrinkingEnv(AssistiveEnv):
         return Bullet(forgetful=True)
 
     def _build(self) -> None:
-        """Arm, cup and water are built once: that takes longer than everything else a reset does."""
-        if self._world.has(PERSON):
-            self._world.remove(HEAD)
-            self._world.remove(PERSON)
-            self._water.put_away()
-            self._world.set_pose(_INSIDE, ELSEWHERE_M)
-        else:
-            self.robot.add_to(self._world, self.tool)
-            _line_cup(self._world, ELSEWHERE_M)
-            self._water = Water(self._world, _CUP, pellet_radius_m(self._pellets), self._pellets)
-        self._world.step()
-        self._add_person()
+        self._build_person_only(self._add_water, self._put_water_away)
 
-    def _add_person(self) -> None:
-        # A body of its own and the last one: only so does removing it leave the order of all others as it was.
-        add_person(self._world, self.person, head_apart=True)
+    def _add_water(self) -> None:
+        _line_cup(self._world, ELSEWHERE_M)
+        self._water = Water(self._world, _CUP, pellet_radius_m(self._pellets), self._pellets)
+
+    def _put_water_away(self) -> None:
+        self._water.put_away()
+        self._world.set_pose(_INSIDE, ELSEWHERE_M)
 
     def _lay_out(self, rng: np.random.Generator) -> None:
         self._world.carry(_INSIDE, ARM, CUP.name)

@@ -89,8 +89,17 @@ class FeedingEnv(AssistiveEnv):
         """(8, 3) m in the world, NaN once eaten or fallen to the floor."""
         return self._portion.positions()
 
+    def _new_world(self) -> Bullet:
+        return Bullet(forgetful=True)
+
+    def _build(self) -> None:
+        self._build_person_only(self._add_food, lambda: self._portion.put_away())
+
+    def _add_food(self) -> None:
+        self._portion: Portion = Portion(self._world)
+
     def _lay_out(self, rng: np.random.Generator) -> None:
-        self._portion = Portion(self._world, self._tool + resting_places_m() @ self._tool_rotation.T)
+        self._portion.serve(self._tool + resting_places_m() @ self._tool_rotation.T)
 
     def _outcome(self, motion: Motion) -> Outcome:
         return self._portion.update(self._tool, self._target, motion.touching)
@@ -114,7 +123,8 @@ def resting_places_m() -> FloatArray:
     rotation = rotation_of(quaternion)
     pitch, height = 2.05 * BALL_RADIUS_M, BALL_RADIUS_M + 0.002
     grid = np.array([((column - 1.5) * pitch, (row - 0.5) * pitch, height) for row in (0, 1) for column in range(4)])
-    portion = Portion(world, spoon + grid @ rotation.T)
+    portion = Portion(world)
+    portion.serve(spoon + grid @ rotation.T)
     for _ in range(SETTLING_SUBSTEPS):
         world.step()
     places: FloatArray = (portion.positions() - spoon) @ rotation

@@ -14,6 +14,8 @@ EATEN_WITHIN_M = 0.03
 SPILLED_BEYOND_M = 0.06
 PORTION_NEEDED = 0.75
 FLOOR_M = 0.0
+_OUT_OF_THE_WAY_M = np.array([(5.0 + 0.1 * index, 5.0, 5.0) for index in range(BALLS)])
+"""Balls that have been eaten fall from here unseen."""
 
 
 class Portion:
@@ -21,9 +23,20 @@ class Portion:
 
     names = tuple(f"ball_{index}" for index in range(BALLS))
 
-    def __init__(self, world: Bullet, positions_m: FloatArray) -> None:
+    def __init__(self, world: Bullet) -> None:
+        """Add the balls to a world, out of the way; serve() brings them onto the spoon."""
         self._world = world
-        world.add_balls(self.names, BALL_RADIUS_M, BALL_MASS_KG, positions_m)
+        world.add_balls(self.names, BALL_RADIUS_M, BALL_MASS_KG, _OUT_OF_THE_WAY_M)
+
+    def put_away(self) -> None:
+        """Move every ball out of the way, none near another."""
+        for name, place in zip(self.names, _OUT_OF_THE_WAY_M.tolist(), strict=True):
+            self._world.set_pose(name, place)
+
+    def serve(self, positions_m: FloatArray) -> None:
+        """Begin with the balls at rest in these places, (8, 3) in the world."""
+        for name, place in zip(self.names, positions_m.tolist(), strict=True):
+            self._world.set_pose(name, place)
         self.on_spoon = set(self.names)
         self.present = set(self.names)
         self.touched: set[str] = set()
@@ -59,7 +72,7 @@ class Portion:
     def _remove(self, name: str) -> None:
         self.on_spoon.discard(name)
         self.present.discard(name)
-        self._world.set_pose(name, (5.0 + 0.1 * self.names.index(name), 5.0, 5.0))
+        self._world.set_pose(name, _OUT_OF_THE_WAY_M[self.names.index(name)].tolist())
 
 
 def _length(vector: FloatArray) -> float:
