@@ -1,34 +1,60 @@
 """Whole clips: what a participant would see, looked at as pixels."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 
-from tests.worker.waving import waving_trajectory
+from tests.worker.waving import itching_trajectory, pouring_trajectory, waving_trajectory
+from worker.sim import layers
+from worker.sim.arm import Tool
+from worker.sim.bullet import Shape
 from worker.sim.camera import scene_camera
+from worker.sim.catalogue import ENVIRONMENTS
+from worker.sim.feeding import SPOON, FeedingEnv
 from worker.sim.highlight import Highlight
-from worker.sim.human import MOUTH_FROM_NECK_M, NECK_PIVOT_M
+from worker.sim.human import RIGHT
+from worker.sim.jaco import JACO
 from worker.sim.motion import clip_motion
 from worker.sim.render import INSET_CORNER_PX, ClipRenderer, RenderStyle
+from worker.sim.scratching import ScratchingEnv
+from worker.sim.shots import Shot
+from worker.sim.stage import Stage
+from worker.sim.task_look import LOOKS
+from worker.trajectory import Trajectory
 
 Picture = npt.NDArray[np.uint8]
+FILMED = {**ENVIRONMENTS, ScratchingEnv.task.name: ScratchingEnv}
 
 
 @pytest.fixture(scope="module")
 def renderer() -> Iterator[ClipRenderer]:
-    renderer = ClipRenderer()
+    renderer = ClipRenderer(environments=FILMED)
     yield renderer
     renderer.close()
+
+
+def film(renderer: ClipRenderer, trajectory: Trajectory) -> list[Picture]:
+    return [np.asarray(picture).copy() for picture in renderer.pictures(trajectory, 0, len(trajectory))]
 
 
 def pictures(renderer: ClipRenderer, force_n: float = 0.0, steps: int = 4, food: bool = True) -> list[Picture]:
     trajectory = waving_trajectory(steps, force_n)
     if not food:
         trajectory.particles[:] = np.nan
-    motion = clip_motion(trajectory, 0, steps, renderer.style.fps)
-    return [np.asarray(picture).copy() for picture in renderer.pictures(motion)]
+    return film(renderer, trajectory)
+
+
+def different(first: Picture, second: Picture, by: int = 12) -> npt.NDArray[np.bool_]:
+    return np.asarray(np.abs(first.astype(int) - second).max(axis=2) > by)
+
+
+def around(point_m: npt.NDArray[np.floating], task: str = "feeding", reach: int = 12) -> tuple[slice, slice]:
+    """A square of the picture around a point in the world."""
+    x, y = scene_camera(LOOKS[task], 640, 480).pixels(point_m.astype(float)).astype(int)
+    return np.s_[y - reach : y + reach, x - reach : x + reach]
 
 
 def test_a_clip_reports_what_it_holds(renderer: ClipRenderer) -> None:
@@ -45,19 +71,117 @@ def test_rendering_twice_gives_identical_bytes(renderer: ClipRenderer) -> None:
     assert renderer.render_clip(trajectory, 0, 5) == first
 
 
+def test_nothing_of_other_clips_remains(renderer: ClipRenderer) -> None:
+    trajectories = [
+        waving_trajectory(2, body="slim", skin_tone=4),
+        pouring_trajectory(2),
+        itching_trajectory(2, lift_rad=0.1),
+        replace(waving_trajectory(2), particles=waving_trajectory(2).particles[:, :5]),
+    ]
+    first = [film(renderer, trajectory) for trajectory in trajectories]
+    for trajectory, before in reversed(list(zip(trajectories, first, strict=True))):
+        assert all((now == then).all() for now, then in zip(film(renderer, trajectory), before, strict=True))
+    fresh = ClipRenderer(environments=FILMED)
+    assert (film(fresh, trajectories[2])[1] == first[2][1]).all()
+    fresh.close()
+
+
 def test_only_the_arm_and_its_shadow_change_between_frames(renderer: ClipRenderer) -> None:
     first, *_, last = pictures(renderer)
-    changed = (np.abs(first.astype(int) - last).max(axis=2) > 12).mean()
-    assert 0.002 < changed < 0.25
+    assert 0.002 < different(first, last).mean() < 0.25
 
 
 def test_the_food_is_visible_on_the_spoon(renderer: ClipRenderer) -> None:
-    with_food, without = pictures(renderer, steps=1)[0], pictures(renderer, steps=1, food=False)[0]
-    different = np.abs(with_food.astype(int) - without).max(axis=2) > 40
-    bowl = clip_motion(waving_trajectory(1), 0, 1, 15).frames[0, -1, :3, 3]
-    x, y = scene_camera(640, 480).pixels(bowl).astype(int)
-    assert different[y - 15 : y + 15, x - 20 : x + 20].sum() > 60
-    assert not different[240:, 320:].any()
+    changed = different(pictures(renderer, steps=1)[0], pictures(renderer, steps=1, food=False)[0], by=40)
+    bowl = clip_motion(waving_trajectory(1), JACO, SPOON, 0, 1, 15).frames[0, -1, :3, 3]
+    assert changed[around(bowl, reach=18)].sum() > 60
+    assert not changed[240:, 320:].any()
+
+
+@pytest.mark.parametrize("pellets", [16, 64])
+def test_the_water_is_seen_in_its_cup(renderer: ClipRenderer, pellets: int) -> None:
+    full = pouring_trajectory(1, pellets)
+    empty = replace(full, particles=np.full_like(full.particles, np.nan))
+    wet, dry = film(renderer, full)[0], film(renderer, empty)[0]
+    water = different(wet, dry, by=30)[around(full.particles[0].mean(axis=0), "drinking", reach=24)]
+    assert water.sum() > 150
+    red, _, blue = wet[around(full.particles[0].mean(axis=0), "drinking", reach=24)][water].mean(axis=0)
+    assert blue > red + 60
+
+
+def test_two_skin_tones_differ_in_the_face_only_and_share_the_still_picture(
+    renderer: ClipRenderer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    light = film(renderer, waving_trajectory(1, skin_tone=0))[0]
+    drawn: list[int] = []
+    still = layers.View.still
+
+    def noted(view: layers.View, stage: Stage) -> Shot:
+        drawn.append(view.width)
+        return still(view, stage)
+
+    monkeypatch.setattr(layers.View, "still", noted)
+    dark = film(renderer, waving_trajectory(1, skin_tone=5))[0]
+    assert drawn == [renderer.style.inset_width]
+    trajectory = waving_trajectory(1)
+    assert different(light, dark, by=60)[around(trajectory.target_m[0] + [0.03, 0.0, 0.0])].mean() > 0.5
+    assert not different(light, dark)[200:300, :200].any()
+
+
+def test_two_bodies_differ(renderer: ClipRenderer) -> None:
+    broad, slim = (film(renderer, waving_trajectory(1, body=body))[0] for body in ("broad", "slim"))
+    assert different(broad, slim).mean() > 0.05
+
+
+def test_the_persons_arms_are_where_the_trajectory_says(renderer: ClipRenderer) -> None:
+    resting, raised = waving_trajectory(1), waving_trajectory(1)
+    raised.arm_positions_rad[:, RIGHT, 0] += 0.5
+    changed = different(film(renderer, resting)[0], film(renderer, raised)[0])
+    assert changed[300:, 250:450].any()
+    assert not changed[:220, 230:].any()
+
+
+def redness(picture: Picture, place: tuple[slice, slice]) -> float:
+    red, green, _ = picture[place].astype(float).mean(axis=(0, 1))
+    return float(red - green)
+
+
+def test_the_itch_is_marked_on_the_skin_and_moves_with_the_arm(renderer: ClipRenderer) -> None:
+    trajectory = itching_trajectory(6, lift_rad=0.35)
+    frames = film(renderer, trajectory)
+    before, after = (around(trajectory.target_m[step], "scratching", reach=5) for step in (0, 5))
+    assert redness(frames[0], before) > redness(frames[0], after) + 25
+    assert redness(frames[-1], after) > redness(frames[-1], before) + 25
+
+
+def test_an_arm_at_rest_looks_as_it_does_at_the_start_of_a_movement(renderer: ClipRenderer) -> None:
+    resting, rising = (film(renderer, itching_trajectory(2, lift_rad))[0] for lift_rad in (0.0, 0.2))
+    assert different(resting, rising, by=40).mean() < 0.004
+
+
+def test_a_trembling_head_is_drawn_moving(renderer: ClipRenderer) -> None:
+    trajectory = waving_trajectory(2)
+    trajectory.head_quaternions[1:] = [0.0, 0.0, np.sin(0.1), np.cos(0.1)]
+    trembling, still = film(renderer, trajectory), film(renderer, waving_trajectory(2))
+    face = around(trajectory.target_m[0], reach=30)
+    assert different(trembling[0], trembling[-1])[face].mean() > 0.2
+    assert not different(still[0], still[-1])[face].any()
+    assert different(trembling[0], still[0], by=40)[face].mean() < 0.03
+
+
+def test_a_task_nobody_designed_a_look_for_is_filmed_all_the_same() -> None:
+    class CombingEnv(FeedingEnv):
+        tool = Tool("comb", (0.13, 0, 0), (-np.pi / 2, 0, 0), (Shape.box((0, 0, 0), (0.06, 0.03, 0.03)),), 0.03)
+
+    renderer = ClipRenderer(RenderStyle(inset=False), {"combing": CombingEnv})
+    with_comb = film(renderer, replace(waving_trajectory(1), task="combing"))[0]
+    renderer.close()
+    renderer = ClipRenderer(RenderStyle(inset=False))
+    with_spoon = film(renderer, waving_trajectory(1))[0]
+    renderer.close()
+    comb = clip_motion(waving_trajectory(1), JACO, CombingEnv.tool, 0, 1, 15).frames[0, -1, :3, 3]
+    assert different(with_comb, with_spoon)[around(comb, reach=4)].mean() > 0.7
+    assert not different(with_comb, with_spoon)[:, 400:].any()
 
 
 def test_pressing_warms_the_frame_of_the_inset(renderer: ClipRenderer) -> None:
@@ -73,19 +197,14 @@ def test_a_light_touch_is_not_marked(renderer: ClipRenderer) -> None:
 
 def test_turning_the_head_moves_the_face_and_leaves_the_arm(renderer: ClipRenderer) -> None:
     ahead, aside = waving_trajectory(1), waving_trajectory(1)
-    aside.head_quaternion[:] = [0.0, 0.0, np.sin(0.2), np.cos(0.2)]
-    seen = []
-    for trajectory in (ahead, aside):
-        motion = clip_motion(trajectory, 0, 1, 15)
-        seen.append(np.asarray(next(iter(renderer.pictures(motion)))).astype(int))
-    different = np.abs(seen[0] - seen[1]).max(axis=2) > 8
-    x, y = scene_camera(640, 480).pixels(np.asarray(NECK_PIVOT_M) + MOUTH_FROM_NECK_M).astype(int)
-    assert different[y - 30 : y + 30, x - 30 : x + 30].mean() > 0.2
-    assert not different[250:, :200].any()
+    aside.head_quaternions[:] = [0.0, 0.0, np.sin(0.2), np.cos(0.2)]
+    changed = different(film(renderer, ahead)[0], film(renderer, aside)[0], by=8)
+    assert changed[around(ahead.target_m[0], reach=30)].mean() > 0.2
+    assert not changed[250:, :200].any()
 
 
 def test_a_style_without_inset_shows_the_room_in_the_corner() -> None:
-    plain = ClipRenderer(RenderStyle(inset=False, supersampling=1.25))
+    plain = ClipRenderer(RenderStyle(inset=False))
     picture = pictures(plain, steps=1)[0]
     plain.close()
     assert picture[:30, :30].std(axis=(0, 1)).max() < 6

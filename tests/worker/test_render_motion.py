@@ -3,24 +3,32 @@
 import numpy as np
 import pytest
 
-from tests.worker.waving import waving_trajectory
-from worker.sim import jaco
+from tests.worker.waving import MOUNT, itching_trajectory, waving_trajectory
 from worker.sim.camera import lamp, scene_camera
-from worker.sim.human import MOUTH_FROM_NECK_M, NECK_PIVOT_M
-from worker.sim.motion import clip_motion, quaternions, smoothly
+from worker.sim.feeding import SPOON
+from worker.sim.human import BROAD, LEFT, RIGHT
+from worker.sim.jaco import JACO
+from worker.sim.motion import Motion, clip_motion, quaternions, smoothly
 from worker.sim.rectangles import GRID_PX, cover, on_grid
+from worker.sim.task_look import FEEDING_LOOK, LOOKS, task_look
+from worker.trajectory import Trajectory
+
+MOUTH_M = np.array(BROAD.neck_pivot_m) + BROAD.mouth_from_neck_m
+
+
+def motion_of(trajectory: Trajectory, first: int, count: int, fps: int = 15) -> Motion:
+    return clip_motion(trajectory, JACO, SPOON, first, count, fps)
 
 
 def test_a_clip_has_one_and_a_half_frames_per_control_step_at_fifteen_frames_per_second() -> None:
-    assert len(clip_motion(waving_trajectory(20), 4, 10, 15)) == 15
+    assert len(motion_of(waving_trajectory(20), 4, 10)) == 15
 
 
 def test_frames_at_control_steps_show_exactly_the_recorded_joints() -> None:
     trajectory = waving_trajectory(20)
-    motion = clip_motion(trajectory, 2, 10, 20)
-    recorded = jaco.link_frames(trajectory.joint_positions[2:12].astype(float))
-    base = jaco.rotation(jaco.ROBOT_BASE_RPY)
-    assert motion.frames[::2, :, :3, 3] == pytest.approx(recorded[:, :, :3, 3] @ base.T + jaco.ROBOT_BASE_M)
+    motion = motion_of(trajectory, 2, 10, 20)
+    recorded = JACO.link_frames(trajectory.joint_positions[2:12].astype(float), SPOON)
+    assert motion.frames[::2] == pytest.approx(MOUNT @ recorded)
 
 
 def test_velocity_has_no_kinks_at_control_steps() -> None:
@@ -38,11 +46,10 @@ def test_steady_motion_stays_steady() -> None:
 
 def test_food_that_was_eaten_goes_on_into_the_mouth_and_is_gone() -> None:
     trajectory = waving_trajectory(20)
-    mouth = np.asarray(NECK_PIVOT_M) + MOUTH_FROM_NECK_M
-    trajectory.particles[:10, 3] = mouth + np.array([0.0, -0.03, 0.0])
+    trajectory.particles[:10, 3] = MOUTH_M + np.array([0.0, -0.03, 0.0])
     trajectory.particles[10:, 3] = np.nan
-    food = clip_motion(trajectory, 0, 20, 15).food_m[:, 3]
-    depth = food[:, 1] - mouth[1]
+    food = motion_of(trajectory, 0, 20).particles_m[:, 3]
+    depth = food[:, 1] - MOUTH_M[1]
     assert depth[:14] == pytest.approx(-0.03)
     assert depth[14:16].tolist() == sorted(depth[14:16])
     assert depth[16] > 0.01
@@ -52,7 +59,7 @@ def test_food_that_was_eaten_goes_on_into_the_mouth_and_is_gone() -> None:
 def test_food_lost_far_from_the_mouth_just_disappears() -> None:
     trajectory = waving_trajectory(20)
     trajectory.particles[10:, 3] = np.nan
-    gone = np.isnan(clip_motion(trajectory, 0, 20, 15).food_m[:, 3, 0])
+    gone = np.isnan(motion_of(trajectory, 0, 20).particles_m[:, 3, 0])
     assert not gone[:14].any()
     assert gone[14:].all()
 
@@ -60,7 +67,19 @@ def test_food_lost_far_from_the_mouth_just_disappears() -> None:
 @pytest.mark.parametrize(("first", "count"), [(-1, 5), (0, 0), (15, 6)])
 def test_steps_outside_the_trajectory_are_refused(first: int, count: int) -> None:
     with pytest.raises(ValueError, match="not within a trajectory of 20 steps"):
-        clip_motion(waving_trajectory(20), first, count, 15)
+        motion_of(waving_trajectory(20), first, count)
+
+
+def test_a_head_whose_quaternion_changes_its_sign_does_not_spin() -> None:
+    trajectory = waving_trajectory(10)
+    trajectory.head_quaternions[5:] *= -1.0
+    assert not motion_of(trajectory, 0, 10).head_moves
+
+
+def test_only_the_arm_that_turns_is_said_to_move() -> None:
+    motion = motion_of(itching_trajectory(10, lift_rad=0.05), 0, 10)
+    assert motion.arm_moves(RIGHT)
+    assert not motion.arm_moves(LEFT)
 
 
 def test_quaternions_turn_vectors_like_their_matrices() -> None:
@@ -75,7 +94,7 @@ def test_quaternions_turn_vectors_like_their_matrices() -> None:
 
 
 def test_a_cropped_picture_shows_the_same_points_as_the_whole() -> None:
-    camera = scene_camera(640, 480)
+    camera = scene_camera(FEEDING_LOOK, 640, 480)
     rectangle = (100.0, 60.0, 260.0, 180.0)
     point = np.array([0.0, -0.07, 1.2, 1.0])
     device = camera.projection(rectangle) @ camera.view @ point
@@ -84,10 +103,15 @@ def test_a_cropped_picture_shows_the_same_points_as_the_whole() -> None:
 
 
 def test_the_person_and_the_spoons_whole_path_are_in_the_picture() -> None:
-    camera = scene_camera(640, 480)
+    camera = scene_camera(FEEDING_LOOK, 640, 480)
     pixels = camera.pixels(np.array([[-0.23, -0.55, 1.0], [-0.13, -0.45, 1.10], [0.0, -0.07, 1.2], [0.0, 0.05, 1.38]]))
     assert (pixels > 0).all()
     assert (pixels < [640, 480]).all()
+
+
+def test_a_task_nobody_designed_a_look_for_is_filmed_like_feeding() -> None:
+    assert task_look("combing") is FEEDING_LOOK
+    assert len(set(LOOKS.values())) == 3
 
 
 def test_the_lamp_sees_the_head_and_the_floor_below_the_arm() -> None:

@@ -1,12 +1,22 @@
 """Generated meshes: closed, outward, painted, and always the same."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from worker.sim import arm_look, head_look
-from worker.sim.colours import RAMPS, Palette
-from worker.sim.meshes import Mesh, curve, gradient, joined, openness, panel, surface, tube
+from worker.sim import arm_look, body_look, chair_look, head_look, human, limb_look, tool_look
+from worker.sim.arm import Tool
+from worker.sim.bullet import Shape
+from worker.sim.colours import COMPLEXIONS, Palette, ramps
+from worker.sim.drinking import CUP
+from worker.sim.feeding import SPOON
+from worker.sim.human import BODY_SHAPES, BROAD, BodyShape
+from worker.sim.jaco import JACO
+from worker.sim.meshes import Mesh, ball, curve, gradient, joined, openness, panel, surface, tube, without_hidden
+from worker.sim.scratching import SCRATCHER
 from worker.sim.solids import Field, box, carve, cone, cylinder, ellipsoid, sphere, torus, union
+from worker.trajectory import SKIN_TONES
 
 BALL = sphere((0.0, 0.0, 0.0), 0.1)
 
@@ -95,13 +105,20 @@ def test_joining_meshes_keeps_every_face_on_its_own_vertices() -> None:
     assert (both.faces[len(first.faces) :] - len(first.vertices) == second.faces).all()
 
 
-def test_palette_positions_give_back_the_colours_of_the_ramp() -> None:
+@pytest.mark.parametrize("tone", range(SKIN_TONES))
+def test_palette_positions_give_back_the_colours_of_the_ramp(tone: int) -> None:
     palette = Palette()
-    image = palette.texture()
-    for name, colours in RAMPS.items():
+    image = palette.texture(tone)
+    for name, colours in ramps(tone).items():
         for share, colour in ((0.0, colours[0]), (1.0, colours[-1])):
             column = int(palette.at(name, share) * palette.columns)
             assert image[0, column] / 255 == pytest.approx(np.array(colour), abs=0.03)
+
+
+def test_every_skin_tone_is_darker_than_the_one_before() -> None:
+    brightness = [sum(complexion.skin) for complexion in COMPLEXIONS]
+    assert len(brightness) == SKIN_TONES
+    assert brightness == sorted(brightness, reverse=True)
 
 
 def test_full_light_is_not_wrapped_around_to_darkness() -> None:
@@ -117,9 +134,79 @@ def test_the_mouth_is_open_wide_enough_for_the_spoon() -> None:
     assert (head_look.face()(bowl_edges) > 0).all()
 
 
+def test_the_mirror_image_of_a_mesh_still_faces_outwards() -> None:
+    arm = limb_look.arm_meshes(BROAD, Palette(), "shirt", BALL)
+    assert volume(arm["right_forearm"]) == pytest.approx(volume(arm["left_forearm"]))
+    assert volume(arm["right_forearm"]) > 0
+
+
+def test_a_ball_is_round_and_faces_outwards() -> None:
+    mesh = ball(0.01, 0.5)
+    assert len(mesh.faces) == 80
+    assert volume(mesh) == pytest.approx(4 / 3 * np.pi * 0.01**3, rel=0.15)
+
+
+def test_faces_hidden_inside_another_solid_are_left_out_and_the_others_kept() -> None:
+    mesh = ball_mesh()
+    rest = without_hidden(mesh, box((0.1, 0, 0), (0.1, 1, 1)), 0.005)
+    assert rest.vertices[:, 0].max() < 0.03
+    assert len(rest.faces) == pytest.approx(len(mesh.faces) / 2, rel=0.1)
+
+
+@pytest.mark.parametrize("body", BODY_SHAPES.values(), ids=lambda body: body.name)
+def test_arms_lie_on_the_armrests_and_not_in_them(body: BodyShape) -> None:
+    _, elbow, wrist, _ = human.arm_points_m(body, np.radians([0.0, 0.0, 0.0, 90.0]), human.LEFT)
+    underside = (elbow + wrist) / 2 - [0.0, 0.0, body.forearm_radius_m]
+    gap = float(chair_look.chair(body)(underside[None])[0])
+    assert -0.002 < gap < 0.02
+
+
+@pytest.mark.parametrize("body", BODY_SHAPES.values(), ids=lambda body: body.name)
+@pytest.mark.parametrize("side", [human.RIGHT, human.LEFT])
+def test_drawn_arms_have_the_thickness_that_the_simulation_feels(body: BodyShape, side: int) -> None:
+    name = ("right", "left")[side]
+    meshes = limb_look.arm_meshes(body, Palette(), "shirt", body_look.trunk(body))
+    bare = meshes[f"{name}_upper_arm"].vertices
+    bare = bare[(bare[:, 2] < -0.62 * body.upper_arm_length_m) & (bare[:, 2] > -0.92 * body.upper_arm_length_m)]
+    forearm = meshes[f"{name}_forearm"].vertices
+    forearm = forearm[(forearm[:, 2] < -0.12 * body.forearm_length_m) & (forearm[:, 2] > -0.7 * body.forearm_length_m)]
+    for vertices, radius_m in ((bare, body.upper_arm_radius_m), (forearm, body.forearm_radius_m)):
+        assert np.abs(np.hypot(vertices[:, 0], vertices[:, 1]) - radius_m).max() < 0.006
+
+
+@pytest.mark.parametrize("body", BODY_SHAPES.values(), ids=lambda body: body.name)
+def test_the_drawn_mouth_is_where_the_simulation_feeds(body: BodyShape) -> None:
+    drawn = head_look.MOUTH * body.head_scale
+    assert drawn == pytest.approx(np.array(body.mouth_from_neck_m), abs=0.001)
+
+
+@pytest.mark.parametrize("tool", [SPOON, CUP, SCRATCHER], ids=lambda tool: tool.name)
+def test_known_tools_have_a_designed_look_as_large_as_what_the_simulation_moves(tool: Tool) -> None:
+    detail = arm_look.Detail(Palette())
+    drawn = tool_look.tool_look(tool).solid(detail).vertices
+    felt = tool_look.plain(detail, tool.shapes).vertices
+    # The spoon's handle is drawn longer, for the hand to hold.
+    assert drawn.min(axis=0) == pytest.approx(felt.min(axis=0), abs=0.065)
+    assert drawn.max(axis=0) == pytest.approx(felt.max(axis=0), abs=0.013)
+
+
+def test_a_tool_nobody_designed_is_drawn_from_its_collision_shapes() -> None:
+    shapes = (Shape.box((0, 0, 0), (0.02, 0.04, 0.06)), Shape("capsule", 0.01, 0.1), Shape("sphere", 0.02))
+    comb = Tool("comb", (0, 0, 0), (0, 0, 0), shapes, 0.1)
+    mesh = tool_look.tool_look(comb).solid(arm_look.Detail(Palette()))
+    assert mesh.vertices.max(axis=0) == pytest.approx([0.02, 0.02, 0.06], abs=0.002)
+    assert volume(mesh) > 0
+
+
+def test_a_robot_nobody_designed_is_drawn_from_its_links() -> None:
+    links = arm_look.arm_meshes(arm_look.Detail(Palette()), replace(JACO, name="other"), arm_look.Grip(0.004))
+    assert list(links) == [joint.link for joint in JACO.joints]
+    assert all(volume(mesh) > 0 for mesh in links.values())
+
+
 def test_the_fingers_touch_the_handle_without_cutting_through_it() -> None:
     detail = arm_look.Detail(Palette())
-    handle = arm_look.spoon(detail).vertices
+    handle = tool_look.spoon(detail).vertices
     grip = handle[(handle[:, 0] > -0.155) & (handle[:, 0] < -0.105)]
     lowest_above, highest_below = _finger_gap(detail)
     assert lowest_above >= grip[:, 2].max() - 0.004
@@ -129,14 +216,16 @@ def test_the_fingers_touch_the_handle_without_cutting_through_it() -> None:
 
 def _finger_gap(detail: arm_look.Detail) -> tuple[float, float]:
     """Heights of the fingertips above and of the thumb below the handle, in the spoon's frame."""
-    hand = arm_look.arm_meshes(detail)["link_7"].vertices
+    grip = tool_look.tool_look(SPOON).grip
+    hand = arm_look.arm_meshes(detail, JACO, grip)["link_7"].vertices
     up = -hand[:, 1]  # the spoon's z axis is link 7's -y axis
     tips = (hand[:, 2] < -0.155) & (hand[:, 2] > -0.165)
     return float(up[tips & (up > 0)].min()), float(up[tips & (up < 0)].max())
 
 
-def test_the_same_code_always_makes_the_same_head() -> None:
-    first, second = head_look.head_mesh(Palette()), head_look.head_mesh(Palette())
+@pytest.mark.parametrize("body", BODY_SHAPES.values(), ids=lambda body: body.name)
+def test_the_same_code_always_makes_the_same_head(body: BodyShape) -> None:
+    first, second = head_look.head_mesh(body, Palette()), head_look.head_mesh(body, Palette())
     assert (first.vertices == second.vertices).all()
     assert (first.faces == second.faces).all()
     assert np.isfinite(first.vertices).all()

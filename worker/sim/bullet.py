@@ -335,6 +335,11 @@ class Bullet:
         )[0]
         return place
 
+    def positions(self, names: Sequence[str]) -> FloatArray:
+        """Where several bodies' bases are, (N, 3)."""
+        client, bodies, where = self.client, self._bodies, pybullet.getBasePositionAndOrientation
+        return np.array([where(bodies[name], physicsClientId=client)[0] for name in names])
+
     def velocity(self, name: str) -> tuple[float, float, float]:
         """Linear velocity of a body's base."""
         speed: tuple[float, float, float] = pybullet.getBaseVelocity(self._bodies[name], physicsClientId=self.client)[0]
@@ -473,10 +478,11 @@ class Drawing(NamedTuple):
 class DrawingClient:
     """A client that only draws: meshes that share one palette texture, placed by name, no physics."""
 
-    def __init__(self, palette: Path) -> None:
-        """`palette` is an image file; it is read at once."""
+    def __init__(self, palettes: Sequence[Path]) -> None:
+        """`palettes` are image files of one size, read at once; the first one is worn until repaint()."""
         self._client: int | None = pybullet.connect(pybullet.DIRECT)
-        self._texture: int = pybullet.loadTexture(str(palette), physicsClientId=self._client)
+        self._textures = [pybullet.loadTexture(str(palette), physicsClientId=self._client) for palette in palettes]
+        self._worn = 0
         self._bodies: dict[str, int] = {}
 
     def close(self) -> None:
@@ -499,8 +505,19 @@ class DrawingClient:
             physicsClientId=self._client,
         )
         body = pybullet.createMultiBody(0.0, -1, shape, physicsClientId=self._client)
-        pybullet.changeVisualShape(body, -1, textureUniqueId=self._texture, physicsClientId=self._client)
         self._bodies[name] = body
+        self._paint(name)
+
+    def repaint(self, palette: int) -> None:
+        """Give every mesh the colours of another palette."""
+        if palette != self._worn:
+            self._worn = palette
+            for name in self._bodies:
+                self._paint(name)
+
+    def _paint(self, name: str) -> None:
+        texture = self._textures[self._worn]
+        pybullet.changeVisualShape(self._bodies[name], -1, textureUniqueId=texture, physicsClientId=self._client)
 
     def place(self, name: str, position_m: Vector, quaternion: Vector = IDENTITY) -> None:
         """Put a mesh somewhere else."""

@@ -9,8 +9,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import numpy.typing as npt
 
 from worker.sim.solids import Array
+from worker.sim.task_look import TaskLook
 
 Rectangle = tuple[float, float, float, float]
 """left, top, right, bottom in pixels of the whole picture."""
@@ -63,11 +65,37 @@ class Camera:
         """World to device coordinates of the whole picture (4, 4)."""
         return np.asarray(self.projection() @ self.view)
 
+    def seen_through(self, matrix: Array, rectangle: Rectangle, depth: npt.NDArray[np.floating]) -> list[Array]:
+        """Coordinates after a homogeneous matrix (4, 4) from the world of what is seen in a part of the picture.
+
+        ``depth`` (h, w) is that part's device depth in [0, 1]; gives three arrays (h, w).
+        """
+        height, width = depth.shape
+        left, top, right, bottom = rectangle
+        x = (left + (np.arange(width) + 0.5) / width * (right - left)) / self.width * 2 - 1
+        y = 1 - (top + (np.arange(height) + 0.5) / height * (bottom - top)) / self.height * 2
+        # A part shares the camera's near and far planes, so the whole picture's matrix inverts its depth too.
+        through = (matrix @ self.device_to_world).astype(np.float32)
+        z = depth.astype(np.float32) * np.float32(2.0) - np.float32(1.0)
+        x, y = x.astype(np.float32)[None, :], y.astype(np.float32)[:, None]
+        rows = [through[k, 0] * x + (through[k, 1] * y + through[k, 3]) + through[k, 2] * z for k in range(4)]
+        return [row / rows[3] for row in rows[:3]]
+
+    @cached_property
+    def device_to_world(self) -> Array:
+        """Device coordinates of the whole picture to homogeneous world coordinates (4, 4)."""
+        return np.asarray(np.linalg.inv(self.world_to_device))
+
     def pixels(self, points_m: Array) -> Array:
         """Where world points (..., 3) appear (..., 2)."""
         device = points_m @ self.world_to_device[:, :3].T + self.world_to_device[:, 3]
         device = device[..., :2] / device[..., 3:]
         return np.asarray((device * [1, -1] + 1) / 2 * [self.width, self.height])
+
+    def pixels_per_m(self, point_m: Array) -> float:
+        """How large things appear at a point."""
+        distance = -float((self.view @ np.append(point_m, 1.0))[2])
+        return self.height / (2 * distance * math.tan(math.radians(self.field_of_view_deg) / 2))
 
 
 def flat(matrix: Array) -> Sequence[float]:
@@ -76,13 +104,9 @@ def flat(matrix: Array) -> Sequence[float]:
     return numbers
 
 
-EYE_M = (0.86, -1.02, 1.50)
-TARGET_M = (-0.20, -0.26, 1.115)
-
-
-def scene_camera(width: int, height: int) -> Camera:
-    """From the person's left front, so that the arm never hides the mouth."""
-    return Camera(EYE_M, TARGET_M, 38.0, width, height, 0.05, 6.0)
+def scene_camera(look: TaskLook, width: int, height: int) -> Camera:
+    """The camera of a task's film."""
+    return Camera(look.eye_m, look.target_m, look.field_of_view_deg, width, height, 0.05, 6.0)
 
 
 LIGHT_CENTRE_M = np.array([-0.25, -0.15, 0.55])

@@ -3,29 +3,37 @@
 import numpy as np
 
 from worker.sim.colours import Palette
+from worker.sim.human import BodyShape
 from worker.sim.meshes import Mesh, joined, softly_lit, surface, tube, turned
 from worker.sim.solids import Field, box, mirrored, union
 
 
-def chair() -> Field:
+def rest_top_m(body: BodyShape) -> float:
+    """How high the armrests are set, so that this body's resting forearms lie on them."""
+    return body.shoulder_m[2] - 0.995 * body.upper_arm_length_m - body.forearm_radius_m
+
+
+def chair(body: BodyShape) -> Field:
     """Seat, back and armrests of the wheelchair, without its wheels."""
+    top = rest_top_m(body)
     seat = box((0, 0.02, 0.425), (0.23, 0.25, 0.035), 0.02)
     back = box((0, 0.235, 0.80), (0.215, 0.035, 0.33), 0.030, turned((1, 0, 0), 0.10))
-    rest = mirrored(box((0.215, -0.02, 0.668), (0.034, 0.235, 0.018), 0.016))
+    rest = mirrored(box((body.shoulder_m[0] + 0.012, -0.02, top - 0.018), (0.034, 0.235, 0.018), 0.016))
     return union(seat, back, rest)
 
 
-def chair_mesh(palette: Palette, around: Field) -> Mesh:
+def chair_mesh(body: BodyShape, palette: Palette, around: Field) -> Mesh:
     """The chair as one mesh; `around` is the person who sits in it."""
-    whole = union(chair(), around)
-    padding = surface(chair(), (-0.27, -0.28, 0.36), (0.27, 0.33, 1.17), 0.014, palette.at("cushion"))
+    solid = chair(body)
+    whole = union(solid, around)
+    padding = surface(solid, (-0.27, -0.28, 0.36), (0.27, 0.33, 1.17), 0.016, palette.at("cushion"))
     padding = softly_lit(whole, padding, 0.08)
-    metal = palette.at("chair")
+    metal, rest, under = palette.at("chair"), body.shoulder_m[0] + 0.016, rest_top_m(body) - 0.02
     parts = [padding]
     for side in (-1.0, 1.0):
         for start, end in (
-            ((0.235, 0.19, 0.45), (0.225, 0.19, 0.66)),
-            ((0.235, -0.17, 0.45), (0.225, -0.17, 0.66)),
+            ((0.235, 0.19, 0.45), (rest, 0.19, under)),
+            ((0.235, -0.17, 0.45), (rest, -0.17, under)),
             ((0.235, -0.20, 0.42), (0.235, 0.22, 0.42)),
             ((0.200, 0.27, 0.60), (0.195, 0.30, 1.06)),
         ):

@@ -1,13 +1,16 @@
-"""How the person's head looks: short hair, a friendly face and an open mouth. Landmarks come from human.py.
+"""How the person's head looks: a friendly face and an open mouth. Landmarks come from human.py.
 
-Head frame: origin at the neck pivot, z up, the face looks along -y.
+Head frame: origin at the neck pivot, z up, the face looks along -y. Heads are made at the broad body's size and scaled.
 """
+
+from dataclasses import dataclass
 
 import numpy as np
 
 from worker.sim.colours import Palette
-from worker.sim.human import MOUTH_FROM_NECK_M
-from worker.sim.meshes import Mesh, curve, gradient, joined, softly_lit, surface, tube, turned
+from worker.sim.hair_look import bun, short_hair, strands
+from worker.sim.human import BROAD, BodyShape
+from worker.sim.meshes import Mesh, curve, gradient, joined, softly_lit, surface, tube, turned, without_hidden
 from worker.sim.solids import (
     Array,
     Field,
@@ -24,7 +27,7 @@ from worker.sim.solids import (
     union,
 )
 
-MOUTH = np.asarray(MOUTH_FROM_NECK_M)
+MOUTH = np.asarray(BROAD.mouth_from_neck_m)
 LIPS = MOUTH + np.array([0.0, -0.0005, 0.0])
 LIP_RADII = (0.0260, 0.0155)
 
@@ -33,31 +36,53 @@ EYE_RADIUS = 0.0165
 GAZE = np.array([-0.16, -1.0, -0.16])
 
 
-LOWER, UPPER, CELL_M = (-0.105, -0.135, -0.065), (0.105, 0.135, 0.245), 0.0044
+LOWER, UPPER, CELL_M = (-0.105, -0.135, -0.065), (0.105, 0.135, 0.245), 0.0048
 """The box that holds the head, and how finely its surface is drawn."""
 
 
-def skull() -> Field:
+@dataclass(frozen=True)
+class Features:
+    """What makes one face differ from another, in metres."""
+
+    cheekbones: float = 0.0665
+    jaw: float = 0.0510
+    chin: float = 0.0180
+    nose: float = 1.0
+    """thickness of the nose, relative"""
+    brows: float = 1.0
+    lashes: float = 1.0
+    neck: tuple[float, float] = (0.0465, 0.050)
+    """its radius where it enters the head"""
+
+
+FEATURES = {
+    "broad": Features(),
+    "slim": Features(0.0660, jaw=0.0445, chin=0.0150, nose=0.84, brows=0.68, lashes=1.5, neck=(0.042, 0.044)),
+}
+HAIR = {"broad": short_hair, "slim": bun}
+
+
+def skull(features: Features) -> Field:
     """The smooth mass of the head, without features."""
     return union(
         ellipsoid((0, 0.012, 0.138), (0.077, 0.097, 0.084)),
-        ellipsoid((0, -0.030, 0.088), (0.0665, 0.0650, 0.080)),
-        ellipsoid((0, -0.040, 0.030), (0.0510, 0.0480, 0.044)),
+        ellipsoid((0, -0.030, 0.088), (features.cheekbones, 0.0650, 0.080)),
+        ellipsoid((0, -0.040, 0.030), (features.jaw, 0.0480, 0.044)),
         blend=0.045,
     )
 
 
-def face() -> Field:
+def face(features: Features = FEATURES["broad"]) -> Field:
     """The skin of the head with nose, ears, lips and an open mouth."""
     solid = union(
-        skull(),
-        sphere((0, -0.0715, 0.0020), 0.0180),
+        skull(features),
+        sphere((0, -0.0715, 0.0020), features.chin),
         mirrored(ellipsoid((0.0370, -0.0640, 0.0740), (0.024, 0.0225, 0.024))),
         blend=0.032,
     )
     solid = carve(solid, mirrored(ellipsoid((0.0335, -0.1045, 0.1150), (0.0220, 0.0165, 0.0150))), blend=0.026)
-    solid = union(solid, _nose(), blend=0.012)
-    solid = union(solid, cone((0, 0.006, -0.004), (0, 0.006, 0.070), 0.0465, 0.050), blend=0.022)
+    solid = union(solid, _nose(features.nose), blend=0.012)
+    solid = union(solid, cone((0, 0.006, -0.004), (0, 0.006, 0.070), *features.neck), blend=0.022)
     solid = union(solid, mirrored(_ear()), blend=0.007)
     solid = union(solid, _lips(), blend=0.009)
     return carve(solid, mouth_cavity(), blend=0.004)
@@ -92,10 +117,11 @@ def _smiling(field: Field) -> Field:
     return distance
 
 
-def _nose() -> Field:
+def _nose(thick: float) -> Field:
+    bridge = [(0, -0.0870, 0.1230), (0, -0.0985, 0.1000), (0, -0.1075, 0.0865)]
     return union(
-        chain([(0, -0.0870, 0.1230), (0, -0.0985, 0.1000), (0, -0.1075, 0.0865)], [0.0055, 0.0072, 0.0102]),
-        mirrored(sphere((0.0098, -0.0965, 0.0825), 0.0072)),
+        chain(bridge, [0.0055 * thick, 0.0072 * thick, 0.0102 * thick]),
+        mirrored(sphere((0.0098 * thick, -0.0965, 0.0825), 0.0072 * thick)),
         blend=0.011,
     )
 
@@ -106,65 +132,25 @@ def _ear() -> Field:
     return carve(lobe, ellipsoid((0.0870, 0.0110, 0.1010), (0.0065, 0.0110, 0.0190), turn), blend=0.006)
 
 
-def hair() -> Field:
-    """Short hair with a side parting, swept over the forehead."""
-    shell = union(
-        ellipsoid((0, 0.018, 0.1480), (0.0825, 0.1005, 0.0870)),
-        ellipsoid((0, 0.048, 0.0960), (0.0690, 0.0620, 0.0720)),
-        blend=0.03,
-    )
-    shell = carve(shell, ellipsoid((0.0, -0.1080, 0.0940), (0.0760, 0.0790, 0.0850)), blend=0.008)
-    shell = carve(shell, mirrored(ellipsoid((0.0930, -0.0080, 0.0760), (0.0300, 0.0340, 0.0480))), blend=0.008)
-    shell = common(shell, half_space((0, 0.06, 0.030), (0, 0.42, -1)), blend=0.016)
-    sweep = union(
-        chain(
-            [(0.050, -0.040, 0.202), (0.022, -0.066, 0.208), (-0.018, -0.074, 0.200), (-0.058, -0.050, 0.174)],
-            [0.010, 0.019, 0.020, 0.009],
-        ),
-        chain(
-            [(0.046, -0.010, 0.216), (0.015, -0.036, 0.225), (-0.026, -0.040, 0.217), (-0.064, -0.020, 0.186)],
-            [0.012, 0.020, 0.021, 0.012],
-        ),
-        blend=0.030,
-    )
-    return _combed(union(shell, sweep, blend=0.026))
-
-
-def _combed(field: Field) -> Field:
-    """Shallow grooves along the strands."""
-
-    def distance(points: Array) -> Array:
-        return np.asarray(field(points) + 0.0009 * _strands(points))
-
-    return distance
-
-
-def _strands(points: Array) -> Array:
-    """A smooth wave in [-1, 1] (N,) that is constant along hairs: across the head in front, downwards behind."""
-    crown = np.array([0.030, 0.035, 0.235])
-    way = points - crown
-    angle = np.arctan2(way[:, 1] + 0.25 * way[:, 0], way[:, 0] - 0.02)
-    wave = angle + 2.0 * way[:, 2]
-    return np.asarray(0.66 * np.sin(19 * wave) + 0.34 * np.sin(41 * wave + 1.0))
-
-
-def head_mesh(palette: Palette) -> Mesh:
+def head_mesh(body: BodyShape, palette: Palette) -> Mesh:
     """The whole head as one mesh."""
-    skin_field, hair_field = face(), hair()
+    features = FEATURES[body.name]
+    skin_field, hair_field = face(features), HAIR[body.name]()
     whole = union(skin_field, hair_field)
     skin = surface(skin_field, LOWER, UPPER, CELL_M, lambda points: palette.along("skin", _complexion(points)))
-    skin = softly_lit(whole, skin, 0.020)
+    skin = softly_lit(whole, without_hidden(skin, hair_field, 0.002), 0.020)
     skin = skin.shaded(_cavity_light(skin.vertices) * skin.paint[:, 1])
     locks = surface(
         hair_field,
         LOWER,
         UPPER,
         CELL_M,
-        lambda points: palette.along("hair", 0.40 + 0.16 * _strands(points) + 1.6 * (points[:, 2] - 0.15)),
+        lambda points: palette.along("hair", 0.40 + 0.16 * strands(points) + 1.6 * (points[:, 2] - 0.15)),
     )
-    locks = softly_lit(whole, locks, 0.02)
-    parts = [skin, locks, *_eyes(palette), *_brows(palette), *_inside_mouth(palette)]
-    return joined(*parts)
+    locks = softly_lit(whole, without_hidden(locks, skin_field, 0.002), 0.02)
+    eyes = _eyes(palette, features.lashes)
+    parts = [skin, locks, *eyes, *_brows(palette, features.brows), *_inside_mouth(palette)]
+    return joined(*parts).scaled(body.head_scale)
 
 
 def _complexion(points: Array) -> Array:
@@ -207,12 +193,12 @@ def _inside_mouth(palette: Palette) -> list[Mesh]:
     return [teeth.shaded(np.full(len(teeth.vertices), 0.86)), tongue.shaded(light)]
 
 
-def _eyes(palette: Palette) -> list[Mesh]:
+def _eyes(palette: Palette, lashes: float) -> list[Mesh]:
     meshes = []
     for side in (-1.0, 1.0):
         centre = EYE * [side, 1, 1]
         gaze = GAZE + np.array([-0.05 * side, 0, 0])
-        meshes += [_eyeball(palette, centre, gaze / np.linalg.norm(gaze)), *_lid(palette, centre)]
+        meshes += [_eyeball(palette, centre, gaze / np.linalg.norm(gaze)), *_lid(palette, centre, lashes)]
     return meshes
 
 
@@ -233,7 +219,7 @@ UPPER_LID = (np.array([0.0, 0.34, -1.0]), 0.0062)
 """Outward normal of the plane that ends the lid, and how far above the middle of the eye's front it lies."""
 
 
-def _lid(palette: Palette, centre: Array) -> list[Mesh]:
+def _lid(palette: Palette, centre: Array, lashes: float) -> list[Mesh]:
     """The upper lid as a cap of a slightly larger ball, and the line of the lashes along its edge."""
     direction, height = UPPER_LID
     normal, radius = _unit(direction), EYE_RADIUS + 0.0015
@@ -242,10 +228,10 @@ def _lid(palette: Palette, centre: Array) -> list[Mesh]:
     lid = common(sphere(tuple(centre), radius), half_space(tuple(front), tuple(normal)), blend=0.003)
     cap = surface(lid, tuple(centre - margin), tuple(centre + margin), 0.0016, palette.at("skin", 0.18))
     cap = cap.shaded(np.full(len(cap.vertices), 0.86))
-    return [cap, _lashes(palette, centre, normal, float((front - centre) @ normal) - 0.0006, radius)]
+    return [cap, _lashes(palette, centre, normal, float((front - centre) @ normal) - 0.0006, radius, lashes)]
 
 
-def _lashes(palette: Palette, centre: Array, normal: Array, offset: float, radius: float) -> Mesh:
+def _lashes(palette: Palette, centre: Array, normal: Array, offset: float, radius: float, thick: float) -> Mesh:
     """A dark line along the circle in which a plane cuts the eye."""
     across = _unit(np.cross(normal, [0, 1.0, 0]))
     front = _unit(np.cross(across, normal))
@@ -253,10 +239,10 @@ def _lashes(palette: Palette, centre: Array, normal: Array, offset: float, radiu
     sweep = np.linspace(-1.25, 1.25, 17)
     circle = np.sin(sweep)[:, None] * across + np.cos(sweep)[:, None] * front
     line = centre + normal * offset + np.sqrt(radius**2 - offset**2) * circle
-    return tube(line, 0.0013 * np.cos(sweep) + 0.0005, 6, np.full(len(line), palette.at("hair", 0.0)))
+    return tube(line, thick * (0.0013 * np.cos(sweep) + 0.0005), 6, np.full(len(line), palette.at("hair", 0.0)))
 
 
-def _brows(palette: Palette) -> list[Mesh]:
+def _brows(palette: Palette, thick: float) -> list[Mesh]:
     field = face()
     meshes = []
     for side in (-1.0, 1.0):
@@ -268,7 +254,7 @@ def _brows(palette: Palette) -> list[Mesh]:
             14,
         )
         points = _onto(field, points)
-        width = np.interp(np.linspace(0, 1, 14), [0, 0.2, 0.6, 1], [0.0026, 0.0036, 0.0032, 0.0010])
+        width = np.interp(np.linspace(0, 1, 14), [0, 0.2, 0.6, 1], [0.0026, 0.0036, 0.0032, 0.0010]) * thick
         # Thick along the skin, thin out of it.
         meshes.append(tube(points, np.column_stack([width * 0.62, width]), 8, np.full(14, palette.at("hair", 0.25))))
     return meshes

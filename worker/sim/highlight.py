@@ -1,4 +1,4 @@
-"""A gentle sign that the robot presses: a warm ring where the spoon is, and a warm frame around the inset."""
+"""A gentle sign that the robot presses: a warm ring where the tool is, and a warm frame around the inset."""
 
 import numpy as np
 from PIL import Image
@@ -18,13 +18,12 @@ class Highlight:
     CALM: Rgb = (255, 255, 255)
     WARM: Rgb = (246, 138, 60)
 
-    def __init__(self, camera: Camera, force_n: Array, spoon: Array, mouth_m: Array) -> None:
-        """force_n (N,) and the spoon's frame (N, 4, 4) in the world."""
+    def __init__(self, camera: Camera, force_n: Array, tool_m: Array, target_m: Array) -> None:
+        """force_n (N,), and where tool and target are in the world (N, 3)."""
         strength = np.clip((force_n - NOTICED_FROM_N) / (STRONG_FROM_N - NOTICED_FROM_N), 0.0, 1.0)
         self._strength = np.where(force_n > NOTICED_FROM_N, 0.25 + 0.75 * np.sqrt(strength), 0.0)
-        bowl = spoon[:, :3, 3]
-        near = np.linalg.norm(bowl - mouth_m, axis=1, keepdims=True) < 0.08
-        self._centres = camera.pixels(np.where(near, mouth_m, bowl)).round().astype(int)
+        near = np.linalg.norm(tool_m - target_m, axis=1, keepdims=True) < 0.08
+        self._centres = camera.pixels(np.where(near, target_m, tool_m)).round().astype(int)
         self._ring = _ring()
 
     def draw(self, picture: Image.Image, index: int) -> None:

@@ -1,102 +1,116 @@
 """One view of the scene, composed in layers: a still picture, soft moving shadows, and the moving parts on top.
 
-The still picture is drawn once, and the head in it once per clip. Per frame only the rectangles that hold moving
-parts are drawn, with an off-centre frustum, and merged by depth; the shadow they cast comes from a small depth map
-seen from the lamp, looked up through a table made once per clip (TinyRenderer's own shadows are wrong when cropped).
+The still picture is drawn once, and what of the person keeps still during a clip is added to it once per clip. Per
+frame only the rectangles that hold moving parts are drawn, with an off-centre frustum, and merged by depth; the shadow
+they cast comes from a small depth map seen from the lamp, looked up through a table made once per clip (TinyRenderer's
+own shadows are wrong when cropped).
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from PIL import Image, ImageChops, ImageFilter
 
-from worker.sim.camera import Camera, Rectangle, lamp
+from worker.sim import skin
+from worker.sim.camera import Camera, Rectangle
 from worker.sim.rectangles import Pixels, cover, on_grid
-from worker.sim.scene import TOWARDS_KEY_LIGHT, Lighting, Stage
+from worker.sim.shots import (
+    WATER_LIGHT,
+    Colours,
+    Depth,
+    Frame,
+    Part,
+    Shot,
+    Supersampling,
+    as_layer,
+    as_mask,
+    distance_m,
+    photograph,
+    resampled,
+    seen_from_lamp,
+)
 from worker.sim.solids import Array
+from worker.sim.stage import Stage
 
 STILL_LAMP_SIZE, MOVING_LAMP_SIZE = 640, 176
-SHADOW_BIAS = 0.0035
-"""How much nearer to the lamp something must be to cast a shadow, as a share of the lamp's depth range."""
 
-AMBIENT, KEY = 0.72, 0.43
-SHADOW_KEY = 0.34
-"""Share of the key light that is left in full shadow."""
+EDGE_BLUR_PX = 0.3
+"""Smooths the edges of moving parts for less than half of what more pixels would cost."""
+CLEAR_SHARPNESS = 0.64
+"""Water and glass are drawn on a coarser grid: the one is blurred anyway, the other is faint."""
+GLASS_OPACITY = 0.42
 
-MOVING_LIGHT = Lighting(TOWARDS_KEY_LIGHT, AMBIENT, KEY, 0.30)
-DEPTH_ONLY = Lighting(TOWARDS_KEY_LIGHT, 1.0, 0.0)
-
-Colours = npt.NDArray[np.float32]
-Number = TypeVar("Number", np.float32, np.bool_)
+HEAD_RADIUS_M = 0.20
+"""Everything of head and arms this close to the middle of the head is head or neck."""
 
 
-class Shot(NamedTuple):
-    """Colours (h, w, 3) in the light and in the shadow, and depth (h, w)."""
+class Portrait(NamedTuple):
+    """A moving part of the person as drawn last, and where its pixels, on half the grid, lie in the lamp's map."""
 
-    lit: Colours
-    shadowed: Colours
-    depth: npt.NDArray[np.float32]
-
-
-def photograph(stage: Stage, camera: Camera, rectangle: Rectangle, width: int, height: int) -> Shot:
-    """Draw a stage with and without the key light's full strength."""
-    ambient = stage.draw(camera, rectangle, width, height, Lighting(TOWARDS_KEY_LIGHT, 1.0, 0.0))
-    key = stage.draw(camera, rectangle, width, height, Lighting(TOWARDS_KEY_LIGHT, 0.0, 1.0, 0.06))
-    base = ambient.rgb * np.float32(AMBIENT)
-    light = key.rgb * np.float32(KEY)
-    return Shot(base + light, base + light * np.float32(SHADOW_KEY), ambient.depth)
+    pose: int
+    rgba: Colours
+    depth: Depth
+    coarse: tuple[int, int]
+    texel: npt.NDArray[np.int32]
+    limit: npt.NDArray[np.float32]
 
 
 class View:
     """A part of the camera's picture, drawn at its own size."""
 
-    def __init__(
-        self, camera: Camera, rectangle: Rectangle, width: int, height: int, supersampling: float, still: Stage
-    ) -> None:
-        """Draws the still stage at once; start() must be called before the first frame."""
-        self._camera, self._rectangle = camera, rectangle
-        self.width, self.height, self._supersampling = width, height, supersampling
+    def __init__(self, camera: Camera, rectangle: Rectangle, width: int, height: int, fine: Supersampling) -> None:
+        self._camera, self._rectangle, self._supersampling = camera, rectangle, fine
+        self.width, self.height = width, height
         self._zoom = float(width / (rectangle[2] - rectangle[0]))
-        self._room = photograph(still, camera, rectangle, self._fine(width), self._fine(height))
+        self._portraits: dict[Rectangle, Portrait] = {}
 
-    def start(self, head: Stage, head_box: Pixels, lamp_depth: npt.NDArray[np.float32]) -> None:
-        """Prepare a clip: add the head, cast the still shadows, and make the tables for the moving ones."""
-        lit, shadowed, self._depth, on_head = self._with_head(head, head_box)
-        depth = _resampled(self._depth, self.height, self.width)
-        texel, distance = self._seen_from_lamp(depth, STILL_LAMP_SIZE)
-        dark = (lamp_depth.ravel()[texel] < distance).reshape(depth.shape)
-        # The head receives no still shadow: that of brows and hair would only make the face look dirty.
-        dark &= ~_resampled(on_head, self.height, self.width)
-        mask = _mask(dark).filter(ImageFilter.BoxBlur(max(1.0, 0.7 * self._zoom)))
-        self._background = self._reduced(lit)
-        dim = self._reduced(shadowed)
+    def still(self, stage: Stage) -> Shot:
+        """What never moves, drawn to be kept for many clips."""
+        share = self._supersampling.still
+        return photograph(stage, self._camera, self._rectangle, round(self.width * share), round(self.height * share))
+
+    def start(self, still: Shot, resting: Sequence[Part], itch_m: Array | None, lamp_depth: Depth) -> None:
+        """Prepare a clip: add what rests during it, cast the still shadows, make the tables for the moving ones."""
+        shot = still.copy()
+        bright: npt.NDArray[np.bool_] = np.zeros(shot.depth.shape, dtype=np.bool_)
+        for part in resting:
+            self._add(shot, part, itch_m, bright)
+        share = self._supersampling.moving
+        self._depth = resampled(shot.depth, round(self.height * share), round(self.width * share))
+        depth = resampled(shot.depth, self.height, self.width)
+        texel, limit = seen_from_lamp(self._camera, self._rectangle, depth, STILL_LAMP_SIZE)
+        dark = (lamp_depth.ravel()[texel] < limit).reshape(depth.shape)
+        dark &= ~resampled(bright, self.height, self.width)
+        mask = as_mask(dark).filter(ImageFilter.BoxBlur(max(1.0, 0.7 * self._zoom)))
+        self._background, dim = self._reduced(shot.lit), self._reduced(shot.shadowed)
         self._background.paste(dim, (0, 0), mask)
         self._background_shadowed = ImageChops.darker(dim, self._background)
-        coarse = _resampled(self._depth, self.height // 2, self.width // 2)
-        self._texel, self._distance = self._seen_from_lamp(coarse, MOVING_LAMP_SIZE)
+        coarse = resampled(shot.depth, self.height // 2, self.width // 2)
+        self._texel, self._limit = seen_from_lamp(self._camera, self._rectangle, coarse, MOVING_LAMP_SIZE)
 
-    def _fine(self, pixels: float) -> int:
-        """A length on the supersampled grid."""
-        return round(pixels * self._supersampling)
+    def frame(self, frame: Frame) -> Image.Image:
+        """One picture."""
+        picture = self._background.copy()
+        self._cast_shadows(picture, frame.lamp_depth)
+        covered = []
+        for part in frame.parts:
+            for pixels in cover(self._own_pixels(part.boxes), self.width, self.height):
+                if part.prepare:
+                    part.prepare()
+                place = _on_grid_of(self._supersampling.moving, pixels)
+                before = self._depth[place].copy()
+                layer = self._layer(part, pixels, place, frame)
+                picture.paste(layer, pixels[:2], layer)
+                covered.append((place, before))
+        for place, before in reversed(covered):
+            self._depth[place] = before
+        return picture
 
     def _reduced(self, colours: Colours) -> Image.Image:
         """Supersampled colours as a picture of this view's size."""
-        fine = Image.fromarray(colours.round().clip(0, 255).astype(np.uint8))
-        return fine.resize((self.width, self.height), Image.Resampling.HAMMING)
-
-    def frame(self, moving: Sequence[tuple[Stage, Array]], lamp_depth: npt.NDArray[np.float32]) -> Image.Image:
-        """One picture. Each moving stage comes with boxes (K, 4) that hold it, in pixels of the whole picture."""
-        picture = self._background.copy()
-        self._cast_shadows(picture, lamp_depth)
-        covered = []
-        for stage, boxes in moving:
-            for pixels in cover(self._own_pixels(boxes), self.width, self.height):
-                covered.append((pixels, self._draw_moving(picture, stage, pixels)))
-        for pixels, before in reversed(covered):
-            self._depth[self._place(pixels)] = before
-        return picture
+        return Image.fromarray(colours).resize((self.width, self.height), Image.Resampling.HAMMING)
 
     def _own_pixels(self, boxes: Array) -> Array:
         """Boxes (K, 4) of the whole picture in this view's pixels."""
@@ -109,48 +123,27 @@ class View:
         x0, y0, x1, y1 = (value / self._zoom for value in pixels)
         return left + x0, top + y0, left + x1, top + y1
 
-    def _with_head(
-        self, head: Stage, head_box: Pixels
-    ) -> tuple[Colours, Colours, npt.NDArray[np.float32], npt.NDArray[np.bool_]]:
-        lit, shadowed, depth = self._room.lit.copy(), self._room.shadowed.copy(), self._room.depth.copy()
-        on_head: npt.NDArray[np.bool_] = np.zeros(depth.shape, dtype=np.bool_)
-        own = self._own_pixels(np.array([head_box], dtype=float))[0]
-        box = on_grid(own, self.width, self.height)
-        left, top, right, bottom = (self._fine(value) for value in box)
-        if right > left and bottom > top:
-            shot = photograph(head, self._camera, self._part(box), right - left, bottom - top)
-            place = np.s_[top:bottom, left:right]
-            nearer = shot.depth < depth[place]
-            lit[place][nearer], shadowed[place][nearer] = shot.lit[nearer], shot.shadowed[nearer]
-            on_head[place] = nearer
-            depth[place] = np.minimum(depth[place], shot.depth)
-        return lit, shadowed, depth, on_head
+    def _add(self, shot: Shot, part: Part, itch_m: Array | None, bright: npt.NDArray[np.bool_]) -> None:
+        """Draw a part into the still picture, and note in ``bright`` (h, w) where no still shadow falls."""
+        boxes = self._own_pixels(part.boxes)
+        whole = np.concatenate([boxes[:, :2].min(axis=0), boxes[:, 2:].max(axis=0)])
+        left, top, right, bottom = pixels = on_grid(whole, self.width, self.height)
+        if right <= left or bottom <= top:
+            return
+        rectangle, place = self._part(pixels), _on_grid_of(self._supersampling.still, pixels)
+        height, width = shot.depth[place].shape
+        own = photograph(part.stage, self._camera, rectangle, width, height)
+        if part.alive and itch_m is not None:
+            for colours in (own.lit, own.shadowed):
+                skin.mark_itch(colours, own.depth, self._camera, rectangle, itch_m)
+        nearer = shot.merge(own, place)
+        if part.head_m is not None:
+            on_head = distance_m(self._camera, rectangle, own.depth, part.head_m) < HEAD_RADIUS_M
+            bright[place] = np.where(nearer, on_head, bright[place])
 
-    def _seen_from_lamp(
-        self, depth: npt.NDArray[np.floating], size: int
-    ) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float32]]:
-        """For each pixel, its texel in a lamp map of this size and the depth below which something shades it."""
-        height, width = depth.shape
-        left, top, right, bottom = self._rectangle
-        x = (left + (np.arange(width) + 0.5) / width * (right - left)) / self._camera.width * 2 - 1
-        y = 1 - (top + (np.arange(height) + 0.5) / height * (bottom - top)) / self._camera.height * 2
-        # The crop shares the camera's near and far planes, so the whole picture's matrix inverts its depth too.
-        to_lamp = lamp(size).world_to_device @ np.linalg.inv(self._camera.world_to_device)
-        z = depth * 2.0 - 1.0
-        rows = [
-            to_lamp[k, 0] * x[None, :] + to_lamp[k, 1] * y[:, None] + to_lamp[k, 2] * z + to_lamp[k, 3]
-            for k in range(4)
-        ]
-        u, v, distance = (rows[0] / rows[3] + 1) / 2, (1 - rows[1] / rows[3]) / 2, (rows[2] / rows[3] + 1) / 2
-        inside = (u >= 0) & (u < 1) & (v >= 0) & (v < 1)
-        column = np.clip((u * size).astype(np.int32), 0, size - 1)
-        row = np.clip((v * size).astype(np.int32), 0, size - 1)
-        limit = np.where(inside, distance - SHADOW_BIAS, 0.0).astype(np.float32)
-        return (row * size + column).ravel().astype(np.int32), limit.ravel()
-
-    def _cast_shadows(self, picture: Image.Image, lamp_depth: npt.NDArray[np.float32]) -> None:
-        dark = lamp_depth.ravel()[self._texel] < self._distance
-        mask = _mask(dark.reshape(self.height // 2, self.width // 2))
+    def _cast_shadows(self, picture: Image.Image, lamp_depth: Depth) -> None:
+        dark = lamp_depth.ravel()[self._texel] < self._limit
+        mask = as_mask(dark.reshape(self.height // 2, self.width // 2))
         found = mask.getbbox()
         if found is None:
             return
@@ -162,34 +155,58 @@ class View:
         soft = soft.resize((full[2] - full[0], full[3] - full[1]), Image.Resampling.BILINEAR)
         picture.paste(self._background_shadowed.crop(full), full[:2], soft)
 
-    def _place(self, pixels: Pixels) -> tuple[slice, slice]:
-        """A rectangle of this view on the supersampled grid."""
-        left, top, right, bottom = (self._fine(value) for value in pixels)
-        return slice(top, bottom), slice(left, right)
-
-    def _draw_moving(self, picture: Image.Image, moving: Stage, pixels: Pixels) -> npt.NDArray[np.float32]:
-        """Draw a stage where it is nearer than what is there, and return the depth that was there before."""
-        place = self._place(pixels)
-        before = self._depth[place].copy()
-        height, width = before.shape
-        rgba, depth = moving.draw_raw(self._camera, self._part(pixels), width, height, MOVING_LIGHT)
-        visible = depth < before
-        self._depth[place] = np.minimum(depth, before)
-        # Premultiplied alpha, so that resizing does not bleed hidden colours into the edges.
-        colour = (rgba.view(np.uint32)[..., 0] | np.uint32(0xFF000000)) * visible.view(np.uint8)
-        layer = Image.frombuffer("RGBa", (width, height), colour, "raw", "RGBa", 0, 1)
+    def _layer(self, part: Part, pixels: Pixels, place: tuple[slice, slice], frame: Frame) -> Image.Image:
+        """What is visible of a part in a rectangle; what is not clear hides whatever is drawn after it behind it."""
         size = (pixels[2] - pixels[0], pixels[3] - pixels[1])
-        layer = layer.resize(size, Image.Resampling.HAMMING).convert("RGBA")
-        picture.paste(layer, pixels[:2], layer)
-        return before
+        rectangle, before = self._part(pixels), self._depth[place]
+        if part.drops_px or part.glass:
+            return self._clear(part, rectangle, size, before)
+        height, width = before.shape
+        if part.alive:
+            colours, depth = self._alive(part, rectangle, (height, width), frame)
+        else:
+            colours, depth = part.stage.draw_raw(self._camera, rectangle, width, height, part.light)
+        layer = as_layer(colours, depth < before).filter(ImageFilter.BoxBlur(EDGE_BLUR_PX))
+        self._depth[place] = np.minimum(depth, before)
+        return layer.resize(size, Image.Resampling.HAMMING).convert("RGBA")
+
+    def _clear(self, part: Part, rectangle: Rectangle, size: tuple[int, int], before: Depth) -> Image.Image:
+        """Balls of water run together: blurred, and cut off where little of them is left. Glass is faint."""
+        share = self._supersampling.moving * CLEAR_SHARPNESS
+        width, height = max(1, round(size[0] * share)), max(1, round(size[1] * share))
+        light = part.light if part.glass else WATER_LIGHT
+        rgba, depth = part.stage.draw_raw(self._camera, rectangle, width, height, light)
+        layer = as_layer(rgba, depth < resampled(before, height, width))
+        if not part.glass:
+            for _ in range(2):
+                layer = layer.filter(ImageFilter.BoxBlur(0.42 * part.drops_px * self._zoom * share))
+        layer = layer.resize(size, Image.Resampling.BICUBIC).convert("RGBA")
+        layer.putalpha(layer.getchannel("A").point(_GLASS_ALPHA if part.glass else _WATER_ALPHA))
+        return layer
+
+    def _alive(self, part: Part, rectangle: Rectangle, shape: tuple[int, int], frame: Frame) -> tuple[Colours, Depth]:
+        """A moving part of the person with shadow and itch on it: colours (h, w, 4) and depth (h, w)."""
+        height, width = shape
+        portrait = self._portraits.get(rectangle)
+        if portrait is None or portrait.pose != part.pose:
+            rgba, depth = part.stage.draw_raw(self._camera, rectangle, width, height, part.light)
+            half = max(1, height // 2), max(1, width // 2)
+            seen = seen_from_lamp(self._camera, rectangle, resampled(depth, *half), MOVING_LAMP_SIZE)
+            portrait = self._portraits[rectangle] = Portrait(part.pose, rgba.copy(), depth.copy(), half, *seen)
+        colours = portrait.rgba.copy()
+        dark = (frame.lamp_depth.ravel()[portrait.texel] < portrait.limit).reshape(portrait.coarse)
+        skin.shade(colours[..., :3], as_mask(dark), 1.5 * self._zoom * self._supersampling.moving)
+        if frame.itch_m is not None:
+            skin.mark_itch(colours[..., :3], portrait.depth, self._camera, rectangle, frame.itch_m)
+        return colours, portrait.depth
 
 
-def _mask(chosen: npt.NDArray[np.bool_]) -> Image.Image:
-    return Image.fromarray(chosen.view(np.uint8) * np.uint8(255))
+_WATER_ALPHA = [round(min(1.0, max(0.0, (alpha / 255 - 0.34) / 0.30)) * 245) for alpha in range(256)]
+"""Opacity of water for each opacity of its blurred balls."""
+_GLASS_ALPHA = [round(GLASS_OPACITY * alpha) for alpha in range(256)]
 
 
-def _resampled(values: npt.NDArray[Number], height: int, width: int) -> npt.NDArray[Number]:
-    """The nearest of values (h, w) on a coarser grid."""
-    rows = ((np.arange(height) + 0.5) * values.shape[0] / height).astype(int)
-    columns = ((np.arange(width) + 0.5) * values.shape[1] / width).astype(int)
-    return np.ascontiguousarray(values[rows][:, columns])
+def _on_grid_of(supersampling: float, pixels: Pixels) -> tuple[slice, slice]:
+    """A rectangle on a supersampled grid."""
+    left, top, right, bottom = (round(value * supersampling) for value in pixels)
+    return slice(top, bottom), slice(left, right)

@@ -5,6 +5,7 @@ Nothing is read from files and nothing is random, so the same code always gives 
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 import numpy.typing as npt
@@ -41,6 +42,15 @@ class Mesh:
             normals=self.normals @ rotation.T,
         )
 
+    def mirrored(self) -> "Mesh":
+        """The mirror image in the plane x = 0, its faces turned over so that they still look outwards."""
+        mirror = np.array([-1.0, 1.0, 1.0])
+        return Mesh(self.vertices * mirror, self.normals * mirror, self.paint, self.faces[:, ::-1])
+
+    def scaled(self, factor: float) -> "Mesh":
+        """The mesh made larger or smaller about its origin."""
+        return replace(self, vertices=self.vertices * factor)
+
     def shaded(self, light: Array) -> "Mesh":
         """The same mesh with light (V,) in [0, 1] reaching its vertices."""
         return replace(self, paint=np.column_stack([self.paint[:, 0], light]))
@@ -72,6 +82,14 @@ def surface(
     vertices = vertices - np.clip(field(vertices), -cell_m, cell_m)[:, None] * gradient(field, vertices)
     colours = colour(vertices) if callable(colour) else np.full(len(vertices), colour)
     return Mesh(vertices, gradient(field, vertices), np.column_stack([colours, np.ones(len(vertices))]), faces)
+
+
+def without_hidden(mesh: Mesh, cover: Field, depth_m: float) -> Mesh:
+    """The mesh without the faces that lie deeper than this inside another solid."""
+    hidden = cover(mesh.vertices) < -depth_m
+    faces = mesh.faces[~hidden[mesh.faces].all(axis=1)]
+    kept, numbers = np.unique(faces, return_inverse=True)
+    return Mesh(mesh.vertices[kept], mesh.normals[kept], mesh.paint[kept], numbers.reshape(-1, 3).astype(np.int32))
 
 
 def gradient(field: Field, points: Array) -> Array:
@@ -129,6 +147,33 @@ def tube(path: Array, radii: Array, sides: int, colours: Array, closed_ends: boo
     if closed_ends:
         pieces += [_cap(rings[0], path[0], colours[0], True), _cap(rings[-1], path[-1], colours[-1], False)]
     return joined(*pieces)
+
+
+def ball(radius_m: float, colour: float, halvings: int = 1) -> Mesh:
+    """A small ball around the origin: an icosahedron (20 faces) whose edges are halved (80 faces)."""
+    golden = (1 + 5**0.5) / 2
+    upright = [(0.0, a, b * golden) for a in (-1, 1) for b in (-1, 1)]
+    points = np.array([*upright, *((y, z, x) for x, y, z in upright), *((z, x, y) for x, y, z in upright)])
+    points /= np.linalg.norm(points[0])
+    gaps = np.linalg.norm(points[:, None] - points[None], axis=-1)
+    near = (gaps > 1e-9) & (gaps < 1.2 * gaps[gaps > 1e-9].min())
+    triples = [triple for triple in combinations(range(12), 3) if near[np.ix_(triple, triple)].sum() == 6]
+    corners = [points[list(triple if np.linalg.det(points[list(triple)]) > 0 else triple[::-1])] for triple in triples]
+    for _ in range(halvings):
+        corners = [piece for triangle in corners for piece in _quartered(*triangle)]
+    vertices, numbers = np.unique(np.round(np.array(corners).reshape(-1, 3), 9), axis=0, return_inverse=True)
+    paint = np.column_stack([np.full(len(vertices), colour), np.ones(len(vertices))])
+    return Mesh(vertices * radius_m, vertices, paint, numbers.reshape(-1, 3).astype(np.int32))
+
+
+def _quartered(a: Array, b: Array, c: Array) -> list[Array]:
+    """A triangle on the unit ball as four."""
+    ab, bc, ca = _unit(a + b), _unit(b + c), _unit(c + a)
+    return [np.array(piece) for piece in ((a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca))]
+
+
+def _unit(vector: Array) -> Array:
+    return np.asarray(vector / np.linalg.norm(vector))
 
 
 def panel(corners: Sequence[Sequence[float]], columns: int, rows: int, colour: float | Paint) -> Mesh:

@@ -4,8 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from worker.sim import jaco
-from worker.sim.human import FACE_IN_HEAD, MOUTH_FROM_NECK_M, NECK_PIVOT_M
+from worker.sim.arm import Robot, Tool, transform
+from worker.sim.bullet import rotation_of
+from worker.sim.human import BODY_SHAPES, FACE_IN_HEAD, BodyShape
 from worker.sim.solids import Array, smooth_step
 from worker.spaces import CONTROL_STEP_S
 from worker.trajectory import Trajectory
@@ -13,28 +14,43 @@ from worker.trajectory import Trajectory
 SWALLOWING_S = 0.22
 SWALLOWED_WITHIN_M = 0.06
 THROAT_DEPTH_M = 0.035
+STILL_RAD = 2e-3
+"""Arms and head that turn by less than this during a clip are drawn as standing still: a fifth of a pixel."""
 
 
 @dataclass(frozen=True)
 class Motion:
-    """Everything that changes during a clip of N frames, with L moving parts and P pieces of food."""
+    """Everything that changes during a clip of N frames, with L moving parts and P pieces of food or water."""
 
+    body: BodyShape
+    skin_tone: int
     frames: Array
-    """(N, L, 4, 4) of links 1 to 7 and the spoon, in the world"""
-    food_m: Array
+    """(N, L, 4, 4) of the robot's links and its tool, in the world"""
+    particles_m: Array
     """(N, P, 3); NaN when gone"""
     force_n: Array
     """(N,)"""
-    head_quaternion: Array
-    """(4,) xyzw"""
-    mouth_m: Array
-    """(3,)"""
+    head_quaternions: Array
+    """(N, 4) xyzw"""
+    arms_rad: Array
+    """(N, 2, 4) right and left arm as in human.py"""
+    target_m: Array
+    """(N, 3)"""
 
     def __len__(self) -> int:
         return len(self.frames)
 
+    @property
+    def head_moves(self) -> bool:
+        """Whether the head turns visibly during the clip."""
+        return float(np.abs(self.head_quaternions - self.head_quaternions[0]).max()) > STILL_RAD / 2
 
-def clip_motion(trajectory: Trajectory, first_step: int, n_steps: int, fps: int) -> Motion:
+    def arm_moves(self, side: int) -> bool:
+        """Whether the person's right or left arm moves visibly during the clip."""
+        return float(np.abs(self.arms_rad[:, side] - self.arms_rad[0, side]).max()) > STILL_RAD
+
+
+def clip_motion(trajectory: Trajectory, robot: Robot, tool: Tool, first_step: int, n_steps: int, fps: int) -> Motion:
     """The motion of steps first_step to first_step + n_steps.
 
     Raises ValueError when the trajectory does not hold these steps.
@@ -43,23 +59,53 @@ def clip_motion(trajectory: Trajectory, first_step: int, n_steps: int, fps: int)
         raise ValueError(
             f"Steps {first_step} to {first_step + n_steps} are not within a trajectory of {len(trajectory)} steps."
         )
-    count = round(n_steps * CONTROL_STEP_S * fps)
+    count = frame_count(n_steps, fps)
     place = first_step + np.arange(count) / (fps * CONTROL_STEP_S)
-    joints = smoothly(np.asarray(trajectory.joint_positions, dtype=float), place)
-    in_base = jaco.link_frames(joints)
-    base = np.eye(4)
-    base[:3, :3], base[:3, 3] = jaco.rotation(jaco.ROBOT_BASE_RPY), jaco.ROBOT_BASE_M
-    turn = rotation_of(np.asarray(trajectory.head_quaternion, dtype=float))
-    mouth: Array = np.asarray(NECK_PIVOT_M) + turn @ np.asarray(MOUTH_FROM_NECK_M)
-    throat = mouth - THROAT_DEPTH_M * turn @ np.asarray(FACE_IN_HEAD)
-    force = np.concatenate([[0.0], np.asarray(trajectory.contact_force_n, dtype=float)])
-    return Motion(
-        frames=np.asarray(base @ in_base),
-        food_m=_food(np.asarray(trajectory.particles, dtype=float), place, mouth, throat),
-        force_n=np.interp(place, np.arange(len(force)), force),
-        head_quaternion=np.asarray(trajectory.head_quaternion, dtype=float),
-        mouth_m=mouth,
+    joints, heads, arms, target, particles = (
+        np.asarray(values, dtype=np.float64)
+        for values in (
+            trajectory.joint_positions,
+            trajectory.head_quaternions,
+            trajectory.arm_positions_rad,
+            trajectory.target_m,
+            trajectory.particles,
+        )
     )
+    force = np.concatenate([[0.0], np.asarray(trajectory.contact_force_n, dtype=float)])
+    body = BODY_SHAPES[trajectory.body]
+    return Motion(
+        body=body,
+        skin_tone=trajectory.skin_tone,
+        frames=np.asarray(transform(robot.mount_m, robot.mount_rpy) @ robot.link_frames(smoothly(joints, place), tool)),
+        particles_m=_particles(particles, place, *_mouth_and_throat(body, heads)),
+        force_n=np.interp(place, np.arange(len(force)), force),
+        head_quaternions=_unit_quaternions(smoothly(_same_sign(heads), place)),
+        arms_rad=smoothly(arms.reshape(len(arms), -1), place).reshape(count, 2, -1),
+        target_m=smoothly(target, place),
+    )
+
+
+def _mouth_and_throat(body: BodyShape, heads: Array) -> tuple[Array, Array]:
+    """Where they are at every control step (T + 1, 3)."""
+    turns = np.array([rotation_of(quaternion) for quaternion in heads])
+    mouth = np.asarray(body.neck_pivot_m) + turns @ np.asarray(body.mouth_from_neck_m)
+    throat: Array = mouth - THROAT_DEPTH_M * turns @ np.asarray(FACE_IN_HEAD)
+    return mouth, throat
+
+
+def _same_sign(heads: Array) -> Array:
+    """A quaternion and its negative are the same turn; neighbours must not differ by their sign."""
+    flips = np.where((heads[1:] * heads[:-1]).sum(axis=1) < 0.0, -1.0, 1.0)
+    return np.asarray(heads * np.concatenate([[1.0], np.cumprod(flips)])[:, None])
+
+
+def _unit_quaternions(values: Array) -> Array:
+    return np.asarray(values / np.linalg.norm(values, axis=1, keepdims=True))
+
+
+def frame_count(n_steps: int, fps: int) -> int:
+    """How many frames show so many control steps."""
+    return round(n_steps * CONTROL_STEP_S * fps)
 
 
 def smoothly(values: Array, place: Array) -> Array:
@@ -73,37 +119,26 @@ def smoothly(values: Array, place: Array) -> Array:
     )
 
 
-def _food(positions: Array, place: Array, mouth_m: Array, throat_m: Array) -> Array:
-    """Food (T, P, 3) at fractional indices (N, P, 3), in straight lines between control steps.
+def _particles(positions: Array, place: Array, mouth_m: Array, throat_m: Array) -> Array:
+    """Particles (T + 1, P, 3) at fractional indices (N, P, 3), in straight lines between control steps.
 
-    The simulation takes food away as soon as it is close to the mouth; here it then goes on into the mouth.
+    The simulation takes food and water away as soon as they are close to the mouth; here they go on into it.
     """
     last = len(positions) - 1
     index = np.clip(np.floor(place).astype(int), 0, max(last - 1, 0))
     share = np.clip(place - index, 0.0, 1.0)[:, None, None]
-    food: Array = positions[index] + share * (positions[np.minimum(index + 1, last)] - positions[index])
-    for piece in range(positions.shape[1]):
-        seen = np.flatnonzero(~np.isnan(positions[:, piece, 0]))
+    drawn: Array = positions[index] + share * (positions[np.minimum(index + 1, last)] - positions[index])
+    for particle in range(positions.shape[1]):
+        seen = np.flatnonzero(~np.isnan(positions[:, particle, 0]))
         if not len(seen) or seen[-1] == last:
             continue
-        final = positions[seen[-1], piece]
-        if np.linalg.norm(final - mouth_m) < SWALLOWED_WITHIN_M:
-            progress = (place - seen[-1]) * CONTROL_STEP_S / SWALLOWING_S
+        final, step = positions[seen[-1], particle], seen[-1]
+        if np.linalg.norm(final - mouth_m[step]) < SWALLOWED_WITHIN_M:
+            progress = (place - step) * CONTROL_STEP_S / SWALLOWING_S
             going = (progress >= 0.0) & (progress < 1.0)
-            food[going, piece] = final + smooth_step(progress[going], 0.0, 1.0)[:, None] * (throat_m - final)
-    return food
-
-
-def rotation_of(quaternion: Array) -> Array:
-    """The rotation matrix (3, 3) of an xyzw quaternion (4,)."""
-    x, y, z, w = quaternion / np.linalg.norm(quaternion)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+            way = throat_m[step] - final
+            drawn[going, particle] = final + smooth_step(progress[going], 0.0, 1.0)[:, None] * way
+    return drawn
 
 
 def quaternions(rotations: Array) -> Array:

@@ -1,134 +1,240 @@
-"""What there is to draw, in clients by how often it moves: the room and the body, the head, the arm with its food."""
+"""What there is to draw: the room, the person in parts, the robot with its tool, made once and shared by all clips."""
 
-import tempfile
+import math
 from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import NamedTuple
+from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
-from PIL import Image
 
-from worker.sim import arm_look, body_look, chair_look, head_look, jaco, room_look
-from worker.sim.bullet import DrawingClient
-from worker.sim.camera import Camera, Rectangle, flat
-from worker.sim.colours import FOOD, Palette
-from worker.sim.human import NECK_PIVOT_M
-from worker.sim.meshes import Mesh
+from worker.sim import arm_look, body_look, chair_look, head_look, human, limb_look, room_look
+from worker.sim.arm import Robot, Tool
+from worker.sim.arm_look import Grip
+from worker.sim.bullet import rotation_of
+from worker.sim.human import BodyShape
+from worker.sim.meshes import Mesh, ball
+from worker.sim.motion import quaternions
 from worker.sim.solids import Array, union
+from worker.sim.stage import Paints, Stage, corners_around
+from worker.sim.task_look import TaskLook
+from worker.sim.tool_look import tool_look
 
-GONE_M = (0.0, 0.0, -5.0)
-"""Where food that was eaten or lost is kept, out of sight."""
-
-TOWARDS_KEY_LIGHT = (0.60, -1.20, 2.20)
-
-UPPER_ARM = ("link_1", "link_2", "link_3")
-HAND_PARTS = ("link_6", "link_7", "spoon")
-"""What of the arm can come near the mouth and is drawn in the inset."""
+UPPER_LINKS = 3
+"""So many of the robot's links are drawn apart from the rest, which is nearer to the person and smaller."""
 
 
-class Lighting(NamedTuple):
-    """How strongly the pieces of one drawing pass are lit."""
+class Sitter:
+    """One body in its chair: the trunk stands still, head and arms are posed."""
 
-    towards: tuple[float, float, float]
-    ambient: float
-    diffuse: float
-    specular: float = 0.0
+    def __init__(self, body: BodyShape, stages: "Stages") -> None:
+        self.body, self._stages = body, stages
+        palette, chair = stages.paints.palette, chair_look.chair(body)
+        trunk, cloth = body_look.trunk(body), body_look.BUILDS[body.name].cloth
+        self._trunk = self._named(
+            {
+                "trunk": body_look.trunk_mesh(body, palette, chair),
+                "chair": chair_look.chair_mesh(body, palette, trunk),
+            }
+        )
+        self._arms = self._named(limb_look.arm_meshes(body, palette, cloth, union(trunk, chair)))
+        head = {"head": head_look.head_mesh(body, palette), "neck": body_look.neck_mesh(body, palette)}
+        stages.still.add(self._trunk)
+        stages.person.add({**self._named(head), **self._arms})
+
+    def _named(self, meshes: Mapping[str, Mesh]) -> dict[str, Mesh]:
+        return {f"{self.body.name}_{name}": mesh for name, mesh in meshes.items()}
+
+    def sit(self, skin_tone: int, base: str) -> None:
+        """Take the place of any other sitter, beside this base of a robot."""
+        shown = [*self._stages.room, base, *self._trunk]
+        self._stages.still.hide_all_but(shown)
+        for name in shown:
+            self._stages.still.place(name)
+        self._stages.person.repaint(skin_tone)
+
+    def turn_head(self, quaternion: Sequence[float] | Array) -> Array:
+        """Turn it, and give the corners (1, 8, 3) in the world of a box that holds head and neck."""
+        stage, head, neck = self._stages.person, f"{self.body.name}_head", f"{self.body.name}_neck"
+        stage.place(head, self.body.neck_pivot_m, quaternion)
+        stage.place(neck)
+        turned = stage.corners_m(head) @ rotation_of(quaternion).T + np.array(self.body.neck_pivot_m)
+        return corners_around(np.concatenate([turned, stage.corners_m(neck)]))[None]
+
+    def hide_head(self) -> None:
+        """Put head and neck out of sight."""
+        for part in ("head", "neck"):
+            self._stages.person.hide(f"{self.body.name}_{part}")
+
+    def pose_arm(self, stage: Stage, side: int, arm_rad: Array) -> Array:
+        """Pose the right or left arm, and give the corners (2, 8, 3) in the world of boxes around its two segments."""
+        boxes = []
+        for name, origin, turn in zip(
+            self.arm_names(side), *limb_look.segment_frames(self.body, arm_rad, side), strict=True
+        ):
+            stage.place(name, origin, quaternions(turn))
+            boxes.append(stage.corners_m(name) @ turn.T + origin)
+        return np.array(boxes)
+
+    def arm_names(self, side: int) -> tuple[str, str]:
+        """Upper arm and forearm."""
+        prefix = f"{self.body.name}_{('right', 'left')[side]}"
+        return f"{prefix}_upper_arm", f"{prefix}_forearm"
+
+    def moving_arm(self, side: int, skin_tone: int) -> Stage:
+        """The stage for arms that move during a clip, with this arm on it."""
+        stage = self._stages.limbs
+        stage.add({name: self._arms[name] for name in self.arm_names(side)})
+        stage.repaint(skin_tone)
+        return stage
 
 
-class Layer(NamedTuple):
-    """Colours (h, w, 3) in [0, 255] and device depth (h, w) of one drawing pass."""
+class Kit:
+    """The robot with the tool of one task and what the tool carries."""
 
-    rgb: npt.NDArray[np.uint8]
-    depth: npt.NDArray[np.float32]
+    def __init__(self, task: str, robot: Robot, tool: Tool, look: TaskLook, stages: "Stages") -> None:
+        self._task, self._look, held = task, look, tool_look(tool)
+        self._palette = stages.paints.palette
+        detail, coarse = arm_look.Detail(self._palette, sides=14), arm_look.Detail(self._palette, sides=6)
+        self.upper, self.casters = stages.upper, stages.casters
+        self.forearm = stages.forearm(robot, held.grip)
+        links = arm_look.arm_meshes(detail, robot, held.grip)
+        # The shadows of two grips must not be mixed up either.
+        gripping = [f", {held.grip}" if index >= UPPER_LINKS else "" for index in range(len(links))]
+        self.names = (*(f"{robot.name} {link}{grip}" for link, grip in zip(links, gripping, strict=True)), tool.name)
+        """the moving parts, in the order of their frames"""
+        named = dict(zip(self.names, links.values(), strict=False))
+        far = self.names[:UPPER_LINKS]
+        self.base = f"{robot.name}_base"
+        stages.still.add({self.base: arm_look.base_mesh(detail, robot)})
+        self.upper.add({name: named[name] for name in far})
+        self.forearm.add({**{name: named[name] for name in named if name not in far}, tool.name: held.solid(detail)})
+        shadows = arm_look.arm_meshes(coarse, robot, held.grip)
+        self.casters.add(dict(zip(self.names, (*shadows.values(), held.solid(coarse)), strict=True)))
+        self.particles = stages.water if look.water else self.forearm
+        self.glass = f"{tool.name} glass" if held.glass else None
+        if self.glass and held.glass:
+            stages.water.add({self.glass: held.glass(detail)})
+        self._particles: list[str] = []
+        self.radius_m = 0.0
+        """of the particles as drawn"""
+
+    @cached_property
+    def corners_m(self) -> Array:
+        """(L, 8, 3) corners of the moving parts' boxes in their own frames."""
+        return np.array([(self.upper if name in self.upper else self.forearm).corners_m(name) for name in self.names])
+
+    def take(self, particle_count: int) -> None:
+        """Take up this tool instead of any other, with so many particles."""
+        look, colours = self._look, self._look.particle_colours
+        self.radius_m = look.particle_scale * look.particle_radius_m(particle_count)
+        self._particles = [f"{self._task}_{index}_of_{self.radius_m:.5f}_m" for index in range(particle_count)]
+        for index, name in enumerate(self._particles):
+            if name not in self.particles:
+                colour = self._palette.at(colours[index % len(colours)])
+                self.particles.add({name: ball(self.radius_m, colour, halvings=0 if look.water else 1)})
+        for stage in (self.upper, self.forearm, self.casters, self.particles):
+            stage.hide_all_but(self.names)
+
+    def place(self, part: int, position_m: Sequence[float], quaternion: Sequence[float]) -> None:
+        """Put one of the moving parts somewhere, on every stage that shows it."""
+        name = self.names[part]
+        (self.upper if part < UPPER_LINKS else self.forearm).place(name, position_m, quaternion)
+        self.casters.place(name, position_m, quaternion)
+
+    def hide_glass(self) -> None:
+        """Put what one sees through out of sight, to draw the water alone."""
+        if self.glass:
+            self.particles.hide(self.glass)
+
+    def place_glass(self, position_m: Sequence[float], quaternion: Sequence[float]) -> None:
+        """Put what one sees through in front of the water."""
+        if self.glass:
+            self.particles.place(self.glass, position_m, quaternion)
+
+    def place_particles(self, positions_m: Array) -> None:
+        """Put the particles at positions (P, 3), out of sight where NaN."""
+        for name, place in zip(self._particles, positions_m.tolist(), strict=True):
+            if any(map(math.isnan, place)):
+                self.particles.hide(name)
+            else:
+                self.particles.place(name, place)
 
 
-class Stage:
-    """A set of meshes that is drawn together."""
+class Stages:
+    """The few stages that all bodies and tasks share, each made when it is first needed."""
 
-    def __init__(self, meshes: Mapping[str, Mesh], palette: Palette, texture: Path) -> None:
-        self._client = DrawingClient(texture)
-        for name, mesh in meshes.items():
-            self._client.add_mesh(name, mesh.vertices, mesh.normals, palette.coordinates(mesh.paint), mesh.faces)
+    def __init__(self) -> None:
+        self.paints = Paints()
+        self._made: dict[str, Stage] = {}
+        room = room_look.room_meshes(self.paints.palette, chair_look.chair(human.BROAD))
+        self.room = tuple(room)
+        self.still.add(room)
 
-    def close(self) -> None:
-        self._client.close()
+    @property
+    def still(self) -> Stage:
+        """Room, robot bases, trunks and chairs."""
+        return self._stage("still")
 
-    def place(self, name: str, position_m: Sequence[float] | Array, quaternion: Sequence[float] | Array) -> None:
-        self._client.place(name, position_m, quaternion)
+    @property
+    def person(self) -> Stage:
+        """Heads and arms."""
+        return self._stage("person", with_skin=True)
 
-    def draw_raw(
-        self, camera: Camera, rectangle: Rectangle | None, width: int, height: int, light: Lighting
-    ) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.float32]]:
-        """Colours (h, w, 4) and depth (h, w), valid until the next call."""
-        return self._client.draw(width, height, flat(camera.view), flat(camera.projection(rectangle)), *light)
+    @property
+    def limbs(self) -> Stage:
+        """Arms of persons that move during a clip."""
+        return self._stage("limbs", with_skin=True)
 
-    def draw(self, camera: Camera, rectangle: Rectangle | None, width: int, height: int, light: Lighting) -> Layer:
-        """One pass, copied."""
-        rgba, depth = self.draw_raw(camera, rectangle, width, height, light)
-        return Layer(rgba[..., :3].copy(), depth.copy())
+    @property
+    def upper(self) -> Stage:
+        """The thick links of robots."""
+        return self._stage("upper")
 
+    @property
+    def casters(self) -> Stage:
+        """Coarse robots and tools, for the shadows they cast."""
+        return self._stage("casters")
 
-class Boxes(NamedTuple):
-    """Corners of the moving meshes' bounding boxes in their own frames."""
+    @property
+    def water(self) -> Stage:
+        """Balls of water, drawn apart because they run together."""
+        return self._stage("water")
 
-    names: tuple[str, ...]
-    corners_m: Array
-    """(L, 8, 3)"""
-
-
-class Scene:
-    """All stages. Building one takes about a second; it is meant to live as long as its process."""
-
-    def __init__(self, food_count: int, food_radius_m: float) -> None:
-        palette = Palette()
-        arm = arm_look.arm_meshes(arm_look.Detail(palette, sides=14))
-        foods = {
-            food_name(index): arm_look.food_mesh(arm_look.Detail(palette), FOOD[index % len(FOOD)], food_radius_m)
-            for index in range(food_count)
-        }
-        with tempfile.TemporaryDirectory() as folder:
-            texture = Path(folder) / "palette.png"
-            Image.fromarray(palette.texture()).save(texture)
-            self.still = Stage(_still_meshes(palette), palette, texture)
-            head = {"head": head_look.head_mesh(palette), "neck": body_look.neck_mesh(palette)}
-            self.head = Stage(head, palette, texture)
-            self.upper_arm = Stage({name: arm[name] for name in UPPER_ARM}, palette, texture)
-            self.forearm = Stage({name: arm[name] for name in arm if name not in UPPER_ARM} | foods, palette, texture)
-            fine = arm_look.arm_meshes(arm_look.Detail(palette, sides=18))
-            self.hand = Stage({name: fine[name] for name in HAND_PARTS} | foods, palette, texture)
-            self.casters = Stage(arm_look.arm_meshes(arm_look.Detail(palette, sides=6)), palette, texture)
-        self.boxes = _boxes(arm)
+    def forearm(self, robot: Robot, grip: Grip) -> Stage:
+        """The thin links of one robot, its hand in one grip, and every tool that is held with it."""
+        return self._stage(f"forearm of {robot.name}, {grip}")
 
     def close(self) -> None:
         """Free every client."""
-        for stage in (self.still, self.head, self.upper_arm, self.forearm, self.hand, self.casters):
+        for stage in self._made.values():
             stage.close()
+        self.paints.close()
 
-    def turn_head(self, quaternion: Sequence[float] | Array) -> None:
-        self.head.place("head", NECK_PIVOT_M, quaternion)
-
-
-def food_name(index: int) -> str:
-    return f"food_{index}"
-
-
-def _still_meshes(palette: Palette) -> dict[str, Mesh]:
-    person = union(body_look.shirt(), body_look.arms(), body_look.trousers())
-    chair = chair_look.chair()
-    base = arm_look.base_mesh(arm_look.Detail(palette)).moved(arm_look.base_turn(), jaco.ROBOT_BASE_M)
-    return {
-        "body": body_look.body_mesh(palette, chair),
-        "chair": chair_look.chair_mesh(palette, person),
-        "base": base,
-        **room_look.room_meshes(palette, union(person, chair)),
-    }
+    def _stage(self, name: str, with_skin: bool = False) -> Stage:
+        if name not in self._made:
+            self._made[name] = Stage(self.paints, with_skin)
+        return self._made[name]
 
 
-def _boxes(meshes: Mapping[str, Mesh]) -> Boxes:
-    corners = []
-    for mesh in meshes.values():
-        lower, upper = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
-        choose = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
-        corners.append(np.where(choose == 1, upper, lower))
-    return Boxes(tuple(meshes), np.array(corners))
+class Scene:
+    """Everything there is to draw, made when it is first needed and shared by all clips."""
+
+    def __init__(self) -> None:
+        self.stages = Stages()
+        self._sitters: dict[str, Sitter] = {}
+        self._kits: dict[str, Kit] = {}
+
+    def sitter(self, body: BodyShape) -> Sitter:
+        """One of the bodies."""
+        if body.name not in self._sitters:
+            self._sitters[body.name] = Sitter(body, self.stages)
+        return self._sitters[body.name]
+
+    def kit(self, task: str, robot: Robot, tool: Tool, look: TaskLook) -> Kit:
+        """The robot as it is equipped for a task."""
+        if task not in self._kits:
+            self._kits[task] = Kit(task, robot, tool, look, self.stages)
+        return self._kits[task]
+
+    def close(self) -> None:
+        """Free every client."""
+        self.stages.close()

@@ -1,0 +1,138 @@
+"""Who and what is filmed in one clip: the person posed, at rest or moving, and the robot frame by frame."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from worker.sim.camera import Camera, lamp
+from worker.sim.human import LEFT, RIGHT
+from worker.sim.layers import MOVING_LAMP_SIZE, STILL_LAMP_SIZE
+from worker.sim.motion import Motion, quaternions
+from worker.sim.scene import UPPER_LINKS, Kit, Sitter, Stages
+from worker.sim.shots import BODY_LIGHT, DEPTH_ONLY, Depth, Part
+from worker.sim.solids import Array
+from worker.sim.stage import GONE_M, Stage
+from worker.sim.task_look import TaskLook
+
+HOLD_RAD = 0.0015
+"""An arm that has turned by less than this since it was last drawn stays as it is: less than half a pixel."""
+
+
+@dataclass(frozen=True)
+class Shoot:
+    """Who and what is filmed in one clip, and from where."""
+
+    camera: Camera
+    look: TaskLook
+    kit: Kit
+    sitter: Sitter
+    motion: Motion
+
+    def boxes(self, corners_m: Array) -> Array:
+        """Boxes (..., 4) in pixels around corners (..., 8, 3)."""
+        pixels = self.camera.pixels(corners_m)
+        return np.concatenate([pixels.min(axis=-2) - 1.5, pixels.max(axis=-2) + 1.5], axis=-1)
+
+
+class Person:
+    """The person's head and arms during one clip: each rests in the still picture, or moves frame by frame."""
+
+    def __init__(self, shoot: Shoot, stages: Stages) -> None:
+        self._shoot, self._stages, motion = shoot, stages, shoot.motion
+        self._moving = [side for side in (RIGHT, LEFT) if motion.arm_moves(side)]
+        self._held: Array | None = None
+        self._pose = 0
+        self._stages.person.hide_all_but(())
+        self._arms = [shoot.sitter.pose_arm(stages.person, side, motion.arms_rad[0, side]) for side in (RIGHT, LEFT)]
+        self._head = shoot.sitter.turn_head(motion.head_quaternions[0])
+
+    def lamp_depth(self) -> Depth:
+        """What the lamp sees of head and arms in the first frame; their own shadows stay where they are."""
+        return still_lamp_depth(self._stages.person)
+
+    def resting(self) -> list[Part]:
+        """What rests during the clip. Everything else is out of sight from now on."""
+        shoot, boxes = self._shoot, []
+        for side in (RIGHT, LEFT):
+            if side in self._moving:
+                for name in shoot.sitter.arm_names(side):
+                    self._stages.person.hide(name)
+            else:
+                boxes.append(self._arms[side])
+        if shoot.motion.head_moves:
+            shoot.sitter.hide_head()
+        else:
+            boxes.append(self._head)
+        if not boxes:
+            return []
+        corners, head_m = np.concatenate(boxes), self._head[0].mean(axis=0)
+        return [Part(self._stages.person, shoot.boxes(corners), BODY_LIGHT, alive=True, head_m=head_m)]
+
+    def keep_only_what_moves(self) -> None:
+        """To be called once the resting parts are in the picture."""
+        self._stages.person.hide_all_but(())
+
+    def moving(self, index: int) -> list[Part]:
+        """What of the person moves, posed for a frame."""
+        shoot, motion, parts = self._shoot, self._shoot.motion, []
+        if self._moving:
+            arms_rad = motion.arms_rad[index, self._moving]
+            if self._held is None or np.abs(arms_rad - self._held).max() > HOLD_RAD:
+                self._held, self._pose, self._moved = arms_rad, self._pose + 1, self._pose_arms(arms_rad)
+            parts.append(Part(self._stages.limbs, shoot.boxes(self._moved), BODY_LIGHT, alive=True, pose=self._pose))
+        if motion.head_moves:
+            corners = shoot.sitter.turn_head(motion.head_quaternions[index])
+            parts.append(Part(self._stages.person, shoot.boxes(corners), BODY_LIGHT, alive=True, pose=-1 - index))
+        return parts
+
+    def _pose_arms(self, arms_rad: Array) -> Array:
+        """Pose the moving arms (A, 4), and give the corners (2 A, 8, 3) of boxes around their segments."""
+        sitter, tone = self._shoot.sitter, self._shoot.motion.skin_tone
+        stages = [sitter.moving_arm(side, tone) for side in self._moving]
+        stages[0].hide_all_but([name for side in self._moving for name in sitter.arm_names(side)])
+        posed = zip(stages, self._moving, arms_rad, strict=True)
+        return np.concatenate([sitter.pose_arm(*each) for each in posed])
+
+
+def moving_parts(shoot: Shoot) -> Iterator[list[Part]]:
+    """The robot, its tool and the particles, posed frame by frame."""
+    kit, motion = shoot.kit, shoot.motion
+    turned = np.einsum("nlij,lcj->nlci", motion.frames[..., :3, :3], kit.corners_m)
+    links = shoot.boxes(turned + motion.frames[:, :, None, :3, 3])
+    drops_px = kit.radius_m * shoot.camera.pixels_per_m(motion.target_m[0])
+    particles = _particle_boxes(shoot, 1.5 * drops_px + 2.0)
+    turns = quaternions(motion.frames[..., :3, :3]).tolist()
+    places = motion.frames[..., :3, 3].tolist()
+    for index in range(len(motion)):
+        for part in range(len(kit.names)):
+            kit.place(part, places[index][part], turns[index][part])
+        kit.place_particles(motion.particles_m[index])
+        upper, near = Part(kit.upper, links[index, :UPPER_LINKS]), links[index, UPPER_LINKS:]
+        if shoot.look.water:
+            show_glass = partial(kit.place_glass, places[index][-1], turns[index][-1])
+            water = Part(kit.particles, particles[index], prepare=kit.hide_glass, drops_px=drops_px)
+            glass = Part(kit.particles, links[index, -1:], prepare=show_glass, glass=True)
+            yield [upper, Part(kit.forearm, near), water, *([glass] if kit.glass else [])]
+        else:
+            yield [upper, Part(kit.forearm, np.concatenate([near, particles[index]]))]
+
+
+def _particle_boxes(shoot: Shoot, reach_px: float) -> Array:
+    """Boxes around every particle in every frame (N, P, 4), in pixels; an empty box when it is gone."""
+    particles = shoot.motion.particles_m
+    gone = np.asarray(np.isnan(particles).any(axis=-1))
+    centre = shoot.camera.pixels(np.where(gone[..., None], GONE_M, particles))
+    boxes = np.concatenate([centre - reach_px, centre + reach_px], axis=-1)
+    return np.where(gone[..., None], 0.0, boxes)
+
+
+def moving_lamp_depth(kit: Kit) -> Depth:
+    return kit.casters.draw_raw(lamp(MOVING_LAMP_SIZE), None, MOVING_LAMP_SIZE, MOVING_LAMP_SIZE, DEPTH_ONLY)[1]
+
+
+def still_lamp_depth(stage: Stage) -> Depth:
+    """Depth of a still stage as the lamp sees it."""
+    size = STILL_LAMP_SIZE
+    return stage.draw(lamp(size), None, size, size, DEPTH_ONLY).depth

@@ -1,0 +1,57 @@
+"""How each task is filmed: from where, what the inset shows, and what its particles look like.
+
+A task that is not listed is filmed like Feeding, its particles as balls of its own size.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from worker.sim.colours import FOOD, WATER
+from worker.sim.drinking import pellet_radius_m
+from worker.sim.food import BALL_RADIUS_M
+
+Point = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class TaskLook:
+    """The film of one task."""
+
+    eye_m: Point
+    target_m: Point
+    field_of_view_deg: float
+    inset_zoom: float
+    inset_focus: tuple[float, float]
+    """where the target lies in the inset, as shares of its width and height"""
+    particle_colours: tuple[str, ...] = FOOD
+    particle_radius_m: Callable[[int], float] = lambda count: BALL_RADIUS_M
+    """of each when there are so many"""
+    particle_scale: float = 1.2
+    """how much larger they are drawn than simulated, so that pieces are seen and water holds together"""
+    water: bool = False
+    """whether the particles run together"""
+    itch: bool = False
+    """whether the target is marked as a red spot on the skin"""
+
+
+# From the person's left front, so that the arm never hides the mouth.
+FEEDING_LOOK = TaskLook((0.86, -1.02, 1.50), (-0.20, -0.26, 1.115), 38.0, 2.3, (0.68, 0.46))
+LOOKS = {
+    "feeding": FEEDING_LOOK,
+    "drinking": replace(
+        FEEDING_LOOK,
+        inset_zoom=2.0,
+        inset_focus=(0.66, 0.50),
+        particle_colours=WATER,
+        particle_radius_m=pellet_radius_m,
+        particle_scale=1.22,
+        water=True,
+    ),
+    # From the front, for the itch is on the outside or in front of the right arm.
+    "scratching": TaskLook((-0.28, -1.45, 1.55), (-0.30, -0.20, 0.97), 38.0, 2.2, (0.58, 0.55), itch=True),
+}
+
+
+def task_look(name: str) -> TaskLook:
+    """The look of a task, known by name or not."""
+    return LOOKS.get(name, FEEDING_LOOK)
