@@ -131,10 +131,8 @@ class Water:
 
     def _look(self, cup_m: FloatArray, rotation: FloatArray) -> int:
         """Read where every pellet is; returns how many have left the cup for good."""
-        self._positions = np.full((len(self.names), 3), np.nan)
-        for index, name in enumerate(self.names):
-            if name in self._present:
-                self._positions[index] = self._world.position(name)
+        self._positions = self._world.positions(self.names)
+        self._positions[[name not in self._present for name in self.names]] = np.nan
         for index in np.flatnonzero(self._positions[:, 2] < FLOOR_M).tolist():
             self._remove(self.names[index])
         local = (self._positions - cup_m) @ rotation
