@@ -11,6 +11,7 @@ import argparse
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ import worker
 from worker.ml.policies import GaussianPolicy
 from worker.sim.assistive import AssistiveEnv
 from worker.sim.catalogue import ENVIRONMENTS
+from worker.sim.drinking import DrinkingEnv
 
 BENCHMARK_STEPS_PER_S = {"feeding": 160.0, "drinking": 21.0, "scratching": 268.0}
 """Medians measured on a comparable core (facts sheet of Assistive Gym v1.0); Drinking with 64 pellets."""
@@ -40,7 +42,7 @@ def main() -> None:
     for name, kind in ENVIRONMENTS.items():
         if name == "drinking":
             for pellets in PELLETS:
-                _row(f"{name}, {pellets} pellets", name, lambda kind=kind, pellets=pellets: kind(pellets=pellets))
+                _row(f"{name}, {pellets} pellets", name, partial(DrinkingEnv, pellets=pellets))
         else:
             _row(name, name, kind)
     for name, kind in ENVIRONMENTS.items():
@@ -78,7 +80,7 @@ def _stepping(env: AssistiveEnv, act: Callable[[np.ndarray], np.ndarray]) -> tup
             actions_s += time.process_time() - before
             observation, *_ = env.step(action)
         spent += time.process_time() - start - actions_s
-    del env._world.step  # type: ignore[attr-defined]  # the class' own method again
+    del env._world.step  # the class' own method again
     return spent / (EPISODES * steps), engine.seconds / spent
 
 

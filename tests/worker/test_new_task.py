@@ -52,7 +52,8 @@ def test_the_example_can_be_done_and_counts_gentle_touches(env: AssistiveEnv) ->
         goal = away + 0.01 * outward
         step = tool[:3, 3] + goal * min(1.0, 0.02 / max(float(np.linalg.norm(goal)), 1e-6))
         wanted, _ = env.robot.solve_pose(joints[None], step[None], tool[:3, :3], env.tool, 5)
-        return np.clip((wanted[0] - joints) / 0.05, -1, 1).astype(np.float32)
+        action: np.ndarray = np.clip((wanted[0] - joints) / 0.05, -1, 1).astype(np.float32)
+        return action
 
     trajectories = [rollout(env, towards_mouth, scenario) for scenario in range(6)]
     assert sum(each.success for each in trajectories) >= 2
