@@ -18,7 +18,7 @@ from worker.sim.highlight import Highlight
 from worker.sim.human import RIGHT
 from worker.sim.jaco import JACO
 from worker.sim.motion import clip_motion
-from worker.sim.render import INSET_CORNER_PX, ClipRenderer, RenderStyle
+from worker.sim.render import INSET_MARGIN_PX, ClipRenderer, RenderStyle
 from worker.sim.scratching import ScratchingEnv
 from worker.sim.shots import Shot
 from worker.sim.stage import Stage
@@ -185,7 +185,7 @@ def test_a_task_nobody_designed_a_look_for_is_filmed_all_the_same() -> None:
 
 
 def test_pressing_warms_the_frame_of_the_inset(renderer: ClipRenderer) -> None:
-    x, y = INSET_CORNER_PX[0] - 2, INSET_CORNER_PX[1] + 40
+    x, y = INSET_MARGIN_PX - 2, INSET_MARGIN_PX + 40
     calm, pressing = (pictures(renderer, force)[-1][y, x].astype(int) for force in (0.0, 15.0))
     assert (calm == 255).all()
     assert pressing == pytest.approx(np.array(Highlight.WARM), abs=2)

@@ -40,7 +40,7 @@ EDGE_BLUR_PX = 0.3
 """Smooths the edges of moving parts for less than half of what more pixels would cost."""
 CLEAR_SHARPNESS = 0.64
 """Water and glass are drawn on a coarser grid: the one is blurred anyway, the other is faint."""
-GLASS_OPACITY = 0.42
+GLASS_OPACITY = 0.34
 
 HEAD_RADIUS_M = 0.20
 """Everything of head and arms this close to the middle of the head is head or neck."""

@@ -130,7 +130,7 @@ class ClipRenderer:
             highlight.draw(picture, index)
             if inset is not None:
                 near = frame._replace(parts=[part for part in frame.parts if part.stage is not shoot.kit.upper])
-                _paste_inset(picture, inset.frame(near), highlight.border(index))
+                _paste_inset(picture, inset.frame(near), shoot.look.inset_on_right, highlight.border(index))
             yield picture
 
     def _main_view(self, shoot: Shoot, task: str) -> tuple[View, Still]:
@@ -153,13 +153,12 @@ class ClipRenderer:
         return View(shoot.camera, rectangle, style.inset_width, style.inset_height, style.supersampling)
 
 
-INSET_CORNER_PX = (11, 11)
-INSET_BORDER_PX = 3
+INSET_MARGIN_PX, INSET_BORDER_PX = 11, 3
 
 
-def _paste_inset(picture: Image.Image, inset: Image.Image, border: tuple[int, int, int]) -> None:
-    x, y = INSET_CORNER_PX
-    edge = INSET_BORDER_PX
+def _paste_inset(picture: Image.Image, inset: Image.Image, on_right: bool, border: tuple[int, int, int]) -> None:
+    edge, y = INSET_BORDER_PX, INSET_MARGIN_PX
+    x = picture.width - inset.width - y if on_right else y
     picture.paste(border, (x - edge, y - edge, x + inset.width + edge, y + inset.height + edge))
     picture.paste(inset, (x, y))
 

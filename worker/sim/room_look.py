@@ -4,11 +4,11 @@ from worker.sim.colours import Palette
 from worker.sim.meshes import Mesh, joined, panel, softly_lit
 from worker.sim.solids import Array, Field, cone, smooth_step, union
 
-LEFT, RIGHT, FRONT, BACK, CEILING = -2.2, 1.6, -1.6, 1.5, 3.0
+LEFT, RIGHT, FRONT, BACK, CEILING = -2.2, 1.6, -2.6, 1.5, 3.0
 
 
 def room_meshes(palette: Palette, furniture: Field) -> dict[str, Mesh]:
-    """Floor, two walls and skirting boards."""
+    """Floor, three walls and skirting boards."""
 
     def wall(points: Array) -> Array:
         return palette.along("wall", smooth_step(points[:, 2], 1.9, 0.2))
@@ -23,14 +23,25 @@ def room_meshes(palette: Palette, furniture: Field) -> dict[str, Mesh]:
     floor = softly_lit(union(furniture, stand), floor, 0.5, 0.8)
     back = panel([(LEFT, BACK, 0), (RIGHT, BACK, 0), (RIGHT, BACK, CEILING), (LEFT, BACK, CEILING)], 20, 24, wall)
     side = panel([(LEFT, FRONT, 0), (LEFT, BACK, 0), (LEFT, BACK, CEILING), (LEFT, FRONT, CEILING)], 20, 24, side_wall)
-    return {"floor": floor, "walls": joined(back, side), "skirting": _skirting(palette)}
+    # The walls face the room only, so that every camera looks in through the one behind it.
+    right = panel(
+        [(RIGHT, BACK, 0), (RIGHT, FRONT, 0), (RIGHT, FRONT, CEILING), (RIGHT, BACK, CEILING)], 20, 24, side_wall
+    )
+    return {"floor": floor, "walls": joined(back, side, right), "skirting": _skirting(palette)}
 
 
 def _skirting(palette: Palette) -> Mesh:
     thick, high = 0.02, 0.10
     y, x = BACK - thick, LEFT + thick
     colour = palette.at("skirting")
+    opposite = RIGHT - thick
     return joined(
+        panel(
+            [(opposite, BACK, 0), (opposite, FRONT, 0), (opposite, FRONT, high), (opposite, BACK, high)], 8, 1, colour
+        ),
+        panel(
+            [(opposite, BACK, high), (opposite, FRONT, high), (RIGHT, FRONT, high), (RIGHT, BACK, high)], 8, 1, colour
+        ),
         panel([(LEFT, y, 0), (RIGHT, y, 0), (RIGHT, y, high), (LEFT, y, high)], 8, 1, colour),
         panel([(LEFT, y, high), (RIGHT, y, high), (RIGHT, BACK, high), (LEFT, BACK, high)], 8, 1, colour),
         panel([(x, FRONT, 0), (x, BACK, 0), (x, BACK, high), (x, FRONT, high)], 8, 1, colour),

@@ -23,6 +23,8 @@ class TaskLook:
     inset_zoom: float
     inset_focus: tuple[float, float]
     """where the target lies in the inset, as shares of its width and height"""
+    inset_on_right: bool = False
+    """whether the inset is in the right upper corner instead of the left one"""
     particle_colours: tuple[str, ...] = FOOD
     particle_radius_m: Callable[[int], float] = lambda count: BALL_RADIUS_M
     """of each when there are so many"""
@@ -47,8 +49,10 @@ LOOKS = {
         particle_scale=1.22,
         water=True,
     ),
-    # From the front, for the itch is on the outside or in front of the right arm.
-    "scratching": TaskLook((-0.28, -1.45, 1.55), (-0.30, -0.20, 0.97), 38.0, 2.2, (0.58, 0.55), itch=True),
+    # From the person's right, where the itch is; the robot comes from the person's front.
+    "scratching": TaskLook(
+        (-1.44, -0.14, 1.52), (-0.22, -0.35, 0.97), 40.0, 2.1, (0.40, 0.52), inset_on_right=True, itch=True
+    ),
 }
 
 

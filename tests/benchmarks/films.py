@@ -1,0 +1,16 @@
+"""Real trajectories to look at and to time: the behaviours of a pool, on people as different as there are."""
+
+from collections.abc import Iterator
+
+from worker import laboratory
+from worker.sim.rollout import rollout
+from worker.trajectory import Trajectory
+
+FIRST_SCENARIO = 7_000
+
+
+def films(task: str, count: int, first: int = FIRST_SCENARIO) -> Iterator[Trajectory]:
+    """The first behaviour of each of so many scenarios."""
+    for scenario in range(first, first + count):
+        behaviour = laboratory.behaviours(task, scenario, 1)[0]
+        yield rollout(laboratory.environment(task), laboratory.act_as(task, behaviour), scenario)
