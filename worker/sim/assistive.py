@@ -146,6 +146,8 @@ class AssistiveEnv(gymnasium.Env[Any, Any]):
 
         ``furnish`` adds what the task brings along, out of the way, and ``put_away`` moves it there again.
         """
+        if self._world.littered:
+            self._world.clear()
         if self._world.has(PERSON):
             self._world.remove(HEAD)
             self._world.remove(PERSON)

@@ -26,6 +26,8 @@ CONTACT_MARGIN_M = 0.001
 """Boxes of bodies that are further apart are not compared. The engine's own 2 cm would pair every pellet in a cup with
 every other; and because it is one number for the whole process, all worlds must agree on it."""
 CARRIER_MASS_KG = 1000.0
+MOST_REMOVED = 1000
+"""Of a removed person, some 20 kB stay behind."""
 
 _SHAPES = {"sphere": pybullet.GEOM_SPHERE, "capsule": pybullet.GEOM_CAPSULE, "box": pybullet.GEOM_BOX}
 _JOINTS = {"revolute": pybullet.JOINT_REVOLUTE, "fixed": pybullet.JOINT_FIXED}
@@ -156,6 +158,7 @@ class Bullet:
             physicsClientId=self.client,
         )
         pybullet.setGravity(0.0, 0.0, -self._gravity_m_s2, physicsClientId=self.client)
+        self._removed = 0
         self._bodies: dict[str, int] = {}
         self._names: dict[int, str] = {}
         self._links: dict[str, dict[str, int]] = {}
@@ -164,6 +167,11 @@ class Bullet:
         self._unseen: int = pybullet.createVisualShape(
             pybullet.GEOM_BOX, halfExtents=[0.001, 0.001, 0.001], physicsClientId=self.client
         )
+
+    @property
+    def littered(self) -> bool:
+        """Whether to clear this world now and then: what the engine keeps of removed bodies, it keeps until clear()."""
+        return self._removed >= MOST_REMOVED
 
     def add_body(
         self,
@@ -220,6 +228,7 @@ class Bullet:
         body = self._bodies.pop(name)
         pybullet.removeBody(body, physicsClientId=self.client)
         del self._names[body], self._links[name]
+        self._removed += 1
 
     def add_chain(
         self,
