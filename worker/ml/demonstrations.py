@@ -60,11 +60,18 @@ def collect(
     return Demonstrations(np.array(rows, np.float32), np.array(wanted, np.float32))
 
 
-def imitate(actor: "Actor", demonstrations: Demonstrations, steps: int) -> None:
-    """Fit the actor's mean to what was wanted, its spread to a usable first value."""
+def imitate(
+    actor: "Actor", demonstrations: Demonstrations, steps: int, early: int, watch: Callable[["Actor"], None]
+) -> None:
+    """Fit the actor's mean to what was wanted, its spread to a usable first value.
+
+    ``watch`` is called once after ``early`` steps.
+    """
     optimiser = torch.optim.Adam(actor.parameters(), IMITATION_LEARNING_RATE, fused=True)
     width = len(actor.offset)
     for step in range(steps):
+        if step == early:
+            watch(actor)
         optimiser.param_groups[0]["lr"] = IMITATION_LEARNING_RATE * (1.0 if step < 0.7 * steps else 0.2)
         rows, wanted = demonstrations.sample(IMITATION_BATCH)
         mean, log_std = actor(rows[:, :width])

@@ -77,6 +77,8 @@ class SacConfig:
     demonstration_share: float = 0.25
     """of every batch"""
     imitation_steps: int = 4_000
+    early_imitation_steps: int = 170
+    """After so few the imitation is still clumsy, and may be kept as an early policy."""
     imitation_weight: float = 0.5
     """of the imitation loss beside the actor's own, fading to 0 over imitation_updates"""
     imitation_updates: int = 40_000
@@ -384,16 +386,24 @@ class _Run:
         outcome = evaluate(self.test_env, policy.mean, EVALUATION_SEED, self.config.evaluation_episodes)
         temperature = float(self.learner.log_temperature.detach().exp())
         self.curve.append({"steps": self.steps, "cpu_s": round(self.cpu_s, 1), "alpha": temperature, **outcome})
-        for share in self.config.early_success:
-            early = self.folder / "early" / f"success_{round(100 * share)}.safetensors"
-            if share <= outcome["success"] < share + 0.25 and not early.exists():
-                early.parent.mkdir(exist_ok=True)
-                _replace(early, policy.save)
-                break
+        self._keep_early(policy, outcome["success"])
         if (outcome["success"], outcome["return"]) > self.best:
             self.best = (outcome["success"], outcome["return"])
             _replace(self.folder / "policy.safetensors", policy.save)
         return outcome
+
+    def _keep_early(self, policy: GaussianPolicy, success: float) -> None:
+        for share in self.config.early_success:
+            early = self.folder / "early" / f"success_{round(100 * share)}.safetensors"
+            if share <= success < share + 0.25 and not early.exists():
+                early.parent.mkdir(exist_ok=True)
+                _replace(early, policy.save)
+                break
+
+    def _watch_imitation(self, actor: Actor) -> None:
+        policy = actor.policy(self.config.action_limit)
+        outcome = evaluate(self.test_env, policy.mean, EVALUATION_SEED, self.config.evaluation_episodes)
+        self._keep_early(policy, outcome["success"])
 
     def finish(self) -> dict[str, Any]:
         """Test the exported policy on scenarios that played no part in the training; write the record."""
@@ -470,7 +480,14 @@ class _Run:
     def _imitate(self) -> None:
         if self.shown:
             self.learner = self._new_learner(self.shown.rows)
-            imitate(self.learner.actor, self.shown, self.config.imitation_steps)
+            config = self.config
+            imitate(
+                self.learner.actor,
+                self.shown,
+                config.imitation_steps,
+                config.early_imitation_steps,
+                self._watch_imitation,
+            )
             self.learner.average.load_state_dict(self.learner.actor.state_dict())
 
     def _scale(self, part: Field) -> float:

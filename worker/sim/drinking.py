@@ -77,8 +77,8 @@ DRINKING = Task(
         (
             Axis("speed_far", -1.0, 0.45, "log of the speed factor while the cup is far from the mouth"),
             Axis("speed_near", -1.0, 0.45, "log of the speed factor close to the mouth, before the cup is tipped"),
-            Axis("from_below", -0.8, 0.8, "how far below (+) or above (-) the mouth the approach passes"),
-            Axis("to_side", -0.6, 0.6, "how far to the person's left (+) or right (-) the approach swings"),
+            Axis("from_below", -0.5, 0.6, "how far below (+) or above (-) the mouth the approach passes"),
+            Axis("to_side", -0.5, 0.6, "how far to the person's left (+) or right (-) the approach swings"),
             Axis("hesitate", 0.0, 1.2, "how much the cup lingers a hand's breadth before the mouth"),
             Axis("tip_early", -0.3, 0.25, "how much further (+) or less (-) the cup is tipped on its way, in rad"),
             Axis("pour_angle", -0.06, 0.12, "how much further (+) or less (-) the cup is tipped at the mouth, in rad"),
