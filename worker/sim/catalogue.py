@@ -1,6 +1,7 @@
 """Every task there is, by the name under which studies know it."""
 
 from worker.sim.assistive import AssistiveEnv
+from worker.sim.drinking import DrinkingEnv
 from worker.sim.feeding import FeedingEnv
 
-ENVIRONMENTS: dict[str, type[AssistiveEnv]] = {env.task.name: env for env in (FeedingEnv,)}
+ENVIRONMENTS: dict[str, type[AssistiveEnv]] = {env.task.name: env for env in (FeedingEnv, DrinkingEnv)}
