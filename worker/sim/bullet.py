@@ -26,7 +26,7 @@ CONTACT_MARGIN_M = 0.001
 """Boxes of bodies that are further apart are not compared. The engine's own 2 cm would pair every pellet in a cup with
 every other; and because it is one number for the whole process, all worlds must agree on it."""
 CARRIER_MASS_KG = 1000.0
-MOST_REMOVED = 1000
+MOST_REMOVED = 100
 """Of a removed person, some 20 kB stay behind."""
 
 _SHAPES = {"sphere": pybullet.GEOM_SPHERE, "capsule": pybullet.GEOM_CAPSULE, "box": pybullet.GEOM_BOX}
