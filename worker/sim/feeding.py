@@ -37,7 +37,7 @@ FEEDING = Task(
             Axis("press", -0.4, 0.4, "how deep the spoon goes into the mouth: gentle (-) or pressing (+)"),
         ),
     ),
-    calibrated_speed_weight=1.14,
+    calibrated_speed_weight=1.56,
 )
 
 SPOON_LENGTH_M, SPOON_WIDTH_M, SPOON_DEPTH_M, SPOON_WALL_M = 0.050, 0.038, 0.011, 0.003
