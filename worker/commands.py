@@ -48,6 +48,7 @@ def _add_training(commands: _Commands) -> None:
     explore = commands.add_parser("explore", help=exploration.explore.__doc__)
     _add_task(explore)
     explore.add_argument("--work-directory", type=Path, help="finished blocks; default: explore/ in the data directory")
+    explore.add_argument("--scenarios", type=int, default=exploration.SCENARIOS, help="each in twelve modes")
     explore.add_argument("--processes", type=int, default=2)
     explore.set_defaults(act=_explore)
 
@@ -81,7 +82,10 @@ def _pretrain(options: argparse.Namespace) -> int:
 
 def _explore(options: argparse.Namespace) -> int:
     record = exploration.explore(
-        options.task, options.work_directory or Settings().data_dir / "explore" / options.task, options.processes
+        options.task,
+        options.work_directory or Settings().data_dir / "explore" / options.task,
+        options.processes,
+        options.scenarios,
     )
     sys.stdout.write(json.dumps(record, indent=2) + "\n")
     return 0

@@ -45,10 +45,10 @@ class Differences:
     """(scenarios,)"""
 
 
-def explore(task: str, work_directory: Path, processes: int) -> dict[str, Any]:
+def explore(task: str, work_directory: Path, processes: int, scenarios: int = SCENARIOS) -> dict[str, Any]:
     """Run what is missing, fit the response surface, write it and its record; returns the record."""
     work_directory.mkdir(parents=True, exist_ok=True)
-    starts = list(range(FIRST_SCENARIO, FIRST_SCENARIO + SCENARIOS, BLOCK))
+    starts = list(range(FIRST_SCENARIO, FIRST_SCENARIO + scenarios, BLOCK))
     files = [work_directory / f"differences-{start}.npz" for start in starts]
     missing = [(task, start, file) for start, file in zip(starts, files, strict=True) if not file.exists()]
     compute = Compute(processes)
@@ -58,7 +58,7 @@ def explore(task: str, work_directory: Path, processes: int) -> dict[str, Any]:
             compute.run_all(Lane.LEARNING, lambda: None, compare_block, batch)
             bar.update(len(batch))
     compute.close()
-    return _fit(task, _joined(files))
+    return _fit(task, scenarios, _joined(files))
 
 
 def compare_block(task: str, first: int, target: Path) -> None:
@@ -86,7 +86,7 @@ def _joined(files: list[Path]) -> Differences:
     return Differences(*(np.concatenate([each[name] for each in loaded]).astype(np.float64) for name in names))
 
 
-def _fit(task: str, found: Differences) -> dict[str, Any]:
+def _fit(task: str, scenarios: int, found: Differences) -> dict[str, Any]:
     family = laboratory.task(task).modes
     surface = response_surface.fit(family, found.modes, found.signals, found.success)
     surface.save(surface_file(task))
@@ -94,8 +94,8 @@ def _fit(task: str, found: Differences) -> dict[str, Any]:
     residual = ((found.signals - predicted) ** 2).mean(axis=0)
     spread = np.maximum((found.signals**2).mean(axis=0), 1e-12)
     record = {
-        "command": f"python -m worker explore --task {task}",
-        "scenarios": [FIRST_SCENARIO, FIRST_SCENARIO + SCENARIOS - 1],
+        "command": f"python -m worker explore --task {task} --scenarios {scenarios}",
+        "scenarios": [FIRST_SCENARIO, FIRST_SCENARIO + scenarios - 1],
         "modes_per_scenario": MODES_PER_SCENARIO,
         "axes": {axis.name: [axis.low, axis.high] for axis in family.axes},
         "reference_success": float(found.reference_success.mean()),
