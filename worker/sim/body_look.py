@@ -120,10 +120,10 @@ def trunk_mesh(body: BodyShape, palette: Palette, around: Field) -> Mesh:
     whole = union(trunk(body), mirrored(arm), around)
     cloth, z = BUILDS[body.name].cloth, body.shoulder_m[2]
     parts: list[tuple[Field, Region, str]] = [
-        (shirt(body), Region((-0.29, -0.10, 0.56), (0.29, 0.20, z + 0.13), 0.012), cloth),
+        (shirt(body), Region((-0.29, -0.10, 0.56), (0.29, 0.20, z + 0.13), 0.015), cloth),
         (collar(body), Region((-0.08, -0.04, z + 0.04), (0.08, 0.13, z + 0.15), 0.0055), f"{cloth}_trim"),
-        (trousers(body), Region((-0.22, -0.56, 0.04), (0.22, 0.24, 0.68), 0.022), "trousers"),
-        (shoes(), Region((-0.18, -0.66, 0.0), (0.18, -0.40, 0.20), 0.020), "shoe"),
+        (trousers(body), Region((-0.22, -0.56, 0.04), (0.22, 0.24, 0.68), 0.028), "trousers"),
+        (shoes(), Region((-0.18, -0.66, 0.0), (0.18, -0.40, 0.20), 0.024), "shoe"),
     ]
     meshes = []
     for field, region, name in parts:

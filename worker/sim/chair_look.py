@@ -26,7 +26,7 @@ def chair_mesh(body: BodyShape, palette: Palette, around: Field) -> Mesh:
     """The chair as one mesh; `around` is the person who sits in it."""
     solid = chair(body)
     whole = union(solid, around)
-    padding = surface(solid, (-0.27, -0.28, 0.36), (0.27, 0.33, 1.17), 0.016, palette.at("cushion"))
+    padding = surface(solid, (-0.27, -0.28, 0.36), (0.27, 0.33, 1.17), 0.021, palette.at("cushion"))
     padding = softly_lit(whole, padding, 0.08)
     metal, rest, under = palette.at("chair"), body.shoulder_m[0] + 0.016, rest_top_m(body) - 0.02
     parts = [padding]

@@ -36,7 +36,7 @@ EYE_RADIUS = 0.0165
 GAZE = np.array([-0.16, -1.0, -0.16])
 
 
-LOWER, UPPER, CELL_M = (-0.105, -0.135, -0.065), (0.105, 0.135, 0.245), 0.0048
+LOWER, UPPER, CELL_M = (-0.105, -0.135, -0.065), (0.105, 0.135, 0.245), 0.0054
 """The box that holds the head, and how finely its surface is drawn."""
 
 

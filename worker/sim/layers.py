@@ -193,11 +193,11 @@ class View:
             half = max(1, height // 2), max(1, width // 2)
             seen = seen_from_lamp(self._camera, rectangle, resampled(depth, *half), MOVING_LAMP_SIZE)
             portrait = self._portraits[rectangle] = Portrait(part.pose, rgba.copy(), depth.copy(), half, *seen)
+            if frame.itch_m is not None:
+                skin.mark_itch(portrait.rgba[..., :3], portrait.depth, self._camera, rectangle, frame.itch_m)
         colours = portrait.rgba.copy()
         dark = (frame.lamp_depth.ravel()[portrait.texel] < portrait.limit).reshape(portrait.coarse)
         skin.shade(colours[..., :3], as_mask(dark), 1.5 * self._zoom * self._supersampling.moving)
-        if frame.itch_m is not None:
-            skin.mark_itch(colours[..., :3], portrait.depth, self._camera, rectangle, frame.itch_m)
         return colours, portrait.depth
 
 

@@ -10,7 +10,7 @@ Pixels = tuple[int, int, int, int]
 CALL_COST_PX = 3000
 """A second drawing call costs about as much as this many pixels."""
 
-_CUTS = 22
+_CUTS = 12
 
 
 GRID_PX = 4
@@ -30,6 +30,8 @@ def cover(boxes: Array, width: int, height: int) -> list[Pixels]:
     boxes = boxes[(boxes[:, 2] > boxes[:, 0] + 0.5) & (boxes[:, 3] > boxes[:, 1] + 0.5)]
     if not len(boxes):
         return []
+    if len(boxes) == 1:
+        return [on_grid(boxes[0], width, height)]
     whole = np.concatenate([boxes[:, :2].min(axis=0), boxes[:, 2:].max(axis=0)])
     best, best_cost = [whole], (whole[2] - whole[0]) * (whole[3] - whole[1]) - CALL_COST_PX
     for axis in (0, 1):

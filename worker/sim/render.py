@@ -23,8 +23,8 @@ from worker.sim.solids import Array
 from worker.sim.task_look import task_look
 from worker.trajectory import Trajectory
 
-STILL_PICTURES = 6
-"""So many still pictures are kept, one per task and body."""
+STILL_PICTURES = 4
+"""So many still pictures of 7 MB are kept, one per task and body."""
 
 
 ANTI_ALIASED = Supersampling(still=1.5, moving=1.0)
@@ -112,23 +112,23 @@ class ClipRenderer:
     def _film(self, shoot: Shoot, task: str) -> Iterator[Image.Image]:
         style, motion = self.style, shoot.motion
         main, still = self._main_view(shoot, task)
-        person = Person(shoot, self._scene.stages)
+        inset = self._inset(shoot) if style.inset else None
+        inset_still = inset.still(self._scene.stages.still) if inset else None
+        person = Person(shoot, self._scene.stages.still)
         lamp_depth = np.minimum(still.lamp_depth, person.lamp_depth())
         resting, itch_m = person.resting(), motion.target_m[0] if shoot.look.itch else None
         main.start(still.picture, resting, itch_m, lamp_depth)
-        inset = None
-        if style.inset:
-            inset = self._inset(shoot)
-            inset.start(inset.still(self._scene.stages.still), resting, itch_m, lamp_depth)
-        person.keep_only_what_moves()
+        if inset and inset_still:
+            inset.start(inset_still, resting, itch_m, lamp_depth)
         force_n = motion.force_n if style.highlight_pressing else np.zeros(len(motion))
         highlight = Highlight(shoot.camera, force_n, motion.frames[:, -1, :3, 3], motion.target_m)
         for index, parts in enumerate(moving_parts(shoot)):
             itch_m = motion.target_m[index] if shoot.look.itch else None
             frame = Frame([*person.moving(index), *parts], moving_lamp_depth(shoot.kit), itch_m)
-            picture = main.frame(frame)
+            # A clear wall hardly shows at the size of the whole picture.
+            picture = main.frame(frame._replace(parts=[part for part in frame.parts if not part.glass or not inset]))
             highlight.draw(picture, index)
-            if inset is not None:
+            if inset:
                 near = frame._replace(parts=[part for part in frame.parts if part.stage is not shoot.kit.upper])
                 _paste_inset(picture, inset.frame(near), shoot.look.inset_on_right, highlight.border(index))
             yield picture

@@ -37,32 +37,34 @@ class Sitter:
         )
         self._arms = self._named(limb_look.arm_meshes(body, palette, cloth, union(trunk, chair)))
         head = {"head": head_look.head_mesh(body, palette), "neck": body_look.neck_mesh(body, palette)}
-        stages.still.add(self._trunk)
-        stages.person.add({**self._named(head), **self._arms})
+        self._head = self._named(head)
+        stages.still.add({**self._trunk, **self._arms, **self._head})
 
     def _named(self, meshes: Mapping[str, Mesh]) -> dict[str, Mesh]:
         return {f"{self.body.name}_{name}": mesh for name, mesh in meshes.items()}
 
     def sit(self, skin_tone: int, base: str) -> None:
-        """Take the place of any other sitter, beside this base of a robot."""
+        """Take the place of any other sitter, beside this base of a robot; head and arms are still out of sight."""
         shown = [*self._stages.room, base, *self._trunk]
-        self._stages.still.hide_all_but(shown)
+        for stage in (self._stages.still, *self._stages.if_made("alive")):
+            stage.hide_all_but(shown)
+            stage.repaint(skin_tone)
         for name in shown:
             self._stages.still.place(name)
-        self._stages.person.repaint(skin_tone)
+        self._skin_tone = skin_tone
 
-    def turn_head(self, quaternion: Sequence[float] | Array) -> Array:
+    def turn_head(self, stage: Stage, quaternion: Sequence[float] | Array) -> Array:
         """Turn it, and give the corners (1, 8, 3) in the world of a box that holds head and neck."""
-        stage, head, neck = self._stages.person, f"{self.body.name}_head", f"{self.body.name}_neck"
+        head, neck = self.head_names
         stage.place(head, self.body.neck_pivot_m, quaternion)
         stage.place(neck)
         turned = stage.corners_m(head) @ rotation_of(quaternion).T + np.array(self.body.neck_pivot_m)
         return corners_around(np.concatenate([turned, stage.corners_m(neck)]))[None]
 
-    def hide_head(self) -> None:
-        """Put head and neck out of sight."""
-        for part in ("head", "neck"):
-            self._stages.person.hide(f"{self.body.name}_{part}")
+    @property
+    def head_names(self) -> tuple[str, str]:
+        """Head and neck."""
+        return f"{self.body.name}_head", f"{self.body.name}_neck"
 
     def pose_arm(self, stage: Stage, side: int, arm_rad: Array) -> Array:
         """Pose the right or left arm, and give the corners (2, 8, 3) in the world of boxes around its two segments."""
@@ -79,11 +81,11 @@ class Sitter:
         prefix = f"{self.body.name}_{('right', 'left')[side]}"
         return f"{prefix}_upper_arm", f"{prefix}_forearm"
 
-    def moving_arm(self, side: int, skin_tone: int) -> Stage:
-        """The stage for arms that move during a clip, with this arm on it."""
-        stage = self._stages.limbs
-        stage.add({name: self._arms[name] for name in self.arm_names(side)})
-        stage.repaint(skin_tone)
+    def alive(self, names: Sequence[str]) -> Stage:
+        """The stage for what moves of persons during a clip, with these parts on it."""
+        stage, parts = self._stages.alive, {**self._arms, **self._head}
+        stage.add({name: parts[name] for name in names})
+        stage.repaint(self._skin_tone)
         return stage
 
 
@@ -94,7 +96,7 @@ class Kit:
         self._task, self._look, held = task, look, tool_look(tool)
         self._palette = stages.paints.palette
         detail, coarse = arm_look.Detail(self._palette, sides=14), arm_look.Detail(self._palette, sides=6)
-        self.upper, self.casters = stages.upper, stages.casters
+        self.upper, self.casters = stages.upper, stages.small
         self.forearm = stages.forearm(robot, held.grip)
         links = arm_look.arm_meshes(detail, robot, held.grip)
         # The shadows of two grips must not be mixed up either.
@@ -109,10 +111,10 @@ class Kit:
         self.forearm.add({**{name: named[name] for name in named if name not in far}, tool.name: held.solid(detail)})
         shadows = arm_look.arm_meshes(coarse, robot, held.grip)
         self.casters.add(dict(zip(self.names, (*shadows.values(), held.solid(coarse)), strict=True)))
-        self.particles = stages.water if look.water else self.forearm
+        self.particles = stages.small if look.water else self.forearm
         self.glass = f"{tool.name} glass" if held.glass else None
         if self.glass and held.glass:
-            stages.water.add({self.glass: held.glass(detail)})
+            self.particles.add({self.glass: held.glass(detail)})
         self._particles: list[str] = []
         self.radius_m = 0.0
         """of the particles as drawn"""
@@ -140,10 +142,16 @@ class Kit:
         (self.upper if part < UPPER_LINKS else self.forearm).place(name, position_m, quaternion)
         self.casters.place(name, position_m, quaternion)
 
-    def hide_glass(self) -> None:
-        """Put what one sees through out of sight, to draw the water alone."""
+    def show_casters(self) -> None:
+        """Be ready to draw the shadow of robot, tool and water."""
         if self.glass:
             self.particles.hide(self.glass)
+
+    def show_water(self) -> None:
+        """Be ready to draw the water alone; the casters come back when they are placed."""
+        self.show_casters()
+        for name in self.names:
+            self.casters.hide(name)
 
     def place_glass(self, position_m: Sequence[float], quaternion: Sequence[float]) -> None:
         """Put what one sees through in front of the water."""
@@ -171,18 +179,13 @@ class Stages:
 
     @property
     def still(self) -> Stage:
-        """Room, robot bases, trunks and chairs."""
-        return self._stage("still")
+        """Room, robot bases, chairs and persons: what is drawn at the start of a clip."""
+        return self._stage("still", with_skin=True)
 
     @property
-    def person(self) -> Stage:
-        """Heads and arms."""
-        return self._stage("person", with_skin=True)
-
-    @property
-    def limbs(self) -> Stage:
-        """Arms of persons that move during a clip."""
-        return self._stage("limbs", with_skin=True)
+    def alive(self) -> Stage:
+        """Arms and heads of persons that move during a clip."""
+        return self._stage("alive", with_skin=True)
 
     @property
     def upper(self) -> Stage:
@@ -190,14 +193,13 @@ class Stages:
         return self._stage("upper")
 
     @property
-    def casters(self) -> Stage:
-        """Coarse robots and tools, for the shadows they cast."""
-        return self._stage("casters")
+    def small(self) -> Stage:
+        """What is quickly drawn: coarse robots and tools for the shadows they cast; water, and what holds it."""
+        return self._stage("small")
 
-    @property
-    def water(self) -> Stage:
-        """Balls of water, drawn apart because they run together."""
-        return self._stage("water")
+    def if_made(self, name: str) -> list[Stage]:
+        """A stage by name, or nothing if no clip has needed it yet."""
+        return [self._made[name]] if name in self._made else []
 
     def forearm(self, robot: Robot, grip: Grip) -> Stage:
         """The thin links of one robot, its hand in one grip, and every tool that is held with it."""

@@ -10,14 +10,14 @@ from worker.sim.camera import Camera, lamp
 from worker.sim.human import LEFT, RIGHT
 from worker.sim.layers import MOVING_LAMP_SIZE, STILL_LAMP_SIZE
 from worker.sim.motion import Motion, quaternions
-from worker.sim.scene import UPPER_LINKS, Kit, Sitter, Stages
+from worker.sim.scene import UPPER_LINKS, Kit, Sitter
 from worker.sim.shots import BODY_LIGHT, DEPTH_ONLY, Depth, Part
 from worker.sim.solids import Array
 from worker.sim.stage import GONE_M, Stage
 from worker.sim.task_look import TaskLook
 
-HOLD_RAD = 0.0015
-"""An arm that has turned by less than this since it was last drawn stays as it is: less than half a pixel."""
+HOLD_RAD = 0.0025
+"""An arm that has turned by less than this since it was last drawn stays as it is: half a pixel."""
 
 
 @dataclass(frozen=True)
@@ -39,61 +39,58 @@ class Shoot:
 class Person:
     """The person's head and arms during one clip: each rests in the still picture, or moves frame by frame."""
 
-    def __init__(self, shoot: Shoot, stages: Stages) -> None:
-        self._shoot, self._stages, motion = shoot, stages, shoot.motion
+    def __init__(self, shoot: Shoot, stage: Stage) -> None:
+        """Hides everything else on the still stage and poses the first frame."""
+        self._shoot, self._stage, sitter, motion = shoot, stage, shoot.sitter, shoot.motion
         self._moving = [side for side in (RIGHT, LEFT) if motion.arm_moves(side)]
         self._held: Array | None = None
         self._pose = 0
-        self._stages.person.hide_all_but(())
-        self._arms = [shoot.sitter.pose_arm(stages.person, side, motion.arms_rad[0, side]) for side in (RIGHT, LEFT)]
-        self._head = shoot.sitter.turn_head(motion.head_quaternions[0])
+        stage.hide_all_but(())
+        self._arms = [sitter.pose_arm(stage, side, motion.arms_rad[0, side]) for side in (RIGHT, LEFT)]
+        self._head = sitter.turn_head(stage, motion.head_quaternions[0])
 
     def lamp_depth(self) -> Depth:
         """What the lamp sees of head and arms in the first frame; their own shadows stay where they are."""
-        return still_lamp_depth(self._stages.person)
+        return still_lamp_depth(self._stage)
 
     def resting(self) -> list[Part]:
         """What rests during the clip. Everything else is out of sight from now on."""
-        shoot, boxes = self._shoot, []
+        shoot, sitter = self._shoot, self._shoot.sitter
+        shown: list[str] = []
+        boxes: list[Array] = []
         for side in (RIGHT, LEFT):
-            if side in self._moving:
-                for name in shoot.sitter.arm_names(side):
-                    self._stages.person.hide(name)
-            else:
+            if side not in self._moving:
+                shown += sitter.arm_names(side)
                 boxes.append(self._arms[side])
-        if shoot.motion.head_moves:
-            shoot.sitter.hide_head()
-        else:
+        if not shoot.motion.head_moves:
+            shown += sitter.head_names
             boxes.append(self._head)
+        self._stage.hide_all_but(shown)
         if not boxes:
             return []
         corners, head_m = np.concatenate(boxes), self._head[0].mean(axis=0)
-        return [Part(self._stages.person, shoot.boxes(corners), BODY_LIGHT, alive=True, head_m=head_m)]
-
-    def keep_only_what_moves(self) -> None:
-        """To be called once the resting parts are in the picture."""
-        self._stages.person.hide_all_but(())
+        return [Part(self._stage, shoot.boxes(corners), BODY_LIGHT, alive=True, head_m=head_m)]
 
     def moving(self, index: int) -> list[Part]:
         """What of the person moves, posed for a frame."""
-        shoot, motion, parts = self._shoot, self._shoot.motion, []
-        if self._moving:
-            arms_rad = motion.arms_rad[index, self._moving]
-            if self._held is None or np.abs(arms_rad - self._held).max() > HOLD_RAD:
-                self._held, self._pose, self._moved = arms_rad, self._pose + 1, self._pose_arms(arms_rad)
-            parts.append(Part(self._stages.limbs, shoot.boxes(self._moved), BODY_LIGHT, alive=True, pose=self._pose))
+        motion, sitter = self._shoot.motion, self._shoot.sitter
+        names: list[str] = []
+        if not self._moving and not motion.head_moves:
+            return []
+        state = np.concatenate([motion.arms_rad[index, self._moving].ravel(), motion.head_quaternions[index]])
+        for side in self._moving:
+            names += sitter.arm_names(side)
         if motion.head_moves:
-            corners = shoot.sitter.turn_head(motion.head_quaternions[index])
-            parts.append(Part(self._stages.person, shoot.boxes(corners), BODY_LIGHT, alive=True, pose=-1 - index))
-        return parts
-
-    def _pose_arms(self, arms_rad: Array) -> Array:
-        """Pose the moving arms (A, 4), and give the corners (2 A, 8, 3) of boxes around their segments."""
-        sitter, tone = self._shoot.sitter, self._shoot.motion.skin_tone
-        stages = [sitter.moving_arm(side, tone) for side in self._moving]
-        stages[0].hide_all_but([name for side in self._moving for name in sitter.arm_names(side)])
-        posed = zip(stages, self._moving, arms_rad, strict=True)
-        return np.concatenate([sitter.pose_arm(*each) for each in posed])
+            names += sitter.head_names
+        stage = sitter.alive(names)
+        if self._held is None or np.abs(state - self._held).max() > HOLD_RAD:
+            self._held, self._pose = state, self._pose + 1
+            stage.hide_all_but(names)
+            corners = [sitter.pose_arm(stage, side, motion.arms_rad[index, side]) for side in self._moving]
+            if motion.head_moves:
+                corners.append(sitter.turn_head(stage, motion.head_quaternions[index]))
+            self._boxes = self._shoot.boxes(np.concatenate(corners))
+        return [Part(stage, self._boxes, BODY_LIGHT, alive=True, pose=self._pose)]
 
 
 def moving_parts(shoot: Shoot) -> Iterator[list[Part]]:
@@ -112,7 +109,7 @@ def moving_parts(shoot: Shoot) -> Iterator[list[Part]]:
         upper, near = Part(kit.upper, links[index, :UPPER_LINKS]), links[index, UPPER_LINKS:]
         if shoot.look.water:
             show_glass = partial(kit.place_glass, places[index][-1], turns[index][-1])
-            water = Part(kit.particles, particles[index], prepare=kit.hide_glass, drops_px=drops_px)
+            water = Part(kit.particles, particles[index], prepare=kit.show_water, drops_px=drops_px)
             glass = Part(kit.particles, links[index, -1:], prepare=show_glass, glass=True)
             yield [upper, Part(kit.forearm, near), water, *([glass] if kit.glass else [])]
         else:
@@ -129,6 +126,8 @@ def _particle_boxes(shoot: Shoot, reach_px: float) -> Array:
 
 
 def moving_lamp_depth(kit: Kit) -> Depth:
+    """Depth of the robot, its tool and water as the lamp sees them."""
+    kit.show_casters()
     return kit.casters.draw_raw(lamp(MOVING_LAMP_SIZE), None, MOVING_LAMP_SIZE, MOVING_LAMP_SIZE, DEPTH_ONLY)[1]
 
 
