@@ -22,6 +22,12 @@ TRAINING: Mapping[str, Mapping[str, Any]] = {
         "imitation_updates": 60_000,
         "evaluation_episodes": 100,
     },
+    "scratching": {
+        "total_steps": 120_000,
+        "training_limit": 0.7,
+        "evaluate_every_steps": 2_500,
+        "input_scales": {"tip_to_last_stroke_m": 30.0, "tool_to_target_m": 10.0, "force_on_person_n": 0.3},
+    },
 }
 """What a task's training does otherwise than SacConfig's defaults."""
 

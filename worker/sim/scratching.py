@@ -16,7 +16,7 @@ from worker.sim.bullet import Bullet, Contact, Shape, capsule_between, rotation_
 from worker.sim.human import ArmRange, Impairment
 from worker.sim.jaco import PI
 from worker.sim.measures import HIGH_FORCE_N, Outcome, StepMeasures, TaskReward
-from worker.sim.yielding_arm import FOREARM, UPPER_ARM, YieldingArm
+from worker.sim.yielding_arm import FOREARM, UPPER_ARM, YieldingArm, add_placeholder
 from worker.spaces import SHARED_FIELDS, Field, Space
 from worker.tasks import Task
 from worker.trajectory import BODIES
@@ -42,19 +42,21 @@ OBSERVATION = Space(
 
 @dataclass(frozen=True)
 class ScratchingModes(ApproachModes):
-    """Adds how quickly the tip goes over the skin, and how far from one reversal to the next."""
+    """Adds how quickly the tip goes over the skin; and who presses firmly also feels less of it."""
 
-    press_m: float = 0.006
+    press_m: float = 0.012
     level_rad: float | None = None
     hesitation_m: float = 0.10
     skin_m: float = 0.05
     """closer than this the speed is that of the strokes"""
+    feeling: float = 1.0
+    """log of the factor by which press = 1 lessens the force that is felt"""
 
     def perceived(self, observation: Any, mode: Any, xp: Any = np) -> Any:
-        """As for any approach; for longer strokes the last one seems nearer than it is."""
+        """As for any approach; the policy, which keeps its force in hand, is shown a smaller one to press firmly."""
         seen = super().perceived(observation, mode, xp)
-        since = self._field(observation, "tip_to_last_stroke_m") * xp.exp(-1.0 * self._of(mode, "stroke_length"))
-        return self._replaced(seen, xp, tip_to_last_stroke_m=since)
+        felt = self._field(observation, "force_on_person_n") * xp.exp(-self.feeling * self._of(mode, "press"))
+        return self._replaced(seen, xp, force_on_person_n=felt)
 
     def speed_factor(self, observation: Any, mode: Any, xp: Any = np) -> Any:
         """The approach's factor, and on the skin the strokes' own."""
@@ -72,15 +74,14 @@ SCRATCHING = Task(
         (
             Axis("speed_far", -0.8, 0.4, "log of the speed factor while the scratcher is far from the arm"),
             Axis("speed_near", -0.8, 0.5, "log of the speed factor close to the arm"),
-            Axis("stroke_speed", -0.6, 0.4, "log of the speed factor on the skin: calm (-) or brisk (+) strokes"),
-            Axis("stroke_length", -1.0, 1.0, "short (-) or long (+) strokes"),
+            Axis("stroke_speed", -0.7, 0.4, "log of the speed factor on the skin: calm (-) or brisk (+) strokes"),
             Axis("press", -1.0, 1.0, "how firmly the tip is pressed on the skin: gentle (-) or firm (+)"),
             Axis("from_below", -1.0, 1.0, "how far below (+) or above (-) the itch the approach passes"),
             Axis("to_side", -1.0, 1.0, "to which side of the itch the approach swings"),
             Axis("hesitate", 0.0, 2.5, "how long the tip waits before it touches the skin"),
         ),
     ),
-    calibrated_speed_weight=1.20,
+    calibrated_speed_weight=0.06,
 )
 
 SCRATCHER_LENGTH_M = 0.20
@@ -115,6 +116,7 @@ RAISED_ARM = ArmRange((10.0, 0.0, 0.0, -5.0), (35.0, 12.0, 20.0, 15.0))
 STROKES_NEEDED = 25
 STROKE_LENGTH_M = 0.01
 AT_ITCH_M = 0.025
+"""As in the benchmark: so many strokes, counted after such a way, within so much of the itch."""
 FELT_N = 0.3
 
 BARE_SKIN = {UPPER_ARM: (0.62, 0.92), FOREARM: (0.12, 0.80)}
@@ -135,34 +137,43 @@ class Itch(NamedTuple):
 class Scratch:
     """Counts strokes as the benchmark does: the contact has moved by more than 1 cm since the last counted one.
 
-    The skin itself must have been rubbed, so places are in the limb's frame. A touch must be felt (.3 N, the weight of a
-    letter or two) and gentle (less than the benchmark's 10 N).
+    The skin itself must have been rubbed, so places are in the limb's frame. A touch must be felt (.3 N, the weight of
+    a letter or two) and gentle (less than the benchmark's 10 N).
     """
 
     def __init__(self) -> None:
         self.strokes = 0
         self.last_m: FloatArray | None = None
         self.peak_force_n = 0.0
-        self.rubbed_m = 0.0
-        """of skin in this control step, at most 2 cm"""
-        self._before: FloatArray | None = None
+        self.progress_m = 0.0
+        """towards the next stroke in this control step; less than 0 when the tip came back"""
+        self._since_last_m = 0.0
 
     def rub(self, place_m: FloatArray | None, force_n: float) -> bool:
-        """One control step: where the tip touched the skin at its end, if it did, and the mean force; a new stroke?"""
+        """One control step: where the tip last touched the skin, if it did, and the mean force; a new stroke?"""
         self.peak_force_n = max(self.peak_force_n, force_n)
-        before, self._before = self._before, place_m if force_n < HIGH_FORCE_N else None
-        self.rubbed_m = 0.0 if before is None or self._before is None else min(0.02, math.dist(before, self._before))
+        self.progress_m = 0.0
         if place_m is None or not FELT_N <= force_n < HIGH_FORCE_N:
             return False
-        if self.last_m is not None and math.dist(place_m, self.last_m) <= STROKE_LENGTH_M:
-            return False
-        self.last_m = place_m
-        self.strokes += 1
-        return True
+        moved = STROKE_LENGTH_M if self.last_m is None else math.dist(place_m, self.last_m)
+        self.progress_m = min(moved, STROKE_LENGTH_M) - self._since_last_m
+        counts = self.last_m is None or moved > STROKE_LENGTH_M
+        self._since_last_m = 0.0 if counts else moved
+        if counts:
+            self.last_m = place_m
+            self.strokes += 1
+        return counts
 
 
 class ScratchingEnv(AssistiveEnv):
-    """Success: at least 25 strokes, the benchmark's number, and never 10 N or more at the itch."""
+    """Success: at least 25 strokes, the benchmark's number, and never 10 N or more at the itch in a control step.
+
+    10 N is where the benchmark's high-force cost begins; here it also ends the hope of success, so that scratching has
+    to be gentle and not only frequent. On this skin 10 N are a tip pushed in by 2 cm: a scripted robot that rubs 5 mm
+    deep makes 20 to 40 strokes at 2.5 N, one that rubs 2 cm deep reaches 9 to 14 N. The shipped policy (mean force 1.9
+    N, mean peak 4.3 N) succeeds in 99 % of scenarios; it would in 93 % with a limit of 6 N, 86 % with 5 N, 47 % with
+    4 N. What is left between its force and the limit is for people who want it firmer.
+    """
 
     task = SCRATCHING
     tool = SCRATCHER
@@ -190,9 +201,19 @@ class ScratchingEnv(AssistiveEnv):
         return np.stack([self._arm.angles_rad(), self.person.arms_rad[human.LEFT]])
 
     def _new_world(self) -> Bullet:
-        return Bullet(gravity_m_s2=0.0)
+        return Bullet(gravity_m_s2=0.0, forgetful=True)
 
-    def _add_person(self) -> None:
+    def _build(self) -> None:
+        """Build the arm once. Removing a chain reverses the order of its links in the engine; twice restores it."""
+        if self._world.littered:
+            self._world.clear()
+        if self._world.has(PERSON):
+            self._world.remove(PERSON)
+            add_placeholder(self._world)
+            self._world.remove(PERSON)
+        else:
+            self.robot.add_to(self._world, self.tool)
+        self._world.step()
         self._arm = YieldingArm(self._world, self.person)
 
     def _lay_out(self, rng: np.random.Generator) -> None:
@@ -246,10 +267,11 @@ class ScratchingEnv(AssistiveEnv):
     def _gentle_rubbing(self, step: StepMeasures) -> float:
         """What the reference policy is trained for: rubbing pays, and from 1.5 N on pressing costs more and more."""
         change = step.action - step.previous_action
-        too_hard = 0.04 * max(0.0, step.force_at_target_n - 1.5) ** 2 + 0.05 * step.force_away_n
-        rubbed = 0.5 * step.outcome.strokes + 50.0 * self._scratch.rubbed_m
+        too_hard = 0.06 * max(0.0, step.force_at_target_n - 1.5) ** 2 + 0.05 * step.force_away_n
+        rubbed = 0.5 * step.outcome.strokes + self._scratch.progress_m / STROKE_LENGTH_M
         facing = 0.1 * min(0.5, float(step.outward @ step.tool_up))
-        return _NEARBY(step) + rubbed + facing - too_hard - 0.01 * float(change @ change)
+        touching = 0.2 * min(1.0, step.force_at_target_n / 0.5)
+        return _NEARBY(step) + touching + rubbed + facing - too_hard - 0.05 * float(change @ change)
 
 
 _NEARBY = TaskReward(speed_per_m_s=0.0, force_per_n=0.0)

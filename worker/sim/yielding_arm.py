@@ -1,9 +1,9 @@
 """The person's right arm as a passive chain: it gives way to what pushes it and comes back.
 
-Three shoulder joints and the elbow are held by damped springs, as a relaxed arm on nothing is; the skin is soft. The
-benchmark holds the same joints by motors of at most 1 N m, which behave like dry friction: nothing moves at 3 N and the
-arm runs away at 5. Springs give way in proportion, so that one sees how hard the tool presses. There must be no gravity
-in a world with such an arm, for the springs do not carry its weight.
+Three shoulder joints and the elbow are held by damped springs, and the skin is soft. The benchmark holds such joints by
+motors of at most 1 N m, which here behaved like dry friction: at 2 N nothing moves, at 5 N the arm runs away. Springs
+give way in proportion, so that one sees how hard the tool presses. There must be no gravity in a world with such an
+arm, for the springs do not carry its weight.
 """
 
 import math
@@ -64,6 +64,13 @@ class YieldingArm:
         """(4,) in the order of human.ARM_JOINTS."""
         abduction, flexion, rotation, elbow = self._world.joints(PERSON, len(human.ARM_JOINTS))
         return np.array([flexion, abduction, rotation, elbow])
+
+
+def add_placeholder(world: Bullet) -> None:
+    """Add a chain of as many links in the person's stead."""
+    speck = (Shape("sphere", 0.001),)
+    still, moving = Link("", (0, 0, 0), IDENTITY, 0.1, ()), Link("", (0, 0, 0), IDENTITY, 0.1, speck)
+    world.add_chain(PERSON, speck, (still, still, moving, moving))
 
 
 def _in_chain_order(arm_rad: FloatArray) -> list[float]:
