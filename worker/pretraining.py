@@ -18,6 +18,7 @@ TRAINING: Mapping[str, Mapping[str, Any]] = {
         "random_steps": 2_000,
         "initial_temperature": 0.02,
         "training_limit": 0.7,
+        "action_limit": 0.5,
         "demonstrations": 45,
         "imitation_updates": 60_000,
         "evaluation_episodes": 100,

@@ -22,3 +22,5 @@ class Task:
     """Weight of the calibrated speed cost with which the reference person (omega = 1) is content with the shipped
     policy's own speed; measured by tests/benchmarks/speed_cost_weight.py, to be repeated for a new policy."""
     episode_steps: int = 100
+    pieces: int = 8
+    """of food or water in the usual portion"""

@@ -19,7 +19,7 @@ class TaskName(StrEnum):
     SCRATCHING = "scratching"
 
 
-USUAL_CLIP_STEPS = {TaskName.FEEDING: 60, TaskName.DRINKING: 100, TaskName.SCRATCHING: 60}
+USUAL_CLIP_STEPS = {TaskName.FEEDING: 60, TaskName.DRINKING: 70, TaskName.SCRATCHING: 60}
 """Control steps (10 Hz) from the start in which what matters has happened: water is poured late."""
 LONGEST_CLIP_STEPS = {TaskName.FEEDING: 100, TaskName.DRINKING: 130, TaskName.SCRATCHING: 100}
 """A whole episode."""

@@ -86,7 +86,7 @@ def test_a_mistake_is_explained_and_what_was_typed_is_kept(
         assert session.scalars(select(Study)).all() == []
 
 
-@pytest.mark.parametrize(("task", "steps"), [("feeding", 60), ("drinking", 100), ("scratching", 60)])
+@pytest.mark.parametrize(("task", "steps"), [("feeding", 60), ("drinking", 70), ("scratching", 60)])
 def test_each_task_has_its_usual_length_of_clips_and_its_own_instructions(
     experimenter: TestClient, database: Database, new_browser: Callable[[], TestClient], task: str, steps: int
 ) -> None:

@@ -150,14 +150,22 @@ def test_the_papers_preference_reward_is_the_benchmarks_weighted_sum() -> None:
 
 def test_the_calibrated_form_charges_speed_squared() -> None:
     costs, signals = one_step(C_v=0.4, speed_squared_m2_s2=0.16)
-    assert cost_items(costs, signals, "calibrated")[0, 1] == pytest.approx(0.8)
+    assert cost_items(FEEDING, costs, signals, "calibrated")[0, 1] == pytest.approx(0.8)
     assert preference_rewards(FEEDING, costs, signals)[0] == pytest.approx(-FEEDING.calibrated_speed_weight * 0.8)
+
+
+def test_the_calibrated_form_counts_eighths_of_the_portion_however_many_pieces_it_has() -> None:
+    costs, signals = one_step(C_fd=4.0, C_fdv=8.0)
+    finer = replace(FEEDING, pieces=32)
+    assert cost_items(finer, costs, signals, "calibrated")[0, 4:].tolist() == [1.0, 2.0]
+    assert cost_items(finer, costs, signals, "paper")[0, 4:].tolist() == [4.0, 8.0]
+    assert cost_items(FEEDING, costs, signals, "calibrated")[0, 4:].tolist() == [4.0, 8.0]
 
 
 def test_both_forms_differ_only_in_speed() -> None:
     rng = np.random.default_rng(0)
     costs, signals = rng.random((5, 6)), rng.random((5, len(SIGNALS)))
-    paper, calibrated = (cost_items(costs, signals, form) for form in ("paper", "calibrated"))  # type: ignore[arg-type]
+    paper, calibrated = (cost_items(FEEDING, costs, signals, form) for form in ("paper", "calibrated"))  # type: ignore[arg-type]
     others = [index for index, name in enumerate(COSTS) if name != "C_v"]
     np.testing.assert_array_equal(paper[:, others], calibrated[:, others])
     assert (base_weights(FEEDING, "paper")[others] == base_weights(FEEDING, "calibrated")[others]).all()

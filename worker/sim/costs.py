@@ -5,7 +5,8 @@
 * ``paper``: C_d, C_v, C_f, C_hf, C_fd, C_fdv as measured, with the benchmark's weights 1, .25, .01, .05, 1, 1. With
   these, even a person who fears speed prefers to be fed faster, because time spent far away costs more.
 * ``calibrated``: the speed item is speed^2 / 0.2 m/s, weighted so that the reference person is content with the
-  policy's own speed; omegas then pull in different directions. The other five items are unchanged.
+  policy's own speed; omegas then pull in different directions. Food and water are counted in eighths of the portion, or
+  dividing the same water into more pellets would make it a greater evil. The other three items are unchanged.
 """
 
 from collections.abc import Mapping
@@ -26,7 +27,11 @@ BASE_WEIGHTS = {"C_d": 1.0, "C_v": 0.25, "C_f": 0.01, "C_hf": 0.05, "C_fd": 1.0,
 SPEED_SCALE_M_S = 0.2
 """At this speed the calibrated item equals the paper's."""
 
+PIECES_AT_WEIGHT_ONE = 8
+"""The calibrated form counts eighths of the portion, as Feeding's eight balls are."""
+
 _SPEED = COSTS.index("C_v")
+_PIECES = [COSTS.index("C_fd"), COSTS.index("C_fdv")]
 _SPEED_SQUARED = SIGNALS.index("speed_squared_m2_s2")
 
 
@@ -38,10 +43,11 @@ def base_weights(task: Task, form: CostForm = "calibrated") -> FloatArray:
     return weights
 
 
-def cost_items(costs: Array, signals: Array, form: CostForm = "calibrated") -> FloatArray:
+def cost_items(task: Task, costs: Array, signals: Array, form: CostForm = "calibrated") -> FloatArray:
     """The six unweighted items of a form: costs (..., 6) and signals (..., S) of a trajectory -> (..., 6)."""
     items = np.array(costs, np.float64)
     if form == "calibrated":
+        items[..., _PIECES] *= PIECES_AT_WEIGHT_ONE / task.pieces
         items[..., _SPEED] = np.asarray(signals, np.float64)[..., _SPEED_SQUARED] / SPEED_SCALE_M_S
     return items
 
@@ -59,7 +65,7 @@ def preference_rewards(
     ``per_signal``: what else this person dislikes, as a cost per unit of a signal and control step; below 0: likes.
     """
     weights = base_weights(task, form) * np.asarray(omega, np.float64)
-    rewards: FloatArray = -(cost_items(costs, signals, form) @ weights)
+    rewards: FloatArray = -(cost_items(task, costs, signals, form) @ weights)
     for name, cost in per_signal.items():
         rewards = rewards - cost * np.asarray(signals, np.float64)[..., SIGNALS.index(name)]
     return rewards

@@ -68,6 +68,8 @@ class PouringModes(ApproachModes):
         return xp.clip((0.09 - self._distance(observation, xp)) / 0.05, 0.0, 1.0)
 
 
+PELLETS = 32
+
 DRINKING = Task(
     name="drinking",
     title="Drinking",
@@ -75,24 +77,24 @@ DRINKING = Task(
     modes=PouringModes(
         OBSERVATION,
         (
-            Axis("speed_far", -1.2, 0.45, "log of the speed factor while the cup is far from the mouth"),
-            Axis("speed_near", -1.2, 0.45, "log of the speed factor close to the mouth, before the cup is tipped"),
-            Axis("from_below", -0.4, 0.3, "how far below (+) or above (-) the mouth the approach passes"),
-            Axis("to_side", -0.2, 0.5, "how far to the person's left (+) or right (-) the approach swings"),
-            Axis("hesitate", 0.0, 1.2, "how much the cup lingers a hand's breadth before the mouth"),
-            Axis("tip_early", -0.3, 0.1, "how much further (+) or less (-) the cup is tipped on its way, in rad"),
-            Axis("pour_angle", -0.06, 0.06, "how much further (+) or less (-) the cup is tipped at the mouth, in rad"),
-            Axis("pour_haste", -1.1, 0.4, "log of the factor on how fast the cup is tipped at the mouth"),
+            Axis("speed_far", -0.6, 0.5, "log of the speed factor while the cup is far from the mouth"),
+            Axis("speed_near", -0.6, 0.5, "log of the speed factor close to the mouth, before the cup is tipped"),
+            Axis("from_below", -0.35, 0.35, "how far below (+) or above (-) the mouth the approach passes"),
+            Axis("to_side", -0.4, 0.4, "how far to the person's left (+) or right (-) the approach swings"),
+            Axis("hesitate", 0, 0.6, "how much the cup lingers a hand's breadth before the mouth"),
+            Axis("tip_early", -0.2, 0.15, "how much further (+) or less (-) the cup is tipped on its way, in rad"),
+            Axis("pour_angle", -0.05, 0.06, "how much further (+) or less (-) the cup is tipped at the mouth, in rad"),
+            Axis("pour_haste", -0.4, 0.3, "log of the factor on how fast the cup is tipped at the mouth"),
         ),
     ),
     # From distance alone: how fast the water comes in already speaks against haste, and would make this negative.
-    calibrated_speed_weight=0.6,
+    calibrated_speed_weight=1.21,
     episode_steps=130,
+    pieces=PELLETS,
 )
 
 CUP_BASE_RADIUS_M, CUP_RIM_RADIUS_M, CUP_HEIGHT_M = 0.028, 0.040, 0.080
 """Inside of the cup."""
-PELLETS = 32
 PELLET_RADIUS_M = 0.0085
 """of the default number; together they fill half of the cup"""
 WALL_FRICTION = 0.1
