@@ -125,8 +125,7 @@ class ClipRenderer:
         for index, parts in enumerate(moving_parts(shoot)):
             itch_m = motion.target_m[index] if shoot.look.itch else None
             frame = Frame([*person.moving(index), *parts], moving_lamp_depth(shoot.kit), itch_m)
-            # A clear wall hardly shows at the size of the whole picture.
-            picture = main.frame(frame._replace(parts=[part for part in frame.parts if not part.glass or not inset]))
+            picture = main.frame(frame)
             highlight.draw(picture, index)
             if inset:
                 near = frame._replace(parts=[part for part in frame.parts if part.stage is not shoot.kit.upper])

@@ -113,27 +113,22 @@ def _wall(detail: Detail, heights: Array, radii: Array, colours: Array, inwards:
 
 
 def cup(detail: Detail) -> Mesh:
-    """The opaque part of a glass: bottom, rim, and the far inner wall (the near one faces away and is not drawn)."""
+    """The opaque part of a glass: its edges, and the far inner wall (the near one faces away and is not drawn)."""
     base, rim, height, wall = CUP_BASE_RADIUS_M, CUP_RIM_RADIUS_M, CUP_HEIGHT_M, CUP_OUTSIDE_M
-    glass, edge = detail.at("glass", 0.6), detail.at("glass_rim")
-    inside = _wall(
-        detail, np.array([-height, -height / 2, 0.0]), np.array([base, (base + rim) / 2, rim]), np.full(2, glass), True
-    )
-    bottom = _wall(
-        detail,
-        np.array([-0.0050, -0.0050, 0.0, 0.0]) - height,
-        np.array([0.001, base + wall, base + wall, 0.001]),
-        np.array([glass, edge, glass]),
-    )
-    rings = [_ring(detail, rim + wall / 2, 0.0, 0.0019, edge), _ring(detail, base + wall, -height, 0.0016, edge)]
-    return joined(inside, bottom, *rings).moved(np.eye(3), CUP_CENTRE_M)
+    edge = detail.at("glass_rim")
+    heights, radii = np.array([-height, -height / 2, 0.0]), np.array([base, (base + rim) / 2, rim])
+    inside = _wall(detail, heights, radii, np.full(2, detail.at("glass", 0.6)), inwards=True)
+    rings = [_ring(detail, rim + wall / 2, 0.0, 0.0019, edge), _ring(detail, base + wall, -height - wall, 0.0019, edge)]
+    return joined(inside, *rings).moved(np.eye(3), CUP_CENTRE_M)
 
 
 def cup_glass(detail: Detail) -> Mesh:
-    """The outer wall, with a few bright reflections."""
-    heights = np.array([-CUP_HEIGHT_M, -0.0005])
-    radii = np.array([CUP_BASE_RADIUS_M, CUP_RIM_RADIUS_M]) + CUP_OUTSIDE_M
-    return _wall(detail, heights, radii, np.array([detail.at("glass", 0.2)])).moved(np.eye(3), CUP_CENTRE_M)
+    """The outer wall and the bottom, through which one sees the water."""
+    below = -CUP_HEIGHT_M - CUP_OUTSIDE_M
+    heights = np.array([below, below, -0.0005])
+    radii = np.array([0.0005, CUP_BASE_RADIUS_M + CUP_OUTSIDE_M, CUP_RIM_RADIUS_M + CUP_OUTSIDE_M])
+    colours = np.array([detail.at("glass", 0.0), detail.at("glass", 0.2)])
+    return _wall(detail, heights, radii, colours).moved(np.eye(3), CUP_CENTRE_M)
 
 
 def _ring(detail: Detail, radius: float, height: float, thick: float, colour: float) -> Mesh:
