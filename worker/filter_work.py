@@ -47,7 +47,7 @@ def _choose_reward(place: Workplace, run_id: int, job: Job) -> str:
         newest = records.newest_model(session, job.participant, ModelKind.FILTER)
         if newest is not None and newest.label_hash == model.label_hash:
             return ""
-    if settings.method is Method.STUDIO or settings.reward_kind is RewardKind.MLP:
+    if settings.method is Method.STUDIO or settings.reward_kind is not RewardKind.STRUCTURED:
         return model.artefact_sha256
     place.report(run_id, "learning a reward model on states and actions", 0.05)
     with place.database.reading() as session:

@@ -2,13 +2,14 @@
 
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Any
+from typing import Any, cast, get_args
 
 import numpy as np
 import numpy.typing as npt
 
 from worker.laboratory import environment, reference_policy, reference_rollouts
 from worker.ml import reward_training
+from worker.ml.pooled_prior import prior_of
 from worker.ml.reward_models import RewardModel, load_reward_model
 from worker.ml.segments import SegmentPairs
 from worker.ml.studio_filter import Act, noisy
@@ -30,13 +31,33 @@ def run_scenarios(task: str, act: Act, scenarios: Sequence[int], noise: float, s
 
 
 def fit_reward(
-    task: str, kind: str, pairs: SegmentPairs, targets: Array, pool: SegmentPairs, seed: int
+    task: str,
+    kind: str,
+    pairs: SegmentPairs,
+    targets: Array,
+    pool: SegmentPairs,
+    seed: int,
+    earlier: Sequence[bytes] = (),
 ) -> tuple[bytes, dict[str, Any]]:
-    """The stored reward model and its metrics. ``pool``: pairs like those that are asked, for the scale of signals."""
+    """The stored reward model and its metrics.
+
+    ``pool``: pairs like those that are asked, for the scale of signals; ``earlier``: models of others for
+    a pooled prior. Raises ValueError for a kind there is not.
+    """
+    if kind not in get_args(reward_training.Kind):
+        raise ValueError(f"There is no reward model of the kind {kind!r}.")
     spread = reward_training.signal_spread(pool)
-    named: reward_training.Kind = "mlp" if kind == "mlp" else "structured"
-    fitted = reward_training.fit(pairs, targets, named, seed, spread=spread, reference=reference_rollouts(task))
-    return fitted.model.to_bytes(), fitted.metrics
+    prior = prior_of([_model(each) for each in earlier], spread)
+    fitted = reward_training.fit(
+        pairs,
+        targets,
+        cast(reward_training.Kind, kind),
+        seed,
+        spread=spread,
+        reference=reference_rollouts(task),
+        prior=prior,
+    )
+    return fitted.model.to_bytes(), {**fitted.metrics, "pooled_from": len(earlier)}
 
 
 def probability_right(stored_model: bytes, pairs: SegmentPairs) -> list[float]:

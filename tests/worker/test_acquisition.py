@@ -3,7 +3,18 @@
 import numpy as np
 import pytest
 
-from worker.ml.acquisition import balanced_sides, choose, disagreement, matched_pairs
+from worker.ml.acquisition import (
+    Rule,
+    balanced_sides,
+    choose,
+    contested,
+    disagreement,
+    entropy,
+    expected_answers,
+    information_gain,
+    matched_pairs,
+    score,
+)
 
 SCORES = np.linspace(0.0, 1.0, 20)
 
@@ -48,6 +59,59 @@ def test_disagreement_prefers_what_members_disagree_about_but_never_excludes_a_p
 def test_members_that_agree_do_not_disagree() -> None:
     scores = disagreement(np.array([[0.9, 0.1], [0.9, 0.9]]))
     assert scores[0] == 0.0 < scores[1]
+
+
+SURE_AND_DIVIDED, ALL_UNSURE, AGREED = 0, 1, 2
+MEMBERS = np.array([[0.99, 0.5, 0.95], [0.01, 0.5, 0.95], [0.98, 0.5, 0.96], [0.02, 0.5, 0.94]])
+"""(E, 3) columns as named above"""
+
+
+def test_information_gain_prefers_confident_disagreement_over_common_doubt_and_entropy_does_not() -> None:
+    gain, doubt = information_gain(MEMBERS), entropy(MEMBERS)
+    assert gain.argmax() == SURE_AND_DIVIDED
+    assert gain[ALL_UNSURE] == pytest.approx(0.0, abs=1e-9)
+    assert doubt[ALL_UNSURE] == pytest.approx(np.log(2))
+    assert doubt[ALL_UNSURE] >= doubt[SURE_AND_DIVIDED] > doubt[AGREED]
+
+
+def test_information_gain_is_never_negative_nor_more_than_the_entropy() -> None:
+    members = np.random.default_rng(0).random((6, 100))
+    assert (information_gain(members) > -1e-12).all()
+    assert (information_gain(members) <= entropy(members)).all()
+
+
+def test_contested_prefers_the_pair_that_others_disagree_about() -> None:
+    assert contested(MEMBERS[:3]).argmax() == SURE_AND_DIVIDED
+    assert contested(MEMBERS[:3])[ALL_UNSURE] == 0.0
+    with pytest.raises(ValueError, match="Two"):
+        contested(MEMBERS[:1])
+
+
+def test_stand_ins_answer_by_their_returns_whatever_their_unit() -> None:
+    differences = np.array([[3.0, -1.0, 0.0], [3000.0, -1000.0, 0.0]])
+    expected = expected_answers(differences)
+    np.testing.assert_allclose(expected[0], expected[1])
+    assert expected[0, 0] > 0.5 > expected[0, 1]
+    assert expected[0, 2] == 0.5
+
+
+RULES: tuple[Rule, ...] = ("disagreement", "entropy", "information_gain")
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_every_rule_logs_chances_of_the_whole_and_keeps_its_random_share(rule: Rule) -> None:
+    members = np.random.default_rng(1).random((4, 6))
+    chances: dict[int, float] = {}
+    for seed in range(300):
+        choice = choose(1, 6, np.random.default_rng(seed), rule=rule, scores=score(rule, members), random_share=0.6)
+        chances[int(choice.indices[0])] = float(choice.propensities[0])
+    assert sum(chances.values()) == pytest.approx(1.0)
+    assert min(chances.values()) >= 0.6 / 6
+
+
+def test_what_others_think_is_no_function_of_one_s_own_model() -> None:
+    with pytest.raises(ValueError, match="alone"):
+        score("contested", MEMBERS)
 
 
 @pytest.mark.parametrize("random_share", [0.0, 1.2])

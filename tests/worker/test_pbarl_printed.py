@@ -8,10 +8,11 @@ from torch import Tensor
 from tests.worker import invented
 from worker.ml import pbarl_printed
 from worker.ml.action_filter import build
+from worker.ml.network_training import MlpTraining, TransformerTraining
 from worker.ml.pbarl_printed import PrintedConfig, PrintedEncoder, reconstruction_loss
 from worker.ml.printed_filter import fit_printed
 from worker.ml.reward_models import StructuredReward
-from worker.ml.reward_training import MlpTraining, fit
+from worker.ml.reward_training import fit
 from worker.ml.studio_filter import FilterProblem
 from worker.trajectory import SIGNALS
 
@@ -110,6 +111,16 @@ def test_training_reports_all_four_losses_is_repeatable_and_exports_like_any_fil
     )
     assert actions.shape == (5, 7)
     assert float(actions.abs().max()) <= 1.0
+
+
+def test_a_preference_transformer_ranks_candidates_too() -> None:
+    shown = invented.pairs(12, np.random.default_rng(0))
+    small = TransformerTraining(steps=5, members=2, hidden=8, heads=2)
+    answers = invented.answers_of(shown, np.eye(len(SIGNALS))[1])
+    reward = fit(shown, answers, "preference_transformer", 0, transformer=small).model
+    reference = [invented.trajectory(np.random.default_rng(seed)) for seed in range(3)]
+    draft = fit_printed(FilterProblem(invented.TASK, POLICY, reward, 0), reference, PrintedConfig(steps=20, batch=8))
+    assert draft.weights.encoder
 
 
 def test_a_reward_that_needs_measurements_cannot_rank_untried_actions() -> None:

@@ -1,4 +1,4 @@
-"""Reward models: the right form of Eq. (2), both kinds, normalisation, storage."""
+"""Reward models: the right form of Eq. (2), all kinds, normalisation, storage."""
 
 import numpy as np
 import pytest
@@ -6,13 +6,15 @@ import torch
 
 from tests.worker import invented
 from worker.ml import bradley_terry, reward_training
+from worker.ml.network_training import MlpTraining, TransformerTraining
 from worker.ml.reward_models import CLIP, RewardModel, StructuredReward, load_reward_model, stored_config
-from worker.ml.reward_training import MlpTraining, fit, posterior, signal_spread
+from worker.ml.reward_training import fit, posterior, signal_spread
 from worker.ml.segments import SegmentPairs
 from worker.trajectory import SIGNALS
 
-KINDS: tuple[reward_training.Kind, ...] = ("structured", "mlp")
+KINDS: tuple[reward_training.Kind, ...] = ("structured", "mlp", "preference_transformer")
 QUICK = MlpTraining(steps=100, members=3, hidden=16, learning_rate=5e-3)
+QUICK_TRANSFORMER = TransformerTraining(steps=120, members=2, hidden=16, learning_rate=1e-2, every_nth_step=1)
 DISLIKES_SPEED = np.array([-1.0 if name == "speed_m_s" else 0.0 for name in SIGNALS])
 
 
@@ -25,8 +27,8 @@ def labelled() -> tuple[SegmentPairs, np.ndarray]:
 
 @pytest.fixture(scope="module", params=KINDS)
 def model(request: pytest.FixtureRequest, labelled: tuple[SegmentPairs, np.ndarray]) -> RewardModel:
-    """Both kinds, fitted."""
-    return fit(*labelled, request.param, 3, mlp=QUICK).model
+    """All kinds, fitted."""
+    return fit(*labelled, request.param, 3, mlp=QUICK, transformer=QUICK_TRANSFORMER).model
 
 
 @pytest.mark.parametrize(("left", "right"), [(1.0, 0.0), (0.0, 1.0), (0.3, 0.3), (-700.0, 700.0)])
@@ -77,7 +79,7 @@ def test_the_structured_fit_minimises_the_right_form_of_equation_2_with_a_normal
     assert np.linalg.eigvalsh(covariance).min() > 0
 
 
-def test_both_kinds_rank_what_they_were_told(model: RewardModel, labelled: tuple[SegmentPairs, np.ndarray]) -> None:
+def test_all_kinds_rank_what_they_were_told(model: RewardModel, labelled: tuple[SegmentPairs, np.ndarray]) -> None:
     shown, targets = labelled
     right = (model.probability_right(shown) > 0.5) == (targets > 0.5)
     assert right.mean() > 0.85
@@ -105,7 +107,9 @@ def test_learned_weights_come_with_intervals_and_find_the_one_that_matters(
 def test_the_same_seed_gives_the_same_model_and_another_seed_another(
     kind: reward_training.Kind, labelled: tuple[SegmentPairs, np.ndarray]
 ) -> None:
-    first, again, other = (fit(*labelled, kind, seed, mlp=QUICK).model.to_bytes() for seed in (5, 5, 6))
+    first, again, other = (
+        fit(*labelled, kind, seed, mlp=QUICK, transformer=QUICK_TRANSFORMER).model.to_bytes() for seed in (5, 5, 6)
+    )
     assert first == again
     assert first != other
 
@@ -178,7 +182,7 @@ def test_weights_on_signals_are_exact_for_the_structured_kind_and_close_for_netw
 def test_a_handful_of_one_sided_labels_does_not_break_the_fit() -> None:
     few = invented.pairs(2, np.random.default_rng(0))
     for kind in KINDS:
-        model = fit(few, [1.0, 1.0], kind, 0, mlp=QUICK).model
+        model = fit(few, [1.0, 1.0], kind, 0, mlp=QUICK, transformer=QUICK_TRANSFORMER).model
         assert np.isfinite(model.probability_right(few)).all()
 
 

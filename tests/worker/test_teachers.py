@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from worker.ml.teachers import OMEGA, Manner, ScriptedTeacher, User
+from worker.ml.teachers import OMEGA, TASTES, Manner, ScriptedTeacher, Taste, User, random_taste, segment_returns
 
 FAULTLESS = Manner(mistakes=0.0, equal_share=0.0)
 POOL = np.random.default_rng(0).standard_normal((400, 2, 10))
@@ -69,3 +69,49 @@ def test_the_three_users_are_the_paper_s() -> None:
     assert OMEGA[User.NEUTRAL] == (1.0,) * 6
     assert OMEGA[User.CAUTIOUS] == (1.0, 2.0, 1.5, 2.5, 3.0, 2.0)
     assert OMEGA[User.IMPATIENT] == (2.0, 0.5, 0.75, 0.5, 1.5, 0.5)
+
+
+def test_at_rationality_1_a_typical_difference_is_seen_as_often_as_the_sigmoid_of_1_says() -> None:
+    teacher = ScriptedTeacher(replace(FAULTLESS, rationality=1.0), spread=2.0, equal_below=0.0)
+    rng = np.random.default_rng(0)
+    said = [teacher.answer([0.0], [2.0], rng) for _ in range(4000)]
+    assert said.count("right") / 4000 == pytest.approx(1 / (1 + np.exp(-1)), abs=0.02)
+
+
+def test_myopia_discounts_by_how_long_ago_a_step_was() -> None:
+    assert segment_returns(np.array([1.0, 1.0, 1.0]), 0.5) == pytest.approx(0.25 + 0.5 + 1.0)
+    assert segment_returns(np.array([1.0, 1.0, 1.0])) == 3.0
+
+
+def test_mistakes_also_befall_teachers_who_are_not_wholly_rational() -> None:
+    sure = ScriptedTeacher(replace(FAULTLESS, rationality=50.0, mistakes=0.3), spread=1.0, equal_below=0.0)
+    rng = np.random.default_rng(0)
+    assert [sure.answer([0.0], [1.0], rng) for _ in range(2000)].count("left") / 2000 == pytest.approx(0.3, abs=0.03)
+
+
+def test_answers_to_one_pair_do_not_depend_on_what_was_skipped_before() -> None:
+    steady, skipping = (replace(FAULTLESS, rationality=1.0, skip_share=share) for share in (0.0, 0.4))
+    pairs = zip(answers(steady), answers(skipping), strict=True)
+    assert all(one == other for one, other in pairs if other != "skip")
+
+
+def test_a_taste_of_one_s_own_is_named_after_its_weights() -> None:
+    own = Taste.of_omega([1, 2, 1.5, 2.5, 3, 2])
+    assert own == Taste("omega-1-2-1.5-2.5-3-2", (1, 2, 1.5, 2.5, 3, 2))
+
+
+@pytest.mark.parametrize("omega", [(1.0,) * 5, (1.0,) * 5 + (float("nan"),)])
+def test_weights_that_mean_nothing_are_refused(omega: tuple[float, ...]) -> None:
+    with pytest.raises(ValueError, match="6 finite weights"):
+        Taste.of_omega(omega)
+
+
+def test_the_paper_s_users_and_the_opposed_ones_go_by_name() -> None:
+    assert set(TASTES) == {"neutral", "cautious", "impatient", "slow", "quick", "close", "wide", "gentle", "brisk"}
+    assert TASTES["cautious"].omega == OMEGA[User.CAUTIOUS]
+
+
+def test_people_of_the_population_differ_and_come_back_with_their_seed() -> None:
+    first, again, other = (random_taste("somebody", np.random.default_rng(seed)) for seed in (1, 1, 2))
+    assert first == again != other
+    assert all(0.2 <= weight <= 5.0 for weight in first.omega)

@@ -3,6 +3,9 @@
 Random choice is the default: below 200 labels cleverer rules were no better, or worse (they chase outliers). Whatever
 the rule, a share of the choices stays random, so that every pair keeps a positive propensity and estimates made from
 the labels can be corrected for how the pairs were chosen.
+
+Every rule but the uniform one is a score of each candidate, made here from predicted probabilities; choose() turns any
+score into chances.
 """
 
 from dataclasses import dataclass
@@ -11,13 +14,15 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-Rule = Literal["uniform", "disagreement"]
+Rule = Literal["uniform", "disagreement", "entropy", "information_gain", "contested"]
 Indices = npt.NDArray[np.int64]
 Floats = npt.NDArray[np.float64]
 
 RANDOM_SHARE = 0.3
 SHARPNESS = 4.0
-"""Disagreement: probability proportional to exp(SHARPNESS * standardised score). Greedy choices repeat themselves."""
+"""Probability proportional to exp(SHARPNESS * standardised score). Greedy choices repeat themselves."""
+STAND_IN_RATIONALITY = 2.0
+"""Log odds of a stand-in's answer per root mean square difference of the returns of a pair."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +52,52 @@ def disagreement(member_probabilities: Floats) -> Floats:
     """(E, M) P(right) under every member -> (M,) their standard deviation."""
     spread: Floats = member_probabilities.std(axis=0)
     return spread
+
+
+def entropy(member_probabilities: Floats) -> Floats:
+    """(E, M) P(right) under every member -> (M,) nats: how open the answer is, whatever the reason."""
+    return _binary_entropy(member_probabilities.mean(axis=0))
+
+
+def information_gain(member_probabilities: Floats) -> Floats:
+    """(E, M) P(right) under every member -> (M,) nats: what an answer says about which member is right (BALD).
+
+    Entropy of the mean minus mean of the entropies (Houlsby et al. 2011): members that are each sure of different
+    answers count, members that are all unsure do not.
+    """
+    doubt_of_each: Floats = _binary_entropy(member_probabilities).mean(axis=0)
+    return _binary_entropy(member_probabilities.mean(axis=0)) - doubt_of_each
+
+
+def score(rule: Rule, member_probabilities: Floats) -> Floats:
+    """(E, M) P(right) under every member of one's own model -> (M,) by a rule that needs nothing else."""
+    own = {"disagreement": disagreement, "entropy": entropy, "information_gain": information_gain}
+    if rule not in own:
+        raise ValueError(f"The rule {rule!r} is no function of one's own model alone.")
+    return own[rule](member_probabilities)
+
+
+def contested(others_probabilities: Floats) -> Floats:
+    """(U, M) P(right) under U other people's models, U at least 2 -> (M,) their standard deviation.
+
+    Such pairs tell people apart; pairs on which everybody is unsure do not. Raises ValueError for fewer than two.
+    """
+    if len(others_probabilities) < 2:
+        raise ValueError("Two other people at least are needed to disagree.")
+    return disagreement(others_probabilities)
+
+
+def expected_answers(return_differences: Floats) -> Floats:
+    """(U, M) right minus left return of U stand-ins with known tastes -> (U, M) P(right), each in their own unit."""
+    unit = np.maximum(np.sqrt((return_differences**2).mean(axis=1, keepdims=True)), 1e-9)
+    probabilities: Floats = 0.5 * (1.0 + np.tanh(0.5 * STAND_IN_RATIONALITY * return_differences / unit))
+    return probabilities
+
+
+def _binary_entropy(probability: Floats) -> Floats:
+    sure = np.clip(probability, 1e-12, 1.0 - 1e-12)
+    nats: Floats = -(sure * np.log(sure) + (1.0 - sure) * np.log(1.0 - sure))
+    return nats
 
 
 def choose(

@@ -13,14 +13,12 @@ import torch
 from torch import Tensor, nn
 
 from worker.ml.adapter import kl_divergence
+from worker.ml.candidate_ranking import Ranker, RankerAt
 from worker.ml.policies import GaussianPolicy
 from worker.ml.policy_module import FrozenPolicy
-from worker.ml.reward_models import MlpReward
 from worker.ml.value import Transitions
 
 Progress = Callable[[float], None]
-Ranker = Callable[[Tensor, Tensor], Tensor]
-"""states (B, n, D), actions (B, n, 7) -> learned reward (B, n)"""
 
 BETAS: Mapping[str, tuple[float, float, float, float]] = {
     "feeding": (1.0, 1.5, 0.1, 1.0),
@@ -125,7 +123,7 @@ def reranked(states: Tensor, outputs: Tensor, ranker: Ranker) -> Tensor:
 
 def train(
     policy: GaussianPolicy,
-    reward: MlpReward,
+    ranker_at: RankerAt,
     data: Transitions,
     config: PrintedConfig,
     seed: int,
@@ -133,7 +131,7 @@ def train(
 ) -> tuple[PrintedEncoder, dict[str, float]]:
     """Minimise Eq. (8), the weighted sum of the four losses, on transitions of the frozen policy.
 
-    The learned reward must be a function of (s, a), because it ranks actions that were never executed: the 'mlp' kind.
+    ``ranker_at`` ranks actions that were never executed (see candidate_ranking); its rows are those of ``data``.
     Returns the encoder and the last values of the losses.
     """
     generator = torch.Generator().manual_seed(seed)
@@ -142,7 +140,6 @@ def train(
         frozen = FrozenPolicy(policy.weights)
         encoder = PrintedEncoder(torch.from_numpy(policy.offset), torch.from_numpy(policy.scale))
         dynamics = _three_layers(policy.action_size, 128, len(policy.offset))
-    ranker = torch_ranker(reward)
     optimiser = torch.optim.Adam([*encoder.parameters(), *dynamics.parameters()], config.learning_rate)
     losses: dict[str, float] = {}
     started = time.perf_counter()
@@ -150,7 +147,7 @@ def train(
         rows = torch.randint(len(data), (config.batch,), generator=generator)
         states, next_states = data.observations[rows], data.next_observations[rows]
         actions = sample_ranked_list(frozen, states, config.list_length, generator)
-        terms = _losses(encoder, dynamics, ranker, states, next_states, actions, config, generator)
+        terms = _losses(encoder, dynamics, ranker_at(rows), states, next_states, actions, config, generator)
         total = sum((beta * term for beta, term in zip(config.betas, terms, strict=True)), torch.zeros(()))
         optimiser.zero_grad()
         total.backward()  # type: ignore[no-untyped-call]
@@ -174,23 +171,6 @@ def sample_ranked_list(frozen: FrozenPolicy, states: Tensor, count: int, generat
     noise = noise.gather(1, order[..., None].expand_as(noise))
     actions: Tensor = frozen.action_limit * (centre[:, None] + log_std.exp()[:, None] * noise).tanh()
     return actions
-
-
-def torch_ranker(reward: MlpReward) -> Ranker:
-    """The learned reward as a torch function, mean over members."""
-    layers = [(torch.from_numpy(np.array(matrix)), torch.from_numpy(np.array(bias))) for matrix, bias in reward.layers]
-    offset, scale = torch.from_numpy(np.array(reward.offset)), torch.from_numpy(np.array(reward.scale))
-
-    def rank(states: Tensor, actions: Tensor) -> Tensor:
-        inputs = torch.cat([states, actions], -1)
-        hidden = ((inputs.reshape(1, -1, inputs.shape[-1]) - offset) / scale).clamp(-6.0, 6.0)
-        for matrix, bias in layers[:-1]:
-            hidden = nn.functional.silu(hidden @ matrix + bias)
-        matrix, bias = layers[-1]
-        rewards: Tensor = (hidden @ matrix + bias).tanh().mean(0).reshape(inputs.shape[:-1])
-        return rewards
-
-    return rank
 
 
 def _losses(

@@ -4,8 +4,8 @@ import time
 from collections.abc import Sequence
 
 from worker.ml.action_filter import FilterWeights, state_of
+from worker.ml.candidate_ranking import ranker_at
 from worker.ml.pbarl_printed import BETAS, OTHER_TASKS_BETAS, PrintedConfig, train
-from worker.ml.reward_models import MlpReward
 from worker.ml.studio_filter import FilterDraft, FilterProblem, Progress
 from worker.ml.value import Transitions
 from worker.trajectory import Trajectory
@@ -20,10 +20,9 @@ def fit_printed(
     """Train the printed method on the transitions of reference rollouts. Its gate is 1: the paper has none.
 
     Raises TypeError for a reward model that cannot score actions that were never executed (the structured kind reads
-    signals measured after the action); fit one of the kind 'mlp' to the same labels.
+    signals measured after the action); fit one of the other kinds to the same labels.
     """
-    if not isinstance(problem.reward, MlpReward):
-        raise TypeError("The printed method ranks untried actions and needs a reward model of the kind 'mlp'.")
+    ranker = ranker_at(problem.reward, reference)
     started = time.perf_counter()
     data = Transitions.joined(
         [Transitions.of(each.observations, each.actions, problem.reward.rewards_of(each)) for each in reference]
@@ -33,7 +32,7 @@ def fit_printed(
         progress("training the printed action encoder", share)
 
     settings = config or PrintedConfig(betas=BETAS.get(problem.task.name, OTHER_TASKS_BETAS))
-    encoder, losses = train(problem.policy, problem.reward, data, settings, problem.seed, report)
+    encoder, losses = train(problem.policy, ranker, data, settings, problem.seed, report)
     notes = (
         f"Printed method: {settings.steps} steps (the paper: 1.5e7), n = {settings.list_length},"
         f" eps = {settings.epsilon:g}, tau = {settings.temperature:g}.",

@@ -1,13 +1,15 @@
-"""Reward models: an ensemble of functions from one control step to how much this person likes it.
+"""Reward models: an ensemble of functions from a control step to how much this person likes it.
 
-Inference is NumPy for both kinds, so a model works anywhere; training lives in reward_training. A learned reward has no
-natural zero or unit (pairs of equal length cannot identify an offset, and the scale grows with the labels), so
-every model is normalised to mean 0 and standard deviation 1 per step over rollouts of the reference policy.
+Three kinds behind one interface: linear in measured signals, a network on (state, action), and the Preference
+Transformer of preference_transformer, whose reward also depends on what came before. Training lives in reward_training.
+A learned reward has no natural zero or unit (pairs of equal length cannot identify an offset, and the scale grows with
+the labels), so every model is normalised to mean 0 and standard deviation 1 per step over rollouts of the reference
+policy. Probabilities do have a unit: they are calibrated with a temperature (see calibration).
 """
 
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self
 
@@ -41,11 +43,20 @@ class Normalisation:
         return cls(float(mean.mean()), max(float(mean.std()), _SMALLEST_SCALE))
 
 
+RAW = Normalisation()
+"""Not normalised yet."""
+
+
 class RewardModel(ABC):
-    """E members, each a function of one step. Arrays have any leading axes, the same for all three arguments."""
+    """E members, each a function of a step and, for one kind, of the steps before it.
+
+    Arrays have any leading axes, the same for all arguments; the axis before the last is time, from an episode's start.
+    """
 
     kind: ClassVar[str]
     normalisation: Normalisation
+    temperature: float
+    """Log odds are divided by it before they are read as probabilities."""
 
     @abstractmethod
     def raw_rewards(self, signals: Array, observations: Array, actions: Array) -> Floats:
@@ -73,14 +84,14 @@ class RewardModel(ABC):
         return mean
 
     def logits(self, pairs: SegmentPairs) -> Floats:
-        """Every member's log odds that the right segment is preferred, (E, N). Not normalised, not clipped."""
+        """Every member's log odds that right is preferred, (E, N). Not normalised, not clipped, not calibrated."""
         returns = self.raw_rewards(pairs.signals, pairs.observations, pairs.actions).sum(axis=-1)
         difference: Floats = preference_logits(returns[..., LEFT], returns[..., RIGHT])
         return difference
 
     def member_probabilities(self, pairs: SegmentPairs) -> Floats:
-        """P(right preferred) under every member, (E, N)."""
-        return probability_right(self.logits(pairs))
+        """Calibrated P(right preferred) under every member, (E, N)."""
+        return probability_right(self.logits(pairs) / self.temperature)
 
     def probability_right(self, pairs: SegmentPairs) -> Floats:
         """P(right preferred), the mean over members, (N,)."""
@@ -123,13 +134,30 @@ class RewardModel(ABC):
 
     def to_bytes(self) -> bytes:
         """One safetensors file; its metadata says what it is."""
-        config = {"kind": self.kind, "offset": self.normalisation.offset, "scale": self.normalisation.scale}
         # A single metadata key: with several, safetensors writes them in an order that changes from run to run.
-        return save(self.tensors(), metadata={"config": json.dumps(config, sort_keys=True)})
+        return save(self.tensors(), metadata={"config": json.dumps(self.config(), sort_keys=True)})
+
+    def config(self) -> dict[str, Any]:
+        """What the file says beside the tensors."""
+        return {
+            "kind": self.kind,
+            "offset": self.normalisation.offset,
+            "scale": self.normalisation.scale,
+            "temperature": self.temperature,
+        }
+
+    @classmethod
+    @abstractmethod
+    def from_tensors(cls, tensors: Mapping[str, Array], config: Mapping[str, Any]) -> Self:
+        """What tensors() and config() describe, in raw units."""
 
     @abstractmethod
     def with_normalisation(self, normalisation: Normalisation) -> Self:
         """The same model in other units."""
+
+    @abstractmethod
+    def with_temperature(self, temperature: float) -> Self:
+        """The same model, more or less sure of itself."""
 
 
 @dataclass(frozen=True)
@@ -139,7 +167,8 @@ class StructuredReward(RewardModel):
     kind: ClassVar[str] = "structured"
     weights: Floats
     """(E, S), reward per unit of each signal"""
-    normalisation: Normalisation = Normalisation()
+    normalisation: Normalisation = RAW
+    temperature: float = 1.0
 
     def raw_rewards(self, signals: Array, observations: Array, actions: Array) -> Floats:
         """See RewardModel; observations and actions are not used."""
@@ -149,6 +178,11 @@ class StructuredReward(RewardModel):
     def tensors(self) -> dict[str, Array]:
         """See RewardModel."""
         return {"weights": self.weights.astype(np.float32)}
+
+    @classmethod
+    def from_tensors(cls, tensors: Mapping[str, Array], config: Mapping[str, Any]) -> Self:
+        """See RewardModel."""
+        return cls(tensors["weights"].astype(np.float64))
 
     def signal_weights(self, reference: Sequence[Trajectory] = ()) -> Floats:
         """(E, S) normalised reward per unit of each signal; exact for this kind."""
@@ -163,6 +197,10 @@ class StructuredReward(RewardModel):
         """See RewardModel."""
         return replace(self, normalisation=normalisation)
 
+    def with_temperature(self, temperature: float) -> Self:
+        """See RewardModel."""
+        return replace(self, temperature=temperature)
+
 
 @dataclass(frozen=True)
 class MlpReward(RewardModel):
@@ -176,7 +214,8 @@ class MlpReward(RewardModel):
     layers: tuple[tuple[Array, Array], ...]
     offset: Array
     scale: Array
-    normalisation: Normalisation = Normalisation()
+    normalisation: Normalisation = RAW
+    temperature: float = 1.0
 
     def raw_rewards(self, signals: Array, observations: Array, actions: Array) -> Floats:
         """See RewardModel; the signals are not used."""
@@ -197,6 +236,13 @@ class MlpReward(RewardModel):
             named[f"matrix_{index}"], named[f"bias_{index}"] = matrix, bias
         return {name: np.ascontiguousarray(array, np.float32) for name, array in named.items()}
 
+    @classmethod
+    def from_tensors(cls, tensors: Mapping[str, Array], config: Mapping[str, Any]) -> Self:
+        """See RewardModel."""
+        count = sum(name.startswith("matrix_") for name in tensors)
+        layers = tuple((tensors[f"matrix_{index}"], tensors[f"bias_{index}"]) for index in range(count))
+        return cls(layers, tensors["offset"], tensors["scale"])
+
     @property
     def size(self) -> int:
         """See RewardModel."""
@@ -206,18 +252,22 @@ class MlpReward(RewardModel):
         """See RewardModel."""
         return replace(self, normalisation=normalisation)
 
+    def with_temperature(self, temperature: float) -> Self:
+        """See RewardModel."""
+        return replace(self, temperature=temperature)
+
 
 def load_reward_model(stored: bytes) -> RewardModel:
     """Read what to_bytes() wrote. Raises ValueError for a file that is something else."""
+    from worker.ml.preference_transformer import PreferenceTransformer  # it is built on this module
+
     config = stored_config(stored)
-    tensors = load(stored)
-    normalisation = Normalisation(float(config["offset"]), float(config["scale"]))
-    if config.get("kind") == StructuredReward.kind:
-        return StructuredReward(tensors["weights"].astype(np.float64), normalisation)
-    if config.get("kind") == MlpReward.kind:
-        count = sum(name.startswith("matrix_") for name in tensors)
-        layers = tuple((tensors[f"matrix_{index}"], tensors[f"bias_{index}"]) for index in range(count))
-        return MlpReward(layers, tensors["offset"], tensors["scale"], normalisation)
+    kinds: tuple[type[RewardModel], ...] = (StructuredReward, MlpReward, PreferenceTransformer)
+    for kind in kinds:
+        if config.get("kind") == kind.kind:
+            model = kind.from_tensors(load(stored), config)
+            model = model.with_normalisation(Normalisation(float(config["offset"]), float(config["scale"])))
+            return model.with_temperature(float(config.get("temperature", 1.0)))
     raise ValueError(f"Not a reward model: {config!r}.")
 
 

@@ -3,27 +3,27 @@
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-import torch
-from torch import Tensor
-from torch.nn import functional
 
-from worker.ml.bradley_terry import preference_loss, probability_right
-from worker.ml.reward_models import MlpReward, Normalisation, RewardModel, StructuredReward
-from worker.ml.segments import LEFT, RIGHT, SegmentPairs
+from worker.ml import calibration
+from worker.ml.bradley_terry import probability_right
+from worker.ml.calibration import HeldOut
+from worker.ml.network_training import MlpTraining, TransformerTraining, fit_mlp, fit_transformer
+from worker.ml.pooled_prior import Prior
+from worker.ml.reward_models import Normalisation, RewardModel, StructuredReward
+from worker.ml.segments import SegmentPairs
 from worker.trajectory import SIGNALS, Trajectory
 
 Floats = npt.NDArray[np.float64]
-Layers = list[tuple[Tensor, Tensor]]
-Kind = Literal["structured", "mlp"]
+Kind = Literal["structured", "mlp", "preference_transformer"]
 
 MEMBERS = 8
 NEWTON_STEPS = 15
 LONGEST_NEWTON_STEP = 3.0
+CALIBRATION_FOLDS = 5
 _SMALLEST_SPREAD = 1e-6
 
 
@@ -35,23 +35,6 @@ class FitResult:
     metrics: dict[str, Any]
 
 
-@dataclass(frozen=True)
-class MlpTraining:
-    """How the network ensemble is trained. More steps overfit at 200 labels (measured: docs/method.md)."""
-
-    members: int = 4
-    hidden: int = 64
-    learning_rate: float = 1e-3
-    weight_decay: float = 1e-4
-    steps: int = 240
-    batch_pairs: int = 32
-    every_nth_step: int = 2
-    """Neighbouring control steps are nearly the same; using every second one halves the cost."""
-    held_out: float = 0.15
-    check_every: int = 20
-    patience: int = 4
-
-
 def fit(
     pairs: SegmentPairs,
     targets: npt.ArrayLike,
@@ -60,24 +43,32 @@ def fit(
     *,
     spread: Floats | None = None,
     reference: Sequence[Trajectory] = (),
+    prior: Prior | None = None,
     mlp: MlpTraining | None = None,
+    transformer: TransformerTraining | None = None,
 ) -> FitResult:
     """Fit an ensemble to N pairs and their targets P(right preferred) in {0, 1/2, 1}.
 
     ``spread`` (S,): standard deviation of summed signal differences over the pool the pairs come from (see
     ``signal_spread``); from the labelled pairs themselves when missing, which is shaky below about 30 labels.
     ``reference``: rollouts of the reference policy to normalise over; the labelled segments when missing.
+    ``prior``: of the structured kind's weights, N(0, I) when missing.
     Raises ValueError for targets outside {0, 1/2, 1} or a count that differs from the pairs'.
     """
     started = time.perf_counter()
     answers = _checked(pairs, targets)
     metrics: dict[str, Any] = {"kind": kind, "trained_on": len(pairs), "seed": seed}
     if kind == "structured":
-        model, found = _fit_structured(pairs, answers, seed, spread)
+        model, found = _fit_structured(pairs, answers, seed, spread, prior or Prior.standard(len(SIGNALS)))
+    elif kind == "mlp":
+        model, found = fit_mlp(pairs, answers, seed, mlp or MlpTraining())
     else:
-        model, found = _fit_mlp(pairs, answers, seed, mlp or MlpTraining())
+        model, found = fit_transformer(pairs, answers, seed, transformer or TransformerTraining())
+    held_out: HeldOut = found.pop("held_out")
+    temperature = calibration.fit_temperature(held_out)
+    model = model.with_temperature(temperature)
     model = model.normalised_over(reference) if reference else _normalised_over_segments(model, pairs)
-    metrics.update(found)
+    metrics.update(found, calibration=calibration.report(held_out, temperature))
     metrics["training_accuracy"] = _accuracy(model, pairs, answers)
     metrics["fit_seconds"] = round(time.perf_counter() - started, 4)
     return FitResult(model, metrics)
@@ -118,40 +109,61 @@ def _normalised_over_segments(model: RewardModel, pairs: SegmentPairs) -> Reward
 
 
 def _fit_structured(
-    pairs: SegmentPairs, answers: Floats, seed: int, spread: Floats | None
+    pairs: SegmentPairs, answers: Floats, seed: int, spread: Floats | None, prior: Prior
 ) -> tuple[RewardModel, dict[str, Any]]:
     scale = signal_spread(pairs) if spread is None else np.where(spread > _SMALLEST_SPREAD, spread, 1.0)
-    mean, covariance = posterior(pairs.signal_differences() / scale, answers)
+    features = pairs.signal_differences() / scale
+    mean, covariance = posterior(features, answers, prior)
     members = _antithetic(mean, covariance, np.random.default_rng(seed)) / scale
     deviation = 1.96 * np.sqrt(np.diag(covariance))
     weights = {
         name: {"mean": float(value), "low": float(value - margin), "high": float(value + margin)}
         for name, value, margin in zip(SIGNALS, mean, deviation, strict=True)
     }
-    return StructuredReward(members), {"weights": weights, "weights_unit": "log odds per standard deviation of a pair"}
+    return StructuredReward(members), {
+        "weights": weights,
+        "weights_unit": "log odds per standard deviation of a pair",
+        "held_out": _held_out(features, answers, seed, prior),
+    }
 
 
-def posterior(features: Floats, answers: Floats) -> tuple[Floats, Floats]:
-    """Laplace approximation of p(w | labels) with the prior N(0, I): its mean (S,) and covariance (S, S).
+def _held_out(features: Floats, answers: Floats, seed: int, prior: Prior) -> HeldOut:
+    """Log odds of every pair under members fitted without its fold."""
+    rng = np.random.default_rng(seed)
+    fold = rng.permutation(len(answers)) % CALIBRATION_FOLDS
+    logits = np.zeros((MEMBERS, len(answers)))
+    for each in range(min(CALIBRATION_FOLDS, len(answers))):
+        inside = fold == each
+        mean, covariance = posterior(features[~inside], answers[~inside], prior)
+        logits[:, inside] = _antithetic(mean, covariance, rng) @ features[inside].T
+    return HeldOut(logits, answers)
+
+
+def posterior(features: Floats, answers: Floats, prior: Prior | None = None) -> tuple[Floats, Floats]:
+    """Laplace approximation of p(w | labels): its mean (S,) and covariance (S, S). The prior is N(0, I) when missing.
 
     features (N, S) standardised differences right minus left; answers (N,) in {0, 1/2, 1}. Newton's method with steps
     of bounded length: separable data then move towards the prior's shoulder instead of overflowing.
     """
-    weights: Floats = np.zeros(features.shape[1])
+    known = prior or Prior.standard(features.shape[1])
+    precision = np.asarray(np.linalg.inv(known.covariance), np.float64)
+    weights: Floats = known.mean.copy()
     for _ in range(NEWTON_STEPS):
-        gradient, hessian = _gradient_and_hessian(features, answers, weights)
+        gradient, hessian = _gradient_and_hessian(features, answers, weights, known.mean, precision)
         step = np.asarray(np.linalg.solve(hessian, gradient), np.float64)
         length = max(float(np.linalg.norm(step)), 1e-12)
         weights = weights - min(1.0, LONGEST_NEWTON_STEP / length) * step
-    hessian = _gradient_and_hessian(features, answers, weights)[1]
+    hessian = _gradient_and_hessian(features, answers, weights, known.mean, precision)[1]
     return weights, np.asarray(np.linalg.inv(hessian), np.float64)
 
 
-def _gradient_and_hessian(features: Floats, answers: Floats, weights: Floats) -> tuple[Floats, Floats]:
-    """Of the summed right form of Eq. (2) plus |w|^2 / 2."""
+def _gradient_and_hessian(
+    features: Floats, answers: Floats, weights: Floats, mean: Floats, precision: Floats
+) -> tuple[Floats, Floats]:
+    """Of the summed right form of Eq. (2) plus (w - mean)' precision (w - mean) / 2."""
     probability = probability_right(features @ weights)
-    gradient: Floats = features.T @ (probability - answers) + weights
-    hessian: Floats = features.T @ (features * (probability * (1 - probability))[:, None]) + np.eye(len(weights))
+    gradient: Floats = features.T @ (probability - answers) + precision @ (weights - mean)
+    hessian: Floats = features.T @ (features * (probability * (1 - probability))[:, None]) + precision
     return gradient, hessian
 
 
@@ -160,88 +172,3 @@ def _antithetic(mean: Floats, covariance: Floats, rng: np.random.Generator) -> F
     half = rng.standard_normal((MEMBERS // 2, len(mean))) @ np.linalg.cholesky(covariance).T
     samples: Floats = mean + np.concatenate([half, -half])
     return samples
-
-
-# -- mlp: an ensemble of networks on (observation, action) -------------------------------------------------------------
-
-
-def _fit_mlp(
-    pairs: SegmentPairs, answers: Floats, seed: int, config: MlpTraining
-) -> tuple[RewardModel, dict[str, Any]]:
-    generator = torch.Generator().manual_seed(seed)
-    inputs, offset, scale = _standardised_inputs(pairs, config.every_nth_step)
-    targets = torch.as_tensor(answers, dtype=torch.float32)
-    order = torch.randperm(len(targets), generator=generator)
-    held_out = max(1, round(config.held_out * len(order))) if len(order) >= 20 else 0
-    validation, training = order[:held_out], order[held_out:]
-    draws = torch.randint(len(training), (config.members, len(training)), generator=generator)
-    counts = torch.stack([torch.bincount(draw, minlength=len(training)) for draw in draws]).float()
-
-    layers = _new_layers(inputs.shape[-1], config, generator)
-    optimiser = torch.optim.AdamW(
-        [tensor for layer in layers for tensor in layer], config.learning_rate, weight_decay=config.weight_decay
-    )
-    best, best_loss, waited, steps = _copied(layers), float("inf"), 0, 0
-    for step in range(1, config.steps + 1):
-        steps = step
-        rows = torch.randint(len(training), (config.batch_pairs,), generator=generator)
-        logits = _ensemble_logits(layers, inputs[training[rows]], config.every_nth_step)
-        loss = preference_loss(logits, targets[training[rows]], counts[:, rows])
-        optimiser.zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
-        optimiser.step()
-        if held_out and step % config.check_every == 0:
-            current = _validation_loss(layers, inputs[validation], targets[validation], config.every_nth_step)
-            if current < best_loss:
-                best, best_loss, waited = _copied(layers), current, 0
-            else:
-                waited += 1
-            if waited >= config.patience:
-                break
-    if not held_out:
-        best = _copied(layers)
-    arrays = tuple((matrix.numpy(), bias.numpy()) for matrix, bias in best)
-    found = {"steps": steps, "validation_loss": best_loss if held_out else None}
-    return MlpReward(arrays, offset, scale), found
-
-
-def _standardised_inputs(
-    pairs: SegmentPairs, every_nth_step: int
-) -> tuple[Tensor, npt.NDArray[np.float32], npt.NDArray[np.float32]]:
-    steps = np.concatenate([pairs.observations, pairs.actions], axis=-1)[:, :, ::every_nth_step]
-    flat = steps.reshape(-1, steps.shape[-1])
-    offset = flat.mean(axis=0)
-    scale = np.maximum(flat.std(axis=0), 1e-3)
-    standardised = np.clip((steps - offset) / scale, -6.0, 6.0)
-    return torch.as_tensor(standardised, dtype=torch.float32), offset.astype(np.float32), scale.astype(np.float32)
-
-
-def _new_layers(inputs: int, config: MlpTraining, generator: torch.Generator) -> Layers:
-    sizes = [inputs, config.hidden, config.hidden, 1]
-    layers = []
-    for fan_in, fan_out in pairwise(sizes):
-        matrix = torch.randn(config.members, fan_in, fan_out, generator=generator) / fan_in**0.5
-        if fan_out == 1:
-            matrix *= 0.1  # returns of a hundred steps: start undecided
-        layers.append((matrix.requires_grad_(), torch.zeros(config.members, 1, fan_out, requires_grad=True)))
-    return layers
-
-
-def _ensemble_logits(layers: Layers, inputs: Tensor, every_nth_step: int) -> Tensor:
-    """(B, 2, T, D + 7) -> (E, B), every member's log odds that right is preferred."""
-    hidden = inputs.reshape(1, -1, inputs.shape[-1])
-    for matrix, bias in layers[:-1]:
-        hidden = functional.silu(hidden @ matrix + bias)
-    matrix, bias = layers[-1]
-    rewards = (hidden @ matrix + bias).tanh().reshape(len(matrix), *inputs.shape[:3])
-    returns = rewards.sum(dim=-1) * every_nth_step
-    return returns[..., RIGHT] - returns[..., LEFT]
-
-
-@torch.no_grad()
-def _validation_loss(layers: Layers, inputs: Tensor, targets: Tensor, every_nth_step: int) -> float:
-    return float(preference_loss(_ensemble_logits(layers, inputs, every_nth_step), targets))
-
-
-def _copied(layers: Layers) -> Layers:
-    return [(matrix.detach().clone(), bias.detach().clone()) for matrix, bias in layers]

@@ -5,13 +5,16 @@ it for an omega) and names the segment with the larger sum. How it errs follows 
 threshold in units of the spread of returns, so that a setting means the same for every taste.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
+from math import isfinite
 from typing import Literal, Self
 
 import numpy as np
 import numpy.typing as npt
+
+from worker.trajectory import COSTS
 
 Floats = npt.NDArray[np.float64]
 Answer = Literal["left", "right", "equal", "skip"]
@@ -31,7 +34,7 @@ OMEGA: Mapping[User, tuple[float, ...]] = {
     User.CAUTIOUS: (1.0, 2.0, 1.5, 2.5, 3.0, 2.0),
     User.IMPATIENT: (2.0, 0.5, 0.75, 0.5, 1.5, 0.5),
 }
-"""The paper's omega, in the order of COSTS."""
+"""The paper's omega, in the order of worker.trajectory.COSTS."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +45,15 @@ class Taste:
     omega: tuple[float, ...] = (1.0,) * 6
     per_signal: Mapping[str, float] = field(default_factory=dict)
     """per control step; below 0: likes it"""
+
+    def __post_init__(self) -> None:
+        if len(self.omega) != len(COSTS) or any(not isfinite(weight) for weight in self.omega):
+            raise ValueError(f"A taste needs {len(COSTS)} finite weights, for {', '.join(COSTS)}; got {self.omega}.")
+
+    @classmethod
+    def of_omega(cls, omega: Sequence[float]) -> Self:
+        """Somebody with these weights, named after them."""
+        return cls("omega-" + "-".join(f"{weight:g}" for weight in omega), tuple(omega))
 
 
 OPPOSED: tuple[tuple[Taste, Taste], ...] = (
@@ -59,6 +71,27 @@ OPPOSED: tuple[tuple[Taste, Taste], ...] = (
     ),
 )
 """Users who truly differ: both of a pair care most about one thing, in opposite directions."""
+
+TASTES: Mapping[str, Taste] = {
+    **{user.value: Taste(user.value, OMEGA[user]) for user in User},
+    **{taste.name: taste for pair in OPPOSED for taste in pair},
+}
+"""Everybody with a name: the paper's three and the opposed ones."""
+
+_POPULATION_SIGNALS = {
+    "lateral_offset_m": 8.0,
+    "near_speed_squared_m2_s2": 8.0,
+    "acceleration_squared_m2_s4": 0.2,
+    "undelivered": 0.06,
+}
+"""Largest size of what the people of a population mind or like beyond the six items."""
+
+
+def random_taste(name: str, rng: np.random.Generator) -> Taste:
+    """Somebody of a population: each omega between a fifth and five times the reference, and one or two more likes."""
+    omega = tuple(float(weight) for weight in 5.0 ** rng.uniform(-1.0, 1.0, len(COSTS)))
+    minded = rng.choice(list(_POPULATION_SIGNALS), int(rng.integers(1, 3)), replace=False)
+    return Taste(name, omega, {str(each): float(rng.uniform(-1, 1)) * _POPULATION_SIGNALS[each] for each in minded})
 
 
 @dataclass(frozen=True)

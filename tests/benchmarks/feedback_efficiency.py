@@ -1,0 +1,294 @@
+"""How much each reward model and each way of choosing pairs makes of a number of answers.
+
+    python -m tests.benchmarks.feedback_efficiency --task feeding --minutes 11 --output docs/results/feedback_efficiency
+
+Scripted users answer (5 % mistakes, 10 % "equal") matched pairs of real rollouts of a pool's behaviours. Measured on
+pairs of other scenarios: how often the model prefers what the user truly prefers, on all of them and on contested ones
+(where at least one of the paper's three users prefers the other clip), and the expected calibration error against
+answers like those it learned from. Rollouts and finished chains are kept under data/; repeat the command to go on, and
+with more --minutes to do more. The pool of the default size has 1020 pairs: --pool-scenarios 850 for 5000 labels.
+"""
+
+import argparse
+import csv
+import json
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from tqdm import tqdm
+
+from tests.benchmarks.pool_rollouts import Pool, pool_rollouts
+from worker import laboratory
+from worker.ml import acquisition, calibration, reward_training
+from worker.ml.pooled_prior import Prior
+from worker.ml.reward_models import RewardModel
+from worker.ml.teachers import TASTES, Manner, ScriptedTeacher, Taste, User, random_taste
+from worker.sim.catalogue import ENVIRONMENTS
+from worker.sim.costs import preference_rewards
+
+Floats = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+POOL_FIRST, UNSEEN_FIRST = 10_800_000, 10_950_000
+UNSEEN_SCENARIOS = 60
+COUNTS = (10, 25, 50, 100, 200, 1000, 5000)
+RETRAIN_EVERY = 10
+"""labels, as in a study; network ensembles, which take seconds, choose anew at every one of COUNTS only"""
+NAMED = ("cautious", "impatient", "slow", "wide")
+NEW_PEOPLE, EARLIER_PEOPLE = range(6), range(100, 112)
+"""Numbers of people drawn from one population: those who are measured, and those who came before them."""
+RULES: tuple[acquisition.Rule, ...] = ("uniform", "disagreement", "entropy", "information_gain", "contested")
+TARGETS = {"left": 0.0, "right": 1.0, "equal": 0.5}
+
+
+@dataclass(frozen=True)
+class Chain:
+    """One user answering one pair after the other."""
+
+    user: str
+    model: reward_training.Kind
+    rule: acquisition.Rule = "uniform"
+    pooled: bool = False
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Measured:
+    """One row of the results."""
+
+    task: str
+    user: str
+    model: str
+    strategy: str
+    pooled_prior: bool
+    seed: int
+    labels: int
+    accuracy: float
+    contested_accuracy: float | None
+    calibration_error: float
+    calibration_error_uncalibrated: float
+    temperature: float
+    fit_seconds: float
+
+
+class Bench:
+    """Pools and users of one task."""
+
+    def __init__(self, task: str, pool_scenarios: int, most_labels: int) -> None:
+        self.task, self.most_labels = laboratory.task(task), most_labels
+        steps = 100 if task == "drinking" else 60
+        self.pool = pool_rollouts(task, POOL_FIRST, pool_scenarios, steps)
+        self.unseen = pool_rollouts(task, UNSEEN_FIRST, UNSEEN_SCENARIOS, steps)
+        self.pairs, self.unseen_pairs = self.pool.pairs(), self.unseen.pairs()
+        self.unseen_segments = self.unseen.segments(self.unseen_pairs)
+        self.spread = reward_training.signal_spread(self.pool.segments(self.pairs))
+
+    def measure(self, chain: Chain) -> Iterator[Measured]:
+        """Answer, fit, choose, and so on."""
+        rng = np.random.default_rng([chain.seed, 7])
+        rewards = self.rewards(chain.user, self.pool)[self.pairs]
+        teacher = ScriptedTeacher.calibrated(Manner(), rewards)
+        rows, answers = np.zeros(0, np.int64), np.zeros(0)
+        model: RewardModel | None = None
+        stops = [count for count in COUNTS if count <= min(self.most_labels, len(self.pairs))]
+        if chain.rule != "uniform" or chain.pooled:
+            stops = [count for count in stops if count <= 200]
+        every = [*range(RETRAIN_EVERY, stops[-1], RETRAIN_EVERY)] if chain.model == "structured" else []
+        for count in sorted({*stops, *every} if chain.rule != "uniform" else stops):
+            added = self._choose(chain, count - len(rows), rows, model, rng)
+            said = [TARGETS[teacher.answer(left, right, rng)] for left, right in rewards[added]]
+            rows, answers = np.concatenate([rows, added]), np.concatenate([answers, said])
+            fitted = self._fit(chain, rows, answers)
+            model = fitted.model
+            if count in stops:
+                yield self._row(chain, count, fitted)
+
+    def _choose(
+        self, chain: Chain, count: int, used: Indices, model: RewardModel | None, rng: np.random.Generator
+    ) -> Indices:
+        free = np.setdiff1d(np.arange(len(self.pairs)), used)
+        scores = self._scores(chain, free, model)
+        rule = "uniform" if scores is None else chain.rule
+        choice = acquisition.choose(count, len(free), rng, rule=rule, scores=scores)
+        return free[choice.indices]
+
+    def _scores(self, chain: Chain, free: Indices, model: RewardModel | None) -> Floats | None:
+        if chain.rule == "contested":
+            others = [user for user in User if user.value != chain.user]
+            returns = np.array([self.rewards(user.value, self.pool).sum(-1) for user in others])
+            differences = returns[:, self.pairs[:, 1]] - returns[:, self.pairs[:, 0]]
+            return acquisition.contested(acquisition.expected_answers(differences)[:, free])
+        if chain.rule == "uniform" or model is None:
+            return None
+        members = model.member_probabilities(self.pool.segments(self.pairs[free]))
+        return acquisition.score(chain.rule, members)
+
+    def _fit(self, chain: Chain, rows: Indices, answers: Floats) -> reward_training.FitResult:
+        prior = self.prior if chain.pooled else None
+        pairs = self.pool.segments(self.pairs[rows])
+        return reward_training.fit(pairs, answers, chain.model, chain.seed, spread=self.spread, prior=prior)
+
+    def _row(self, chain: Chain, count: int, fitted: reward_training.FitResult) -> Measured:
+        sides = self.rewards(chain.user, self.unseen)[self.unseen_pairs]
+        wants = self._wants(chain.user)
+        contested = np.any([self._wants(user.value) != wants for user in User], axis=0)
+        predicted = fitted.model.probability_right(self.unseen_segments)
+        right = (predicted > 0.5) == wants
+        teacher, rng = ScriptedTeacher.calibrated(Manner(), sides), np.random.default_rng([chain.seed, 8])
+        said = np.array([TARGETS[teacher.answer(left, right, rng)] for left, right in sides])
+        plain = fitted.model.with_temperature(1.0).probability_right(self.unseen_segments)
+        return Measured(
+            task=self.task.name,
+            user=chain.user,
+            model=chain.model,
+            strategy=chain.rule,
+            pooled_prior=chain.pooled,
+            seed=chain.seed,
+            labels=count,
+            accuracy=float(right.mean()),
+            contested_accuracy=float(right[contested].mean()) if contested.any() else None,
+            calibration_error=calibration.expected_calibration_error(predicted, said),
+            calibration_error_uncalibrated=calibration.expected_calibration_error(plain, said),
+            temperature=fitted.model.temperature,
+            fit_seconds=fitted.metrics["fit_seconds"],
+        )
+
+    @cached_property
+    def prior(self) -> Prior:
+        """From earlier people of the population, each with 200 answers."""
+        weights = []
+        for number in EARLIER_PEOPLE:
+            rng = np.random.default_rng([number, 9])
+            rewards = self.rewards(f"person-{number}", self.pool)[self.pairs]
+            teacher = ScriptedTeacher.calibrated(Manner(), rewards)
+            rows = rng.choice(len(self.pairs), 200, replace=False)
+            said = np.array([TARGETS[teacher.answer(left, right, rng)] for left, right in rewards[rows]])
+            features = self.pool.segments(self.pairs[rows]).signal_differences() / self.spread
+            weights.append(reward_training.posterior(features, said)[0])
+        return Prior.pooled(weights)
+
+    def rewards(self, user: str, pool: Pool) -> Floats:
+        """True preference rewards, (C, T)."""
+        taste = _taste(user)
+        return preference_rewards(self.task, pool.costs, pool.signals, taste.omega, "calibrated", taste.per_signal)
+
+    def _wants(self, user: str) -> npt.NDArray[np.bool_]:
+        """Whether the user truly prefers the right clip of every unseen pair."""
+        returns = self.rewards(user, self.unseen).sum(-1)
+        wants: npt.NDArray[np.bool_] = returns[self.unseen_pairs[:, 1]] > returns[self.unseen_pairs[:, 0]]
+        return wants
+
+
+def _taste(user: str) -> Taste:
+    if user in TASTES:
+        return TASTES[user]
+    return random_taste(user, np.random.default_rng([int(user.removeprefix("person-")), 10]))
+
+
+def chains(seeds: int) -> list[Chain]:
+    """What matters most first: when time is up, the rest is left out."""
+    people = [*NAMED, *(f"person-{number}" for number in NEW_PEOPLE)]
+    quick = [Chain(user, "structured", rule, seed=seed) for seed in range(seeds) for user in people for rule in RULES]
+    quick += [Chain(user, "structured", pooled=True, seed=seed) for seed in range(seeds) for user in people]
+    networks: tuple[reward_training.Kind, ...] = ("mlp", "preference_transformer")
+    slow = [Chain(user, kind) for user in NAMED for kind in networks]
+    slow += [Chain(user, kind, rule) for user in NAMED for rule in RULES[1:] for kind in networks]
+    return [*quick, *slow]
+
+
+def main() -> None:
+    """See the module."""
+    options = _options()
+    torch.set_num_threads(1)
+    bench = Bench(options.task, options.pool_scenarios, options.most_labels)
+    journal = Path("data") / f"feedback_efficiency-{options.task}-{options.pool_scenarios}.jsonl"
+    journal.touch()
+    done = {line["chain"]: line["rows"] for line in map(json.loads, journal.read_text().splitlines())}
+    planned, until = chains(options.seeds), time.monotonic() + 60 * options.minutes
+    for chain in tqdm(planned, unit="chain", mininterval=5):
+        name = json.dumps([asdict(chain), options.most_labels])
+        if name not in done and time.monotonic() < until:
+            done[name] = [asdict(row) for row in bench.measure(chain)]
+            with journal.open("a") as stream:
+                stream.write(json.dumps({"chain": name, "rows": done[name]}) + "\n")
+    rows = [row for chain in planned for row in done.get(json.dumps([asdict(chain), options.most_labels]), [])]
+    sys.stdout.write(report(rows))
+    if options.output:
+        options.output.with_suffix(".tables.md").write_text(report(rows))
+        with options.output.with_suffix(".csv").open("w", newline="") as stream:
+            writer = csv.DictWriter(stream, list(rows[0]), lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(
+                {name: round(v, 4) if isinstance(v, float) else v for name, v in row.items()} for row in rows
+            )
+
+
+def report(rows: Sequence[dict[str, Any]]) -> str:
+    """Markdown tables: means over users and seeds, only of users that every line of the table has."""
+    named = [row for row in rows if row["user"] in NAMED]
+    plain = [row for row in named if not row["pooled_prior"]]
+    random = [row for row in rows if row["user"].startswith("person-")]
+    lines: list[str] = []
+    for title, field in (("accuracy", "accuracy"), ("accuracy on contested pairs", "contested_accuracy")):
+        lines += [f"### Unseen pairs: {title}, named users", "", *_table(plain, field), ""]
+        drawn = [{**row, "strategy": "pooled prior" if row["pooled_prior"] else row["strategy"]} for row in random]
+        lines += [f"### Unseen pairs: {title}, people of the population", "", *_table(drawn, field), ""]
+    both = [(name, f"calibration_error{name}") for name in ("_uncalibrated", "")]
+    for name, field in both:
+        uniform = [row for row in plain if row["strategy"] == "uniform"]
+        lines += [
+            f"### Expected calibration error, {'T = 1' if name else 'calibrated'}",
+            "",
+            *_table(uniform, field),
+            "",
+        ]
+    uniform = [row for row in plain if row["strategy"] == "uniform"]
+    return "\n".join([*lines, "### Seconds per fit", "", *_table(uniform, "fit_seconds", 2)]) + "\n"
+
+
+def _table(rows: Sequence[dict[str, Any]], field: str, digits: int = 3) -> list[str]:
+    counts = sorted({row["labels"] for row in rows})
+    lines = [
+        "| model | pairs chosen | chains | " + " | ".join(map(str, counts)) + " |",
+        "|---" * (3 + len(counts)) + "|",
+    ]
+    for model, strategy in dict.fromkeys((row["model"], row["strategy"]) for row in rows):
+        mine = [row for row in rows if (row["model"], row["strategy"]) == (model, strategy)]
+        cells = [
+            _cell([row[field] for row in mine if row["labels"] == count and row[field] is not None], digits)
+            for count in counts
+        ]
+        number = len({(row["user"], row["seed"]) for row in mine})
+        lines.append(f"| {model} | {strategy} | {number} | " + " | ".join(cells) + " |")
+    return lines
+
+
+def _cell(values: Sequence[float], digits: int) -> str:
+    """Mean and its standard error over chains."""
+    if not values:
+        return "-"
+    error = np.std(values, ddof=1) / len(values) ** 0.5 if len(values) > 1 else float("nan")
+    return f"{np.mean(values):.{digits}f} ({error:.{digits}f})"
+
+
+def _options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--task", choices=ENVIRONMENTS, default="feeding")
+    parser.add_argument("--seeds", type=int, default=2, help="of the quick chains; those of networks have one")
+    parser.add_argument("--pool-scenarios", type=int, default=170)
+    parser.add_argument("--most-labels", type=int, choices=COUNTS, default=1000)
+    parser.add_argument("--minutes", type=float, default=11.0, help="no chain is begun after that")
+    parser.add_argument("--output", type=Path, help="path without ending of the .csv and the tables")
+    return parser.parse_args()
+
+
+if __name__ == "__main__":
+    main()
