@@ -1,5 +1,7 @@
 """The paper's method as printed, and the errata that a test can pin."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -62,10 +64,30 @@ def test_the_dynamics_see_the_executed_action_only() -> None:
     assert float(pbarl_printed.dynamics_loss(states, following, torch.full((2, 3), 0.5))) == pytest.approx(0.75)
 
 
-@pytest.mark.parametrize("length", [0, 1])
-def test_a_list_of_one_action_is_refused_with_a_reason(length: int) -> None:
-    with pytest.raises(ValueError, match="cannot be re-ranked"):
-        PrintedConfig(list_length=length)
+def test_equation_4_is_undefined_for_one_action_and_then_says_nothing() -> None:
+    """As printed the mean over n - 1 = 0 negatives is 0/0; the reading here leaves the preference term out."""
+    outputs = torch.randn(3, 1, 7, requires_grad=True)
+    assert float(pbarl_printed.preference_loss(outputs, outputs, 1.0)) == 0.0
+
+
+def test_with_one_action_the_encoder_does_not_depend_on_who_it_is_for(problem: FilterProblem) -> None:
+    reference = [invented.trajectory(np.random.default_rng(seed)) for seed in range(3)]
+    shown = invented.pairs(30, np.random.default_rng(1))
+    other = fit(shown, invented.answers_of(shown, -np.eye(len(SIGNALS))[1]), "mlp", 0, mlp=MlpTraining(steps=20))
+    somebody_else = replace(problem, reward=other.model)
+
+    def encoders(length: int) -> list[bytes]:
+        settings = PrintedConfig(steps=30, batch=8, list_length=length)
+        return [fit_printed(each, reference, settings).weights.to_bytes() for each in (problem, somebody_else)]
+
+    alone, listed = encoders(1), encoders(3)
+    assert alone[0] == alone[1]
+    assert listed[0] != listed[1]
+
+
+def test_an_empty_list_is_refused() -> None:
+    with pytest.raises(ValueError, match="at least n = 1"):
+        PrintedConfig(list_length=0)
 
 
 def test_reranking_puts_the_best_learned_reward_first() -> None:

@@ -35,7 +35,8 @@ class PrintedConfig:
     """The paper's settings where it gives them; a comment where it does not."""
 
     list_length: int = 10
-    """n. The paper's ablation has n = 1, but Eq. (4) is then 0/0 and a list of one cannot be re-ranked: rejected."""
+    """n. For the paper's n = 1 Eq. (4) is 0/0, and a list of one cannot be re-ranked. The reading that can be run: one
+    sample of the policy, without a preference term, since one action says nothing about what is preferred to what"""
     epsilon: float = 1.0
     temperature: float = 1.0  # tau: not given
     betas: tuple[float, float, float, float] = BETAS["feeding"]  # those of the task, see BETAS
@@ -51,11 +52,8 @@ class PrintedConfig:
     """whether the re-ranked list is a constant in Eq. (4): not said; the literal reading differentiates both lists"""
 
     def __post_init__(self) -> None:
-        if self.list_length < 2:
-            raise ValueError(
-                "A list of n = 1 action cannot be re-ranked and makes Eq. (4) 0/0; use n of at least 2. "
-                "(How the paper ran its n = 1 row is not described.)"
-            )
+        if self.list_length < 1:
+            raise ValueError("A list needs at least n = 1 action.")
 
 
 class PrintedEncoder(nn.Module):
@@ -99,8 +97,11 @@ def preference_loss(outputs: Tensor, reranked: Tensor, temperature: float) -> Te
     """Eq. (4) with sim = -d^2 (Eq. 5): positives at equal positions, negatives averaged over j != i. (B, n, 7) -> ()
 
     Without averaging in the exponent it would be plain InfoNCE; the mean over the n - 1 negatives only adds log(n - 1).
+    0 for n = 1, see PrintedConfig.list_length.
     """
     count = outputs.shape[-2]
+    if count == 1:
+        return torch.zeros(())
     similarity = -((outputs[:, :, None] - reranked[:, None]) ** 2).sum(-1) / temperature
     positive = similarity.diagonal(dim1=1, dim2=2)
     others = similarity.masked_fill(torch.eye(count, dtype=torch.bool), -torch.inf)

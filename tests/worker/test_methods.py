@@ -1,0 +1,239 @@
+"""Every method of the comparison on an invented world in which only the first joint's action is disliked."""
+
+import pickle
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+
+from tests.worker import invented
+from worker.ml import methods, pbrl_hri, preference_rl, prefft, response_surface, studio_filter
+from worker.ml.action_filter import load_state
+from worker.ml.best_of_n import BestOfN, fit_best_of_n
+from worker.ml.methods import METHODS, MethodConfig, Setting
+from worker.ml.pbrl_hri import FromScratch
+from worker.ml.prefft import FineTuning
+from worker.ml.reward_models import MlpReward, StructuredReward
+from worker.ml.studio_filter import FilterConfig, FilterProblem, noisy
+from worker.ml.value import ActionValue
+from worker.trajectory import SIGNALS, Trajectory
+
+POLICY = invented.small_policy()
+SPEED, DISTANCE = SIGNALS.index("speed_m_s"), SIGNALS.index("distance_m")
+STEPS = 15
+
+
+class World(gymnasium.Env[Any, Any]):
+    """Observations are noise that belongs to the scenario; the signal "speed" is the first joint's action."""
+
+    def __init__(self) -> None:
+        self.observation_space = gymnasium.spaces.Box(-2, 2, (invented.D,), np.float32)
+        self.action_space = gymnasium.spaces.Box(-1, 1, (invented.A,), np.float32)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """See gymnasium."""
+        super().reset(seed=seed)
+        self._seen = invented.observations(STEPS + 1, np.random.default_rng(seed))
+        self._step = 0
+        return self._seen[0], {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """See gymnasium."""
+        self._step += 1
+        signals = dict.fromkeys(SIGNALS, 0.0) | {"speed_m_s": float(action[0])}
+        return self._seen[self._step], 0.0, False, self._step == STEPS, {"signals": signals}
+
+
+def collect(act: studio_filter.Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
+    """See studio_filter.Collect; the same world."""
+    return [_episode(noisy(act, noise, seed, scenario), scenario) for scenario in scenarios]
+
+
+def _episode(act: studio_filter.Act, scenario: int) -> Trajectory:
+    rng = np.random.default_rng(scenario)
+    seen = invented.observations(STEPS + 1, rng)
+    actions = np.clip([act(each) for each in seen[:-1]], -1, 1).astype(np.float32)
+    signals = np.zeros((STEPS, len(SIGNALS)), np.float32)
+    signals[:, SPEED] = actions[:, 0]
+    episode = invented.trajectory(rng, steps=STEPS, scenario=scenario, signals=signals, actions=actions)
+    return replace(episode, observations=seen)
+
+
+REWARD = StructuredReward(-np.tile(np.eye(len(SIGNALS))[SPEED], (8, 1)))
+SMALL = MethodConfig(
+    printed_steps=20,
+    printed_rollouts=4,
+    fine_tuning=FineTuning(steps=240, warm_up_steps=120, critic_first_updates=20, cloning_steps=50),
+    from_scratch=FromScratch(steps=240, random_steps=120, hidden=16),
+    candidates=4,
+    value_rollouts=4,
+    value_steps=20,
+)
+
+
+@pytest.fixture(scope="module")
+def action_reward() -> MlpReward:
+    """Minus the first joint's action, as far as a network without hidden layers goes."""
+    matrix = np.zeros((1, invented.D + 7, 1), np.float32)
+    matrix[0, invented.D] = -0.5
+    zeros, ones = np.zeros(invented.D + 7, np.float32), np.ones(invented.D + 7, np.float32)
+    return MlpReward(((matrix, np.zeros((1, 1, 1), np.float32)),), zeros, ones)
+
+
+@pytest.fixture
+def setting(action_reward: MlpReward) -> Setting:
+    config = FilterConfig(
+        gates=(1.0,), gate_scenarios=4, round_rollouts=(4,), round_noise=(0.3,), value_steps=20, adapter_steps=10
+    )
+    family = invented.TASK.modes
+    modes = family.sample(30, np.random.default_rng(0))
+    deltas = np.zeros((30, len(SIGNALS)))
+    deltas[:, SPEED] = modes[:, 0]
+    return Setting(
+        problem=FilterProblem(invented.TASK, POLICY, REWARD, 0, config),
+        labels=33,
+        pool=collect(POLICY.mean, range(4), 0.3, 0),
+        surface=lambda: response_surface.fit(family, modes, deltas, np.zeros(30)),
+        action_reward=lambda: action_reward,
+        reference=lambda scenarios: collect(POLICY.mean, scenarios, 0.0, 0),
+        collect=collect,
+        make_env=World,
+        config=SMALL,
+    )
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_every_method_gives_an_act_that_travels_and_is_the_same_again(name: str, setting: Setting) -> None:
+    seen = invented.observations(3, np.random.default_rng(0))
+    fitted = methods.fit(name, setting)
+    actions = np.array([fitted.act(each) for each in seen])
+    assert actions.shape == (3, 7)
+    assert np.abs(actions).max() <= 1.0
+    travelled = pickle.loads(pickle.dumps(fitted.act))  # noqa: S301
+    np.testing.assert_array_equal([travelled(each) for each in seen], actions)
+    again = methods.fit(name, setting)
+    np.testing.assert_array_equal([again.act(each) for each in seen], actions)
+    assert (again.environment_steps, again.labels) == (fitted.environment_steps, fitted.labels)
+
+
+@pytest.mark.parametrize(
+    ("name", "steps", "labels"),
+    [
+        ("reference", 0, 0),
+        ("pbarl_printed", 4 * STEPS, 33),
+        ("best_of_n", 4 * STEPS, 33),
+        ("prefft", 240, 33),
+        ("pbrl_hri", 240 + 4 * STEPS, 33),
+    ],
+)
+def test_every_environment_step_a_method_asks_for_is_counted(
+    name: str, steps: int, labels: int, setting: Setting
+) -> None:
+    fitted = methods.fit(name, setting)
+    assert (fitted.environment_steps, fitted.labels) == (steps, labels)
+
+
+def test_the_trained_policy_begins_as_the_frozen_one_in_the_arms_full_range() -> None:
+    torch.manual_seed(0)
+    states = invented.observations(600, np.random.default_rng(0))
+    actor = prefft.in_full_range(POLICY, torch.from_numpy(states), 600)
+    assert POLICY.action_limit < 1.0
+    began = actor.policy()
+    assert began.action_limit == 1.0
+    assert np.abs(began.mean(states) - POLICY.mean(states)).mean() < 0.02
+    np.testing.assert_allclose(began.action_std(states).mean(), POLICY.action_std(states).mean(), rtol=0.15)
+
+
+def test_a_policy_that_already_has_the_full_range_is_taken_over_exactly() -> None:
+    policy = type(POLICY)({**POLICY.weights, "action_limit": np.ones(1, np.float32)})
+    states = invented.observations(5, np.random.default_rng(0))
+    began = prefft.in_full_range(policy, torch.from_numpy(states), 0).policy()
+    np.testing.assert_array_equal(began.mean(states), policy.mean(states))
+
+
+def test_the_divergence_is_that_of_gaussians() -> None:
+    generator = torch.Generator().manual_seed(0)
+    mean, log_std, other, other_log_std = torch.randn(4, 5, 7, generator=generator).unbind(0)
+    expected = torch.distributions.kl_divergence(
+        torch.distributions.Normal(mean, log_std.exp()), torch.distributions.Normal(other, other_log_std.exp())
+    )
+    torch.testing.assert_close(prefft.gaussian_divergence(mean, log_std, other, other_log_std), expected.sum(-1))
+
+
+def fine_tuned(tie_weight: float) -> np.ndarray:
+    """Actions in unseen states after some learning."""
+    config = FineTuning(steps=1_500, warm_up_steps=300, critic_first_updates=200, cloning_steps=200, learning_rate=3e-3)
+    policy = prefft.fine_tune(
+        World,
+        POLICY,
+        preference_rl.learned(REWARD),
+        invented.TASK.observation,
+        replace(config, tie_weight=tie_weight),
+        0,
+    )
+    actions: np.ndarray = policy.mean(invented.observations(300, np.random.default_rng(9)))
+    return actions
+
+
+def test_fine_tuning_follows_the_learned_reward_and_the_tie_holds_it_back() -> None:
+    before = POLICY.mean(invented.observations(300, np.random.default_rng(9)))
+    free, tied = fine_tuned(0.0), fine_tuned(prefft.TIED)
+    assert free[:, 0].mean() < before[:, 0].mean() - 0.2
+    assert tied[:, 0].mean() < before[:, 0].mean()
+    assert np.abs(tied - before).mean() < 0.7 * np.abs(free - before).mean()
+
+
+def test_an_episode_is_rewarded_as_a_whole() -> None:
+    asked: list[tuple[int, ...]] = []
+
+    def reward(signals: np.ndarray, observations: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        asked.append((len(signals), len(observations), len(actions)))
+        return np.arange(len(actions), dtype=np.float32)
+
+    config = FineTuning(steps=120, warm_up_steps=60, critic_first_updates=1, cloning_steps=1, environments=2)
+    prefft.fine_tune(World, POLICY, reward, invented.TASK.observation, config, 0)
+    assert set(asked) == {(STEPS, STEPS, STEPS)}
+    assert len(asked) == 120 // STEPS
+
+
+def test_the_sketchy_reward_is_minus_the_distance_in_the_references_spread_plus_the_learned_one() -> None:
+    reference = collect(POLICY.mean, range(3), 0.0, 0)
+    for number, each in enumerate(reference):
+        each.signals[:, DISTANCE] = number
+    both = pbrl_hri.sketchy(reference, lambda signals, observations, actions: np.full(len(signals), 10.0))
+    signals = np.zeros((2, len(SIGNALS)), np.float32)
+    signals[:, DISTANCE] = (0.0, 3.0)
+    spread = float(np.std([0.0, 1.0, 2.0]))
+    rewards = both(signals, signals, signals).tolist()
+    assert rewards == pytest.approx([10.0, 10.0 - 3.0 / spread])
+
+
+@pytest.fixture
+def best_of() -> BestOfN:
+    rollouts = collect(POLICY.mean, range(20), 0.3, 0)
+    return fit_best_of_n(POLICY, REWARD, rollouts, count=8, steps=300, seed=0)
+
+
+def test_best_of_n_computes_the_value_it_has_learned(best_of: BestOfN) -> None:
+    value = ActionValue(torch.zeros(invented.D), torch.ones(invented.D))
+    load_state(value, best_of.value)
+    seen = invented.observations(1, np.random.default_rng(0))[0]
+    candidates = np.random.default_rng(0).uniform(-1, 1, (5, 7)).astype(np.float32)
+    expected = value(torch.from_numpy(seen).expand(5, -1), torch.from_numpy(candidates)).detach().numpy()
+    np.testing.assert_allclose(best_of.values(seen, candidates), expected, rtol=1e-4, atol=1e-5)
+
+
+def test_best_of_n_chooses_what_is_liked_among_what_the_policy_would_do(best_of: BestOfN) -> None:
+    seen = invented.observations(100, np.random.default_rng(0))
+    chosen = np.array([best_of(each) for each in seen])
+    assert chosen[:, 0].mean() < POLICY.mean(seen)[:, 0].mean() - 0.02
+    assert np.abs(chosen).max() <= POLICY.action_limit + 1e-6
+
+
+def test_an_unknown_method_is_refused(setting: Setting) -> None:
+    with pytest.raises(KeyError):
+        methods.fit("magic", setting)
