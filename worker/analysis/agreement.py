@@ -8,10 +8,11 @@ import numpy.typing as npt
 Z_95 = 1.959963984540054
 
 
-def wilson_interval(correct: int, scored: int, z: float = Z_95) -> tuple[float, float]:
+def wilson_interval(correct: float, scored: int, z: float = Z_95) -> tuple[float, float]:
     """95 % interval of a proportion; unlike the textbook one it stays inside [0, 1] and works for few trials.
 
-    Wilson (1927). Raises ValueError when nothing was scored.
+    Wilson (1927). ``correct`` may be a fraction where every trial is a mean over repetitions.
+    Raises ValueError when nothing was scored.
     """
     if scored < 1 or not 0 <= correct <= scored:
         raise ValueError(f"{correct} of {scored} is not a proportion.")

@@ -51,14 +51,14 @@ def mean_change(before: Floats, after: Floats) -> dict[str, float]:
 
 
 def success_change(before: Floats, after: Floats) -> dict[str, float]:
-    """Success rates and their paired difference with its interval. (N,) of 0 and 1.
+    """Success rates and their paired difference with its interval. (N,) of 0 and 1, or of means over repetitions.
 
     Method 10 of Newcombe (1998), Statistics in Medicine 17, 2635-2650: Wilson's intervals of the two rates, squared
     and added, with their correlation.
     """
     count, rates = len(before), (float(before.mean()), float(after.mean()))
     (low_before, high_before), (low_after, high_after) = (
-        wilson_interval(int(values.sum()), count) for values in (before, after)
+        wilson_interval(float(values.sum()), count) for values in (before, after)
     )
     delta, phi = rates[1] - rates[0], _correlation(before, after)
     down, up = rates[1] - low_after, high_after - rates[1]

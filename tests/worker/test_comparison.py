@@ -1,0 +1,160 @@
+"""Table I and the personalisation matrix, from runs with known answers."""
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import replace
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from worker.analysis import comparison
+from worker.analysis.comparison import Run, pooled, table_rows
+from worker.analysis.evaluation import success_change
+from worker.analysis.pareto import pareto_svg
+from worker.analysis.published import TABLE_1, published
+from worker.analysis.table_files import to_csv, to_markdown
+
+USERS = ("neutral", "cautious", "impatient")
+N = 40
+TABLE_COLUMNS = (
+    "task,user,method,labels,seeds,scenarios,success,success_low,success_high,"
+    "success_delta,success_delta_low,success_delta_high,preference,preference_low,preference_high,"
+    "preference_delta,preference_delta_low,preference_delta_high,true_preference,true_preference_low,"
+    "true_preference_high,true_preference_delta,true_preference_delta_low,true_preference_delta_high"
+)
+MATRIX_COLUMNS = (
+    "task,trained_for,judged_by,labels,gain,gain_low,gain_high,success_delta,"
+    "own_advantage,own_advantage_low,own_advantage_high"
+)
+HARDNESS = np.random.default_rng(0).normal(0.0, 5.0, N)
+"""Scenarios differ far more than methods do."""
+
+
+def run(user: str, method: str, better: Sequence[float] = (0, 0, 0), seed: int = 0, lost: int = 0) -> Run:
+    """A run with true returns -20 for everybody, more by ``better``; ``lost``: episodes that fail."""
+    success = np.ones(N)
+    success[:lost] = 0.0
+    return Run(
+        task="feeding",
+        user=user,
+        method=method,
+        seed=seed,
+        labels=200,
+        success=success,
+        preference=HARDNESS + better[USERS.index(user)],
+        true_returns={judge: HARDNESS - 20.0 + gain for judge, gain in zip(USERS, better, strict=True)},
+        costs=np.tile(HARDNESS[:, None] + 100.0 + better[0], (1, 6)),
+        spent={"labels": 200, "environment_steps": 1000, "cpu_s": 4.0 + seed, "wall_s": 5.0},
+        notes=("said so",),
+    )
+
+
+RUNS = [
+    *(run(user, "reference") for user in USERS),
+    run("neutral", "pbarl", (4, 1, -2), lost=2),
+    run("cautious", "pbarl", (2, 6, -4)),
+    run("impatient", "pbarl", (5, -4, 8)),
+    run("neutral", "prefft", (1, 0, 0), lost=20),
+]
+
+
+def test_changes_are_paired_by_scenario() -> None:
+    row = next(row for row in table_rows(pooled(RUNS)) if (row["user"], row["method"]) == ("cautious", "pbarl"))
+    assert row["true_preference_delta"] == pytest.approx(6.0)
+    assert row["true_preference_delta_high"] - row["true_preference_delta_low"] < 1e-9
+    assert row["true_preference_high"] - row["true_preference_low"] > 2.0
+    assert (row["success"], row["success_delta"]) == (1.0, 0.0)
+
+
+def test_the_reference_policy_does_not_differ_from_itself() -> None:
+    row = table_rows(pooled(RUNS))[0]
+    assert row["method"] == "reference"
+    assert [row[f"success_delta{end}"] for end in ("", "_low", "_high")] == [0.0, 0.0, 0.0]
+
+
+def test_seeds_are_averaged_before_anything_else() -> None:
+    other = run("neutral", "pbarl", (8, 0, 0), seed=1)
+    by_name = {
+        (row["user"], row["method"]): row
+        for row in table_rows(pooled([*RUNS, run("neutral", "reference", seed=1), other]))
+    }
+    row = by_name["neutral", "pbarl"]
+    assert (row["seeds"], row["scenarios"]) == (2, N)
+    assert row["true_preference_delta"] == pytest.approx(6.0)
+    assert row["success"] == pytest.approx(1.0 - 1 / N)
+
+
+def test_a_run_whose_reference_is_missing_waits_for_it() -> None:
+    cells = pooled([*RUNS, run("neutral", "pbarl", (9, 0, 0), seed=7)])
+    assert len(cells["feeding", "neutral", "pbarl"].runs) == 1
+    assert pooled([run("neutral", "pbarl")]) == {}
+
+
+def test_the_files_have_the_promised_columns() -> None:
+    cells = pooled(RUNS)
+    assert to_csv(table_rows(cells)).splitlines()[0] == TABLE_COLUMNS
+    matrix = to_csv(comparison.personalisation_rows(cells, "pbarl", [USERS]))
+    assert matrix.splitlines()[0] == MATRIX_COLUMNS
+    assert len(matrix.splitlines()) == 1 + 9
+
+
+def test_own_advantage_is_over_the_best_of_the_others_and_on_the_diagonal_only() -> None:
+    rows = comparison.personalisation_rows(pooled(RUNS), "pbarl", [USERS])
+    found = {(row["trained_for"], row["judged_by"]): row for row in rows}
+    assert found["cautious", "cautious"]["gain"] == pytest.approx(6.0 / abs(HARDNESS.mean() - 20.0))
+    assert found["neutral", "neutral"]["own_advantage"] < 0 < found["cautious", "cautious"]["own_advantage"]
+    unit = abs(HARDNESS.mean() - 20.0)
+    assert found["impatient", "impatient"]["own_advantage"] == pytest.approx((8 + 2) / unit)
+    assert found["neutral", "cautious"]["own_advantage"] == ""
+
+
+def test_users_of_different_groups_are_not_compared() -> None:
+    rows = comparison.personalisation_rows(pooled(RUNS), "pbarl", [("neutral", "cautious"), ("impatient",)])
+    found = {(row["trained_for"], row["judged_by"]): row for row in rows}
+    assert found["impatient", "impatient"]["own_advantage"] == ""
+    assert found["neutral", "neutral"]["own_advantage"] > 0
+
+
+def test_the_page_stands_beside_the_papers_numbers_and_says_where_the_claim_fails() -> None:
+    page = to_markdown(pooled(RUNS), [USERS], "    the command")
+    assert "| 88 (-4) |" in page
+    assert "| 50.7 (+39.5) |" in page
+    assert "| feeding, neutral | yes | yes | yes | +3.0" in page
+    worse = [each if each.method != "pbarl" else replace(each, success=np.zeros(N)) for each in RUNS]
+    assert "| feeding, neutral | **no** | yes | yes |" in to_markdown(pooled(worse), [USERS], "")
+
+
+def test_time_is_averaged_over_users_and_seeds() -> None:
+    cells = pooled([*RUNS, run("neutral", "reference", seed=1), run("neutral", "pbarl", seed=1)])
+    row = next(row for row in comparison.spent_rows(cells) if row["method"] == "pbarl")
+    assert (row["fits"], row["cpu_s"]) == (4, pytest.approx(4.25))
+
+
+def test_the_paper_lost_success_wherever_it_gained_preference() -> None:
+    """Copied numbers: their changes are those that the paper prints beside them."""
+    changes = {
+        (task, user, method): (success - of["reference"][0], round(gain - of["reference"][1], 1))
+        for (task, user), of in TABLE_1.items()
+        for method, (success, gain) in of.items()
+    }
+    assert changes["feeding", "neutral", "pbarl"] == (-4, 39.5)
+    assert changes["drinking", "impatient", "prefft"] == (-11, 22.7)
+    assert changes["scratching", "impatient", "pbarl"] == (-4, 40.9)
+    assert published("feeding", "neutral", "pbarl_printed") == published("feeding", "neutral", "pbarl")
+    assert published("feeding", "neutral", "best_of_n") is None
+
+
+def test_success_averaged_over_repetitions_has_an_interval_too() -> None:
+    halves = np.full(N, 0.5)
+    change = success_change(np.ones(N), halves)
+    assert change["low"] < change["delta"] == -0.5 < change["high"]
+
+
+def test_the_picture_is_valid_and_has_a_mark_per_method_and_user() -> None:
+    rows = table_rows(pooled(RUNS))
+    drawn = ElementTree.fromstring(pareto_svg("feeding", rows))  # noqa: S314
+    titled = drawn.findall(".//{*}circle/{*}title")
+    assert sorted(each.text or "" for each in titled) == sorted(row["method"] for row in rows)
+    assert list(csv.reader(io.StringIO(to_csv([])))) == []

@@ -1,0 +1,93 @@
+"""Success against preference as a picture: one panel per user, one mark per method, drawn as plain SVG."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from xml.sax.saxutils import escape
+
+from worker.analysis.comparison import Row
+
+PANEL, GAP, LEFT, TOP, BOTTOM = 300.0, 46.0, 52.0, 56.0, 78.0
+# Okabe and Ito's colours, which people with any colour vision can tell apart.
+COLOURS = ("#000000", "#0072b2", "#d55e00", "#e69f00", "#cc79a7", "#009e73", "#56b4e9", "#8a6d00", "#666666")
+TICKS = 5
+
+
+@dataclass(frozen=True)
+class _Axis:
+    """From values to pixels."""
+
+    low: float
+    high: float
+    start: float
+    end: float
+
+    def __call__(self, value: float) -> float:
+        return self.start + (value - self.low) / (self.high - self.low) * (self.end - self.start)
+
+    def ticks(self) -> list[float]:
+        return [self.low + (self.high - self.low) * index / (TICKS - 1) for index in range(TICKS)]
+
+
+def pareto_svg(task: str, rows: Sequence[Row]) -> str:
+    """``rows``: of comparison.table_rows() for one task. Up and to the right is better; bars are 95 % intervals."""
+    users = list(dict.fromkeys(row["user"] for row in rows))
+    methods = list(dict.fromkeys(row["method"] for row in rows))
+    colours = {method: COLOURS[index % len(COLOURS)] for index, method in enumerate(methods)}
+    width = LEFT + len(users) * (PANEL + GAP)
+    height = TOP + PANEL + BOTTOM
+    body = [_text(LEFT, 22, f"{task}: success against true preference, change from the reference policy", size=15)]
+    for index, user in enumerate(users):
+        own = [row for row in rows if row["user"] == user]
+        body += _panel(LEFT + index * (PANEL + GAP), user, own, colours)
+    for index, method in enumerate(methods):
+        x = LEFT + index * (width - LEFT) / len(methods)
+        body.append(f'<circle cx="{x:.1f}" cy="{height - 18:.1f}" r="5" fill="{colours[method]}"/>')
+        body.append(_text(x + 9, height - 14, method, size=11))
+    head = (
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:.0f} {height:.0f}" role="img" '
+        f'font-family="sans-serif"><title>{escape(task)}: success against preference</title>'
+        f'<rect width="100%" height="100%" fill="#ffffff"/>'
+    )
+    return "\n".join([head, *body, "</svg>"]) + "\n"
+
+
+def _panel(left: float, user: str, rows: Sequence[Row], colours: dict[str, str]) -> list[str]:
+    across = _axis([100 * row[f"success{end}"] for row in rows for end in ("_low", "_high")], left, left + PANEL)
+    up = _axis([row[f"true_preference_delta{end}"] for row in rows for end in ("_low", "_high")], TOP + PANEL, TOP)
+    parts = [f'<rect x="{left}" y="{TOP}" width="{PANEL}" height="{PANEL}" fill="none" stroke="#999999"/>']
+    parts.append(_text(left, TOP - 10, user, size=13))
+    for value in across.ticks():
+        parts.append(_text(across(value), TOP + PANEL + 16, f"{value:.0f}", size=10, anchor="middle"))
+    for value in up.ticks():
+        parts.append(_text(left - 5, up(value) + 3, f"{value:.1f}", size=10, anchor="end"))
+    if up.low < 0 < up.high:
+        parts.append(_line(left, up(0), left + PANEL, up(0), "#cccccc", "4 3"))
+    parts.append(_text(left + PANEL / 2, TOP + PANEL + 34, "success, %", size=11, anchor="middle"))
+    for row in rows:
+        parts += _mark(row, across, up, colours[row["method"]])
+    return parts
+
+
+def _mark(row: Row, across: _Axis, up: _Axis, colour: str) -> Iterable[str]:
+    x, y = across(100 * row["success"]), up(row["true_preference_delta"])
+    low, high = (across(100 * row[f"success_{end}"]) for end in ("low", "high"))
+    bottom, top = (up(row[f"true_preference_delta_{end}"]) for end in ("low", "high"))
+    return [
+        _line(low, y, high, y, colour),
+        _line(x, bottom, x, top, colour),
+        f'<circle cx="{x:.1f}" cy="{y:.1f}" r="5" fill="{colour}"><title>{escape(row["method"])}</title></circle>',
+    ]
+
+
+def _axis(values: Sequence[float], start: float, end: float) -> _Axis:
+    margin = max(0.06 * (max(values) - min(values)), 1e-3)
+    return _Axis(min(values) - margin, max(values) + margin, start, end)
+
+
+def _text(x: float, y: float, text: str, *, size: int, anchor: str = "start") -> str:
+    return f'<text x="{x:.1f}" y="{y:.1f}" font-size="{size}" text-anchor="{anchor}">{escape(text)}</text>'
+
+
+def _line(x: float, y: float, to_x: float, to_y: float, colour: str, dashes: str = "none") -> str:
+    ends = f'x1="{x:.1f}" y1="{y:.1f}" x2="{to_x:.1f}" y2="{to_y:.1f}"'
+    return f'<line {ends} stroke="{colour}" stroke-dasharray="{dashes}"/>'
