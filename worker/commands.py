@@ -6,14 +6,17 @@ import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TypeAlias
+from typing import TypeAlias, get_args
 
 from app.db import Database
 from app.domain.studies import Method, RewardKind, Strategy, StudySettings
 from app.settings import Settings
 from app.storage import ArtefactStore
-from worker import exploration, laboratory, pretraining, rehearsal, service
-from worker.ml.teachers import Manner, User
+from worker import benchmark, exploration, laboratory, pretraining, rehearsal, service
+from worker.contest import OPPOSED_USERS, PAPER_USERS
+from worker.ml import reward_training
+from worker.ml.methods import METHODS
+from worker.ml.teachers import Manner, Taste, User
 from worker.own_studio import OwnStudio
 from worker.sim.catalogue import ENVIRONMENTS
 
@@ -24,6 +27,7 @@ def run(arguments: Sequence[str] | None) -> int:
     commands = parser.add_subparsers(dest="command", required=True)
     _add_service(commands)
     _add_training(commands)
+    _add_benchmark(commands)
     _add_rehearsal(commands)
     options = parser.parse_args(arguments)
     result: int = options.act(options)
@@ -51,6 +55,74 @@ def _add_training(commands: _Commands) -> None:
     explore.add_argument("--scenarios", type=int, default=exploration.SCENARIOS, help="each in twelve modes")
     explore.add_argument("--processes", type=int, default=2)
     explore.set_defaults(act=_explore)
+
+
+def _add_benchmark(commands: _Commands) -> None:
+    command = commands.add_parser("benchmark", help=benchmark.__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    command.add_argument("--profile", choices=list(benchmark.PROFILES), default="full")
+    command.add_argument("--methods", nargs="+", choices=list(METHODS), default=list(METHODS))
+    command.add_argument("--tasks", nargs="+", choices=list(ENVIRONMENTS), default=list(ENVIRONMENTS))
+    command.add_argument(
+        "--users",
+        nargs="+",
+        type=_taste,
+        default=list(PAPER_USERS.values()),
+        help="names, or NAME=six weights: shy=1,3,2,2,1,1",
+    )
+    command.add_argument("--opposed", action="store_true", help="also the six users who truly differ")
+    command.add_argument("--population", type=int, default=0, help="also so many users drawn at random")
+    command.add_argument("--seeds", type=int, default=1)
+    command.add_argument("--labels", type=int, help="200; the paper's offline training has 5000")
+    command.add_argument("--scenarios", type=int, help="unseen ones; 500")
+    command.add_argument("--reward", choices=get_args(reward_training.Kind))
+    command.add_argument("--form", choices=["calibrated", "paper"], help="of the costs")
+    command.add_argument("--prefft-steps", type=int, help="environment steps of PrefFT; 100000 as in the paper")
+    command.add_argument("--pbrl-steps", type=int, help="environment steps of PbRL-HRI; 260000")
+    command.add_argument("--printed-steps", type=int, help="gradient steps of the printed method; 3000")
+    command.add_argument("--processes", type=int, default=2)
+    command.add_argument(
+        "--work-directory", type=Path, help="finished cells; default: benchmark/ in the data directory"
+    )
+    command.add_argument(
+        "--output", type=Path, help="tables; default: docs/results, or inside the work directory if quick"
+    )
+    command.add_argument("--report-only", action="store_true", help="run nothing, write the tables from what there is")
+    command.set_defaults(act=_benchmark)
+
+
+def _taste(text: str) -> Taste:
+    """A known user, or somebody with weights of their own."""
+    known = {**PAPER_USERS, **OPPOSED_USERS}
+    name, _, weights = text.partition("=")
+    if not weights and name in known:
+        return known[name]
+    try:
+        omega = tuple(float(value) for value in weights.split(","))
+    except ValueError:
+        omega = ()
+    if len(omega) != 6 or not name.replace("-", "").isalnum() or name in known:
+        raise argparse.ArgumentTypeError(f"{text!r} is none of {', '.join(known)}, nor NAME=six,weights,with,commas.")
+    return Taste(name, omega)
+
+
+def _benchmark(options: argparse.Namespace) -> int:
+    terms = benchmark.with_options(
+        benchmark.PROFILES[options.profile],
+        labels=options.labels,
+        scenarios=options.scenarios,
+        reward=options.reward,
+        form=options.form,
+        prefft_steps=options.prefft_steps,
+        pbrl_steps=options.pbrl_steps,
+        printed_steps=options.printed_steps,
+    )
+    others = [*(OPPOSED_USERS.values() if options.opposed else ()), *benchmark.population(options.population)]
+    tastes = {taste.name: taste for taste in [*options.users, *others]}
+    selection = benchmark.Selection(options.methods, options.tasks, tuple(tastes.values()), options.seeds)
+    work = options.work_directory or Settings().data_dir / "benchmark"
+    output = options.output or (work / "quick" if options.profile == "quick" else Path("docs/results"))
+    command = "python -m worker " + " ".join(sys.argv[1:] or ["benchmark"])
+    return benchmark.benchmark(selection, terms, work, output, options.processes, command, not options.report_only)
 
 
 def _add_rehearsal(commands: _Commands) -> None:

@@ -1,0 +1,112 @@
+"""The benchmark's command on the real simulation, as tiny as it goes: cells, resuming, tables."""
+
+import csv
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from worker import benchmark, commands, contest
+from worker.benchmark import PROFILES, Selection, with_options
+from worker.contest import OPPOSED_USERS, PAPER_USERS, Cell, Terms
+from worker.ml.methods import METHODS
+from worker.ml.studio_filter import FilterConfig
+from worker.ml.teachers import Taste
+
+SHY = Taste("shy", (1.0, 3.0, 2.0, 2.0, 1.0, 1.0))
+TINY = replace(
+    with_options(PROFILES["quick"], labels=12, scenarios=3, printed_steps=5),
+    smallest_pool=2,
+    filter=FilterConfig(gates=(1.0,), gate_scenarios=3, round_rollouts=()),
+)
+
+
+@pytest.fixture(scope="module")
+def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A benchmark of two users that has been run once, in this process."""
+    directory = tmp_path_factory.mktemp("benchmark")
+    for method in ("reference", "pbarl"):
+        for taste in (PAPER_USERS["cautious"], SHY):
+            contest.run_cell(Cell("feeding", taste, method, 0), TINY, directory)
+    return directory
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    """A CSV file."""
+    with path.open() as handle:
+        return list(csv.DictReader(handle))
+
+
+def report(work: Path, output: Path, terms: Terms = TINY) -> int:
+    """Write the tables and run nothing."""
+    return benchmark.benchmark(Selection(), terms, work, output, 1, "the command", run=False)
+
+
+def test_the_tables_are_written_from_whatever_is_finished(work: Path, tmp_path: Path) -> None:
+    assert report(work, tmp_path) == 0
+    table = rows(tmp_path / "table1.csv")
+    assert [(row["user"], row["method"]) for row in table] == [
+        ("cautious", "reference"),
+        ("cautious", "pbarl"),
+        ("shy", "reference"),
+        ("shy", "pbarl"),
+    ]
+    assert {(row["labels"], row["scenarios"], row["seeds"]) for row in table} == {("12", "3", "1")}
+    matrix = rows(tmp_path / "personalisation.csv")
+    assert len(matrix) == 4
+    assert "shy (1, 3, 2, 2, 1, 1)" in (tmp_path / "table1.md").read_text()
+    assert (tmp_path / "pareto-feeding.svg").read_text().startswith("<svg")
+    assert len(rows(tmp_path / "costs.csv")) == 4
+
+
+def test_cells_of_other_terms_are_not_mixed_in(work: Path, tmp_path: Path) -> None:
+    assert report(work, tmp_path, with_options(TINY, labels=13)) == 0
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_cell_run_again_gives_the_same_numbers(work: Path, tmp_path: Path) -> None:
+    report(work, tmp_path / "before")
+    contest.run_cell(Cell("feeding", SHY, "pbarl", 0), TINY, work)
+    report(work, tmp_path / "after")
+    assert (tmp_path / "before" / "table1.csv").read_text() == (tmp_path / "after" / "table1.csv").read_text()
+
+
+def test_an_interrupted_benchmark_runs_what_is_missing_and_nothing_else(work: Path, tmp_path: Path) -> None:
+    cells = Selection(["pbarl_n1"], ["feeding"], [SHY]).cells()
+    assert [cell.method for cell in cells] == ["reference", "pbarl_n1"]
+    reference, missing = (cell.path(TINY, work) for cell in cells)
+    written = reference.stat().st_mtime_ns
+    selection = Selection(["pbarl_n1"], ["feeding"], [SHY])
+    assert benchmark.benchmark(selection, TINY, work, tmp_path, 1, "the command") == 0
+    assert missing.exists()
+    assert reference.stat().st_mtime_ns == written
+    assert "pbarl_n1" in [row["method"] for row in rows(tmp_path / "table1.csv")]
+
+
+def test_the_reference_policy_comes_first_and_a_seed_is_finished_before_the_next() -> None:
+    cells = Selection(["prefft", "pbarl"], ["feeding"], list(PAPER_USERS.values()), seeds=2).cells()
+    assert [cell.method for cell in cells[:4]] == ["reference"] * 3 + ["pbarl"]
+    assert [cell.seed for cell in cells] == [0] * 9 + [1] * 9
+
+
+def test_the_quick_profile_does_everything_a_little() -> None:
+    quick, full = PROFILES["quick"], PROFILES["full"]
+    assert (full.labels, full.scenarios, full.methods.fine_tuning.steps) == (200, 500, 100_000)
+    assert quick.methods.fine_tuning.steps < 5_000
+    assert set(Selection().methods) == set(METHODS)
+    assert len(full.pool) == 36
+    assert len(with_options(full, labels=5000).pool) == 834
+
+
+def test_users_are_named_or_given_by_their_weights() -> None:
+    assert commands._taste("slow") == OPPOSED_USERS["slow"]
+    assert commands._taste("shy=1,3,2,2,1,1") == SHY
+    for wrong in ("nobody", "shy=1,2", "neutral=1,1,1,1,1,1", "a/b=1,1,1,1,1,1", "shy=a,1,1,1,1,1"):
+        with pytest.raises(Exception, match="is none of"):
+            commands._taste(wrong)
+
+
+def test_the_command_can_only_report(tmp_path: Path) -> None:
+    arguments = ["benchmark", "--profile", "quick", "--report-only", "--work-directory", str(tmp_path)]
+    assert commands.run(arguments) == 0
+    assert not (tmp_path / "quick").exists()
