@@ -51,7 +51,7 @@ LOOKS = {
     ),
     # From the person's right, where the itch is; the robot comes from the person's front.
     "scratching": TaskLook(
-        (-1.44, -0.14, 1.52), (-0.22, -0.35, 0.97), 40.0, 2.1, (0.40, 0.52), inset_on_right=True, itch=True
+        (-1.62, -0.12, 1.58), (-0.22, -0.33, 0.96), 38.0, 2.3, (0.40, 0.52), inset_on_right=True, itch=True
     ),
 }
 
