@@ -263,4 +263,4 @@ def test_its_modes_are_gentler_or_firmer_calmer_or_brisker(env: ScratchingEnv, p
         return summed
 
     assert mean_signals(press=-1.0)["force_at_target_n"] < 0.8 * mean_signals(press=1.0)["force_at_target_n"]
-    assert mean_signals(stroke_speed=-0.6)["strokes"] < 0.8 * mean_signals(stroke_speed=0.4)["strokes"]
+    assert mean_signals(stroke_speed=-0.8)["strokes"] < 0.8 * mean_signals(stroke_speed=0.4)["strokes"]
