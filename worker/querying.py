@@ -8,9 +8,17 @@ from app.domain.clips import Clip
 from app.domain.models import ModelKind
 from app.domain.preferences import Query
 from app.domain.studies import Participant, Strategy, Study
-from worker import dataset, lessons, records
+from worker import dataset, laboratory, lessons, records
 from worker.ml import acquisition
+from worker.ml.teachers import OMEGA, User
+from worker.sim.costs import preference_rewards
+from worker.tasks import Task
 from worker.workplace import Workplace
+
+OTHERS_LABELS = 20
+"""So many answers a participant has given before their model speaks for them to others."""
+MOST_OTHERS = 12
+"""More people cost time and hardly change on which pairs people differ."""
 
 
 def refill_queries(place: Workplace, participant_id: int) -> None:
@@ -65,13 +73,36 @@ def predict_waiting(place: Workplace, participant_id: int) -> None:
 def _scores(
     place: Workplace, session: Session, participant: Participant, pairs: list[tuple[Clip, Clip]], strategy: Strategy
 ) -> acquisition.Floats | None:
-    """Ensemble disagreement of every candidate; None when the choice is to be uniform."""
+    """How much every candidate is worth asking; None when the choice is to be uniform."""
+    if strategy is Strategy.CONTESTED:
+        return acquisition.contested(_answers_of_others(place, session, participant, pairs))
     model = records.newest_model(session, participant.id, ModelKind.REWARD)
     if strategy is Strategy.UNIFORM or model is None:
         return None
     segments = dataset.segment_pairs(place.store, pairs)
     members = lessons.member_probabilities(place.store.read(model.artefact_sha256), segments)
-    return acquisition.disagreement(members)
+    return acquisition.score(strategy.value, members)
+
+
+def _answers_of_others(
+    place: Workplace, session: Session, participant: Participant, pairs: list[tuple[Clip, Clip]]
+) -> acquisition.Floats:
+    """(U, M) what other people would say about each pair: participants, or the paper's users while there are few."""
+    others = records.models_of_others(session, participant.id, ModelKind.REWARD, OTHERS_LABELS, MOST_OTHERS)
+    if len(others) >= 2:
+        segments = dataset.segment_pairs(place.store, pairs)
+        said = [lessons.probability_right(place.store.read(model.artefact_sha256), segments) for model in others]
+        return np.array(said, np.float64)
+    task = laboratory.task(session.get_one(Study, participant.study_id).task)
+    returns = {clip.id: _stand_ins(place, task, clip) for pair in pairs for clip in pair}
+    return acquisition.expected_answers(np.array([returns[right.id] - returns[left.id] for left, right in pairs]).T)
+
+
+def _stand_ins(place: Workplace, task: Task, clip: Clip) -> acquisition.Floats:
+    """(3,) what the paper's users would feel about what a clip shows, by their own costs."""
+    shown, steps = dataset.shown(place.store, clip), slice(clip.first_step, clip.first_step + clip.step_count)
+    costs, signals = shown.costs[steps], shown.signals[steps]
+    return np.array([preference_rewards(task, costs, signals, OMEGA[user]).sum() for user in User])
 
 
 def _unused_pairs(session: Session, participant: Participant) -> list[tuple[Clip, Clip]]:

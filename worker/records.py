@@ -16,7 +16,7 @@ from app.db import now
 from app.domain.clips import Clip, Rollout
 from app.domain.models import Bundle, Model, ModelKind, Run, RunKind, RunStatus, WorkerPresence
 from app.domain.preferences import LabelEvent, Query
-from app.domain.studies import StudySettings
+from app.domain.studies import Participant, StudySettings
 
 ATTEMPTS = 3
 """How often a failing run is tried before somebody has to look."""
@@ -209,6 +209,24 @@ def newest_model(session: Session, participant_id: int, kind: ModelKind) -> Mode
         .order_by(Model.label_count.desc(), Model.id.desc())
         .limit(1)
     )
+
+
+def models_of_others(
+    session: Session, participant_id: int, kind: ModelKind, at_least_labels: int, most: int
+) -> Sequence[Model]:
+    """The newest model of every other participant of the study with enough labels behind it, in order of joining.
+
+    Of more than ``most`` people those who joined last.
+    """
+    study = select(Participant.study_id).where(Participant.id == participant_id).scalar_subquery()
+    others = session.scalars(
+        select(Participant.id)
+        .where(Participant.study_id == study, Participant.id != participant_id)
+        .order_by(Participant.id)
+    )
+    newest = [newest_model(session, other, kind) for other in others]
+    enough = [model for model in newest if model is not None and (model.label_count or 0) >= at_least_labels]
+    return enough[-most:]
 
 
 def sign_presence(session: Session, name: str) -> None:

@@ -1,6 +1,8 @@
 """Reward models: learn from everything one participant has said, then choose and predict what comes next."""
 
-from app.domain.models import ModelKind
+from sqlalchemy.orm import Session
+
+from app.domain.models import Model, ModelKind
 from app.domain.studies import Participant, Strategy, Study
 from worker import dataset, lessons, querying, records
 from worker.compute import Lane
@@ -9,6 +11,8 @@ from worker.workplace import Step, Workplace
 
 KEPT_QUERIES = 3
 """Queries ahead that stay when a new model chooses: the page may already be loading them."""
+MOST_EARLIER = 100
+"""Participants whose weights make up a pooled prior."""
 
 
 def train_reward(place: Workplace, job: Job, run_id: int, step: Step) -> None:
@@ -22,6 +26,7 @@ def _fit(place: Workplace, run_id: int, participant_id: int) -> None:
         participant = session.get_one(Participant, participant_id)
         study = session.get_one(Study, participant.study_id)
         task, kind = study.task, study.settings.reward_kind
+        earlier = earlier_models(session, participant, study) if study.settings.pooled_prior else []
         preferences = dataset.load_preferences(session, place.store, participant_id)
         pool = dataset.pool_pairs(session, place.store, participant.study_id)
     if preferences.pairs is None:
@@ -37,11 +42,19 @@ def _fit(place: Workplace, run_id: int, participant_id: int) -> None:
         preferences.targets,
         pool,
         participant.seed,
+        [place.store.read(model.artefact_sha256) for model in earlier],
     )
     artefact = place.store.put(stored)
     with place.database.writing() as session:
         records.set_labels(session, run_id, preferences.label_count, preferences.label_hash)
         records.save_model(session, run_id, ModelKind.REWARD, artefact, metrics)
+
+
+def earlier_models(session: Session, participant: Participant, study: Study) -> list[Model]:
+    """The finished models of those who joined before: what they said later must not change what was learned here."""
+    wanted = study.settings.labels_per_participant
+    others = records.models_of_others(session, participant.id, ModelKind.REWARD, wanted, MOST_EARLIER)
+    return [model for model in others if model.participant_id is not None and model.participant_id < participant.id]
 
 
 def _look_ahead(place: Workplace, participant_id: int) -> None:

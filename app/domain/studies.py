@@ -37,6 +37,7 @@ class RewardKind(StrEnum):
 
     STRUCTURED = "structured"
     MLP = "mlp"
+    PREFERENCE_TRANSFORMER = "preference_transformer"
 
 
 class Strategy(StrEnum):
@@ -44,6 +45,9 @@ class Strategy(StrEnum):
 
     UNIFORM = "uniform"
     DISAGREEMENT = "disagreement"
+    ENTROPY = "entropy"
+    INFORMATION_GAIN = "information_gain"
+    CONTESTED = "contested"
 
 
 class StudySettings(BaseModel):
@@ -65,6 +69,7 @@ class StudySettings(BaseModel):
     strategy: Strategy = Strategy.UNIFORM
     random_share: float = Field(default=0.5, ge=0.1, le=1.0, description="Share of queries always drawn uniformly.")
     reward_kind: RewardKind = RewardKind.STRUCTURED
+    pooled_prior: bool = Field(default=False, description="Start from earlier participants' weights; structured only.")
     method: Method = Method.STUDIO
     success_tolerance: float = Field(default=0.035, ge=0.0, le=0.5, description="Success the filter may cost.")
     evaluation_scenarios: int = Field(default=100, ge=10, le=1000)

@@ -3,6 +3,8 @@
 from collections import Counter
 from collections.abc import Callable
 
+import numpy as np
+import numpy.typing as npt
 import pytest
 from sqlalchemy import select
 
@@ -10,11 +12,13 @@ from app.db import Database
 from app.domain.clips import Clip
 from app.domain.models import ModelKind, Run
 from app.domain.preferences import Query, Response
-from app.domain.studies import Participant
+from app.domain.studies import Participant, Strategy, Study
 from app.storage import ArtefactStore
-from worker import dataset, querying, records
+from worker import dataset, querying, records, reward_work
 from worker.compute import Compute
-from worker.ml import reward_training
+from worker.ml import acquisition, reward_training
+from worker.ml.reward_models import StructuredReward
+from worker.trajectory import SIGNALS
 from worker.workplace import Workplace
 
 AddClips = Callable[..., list[Clip]]
@@ -110,6 +114,100 @@ def test_waiting_queries_are_predicted_by_the_newest_model(
     assert waiting
     assert {query.predicted_by_model_id for query in waiting} == {model_id}
     assert all(query.predicted_right is not None and 0.0 < query.predicted_right < 1.0 for query in waiting)
+
+
+@pytest.mark.parametrize("strategy", [Strategy.ENTROPY, Strategy.INFORMATION_GAIN, Strategy.DISAGREEMENT])
+def test_a_strategy_needs_a_model_and_until_then_pairs_are_random(
+    place: Workplace, participant: Participant, add_clips: AddClips, answer: Answer, strategy: Strategy
+) -> None:
+    settle_on(place, strategy)
+    clips = add_clips(1) + add_clips(2) + add_clips(3)
+    for left, right in ((0, 1), (1, 2), (2, 3)):
+        answer(clips[left], clips[right], Response.RIGHT)
+    querying.refill_queries(place, participant.id)
+    assert {query.strategy for query in queries_of(place.database, participant)[3:]} == {"uniform"}
+    with place.database.writing() as session:
+        records.drop_unseen_queries(session, participant.id, keep=0)
+    save_reward_model(place, participant)
+    querying.refill_queries(place, participant.id)
+    chosen = queries_of(place.database, participant)[3:]
+    assert {query.strategy for query in chosen} == {strategy}
+    assert len({query.propensity for query in chosen[:1]} | {1 / 15}) == 2, "not every pair was equally likely"
+
+
+def test_contested_pairs_are_found_with_the_paper_s_users_before_others_have_answered(
+    place: Workplace, participant: Participant, add_clips: AddClips
+) -> None:
+    settle_on(place, Strategy.CONTESTED)
+    add_clips(1)
+    add_clips(2)
+    querying.refill_queries(place, participant.id)
+    queries = queries_of(place.database, participant)
+    assert {query.strategy for query in queries} == {Strategy.CONTESTED}
+    assert all(query.propensity >= 0.5 / 12 for query in queries), "half of the chance is spread over all pairs"
+
+
+def test_contested_pairs_are_those_other_participants_disagree_about(
+    place: Workplace, participant: Participant, add_clips: AddClips, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two others who want opposite things about a single signal: where it differs most they disagree most."""
+    settle_on(place, Strategy.CONTESTED)
+    add_clips(1)
+    wish = np.eye(len(SIGNALS))[0]
+    for number, sign in ((2, 1.0), (3, -1.0)):
+        somebody_else(place, participant, number, sign * wish, querying.OTHERS_LABELS)
+    seen: list[npt.NDArray[np.float64]] = []
+
+    def contested(said: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        seen.append(disagreement(said))
+        return seen[-1]
+
+    disagreement = acquisition.contested
+    monkeypatch.setattr(acquisition, "contested", contested)
+    querying.refill_queries(place, participant.id)
+    with place.database.reading() as session:
+        clips = dataset.pool_clips(session, participant.study_id)
+    sums = {clip.id: dataset.shown(place.store, clip).signals[:, 0].sum() for clip in clips}
+    differences = [abs(sums[left.id] - sums[right.id]) for left, right in dataset.matched_pairs(clips)]
+    assert np.argsort(seen[0]).tolist() == np.argsort(differences).tolist()
+
+
+def test_a_pooled_prior_is_of_those_who_joined_before_and_have_answered_everything(
+    place: Workplace, participant: Participant
+) -> None:
+    wish = np.ones(len(SIGNALS))
+    finished = somebody_else(place, participant, 2, wish, labels=20)
+    somebody_else(place, participant, 3, wish, labels=19)
+    last = somebody_else(place, participant, 4, wish, labels=20)
+    with place.database.reading() as session:
+        study = session.scalars(select(Study)).one()
+        newcomers = [session.get_one(Participant, each) for each in (participant.id, finished, last)]
+        earlier = [reward_work.earlier_models(session, each, study) for each in newcomers]
+    assert [[model.participant_id for model in each] for each in earlier] == [[], [], [finished]]
+
+
+def somebody_else(
+    place: Workplace, participant: Participant, number: int, weights: npt.NDArray[np.float64], labels: int
+) -> int:
+    """Another participant of the study with a reward model of these weights; returns their id."""
+    stored = StructuredReward(np.tile(weights, (8, 1))).to_bytes()
+    with place.database.writing() as session:
+        other = Participant(study_id=participant.study_id, number=number, token_sha256=f"{number:064}", seed=1)
+        session.add(other)
+        session.flush()
+        run = Run(workflow_id=f"{number}", kind="reward", study_id=other.study_id, participant_id=other.id, seed=0)
+        session.add(run)
+        session.flush()
+        records.set_labels(session, run.id, labels, "hash")
+        records.save_model(session, run.id, ModelKind.REWARD, place.store.put(stored), {})
+        return other.id
+
+
+def settle_on(place: Workplace, strategy: Strategy) -> None:
+    """Have the study choose its pairs like this."""
+    with place.database.writing() as session:
+        study = session.scalars(select(Study)).one()
+        study.stored_settings = {**study.stored_settings, "strategy": strategy}
 
 
 def save_reward_model(place: Workplace, participant: Participant) -> int:

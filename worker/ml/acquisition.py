@@ -69,7 +69,7 @@ def information_gain(member_probabilities: Floats) -> Floats:
     return _binary_entropy(member_probabilities.mean(axis=0)) - doubt_of_each
 
 
-def score(rule: Rule, member_probabilities: Floats) -> Floats:
+def score(rule: str, member_probabilities: Floats) -> Floats:
     """(E, M) P(right) under every member of one's own model -> (M,) by a rule that needs nothing else."""
     own = {"disagreement": disagreement, "entropy": entropy, "information_gain": information_gain}
     if rule not in own:
