@@ -43,11 +43,11 @@ def main() -> None:
     for name in options.task:
         task, pool = laboratory.task(name), _pool(name, options.scenarios)
         sys.stdout.write(f"## {task.title}\n\n{_successes(name, pool)}\n\n{_axes(name)}\n\n")
-        sys.stdout.write("| first steps | " + " | ".join(_agreements(task, pool, 60)) + " |\n")
-        sys.stdout.write("|---" * (1 + len(_agreements(task, pool, 60))) + "|\n")
-        for steps in options.steps:
-            shares = (f"{100 * share:.0f} %" for share in _agreements(task, pool, steps).values())
-            sys.stdout.write(f"| {steps} | " + " | ".join(shares) + " |\n")
+        found = [_agreements(task, pool, steps) for steps in options.steps]
+        sys.stdout.write("| prefer the same clip | " + " | ".join(f"first {steps / 10:g} s" for steps in options.steps))
+        sys.stdout.write(" |\n" + "|---" * (1 + len(found)) + "|\n")
+        for pair in found[0]:
+            sys.stdout.write(f"| {pair} | " + " | ".join(f"{100 * each[pair]:.0f} %" for each in found) + " |\n")
         sys.stdout.write("\n")
 
 
