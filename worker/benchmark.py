@@ -33,6 +33,8 @@ from worker.shelf import Shelf, policy_mark
 from worker.sim.catalogue import ENVIRONMENTS
 from worker.sim.costs import preference_rewards
 
+INTERRUPTED = 130
+"""Exit code after Ctrl-C, as shells have it."""
 REPORT_EVERY_S = 20.0
 SHELF_CHUNK = 10
 CLOSE_POINTS = 0.2
@@ -94,22 +96,31 @@ def population(count: int) -> list[Taste]:
 def benchmark(
     selection: Selection, terms: Terms, work: Path, output: Path, processes: int, command: str, run: bool = True
 ) -> int:
-    """Run what is missing (unless ``run`` is False) and write the tables; returns 1 when a cell failed."""
+    """Run what is missing (unless ``run`` is False) and write the tables; returns the exit code.
+
+    1: a cell failed, and its reason is on the standard error; all others were run. 130: interrupted.
+    """
     missing = [cell for cell in selection.cells() if not cell.path(terms, work).exists()]
     failures: list[str] = []
+    code = 0
+
+    def report() -> None:
+        _report(terms, work, output, command)
+
     if run and missing:
         compute = Compute(processes)
         try:
             _fill_shelves(compute, processes, missing, terms, work)
-            failures = _run_cells(
-                compute, processes, missing, terms, work, lambda: _report(terms, work, output, command)
-            )
+            failures = _run_cells(compute, processes, missing, terms, work, report)
+        except KeyboardInterrupt:
+            sys.stderr.write("Interrupted. The same command goes on from here.\n")
+            code = INTERRUPTED
         finally:
             compute.close()
-    _report(terms, work, output, command)
+    report()
     for failure in failures:
         sys.stderr.write(failure + "\n")
-    return 1 if failures else 0
+    return code or (1 if failures else 0)
 
 
 # -- running -----------------------------------------------------------------------------------------------------------
