@@ -1,12 +1,14 @@
 """Success against preference as a picture: one panel per user, one mark per method, drawn as plain SVG."""
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from xml.sax.saxutils import escape
 
 from worker.analysis.comparison import Row
 
-PANEL, GAP, LEFT, TOP, BOTTOM = 300.0, 46.0, 52.0, 56.0, 78.0
+PANEL, GAP, LEFT, TOP, BOTTOM = 300.0, 46.0, 52.0, 56.0, 58.0
+LEGEND_WIDTH, LEGEND_LINE = 112.0, 18.0
 # Okabe and Ito's colours, which people with any colour vision can tell apart.
 COLOURS = ("#000000", "#0072b2", "#d55e00", "#e69f00", "#cc79a7", "#009e73", "#56b4e9", "#8a6d00", "#666666")
 TICKS = 5
@@ -25,7 +27,12 @@ class _Axis:
         return self.start + (value - self.low) / (self.high - self.low) * (self.end - self.start)
 
     def ticks(self) -> list[float]:
-        return [self.low + (self.high - self.low) * index / (TICKS - 1) for index in range(TICKS)]
+        """Round numbers within the range, about TICKS of them."""
+        rough = (self.high - self.low) / TICKS
+        power = 10.0 ** math.floor(math.log10(rough))
+        step = next(factor * power for factor in (1, 2, 5, 10) if factor * power >= rough)
+        first, last = math.ceil(self.low / step), math.floor(self.high / step)
+        return [round(number * step, 6) for number in range(first, last + 1)]
 
 
 def pareto_svg(task: str, rows: Sequence[Row]) -> str:
@@ -34,15 +41,16 @@ def pareto_svg(task: str, rows: Sequence[Row]) -> str:
     methods = list(dict.fromkeys(row["method"] for row in rows))
     colours = {method: COLOURS[index % len(COLOURS)] for index, method in enumerate(methods)}
     width = LEFT + len(users) * (PANEL + GAP)
-    height = TOP + PANEL + BOTTOM
-    body = [_text(LEFT, 22, f"{task}: success against true preference, change from the reference policy", size=15)]
+    columns = max(1, int((width - LEFT) // LEGEND_WIDTH))
+    height = TOP + PANEL + BOTTOM + LEGEND_LINE * math.ceil(len(methods) / columns)
+    body = [_text(LEFT, 22, f"{task}: success, and change of the true preference", size=14)]
     for index, user in enumerate(users):
         own = [row for row in rows if row["user"] == user]
         body += _panel(LEFT + index * (PANEL + GAP), user, own, colours)
     for index, method in enumerate(methods):
-        x = LEFT + index * (width - LEFT) / len(methods)
-        body.append(f'<circle cx="{x:.1f}" cy="{height - 18:.1f}" r="5" fill="{colours[method]}"/>')
-        body.append(_text(x + 9, height - 14, method, size=11))
+        x, y = LEFT + index % columns * LEGEND_WIDTH, TOP + PANEL + BOTTOM + index // columns * LEGEND_LINE
+        body.append(f'<circle cx="{x + 5:.1f}" cy="{y - 4:.1f}" r="5" fill="{colours[method]}"/>')
+        body.append(_text(x + 15, y, method, size=11))
     head = (
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:.0f} {height:.0f}" role="img" '
         f'font-family="sans-serif"><title>{escape(task)}: success against preference</title>'
@@ -57,9 +65,9 @@ def _panel(left: float, user: str, rows: Sequence[Row], colours: dict[str, str])
     parts = [f'<rect x="{left}" y="{TOP}" width="{PANEL}" height="{PANEL}" fill="none" stroke="#999999"/>']
     parts.append(_text(left, TOP - 10, user, size=13))
     for value in across.ticks():
-        parts.append(_text(across(value), TOP + PANEL + 16, f"{value:.0f}", size=10, anchor="middle"))
+        parts.append(_text(across(value), TOP + PANEL + 16, f"{value:g}", size=10, anchor="middle"))
     for value in up.ticks():
-        parts.append(_text(left - 5, up(value) + 3, f"{value:.1f}", size=10, anchor="end"))
+        parts.append(_text(left - 5, up(value) + 3, f"{value:g}", size=10, anchor="end"))
     if up.low < 0 < up.high:
         parts.append(_line(left, up(0), left + PANEL, up(0), "#cccccc", "4 3"))
     parts.append(_text(left + PANEL / 2, TOP + PANEL + 34, "success, %", size=11, anchor="middle"))
