@@ -10,15 +10,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from app.domain.models import Bundle, Model
 
-COST_NAMES = {
-    "C_d": "Distance from the target",
-    "C_v": "Speed of the tool",
-    "C_f": "Force away from the target",
-    "C_hf": "High force at the target",
-    "C_fd": "Food spilled on the person",
-    "C_fdv": "Food entering fast",
-}
-"""The paper's six preference costs in words; less of each is what its name calls bad."""
+COST_SYMBOLS = ("C_d", "C_v", "C_f", "C_hf", "C_fd", "C_fdv")
+"""The paper's six preference costs; what each is called depends on the task."""
 
 
 class Verdict(StrEnum):
@@ -34,6 +27,7 @@ class Change:
     """One number with the reference policy and with the filter; the interval (95 %) belongs to the difference."""
 
     name: str
+    """Empty for costs: their names are the task's."""
     symbol: str
     more_is_better: bool
     reference: float | None
@@ -123,9 +117,7 @@ def filter_version(model: Model, bundle: Bundle | None) -> FilterVersion:
     """What is known about one filter; unreadable numbers are left out."""
     metrics = _read(_Filter, model.metrics)
     evaluation = metrics.evaluation
-    costs = [
-        _change(COST_NAMES[symbol], symbol, evaluation.costs.get(symbol), more_is_better=False) for symbol in COST_NAMES
-    ]
+    costs = [_change("", symbol, evaluation.costs.get(symbol), more_is_better=False) for symbol in COST_SYMBOLS]
     return FilterVersion(
         label_count=model.label_count,
         created_at=model.created_at,

@@ -9,8 +9,10 @@ from fastapi.responses import FileResponse, RedirectResponse, Response
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 from sqlalchemy.orm import Session
 
+from app.domain.people import Experimenter
+from app.domain.studies import TaskName
 from app.services import audit, dashboard, enrolment, publishing, studies
-from app.web import charts, live, study_form
+from app.web import charts, live, study_form, task_words
 from app.web.deps import (
     ActingExperimenter,
     Code,
@@ -67,8 +69,7 @@ async def stream_studies(request: Request, studio: StudioDep, _allowed: MayStrea
 @router.get("/new", name="show_new_study")
 def show_new_study(request: Request, experimenter: CurrentExperimenter) -> Response:
     """The form, filled in with what usually works."""
-    context = {"experimenter": experimenter, "form": study_form.form_with_defaults(), "errors": {}}
-    return page(request, "experimenter/new_study.html", context)
+    return _form_page(request, experimenter, study_form.form_with_defaults(), {})
 
 
 @router.post("/new", name="create_study")
@@ -79,8 +80,7 @@ def create_study(
     try:
         name, task, settings = study_form.settings_of(form)
     except study_form.FormInvalid as invalid:
-        context = {"experimenter": experimenter, "form": form, "errors": invalid.errors}
-        return page(request, "experimenter/new_study.html", context, HTTPStatus.UNPROCESSABLE_ENTITY)
+        return _form_page(request, experimenter, form, invalid.errors, HTTPStatus.UNPROCESSABLE_ENTITY)
     study = studies.create_study(session, name, settings, actor=experimenter.name, task=task)
     return _see(request, "show_study", slug=study.slug)
 
@@ -214,6 +214,18 @@ def download_bundle(
     return FileResponse(studio.store.path(bundle.artefact_sha256), media_type="application/zip", filename=filename)
 
 
+def _form_page(
+    request: Request,
+    experimenter: Experimenter,
+    form: study_form.StudyForm,
+    errors: Mapping[str, str],
+    status: HTTPStatus = HTTPStatus.OK,
+) -> Response:
+    tasks = [(name, task_words.words_of(name)) for name in TaskName]
+    context = {"experimenter": experimenter, "form": form, "errors": errors, "tasks": tasks}
+    return page(request, "experimenter/new_study.html", context, status)
+
+
 def _list_context(session: Session, studio: Studio) -> dict[str, Any]:
     return {
         "machine": dashboard.machine(session, studio.settings.data_dir),
@@ -242,6 +254,7 @@ def _participant_context(session: Session, studio: Studio, slug: str, code: str)
         "machine": dashboard.machine(session, studio.settings.data_dir),
         "chart": charts.accuracy_chart(detail.row.curve, study.settings.labels_per_participant),
         "interval": charts.interval,
+        "words": task_words.words_of(study.task),
     }
 
 

@@ -12,6 +12,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from starlette.datastructures import URLPath
 
 from app.db import now
+from app.web.task_words import words_of
 
 ROOT = Path(__file__).resolve().parents[2]
 _UNITS = {
@@ -97,6 +98,11 @@ def in_words(name: str) -> str:
     return name.replace("_", " ")
 
 
+def task_title(task: str) -> str:
+    """What people call a task."""
+    return words_of(task).title
+
+
 def page(request: Request, template: str, context: Mapping[str, Any], status: int = 200) -> HTMLResponse:
     """A whole page."""
     return HTMLResponse(fragment(request, template, context), status)
@@ -120,8 +126,9 @@ def make_environment(path_for: Callable[..., URLPath]) -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    words = (percent, signed_points, quantity, signed, ago, time_left, moment, seconds, bytes_in_words, in_words)
-    environment.filters.update({word.__name__: word for word in words})
+    numbers = (percent, signed_points, quantity, signed)
+    words = (ago, time_left, moment, seconds, bytes_in_words, in_words, task_title)
+    environment.filters.update({word.__name__: word for word in (*numbers, *words)})
     environment.globals["path_for"] = path_for
     return environment
 

@@ -70,6 +70,7 @@ def test_an_open_page_updates_itself_and_keeps_what_the_person_does(
 def test_what_was_folded_stays_folded_when_the_page_updates(page: Page, study: Study, database: Database) -> None:
     page.goto("/studies/pilot/participants/P01")
     expect(page.locator("[data-live-state]")).to_have_text("live")
+    expect(page.get_by_text("Speed of the spoon")).to_be_visible()
     page.locator("details.version > summary").click()
     expect(page.get_by_text("Speed of the spoon")).to_be_hidden()
     with database.writing() as session:
@@ -107,3 +108,15 @@ def test_no_page_shuts_anybody_out(page: Page, path: str, scheme: str) -> None:
         violations = Axe().run(page).response["violations"]
         assert [(each["id"], each["nodes"][0]["html"]) for each in violations] == []
         assert page.evaluate("document.documentElement.scrollWidth - innerWidth") <= 0
+
+
+def test_a_task_is_chosen_with_the_keyboard_alone(page: Page) -> None:
+    page.goto("/studies/new")
+    page.get_by_role("radio", name="Feeding").focus()
+    page.keyboard.press("ArrowRight")
+    page.keyboard.press("ArrowRight")
+    expect(page.get_by_role("radio", name="Itch scratching")).to_be_checked()
+    page.get_by_label("Name of the study").fill("Itches")
+    page.keyboard.press("Enter")
+    expect(page.get_by_role("heading", name="Itches")).to_be_visible()
+    expect(page.locator(".page-sub")).to_contain_text("Itch scratching")

@@ -1,0 +1,92 @@
+"""What pages call a task and its parts: per task, and plainly where there is no word."""
+
+import re
+
+import pytest
+from fastapi.testclient import TestClient
+
+from app.db import Database
+from app.domain.models import ModelKind, RunKind, RunStatus
+from app.domain.studies import Study, StudySettings, TaskName
+from app.services import studies
+from tests import factories
+
+
+@pytest.fixture
+def study(database: Database, task: str) -> Study:
+    """A study of the task, with a filter and a reward model about it."""
+    with database.writing() as session:
+        study = studies.create_study(session, "Pilot", StudySettings())
+        study.task = task
+        person, _ = factories.make_participant(session, study)
+        metrics = factories.filter_metrics()
+        metrics["mode"] |= {"hop_height": 0.4}
+        factories.make_model(session, study, person, ModelKind.FILTER, metrics)
+        reward = factories.reward_metrics()
+        reward["weights"] |= {name: {"mean": 0.1, "low": 0.0, "high": 0.2} for name in ("strokes", "warmth_k")}
+        factories.make_model(session, study, person, ModelKind.REWARD, reward)
+        return study
+
+
+def shown(experimenter: TestClient, path: str) -> str:
+    return re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", experimenter.get(path).text))
+
+
+@pytest.mark.parametrize(
+    ("task", "said", "unsaid"),
+    [
+        ("feeding", ["Speed of the spoon", "Food spilled", "goes into the mouth"], ["strokes over", "itch"]),
+        ("drinking", ["Speed of the cup", "Water spilled", "force at the mouth"], ["ood", "spoon", "itch"]),
+        ("scratching", ["Speed of the scratcher", "presses gently", "strokes over the itch"], ["spilled", "mouth"]),
+        ("dressing", ["Speed of the tool", "Food or water spilled", "speed far", "strokes"], ["spoon", "itch"]),
+    ],
+)
+def test_a_filter_and_a_model_are_described_in_words_of_the_task(
+    experimenter: TestClient, study: Study, said: list[str], unsaid: list[str]
+) -> None:
+    page = shown(experimenter, "/studies/pilot/participants/P01")
+    for words in said:
+        assert words in page
+    for words in unsaid:
+        assert words not in page
+    assert "hop height" in page
+    assert "warmth k" in page
+
+
+@pytest.mark.parametrize(
+    ("task", "title"), [("scratching", "Itch scratching"), ("feeding", "Feeding"), ("dress_up", "Dress up")]
+)
+def test_the_task_is_named_on_the_list_and_on_the_page_of_the_study(
+    experimenter: TestClient, study: Study, title: str
+) -> None:
+    assert f"{title} · since" in shown(experimenter, "/studies")
+    assert f"Task {title}" in shown(experimenter, "/studies/pilot")
+
+
+@pytest.mark.parametrize("task", ["dressing"])
+def test_a_task_that_this_worker_does_not_know_is_a_failure_with_a_reason(
+    experimenter: TestClient, study: Study, database: Database
+) -> None:
+    reason = "There is no task named 'dressing'; this installation knows feeding, drinking, scratching."
+    with database.writing() as session:
+        factories.make_run(session, study, kind=RunKind.CLIPS, status=RunStatus.FAILED, error=reason)
+    page = experimenter.get("/studies/pilot").text
+    assert "There is no task named &#39;dressing&#39;" in page
+    assert "Try again" in page
+
+
+@pytest.mark.parametrize("task", ["dressing"])
+def test_a_participant_of_an_unknown_task_still_gets_instructions(
+    study: Study, database: Database, client: TestClient
+) -> None:
+    with database.writing() as session:
+        _, token = factories.make_participant(session, study, ready=False)
+    client.get(f"/p/{token}")
+    client.post("/p/consent", data={"version": "1"})
+    assert "A robot arm helps" in client.get("/p/instructions").text
+
+
+def test_the_form_offers_every_task_with_one_chosen(experimenter: TestClient) -> None:
+    page = experimenter.get("/studies/new").text
+    offered = re.findall(r'name="task" value="(\w+)" (checked)?', page)
+    assert offered == [(TaskName.FEEDING, "checked"), (TaskName.DRINKING, ""), (TaskName.SCRATCHING, "")]
