@@ -16,22 +16,27 @@ from worker import benchmark, exploration, laboratory, pretraining, rehearsal, s
 from worker.contest import OPPOSED_USERS, PAPER_USERS
 from worker.ml import reward_training
 from worker.ml.methods import METHODS
-from worker.ml.teachers import Manner, Taste, User
+from worker.ml.teachers import Manner, Taste
 from worker.own_studio import OwnStudio
 from worker.sim.catalogue import ENVIRONMENTS
 
 
 def run(arguments: Sequence[str] | None) -> int:
     """Parse the command line and do what it says; returns the exit code."""
-    parser = argparse.ArgumentParser(prog="python -m worker", description="The worker of PbARL Studio and its tools.")
-    commands = parser.add_subparsers(dest="command", required=True)
+    options = parser().parse_args(arguments)
+    result: int = options.act(options)
+    return result
+
+
+def parser() -> argparse.ArgumentParser:
+    """What can be said on the command line."""
+    whole = argparse.ArgumentParser(prog="python -m worker", description="The worker of PbARL Studio and its tools.")
+    commands = whole.add_subparsers(dest="command", required=True)
     _add_service(commands)
     _add_training(commands)
     _add_benchmark(commands)
     _add_rehearsal(commands)
-    options = parser.parse_args(arguments)
-    result: int = options.act(options)
-    return result
+    return whole
 
 
 _Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
@@ -128,13 +133,21 @@ def _benchmark(options: argparse.Namespace) -> int:
 def _add_rehearsal(commands: _Commands) -> None:
     rehearse = commands.add_parser("rehearse", help=_rehearse.__doc__)
     _add_task(rehearse)
-    rehearse.add_argument("--users", nargs="+", type=User, choices=list(User), default=list(User))
+    rehearse.add_argument(
+        "--users", nargs="+", type=_taste, default=[], help="names, or NAME=six weights; default: the paper's three"
+    )
+    rehearse.add_argument(
+        "--omega", nargs=6, type=float, action="append", default=[], help="somebody with these six weights; repeatable"
+    )
     rehearse.add_argument("--labels", type=int, default=200, help="labels per participant")
     rehearse.add_argument("--retrain-every", type=int, default=10)
     rehearse.add_argument("--clip-scenarios", type=int, help="size of the pool; default: just enough pairs")
     rehearse.add_argument("--method", type=Method, choices=list(Method), default=Method.STUDIO)
     rehearse.add_argument("--reward", type=RewardKind, choices=list(RewardKind), default=RewardKind.STRUCTURED)
     rehearse.add_argument("--strategy", type=Strategy, choices=list(Strategy), default=Strategy.UNIFORM)
+    rehearse.add_argument("--pooled-prior", action="store_true", help="start from those who finished before")
+    rehearse.add_argument("--rationality", type=float, help="log odds per typical difference; default: no doubt at all")
+    rehearse.add_argument("--myopia", type=float, default=1.0, help="below 1 the end of a clip weighs more")
     rehearse.add_argument("--mistakes", type=float, default=0.05, help="share of answers that say the opposite")
     rehearse.add_argument("--equal", type=float, default=0.10, help="share of pairs that are called equal")
     rehearse.add_argument("--skip", type=float, default=0.02, help="share of pairs called can't tell")
@@ -171,16 +184,31 @@ def _rehearse(options: argparse.Namespace) -> int:
             database = Database(studio.settings.sqlalchemy_url)
             store = ArtefactStore(directory / "artefacts")
             rehearsed = rehearsal.Rehearsal(database, store, studio.settings.base_url, options.pace)
-            manner = Manner(mistakes=options.mistakes, equal_share=options.equal, skip_share=options.skip)
-            outcomes = rehearsed.run(options.task, options.users, _settings(options), manner, options.seed)
+            outcomes = rehearsed.run(options.task, _tastes(options), _settings(options), _manner(options), options.seed)
             database.dispose()
         for each in outcomes:
-            target = directory / f"{each.code}-{each.user}.zip"
+            target = directory / f"{each.code}-{each.taste.name}.zip"
             target.write_bytes(each.bundle)
         sys.stdout.write(rehearsal.summary(outcomes) + "\n")
         if options.directory:
             sys.stdout.write(f"Bundles and logs are in {directory}\n")
     return 0
+
+
+def _tastes(options: argparse.Namespace) -> list[Taste]:
+    """Whoever was asked for; the paper's three when nobody was."""
+    own = [Taste.of_omega(omega) for omega in options.omega]
+    return [*options.users, *own] or list(PAPER_USERS.values())
+
+
+def _manner(options: argparse.Namespace) -> Manner:
+    return Manner(
+        rationality=options.rationality,
+        myopia=options.myopia,
+        mistakes=options.mistakes,
+        equal_share=options.equal,
+        skip_share=options.skip,
+    )
 
 
 def _settings(options: argparse.Namespace) -> StudySettings:
@@ -193,4 +221,5 @@ def _settings(options: argparse.Namespace) -> StudySettings:
         method=options.method,
         reward_kind=options.reward,
         strategy=options.strategy,
+        pooled_prior=options.pooled_prior,
     )

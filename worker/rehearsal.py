@@ -1,6 +1,6 @@
 """Rehearsal: scripted participants walk through the real pages, from the personal link to the downloaded bundle.
 
-They see what a browser without scripts sees, and answer like one of the paper's users would, mistakes and indifference
+They see what a browser without scripts sees, and answer as somebody of a given taste would, mistakes and indifference
 included. What a robot "really" did in a clip they look up in the database, which a person does by watching.
 """
 
@@ -22,7 +22,7 @@ from app.domain.studies import Study, StudySettings, TaskName
 from app.services import accounts, enrolment, studies
 from app.storage import ArtefactStore
 from worker import dataset, laboratory
-from worker.ml.teachers import OMEGA, Manner, ScriptedTeacher, User
+from worker.ml.teachers import Manner, ScriptedTeacher, Taste
 from worker.own_studio import PATIENCE_S, wait_until
 from worker.sim.costs import preference_rewards
 from worker.visitor import Visitor
@@ -36,7 +36,7 @@ class Outcome:
 
     participant_id: int
     code: str
-    user: User
+    taste: Taste
     labels: int = 0
     save_seconds: list[float] = field(default_factory=list)
     """of each answer: from sending it to having the next page"""
@@ -58,7 +58,7 @@ def summary(outcomes: Sequence[Outcome]) -> str:
         accuracy = "-" if each.prequential_accuracy is None else f"{each.prequential_accuracy:.2f}"
         middle, late = (1000 * float(np.quantile(each.save_seconds, share)) for share in (0.5, 0.95))
         lines.append(
-            f"{each.code:<4} {each.user:<10} {each.labels:>6} {accuracy:>8} "
+            f"{each.code:<4} {each.taste.name:<10} {each.labels:>6} {accuracy:>8} "
             f"{success['reference']:>6.1%} {success['delta']:>+6.1%} {preference['delta']:>+7.2f} sd {each.gate:>5.2f} "
             f"{middle:>9.0f} / {late:<6.0f} {len(each.bundle) / 1024:>4.0f} kB in {each.bundle_seconds:.0f} s"
         )
@@ -76,17 +76,17 @@ class Rehearsal:
     """how long a scripted participant thinks about a pair"""
 
     def run(
-        self, task: str, users: Sequence[User], settings: StudySettings, manner: Manner, seed: int
+        self, task: str, tastes: Sequence[Taste], settings: StudySettings, manner: Manner, seed: int
     ) -> list[Outcome]:
-        """One participant per user, one after the other; the bundles are waited for and downloaded at the end."""
+        """One participant per taste, one after the other; the bundles are waited for and downloaded at the end."""
         with self.database.writing() as session:
             study = studies.create_study(session, "Rehearsal", settings, seed=seed, task=TaskName(task))
-            enrolled = [enrolment.add_participant(session, study) for _ in users]
+            enrolled = [enrolment.add_participant(session, study) for _ in tastes]
             password = accounts.create_first_experimenter(session)
         outcomes = []
-        for (participant, token), user in zip(enrolled, users, strict=True):
-            teacher = _Teacher(self.database, self.store, study, user, manner, seed + participant.number)
-            outcome = Outcome(participant.id, participant.code, user)
+        for (participant, token), taste in zip(enrolled, tastes, strict=True):
+            teacher = _Teacher(self.database, self.store, study, taste, manner, seed + participant.number)
+            outcome = Outcome(participant.id, participant.code, taste)
             with Visitor(self.base_url, f"/p/{token}") as visitor:
                 self._answer_everything(visitor, teacher, outcome, settings)
             outcome.finished_at = time.monotonic()
@@ -102,7 +102,7 @@ class Rehearsal:
     ) -> None:
         visitor.come_in()
         labels = settings.labels_per_participant
-        with tqdm(total=labels, desc=f"{outcome.code} {outcome.user}", unit="label") as bar:
+        with tqdm(total=labels, desc=f"{outcome.code} {outcome.taste.name}", unit="label") as bar:
             while outcome.labels < labels:
                 query_id = wait_until(PATIENCE_S, "no pair to label", visitor.query_id)
                 time.sleep(self.pace_s)
@@ -153,11 +153,11 @@ class _Teacher:
     """A scripted user who knows what happened in each clip."""
 
     def __init__(
-        self, database: Database, store: ArtefactStore, study: Study, user: User, manner: Manner, seed: int
+        self, database: Database, store: ArtefactStore, study: Study, taste: Taste, manner: Manner, seed: int
     ) -> None:
         self._database, self._store, self._study_id = database, store, study.id
         self._task = laboratory.task(study.task)
-        self._user, self._manner = user, manner
+        self._taste, self._manner = taste, manner
         self._rng = np.random.default_rng(seed)
         self._teacher: ScriptedTeacher | None = None
 
@@ -181,7 +181,10 @@ class _Teacher:
     def _rewards(self, clip: Clip) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
         shown = dataset.shown(self._store, clip)
         steps = slice(clip.first_step, clip.first_step + clip.step_count)
-        rewards = preference_rewards(self._task, shown.costs, shown.signals, OMEGA[self._user], form="calibrated")
+        taste = self._taste
+        rewards = preference_rewards(
+            self._task, shown.costs, shown.signals, taste.omega, "calibrated", taste.per_signal
+        )
         return np.asarray(rewards, np.float64)[steps]
 
 

@@ -24,6 +24,7 @@ class StudyForm(BaseModel):
     filter_milestones: _Text = ""
     method: _Text = ""
     reward_kind: _Text = ""
+    pooled_prior: _Text = ""
     strategy: _Text = ""
     random_share: _Text = ""
     success_tolerance: _Text = ""
@@ -64,6 +65,7 @@ def form_with_defaults() -> StudyForm:
         task=TaskName.FEEDING,
         **{name: str(getattr(usual, name)) for name in (*_COUNTS, *_WORDS) if name != "clip_steps"},
         **{name: f"{getattr(usual, name) * 100:g}" for name in _PERCENTS},
+        pooled_prior="yes" if usual.pooled_prior else "no",
         filter_milestones=", ".join(str(count) for count in usual.filter_milestones),
     )
 
@@ -73,6 +75,7 @@ def settings_of(form: StudyForm) -> tuple[str, TaskName, StudySettings]:
     errors: dict[str, str] = {}
     task = _task(errors, form.task)
     values: dict[str, Any] = {name: getattr(form, name).strip() for name in _WORDS}
+    values["pooled_prior"] = form.pooled_prior == "yes"
     for name in _COUNTS:
         values[name] = _number(errors, name, getattr(form, name), whole=True)
     if not form.clip_steps.strip():

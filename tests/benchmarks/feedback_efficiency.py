@@ -232,51 +232,61 @@ def main() -> None:
 
 
 def report(rows: Sequence[dict[str, Any]]) -> str:
-    """Markdown tables: means over users and seeds, only of users that every line of the table has."""
-    named = [row for row in rows if row["user"] in NAMED]
-    plain = [row for row in named if not row["pooled_prior"]]
-    random = [row for row in rows if row["user"].startswith("person-")]
+    """Markdown tables: means over chains, of users and seeds that every line of a table has."""
+    named = [row for row in rows if row["user"] in NAMED and not row["pooled_prior"]]
+    uniform = [row for row in named if row["strategy"] == "uniform"]
+    structured = [row for row in named if row["model"] == "structured"]
+    networks = [row for row in named if row["model"] != "structured"]
+    drawn = [
+        {**row, "strategy": "uniform, pooled prior" if row["pooled_prior"] else row["strategy"]}
+        for row in rows
+        if row["user"].startswith("person-")
+    ]
+    accuracies = [
+        ("Reward models, pairs at random, named users", uniform),
+        ("Ways of choosing pairs, structured, named users", structured),
+        ("Ways of choosing pairs and the pooled prior, structured, people of the population", drawn),
+        ("Ways of choosing pairs, networks, users finished in time", networks),
+    ]
     lines: list[str] = []
-    for title, field in (("accuracy", "accuracy"), ("accuracy on contested pairs", "contested_accuracy")):
-        lines += [f"### Unseen pairs: {title}, named users", "", *_table(plain, field), ""]
-        drawn = [{**row, "strategy": "pooled prior" if row["pooled_prior"] else row["strategy"]} for row in random]
-        lines += [f"### Unseen pairs: {title}, people of the population", "", *_table(drawn, field), ""]
-    both = [(name, f"calibration_error{name}") for name in ("_uncalibrated", "")]
-    for name, field in both:
-        uniform = [row for row in plain if row["strategy"] == "uniform"]
-        lines += [
-            f"### Expected calibration error, {'T = 1' if name else 'calibrated'}",
-            "",
-            *_table(uniform, field),
-            "",
-        ]
-    uniform = [row for row in plain if row["strategy"] == "uniform"]
-    return "\n".join([*lines, "### Seconds per fit", "", *_table(uniform, "fit_seconds", 2)]) + "\n"
+    for title, chosen in accuracies:
+        lines += [f"### {title}: accuracy on all unseen pairs", "", *_table(chosen, "accuracy"), ""]
+        lines += [f"### {title}: accuracy on contested pairs", "", *_table(chosen, "contested_accuracy"), ""]
+    lines += ["### Expected calibration error without temperature", ""]
+    lines += [*_table(uniform, "calibration_error_uncalibrated"), "", "### Expected calibration error as shipped", ""]
+    return (
+        "\n".join([*lines, *_table(uniform, "calibration_error"), "", "### Seconds per fit", "", *_seconds(uniform)])
+        + "\n"
+    )
+
+
+def _seconds(rows: Sequence[dict[str, Any]]) -> list[str]:
+    return _table(rows, "fit_seconds", 2)
 
 
 def _table(rows: Sequence[dict[str, Any]], field: str, digits: int = 3) -> list[str]:
-    counts = sorted({row["labels"] for row in rows})
-    lines = [
-        "| model | pairs chosen | chains | " + " | ".join(map(str, counts)) + " |",
-        "|---" * (3 + len(counts)) + "|",
+    lines_of = dict.fromkeys((row["model"], row["strategy"]) for row in rows)
+    chains_of = [
+        {(row["user"], row["seed"]) for row in rows if (row["model"], row["strategy"]) == line} for line in lines_of
     ]
-    for model, strategy in dict.fromkeys((row["model"], row["strategy"]) for row in rows):
-        mine = [row for row in rows if (row["model"], row["strategy"]) == (model, strategy)]
-        cells = [
-            _cell([row[field] for row in mine if row["labels"] == count and row[field] is not None], digits)
-            for count in counts
-        ]
-        number = len({(row["user"], row["seed"]) for row in mine})
-        lines.append(f"| {model} | {strategy} | {number} | " + " | ".join(cells) + " |")
+    shared = set.intersection(*chains_of) if chains_of else set()
+    kept = [row for row in rows if (row["user"], row["seed"]) in shared and row[field] is not None]
+    counts = sorted({row["labels"] for row in kept})
+    head = "| model | pairs chosen | chains | " + " | ".join(map(str, counts)) + " |"
+    lines = [head, "|---" * (3 + len(counts)) + "|"]
+    for model, strategy in lines_of:
+        mine = [row for row in kept if (row["model"], row["strategy"]) == (model, strategy)]
+        cells = [_cell([row[field] for row in mine if row["labels"] == count], digits) for count in counts]
+        lines.append(f"| {model} | {strategy} | {len(shared)} | " + " | ".join(cells) + " |")
     return lines
 
 
 def _cell(values: Sequence[float], digits: int) -> str:
-    """Mean and its standard error over chains."""
+    """Mean and, of several chains, its standard error."""
     if not values:
         return "-"
-    error = np.std(values, ddof=1) / len(values) ** 0.5 if len(values) > 1 else float("nan")
-    return f"{np.mean(values):.{digits}f} ({error:.{digits}f})"
+    mean = f"{np.mean(values):.{digits}f}"
+    return f"{mean} ({np.std(values, ddof=1) / len(values) ** 0.5:.{digits}f})" if len(values) > 1 else mean
 
 
 def _options() -> argparse.Namespace:

@@ -21,7 +21,7 @@ from app.domain.studies import StudySettings
 from app.storage import ArtefactStore
 from worker import dataset
 from worker.ml import bundle
-from worker.ml.teachers import Manner, User
+from worker.ml.teachers import TASTES, Manner
 from worker.own_studio import OwnStudio
 from worker.rehearsal import Outcome, Rehearsal
 
@@ -60,7 +60,7 @@ def outcome(studio: OwnStudio, database: Database) -> Outcome:
     store = ArtefactStore(studio.settings.data_dir / "artefacts")
     rehearsal = Rehearsal(database, store, studio.settings.base_url)
     manner = Manner(mistakes=0.1, equal_share=0.1, skip_share=0.1)
-    (outcome,) = rehearsal.run("feeding", [User.CAUTIOUS], settings, manner, seed=1)
+    (outcome,) = rehearsal.run("feeding", [TASTES["cautious"]], settings, manner, seed=1)
     for killer in killers:
         killer.join()
         assert killer.killed, f"the worker was never caught in the middle of {killer.kind}"

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from worker import commands
 from worker.ml.teachers import OMEGA, TASTES, Manner, ScriptedTeacher, Taste, User, random_taste, segment_returns
 
 FAULTLESS = Manner(mistakes=0.0, equal_share=0.0)
@@ -115,3 +116,21 @@ def test_people_of_the_population_differ_and_come_back_with_their_seed() -> None
     first, again, other = (random_taste("somebody", np.random.default_rng(seed)) for seed in (1, 1, 2))
     assert first == again != other
     assert all(0.2 <= weight <= 5.0 for weight in first.omega)
+
+
+def test_a_rehearsal_takes_names_and_weights_and_the_paper_s_three_when_nobody_is_named() -> None:
+    def tastes(*words: str) -> list[str]:
+        return [taste.name for taste in commands._tastes(commands.parser().parse_args(["rehearse", *words]))]
+
+    assert tastes() == ["neutral", "cautious", "impatient"]
+    assert tastes("--users", "wide", "shy=1,3,2,2,1,1") == ["wide", "shy"]
+    assert tastes("--omega", "1", "2", "1.5", "2.5", "3", "2") == ["omega-1-2-1.5-2.5-3-2"]
+    assert tastes("--users", "slow", "--omega", *"111111") == ["slow", "omega-1-1-1-1-1-1"]
+
+
+def test_a_rehearsal_can_use_any_reward_model_and_manner() -> None:
+    words = "rehearse --reward preference_transformer --rationality 2 --myopia 0.9 --mistakes 0.1 --pooled-prior"
+    options = commands.parser().parse_args(words.split())
+    assert commands._manner(options) == Manner(2.0, 0.9, 0.1, 0.10, 0.02)
+    assert commands._settings(options).reward_kind == "preference_transformer"
+    assert commands._settings(options).pooled_prior
