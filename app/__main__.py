@@ -42,7 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for name, act in _COMMANDS.items():
         commands.add_parser(name, help=act.__doc__).set_defaults(act=act)
     demo = commands.add_parser("demo", help=demo_study.__doc__)
-    demo.add_argument("--task", type=TaskName, choices=list(TaskName), default=TaskName.FEEDING)
+    demo.add_argument("--task", choices=[task.value for task in TaskName], default=TaskName.FEEDING.value)
     demo.set_defaults(act=demo_study)
     chosen = vars(parser.parse_args(arguments))
     act, _ = chosen.pop("act"), chosen.pop("command")
@@ -85,11 +85,11 @@ def participant_link(settings: Settings) -> int:
     return 0
 
 
-def demo_study(settings: Settings, task: TaskName) -> int:
+def demo_study(settings: Settings, task: str) -> int:
     """Make a demo study of a task with one participant and print the personal link."""
     migrate(settings)
     with _database(settings).writing() as session:
-        link = _demo(session, settings, task)
+        link = _demo(session, settings, TaskName(task))
     _say(link)
     return 0
 
