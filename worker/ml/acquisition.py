@@ -1,8 +1,9 @@
 """Which pair to show next: pure functions on arrays, every choice with the probability it had.
 
-Random choice is the default: below 200 labels cleverer rules were no better, or worse (they chase outliers). Whatever
-the rule, a share of the choices stays random, so that every pair keeps a positive propensity and estimates made from
-the labels can be corrected for how the pairs were chosen.
+Random choice is the default: accuracy is then measured without bias. Greedy rules chased outliers and were worse than
+random below 200 labels; drawn with a random share, entropy needed a quarter of the labels for the structured model
+(docs/results/feedback_efficiency.md). Whatever the rule, a share of the choices stays random, so that every pair keeps
+a positive propensity and estimates made from the labels can be corrected for how the pairs were chosen.
 
 Every rule but the uniform one is a score of each candidate, made here from predicted probabilities; choose() turns any
 score into chances.
