@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -301,7 +301,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--pool-scenarios", type=int, default=36)
     parser.add_argument("--form", choices=["calibrated", "paper"], default="calibrated")
     parser.add_argument("--method", choices=["studio", "printed"], default="studio")
-    parser.add_argument("--reward", choices=["structured", "mlp"], default="structured")
+    parser.add_argument("--reward", choices=get_args(reward_training.Kind), default="structured")
     parser.add_argument("--no-residual", action="store_true")
     parser.add_argument("--preference-weight", type=float, default=0.3)
     parser.add_argument("--processes", type=int, default=2)
