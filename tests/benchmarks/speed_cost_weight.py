@@ -30,7 +30,9 @@ def main() -> None:
         successes = 0
         for scenario in SCENARIOS:
             episode = rollout(env, lambda seen, scale=factor: scale * policy.mean(seen), scenario)  # type: ignore[misc]
-            sums[row] += cost_items(laboratory.task(task), episode.costs, episode.signals, "calibrated").sum(0) / len(SCENARIOS)
+            sums[row] += cost_items(laboratory.task(task), episode.costs, episode.signals, "calibrated").sum(0) / len(
+                SCENARIOS
+            )
             successes += episode.success
         items = "  ".join(f"{name} {value:7.3f}" for name, value in zip(COSTS, sums[row], strict=True))
         sys.stdout.write(f"x{factor:.1f}  success {successes / len(SCENARIOS):.3f}  {items}\n")
