@@ -69,7 +69,10 @@ def test_chance_in_a_behaviour_comes_from_its_seed_alone(behaviour: Behaviour) -
 
 def test_an_early_policy_acts_differently_from_the_finished_one() -> None:
     observation = laboratory.environment("feeding").reset(seed=3)[0]
-    early, finished = (laboratory.act_as("feeding", Behaviour(checkpoint=each))(observation) for each in (EARLY[0], ""))
+    early, finished = (
+        laboratory.act_as("feeding", Behaviour(checkpoint=each))(observation)
+        for each in (laboratory.early_policies("feeding")[0], "")
+    )
     assert np.abs(early - finished).max() > 0.02
 
 
