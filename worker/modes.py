@@ -6,6 +6,7 @@ mode has moved, and its action is scaled. The same functions serve the simulator
 filter (torch, a batch), so that what is trained is what is shipped.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
@@ -28,7 +29,7 @@ class Axis:
 
 
 @dataclass(frozen=True)
-class ModeFamily:
+class ModeFamily(ABC):
     """The modes of one task. Observations are (..., D), modes (..., A); ``xp`` is numpy or torch."""
 
     observation: Space
@@ -77,13 +78,13 @@ class ModeFamily:
         kept: npt.NDArray[np.float64] = modes * (rng.random(modes.shape) < 0.75)
         return kept
 
+    @abstractmethod
     def perceived(self, observation: Any, mode: Any, xp: Any = np) -> Any:
         """The observation (..., D) as the policy should see it in this mode."""
-        raise NotImplementedError
 
+    @abstractmethod
     def speed_factor(self, observation: Any, mode: Any, xp: Any = np) -> Any:
         """The factor on the policy's mean action, (..., 1) or (..., 7)."""
-        raise NotImplementedError
 
     # For subclasses
 
