@@ -14,10 +14,12 @@ from fastapi.testclient import TestClient
 from sqlalchemy import select
 
 import app.domain.clips
+import app.domain.evaluation
 import app.domain.models
+import app.domain.participation
 import app.domain.people
 import app.domain.preferences
-import app.domain.studies  # noqa: F401  (all five fill Base.metadata)
+import app.domain.studies  # noqa: F401  (all of them fill Base.metadata)
 from app.db import Base, Database
 from app.domain.people import Experimenter
 from app.main import create_app

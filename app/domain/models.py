@@ -16,6 +16,12 @@ class RunKind(StrEnum):
     CLIPS = "clips"
     REWARD = "reward"
     FILTER = "filter"
+    METHOD = "method"
+    """A method that is only evaluated, such as PrefFT."""
+    FILMS = "films"
+    """Videos of methods on unseen scenarios."""
+    REPORT = "report"
+    EXPORT = "export"
 
 
 class RunStatus(StrEnum):
@@ -33,6 +39,7 @@ class ModelKind(StrEnum):
 
     REWARD = "reward"
     FILTER = "filter"
+    METHOD = "method"
 
 
 class Run(Base):
@@ -88,6 +95,37 @@ class Bundle(Base):
     artefact_sha256: Mapped[str] = mapped_column(String(64))
     byte_count: Mapped[int]
     created_at: Mapped[datetime] = mapped_column(default=now)
+
+
+class Report(Base):
+    """Statistics and figures of one study, made when ratings or answers were newer than the last report."""
+
+    __tablename__ = "report"
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    study_id: Mapped[int] = mapped_column(ForeignKey("study.id"), index=True)
+    run_id: Mapped[int] = mapped_column(ForeignKey("run.id"), unique=True)
+    basis: Mapped[str] = mapped_column(String(64))
+    """Fingerprint of the rows it was made from."""
+    contents: Mapped[dict[str, Any]]
+    figures: Mapped[dict[str, Any]]
+    """By name: {"svg": sha256, "png": sha256}."""
+    created_at: Mapped[datetime] = mapped_column(default=now)
+
+
+class Export(Base):
+    """A file somebody has asked for: the whole data of a study, or an archive that another installation imports."""
+
+    __tablename__ = "export"
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    study_id: Mapped[int] = mapped_column(ForeignKey("study.id"), index=True)
+    kind: Mapped[str] = mapped_column(String(20))
+    requested_by: Mapped[str] = mapped_column(String(80))
+    requested_at: Mapped[datetime] = mapped_column(default=now)
+    finished_at: Mapped[datetime | None]
+    artefact_sha256: Mapped[str | None] = mapped_column(String(64))
+    byte_count: Mapped[int | None]
 
 
 class WorkerPresence(Base):

@@ -22,6 +22,34 @@ class Response(StrEnum):
     SKIP = "skip"
 
 
+class SkipReason(StrEnum):
+    """Why somebody cannot tell."""
+
+    NO_DIFFERENCE_SEEN = "no_difference_seen"
+    BOTH_BAD = "both_bad"
+    NOT_COMPARABLE = "not_comparable"
+    NOT_SEEN = "not_seen"
+    OTHER = "other"
+
+
+class Purpose(StrEnum):
+    """Why a pair is shown."""
+
+    PRACTICE = "practice"
+    """To learn the keys; never learned from."""
+    INTRODUCTION = "introduction"
+    """A label on whole trajectories, before the others."""
+    PREFERENCE = "preference"
+    REPEAT = "repeat"
+    """An earlier pair again, half of them with the sides exchanged: how far the person agrees with themselves."""
+    CATCH = "catch"
+    """A pair with an obvious answer."""
+
+
+LEARNED_FROM = (Purpose.INTRODUCTION, Purpose.PREFERENCE)
+"""What counts as a label: everything else measures the person, not their taste."""
+
+
 class Query(Base):
     """Two clips put to one participant; sides are fixed here and never drawn again."""
 
@@ -36,6 +64,11 @@ class Query(Base):
     ordinal: Mapped[int]
     left_clip_id: Mapped[int] = mapped_column(ForeignKey("clip.id"), index=True)
     right_clip_id: Mapped[int] = mapped_column(ForeignKey("clip.id"), index=True)
+    purpose: Mapped[str] = mapped_column(String(20), default=Purpose.PREFERENCE, server_default=Purpose.PREFERENCE)
+    repeats_query_id: Mapped[int | None] = mapped_column(ForeignKey("query.id"), index=True)
+    """Which pair a repeat asks again."""
+    expected: Mapped[str | None] = mapped_column(String(8))
+    """The obvious answer to a catch pair: left or right."""
     strategy: Mapped[str] = mapped_column(String(40))
     propensity: Mapped[float]
     predicted_right: Mapped[float | None]
@@ -67,6 +100,18 @@ class LabelEvent(Base):
     """From the first frame of both videos to the answer; None when not measured."""
     replay_count: Mapped[int | None]
     play_error_count: Mapped[int | None]
+    reason: Mapped[str | None] = mapped_column(String(40))
+    """Why the person could not tell, one of SkipReason."""
+    stall_count: Mapped[int | None]
+    stalled_ms: Mapped[int | None]
+    """How long a clip had to wait for the network while playing."""
+    largest_drift_ms: Mapped[int | None]
+    """By how much the two clips were apart at worst, before they were brought together again."""
+    playback_rate: Mapped[float | None]
+    """The speed at the moment of the answer; 1 is real time."""
+    scrub_count: Mapped[int | None]
+    watched_whole: Mapped[bool | None]
+    """Whether both clips were seen from beginning to end before the answer."""
     created_at: Mapped[datetime] = mapped_column(default=now)
 
 

@@ -5,10 +5,19 @@ from enum import StrEnum
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
-from sqlalchemy import ForeignKey, String, UniqueConstraint
+from sqlalchemy import ForeignKey, String, Text, UniqueConstraint
 from sqlalchemy.orm import Mapped, mapped_column, relationship
 
 from app.db import Base, now
+from app.domain.protocol import (
+    PAPER_DEMOGRAPHICS,
+    USUAL_QUESTIONNAIRE,
+    Advisor,
+    EvaluationSettings,
+    FormItem,
+    Language,
+    PlannedTest,
+)
 
 
 class TaskName(StrEnum):
@@ -75,6 +84,23 @@ class StudySettings(BaseModel):
     evaluation_scenarios: int = Field(default=100, ge=10, le=1000)
     question: str = Field(default="Which robot would you rather have?", min_length=1, max_length=200)
     consent_version: str = Field(default="1", min_length=1, max_length=40)
+    language: Language = Language.ENGLISH
+    wording: dict[str, str] = Field(default_factory=dict, description="Texts of the pages in the study's own words.")
+    demographics: tuple[FormItem, ...] = ()
+    practice_pairs: int = Field(default=0, ge=0, le=5, description="Before the first label; never learned from.")
+    introduction_pairs: int = Field(default=0, ge=0, le=50, description="First labels, on whole trajectories.")
+    repeated_pairs: int = Field(default=0, ge=0, le=100, description="Asked again later; never learned from.")
+    catch_pairs: int = Field(default=0, ge=0, le=20, description="With an obvious answer; never learned from.")
+    break_every: int = Field(default=50, ge=0, le=500, description="Answers between two break screens; 0: none.")
+    answer_after_first_play: bool = Field(default=True, description="Answers open when both clips were seen once.")
+    evaluation: EvaluationSettings | None = None
+    questionnaire: tuple[FormItem, ...] = ()
+    debrief: bool = Field(default=False, description="Show the person's own robot before and after, at the end.")
+    completion_code: str = Field(default="", max_length=80)
+    return_url: str = Field(default="", max_length=500, pattern=r"^(https?://\S+)?$")
+    panel_parameter: str = Field(default="PROLIFIC_PID", pattern=r"^[A-Za-z][A-Za-z0-9_]{0,39}$")
+    advisor: Advisor = Advisor.SHOW
+    planned_tests: tuple[PlannedTest, ...] = (PlannedTest.PAIRED_T,)
 
     @model_validator(mode="after")
     def _enough_pairs(self) -> "StudySettings":
@@ -88,10 +114,28 @@ class StudySettings(BaseModel):
         return self
 
     @property
+    def question_count(self) -> int:
+        """Pairs a participant answers altogether: labels, repeats and catch pairs; practice not counted."""
+        return self.labels_per_participant + self.repeated_pairs + self.catch_pairs
+
+    @property
     def milestones(self) -> tuple[int, ...]:
         """Label counts at which a filter is trained, ascending, the last label included."""
         early = {count for count in self.filter_milestones if 0 < count < self.labels_per_participant}
         return (*sorted(early), self.labels_per_participant)
+
+
+PAPER_PROTOCOL = StudySettings(
+    demographics=PAPER_DEMOGRAPHICS,
+    practice_pairs=1,
+    introduction_pairs=10,
+    evaluation=EvaluationSettings(),
+    questionnaire=USUAL_QUESTIONNAIRE,
+    debrief=True,
+    advisor=Advisor.LOG,
+    planned_tests=(PlannedTest.TWO_SAMPLE_T, PlannedTest.PAIRED_T, PlannedTest.MIXED_MODEL),
+)
+"""The user study of the paper: 10 + 190 labels, three methods, three trials each. The default of everything else."""
 
 
 class Study(Base):
@@ -106,6 +150,15 @@ class Study(Base):
     stored_settings: Mapped[dict[str, Any]]
     seed: Mapped[int]
     created_at: Mapped[datetime] = mapped_column(default=now)
+    join_token: Mapped[str | None] = mapped_column(String(64), unique=True)
+    """Part of the address by which anybody may join, as recruitment panels need it; None: by invitation only."""
+    material: Mapped[dict[str, Any] | None]
+    """What imported clips are made of (names of signals, rates); None when the clips are simulated here."""
+    locked_at: Mapped[datetime | None]
+    lock_hash: Mapped[str | None] = mapped_column(String(64))
+    lock_document: Mapped[dict[str, Any] | None]
+    """Settings, plan of pairs, stop rule and planned tests as they were locked; lock_hash is the hash of this."""
+    unblinded_at: Mapped[datetime | None]
 
     @property
     def settings(self) -> StudySettings:
@@ -113,11 +166,28 @@ class Study(Base):
         return StudySettings.model_validate(self.stored_settings)
 
 
+class Deviation(Base):
+    """A change to a locked study, kept with its reason and listed in every export."""
+
+    __tablename__ = "deviation"
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    study_id: Mapped[int] = mapped_column(ForeignKey("study.id"), index=True)
+    at: Mapped[datetime] = mapped_column(default=now)
+    actor: Mapped[str] = mapped_column(String(80))
+    reason: Mapped[str] = mapped_column(Text)
+    before: Mapped[dict[str, Any]]
+    after: Mapped[dict[str, Any]]
+
+
 class Participant(Base):
     """One person in one study, known by a code. The link's token is stored only as a hash."""
 
     __tablename__ = "participant"
-    __table_args__ = (UniqueConstraint("study_id", "number"),)
+    __table_args__ = (
+        UniqueConstraint("study_id", "number"),
+        UniqueConstraint("study_id", "panel_id", name="uq_participant_panel_id"),
+    )
 
     id: Mapped[int] = mapped_column(primary_key=True)
     study_id: Mapped[int] = mapped_column(ForeignKey("study.id"), index=True)
@@ -129,6 +199,14 @@ class Participant(Base):
     consented_at: Mapped[datetime | None]
     consent_version: Mapped[str | None] = mapped_column(String(40))
     instructed_at: Mapped[datetime | None]
+    language: Mapped[str | None] = mapped_column(String(8))
+    """The person's own choice; None: the study's."""
+    panel_id: Mapped[str | None] = mapped_column(String(120))
+    """Who this is at the recruitment panel; the same id comes back to the same participant."""
+    panel_parameters: Mapped[dict[str, Any] | None]
+    completed_at: Mapped[datetime | None]
+    withdrawn_at: Mapped[datetime | None]
+    """Everything else about the person is erased then; this row stays as the tombstone."""
 
     study: Mapped[Study] = relationship(lazy="raise")
 

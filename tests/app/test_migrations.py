@@ -11,10 +11,12 @@ from alembic.migration import MigrationContext
 from sqlalchemy import Engine, create_engine, inspect
 
 import app.domain.clips
+import app.domain.evaluation
 import app.domain.models
+import app.domain.participation
 import app.domain.people
 import app.domain.preferences
-import app.domain.studies  # noqa: F401  (all five fill Base.metadata)
+import app.domain.studies  # noqa: F401  (all of them fill Base.metadata)
 from app.db import Base
 
 

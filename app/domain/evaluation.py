@@ -1,0 +1,107 @@
+"""The blinded evaluation: which letter hides which method, what was shown or run, and how it was rated."""
+
+from datetime import datetime
+
+from sqlalchemy import CheckConstraint, ForeignKey, String, UniqueConstraint
+from sqlalchemy.orm import Mapped, mapped_column, relationship
+
+from app.db import Base, now
+
+
+class Film(Base):
+    """One method in one unseen scenario, for one participant, as a video."""
+
+    __tablename__ = "film"
+    __table_args__ = (UniqueConstraint("participant_id", "method", "model_id", "scenario"),)
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    participant_id: Mapped[int] = mapped_column(ForeignKey("participant.id"), index=True)
+    method: Mapped[str] = mapped_column(String(40))
+    """One of protocol.EvaluatedMethod."""
+    model_id: Mapped[int | None] = mapped_column(ForeignKey("model.id"), index=True)
+    """None for the reference policy, which nobody has trained."""
+    scenario: Mapped[int]
+    success: Mapped[bool]
+    trajectory_sha256: Mapped[str] = mapped_column(String(64))
+    video_sha256: Mapped[str] = mapped_column(String(64), index=True)
+    poster_sha256: Mapped[str] = mapped_column(String(64), index=True)
+    width: Mapped[int]
+    height: Mapped[int]
+    fps: Mapped[int]
+    duration_ms: Mapped[int]
+    byte_count: Mapped[int]
+    created_at: Mapped[datetime] = mapped_column(default=now)
+
+
+class Controller(Base):
+    """One method as a file that runs on a robot, named by its letter and by nothing else."""
+
+    __tablename__ = "controller"
+    __table_args__ = (UniqueConstraint("participant_id", "method"),)
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    participant_id: Mapped[int] = mapped_column(ForeignKey("participant.id"), index=True)
+    method: Mapped[str] = mapped_column(String(40))
+    model_id: Mapped[int | None] = mapped_column(ForeignKey("model.id"), index=True)
+    artefact_sha256: Mapped[str] = mapped_column(String(64))
+    byte_count: Mapped[int]
+    created_at: Mapped[datetime] = mapped_column(default=now)
+
+
+class Assignment(Base):
+    """Which letter a method has for one participant; drawn by the server, balanced over participants."""
+
+    __tablename__ = "assignment"
+    __table_args__ = (
+        UniqueConstraint("participant_id", "letter", name="uq_assignment_letter"),
+        UniqueConstraint("participant_id", "method", name="uq_assignment_method"),
+    )
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    participant_id: Mapped[int] = mapped_column(ForeignKey("participant.id"), index=True)
+    letter: Mapped[str] = mapped_column(String(1))
+    method: Mapped[str] = mapped_column(String(40))
+    created_at: Mapped[datetime] = mapped_column(default=now)
+
+
+class Trial(Base):
+    """One execution to be rated. Trials are shown in the order of their ordinals."""
+
+    __tablename__ = "trial"
+    __table_args__ = (UniqueConstraint("participant_id", "ordinal"),)
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    participant_id: Mapped[int] = mapped_column(ForeignKey("participant.id"), index=True)
+    ordinal: Mapped[int]
+    letter: Mapped[str] = mapped_column(String(1))
+    repetition: Mapped[int]
+    scenario: Mapped[int]
+    film_id: Mapped[int | None] = mapped_column(ForeignKey("film.id"), index=True)
+    """In video mode, once it is rendered."""
+    shown_at: Mapped[datetime | None]
+    started_at: Mapped[datetime | None]
+    """In physical mode: when the operator started the robot."""
+    finished_at: Mapped[datetime | None]
+    """In physical mode: when the operator said that it is done."""
+
+    film: Mapped[Film | None] = relationship(lazy="raise")
+
+
+class Rating(Base):
+    """What was said about a trial, 1 to 5. Append-only: the highest revision counts."""
+
+    __tablename__ = "rating"
+    __table_args__ = (
+        UniqueConstraint("trial_id", "revision"),
+        CheckConstraint("satisfaction BETWEEN 1 AND 5", name="satisfaction_from_1_to_5"),
+        CheckConstraint("personalisation BETWEEN 1 AND 5", name="personalisation_from_1_to_5"),
+    )
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    trial_id: Mapped[int] = mapped_column(ForeignKey("trial.id"), index=True)
+    revision: Mapped[int]
+    satisfaction: Mapped[int]
+    personalisation: Mapped[int]
+    client_uuid: Mapped[str] = mapped_column(String(36), unique=True)
+    response_time_ms: Mapped[int | None]
+    created_at: Mapped[datetime] = mapped_column(default=now)
