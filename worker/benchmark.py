@@ -23,7 +23,7 @@ from worker.analysis.comparison import Cells, Row, Run, cost_rows, personalisati
 from worker.analysis.pareto import pareto_svg
 from worker.analysis.table_files import METHOD, to_csv, to_markdown
 from worker.compute import Compute, Lane
-from worker.contest import OPPOSED_USERS, PAPER_USERS, Cell, Terms
+from worker.contest import INDIRECT_USERS, OPPOSED_USERS, PAPER_USERS, Cell, Terms
 from worker.ml.methods import METHODS, MethodConfig
 from worker.ml.pbrl_hri import FromScratch
 from worker.ml.prefft import FineTuning
@@ -252,14 +252,14 @@ def _run(record: dict[str, Any], arrays: dict[str, Any], terms: Terms, tastes: d
 
 
 def _order(run: Run) -> tuple[int, int, int, str]:
-    users = [*PAPER_USERS, *OPPOSED_USERS]
+    users = [*PAPER_USERS, *OPPOSED_USERS, *INDIRECT_USERS]
     user = users.index(run.user) if run.user in users else len(users)
     return list(ENVIRONMENTS).index(run.task), user, list(METHODS).index(run.method), run.user
 
 
 def _groups(users: Sequence[str]) -> list[list[str]]:
-    """The paper's users among themselves, those who truly differ among themselves, and all others."""
-    known = [list(PAPER_USERS), list(OPPOSED_USERS)]
+    """The paper's users among themselves, so those who truly differ, those no mode is made for, and all others."""
+    known = [list(PAPER_USERS), list(OPPOSED_USERS), list(INDIRECT_USERS)]
     others = [user for user in users if not any(user in group for group in known)]
     return [*known, others]
 

@@ -13,10 +13,10 @@ from app.domain.studies import Method, RewardKind, Strategy, StudySettings
 from app.settings import Settings
 from app.storage import ArtefactStore
 from worker import benchmark, exploration, laboratory, pretraining, rehearsal, service
-from worker.contest import OPPOSED_USERS, PAPER_USERS
+from worker.contest import INDIRECT_USERS, OPPOSED_USERS, PAPER_USERS
 from worker.ml import reward_training
 from worker.ml.methods import METHODS
-from worker.ml.teachers import Manner, Taste
+from worker.ml.teachers import TASTES, Manner, Taste
 from worker.own_studio import OwnStudio
 from worker.sim.catalogue import ENVIRONMENTS
 
@@ -72,9 +72,12 @@ def _add_benchmark(commands: _Commands) -> None:
         nargs="+",
         type=_taste,
         default=list(PAPER_USERS.values()),
-        help="names, or NAME=six weights: shy=1,3,2,2,1,1",
+        help="names, or NAME=six weights and costs per signal: shy=1,3,2,2,1,1 or level=1,1,1,1,1,1,tilt_rad:0.3",
     )
     command.add_argument("--opposed", action="store_true", help="also the six users who truly differ")
+    command.add_argument(
+        "--indirect", action="store_true", help="also three users whose taste no mode axis moves directly"
+    )
     command.add_argument("--population", type=int, default=0, help="also so many users drawn at random")
     command.add_argument("--seeds", type=int, default=1)
     command.add_argument("--labels", type=int, help="200; the paper's offline training has 5000")
@@ -96,18 +99,20 @@ def _add_benchmark(commands: _Commands) -> None:
 
 
 def _taste(text: str) -> Taste:
-    """A known user, or somebody with weights of their own."""
-    known = {**PAPER_USERS, **OPPOSED_USERS}
+    """A known user, or somebody with weights of their own: six for omega, then signal:weight as often as wanted."""
     name, _, weights = text.partition("=")
-    if not weights and name in known:
-        return known[name]
+    if not weights and name in TASTES:
+        return TASTES[name]
+    omega = [part for part in weights.split(",") if ":" not in part]
+    signals = [part.split(":", 1) for part in weights.split(",") if ":" in part]
     try:
-        omega = tuple(float(value) for value in weights.split(","))
-    except ValueError:
-        omega = ()
-    if len(omega) != 6 or not name.replace("-", "").isalnum() or name in known:
-        raise argparse.ArgumentTypeError(f"{text!r} is none of {', '.join(known)}, nor NAME=six,weights,with,commas.")
-    return Taste(name, omega)
+        if not name.replace("-", "").isalnum() or name in TASTES:
+            raise ValueError(f"A user of one's own needs a new name of letters, digits and hyphens; got {name!r}.")
+        per_signal = {signal: float(weight) for signal, weight in signals}
+        return Taste(name, tuple(float(weight) for weight in omega), per_signal)
+    except ValueError as error:
+        known = ", ".join(TASTES)
+        raise argparse.ArgumentTypeError(f"{text!r} is none of {known}, nor NAME=six,weights,...: {error}") from error
 
 
 def _benchmark(options: argparse.Namespace) -> int:
@@ -121,7 +126,11 @@ def _benchmark(options: argparse.Namespace) -> int:
         pbrl_steps=options.pbrl_steps,
         printed_steps=options.printed_steps,
     )
-    others = [*(OPPOSED_USERS.values() if options.opposed else ()), *benchmark.population(options.population)]
+    others = [
+        *(OPPOSED_USERS.values() if options.opposed else ()),
+        *(INDIRECT_USERS.values() if options.indirect else ()),
+        *benchmark.population(options.population),
+    ]
     tastes = {taste.name: taste for taste in [*options.users, *others]}
     selection = benchmark.Selection(options.methods, options.tasks, tuple(tastes.values()), options.seeds)
     work = options.work_directory or Settings().data_dir / "benchmark"

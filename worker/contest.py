@@ -27,7 +27,7 @@ from worker.ml.response_surface import ResponseSurface
 from worker.ml.reward_models import MlpReward, RewardModel, load_reward_model
 from worker.ml.segments import SegmentPairs
 from worker.ml.studio_filter import FilterConfig, FilterProblem
-from worker.ml.teachers import OPPOSED, TASTES, Manner, ScriptedTeacher, Taste, User
+from worker.ml.teachers import INDIRECT, OPPOSED, TASTES, Manner, ScriptedTeacher, Taste, User
 from worker.shelf import BEHAVIOURS_PER_SCENARIO, Shelf, policy_mark
 from worker.sim.costs import CostForm, preference_rewards
 from worker.trajectory import Trajectory
@@ -41,6 +41,7 @@ Floats = npt.NDArray[np.float64]
 
 PAPER_USERS: Mapping[str, Taste] = {user.value: TASTES[user.value] for user in User}
 OPPOSED_USERS: Mapping[str, Taste] = {taste.name: taste for pair in OPPOSED for taste in pair}
+INDIRECT_USERS: Mapping[str, Taste] = {taste.name: taste for taste in INDIRECT}
 
 
 @dataclass(frozen=True)

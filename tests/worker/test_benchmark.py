@@ -101,7 +101,9 @@ def test_the_quick_profile_does_everything_a_little() -> None:
 def test_users_are_named_or_given_by_their_weights() -> None:
     assert commands._taste("slow") == OPPOSED_USERS["slow"]
     assert commands._taste("shy=1,3,2,2,1,1") == SHY
-    for wrong in ("nobody", "shy=1,2", "neutral=1,1,1,1,1,1", "a/b=1,1,1,1,1,1", "shy=a,1,1,1,1,1"):
+    level = commands._taste("level=1,1,1,1,1,1,tilt_rad:0.3")
+    assert (level.omega, level.per_signal) == ((1.0,) * 6, {"tilt_rad": 0.3})
+    for wrong in ("nobody", "shy=1,2", "neutral=1,1,1,1,1,1", "a/b=1,1,1,1,1,1", "shy=a,1,1,1,1,1", "shy=1,1,1,1,1,1,noise:1"):
         with pytest.raises(Exception, match="is none of"):
             commands._taste(wrong)
 

@@ -107,8 +107,14 @@ def test_weights_that_mean_nothing_are_refused(omega: tuple[float, ...]) -> None
         Taste.of_omega(omega)
 
 
-def test_the_paper_s_users_and_the_opposed_ones_go_by_name() -> None:
-    assert set(TASTES) == {"neutral", "cautious", "impatient", "slow", "quick", "close", "wide", "gentle", "brisk"}
+def test_a_cost_of_a_signal_that_is_not_measured_is_refused() -> None:
+    with pytest.raises(ValueError, match="No signal is called noise"):
+        Taste("quiet", per_signal={"noise": 1.0})
+
+
+def test_the_paper_s_users_the_opposed_and_the_indirect_ones_go_by_name() -> None:
+    opposed, indirect = {"slow", "quick", "close", "wide", "gentle", "brisk"}, {"steady", "upright", "tidy"}
+    assert set(TASTES) == {"neutral", "cautious", "impatient"} | opposed | indirect
     assert TASTES["cautious"].omega == OMEGA[User.CAUTIOUS]
 
 

@@ -14,7 +14,7 @@ from typing import Literal, Self
 import numpy as np
 import numpy.typing as npt
 
-from worker.trajectory import COSTS
+from worker.trajectory import COSTS, SIGNALS
 
 Floats = npt.NDArray[np.float64]
 Answer = Literal["left", "right", "equal", "skip"]
@@ -49,6 +49,9 @@ class Taste:
     def __post_init__(self) -> None:
         if len(self.omega) != len(COSTS) or any(not isfinite(weight) for weight in self.omega):
             raise ValueError(f"A taste needs {len(COSTS)} finite weights, for {', '.join(COSTS)}; got {self.omega}.")
+        unknown = self.per_signal.keys() - set(SIGNALS)
+        if unknown:
+            raise ValueError(f"No signal is called {', '.join(sorted(unknown))}; there are {', '.join(SIGNALS)}.")
 
     @classmethod
     def of_omega(cls, omega: Sequence[float]) -> Self:
@@ -72,11 +75,19 @@ OPPOSED: tuple[tuple[Taste, Taste], ...] = (
 )
 """Users who truly differ: both of a pair care most about one thing, in opposite directions."""
 
+INDIRECT: tuple[Taste, ...] = (
+    Taste("steady", per_signal={"turn_speed_squared_rad2_s2": 3.0}),
+    Taste("upright", per_signal={"tilt_rad": 0.3}),
+    Taste("tidy", (1.0, 1.0, 1.0, 1.0, 8.0, 8.0), {"spilled": 5.0}),
+)
+"""Users whose taste no mode axis moves directly: how the tool turns, how it is held, what is spilled."""
+
 TASTES: Mapping[str, Taste] = {
     **{user.value: Taste(user.value, OMEGA[user]) for user in User},
     **{taste.name: taste for pair in OPPOSED for taste in pair},
+    **{taste.name: taste for taste in INDIRECT},
 }
-"""Everybody with a name: the paper's three and the opposed ones."""
+"""Everybody with a name: the paper's three, the opposed ones, and those that no mode is made for."""
 
 _POPULATION_SIGNALS = {
     "lateral_offset_m": 8.0,
