@@ -103,7 +103,8 @@ def test_users_are_named_or_given_by_their_weights() -> None:
     assert commands._taste("shy=1,3,2,2,1,1") == SHY
     level = commands._taste("level=1,1,1,1,1,1,tilt_rad:0.3")
     assert (level.omega, level.per_signal) == ((1.0,) * 6, {"tilt_rad": 0.3})
-    for wrong in ("nobody", "shy=1,2", "neutral=1,1,1,1,1,1", "a/b=1,1,1,1,1,1", "shy=a,1,1,1,1,1", "shy=1,1,1,1,1,1,noise:1"):
+    unknown_signal = "shy=1,1,1,1,1,1,noise:1"
+    for wrong in ("nobody", "shy=1,2", "neutral=1,1,1,1,1,1", "a/b=1,1,1,1,1,1", "shy=a,1,1,1,1,1", unknown_signal):
         with pytest.raises(Exception, match="is none of"):
             commands._taste(wrong)
 
