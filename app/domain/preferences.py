@@ -117,7 +117,7 @@ class LabelEvent(Base):
 
 @dataclass(frozen=True)
 class Label:
-    """The answer that counts for one query."""
+    """The answer that counts for one query, whatever the query was for."""
 
     query: Query
     event: LabelEvent
@@ -125,10 +125,21 @@ class Label:
 
 
 def current_labels(session: Session, participant_id: int, *options: ExecutableOption) -> Sequence[Label]:
-    """Every answer of the participant that has not been undone, in the order of the queries.
+    """Every label of the participant that has not been undone, in the order of the queries.
 
-    ``options`` say what to load with each query.
+    Labels are answers that are learned from; ``options`` say what to load with each query.
     """
+    return _answered(session, participant_id, LEARNED_FROM, options)
+
+
+def current_answers(session: Session, participant_id: int, *options: ExecutableOption) -> Sequence[Label]:
+    """Like current_labels, with practice, repeats and catch pairs: everything that was answered and not undone."""
+    return _answered(session, participant_id, tuple(Purpose), options)
+
+
+def _answered(
+    session: Session, participant_id: int, purposes: Sequence[Purpose], options: Sequence[ExecutableOption]
+) -> Sequence[Label]:
     newest = (
         select(LabelEvent.query_id, func.max(LabelEvent.revision).label("revision"))
         .join(Query, Query.id == LabelEvent.query_id)
@@ -140,7 +151,7 @@ def current_labels(session: Session, participant_id: int, *options: ExecutableOp
         select(Query, LabelEvent)
         .join(LabelEvent, LabelEvent.query_id == Query.id)
         .join(newest, (newest.c.query_id == LabelEvent.query_id) & (newest.c.revision == LabelEvent.revision))
-        .where(LabelEvent.response.is_not(None))
+        .where(LabelEvent.response.is_not(None), Query.purpose.in_(purposes))
         .order_by(Query.ordinal)
         .options(*options)
     )

@@ -24,8 +24,9 @@ from worker.ml.segments import LEFT, RIGHT, SegmentPairs
 
 Floats = npt.NDArray[np.float64]
 Array = npt.NDArray[np.float32]
-Logits = Callable[[Tensor, int], Tensor]
-"""Inputs (B, 2, T, F) and the first step to look at -> every member's log odds that right is preferred, (E, B)."""
+Logits = Callable[[Tensor, Tensor, int], Tensor]
+"""Inputs (B, 2, T, F), which steps were shown (B, 2, T), and the first step to look at -> every member's log odds that
+right is preferred, (E, B)."""
 
 FEWEST_TO_STOP = 20
 """With fewer labels none is held out: every one is needed for learning."""
@@ -66,7 +67,7 @@ class TransformerTraining(MlpTraining):
 def fit_mlp(pairs: SegmentPairs, answers: Floats, seed: int, config: MlpTraining) -> tuple[RewardModel, dict[str, Any]]:
     """The model in raw units, and what is worth knowing about its training."""
     generator = torch.Generator().manual_seed(seed)
-    inputs, offset, scale = _standardised(pairs)
+    inputs, shown, offset, scale = _standardised(pairs)
     sizes = [inputs.shape[-1], config.hidden, config.hidden, 1]
     layers = []
     for fan_in, fan_out in pairwise(sizes):
@@ -75,10 +76,11 @@ def fit_mlp(pairs: SegmentPairs, answers: Floats, seed: int, config: MlpTraining
             matrix *= 0.1  # returns of a hundred steps: start undecided
         layers += [matrix, torch.zeros(config.members, 1, fan_out)]
 
-    def logits(shown: Tensor, first: int) -> Tensor:
-        return _mlp_logits(layers, shown[:, :, first :: config.every_nth_step]) * config.every_nth_step
+    def logits(segments: Tensor, seen: Tensor, first: int) -> Tensor:
+        steps = slice(first, None, config.every_nth_step)
+        return _mlp_logits(layers, segments[:, :, steps], seen[:, :, steps]) * config.every_nth_step
 
-    trained = _train(layers, logits, inputs, answers, config, generator)
+    trained = _train(layers, logits, inputs, shown, answers, config, generator)
     arrays = [tensor.numpy() for tensor in trained.best]
     model = MlpReward(tuple(zip(arrays[::2], arrays[1::2], strict=True)), offset, scale)
     return model, trained.metrics(model, pairs, answers)
@@ -89,21 +91,22 @@ def fit_transformer(
 ) -> tuple[RewardModel, dict[str, Any]]:
     """The model in raw units, and what is worth knowing about its training."""
     generator = torch.Generator().manual_seed(seed)
-    inputs, offset, scale = _standardised(pairs)
+    inputs, shown, offset, scale = _standardised(pairs)
     weights = preference_transformer.new_weights(
         inputs.shape[-1], config.members, config.hidden, config.layers, generator
     )
 
-    def logits(shown: Tensor, first: int) -> Tensor:
-        tokens = shown[:, :, first :: config.every_nth_step].flatten(0, 1)
+    def logits(segments: Tensor, seen: Tensor, first: int) -> Tensor:
+        tokens = segments[:, :, first :: config.every_nth_step].flatten(0, 1)
+        counting = seen[:, :, first :: config.every_nth_step].flatten(0, 1)
         hidden = preference_transformer.hidden_states(weights, tokens, config.heads)
         rewards = preference_transformer.step_rewards(weights, hidden)
-        importance = preference_transformer.preference_attention(weights, hidden)
+        importance = preference_transformer.preference_attention(weights, hidden, counting)
         returns = (rewards * importance).sum(-1).reshape(config.members, -1, 2) * config.every_nth_step
         difference: Tensor = returns[..., RIGHT] - returns[..., LEFT]
         return difference
 
-    trained = _train(list(weights.values()), logits, inputs, answers, config, generator)
+    trained = _train(list(weights.values()), logits, inputs, shown, answers, config, generator)
     arrays = {name: tensor.numpy() for name, tensor in zip(weights, trained.best, strict=True)}
     model = PreferenceTransformer(arrays, offset, scale, config.heads, config.every_nth_step)
     return model, trained.metrics(model, pairs, answers)
@@ -129,6 +132,7 @@ def _train(
     parameters: list[Tensor],
     logits: Logits,
     inputs: Tensor,
+    shown: Tensor,
     answers: Floats,
     config: MlpTraining,
     generator: torch.Generator,
@@ -150,13 +154,13 @@ def _train(
         steps = step
         rows = training[torch.randint(len(training), (config.batch_pairs,), generator=generator)]
         first = int(torch.randint(min(config.every_nth_step, inputs.shape[2]), (), generator=generator))
-        loss = preference_loss(logits(inputs[rows], first), targets[rows], counts[:, rows])
+        loss = preference_loss(logits(inputs[rows], shown[rows], first), targets[rows], counts[:, rows])
         optimiser.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         optimiser.step()
         if held_out and step % config.check_every == 0:
             with torch.no_grad():
-                current = float(preference_loss(logits(inputs[validation], 0), targets[validation]))
+                current = float(preference_loss(logits(inputs[validation], shown[validation], 0), targets[validation]))
             if current < best_loss:
                 best, best_loss, waited = _copied(parameters), current, 0
             else:
@@ -168,24 +172,26 @@ def _train(
     return _Trained(best, unseen, steps, best_loss if held_out else None)
 
 
-def _standardised(pairs: SegmentPairs) -> tuple[Tensor, Array, Array]:
-    """Inputs (N, 2, T, D + 7) with mean 0 and deviation 1 over the labelled steps, and the offset and scale used."""
+def _standardised(pairs: SegmentPairs) -> tuple[Tensor, Tensor, Array, Array]:
+    """Inputs (N, 2, T, D + 7) with mean 0 and deviation 1 over the steps shown, which those are (N, 2, T), and the
+    offset and scale used."""
     steps = np.concatenate([pairs.observations, pairs.actions], axis=-1)
-    flat = steps.reshape(-1, steps.shape[-1])
+    flat = steps[pairs.shown]
     offset = flat.mean(axis=0)
     scale = np.maximum(flat.std(axis=0), 1e-3)
     standardised = np.clip((steps - offset) / scale, -6.0, 6.0)
     inputs = torch.from_numpy(standardised.astype(np.float32))
-    return inputs, offset.astype(np.float32), scale.astype(np.float32)
+    return inputs, torch.from_numpy(pairs.shown.copy()), offset.astype(np.float32), scale.astype(np.float32)
 
 
-def _mlp_logits(layers: list[Tensor], inputs: Tensor) -> Tensor:
-    """(B, 2, T, F) -> (E, B)"""
+def _mlp_logits(layers: list[Tensor], inputs: Tensor, shown: Tensor) -> Tensor:
+    """(B, 2, T, F), (B, 2, T) -> (E, B)"""
     hidden = inputs.reshape(1, -1, inputs.shape[-1])
     for matrix, bias in zip(layers[:-2:2], layers[1:-2:2], strict=True):
         hidden = functional.silu(hidden @ matrix + bias)
     matrix, bias = layers[-2:]
-    returns = (hidden @ matrix + bias).tanh().reshape(len(matrix), *inputs.shape[:3]).sum(dim=-1)
+    rewards = (hidden @ matrix + bias).tanh().reshape(len(matrix), *inputs.shape[:3])
+    returns = (rewards * shown).sum(dim=-1)
     return returns[..., RIGHT] - returns[..., LEFT]
 
 

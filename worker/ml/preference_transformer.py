@@ -26,12 +26,14 @@ from torch import Tensor
 from torch.nn import functional
 
 from worker.ml.reward_models import RAW, Array, Floats, Normalisation, RewardModel
-from worker.ml.segments import LEFT, RIGHT, SegmentPairs
+from worker.ml.segments import LEFT, RIGHT, Mask, SegmentPairs
 
 Weights = Mapping[str, Tensor]
 """By name, each (E, in, out), or (E, 1, out) for a bias; layers are numbered."""
 
 INPUT_CLIP = 6.0
+_UNATTENDED = -1e9
+"""Score of a token that was not shown; finite, since a row of nothing but infinities has no softmax."""
 _CHUNK = 256
 """Segments read at a time: bounds the memory."""
 
@@ -55,14 +57,14 @@ class PreferenceTransformer(RewardModel):
 
     def logits(self, pairs: SegmentPairs) -> Floats:
         """See RewardModel: here the steps are weighed by preference attention."""
-        rewards, weights = self._read(pairs.observations, pairs.actions)
-        returns = (rewards * weights).sum(axis=-1)
+        rewards, weights = self._read(pairs.observations, pairs.actions, pairs.mask)
+        returns = (rewards * weights).sum(axis=-1)  # steps that were not shown weigh nothing
         difference: Floats = returns[..., RIGHT] - returns[..., LEFT]
         return difference
 
     def step_weights(self, pairs: SegmentPairs) -> Floats:
-        """How much every step counts in its segment; the mean is 1. (E, N, 2, T)"""
-        return self._read(pairs.observations, pairs.actions)[1]
+        """How much every step counts in its segment; the mean over shown steps is 1. (E, N, 2, T)"""
+        return self._read(pairs.observations, pairs.actions, pairs.mask)[1]
 
     def inputs(self, observations: npt.ArrayLike, actions: npt.ArrayLike) -> Tensor:
         """(..., D), (..., 7) -> (..., D + 7) standardised."""
@@ -75,9 +77,10 @@ class PreferenceTransformer(RewardModel):
         return {name: torch.from_numpy(np.array(array)) for name, array in self.weights.items()}
 
     @torch.no_grad()
-    def _read(self, observations: Array, actions: Array) -> tuple[Floats, Floats]:
-        """Rewards and preference weights, (E, ..., T) each."""
+    def _read(self, observations: Array, actions: Array, mask: Mask | None = None) -> tuple[Floats, Floats]:
+        """Rewards and preference weights, (E, ..., T) each; ``mask`` (..., T): the steps that were shown."""
         leading = np.shape(actions)[:-1]
+        shown = None if mask is None else torch.from_numpy(np.array(mask)).reshape(-1, leading[-1])
         inputs = self.inputs(observations, actions).reshape(-1, leading[-1], len(self.offset))
         weights = self.torch_weights()
         rewards, importance = np.zeros((2, self.size, *inputs.shape[:2]))
@@ -86,7 +89,8 @@ class PreferenceTransformer(RewardModel):
             for begin in range(min(self.stride, leading[-1])):
                 tokens = hidden_states(weights, inputs[part, begin :: self.stride], self.heads)
                 rewards[:, part, begin :: self.stride] = step_rewards(weights, tokens).numpy()
-                importance[:, part, begin :: self.stride] = preference_attention(weights, tokens).numpy()
+                seen = None if shown is None else shown[part, begin :: self.stride]
+                importance[:, part, begin :: self.stride] = preference_attention(weights, tokens, seen).numpy()
         return rewards.reshape(self.size, *leading), importance.reshape(self.size, *leading)
 
     def tensors(self) -> dict[str, Array]:
@@ -159,11 +163,18 @@ def step_rewards(weights: Weights, tokens: Tensor) -> Tensor:
     return _linear(tokens, weights["reward"])[..., 0]
 
 
-def preference_attention(weights: Weights, tokens: Tensor) -> Tensor:
-    """w_t of every token: how much all tokens attend to it; the mean over time is 1. (E, B, T, W) -> (E, B, T)"""
+def preference_attention(weights: Weights, tokens: Tensor, shown: Tensor | None = None) -> Tensor:
+    """w_t of every token: how much all tokens attend to it; the mean over time is 1. (E, B, T, W) -> (E, B, T)
+
+    ``shown`` (B, T): tokens outside it neither attend nor are attended to; the mean over the others is 1.
+    """
     query, key = _linear(tokens, weights["query_key"]).chunk(2, -1)
     scores = query @ key.transpose(-1, -2) / query.shape[-1] ** 0.5
-    importance: Tensor = scores.softmax(-1).sum(-2)
+    if shown is None:
+        importance: Tensor = scores.softmax(-1).sum(-2)
+        return importance
+    scores = scores.masked_fill(~shown[:, None, :], _UNATTENDED)
+    importance = (scores.softmax(-1) * shown[:, :, None]).sum(-2) * shown
     return importance
 
 

@@ -85,7 +85,8 @@ class RewardModel(ABC):
 
     def logits(self, pairs: SegmentPairs) -> Floats:
         """Every member's log odds that right is preferred, (E, N). Not normalised, not clipped, not calibrated."""
-        returns = self.raw_rewards(pairs.signals, pairs.observations, pairs.actions).sum(axis=-1)
+        rewards = self.raw_rewards(pairs.signals, pairs.observations, pairs.actions)
+        returns = rewards.sum(axis=-1, where=pairs.shown)
         difference: Floats = preference_logits(returns[..., LEFT], returns[..., RIGHT])
         return difference
 

@@ -102,7 +102,7 @@ def _accuracy(model: RewardModel, pairs: SegmentPairs, answers: Floats) -> float
 
 def _normalised_over_segments(model: RewardModel, pairs: SegmentPairs) -> RewardModel:
     raw = model.raw_rewards(pairs.signals, pairs.observations, pairs.actions)
-    return model.with_normalisation(Normalisation.over(raw))
+    return model.with_normalisation(Normalisation.over(raw[:, pairs.shown]))
 
 
 # -- structured: Bayesian logistic regression --------------------------------------------------------------------------
