@@ -13,6 +13,7 @@ from starlette.datastructures import URLPath
 
 from app.db import now
 from app.web.task_words import words_of
+from app.web.wording import page_language, say, study_question
 
 ROOT = Path(__file__).resolve().parents[2]
 _UNITS = {
@@ -130,6 +131,8 @@ def make_environment(path_for: Callable[..., URLPath]) -> Environment:
     words = (ago, time_left, moment, seconds, bytes_in_words, in_words, task_title)
     environment.filters.update({word.__name__: word for word in (*numbers, *words)})
     environment.globals["path_for"] = path_for
+    for text in (say, page_language, study_question):
+        environment.globals[text.__name__] = text
     return environment
 
 

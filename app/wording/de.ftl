@@ -1,0 +1,184 @@
+# Alles, was Teilnehmende lesen, auf Deutsch. Jede Nachricht gibt es in jeder Sprache, mit denselben Variablen.
+
+## Jede Seite
+
+page-title = { $title } · PbARL Studio
+foot-language = Sprache
+foot-withdraw = Teilnahme widerrufen
+foot-code = Sie sind { $code }
+back = Zurück
+go-on = Weiter
+saved = Gespeichert
+
+## Begrüßung und Einwilligung
+
+consent-title = Teilnahme
+consent-welcome = Herzlich willkommen, und danke für Ihr Interesse.
+consent-body =
+    Sie sehen Paare kurzer Filme eines Assistenzroboters und sagen jeweils, welcher Ihnen lieber ist. Aus Ihren Antworten lernt ein Roboter, die Aufgabe so auszuführen, wie Sie es mögen.
+
+    - { $count } Paare, verteilt auf so viele Sitzungen, wie Sie möchten. Ihr Link bringt Sie immer dorthin zurück, wo Sie waren.
+    - Gespeichert werden Ihre Antworten, wann Sie sie gegeben haben und wie lange es gedauert hat, unter dem Kürzel { $code }. Kein Name, keine Kamera, kein Mikrofon.
+    - Sie können jederzeit ohne Angabe von Gründen aufhören: Schließen Sie einfach die Seite. Wenn Sie unten auf einer Seite „Teilnahme widerrufen“ wählen, wird alles über Sie gelöscht.
+    - Fragen? Wenden Sie sich an die Person, von der Sie den Link haben.
+consent-version = Informationen für Teilnehmende, Version { $version }
+consent-agree = Ich willige ein und nehme teil
+consent-changed = Dieser Text hat sich geändert, seit Sie ihn zuletzt gesehen haben. Bitte lesen Sie ihn noch einmal.
+consent-copy-link = Eine Kopie zum Aufheben
+consent-copy-title = Worin Sie eingewilligt haben
+consent-copy-before = Worum wir Sie bitten werden
+consent-copy-agreed = Sie haben in diesen Text am { $date } eingewilligt.
+consent-copy-print = Drucken
+consent-copy-save = Als Datei sichern
+consent-copy-file = einwilligung
+
+## Fragebögen: zur Person und zur Studie
+
+demographics-title = Zu Ihrer Person
+demographics-lead = Einige Fragen, damit wir berichten können, wer teilgenommen hat. Lassen Sie aus, was Sie möchten.
+questionnaire-title = Wie war es?
+questionnaire-lead = Das Vergleichen ist geschafft. Noch einige letzte Fragen; lassen Sie aus, was Sie möchten.
+form-save = Speichern und weiter
+form-no-answer = Keine Angabe
+form-optional = darf leer bleiben
+form-number-problem = Bitte schreiben Sie hier eine Zahl, oder lassen Sie das Feld leer.
+form-long-problem = Bitte kürzen Sie dies auf { $count } Zeichen.
+form-choice-problem = Bitte wählen Sie eine dieser Möglichkeiten.
+form-problems =
+    { $count ->
+        [one] Bitte sehen Sie sich eine Antwort noch einmal an. Es ist nichts verloren.
+       *[other] Bitte sehen Sie sich { $count } Antworten noch einmal an. Es ist nichts verloren.
+    }
+form-likert-low = überhaupt nicht
+form-likert-high = sehr
+form-age = Wie alt sind Sie?
+form-gender = Welches Geschlecht haben Sie?
+form-robot_experience = Wie viel Erfahrung haben Sie mit Robotern?
+form-robot_experience-low = keine
+form-robot_experience-high = sehr viel
+form-felt_understood = Der Roboter hat verstanden, was ich möchte.
+form-felt_understood-low = überhaupt nicht
+form-felt_understood-high = vollkommen
+form-felt_safe = Mit diesem Roboter würde ich mich sicher fühlen.
+form-felt_safe-low = überhaupt nicht
+form-felt_safe-high = vollkommen
+form-would_use = Ich würde einen solchen Roboter benutzen.
+form-would_use-low = niemals
+form-would_use-high = sehr gern
+form-comments = Möchten Sie uns sonst noch etwas sagen?
+
+## Anleitung
+
+instructions-title = So geht es
+task-feeding = Ein Roboterarm reicht einer sitzenden Person mit einem Löffel Essen. Jedes Paar zeigt dieselbe Situation auf zwei verschiedene Weisen: Der Roboter kann schneller oder langsamer sein, auf einem anderen Weg kommen, mehr oder weniger weit in den Mund gehen oder etwas Essen verlieren. Stellen Sie sich vor, dass Sie selbst gefüttert werden.
+task-drinking = Ein Roboterarm bringt einer sitzenden Person einen Becher Wasser und neigt ihn, sodass sie trinken kann; das Wasser ist blau. Jedes Paar zeigt dieselbe Situation auf zwei verschiedene Weisen: Der Roboter kann schneller oder langsamer sein, auf einem anderen Weg kommen, vor dem Mund warten, mehr oder weniger auf einmal geben oder etwas verschütten. Stellen Sie sich vor, dass Sie selbst trinken.
+task-scratching = Ein Roboterarm kratzt eine juckende Stelle, den rötlichen Fleck am rechten Arm einer sitzenden Person. Jedes Paar zeigt dieselbe Situation auf zwei verschiedene Weisen: Der Roboter kann schneller oder langsamer sein, auf einem anderen Weg kommen, vor der Berührung warten, stärker oder schwächer drücken, ruhiger oder flotter kratzen. Stellen Sie sich vor, dass es Ihr Arm ist.
+task-other = Ein Roboterarm hilft einer sitzenden Person. Jedes Paar zeigt dieselbe Situation auf zwei verschiedene Weisen. Stellen Sie sich vor, dass Ihnen selbst geholfen wird.
+instructions-keys = Antworten und ihre Tasten
+instructions-key = Taste
+instructions-answer = Antwort
+instructions-left = Links ist besser (auf dem Telefon: oben)
+instructions-right = Rechts ist besser (auf dem Telefon: unten)
+instructions-equal = Gleich: Für mich sind beide gleich gut
+instructions-skip = Weiß nicht: Ich konnte es nicht beurteilen; dieses Paar zählt nicht
+instructions-replay = Von vorn abspielen
+instructions-undo = Letzte Antwort zurücknehmen
+instructions-taste = Es gibt keine richtige Antwort; nur Ihr eigener Geschmack zählt. Ein Tastendruck antwortet und bringt das nächste Paar. Die Schaltflächen bewirken dasselbe wie die Tasten.
+instructions-start = Mit dem Vergleichen beginnen
+instructions-practice = Mit der Übung beginnen
+
+## Zum Schluss: der eigene Roboter
+
+debrief-title = Das ist Ihr Roboter
+debrief-lead = Links der Roboter, wie ihn alle kennenlernen, rechts der, der aus Ihren Antworten gelernt hat. Beide lösen dieselbe Aufgabe in derselben Situation, die für beide neu war.
+debrief-before = Vorher
+debrief-before-alt = Der Roboter, bevor er von Ihnen gelernt hat
+debrief-after = Ihr Roboter
+debrief-after-alt = Der Roboter, nachdem er von Ihnen gelernt hat
+debrief-play = Beide abspielen
+debrief-again = Beide noch einmal abspielen
+debrief-making = Ihr Roboter entsteht gerade
+debrief-making-text = Er lernt aus Ihren Antworten und wird dann gefilmt. Das kann eine Weile dauern. Sie brauchen nicht zu warten: Gehen Sie weiter, und öffnen Sie Ihren Link später noch einmal, um ihn zu sehen.
+debrief-films-making = Die Filme entstehen gerade
+debrief-films-making-text = Ihr Roboter hat gelernt; nun wird er gefilmt. Sie brauchen nicht zu warten: Gehen Sie weiter, und öffnen Sie Ihren Link später noch einmal, um ihn zu sehen.
+debrief-learned = Was er von Ihnen gelernt hat
+debrief-learned-how = Verglichen mit dem Roboter vorher, über { $count } Situationen, die neu für ihn waren:
+debrief-learned-nothing = Über { $count } Situationen, die neu für ihn waren, bewegt er sich ganz ähnlich wie der Roboter vorher. Entweder mochten Sie jenen, oder Ihre Antworten zogen in verschiedene Richtungen; beides ist in Ordnung.
+debrief-C_d-less = Er ist eher bei Ihnen.
+debrief-C_d-more = Er lässt sich auf dem Weg zu Ihnen mehr Zeit.
+debrief-C_v-less = Er bewegt sich langsamer ({ $percent } % weniger).
+debrief-C_v-more = Er bewegt sich schneller ({ $percent } % mehr).
+debrief-C_f-less = Er berührt Sie seltener, wo er nicht soll ({ $percent } % weniger).
+debrief-C_f-more = Er berührt Sie unterwegs öfter ({ $percent } % mehr).
+debrief-C_hf-less = Er drückt weniger stark ({ $percent } % weniger).
+debrief-C_hf-more = Er drückt stärker ({ $percent } % mehr).
+debrief-C_fd-less = Er verschüttet weniger auf Sie ({ $percent } % weniger).
+debrief-C_fd-more = Er verschüttet mehr auf Sie ({ $percent } % mehr).
+debrief-C_fdv-less = Was er bringt, kommt langsamer zu Ihnen ({ $percent } % weniger).
+debrief-C_fdv-more = Was er bringt, kommt schneller zu Ihnen ({ $percent } % mehr).
+debrief-done = Abschließen
+
+## Das Ende
+
+finished-title = Vielen Dank!
+finished-lead = Sie haben die Studie abgeschlossen, und alle Ihre Antworten sind sicher gespeichert.
+finished-lead-pairs = Alle { $count } Antworten sind sicher gespeichert. Sie können diese Seite schließen.
+finished-code = Ihr Abschlusscode
+finished-copy = Kopieren
+finished-copied = Kopiert.
+finished-return = Jetzt zurückkehren
+finished-return-lead = Ein letzter Schritt: Kehren Sie dorthin zurück, woher Sie gekommen sind, damit man dort weiß, dass Sie fertig sind.
+finished-return-soon = In wenigen Sekunden geht es von selbst dorthin.
+finished-stay = Hier bleiben
+finished-sending = Einen Moment: Ihre letzte Antwort ist noch unterwegs.
+finished-debrief = Ihren Roboter ansehen
+finished-robot-ready = Ihr Roboter ist fertig
+finished-robot-ready-text = Er hat aus Ihren Antworten gelernt. Die Person, von der Sie den Link haben, kann ihn Ihnen jetzt zeigen.
+finished-robot-making = Ihr Roboter wird vorbereitet
+finished-robot-making-text = Er lernt aus Ihren Antworten. Sie brauchen nicht darauf zu warten.
+finished-robot-progress = Wie weit Ihr Roboter ist
+finished-undo = Meine letzte Antwort zurücknehmen
+
+## Widerruf
+
+withdraw-title = Teilnahme widerrufen
+withdraw-lead = Sie können jederzeit gehen und brauchen keinen Grund zu nennen. Dann geschieht Folgendes:
+withdraw-body =
+    - Alles, was Sie uns gesagt haben, wird gelöscht: Ihre Antworten, Ihre Fragebögen, der Text Ihrer Einwilligung, Ihre Bewertungen.
+    - Alles, was daraus entstanden ist, wird gelöscht: der Roboter, der von Ihnen gelernt hat, seine Filme und Dateien.
+    - Es bleibt nur, dass { $code } teilgenommen und widerrufen hat, und wann. Nicht wer, nicht was.
+    - Ergebnisse, die vorher veröffentlicht wurden, lassen sich nicht zurückrufen.
+withdraw-final = Das lässt sich nicht rückgängig machen, auch nicht von uns.
+withdraw-confirm = Alles über mich löschen
+withdraw-keep = Nein, behalten und zurück
+withdrawn-title = Es ist gelöscht
+withdrawn-lead = Sie haben Ihre Teilnahme widerrufen, und alles über Sie wurde gelöscht. Danke, dass Sie hereingeschaut haben.
+withdrawn-text = Die letzten Spuren auf dem Rechner verschwinden innerhalb von Minuten. Sie können diese Seite schließen; Ihr Link führt von jetzt an hierher.
+
+## Teilnahme über ein Panel oder eine offene Adresse
+
+join-title = Herzlich willkommen
+join-missing-title = In dieser Adresse fehlt etwas
+join-missing = Wir können nicht erkennen, wer Sie sind: Die Adresse sollte { $parameter } mitbringen. Bitte öffnen Sie die Studie noch einmal von der Seite aus, die sie Ihnen angeboten hat. Hilft das nicht, wenden Sie sich an die Betreiber jener Seite.
+join-link-lead = Dies ist Ihr persönlicher Link. Heben Sie ihn auf, falls Sie später oder auf einem anderen Gerät weitermachen möchten; niemand sonst sollte ihn haben.
+join-link-label = Ihr persönlicher Link
+join-link-copy = Kopieren
+
+## Was schiefgehen kann
+
+error-link-needed-title = Wer sind Sie?
+error-link-needed = Wir können nicht erkennen, wer Sie sind. Bitte öffnen Sie Ihren persönlichen Link noch einmal: Sie machen genau dort weiter, wo Sie waren.
+error-link-not-valid-title = Hier ist nichts
+error-link-not-valid = Dieser Link ist nicht gültig. Vielleicht wurde er durch einen neueren ersetzt; bitte fragen Sie die Person, von der Sie ihn haben.
+error-joining-closed-title = Hier ist nichts
+error-joining-closed = An dieser Studie kann man über diese Adresse nicht (mehr) teilnehmen. Bitte fragen Sie die Menschen, von denen Sie sie haben.
+
+## Paare (Vorsilbe pair-)
+
+pair-question = Welchen Roboter hätten Sie lieber?
+
+## Übung (Vorsilbe practice-)
+
+## Pausen (Vorsilbe break-)
+
+## Bewertung (Vorsilbe evaluation-)

@@ -1,0 +1,186 @@
+# Everything a participant reads, in English. Each message exists in every language, with the same variables.
+# Plain text: an empty line makes a paragraph, lines that begin with "- " make a list.
+# A study may replace any of them (StudySettings.wording).
+
+## Every page
+
+page-title = { $title } · PbARL Studio
+foot-language = Language
+foot-withdraw = Withdraw
+foot-code = You are { $code }
+back = Back
+go-on = Go on
+saved = Saved
+
+## Welcome and consent
+
+consent-title = Taking part
+consent-welcome = Welcome, and thank you for your interest.
+consent-body =
+    You will watch pairs of short clips of an assistive robot and say which one you prefer. From your answers a robot learns to do the task the way you like it.
+
+    - { $count } pairs, in as many sittings as you like. Your link brings you back to where you were.
+    - What is kept: your answers, when you gave them and how long they took, under the code { $code }. No name, no camera, no microphone.
+    - You are free to stop at any time, without giving a reason: just close the page. If you choose “Withdraw” at the foot of a page, everything about you is erased.
+    - Questions? Ask the person who sent you the link.
+consent-version = Information for participants, version { $version }
+consent-agree = I agree to take part
+consent-changed = This text has changed since you saw it last. Please read it again.
+consent-copy-link = A copy to keep
+consent-copy-title = What you agreed to
+consent-copy-before = What you will be asked to agree to
+consent-copy-agreed = You agreed to this text on { $date }.
+consent-copy-print = Print
+consent-copy-save = Save as a file
+consent-copy-file = consent
+
+## Forms: questions about the person, and about the study
+
+demographics-title = About you
+demographics-lead = A few questions, so that we can say who took part. Leave out whatever you like.
+questionnaire-title = How was it?
+questionnaire-lead = The comparing is done. A few last questions; leave out whatever you like.
+form-save = Save and go on
+form-no-answer = No answer
+form-optional = may be left empty
+form-number-problem = Please write a number here, or leave it empty.
+form-long-problem = Please shorten this to { $count } characters.
+form-choice-problem = Please choose one of these.
+form-problems =
+    { $count ->
+        [one] One answer needs another look. Nothing is lost.
+       *[other] { $count } answers need another look. Nothing is lost.
+    }
+form-likert-low = not at all
+form-likert-high = very much
+form-age = How old are you?
+form-gender = What is your gender?
+form-robot_experience = How much experience do you have with robots?
+form-robot_experience-low = none
+form-robot_experience-high = a lot
+form-felt_understood = The robot understood what I want.
+form-felt_understood-low = not at all
+form-felt_understood-high = completely
+form-felt_safe = I would feel safe with this robot.
+form-felt_safe-low = not at all
+form-felt_safe-high = completely
+form-would_use = I would use such a robot.
+form-would_use-low = never
+form-would_use-high = gladly
+form-comments = Is there anything else you would like to tell us?
+
+## Instructions
+
+instructions-title = How it works
+task-feeding = A robot arm feeds a seated person with a spoon. Every pair shows the same situation, carried out in two different ways: the robot may be quicker or slower, come by another path, go more or less into the mouth, or lose some food. Imagine it is you who is being fed.
+task-drinking = A robot arm brings a cup of water to a seated person and tips it so that they can drink; the water is blue. Every pair shows the same situation, carried out in two different ways: the robot may be quicker or slower, come by another path, wait before the mouth, pour more or less at once, or spill some. Imagine it is you who is drinking.
+task-scratching = A robot arm scratches an itch, the reddish spot on a seated person’s right arm. Every pair shows the same situation, carried out in two different ways: the robot may be quicker or slower, come by another path, wait before it touches the skin, press more or less, or stroke more calmly or more briskly. Imagine it is your arm.
+task-other = A robot arm helps a seated person. Every pair shows the same situation, carried out in two different ways. Imagine it is you who is being helped.
+instructions-keys = Answers and their keys
+instructions-key = Key
+instructions-answer = Answer
+instructions-left = Left is better (on a phone: the one on top)
+instructions-right = Right is better (on a phone: the one below)
+instructions-equal = Equal: both are as good for me
+instructions-skip = Can’t tell: I could not judge; this pair is left out
+instructions-replay = Replay from the start
+instructions-undo = Undo the last answer
+instructions-taste = There is no right answer; only your own taste counts. One press answers and brings the next pair. The buttons do the same as the keys.
+instructions-start = Start comparing
+instructions-practice = Start with practice
+
+## Debrief
+
+debrief-title = This is your robot
+debrief-lead = On the left the robot as everybody meets it, on the right the one that has learned from your answers. Both do the same task in the same situation, one that neither has met before.
+debrief-before = Before
+debrief-before-alt = The robot before it learned from you
+debrief-after = Your robot
+debrief-after-alt = The robot after it learned from you
+debrief-play = Play both
+debrief-again = Play both again
+debrief-making = Your robot is still being made
+debrief-making-text = It is learning from your answers and will then be filmed. That can take a while. You need not wait: go on, and open your link again later to see it.
+debrief-films-making = The films are still being made
+debrief-films-making-text = Your robot has learned; now it is being filmed. You need not wait: go on, and open your link again later to see it.
+debrief-learned = What it learned from you
+debrief-learned-how = Compared with the robot before, over { $count } situations it had not met:
+debrief-learned-nothing = Over { $count } situations it had not met, it moves much like the robot before. Either you liked that one, or your answers pulled in several directions; both are fine.
+debrief-C_d-less = It is with you sooner.
+debrief-C_d-more = It takes more time on its way to you.
+debrief-C_v-less = It moves more slowly ({ $percent } % less).
+debrief-C_v-more = It moves more quickly ({ $percent } % more).
+debrief-C_f-less = It touches you less where it should not ({ $percent } % less).
+debrief-C_f-more = It touches you more on its way ({ $percent } % more).
+debrief-C_hf-less = It presses less hard ({ $percent } % less).
+debrief-C_hf-more = It presses harder ({ $percent } % more).
+debrief-C_fd-less = It spills less on you ({ $percent } % less).
+debrief-C_fd-more = It spills more on you ({ $percent } % more).
+debrief-C_fdv-less = What it brings comes to you more slowly ({ $percent } % less).
+debrief-C_fdv-more = What it brings comes to you more quickly ({ $percent } % more).
+debrief-done = Finish
+
+## The end
+
+finished-title = Thank you!
+finished-lead = You have completed the study, and all your answers are safely stored.
+finished-lead-pairs = All { $count } of your answers are safely stored. You can close this page.
+finished-code = Your completion code
+finished-copy = Copy
+finished-copied = Copied.
+finished-return = Go back now
+finished-return-lead = One last step: go back to where you came from, so that they know you are done.
+finished-return-soon = You are taken there in a few seconds.
+finished-stay = Stay here
+finished-sending = One moment: your last answer is still on its way.
+finished-debrief = See your robot
+finished-robot-ready = Your robot is ready
+finished-robot-ready-text = It has learned from your answers. The person who sent you the link can now show it to you.
+finished-robot-making = Your robot is being prepared
+finished-robot-making-text = It is learning from your answers. You do not need to wait for it.
+finished-robot-progress = How far your robot is
+finished-undo = Take back my last answer
+
+## Withdrawing
+
+withdraw-title = Withdraw from the study
+withdraw-lead = You may leave at any time and need not say why. This is what happens then:
+withdraw-body =
+    - Everything you told us is erased: your answers, your forms, the text you agreed to, your ratings.
+    - Everything made from it is erased: the robot that learned from you, its films and files.
+    - All that stays is that { $code } took part and withdrew, and when. Not who, not what.
+    - Results that were published before cannot be called back.
+withdraw-final = It cannot be undone, not even by us.
+withdraw-confirm = Erase everything about me
+withdraw-keep = No, keep it and go back
+withdrawn-title = It is erased
+withdrawn-lead = You have withdrawn, and everything about you has been erased. Thank you for having looked in.
+withdrawn-text = The last traces on the computing machine go within minutes. You can close this page; your link leads here from now on.
+
+## Joining through a panel or an open address
+
+join-title = Welcome
+join-missing-title = Something is missing in this address
+join-missing = We cannot tell who you are: the address should bring along { $parameter }. Please open the study again from the page that offered it to you. If that does not help, tell the people who run that page.
+join-link-lead = This is your personal link. Keep it if you may want to go on later or on another device; nobody else should have it.
+join-link-label = Your personal link
+join-link-copy = Copy
+
+## What can go wrong
+
+error-link-needed-title = Who are you?
+error-link-needed = We cannot tell who you are. Please open your personal link again: you go on exactly where you were.
+error-link-not-valid-title = Nothing here
+error-link-not-valid = This link is not valid. It may have been replaced by a newer one; please ask the person who sent it to you.
+error-joining-closed-title = Nothing here
+error-joining-closed = This study cannot be joined by this address (any more). Please ask the people who gave it to you.
+
+## Pairs (prefix pair-)
+
+pair-question = Which robot would you rather have?
+
+## Practice (prefix practice-)
+
+## Breaks (prefix break-)
+
+## Evaluation (prefix evaluation-)

@@ -1,0 +1,86 @@
+"""What participants read: in two complete languages, and in a study's own words."""
+
+import logging
+import re
+from pathlib import Path
+
+import pytest
+from fluent.syntax import ast
+
+from app.domain.protocol import Language
+from app.domain.studies import StudySettings
+from app.web import wording
+from app.web.templating import ROOT
+from app.web.wording import Wording, built_in_texts, variables_of, wording_for
+
+TEMPLATES = sorted((ROOT / "templates" / "participant").glob("*.html"))
+SAID = re.compile(r"""say\(\s*["']([a-zA-Z0-9_-]+)["']\s*[,)]""")
+
+
+def test_every_language_has_the_same_messages_with_the_same_variables() -> None:
+    english, *others = (
+        {key: variables_of(message) for key, message in built_in_texts(language).items()} for language in Language
+    )
+    for other in others:
+        assert other == english
+
+
+@pytest.mark.parametrize("language", Language)
+def test_no_message_is_broken_or_there_twice(language: Language) -> None:
+    text = (wording.FOLDER / f"{language}.ftl").read_text(encoding="utf-8")
+    body = wording._resource(language).body
+    assert [entry for entry in body if isinstance(entry, ast.Junk)] == []
+    keys = re.findall(r"^([a-zA-Z][a-zA-Z0-9_-]*) =", text, re.MULTILINE)
+    assert len(keys) == len(set(keys)) == len(built_in_texts(language))
+
+
+@pytest.mark.parametrize("template", TEMPLATES, ids=lambda path: path.name)
+def test_pages_ask_for_messages_that_exist(template: Path) -> None:
+    known = built_in_texts(Language.ENGLISH)
+    assert [key for key in SAID.findall(template.read_text(encoding="utf-8")) if key not in known] == []
+
+
+def test_the_study_speaks_first_and_in_every_language_until_it_says_otherwise() -> None:
+    settings = StudySettings(wording={"consent-title": "Our study", "finished-title": "Ta", "de:finished-title": "Na"})
+    assert wording_for(settings)("consent-title") == "Our study"
+    assert wording_for(settings, "de")("consent-title") == "Our study"
+    assert wording_for(settings, "de")("finished-title") == "Na"
+    assert wording_for(settings)("finished-title") == "Ta"
+    assert wording_for(settings, "de")("back") == "Zurück"
+
+
+@pytest.mark.parametrize(
+    "broken", ["", "{ $nobody } knows this", "a { brace", "a } brace", "{ -no-such-term }", "x\n.attribute = y {"]
+)
+def test_a_broken_text_gives_way_to_the_built_in_one_and_is_in_the_log(
+    broken: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.WARNING, logger="app.wording")
+    words = Wording(Language.ENGLISH, {"foot-code": broken})
+    assert words("foot-code", code="P07") == "You are P07"
+    assert words("foot-code", code="P07") == "You are P07"
+    assert len(caplog.records) == 1
+    assert "foot-code" in caplog.text
+
+
+def test_the_form_for_texts_learns_what_is_wrong_with_them() -> None:
+    own = {"foot-code": "{ $person }", "de:back": "Retour", "no-such-text": "x", "fr:back": "Retour", "back": "{"}
+    assert set(wording.broken_texts(own)) == {"foot-code", "no-such-text", "fr:back", "back"}
+
+
+@pytest.mark.parametrize("text", ["[sic] two\n* three", "one\n\n.four\n}five", "plain & <b>simple</b>"])
+def test_a_study_may_begin_its_lines_with_any_letter(text: str) -> None:
+    assert Wording(Language.ENGLISH, {"back": text})("back") == text
+
+
+def test_numbers_are_written_as_the_language_writes_them() -> None:
+    own = {"back": "{ $count }"}
+    assert Wording(Language.ENGLISH, own)("back", count=1000) == "1,000"
+    assert Wording(Language.GERMAN, own)("back", count=1000) == "1.000"
+
+
+@pytest.mark.parametrize(
+    ("asked", "given"), [("de-AT,de;q=0.9,en;q=0.8", "de"), ("fr,en;q=0.5", "en"), ("", "en"), ("xx", "en")]
+)
+def test_without_a_choice_the_browser_is_asked(asked: str, given: str) -> None:
+    assert wording.preferred(asked) == given
