@@ -80,6 +80,11 @@ class EvaluationSettings(BaseModel):
             raise ValueError("Each method can be evaluated once only.")
         return self
 
+    @property
+    def trial_count(self) -> int:
+        """Trials that one participant rates altogether."""
+        return len(self.methods) * self.trials
+
 
 class Advisor(StrEnum):
     """What becomes of the advice that more labels will hardly pay."""

@@ -98,7 +98,11 @@ class StudySettings(BaseModel):
     debrief: bool = Field(default=False, description="Show the person's own robot before and after, at the end.")
     completion_code: str = Field(default="", max_length=80)
     return_url: str = Field(default="", max_length=500, pattern=r"^(https?://\S+)?$")
-    panel_parameter: str = Field(default="PROLIFIC_PID", pattern=r"^[A-Za-z][A-Za-z0-9_]{0,39}$")
+    panel_parameter: str = Field(
+        default="PROLIFIC_PID",
+        pattern=r"^([A-Za-z][A-Za-z0-9_]{0,39})?$",
+        description="Names the person in the address of a recruitment panel; empty: anybody may join without a name.",
+    )
     advisor: Advisor = Advisor.SHOW
     planned_tests: tuple[PlannedTest, ...] = (PlannedTest.PAIRED_T,)
 
@@ -207,6 +211,8 @@ class Participant(Base):
     completed_at: Mapped[datetime | None]
     withdrawn_at: Mapped[datetime | None]
     """Everything else about the person is erased then; this row stays as the tombstone."""
+    erased_at: Mapped[datetime | None]
+    """When the worker had removed the last traces as well: its own notes, late results, freed pages of databases."""
 
     study: Mapped[Study] = relationship(lazy="raise")
 

@@ -275,6 +275,7 @@ def upgrade() -> None:
         batch_op.add_column(sa.Column("panel_parameters", sa.JSON(), nullable=True))
         batch_op.add_column(sa.Column("completed_at", sa.DateTime(timezone=True), nullable=True))
         batch_op.add_column(sa.Column("withdrawn_at", sa.DateTime(timezone=True), nullable=True))
+        batch_op.add_column(sa.Column("erased_at", sa.DateTime(timezone=True), nullable=True))
         batch_op.create_unique_constraint("uq_participant_panel_id", ["study_id", "panel_id"])
 
     with op.batch_alter_table("query", schema=None) as batch_op:
@@ -315,6 +316,7 @@ def downgrade() -> None:
 
     with op.batch_alter_table("participant", schema=None) as batch_op:
         batch_op.drop_constraint("uq_participant_panel_id", type_="unique")
+        batch_op.drop_column("erased_at")
         batch_op.drop_column("withdrawn_at")
         batch_op.drop_column("completed_at")
         batch_op.drop_column("panel_parameters")
