@@ -25,6 +25,7 @@ from worker.ml import acquisition, methods, reward_training, studio_filter
 from worker.ml.methods import MethodConfig, Setting
 from worker.ml.response_surface import ResponseSurface
 from worker.ml.reward_models import MlpReward, RewardModel, load_reward_model
+from worker.ml.reward_training import SignalScale
 from worker.ml.segments import SegmentPairs
 from worker.ml.studio_filter import FilterConfig, FilterProblem
 from worker.ml.teachers import INDIRECT, OPPOSED, TASTES, Manner, ScriptedTeacher, Taste, User
@@ -209,6 +210,6 @@ class _Bench:
             self.targets,
             kind,
             self.cell.seed,
-            spread=reward_training.signal_spread(self.everything),
+            scale=SignalScale.of(self.everything),
             reference=laboratory.reference_rollouts(self.cell.task),
         ).model

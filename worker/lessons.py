@@ -11,6 +11,7 @@ from worker.laboratory import environment, reference_policy, reference_rollouts
 from worker.ml import reward_training
 from worker.ml.pooled_prior import prior_of
 from worker.ml.reward_models import RewardModel, load_reward_model
+from worker.ml.reward_training import SignalScale
 from worker.ml.segments import SegmentPairs
 from worker.ml.studio_filter import Act, noisy
 from worker.sim.rollout import rollout
@@ -46,14 +47,14 @@ def fit_reward(
     """
     if kind not in get_args(reward_training.Kind):
         raise ValueError(f"There is no reward model of the kind {kind!r}.")
-    spread = reward_training.signal_spread(pool)
-    prior = prior_of([_model(each) for each in earlier], spread)
+    scale = SignalScale.of(pool)
+    prior = prior_of([_model(each) for each in earlier], scale.spread)
     fitted = reward_training.fit(
         pairs,
         targets,
         cast(reward_training.Kind, kind),
         seed,
-        spread=spread,
+        scale=scale,
         reference=reference_rollouts(task),
         prior=prior,
     )

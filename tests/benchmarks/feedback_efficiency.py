@@ -30,6 +30,7 @@ from worker import laboratory
 from worker.ml import acquisition, calibration, reward_training
 from worker.ml.pooled_prior import Prior
 from worker.ml.reward_models import RewardModel
+from worker.ml.reward_training import SignalScale
 from worker.ml.teachers import TASTES, Manner, ScriptedTeacher, Taste, User, random_taste
 from worker.sim.catalogue import ENVIRONMENTS
 from worker.sim.costs import preference_rewards
@@ -89,7 +90,7 @@ class Bench:
         self.unseen = pool_rollouts(task, UNSEEN_FIRST, UNSEEN_SCENARIOS, steps)
         self.pairs, self.unseen_pairs = self.pool.pairs(), self.unseen.pairs()
         self.unseen_segments = self.unseen.segments(self.unseen_pairs)
-        self.spread = reward_training.signal_spread(self.pool.segments(self.pairs))
+        self.scale = SignalScale.of(self.pool.segments(self.pairs))
 
     def measure(self, chain: Chain) -> Iterator[Measured]:
         """Answer, fit, choose, and so on."""
@@ -134,7 +135,7 @@ class Bench:
     def _fit(self, chain: Chain, rows: Indices, answers: Floats) -> reward_training.FitResult:
         prior = self.prior if chain.pooled else None
         pairs = self.pool.segments(self.pairs[rows])
-        return reward_training.fit(pairs, answers, chain.model, chain.seed, spread=self.spread, prior=prior)
+        return reward_training.fit(pairs, answers, chain.model, chain.seed, scale=self.scale, prior=prior)
 
     def _row(self, chain: Chain, count: int, fitted: reward_training.FitResult) -> Measured:
         sides = self.rewards(chain.user, self.unseen)[self.unseen_pairs]
@@ -171,7 +172,7 @@ class Bench:
             teacher = ScriptedTeacher.calibrated(Manner(), rewards)
             rows = rng.choice(len(self.pairs), 200, replace=False)
             said = np.array([TARGETS[teacher.answer(left, right, rng)] for left, right in rewards[rows]])
-            features = self.pool.segments(self.pairs[rows]).signal_differences() / self.spread
+            features = self.pool.segments(self.pairs[rows]).signal_differences() / self.scale.spread
             weights.append(reward_training.posterior(features, said)[0])
         return Prior.pooled(weights)
 

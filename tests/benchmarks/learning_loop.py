@@ -31,6 +31,7 @@ from worker.behaviours import Behaviour
 from worker.exploration import surface_file
 from worker.ml import acquisition, printed_filter, reward_training, studio_filter
 from worker.ml.response_surface import ResponseSurface
+from worker.ml.reward_training import SignalScale
 from worker.ml.segments import SegmentPairs
 from worker.ml.teachers import OMEGA, Manner, ScriptedTeacher, User
 from worker.sim.catalogue import ENVIRONMENTS
@@ -119,8 +120,8 @@ class Bench:
         labelled, targets, curve = self.label(user, seed)
         started = time.perf_counter()
         kind: reward_training.Kind = "mlp" if self.options.method == "printed" else self.options.reward
-        spread = reward_training.signal_spread(SegmentPairs.cut(self.pairs_of(self.clips), 0, self.options.clip_steps))
-        reward = reward_training.fit(labelled, targets, kind, seed, spread=spread, reference=self.normalising)
+        scale = SignalScale.of(SegmentPairs.cut(self.pairs_of(self.clips), 0, self.options.clip_steps))
+        reward = reward_training.fit(labelled, targets, kind, seed, scale=scale, reference=self.normalising)
         problem = studio_filter.FilterProblem(self.task, self.policy, reward.model, seed, self.config())
         if self.options.method == "printed":
             draft = printed_filter.fit_printed(problem, self.reference)
@@ -170,12 +171,10 @@ class Bench:
         sides = self.pair_rewards(user, self.clips, np.array(chosen))
         targets = np.array([TARGETS[teacher.answer(left, right, rng)] for left, right in sides])
         predicted = np.full(len(targets), np.nan)
-        everything = reward_training.signal_spread(
-            SegmentPairs.cut(self.pairs_of(self.clips), 0, self.options.clip_steps)
-        )
+        everything = SignalScale.of(SegmentPairs.cut(self.pairs_of(self.clips), 0, self.options.clip_steps))
         for seen in range(10, len(targets), 10):
             rows = np.arange(seen)
-            model = reward_training.fit(shown.take(rows), targets[rows], "structured", seed, spread=everything).model
+            model = reward_training.fit(shown.take(rows), targets[rows], "structured", seed, scale=everything).model
             following = np.arange(seen, min(seen + 10, len(targets)))
             predicted[following] = model.probability_right(shown.take(following))
         curve = {

@@ -14,6 +14,7 @@ from worker import laboratory
 from worker.exploration import surface_file
 from worker.ml import acquisition, response_surface, reward_training
 from worker.ml.response_surface import ResponseSurface
+from worker.ml.reward_training import SignalScale
 from worker.ml.segments import SegmentPairs
 from worker.ml.teachers import OMEGA, Manner, ScriptedTeacher, User
 from worker.sim.costs import SPEED_SCALE_M_S, base_weights, preference_rewards
@@ -49,7 +50,7 @@ def main() -> None:
     surface = ResponseSurface.load(surface_file(TASK.name), TASK.modes)
     rows = acquisition.matched_pairs([clip.scenario for clip in clips])
     shown = SegmentPairs.cut([(clips[left], clips[right]) for left, right in rows], 0, CLIP_STEPS)
-    spread = reward_training.signal_spread(shown)
+    scale = SignalScale.of(shown)
     rewards = {
         user: np.array([preference_rewards(TASK, clip.costs, clip.signals, OMEGA[user]) for clip in clips])
         for user in User
@@ -63,7 +64,7 @@ def main() -> None:
                 teacher = ScriptedTeacher.calibrated(Manner(), sides)
                 chosen = rng.permutation(len(rows))[:count]
                 targets = [TARGETS[teacher.answer(left, right, rng)] for left, right in sides[chosen]]
-                model = reward_training.fit(shown.take(chosen), targets, "structured", seed, spread=spread).model
+                model = reward_training.fit(shown.take(chosen), targets, "structured", seed, scale=scale).model
                 unit = abs(rewards[user].sum(axis=1).mean()) / 100
                 for caution, found in gains.items():
                     with patch.object(response_surface, "CAUTION", caution):

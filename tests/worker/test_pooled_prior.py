@@ -6,7 +6,7 @@ import pytest
 from tests.worker import invented
 from worker.ml.pooled_prior import Prior, prior_of
 from worker.ml.reward_models import StructuredReward
-from worker.ml.reward_training import fit, posterior, signal_spread
+from worker.ml.reward_training import SignalScale, fit, posterior
 from worker.trajectory import SIGNALS
 
 SIZE = len(SIGNALS)
@@ -43,13 +43,13 @@ def test_earlier_models_give_their_weights_in_the_unit_of_the_fit() -> None:
 def test_ten_labels_go_further_when_earlier_people_wanted_the_same() -> None:
     wish = np.random.default_rng(2).normal(0.0, 1.0, SIZE)
     shown, unseen = (invented.pairs(count, np.random.default_rng(count)) for count in (10, 300))
-    spread = signal_spread(unseen)
+    scale = SignalScale.of(unseen)
     people = [StructuredReward(wish + np.random.default_rng(seed).normal(0, 0.2, (8, SIZE))) for seed in range(5)]
     answers, truth = (invented.answers_of(each, wish) for each in (shown, unseen))
 
     def accuracy(prior: Prior | None) -> float:
-        model = fit(shown, answers, "structured", 0, spread=spread, prior=prior).model
+        model = fit(shown, answers, "structured", 0, scale=scale, prior=prior).model
         return float(((model.probability_right(unseen) > 0.5) == (truth > 0.5)).mean())
 
-    assert accuracy(prior_of(people, spread)) > accuracy(None) + 0.1
+    assert accuracy(prior_of(people, scale.spread)) > accuracy(None) + 0.1
     assert accuracy(None) == pytest.approx(accuracy(Prior.standard(SIZE)))

@@ -8,7 +8,7 @@ from tests.worker import invented
 from worker.ml import bradley_terry, reward_training
 from worker.ml.network_training import MlpTraining, TransformerTraining
 from worker.ml.reward_models import CLIP, RewardModel, StructuredReward, load_reward_model, stored_config
-from worker.ml.reward_training import fit, posterior, signal_spread
+from worker.ml.reward_training import SignalScale, fit, posterior
 from worker.ml.segments import SegmentPairs
 from worker.trajectory import SIGNALS
 
@@ -68,7 +68,7 @@ def test_the_structured_fit_minimises_the_right_form_of_equation_2_with_a_normal
     labelled: tuple[SegmentPairs, np.ndarray],
 ) -> None:
     shown, targets = labelled
-    features = shown.signal_differences() / signal_spread(shown)
+    features = shown.signal_differences() / SignalScale.of(shown).spread
     mean, covariance = posterior(features, targets)
     weights = torch.tensor(mean, requires_grad=True)
     logits = torch.tensor(features) @ weights
@@ -134,7 +134,9 @@ def test_the_probability_is_the_mean_over_members(
 
 def test_rewards_have_mean_0_and_deviation_1_over_the_reference_rollouts(model: RewardModel) -> None:
     reference = [invented.trajectory(np.random.default_rng(seed)) for seed in range(20)]
-    rewards = np.concatenate([model.normalised_over(reference).rewards_of(each) for each in reference])
+    normalised = model.normalised_over(reference)
+    steps = [(each.signals, each.observations[: len(each)], each.actions) for each in reference]
+    rewards = np.concatenate([normalised.step_rewards(*each).mean(axis=0) for each in steps])
     assert rewards.mean() == pytest.approx(0, abs=1e-6)
     assert rewards.std() == pytest.approx(1, abs=1e-6)
 
@@ -194,3 +196,38 @@ def test_segments_are_cut_at_the_same_steps_on_both_sides() -> None:
     np.testing.assert_array_equal(cut.observations[0, 0], left.observations[5:15])
     with pytest.raises(ValueError, match="only 20"):
         SegmentPairs.cut([(left, right)], first_step=15, step_count=10)
+
+
+def test_nobody_is_rewarded_for_more_of_a_signal_than_was_ever_shown() -> None:
+    weights = np.zeros((8, len(SIGNALS)))
+    weights[:, SIGNALS.index("force_away_n")] = 0.5  # liked by chance
+    weights[:, SIGNALS.index("distance_m")] = -1.0
+    most = np.full(len(SIGNALS), 0.1)
+    model = StructuredReward(weights, most_per_step=most)
+    usual, extreme = np.zeros((10, len(SIGNALS)), np.float32), np.zeros((10, len(SIGNALS)), np.float32)
+    usual[:, SIGNALS.index("force_away_n")] = 0.1
+    extreme[:, SIGNALS.index("force_away_n")] = 3.0
+    states, actions = np.zeros((10, 4), np.float32), np.zeros((10, 7), np.float32)
+    paid = model.episode_rewards(usual, states, actions).sum(axis=1)
+    assert paid == pytest.approx(np.full(8, 10 * 0.1 * 0.5))
+    assert model.episode_rewards(extreme, states, actions).sum(axis=1) == pytest.approx(paid)
+    extreme[:, SIGNALS.index("distance_m")] = 2.0
+    costs = model.episode_rewards(extreme, states, actions).sum(axis=1) - paid
+    assert costs == pytest.approx(np.full(8, -20.0)), "costs go on counting"
+
+
+def test_what_was_shown_is_rewarded_as_it_was_learned_and_the_limit_survives_storage(
+    labelled: tuple[SegmentPairs, np.ndarray],
+) -> None:
+    again = load_reward_model(fit(*labelled, "structured", 0).model.to_bytes())
+    assert isinstance(again, StructuredReward)
+    assert again.most_per_step is not None
+    pairs = labelled[0]
+    signals, states, actions = np.abs(pairs.signals[0, 0]), pairs.observations[0, 0], pairs.actions[0, 0]
+    usual = np.where(signals.mean(axis=0) <= again.most_per_step, signals, 0.0)
+    np.testing.assert_allclose(
+        again.episode_rewards(usual, states, actions).sum(axis=1),
+        again.step_rewards(usual, states, actions).sum(axis=1),
+        rtol=1e-5,
+        atol=1e-5,
+    )

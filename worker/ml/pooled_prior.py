@@ -47,6 +47,6 @@ class Prior:
 
 
 def prior_of(models: Sequence[RewardModel], spread: Floats) -> Prior:
-    """The prior that earlier participants' reward models give; ``spread`` (S,) as in reward_training.fit."""
+    """The prior that earlier participants' reward models give; ``spread`` (S,) as in SignalScale."""
     known = [each.weights.mean(axis=0) * spread for each in models if isinstance(each, StructuredReward)]
     return Prior.pooled(known) if known else Prior.standard(len(spread))

@@ -44,7 +44,7 @@ class PolicyAct:
 
 def learned(reward: RewardModel) -> EpisodeReward:
     """The mean over the members, normalised and clipped."""
-    return lambda signals, observations, actions: reward.step_rewards(signals, observations, actions).mean(axis=0)
+    return lambda signals, observations, actions: reward.episode_rewards(signals, observations, actions).mean(axis=0)
 
 
 @dataclass

@@ -68,9 +68,16 @@ class RewardModel(ABC):
 
     def step_rewards(self, signals: Array, observations: Array, actions: Array) -> Floats:
         """Normalised and clipped rewards. (..., S), (..., D), (..., 7) -> (E, ...)"""
-        raw = self.raw_rewards(signals, observations, actions)
-        clipped: Floats = np.clip((raw - self.normalisation.offset) / self.normalisation.scale, -CLIP, CLIP)
-        return clipped
+        return self.normalised(self.raw_rewards(signals, observations, actions))
+
+    def normalised(self, raw_rewards: Floats) -> Floats:
+        """In units of the reference policy's steps, and clipped. Any shape."""
+        rewards: Floats = (raw_rewards - self.normalisation.offset) / self.normalisation.scale
+        return np.clip(rewards, -CLIP, CLIP)
+
+    def episode_rewards(self, signals: Array, observations: Array, actions: Array) -> Floats:
+        """Normalised and clipped rewards of one episode from its start. (T, S), (T, D), (T, 7) -> (E, T)"""
+        return self.step_rewards(signals, observations, actions)
 
     def returns(self, trajectories: Sequence[Trajectory]) -> Floats:
         """Mean over members of the summed normalised rewards of each trajectory, (N,)."""
@@ -79,7 +86,7 @@ class RewardModel(ABC):
     def rewards_of(self, trajectory: Trajectory) -> Floats:
         """Mean over members of the normalised reward of every step, (T,)."""
         steps = len(trajectory)
-        rewards = self.step_rewards(trajectory.signals, trajectory.observations[:steps], trajectory.actions)
+        rewards = self.episode_rewards(trajectory.signals, trajectory.observations[:steps], trajectory.actions)
         mean: Floats = rewards.mean(axis=0)
         return mean
 
@@ -163,27 +170,48 @@ class RewardModel(ABC):
 
 @dataclass(frozen=True)
 class StructuredReward(RewardModel):
-    """Linear in the measured signals: r = w . signals. Members are samples of the weights' posterior."""
+    """Linear in the measured signals: r = w . signals. Members are samples of the weights' posterior.
+
+    Within an episode nobody is rewarded for more of a signal than was ever shown, while costs go on counting: a weight
+    that is slightly too large by chance would otherwise pay for any amount (a policy trained on such a reward pressed
+    on the person with 227 N; docs/method.md, section 2).
+    """
 
     kind: ClassVar[str] = "structured"
     weights: Floats
     """(E, S), reward per unit of each signal"""
     normalisation: Normalisation = RAW
     temperature: float = 1.0
+    most_per_step: Floats | None = None
+    """(S,) the largest mean of each signal over the steps of one clip; None: not known, and not limited"""
 
     def raw_rewards(self, signals: Array, observations: Array, actions: Array) -> Floats:
         """See RewardModel; observations and actions are not used."""
         rewards: Floats = np.moveaxis(np.asarray(signals, np.float64) @ self.weights.T, -1, 0)
         return rewards
 
+    def episode_rewards(self, signals: Array, observations: Array, actions: Array) -> Floats:
+        """See RewardModel; what exceeds ``most_per_step`` over the whole episode is worth nothing more."""
+        if self.most_per_step is None:
+            return self.step_rewards(signals, observations, actions)
+        totals = np.cumsum(signals, axis=0, dtype=np.float64)
+        beyond = np.maximum(totals - self.most_per_step * len(totals), 0.0)
+        undeserved = np.diff(beyond, axis=0, prepend=0.0) @ np.maximum(self.weights, 0.0).T
+        raw = self.raw_rewards(signals, observations, actions) - undeserved.T
+        return self.normalised(raw)
+
     def tensors(self) -> dict[str, Array]:
         """See RewardModel."""
-        return {"weights": self.weights.astype(np.float32)}
+        known = {} if self.most_per_step is None else {"most_per_step": self.most_per_step.astype(np.float32)}
+        return {"weights": self.weights.astype(np.float32)} | known
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, Array], config: Mapping[str, Any]) -> Self:
         """See RewardModel."""
-        return cls(tensors["weights"].astype(np.float64))
+        most = tensors.get("most_per_step")
+        return cls(
+            tensors["weights"].astype(np.float64), most_per_step=None if most is None else most.astype(np.float64)
+        )
 
     def signal_weights(self, reference: Sequence[Trajectory] = ()) -> Floats:
         """(E, S) normalised reward per unit of each signal; exact for this kind."""

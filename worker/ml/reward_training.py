@@ -24,6 +24,8 @@ MEMBERS = 8
 NEWTON_STEPS = 15
 LONGEST_NEWTON_STEP = 3.0
 CALIBRATION_FOLDS = 5
+MOST_QUANTILE = 0.99
+"""Of the clips' mean signals: the single wildest clip does not say what is usual."""
 _SMALLEST_SPREAD = 1e-6
 
 
@@ -35,13 +37,30 @@ class FitResult:
     metrics: dict[str, Any]
 
 
+@dataclass(frozen=True)
+class SignalScale:
+    """What the signals are like in the clips of a pool."""
+
+    spread: Floats
+    """(S,) root mean square of the summed differences of a pair; a column that never differs has 1"""
+    most_per_step: Floats
+    """(S,) the largest mean of each signal over the steps of one clip, outliers excepted"""
+
+    @classmethod
+    def of(cls, pairs: SegmentPairs) -> "SignalScale":
+        """From pairs like those that are asked."""
+        shown = pairs.shown[..., None]
+        means = pairs.signals.mean(axis=2, dtype=np.float64, where=shown).reshape(-1, pairs.signals.shape[-1])
+        return cls(_spread_of(pairs.signal_differences()), np.quantile(means, MOST_QUANTILE, axis=0))
+
+
 def fit(
     pairs: SegmentPairs,
     targets: npt.ArrayLike,
     kind: Kind,
     seed: int,
     *,
-    spread: Floats | None = None,
+    scale: SignalScale | None = None,
     reference: Sequence[Trajectory] = (),
     prior: Prior | None = None,
     mlp: MlpTraining | None = None,
@@ -49,8 +68,8 @@ def fit(
 ) -> FitResult:
     """Fit an ensemble to N pairs and their targets P(right preferred) in {0, 1/2, 1}.
 
-    ``spread`` (S,): standard deviation of summed signal differences over the pool the pairs come from (see
-    ``signal_spread``); from the labelled pairs themselves when missing, which is shaky below about 30 labels.
+    ``scale``: of the signals in the pool the pairs come from; from the labelled pairs themselves when missing, which
+    is shaky below about 30 labels.
     ``reference``: rollouts of the reference policy to normalise over; the labelled segments when missing.
     ``prior``: of the structured kind's weights, N(0, I) when missing.
     Raises ValueError for targets outside {0, 1/2, 1} or a count that differs from the pairs'.
@@ -59,7 +78,9 @@ def fit(
     answers = _checked(pairs, targets)
     metrics: dict[str, Any] = {"kind": kind, "trained_on": len(pairs), "seed": seed}
     if kind == "structured":
-        model, found = _fit_structured(pairs, answers, seed, spread, prior or Prior.standard(len(SIGNALS)))
+        model, found = _fit_structured(
+            pairs, answers, seed, scale or SignalScale.of(pairs), prior or Prior.standard(len(SIGNALS))
+        )
     elif kind == "mlp":
         model, found = fit_mlp(pairs, answers, seed, mlp or MlpTraining())
     else:
@@ -72,11 +93,6 @@ def fit(
     metrics["training_accuracy"] = _accuracy(model, pairs, answers)
     metrics["fit_seconds"] = round(time.perf_counter() - started, 4)
     return FitResult(model, metrics)
-
-
-def signal_spread(pairs: SegmentPairs) -> Floats:
-    """(S,) standard deviation of the summed signal differences; a column that never differs gets 1."""
-    return _spread_of(pairs.signal_differences())
 
 
 def _spread_of(differences: Floats) -> Floats:
@@ -109,18 +125,17 @@ def _normalised_over_segments(model: RewardModel, pairs: SegmentPairs) -> Reward
 
 
 def _fit_structured(
-    pairs: SegmentPairs, answers: Floats, seed: int, spread: Floats | None, prior: Prior
+    pairs: SegmentPairs, answers: Floats, seed: int, scale: SignalScale, prior: Prior
 ) -> tuple[RewardModel, dict[str, Any]]:
-    scale = signal_spread(pairs) if spread is None else np.where(spread > _SMALLEST_SPREAD, spread, 1.0)
-    features = pairs.signal_differences() / scale
+    features = pairs.signal_differences() / scale.spread
     mean, covariance = posterior(features, answers, prior)
-    members = _antithetic(mean, covariance, np.random.default_rng(seed)) / scale
+    members = _antithetic(mean, covariance, np.random.default_rng(seed)) / scale.spread
     deviation = 1.96 * np.sqrt(np.diag(covariance))
     weights = {
         name: {"mean": float(value), "low": float(value - margin), "high": float(value + margin)}
         for name, value, margin in zip(SIGNALS, mean, deviation, strict=True)
     }
-    return StructuredReward(members), {
+    return StructuredReward(members, most_per_step=scale.most_per_step), {
         "weights": weights,
         "weights_unit": "log odds per standard deviation of a pair",
         "held_out": _held_out(features, answers, seed, prior),
