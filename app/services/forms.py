@@ -1,0 +1,76 @@
+"""Forms: questions that a study asks besides the pairs. Every answer may be left out, corrected, and is kept."""
+
+import math
+from collections.abc import Mapping, Sequence
+from enum import StrEnum
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from app.domain.participation import FormAnswer
+from app.domain.protocol import LIKERT_POINTS, FormItem, Stage
+from app.domain.studies import Participant, StudySettings
+
+MOST_CHARACTERS = 4000
+
+
+class Problem(StrEnum):
+    """Why an answer cannot be kept as it is; also names the message that says so."""
+
+    NUMBER = "form-number-problem"
+    LONG = "form-long-problem"
+    CHOICE = "form-choice-problem"
+
+
+def items_of(settings: StudySettings, form: Stage) -> Sequence[FormItem]:
+    """The questions of a form."""
+    return settings.demographics if form is Stage.DEMOGRAPHICS else settings.questionnaire
+
+
+def answers_of(session: Session, participant: Participant, form: Stage) -> dict[str, str | None]:
+    """The newest answer to every question that was put; None where it was left out."""
+    given = select(FormAnswer).where(FormAnswer.participant_id == participant.id, FormAnswer.form == form)
+    return {answer.item: answer.value for answer in session.scalars(given.order_by(FormAnswer.id))}
+
+
+def problems(items: Sequence[FormItem], given: Mapping[str, str]) -> dict[str, Problem]:
+    """What is wrong with answers as they were typed, by question."""
+    found = {item.name: _problem(item, given.get(item.name, "").strip()) for item in items}
+    return {name: problem for name, problem in found.items() if problem is not None}
+
+
+def record(
+    session: Session, participant: Participant, form: Stage, items: Sequence[FormItem], given: Mapping[str, str]
+) -> None:
+    """Append what differs from the answers so far; the answers have no problems."""
+    known = answers_of(session, participant, form)
+    for item in items:
+        value = _stored(item, given.get(item.name, "").strip())
+        if item.name not in known or known[item.name] != value:
+            session.add(FormAnswer(participant_id=participant.id, form=form, item=item.name, value=value))
+
+
+def _problem(item: FormItem, text: str) -> Problem | None:
+    if not text:
+        return None
+    if item.kind == "number":
+        return None if _number(text) is not None else Problem.NUMBER
+    if item.kind == "text":
+        return Problem.LONG if len(text) > MOST_CHARACTERS else None
+    possible = item.choices if item.kind == "choice" else [str(point + 1) for point in range(LIKERT_POINTS)]
+    return None if text in possible else Problem.CHOICE
+
+
+def _stored(item: FormItem, text: str) -> str | None:
+    if not text:
+        return None
+    return f"{_number(text):g}" if item.kind == "number" else text
+
+
+def _number(text: str) -> float | None:
+    """28, 28.5 and 28,5; None for anything else."""
+    try:
+        number = float(text.replace(",", "."))
+    except ValueError:
+        return None
+    return number if math.isfinite(number) and abs(number) < 1e6 else None
