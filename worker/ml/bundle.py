@@ -144,8 +144,8 @@ def _manifest(contents: BundleContents) -> dict[str, Any]:
         "labels": {"count": provenance.label_count, "sha256": provenance.label_hash},
         "seed": provenance.seed,
         "control_rate_hz": round(1.0 / CONTROL_STEP_S, 6),
-        "observation": _table(contents.task.observation),
-        "action": _table(JOINT_ACTION),
+        "observation": described_space(contents.task.observation),
+        "action": described_space(JOINT_ACTION),
         "onnx": _onnx_interface(contents.filter_onnx, contents.task.observation.size),
         "normalisation": {
             "inside_filter": True,
@@ -178,7 +178,8 @@ def _manifest(contents: BundleContents) -> dict[str, Any]:
     }
 
 
-def _table(space: Space) -> dict[str, Any]:
+def described_space(space: Space) -> dict[str, Any]:
+    """Name, place, unit, range and meaning of every number of a space."""
     fields = [
         {
             "name": field.name,
