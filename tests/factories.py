@@ -28,8 +28,13 @@ WIDTH, HEIGHT = 320, 240
 
 
 def make_study(session: Session, name: str = "Feeding at home", **settings: Any) -> Study:
-    """A study; few labels and a small pool unless told otherwise."""
-    usual = {"labels_per_participant": 10, "pool_scenarios": 4, "filter_milestones": ()}
+    """A study; few labels and a small pool unless told otherwise, and answers need not wait for the end of a clip."""
+    usual = {
+        "labels_per_participant": 10,
+        "pool_scenarios": 4,
+        "filter_milestones": (),
+        "answer_after_first_play": False,
+    }
     return studies.create_study(session, name, StudySettings(**{**usual, **settings}), seed=7)
 
 

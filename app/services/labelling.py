@@ -1,7 +1,7 @@
 """Recording answers: each exactly once, whatever the network, the browser or an impatient finger does."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from http import HTTPStatus
 from uuid import UUID
 
@@ -9,7 +9,7 @@ from sqlalchemy import select
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
-from app.domain.preferences import LabelEvent, Query, Response
+from app.domain.preferences import LabelEvent, Query, Response, SkipReason
 from app.domain.studies import Participant
 from app.errors import AppError
 from app.services import querying
@@ -46,12 +46,26 @@ class Watching:
     response_time_ms: int | None = None
     replay_count: int | None = None
     play_error_count: int | None = None
+    stall_count: int | None = None
+    stalled_ms: int | None = None
+    largest_drift_ms: int | None = None
+    playback_rate: float | None = None
+    scrub_count: int | None = None
+    watched_whole: bool | None = None
 
 
 def record_label(
-    session: Session, participant: Participant, query_id: int, response: Response, client_uuid: UUID, watching: Watching
+    session: Session,
+    participant: Participant,
+    query_id: int,
+    response: Response,
+    client_uuid: UUID,
+    watching: Watching,
+    reason: SkipReason | None = None,
 ) -> LabelEvent:
     """Store one answer and return the one that counts: this, or an earlier one that this repeats or contradicts.
+
+    ``reason``: why somebody could not tell; kept with that answer only.
 
     Raises QueryNotFound (missing, or put to someone else), QueryNotShown and AnswerMisdirected.
     """
@@ -69,9 +83,8 @@ def record_label(
         revision=len(events) + 1,
         response=response,
         client_uuid=str(client_uuid),
-        response_time_ms=watching.response_time_ms,
-        replay_count=watching.replay_count,
-        play_error_count=watching.play_error_count,
+        reason=reason if response is Response.SKIP else None,
+        **asdict(watching),
     )
     return _append(session, query, event)
 

@@ -11,12 +11,16 @@ from sqlalchemy import func, select
 from sqlalchemy.orm import Session, aliased, joinedload
 
 from app.db import now
-from app.domain.preferences import LabelEvent, Query
+from app.domain.preferences import LabelEvent, Purpose, Query
 from app.domain.studies import Participant
+from app.services import participant_events
+from app.services.participant_events import EventKind
 from app.storage import ArtefactStore
 
 log = logging.getLogger("app.querying")
 
+PAIRS_AHEAD = 2
+"""Pairs that the page loads while another is shown."""
 RECENT_ANSWERS = 15
 MIN_KNOWN_PACES = 5
 LONGEST_PAUSE = timedelta(minutes=2)
@@ -30,24 +34,35 @@ class Given:
     """The answers that count, in short."""
 
     count: int
+    """to what is asked for in earnest: labels, repeats and catch pairs"""
+    practised: int
+    """practice pairs answered"""
     newest_query_id: int | None
+    newest_is_practice: bool
     times: Sequence[datetime]
     """When the newest ones were given, in their order."""
 
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a participant is."""
+    """How far a participant is. Everything they will be asked counts, whatever it is for; practice does not."""
 
     answered: int
     wanted: int
     seconds_left: int | None
     """At the person's own recent pace; None while too little is known."""
+    practised: int = 0
+    practice_wanted: int = 0
+
+    @property
+    def practising(self) -> bool:
+        """Whether practice pairs are still to come."""
+        return self.practised < self.practice_wanted
 
     @property
     def finished(self) -> bool:
-        """Whether every label asked for has been given."""
-        return self.answered >= self.wanted
+        """Whether every answer asked for has been given."""
+        return not self.practising and self.answered >= self.wanted
 
 
 @dataclass(frozen=True)
@@ -56,11 +71,13 @@ class Turn:
 
     progress: Progress
     query: Query | None
-    """None while no pair is ready, and when all are answered."""
-    following: Query | None
-    """The pair after it, so that the page can load it ahead."""
+    """None while no pair is ready, during a break, and when all are answered."""
+    following: Sequence[Query]
+    """The next few pairs after it, so that the page can load them ahead."""
     undoable_id: int | None
     """The id of the query answered last, whose answer can be taken back."""
+    break_due: bool = False
+    """Whether a break is to be offered before the next pair."""
 
 
 def next_turn(session: Session, store: ArtefactStore, participant: Participant) -> Turn:
@@ -70,12 +87,15 @@ def next_turn(session: Session, store: ArtefactStore, participant: Participant) 
     """
     given = answers_given(session, participant)
     progress = progress_of(participant, given)
-    ready = [] if progress.finished else list(islice(_ready(session, store, participant), 2))
+    undoable_id = given.newest_query_id if given.newest_is_practice == progress.practising else None
+    if _break_due(session, participant, progress):
+        return Turn(progress, None, (), undoable_id, break_due=True)
+    ready = [] if progress.finished else list(islice(_ready(session, store, participant), 1 + PAIRS_AHEAD))
     query = ready[0] if ready else None
-    following = ready[1] if len(ready) > 1 and progress.answered + 1 < progress.wanted else None
     if query is not None and query.served_at is None:
         query.served_at = now()
-    return Turn(progress, query, following, given.newest_query_id)
+    left = progress.practice_wanted - progress.practised + progress.wanted - progress.answered
+    return Turn(progress, query, ready[1:left], undoable_id)
 
 
 def answers_given(session: Session, participant: Participant) -> Given:
@@ -83,24 +103,52 @@ def answers_given(session: Session, participant: Participant) -> Given:
     newer = aliased(LabelEvent)
     superseded = select(newer.id).where(newer.query_id == LabelEvent.query_id, newer.revision > LabelEvent.revision)
     counting = (
-        select(LabelEvent.query_id, LabelEvent.created_at)
+        select(LabelEvent.query_id, LabelEvent.created_at, Query.purpose)
         .join(Query, Query.id == LabelEvent.query_id)
         .where(Query.participant_id == participant.id, LabelEvent.response.is_not(None), ~superseded.exists())
     )
     newest = session.execute(counting.order_by(LabelEvent.id.desc()).limit(RECENT_ANSWERS + 1)).all()
+    answers = counting.subquery()
+    total, practised = session.execute(
+        select(func.count(), func.count().filter(answers.c.purpose == Purpose.PRACTICE)).select_from(answers)
+    ).one()
     return Given(
-        count=session.scalar(select(func.count()).select_from(counting.subquery())) or 0,
+        count=total - practised,
+        practised=practised,
         newest_query_id=newest[0].query_id if newest else None,
+        newest_is_practice=bool(newest) and newest[0].purpose == Purpose.PRACTICE,
         times=[row.created_at for row in reversed(newest)],
     )
 
 
 def progress_of(participant: Participant, given: Given) -> Progress:
-    """Answered and wanted labels, and the time the rest will take."""
-    wanted = participant.study.settings.labels_per_participant
+    """Given and wanted answers, and the time the rest will take."""
+    settings = participant.study.settings
     pace_s = _pace_s(given.times)
-    left = max(0, wanted - given.count)
-    return Progress(given.count, wanted, None if pace_s is None else round(pace_s * left))
+    left = max(0, settings.question_count - given.count)
+    return Progress(
+        answered=given.count,
+        wanted=settings.question_count,
+        seconds_left=None if pace_s is None else round(pace_s * left),
+        practised=given.practised,
+        practice_wanted=settings.practice_pairs,
+    )
+
+
+def end_break(session: Session, participant: Participant) -> None:
+    """Store that the person goes on. At other times than in a break this changes nothing."""
+    progress = progress_of(participant, answers_given(session, participant))
+    if _break_due(session, participant, progress):
+        participant_events.note_once(session, participant, EventKind.BREAK_OVER, progress.answered)
+
+
+def _break_due(session: Session, participant: Participant, progress: Progress) -> bool:
+    """After every so many answers, once: whoever takes one back and gives it again is not stopped again."""
+    every = participant.study.settings.break_every
+    between = every > 0 and 0 < progress.answered < progress.wanted and progress.answered % every == 0
+    if not between or progress.practising:
+        return False
+    return not participant_events.known_at(session, participant, EventKind.BREAK_OVER, progress.answered)
 
 
 def seen(participant: Participant) -> None:

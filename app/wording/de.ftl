@@ -148,6 +148,7 @@ withdraw-body =
     - Alles, was daraus entstanden ist, wird gelöscht: der Roboter, der von Ihnen gelernt hat, seine Filme und Dateien.
     - Es bleibt nur, dass { $code } teilgenommen und widerrufen hat, und wann. Nicht wer, nicht was.
     - Ergebnisse, die vorher veröffentlicht wurden, lassen sich nicht zurückrufen.
+withdraw-average = Die Roboter von Menschen, die später kamen, können mit einem Durchschnitt begonnen haben, zu dem Ihrer beigetragen hat. Auf Sie zurückführen lässt er sich nicht.
 withdraw-final = Das lässt sich nicht rückgängig machen, auch nicht von uns.
 withdraw-confirm = Alles über mich löschen
 withdraw-keep = Nein, behalten und zurück
@@ -176,9 +177,80 @@ error-joining-closed = An dieser Studie kann man über diese Adresse nicht (mehr
 ## Paare (Vorsilbe pair-)
 
 pair-question = Welchen Roboter hätten Sie lieber?
+pair-title = Was ist Ihnen lieber?
+pair-left = Links
+pair-right = Rechts
+pair-top = Oben
+pair-bottom = Unten
+pair-equal = Gleich gut
+pair-skip = Weiß nicht
+pair-left-clip = Linkes Video
+pair-right-clip = Rechtes Video
+pair-progress = Ihr Fortschritt
+pair-count = { $answered } von { $wanted }
+pair-time-left = noch { $time }
+pair-time-left-minute = etwa eine Minute
+pair-time-left-minutes = etwa { $minutes } min
+pair-time-left-hours = etwa { $hours } h
+pair-replay = Von vorn
+pair-undo = Rückgängig
+pair-play = Abspielen
+pair-pause = Anhalten
+pair-back = Ein Bild zurück
+pair-forward = Ein Bild vor
+pair-position = Stelle in beiden Videos
+pair-position-value = { $seconds } von { $total } Sekunden
+pair-speed = Tempo
+pair-speed-value = { $rate }-faches Tempo
+pair-play-both = Beide abspielen
+pair-play-again = Noch einmal
+pair-watch-first = Erst beide einmal ansehen, dann antworten
+pair-now-answer = Sie können jetzt antworten
+pair-saving = Wird gespeichert …
+pair-saving-earlier = Eine frühere Antwort wird gespeichert …
+pair-saved = Gespeichert. { $answered } von { $wanted }.
+pair-not-saved = Noch nicht gespeichert. Neuer Versuch …
+pair-taken-back = Zurückgenommen. Bitte antworten Sie noch einmal.
+pair-unplayable = Diese Videos konnten nicht geladen werden.
+pair-broken-off = Diese Videos sind stehen geblieben. Sie können sie neu laden oder antworten, wenn Sie genug gesehen haben.
+pair-load-again = Neu laden
+pair-go-on = Weiter
+pair-try-again = Noch einmal versuchen
+pair-why = Warum können Sie es nicht sagen?
+pair-why-no_difference_seen = Ich sehe keinen Unterschied
+pair-why-both_bad = Beide sind schlecht
+pair-why-not_comparable = Zu verschieden zum Vergleichen
+pair-why-not_seen = Ich konnte es nicht gut sehen
+pair-why-other = Ein anderer Grund
+pair-why-none = Möchte ich nicht sagen
+pair-why-back = Zurück zum Paar
+waiting-title = Einen Moment
+waiting-heading = Ihr nächstes Paar wird vorbereitet
+waiting-text = Der Roboter nimmt gerade Videos auf. Diese Seite geht von selbst weiter; Sie brauchen nichts zu tun.
+waiting-answered = { $answered } von { $wanted } Antworten sind sicher gespeichert.
 
 ## Übung (Vorsilbe practice-)
 
+practice-title = Übung
+practice-count = Übung { $answered } von { $wanted }
+practice-lead = Dies ist eine Übung und zählt nicht. Probieren Sie die Tasten aus:
+practice-lead-touch = Dies ist eine Übung und zählt nicht. Spielen Sie ab, halten Sie an, ziehen Sie am Balken, dann tippen Sie auf eine Antwort.
+practice-key-pause = anhalten
+practice-key-speed = Tempo
+practice-key-replay = von vorn
+practice-key-answer = antworten
+practice-key-step = ein Bild
+practice-key-used = { $key }: haben Sie benutzt
+practice-all-used = Sie haben alle Tasten benutzt. Antworten Sie, wann Sie mögen.
+
 ## Pausen (Vorsilbe break-)
+
+break-title = Zeit für eine Pause?
+break-heading = { $answered } Antworten sind geschafft
+break-lead = Alle sind sicher gespeichert. Schauen Sie aus dem Fenster, strecken Sie sich, trinken Sie etwas. Kommen Sie wieder, wann Sie mögen, auch an einem anderen Tag: Ihr Link führt hierher zurück.
+break-left = Noch { $count }, { $time }.
+break-left-unknown = Noch { $count }.
+break-go-on = Weiter
+break-key = Die Eingabetaste geht weiter
 
 ## Bewertung (Vorsilbe evaluation-)

@@ -150,6 +150,7 @@ withdraw-body =
     - Everything made from it is erased: the robot that learned from you, its films and files.
     - All that stays is that { $code } took part and withdrew, and when. Not who, not what.
     - Results that were published before cannot be called back.
+withdraw-average = The robots of people who came later may have begun with an average to which yours had contributed. It cannot be traced back to you.
 withdraw-final = It cannot be undone, not even by us.
 withdraw-confirm = Erase everything about me
 withdraw-keep = No, keep it and go back
@@ -178,9 +179,80 @@ error-joining-closed = This study cannot be joined by this address (any more). P
 ## Pairs (prefix pair-)
 
 pair-question = Which robot would you rather have?
+pair-title = Which do you prefer?
+pair-left = Left
+pair-right = Right
+pair-top = Top
+pair-bottom = Bottom
+pair-equal = Equal
+pair-skip = Can’t tell
+pair-left-clip = Left clip
+pair-right-clip = Right clip
+pair-progress = Your progress
+pair-count = { $answered } of { $wanted }
+pair-time-left = { $time } left
+pair-time-left-minute = about a minute
+pair-time-left-minutes = about { $minutes } min
+pair-time-left-hours = about { $hours } h
+pair-replay = Replay
+pair-undo = Undo
+pair-play = Play
+pair-pause = Pause
+pair-back = One frame back
+pair-forward = One frame forward
+pair-position = Position in both clips
+pair-position-value = { $seconds } of { $total } seconds
+pair-speed = Speed
+pair-speed-value = { $rate } times real time
+pair-play-both = Play both
+pair-play-again = Play again
+pair-watch-first = Watch both once, then answer
+pair-now-answer = You can answer now
+pair-saving = Saving …
+pair-saving-earlier = Saving an earlier answer …
+pair-saved = Saved. { $answered } of { $wanted }.
+pair-not-saved = Not saved yet. Trying again …
+pair-taken-back = Taken back. Please answer again.
+pair-unplayable = These clips could not be loaded.
+pair-broken-off = These clips stopped playing. You can load them again, or answer if you have seen enough.
+pair-load-again = Load them again
+pair-go-on = Go on
+pair-try-again = Try again
+pair-why = Why can’t you tell?
+pair-why-no_difference_seen = I see no difference
+pair-why-both_bad = Both are bad
+pair-why-not_comparable = Too different to compare
+pair-why-not_seen = I could not see it well
+pair-why-other = Another reason
+pair-why-none = Rather not say
+pair-why-back = Back to the pair
+waiting-title = A moment
+waiting-heading = Your next pair is being prepared
+waiting-text = The robot is recording clips. This page goes on by itself; there is nothing you need to do.
+waiting-answered = { $answered } of { $wanted } answers are safely stored.
 
 ## Practice (prefix practice-)
 
+practice-title = Practice
+practice-count = Practice { $answered } of { $wanted }
+practice-lead = This is practice and does not count. Try the keys:
+practice-lead-touch = This is practice and does not count. Play, pause, drag along the bar, then tap an answer.
+practice-key-pause = pause
+practice-key-speed = speed
+practice-key-replay = replay
+practice-key-answer = answer
+practice-key-step = one frame
+practice-key-used = { $key }: you have used it
+practice-all-used = You have used every key. Answer when you like.
+
 ## Breaks (prefix break-)
+
+break-title = Time for a break?
+break-heading = { $answered } answers are done
+break-lead = All of them are safely stored. Look out of the window, stretch, have some water. Come back whenever you like, also on another day: your link brings you here.
+break-left = { $count } to go, { $time }.
+break-left-unknown = { $count } to go.
+break-go-on = Go on
+break-key = Enter goes on
 
 ## Evaluation (prefix evaluation-)
