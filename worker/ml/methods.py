@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from worker.ml import pbrl_hri, prefft, studio_filter
 from worker.ml.best_of_n import fit_best_of_n
+from worker.ml.checkpoint import Checkpoint
 from worker.ml.pbarl_printed import BETAS, OTHER_TASKS_BETAS, PrintedConfig
 from worker.ml.pbrl_hri import FromScratch
 from worker.ml.preference_rl import Env, MakeEnv, PolicyAct, learned
@@ -63,6 +64,8 @@ class Setting:
     collect: Collect
     make_env: MakeEnv
     config: MethodConfig = MethodConfig()
+    checkpoint: Checkpoint | None = None
+    """where a training that takes minutes keeps what a restart needs, and says how far it is"""
 
 
 @dataclass(frozen=True)
@@ -116,7 +119,8 @@ def fit_as_printed(setting: Setting, list_length: int) -> tuple[Act, tuple[str, 
         betas=BETAS.get(problem.task.name, OTHER_TASKS_BETAS),
         steps=setting.config.printed_steps,
     )
-    draft = fit_printed(problem, rollouts, config)
+    checkpoint = setting.checkpoint
+    draft = fit_printed(problem, rollouts, config, lambda stage, share: checkpoint.note(share) if checkpoint else None)
     return _exported(problem, draft), draft.notes
 
 
@@ -130,6 +134,7 @@ def fit_prefft(setting: Setting, tie_weight: float) -> tuple[Act, tuple[str, ...
         problem.task.observation,
         config,
         problem.seed,
+        setting.checkpoint,
     )
     return PolicyAct(policy), (f"SAC for {config.steps} steps; tie {tie_weight:g}.",)
 

@@ -12,7 +12,9 @@ import gymnasium
 import numpy as np
 import numpy.typing as npt
 import torch
+from torch import Tensor
 
+from worker.ml.checkpoint import Checkpoint
 from worker.ml.policies import GaussianPolicy
 from worker.ml.reward_models import RewardModel
 from worker.ml.sac import Learner, Replay, SacConfig
@@ -77,13 +79,15 @@ class PreferenceRl:
         finished: Array = self.replay.rows[: self.replay.count, : self.config.observation.size].numpy()
         return finished
 
-    def learn(self, learner: Learner) -> None:
+    def learn(self, learner: Learner, checkpoint: Checkpoint | None = None) -> None:
         """The rest of the steps: first the critics alone, on the warm-up's episodes, then everything."""
         config = self.config
-        for _ in range(config.critic_first_updates):
+        for _ in range(0 if learner.updates else config.critic_first_updates):
             learner.update(self.replay, actor=False)
         owed = 0.0
         while self.steps < config.total_steps:
+            if checkpoint:
+                self._keep_state(learner, checkpoint)
             with torch.no_grad():
                 actions: Array = learner.actor.sample(torch.from_numpy(self.states))[0].numpy()
             self._step(actions)
@@ -92,6 +96,23 @@ class PreferenceRl:
             while owed >= 1:
                 learner.update(self.replay)
                 owed -= 1
+
+    def restore(self, learner: Learner, tensors: dict[str, Tensor], counts: dict[str, Any]) -> None:
+        """Go on from a checkpoint of learn(); the episodes that were in flight then begin anew."""
+        self.replay.count, self.steps = len(tensors["replay"]), counts["steps"]
+        self.replay.rows[: self.replay.count] = tensors["replay"]
+        learner.load_state(tensors, counts["updates"])
+        torch.set_rng_state(tensors["torch_rng"])
+        self.rng.bit_generator.state = counts["rng"]
+
+    def _keep_state(self, learner: Learner, checkpoint: Checkpoint) -> None:
+        checkpoint.note(self.steps / self.config.total_steps)
+        if checkpoint.is_due:
+            rows = self.replay.rows[: self.replay.count]
+            tensors = {**learner.state(), "replay": rows, "torch_rng": torch.get_rng_state()}
+            rng = self.rng.bit_generator.state
+            counts = {"steps": self.steps, "updates": learner.updates, "rng": rng}
+            checkpoint.write(tensors, {**counts, "target_entropy": learner.config.target_entropy})
 
     def close(self) -> None:
         """Free the environments."""

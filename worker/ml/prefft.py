@@ -18,6 +18,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from worker.ml.checkpoint import Checkpoint
 from worker.ml.policies import LAYERS, LOG_STD_HIGH, LOG_STD_LOW, GaussianPolicy
 from worker.ml.policy_module import FrozenPolicy
 from worker.ml.preference_rl import EpisodeReward, MakeEnv, PreferenceRl
@@ -52,16 +53,31 @@ TIED = 1.0
 
 
 def fine_tune(
-    make_env: MakeEnv, policy: GaussianPolicy, reward: EpisodeReward, space: Space, config: FineTuning, seed: int
+    make_env: MakeEnv,
+    policy: GaussianPolicy,
+    reward: EpisodeReward,
+    space: Space,
+    config: FineTuning,
+    seed: int,
+    checkpoint: Checkpoint | None = None,
 ) -> GaussianPolicy:
-    """The policy after ``config.steps`` environment steps: the running average of the actor, as everywhere in sac."""
+    """The policy after ``config.steps`` environment steps: the running average of the actor, as everywhere in sac.
+
+    With a checkpoint, a training that was killed goes on where it was; its result then is as good, but not the same
+    to the bit, because the episodes in flight begin anew.
+    """
     settings = _settings(policy, space, config, seed)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         training = PreferenceRl(make_env, reward, settings)
-        states = training.warm_up(lambda seen: policy.sample(seen, training.rng))
-        learner = _learner(policy, settings, config, torch.from_numpy(states))
-        training.learn(learner)
+        kept = checkpoint.read() if checkpoint else None
+        if kept is None:
+            states = training.warm_up(lambda seen: policy.sample(seen, training.rng))
+            learner = _learner(policy, settings, config, torch.from_numpy(states))
+        else:
+            learner = _new_learner(policy, replace(settings, target_entropy=kept[1]["target_entropy"]), config)
+            training.restore(learner, *kept)
+        training.learn(learner, checkpoint)
         training.close()
     return learner.average.policy()
 
@@ -78,6 +94,19 @@ class TiedLearner(Learner):
     def hold(self) -> None:
         """From here on, stay close to the present actor."""
         self.anchor = copy.deepcopy(self.actor).requires_grad_(False)
+
+    def state(self) -> dict[str, Tensor]:
+        """See Learner; with where it is held."""
+        anchor = {f"anchor.{name}": value.clone() for name, value in self.anchor.state_dict().items()}
+        return {**super().state(), **anchor, "unit": torch.tensor(self._unit)}
+
+    def load_state(self, tensors: dict[str, Tensor], updates: int) -> None:
+        """See Learner."""
+        super().load_state(tensors, updates)
+        self.hold()
+        names = [name for name in tensors if name.startswith("anchor.")]
+        self.anchor.load_state_dict({name.removeprefix("anchor."): tensors[name] for name in names})
+        self._unit = float(tensors["unit"])
 
     def tie(self, states: Tensor) -> Tensor | float:
         """See Learner."""
@@ -153,11 +182,17 @@ def _learner(policy: GaussianPolicy, settings: SacConfig, config: FineTuning, st
     with torch.no_grad():
         entropy = -float(actor.sample(states)[1].mean())
     kept = replace(settings, target_entropy=entropy)  # as undecided as it was: neither pulled apart nor made rigid
-    learner = TiedLearner(kept, actor.offset, actor.scale, policy.action_size, config.tie_weight)
+    learner = _new_learner(policy, kept, config)
     learner.actor.load_state_dict(actor.state_dict())
     learner.average.load_state_dict(actor.state_dict())
     learner.hold()
     return learner
+
+
+def _new_learner(policy: GaussianPolicy, settings: SacConfig, config: FineTuning) -> TiedLearner:
+    """With random weights."""
+    offset, scale = torch.from_numpy(policy.offset), torch.from_numpy(policy.scale)
+    return TiedLearner(settings, offset, scale, policy.action_size, config.tie_weight)
 
 
 def _settings(policy: GaussianPolicy, space: Space, config: FineTuning, seed: int) -> SacConfig:

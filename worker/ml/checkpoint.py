@@ -1,0 +1,80 @@
+"""Checkpoints of a training that takes minutes: whoever was killed goes on where the last one was written.
+
+Everything is in one file that is replaced as a whole. Beside it lies a short note of how far the training is, for
+whoever waits for it in another process. When the folder is gone, nobody wants the result any more.
+"""
+
+import json
+import os
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from safetensors import safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+STATE_FILE, NOTE_FILE = "state.safetensors", "share"
+EVERY_S = 45.0
+NOTE_EVERY_S = 1.0
+
+
+class Abandoned(RuntimeError):
+    """The folder of this training has been removed, so its result is not wanted any more."""
+
+
+@dataclass
+class Checkpoint:
+    """The folder of one training; it must exist."""
+
+    folder: Path
+    every_s: float = EVERY_S
+    _written_at: float = field(default_factory=time.monotonic)
+    _noted_at: float = float("-inf")
+
+    def note(self, share: float) -> None:
+        """Say which share of the training is done; at most once a second. Raises Abandoned."""
+        if time.monotonic() - self._noted_at < NOTE_EVERY_S:
+            return
+        if not self.folder.is_dir():
+            raise Abandoned(" ".join((Abandoned.__doc__ or "").split()))
+        self._noted_at = time.monotonic()
+        self._replace(NOTE_FILE, lambda path: path.write_text(f"{share:.4f}"))
+
+    @property
+    def is_due(self) -> bool:
+        """Whether it is time to write again."""
+        return time.monotonic() - self._written_at >= self.every_s
+
+    def write(self, tensors: dict[str, Tensor], counts: dict[str, Any]) -> None:
+        """Keep everything a restart needs: arrays, and plain values that JSON can hold."""
+        whole = {name: tensor.contiguous() for name, tensor in tensors.items()}
+        self._replace(STATE_FILE, lambda path: save_file(whole, path, metadata={"counts": json.dumps(counts)}))
+        self._written_at = time.monotonic()
+
+    def read(self) -> tuple[dict[str, Tensor], dict[str, Any]] | None:
+        """What was written last; None at the beginning."""
+        path = self.folder / STATE_FILE
+        if not path.exists():
+            return None
+        with safe_open(path, "pt") as stored:
+            tensors = {name: stored.get_tensor(name) for name in stored.keys()}  # noqa: SIM118  (no mapping)
+            counts: dict[str, Any] = json.loads(stored.metadata()["counts"])
+        return tensors, counts
+
+    def _replace(self, name: str, write: Any) -> None:
+        temporary = self.folder / f".{name}.{os.getpid()}"
+        try:
+            write(temporary)
+        except FileNotFoundError as error:
+            raise Abandoned(" ".join((Abandoned.__doc__ or "").split())) from error
+        temporary.replace(self.folder / name)
+
+
+def share_done(folder: Path) -> float:
+    """What the training in this folder noted last; 0 before it began."""
+    try:
+        return float((folder / NOTE_FILE).read_text())
+    except (FileNotFoundError, ValueError):
+        return 0.0
