@@ -60,6 +60,10 @@ class ArtefactStore:
         """Whether the artefact is there."""
         return self.path(sha256).exists()
 
+    def unfinished(self, participant_id: int) -> Path:
+        """A folder for what long trainings for one person keep until they are done; it may not exist."""
+        return self.root.parent / "unfinished" / f"participant-{participant_id}"
+
     def delete(self, sha256: str) -> None:
         """Remove the artefact if it is there."""
         self.path(sha256).unlink(missing_ok=True)

@@ -10,7 +10,7 @@ from app.domain.evaluation import Film
 from app.domain.models import Bundle, Model, ModelKind
 from app.domain.protocol import EvaluatedMethod
 from app.domain.studies import Participant
-from app.services import results
+from app.services import evaluating, results
 
 MOST_LESSONS = 4
 """More would not be read."""
@@ -52,7 +52,8 @@ def before_and_after(session: Session, participant: Participant) -> BeforeAndAft
         .where(
             before.participant_id == participant.id,
             before.method == EvaluatedMethod.REFERENCE,
-            after.method.in_([EvaluatedMethod.PBARL, EvaluatedMethod.PBARL_PRINTED]),
+            after.method == EvaluatedMethod.PBARL,
+            before.scenario.in_(evaluating.comparison_scenarios(participant)),  # never one that was rated blindly
         )
         .order_by(after.model_id.desc(), after.success.desc(), after.scenario)
         .limit(1)

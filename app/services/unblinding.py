@@ -1,0 +1,87 @@
+"""Who may know which letter hides which method: nobody, until somebody unblinds the study on purpose."""
+
+from collections.abc import Sequence
+from http import HTTPStatus
+
+from sqlalchemy import func, select
+from sqlalchemy.orm import Session
+
+from app.db import now
+from app.domain.evaluation import Assignment, Rating, Trial
+from app.domain.studies import Participant, Study
+from app.errors import AppError
+from app.services import audit
+
+
+class ConfirmationDiffers(AppError):
+    """What you typed is not the short name of the study. Nothing was unblinded."""
+
+    status = HTTPStatus.UNPROCESSABLE_ENTITY
+
+
+class NothingToUnblind(AppError):
+    """This study has no blinded evaluation."""
+
+    status = HTTPStatus.NOT_FOUND
+
+
+class StillBlinded(AppError):
+    """This study is blinded: which letter is which method is shown after somebody has unblinded it."""
+
+    status = HTTPStatus.FORBIDDEN
+
+
+def is_blinded(study: Study) -> bool:
+    """Whether letters must stand for methods wherever people look."""
+    return study.settings.evaluation is not None and study.unblinded_at is None
+
+
+def unblind(session: Session, study: Study, typed: str, actor: str) -> None:
+    """Unblind for good; ``typed`` must be the study's slug. Doing it again changes nothing.
+
+    Raises NothingToUnblind and ConfirmationDiffers.
+    """
+    if study.settings.evaluation is None:
+        raise NothingToUnblind
+    if typed.strip() != study.slug:
+        raise ConfirmationDiffers
+    if study.unblinded_at is None:
+        study.unblinded_at = now()
+        rated, wanted = rated_and_wanted(session, study)
+        audit.record(session, actor, "study unblinded", f"{study.slug} ({rated} of {wanted} trials rated)")
+
+
+def rated_and_wanted(session: Session, study: Study) -> tuple[int, int]:
+    """Trials rated, and trials that all participants are to rate: what unblinding too early would spoil."""
+    settings = study.settings.evaluation
+    people = select(func.count(Participant.id)).where(
+        Participant.study_id == study.id, Participant.withdrawn_at.is_(None)
+    )
+    rated = (
+        select(func.count(func.distinct(Rating.trial_id)))
+        .join(Trial)
+        .join(Participant, Participant.id == Trial.participant_id)
+        .where(Participant.study_id == study.id)
+    )
+    per_person = settings.trial_count if settings else 0
+    return session.scalar(rated) or 0, (session.scalar(people) or 0) * per_person
+
+
+def methods_by_letter(session: Session, study: Study) -> dict[tuple[int, str], str]:
+    """Method by participant id and letter. Raises StillBlinded before the study is unblinded."""
+    if is_blinded(study):
+        raise StillBlinded
+    return {(each.participant_id, each.letter): each.method for each in _assignments(session, study)}
+
+
+def shown_name(study: Study, assignments: Sequence[Assignment], letter: str) -> str:
+    """What to call a robot on an experimenter's page: its letter, with its method once the study is unblinded."""
+    if is_blinded(study):
+        return letter
+    method = next((each.method for each in assignments if each.letter == letter), None)
+    return letter if method is None else f"{letter} ({method})"
+
+
+def _assignments(session: Session, study: Study) -> Sequence[Assignment]:
+    theirs = select(Assignment).join(Participant, Participant.id == Assignment.participant_id)
+    return session.scalars(theirs.where(Participant.study_id == study.id)).all()
