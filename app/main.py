@@ -11,7 +11,19 @@ from fastapi.staticfiles import StaticFiles
 from app.db import Database
 from app.settings import Settings
 from app.storage import ArtefactStore
-from app.web import experimenter, live, login, media, participant
+from app.web import (
+    experimenter,
+    joining,
+    live,
+    login,
+    media,
+    participant,
+    participant_consent,
+    participant_ending,
+    participant_forms,
+    participant_pairs,
+    withdrawing,
+)
 from app.web.deps import Studio
 from app.web.error_pages import add_error_pages, error_page
 from app.web.guard import Guard
@@ -20,6 +32,16 @@ from app.web.templating import ROOT, make_environment
 from app.web.turns import Turns
 
 MAX_BODY_BYTES = 256 * 1024
+PARTICIPANT_PARTS = (
+    joining,
+    participant_consent,
+    participant_forms,
+    participant_pairs,
+    participant_ending,
+    withdrawing,
+    participant,
+)
+"""The last one comes last: it takes whatever address below /p/ is left for a personal link."""
 
 
 def create_app(settings: Settings | None = None) -> FastAPI:
@@ -47,7 +69,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.state.templates = make_environment(app.url_path_for)
     app.add_middleware(Guard, https=settings.secure_cookies, refuse=error_page)
     add_error_pages(app)
-    for part in (login, experimenter, participant, media):
+    for part in (login, experimenter, media, *PARTICIPANT_PARTS):
         app.include_router(part.router)
     app.mount("/static", StaticFiles(directory=ROOT / "static"), name="static")
 

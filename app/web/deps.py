@@ -31,6 +31,12 @@ class LinkNeeded(AppError):
     status = HTTPStatus.UNAUTHORIZED
 
 
+class NotYet(AppError):
+    """Something else comes first. You are taken there."""
+
+    status = HTTPStatus.CONFLICT
+
+
 class LoginNeeded(AppError):
     """Please log in."""
 
@@ -86,7 +92,7 @@ def participant_asking(request: Request, session: Session) -> Participant:
     """The participant whose browser this is, study loaded. Raises LinkNeeded."""
     cookie = request.cookies.get(PARTICIPANT_COOKIE)
     participant = browser_sessions.participant_of(session, cookie) if cookie else None
-    if participant is None:
+    if participant is None or participant.withdrawn_at is not None:
         raise LinkNeeded
     return participant
 

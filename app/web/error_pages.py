@@ -11,7 +11,7 @@ from sqlalchemy.exc import OperationalError
 from starlette.exceptions import HTTPException
 
 from app.errors import AppError
-from app.web.deps import LoginNeeded, PasswordChangeDue
+from app.web.deps import LoginNeeded, NotYet, PasswordChangeDue
 from app.web.guard import HEADERS
 from app.web.templating import page
 
@@ -57,6 +57,12 @@ def add_error_pages(app: FastAPI) -> None:
             return error_page(request, error)
         target = request.app.url_path_for("show_login")
         return RedirectResponse(f"{target}?next={request.url.path}", HTTPStatus.SEE_OTHER)
+
+    @app.exception_handler(NotYet)
+    def not_yet(request: Request, error: NotYet) -> Response:
+        if wants_json(request):
+            return error_page(request, error)
+        return RedirectResponse(request.app.url_path_for("show_next"), HTTPStatus.SEE_OTHER)
 
     @app.exception_handler(PasswordChangeDue)
     def password_change_due(request: Request, error: PasswordChangeDue) -> Response:

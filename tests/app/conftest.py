@@ -1,5 +1,6 @@
 """A participant in the middle of a study, as most tests of pages need one."""
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from uuid import UUID, uuid4
@@ -16,6 +17,13 @@ from app.storage import ArtefactStore
 from tests import factories
 
 JSON = {"Accept": "application/json"}
+
+
+def agree(browser: TestClient) -> Answer:
+    """Agree to the consent text that the browser is shown."""
+    shown = re.search(r'name="shown" value="(\w+)"', browser.get("/p/consent").text)
+    assert shown is not None
+    return browser.post("/p/consent", data={"shown": shown[1]})
 
 
 @dataclass

@@ -10,7 +10,7 @@ from app.db import Database, now
 from app.domain.people import BrowserSession
 from app.domain.studies import Participant
 from tests import factories
-from tests.app.conftest import TakingPart
+from tests.app.conftest import TakingPart, agree
 
 
 @pytest.fixture
@@ -75,8 +75,8 @@ def test_an_expired_cookie_is_worth_nothing(taking_part: TakingPart, database: D
 def test_consent_and_instructions_come_first_and_are_stored(client: TestClient, token: str, database: Database) -> None:
     client.get(f"/p/{token}")
     assert client.get("/p/next").headers["location"] == "/p/consent"
-    assert client.get("/p/instructions").headers["location"] == "/p/consent"
-    assert client.post("/p/consent", data={"version": "1"}).headers["location"] == "/p/instructions"
+    assert client.get("/p/instructions").headers["location"] == "/p/next"
+    assert agree(client).headers["location"] == "/p/next"
     assert client.get("/p/next").headers["location"] == "/p/instructions"
     assert client.post("/p/instructions").headers["location"] == "/p/next"
     assert client.get("/p/next").status_code == 200
@@ -89,7 +89,8 @@ def test_consent_and_instructions_come_first_and_are_stored(client: TestClient, 
 
 def test_agreeing_to_another_text_is_not_agreeing(client: TestClient, token: str, database: Database) -> None:
     client.get(f"/p/{token}")
-    client.post("/p/consent", data={"version": "0"})
+    answer = client.post("/p/consent", data={"shown": "0" * 64})
+    assert "has changed" in answer.text
     assert client.get("/p/next").headers["location"] == "/p/consent"
 
 

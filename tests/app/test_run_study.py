@@ -16,6 +16,7 @@ from app.domain.studies import Participant, Study
 from app.services import enrolment
 from app.storage import ArtefactStore
 from tests import factories
+from tests.app.conftest import agree
 
 FORM = re.compile(r'name="(\w+)" type="text" value="([^"]*)"')
 
@@ -97,7 +98,7 @@ def test_each_task_has_its_usual_length_of_clips_and_its_own_instructions(
         _, token = enrolment.add_participant(session, study)
     browser = new_browser()
     browser.get(f"/p/{token}")
-    browser.post("/p/consent", data={"version": "1"})
+    agree(browser)
     words = {"feeding": "being fed", "drinking": "cup of water", "scratching": "reddish spot"}
     assert words[task] in browser.get("/p/instructions").text
 

@@ -10,6 +10,7 @@ from app.domain.models import ModelKind, RunKind, RunStatus
 from app.domain.studies import Study, StudySettings, TaskName
 from app.services import studies
 from tests import factories
+from tests.app.conftest import agree
 
 
 @pytest.fixture
@@ -82,7 +83,7 @@ def test_a_participant_of_an_unknown_task_still_gets_instructions(
     with database.writing() as session:
         _, token = factories.make_participant(session, study, ready=False)
     client.get(f"/p/{token}")
-    client.post("/p/consent", data={"version": "1"})
+    agree(client)
     assert "A robot arm helps" in client.get("/p/instructions").text
 
 

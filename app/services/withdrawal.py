@@ -1,0 +1,111 @@
+"""Withdrawing: everything about a person is erased, rows and files; a tombstone says that, and not what.
+
+What the worker keeps for itself (its engine's notes, results of work that was still running) it erases when it finds
+``withdrawn_at`` without ``erased_at``.
+"""
+
+from collections.abc import Collection, Iterator
+from typing import Any
+
+from sqlalchemy import ColumnElement, Table, delete, select
+from sqlalchemy.orm import InstrumentedAttribute, Session
+
+from app.db import Base, now
+from app.domain import participation, preferences  # noqa: F401  (their tables belong to what is erased)
+from app.domain.clips import Clip, Rollout
+from app.domain.evaluation import Controller, Film
+from app.domain.models import Bundle, Export, Model, Report
+from app.domain.studies import Participant, Study
+from app.services import audit
+from app.storage import ArtefactStore
+
+ARTEFACT_COLUMNS: tuple[InstrumentedAttribute[Any], ...] = (
+    Rollout.trajectory_sha256,
+    Clip.video_sha256,
+    Clip.poster_sha256,
+    Film.trajectory_sha256,
+    Film.video_sha256,
+    Film.poster_sha256,
+    Controller.artefact_sha256,
+    Model.artefact_sha256,
+    Bundle.artefact_sha256,
+    Export.artefact_sha256,
+)
+"""Every column that names a file of the artefact store. Report.figures does so too, inside its JSON."""
+
+KEPT_COLUMNS = frozenset(
+    {"id", "study_id", "number", "token_sha256", "seed", "created_at", "withdrawn_at", "erased_at"}
+)
+"""Of the tombstone: what makes the code, and what lets the old link end at a page that says what happened."""
+
+
+def withdraw(session: Session, store: ArtefactStore, participant: Participant, actor: str) -> None:
+    """Erase everything about the participant, now and for good. ``actor``: the person, or who erases at their request.
+
+    Files go before the transaction ends: should it fail, the person is asked to do it again, and nothing is left over.
+    """
+    study = session.get_one(Study, participant.study_id)
+    if participant.withdrawn_at is None:
+        participant.withdrawn_at = now()
+        audit.record(session, actor, "participant withdrew", f"{study.slug}/{participant.code}")
+    erase(session, store, participant)
+
+
+def erase(session: Session, store: ArtefactStore, participant: Participant) -> None:
+    """Erase rows and files of somebody who has withdrawn. Doing it again erases what has come in since."""
+    for column in Participant.__table__.columns:
+        if column.name not in KEPT_COLUMNS:
+            setattr(participant, column.name, None)
+    session.flush()
+    artefacts = set(_artefacts(session, participant))
+    session.execute(delete(Report).where(Report.study_id == participant.study_id))
+    session.execute(delete(Export).where(Export.study_id == participant.study_id))
+    for table, theirs in reversed(list(personal_rows(participant.id))):
+        session.execute(delete(table).where(theirs))
+    session.expire_all()  # what the session remembers of those rows is gone as well
+    for sha256 in artefacts - in_use(session, artefacts):
+        store.delete(sha256)
+
+
+def personal_rows(participant_id: int) -> Iterator[tuple[Table, ColumnElement[bool]]]:
+    """Every table that holds something about participants, with which rows are this one's; parents first.
+
+    Read from the schema, so that a new table belongs to it by its foreign key.
+    """
+    people = Base.metadata.tables[Participant.__tablename__]
+    found: dict[Table, ColumnElement[bool]] = {people: people.c.id == participant_id}
+    for table in Base.metadata.sorted_tables:
+        if table is people:
+            continue
+        parents = [key for key in table.foreign_keys if key.column.table in found and key.column.table is not table]
+        direct = [key for key in parents if key.column.table is people]
+        for key in direct or parents[:1]:
+            found[table] = key.parent.in_(select(key.column).where(found[key.column.table]))
+            yield table, found[table]
+
+
+def in_use(session: Session, artefacts: Collection[str]) -> set[str]:
+    """Which of these artefacts some row still refers to."""
+    used: set[str] = set()
+    for column in ARTEFACT_COLUMNS:
+        used |= {sha256 for sha256 in session.scalars(select(column).distinct()) if sha256 in artefacts}
+    for figures in session.scalars(select(Report.figures)):
+        used |= _hashes(figures) & set(artefacts)
+    return used
+
+
+def _artefacts(session: Session, participant: Participant) -> Iterator[str]:
+    """What rows of this person, and everything that was made of the whole study, refer to."""
+    rows = dict(personal_rows(participant.id))
+    for column in ARTEFACT_COLUMNS:
+        table = column.class_.__table__
+        if table in rows:
+            yield from session.scalars(select(column).where(rows[table], column.is_not(None)))
+    exports = select(Export.artefact_sha256).where(Export.study_id == participant.study_id)
+    yield from (sha256 for sha256 in session.scalars(exports) if sha256 is not None)
+    for figures in session.scalars(select(Report.figures).where(Report.study_id == participant.study_id)):
+        yield from _hashes(figures)
+
+
+def _hashes(figures: dict[str, Any]) -> set[str]:
+    return {sha256 for formats in figures.values() for sha256 in formats.values()}

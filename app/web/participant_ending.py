@@ -1,0 +1,57 @@
+"""The end of the way: the person's own robot, thanks, and the way back to a recruitment panel."""
+
+from typing import Annotated
+from uuid import uuid4
+
+from fastapi import APIRouter, Request
+from fastapi.responses import Response
+
+from app.domain.protocol import Stage
+from app.domain.studies import Participant
+from app.services import completion, dashboard, debrief, querying, stages
+from app.web.deps import CurrentParticipant, NotYet, StudioDep, WritingSession
+from app.web.participant_pages import back_from, go, has_reached, participant_page
+
+router = APIRouter(prefix="/p")
+
+AtDebrief = Annotated[Participant, has_reached(Stage.DEBRIEF)]
+
+
+@router.get("/debrief", name="show_debrief")
+def show_debrief(request: Request, participant: AtDebrief, session: WritingSession) -> Response:
+    """The person's own robot before and after, side by side, and what it learned; or that it is still being made."""
+    context = {
+        "films": debrief.before_and_after(session, participant),
+        "learned": debrief.learned(session, participant),
+        "back_path": back_from(request, participant.study.settings, Stage.DEBRIEF),
+    }
+    return participant_page(request, "participant/debrief.html", participant, context)
+
+
+@router.post("/debrief", name="finish_debrief")
+def finish_debrief(request: Request, participant: AtDebrief, session: WritingSession) -> Response:
+    """On to the end."""
+    stages.finish(session, participant, Stage.DEBRIEF)
+    return go(request, "show_next")
+
+
+@router.get("/finished", name="show_finished")
+def show_finished(
+    request: Request, participant: CurrentParticipant, session: WritingSession, studio: StudioDep
+) -> Response:
+    """Thanks: the completion code, or the way back, which is taken by itself the first time only."""
+    if stages.current_stage(session, participant) is not None:
+        raise NotYet
+    querying.seen(participant)
+    first_time = completion.complete(participant)
+    settings = participant.study.settings
+    turn = querying.next_turn(session, studio.store, participant)
+    context = {
+        "turn": turn,
+        "detail": dashboard.participant_detail(session, participant.study, participant),
+        "only_pairs": stages.stages_of(settings)[-1] is Stage.PAIRS,
+        "return_address": completion.return_address(participant),
+        "first_time": first_time,
+        "undo_uuid": uuid4(),
+    }
+    return participant_page(request, "participant/finished.html", participant, context)

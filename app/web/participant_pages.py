@@ -1,0 +1,88 @@
+"""What the participant's pages share: their frame, the way on, and that nobody skips ahead."""
+
+from collections.abc import Mapping
+from http import HTTPStatus
+from typing import Any
+
+from fastapi import Depends, Request
+from fastapi.responses import RedirectResponse, Response
+
+from app.domain.protocol import Stage
+from app.domain.studies import Participant, StudySettings
+from app.services import stages
+from app.web.deps import CurrentParticipant, NotYet, WritingSession
+from app.web.templating import page
+from app.web.wording import NAMES, wording_of
+
+ADDRESSES = {
+    Stage.CONSENT: "show_consent",
+    Stage.DEMOGRAPHICS: "show_demographics",
+    Stage.INSTRUCTIONS: "show_instructions",
+    Stage.EVALUATION: "show_evaluation",
+    Stage.QUESTIONNAIRE: "show_questionnaire",
+    Stage.DEBRIEF: "show_debrief",
+}
+"""Route names of stages with an address of their own; practice and pairs are shown at /p/next itself."""
+
+_READ_AGAIN = {
+    Stage.CONSENT: "show_consent_copy",
+    Stage.DEMOGRAPHICS: "show_demographics",
+    Stage.INSTRUCTIONS: "show_instructions",
+    Stage.QUESTIONNAIRE: "show_questionnaire",
+}
+"""Stages one may go back to from the next; what was compared and rated is left as it was said."""
+
+
+def participant_page(
+    request: Request,
+    template: str,
+    participant: Participant,
+    context: Mapping[str, Any] | None = None,
+    status: int = HTTPStatus.OK,
+) -> Response:
+    """A page with what every participant's page needs: study, settings, participant, wording and languages."""
+    shared = {
+        "study": participant.study,
+        "settings": participant.study.settings,
+        "participant": participant,
+        "wording": wording_of(participant),
+        "languages": NAMES,
+    }
+    return page(request, template, {**shared, **(context or {})}, status)
+
+
+def go(request: Request, name: str) -> RedirectResponse:
+    """On to the route of this name, with GET."""
+    return RedirectResponse(request.app.url_path_for(name), HTTPStatus.SEE_OTHER)
+
+
+def has_reached(stage: Stage) -> Any:
+    """A dependency that gives the participant, if they are in this stage or through with it; else leads them back."""
+
+    def check(participant: CurrentParticipant, session: WritingSession) -> Participant:
+        if not stages.reached(session, participant, stage):
+            raise NotYet
+        return participant
+
+    return Depends(check, scope="function")
+
+
+def is_in(stage: Stage) -> Any:
+    """A dependency that gives the participant, if this is the stage they are in; else leads them to where they are."""
+
+    def check(participant: CurrentParticipant, session: WritingSession) -> Participant:
+        if stages.current_stage(session, participant) != stage:
+            raise NotYet
+        return participant
+
+    return Depends(check, scope="function")
+
+
+def back_from(request: Request, settings: StudySettings, stage: Stage) -> str | None:
+    """The path of the page before, where going back makes sense."""
+    way = stages.stages_of(settings)
+    before = way[: way.index(stage)] if stage in way else []
+    if not before or before[-1] not in _READ_AGAIN:
+        return None
+    path: str = request.app.url_path_for(_READ_AGAIN[before[-1]])
+    return path
