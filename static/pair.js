@@ -277,6 +277,7 @@ function unplayable() {
   setPhase("unplayable");
   notice(seen ? words.brokenOff : words.unplayable, words.loadAgain, async () => {
     keepOnly([]);
+    prepared = null; // it may have failed as well
     const videos = await videosOf(turn.pair);
     page.querySelectorAll("figure video").forEach((old, index) => old.replaceWith(videos[index]));
     await show(videos);

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 from uuid import UUID, uuid4
 
 from fastapi import APIRouter, Form, Request
-from fastapi.responses import JSONResponse, RedirectResponse, Response
+from fastapi.responses import JSONResponse, Response
 from pydantic import BaseModel, BeforeValidator, Field
 from sqlalchemy.orm import Session
 
@@ -18,7 +18,7 @@ from app.services import labelling, participant_events, querying
 from app.services.participant_events import EventKind
 from app.web.deps import CurrentParticipant, RowId, Studio, StudioDep, WritingSession
 from app.web.error_pages import wants_json
-from app.web.templating import page
+from app.web.participant_pages import go, participant_page
 from app.web.wording import Wording, wording_of
 
 router = APIRouter(prefix="/p")
@@ -81,17 +81,10 @@ def show_turn(request: Request, session: Session, studio: Studio, participant: P
         return JSONResponse(state)
     if turn.break_due:
         participant_events.note_once(session, participant, EventKind.BREAK_BEGUN, turn.progress.answered)
-    context = {
-        "study": participant.study,
-        "settings": participant.study.settings,
-        "participant": participant,
-        "turn": turn,
-        "state": state,
-        "undo_uuid": uuid4(),
-    }
+    context: dict[str, Any] = {"turn": turn, "state": state, "undo_uuid": uuid4()}
     if turn.query is not None:
         context |= {"pair": _pair(request, turn.query), "client_uuid": uuid4(), "reasons": list(SkipReason)}
-    return page(request, f"participant/{_template(turn)}.html", context)
+    return participant_page(request, f"participant/{_template(turn)}.html", participant, context)
 
 
 @router.post("/queries/{query_id}/label", name="label_query")
@@ -128,7 +121,7 @@ def end_break(request: Request, participant: CurrentParticipant, session: Writin
     """Go on after a break."""
     querying.seen(participant)
     querying.end_break(session, participant)
-    return _go(request)
+    return go(request, "show_next")
 
 
 @router.post("/events", name="note_event", status_code=HTTPStatus.NO_CONTENT)
@@ -159,15 +152,11 @@ def _template(turn: querying.Turn) -> str:
     return "practice" if turn.query.purpose == Purpose.PRACTICE else "pair"
 
 
-def _go(request: Request) -> RedirectResponse:
-    return RedirectResponse(request.app.url_path_for("show_next"), HTTPStatus.SEE_OTHER)
-
-
 def _go_on(request: Request, session: Session, studio: Studio, participant: Participant) -> Response:
     """What comes after an answer: for a script the next pair at once, for a plain form the page that shows it."""
     querying.seen(participant)
     if not wants_json(request):
-        return _go(request)
+        return go(request, "show_next")
     turn = querying.next_turn(session, studio.store, participant)
     return JSONResponse(_turn_for_script(request, turn, wording_of(participant)))
 

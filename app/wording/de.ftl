@@ -224,7 +224,6 @@ pair-why-not_seen = Ich konnte es nicht gut sehen
 pair-why-other = Ein anderer Grund
 pair-why-none = Möchte ich nicht sagen
 pair-why-back = Zurück zum Paar
-waiting-title = Einen Moment
 waiting-heading = Ihr nächstes Paar wird vorbereitet
 waiting-text = Der Roboter nimmt gerade Videos auf. Diese Seite geht von selbst weiter; Sie brauchen nichts zu tun.
 waiting-answered = { $answered } von { $wanted } Antworten sind sicher gespeichert.
@@ -245,7 +244,6 @@ practice-all-used = Sie haben alle Tasten benutzt. Antworten Sie, wann Sie möge
 
 ## Pausen (Vorsilbe break-)
 
-break-title = Zeit für eine Pause?
 break-heading = { $answered } Antworten sind geschafft
 break-lead = Alle sind sicher gespeichert. Schauen Sie aus dem Fenster, strecken Sie sich, trinken Sie etwas. Kommen Sie wieder, wann Sie mögen, auch an einem anderen Tag: Ihr Link führt hierher zurück.
 break-left = Noch { $count }, { $time }.

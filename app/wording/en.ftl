@@ -226,7 +226,6 @@ pair-why-not_seen = I could not see it well
 pair-why-other = Another reason
 pair-why-none = Rather not say
 pair-why-back = Back to the pair
-waiting-title = A moment
 waiting-heading = Your next pair is being prepared
 waiting-text = The robot is recording clips. This page goes on by itself; there is nothing you need to do.
 waiting-answered = { $answered } of { $wanted } answers are safely stored.
@@ -247,7 +246,6 @@ practice-all-used = You have used every key. Answer when you like.
 
 ## Breaks (prefix break-)
 
-break-title = Time for a break?
 break-heading = { $answered } answers are done
 break-lead = All of them are safely stored. Look out of the window, stretch, have some water. Come back whenever you like, also on another day: your link brings you here.
 break-left = { $count } to go, { $time }.

@@ -39,10 +39,12 @@ def test_nought_replays_are_nought(taking_part: TakingPart) -> None:
     assert taking_part.events(taking_part.queries[0])[0].replay_count == 0
 
 
-def test_the_answer_to_an_answer_is_the_next_pair_and_the_one_after(taking_part: TakingPart) -> None:
+def test_the_answer_to_an_answer_is_the_next_pair_and_the_two_after(taking_part: TakingPart) -> None:
     shown = taking_part.turn().json()
     turn = taking_part.answer(taking_part.queries[0]).json()
-    assert turn["pair"] == shown["following"]
+    assert turn["pair"] == shown["following"][0]
+    assert turn["following"][0] == shown["following"][1]
+    assert len(turn["following"]) == 2
     assert turn["following"]["query_id"] == taking_part.queries[2].id
     assert (turn["answered"], turn["wanted"]) == (1, 10)
 

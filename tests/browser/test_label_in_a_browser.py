@@ -115,6 +115,8 @@ def test_from_the_link_to_the_tenth_answer_and_on_the_dashboard(
         if number == 0:
             assert serious_findings(page) == []
         page.keyboard.press(KEYS[response])
+        if response == "skip":
+            page.keyboard.press("1")  # the reason
     expect(page.get_by_role("heading", name="Thank you")).to_be_visible()
     assert serious_findings(page) == []
     assert invited.responses() == given
