@@ -1,7 +1,8 @@
 """What every kind of work needs: the database, the artefacts, the processes, and a way to say how far it is."""
 
+import hashlib
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 from app.db import Database
@@ -22,6 +23,19 @@ class Step(Protocol):
         ...
 
 
+class NotingStore(ArtefactStore):
+    """Remembers what is put away, so that it can be erased although nothing refers to it (yet)."""
+
+    def __init__(self, store: ArtefactStore, noted: set[str]) -> None:
+        super().__init__(store.root)
+        self._noted = noted
+
+    def put(self, content: bytes) -> str:
+        """Store the bytes and return their hash, noted before the first of them is written."""
+        self._noted.add(hashlib.sha256(content).hexdigest())
+        return super().put(content)
+
+
 @dataclass(frozen=True)
 class Workplace:
     """One worker's means."""
@@ -31,6 +45,10 @@ class Workplace:
     compute: Compute
     references: dict[tuple[str, range], list[Trajectory]] = field(default_factory=dict)
     """rollouts of the frozen policy by scenarios: the same for everybody, so each worker makes them once"""
+
+    def noting(self, noted: set[str]) -> "Workplace":
+        """The same place, remembering the artefacts that are stored through it."""
+        return replace(self, store=NotingStore(self.store, noted))
 
     def report(self, run_id: int, stage: str, progress: float) -> None:
         """Say in a few words, and as a share between 0 and 1, where a run is."""

@@ -4,6 +4,7 @@ What the worker keeps for itself (its engine's notes, results of work that was s
 ``withdrawn_at`` without ``erased_at``.
 """
 
+import shutil
 from collections.abc import Collection, Iterator
 from typing import Any
 
@@ -14,7 +15,7 @@ from app.db import Base, now
 from app.domain import participation, preferences  # noqa: F401  (their tables belong to what is erased)
 from app.domain.clips import Clip, Rollout
 from app.domain.evaluation import Controller, Film
-from app.domain.models import Bundle, Export, Model, Report
+from app.domain.models import Bundle, Export, Model, Report, Run, RunKind
 from app.domain.studies import Participant, Study
 from app.services import audit
 from app.storage import ArtefactStore
@@ -58,13 +59,13 @@ def erase(session: Session, store: ArtefactStore, participant: Participant) -> N
             setattr(participant, column.name, None)
     session.flush()
     artefacts = set(_artefacts(session, participant))
-    session.execute(delete(Report).where(Report.study_id == participant.study_id))
-    session.execute(delete(Export).where(Export.study_id == participant.study_id))
+    _erase_made_of_everybody(session, participant.study_id)
     for table, theirs in reversed(list(personal_rows(participant.id))):
         session.execute(delete(table).where(theirs))
     session.expire_all()  # what the session remembers of those rows is gone as well
     for sha256 in artefacts - in_use(session, artefacts):
         store.delete(sha256)
+    shutil.rmtree(store.unfinished(participant.id), ignore_errors=True)
 
 
 def personal_rows(participant_id: int) -> Iterator[tuple[Table, ColumnElement[bool]]]:
@@ -92,6 +93,14 @@ def in_use(session: Session, artefacts: Collection[str]) -> set[str]:
     for figures in session.scalars(select(Report.figures)):
         used |= _hashes(figures) & set(artefacts)
     return used
+
+
+def _erase_made_of_everybody(session: Session, study_id: int) -> None:
+    """Reports and exports hold something of each participant; new ones are made without this one."""
+    session.execute(delete(Report).where(Report.study_id == study_id))
+    session.execute(delete(Export).where(Export.study_id == study_id))
+    kinds = (RunKind.REPORT, RunKind.EXPORT)
+    session.execute(delete(Run).where(Run.study_id == study_id, Run.kind.in_(kinds)))
 
 
 def _artefacts(session: Session, participant: Participant) -> Iterator[str]:

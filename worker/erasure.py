@@ -1,0 +1,99 @@
+"""The worker's part of a withdrawal: its own notes, the results of work that was under way, the bytes of freed pages.
+
+The web has erased rows and files and written down when. Here that is found (``withdrawn_at`` without ``erased_at``),
+work for the person is cancelled and waited for, and what it left is erased before anybody says that all is gone.
+"""
+
+import logging
+import re
+from collections.abc import Collection, Iterator, Mapping, MutableMapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from dbos import DBOS, WorkflowStatus
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from app.db import now, rewrite
+from app.domain.models import RunKind
+from app.domain.studies import Participant
+from app.services import withdrawal
+from worker.records import Job
+from worker.workplace import Workplace
+
+log = logging.getLogger("worker")
+
+_ACTIVE = frozenset({"PENDING", "ENQUEUED", "DELAYED"})
+_OF_WHOLE_STUDIES = frozenset({RunKind.REPORT.value, RunKind.EXPORT.value})
+"""Kinds of work whose results hold something of everybody."""
+_SHA256 = re.compile(r"\b[0-9a-f]{64}\b")
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What one attempt at erasing came to."""
+
+    finished: bool
+    forgotten: frozenset[str] = frozenset()
+    """Names of workflows that the engine no longer knows, so that they may be started again if they are due."""
+
+
+def unfinished(session: Session) -> Sequence[int]:
+    """Participants of whom traces may be left."""
+    return session.scalars(
+        select(Participant.id).where(Participant.withdrawn_at.is_not(None), Participant.erased_at.is_(None))
+    ).all()
+
+
+def erase_traces(
+    place: Workplace,
+    participant_id: int,
+    in_hand: Collection[str],
+    stored: MutableMapping[str, set[str]],
+    engine_file: Path | None,
+) -> Progress:
+    """Erase what the worker knows of somebody who has withdrawn; asked again until it says that it has finished.
+
+    ``in_hand``: findings this process works on; ``stored``: artefacts that unfinished work has put away, by finding.
+    """
+    with place.database.reading() as session:
+        study_id = session.get_one(Participant, participant_id).study_id
+    jobs = dict(_workflows(participant_id, study_id))
+    active = [name for name, (_, status) in jobs.items() if status in _ACTIVE]
+    if active:
+        DBOS.cancel_workflows(active)  # and look again: one of them may just be beginning
+    if active or any(job.finding in in_hand for job, _ in jobs.values()):
+        return Progress(finished=False)
+    left_over = {sha256 for name in jobs for sha256 in _artefacts_of_steps(name)}
+    for job, _ in jobs.values():
+        left_over |= stored.pop(job.finding, set())
+    with place.database.writing() as session:
+        withdrawal.erase(session, place.store, session.get_one(Participant, participant_id))
+        for sha256 in left_over - withdrawal.in_use(session, left_over):
+            place.store.delete(sha256)
+    DBOS.delete_workflows(list(jobs))
+    if not place.database.forget_erased() or (engine_file is not None and not rewrite(engine_file)):
+        return Progress(finished=False, forgotten=frozenset(jobs))  # somebody is reading; the next round tries again
+    with place.database.writing() as session:
+        session.get_one(Participant, participant_id).erased_at = now()
+    log.info("participant %d has withdrawn: the last traces are erased", participant_id)
+    return Progress(finished=True, forgotten=frozenset(jobs))
+
+
+def _workflows(participant_id: int, study_id: int) -> Iterator[tuple[str, tuple[Job, str]]]:
+    """Names, jobs and states of every workflow that was for this person, or for the whole study's data."""
+    for workflow in DBOS.list_workflows(load_input=True, load_output=False):
+        job = _job(workflow)
+        of_study = job is not None and job.kind in _OF_WHOLE_STUDIES and job.study_id == study_id
+        if job is not None and (job.participant_id == participant_id or of_study):
+            yield workflow.workflow_id, (job, workflow.status)
+
+
+def _job(workflow: WorkflowStatus) -> Job | None:
+    arguments = workflow.input["args"][-1] if workflow.input and workflow.input["args"] else None
+    return Job(**arguments) if isinstance(arguments, Mapping) else None
+
+
+def _artefacts_of_steps(workflow: str) -> set[str]:
+    """Drafts are known to the engine alone: their hashes are what the steps returned."""
+    return {sha256 for step in DBOS.list_workflow_steps(workflow) for sha256 in _SHA256.findall(repr(step["output"]))}
