@@ -1,6 +1,7 @@
 """Processes for heavy work: simulation and training run there, the durable engine only waits for them.
 
-Two lanes, so that a training never stands behind a queue of videos. The processes are polite (niced), single-threaded,
+Several lanes, so that a training never stands behind a queue of videos, and nobody's pairs wait for a fine-tuning that
+takes minutes. The processes are polite (niced), single-threaded,
 and die with their parent even when that is killed outright.
 """
 
@@ -21,7 +22,6 @@ R = TypeVar("R")
 log = logging.getLogger("worker.compute")
 
 HEARTBEAT_S = 5.0
-_NICENESS = 5
 _PARENT_CHECK_S = 1.0
 
 
@@ -30,6 +30,11 @@ class Lane(StrEnum):
 
     CLIPS = "clips"
     LEARNING = "learning"
+    PATIENT = "patient"
+    """Trainings of many minutes: one at a time on one core, and only with what the others leave."""
+
+
+_NICENESS = {Lane.CLIPS: 5, Lane.LEARNING: 5, Lane.PATIENT: 15}
 
 
 class ComputeLost(RuntimeError):
@@ -44,7 +49,7 @@ class Compute:
     """Process pools, one per lane, started when first needed and replaced when one of their processes dies."""
 
     def __init__(self, processes: int) -> None:
-        self._sizes = {Lane.CLIPS: processes, Lane.LEARNING: processes}
+        self._sizes = {Lane.CLIPS: processes, Lane.LEARNING: processes, Lane.PATIENT: 1}
         self._pools: dict[Lane, ProcessPoolExecutor] = {}
         self._closing = threading.Event()
 
@@ -96,7 +101,7 @@ class Compute:
                 self._sizes[lane],
                 mp_context=multiprocessing.get_context("spawn"),
                 initializer=_settle_in,
-                initargs=(os.getpid(),),
+                initargs=(os.getpid(), _NICENESS[lane]),
             )
         return self._pools[lane]
 
@@ -115,11 +120,11 @@ class Compute:
         self._pools.clear()
 
 
-def _settle_in(parent: int) -> None:
+def _settle_in(parent: int, niceness: int) -> None:
     """Run once in each new process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's business
     threading.Thread(target=_leave_with, args=(parent,), daemon=True).start()
-    os.nice(_NICENESS)
+    os.nice(niceness)
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ[variable] = "1"
 

@@ -141,6 +141,16 @@ def record_clip(name: str, scenario: int, behaviour: Behaviour, first_step: int,
     )
 
 
+def film(name: str, controller: bytes, scenario: int) -> RecordedClip:
+    """Run a whole episode as a controller (see worker.ml.controller) acts, and render all of it."""
+    from worker.ml.run_controller import Controller  # processes that never film controllers do without its runtime
+
+    trajectory = rollout(environment(name), Controller(controller), scenario, reference_policy(name).mean)
+    target = io.BytesIO()
+    trajectory.save(target)
+    return RecordedClip(target.getvalue(), trajectory.success, renderer().render_clip(trajectory, 0, len(trajectory)))
+
+
 @lru_cache(maxsize=4)
 def reference_rollouts(
     name: str, first: int = REFERENCE_SCENARIOS, count: int = REFERENCE_COUNT

@@ -7,14 +7,15 @@ anything undone or do it twice: each finding has one name, and work is started u
 from collections.abc import Collection, Iterator
 from datetime import datetime, timedelta
 
-from sqlalchemy import func, select
+from sqlalchemy import Select, func, select
 from sqlalchemy.orm import Session
 
 from app.db import now
 from app.domain.clips import Clip, Rollout
 from app.domain.models import Run, RunKind, RunStatus
-from app.domain.preferences import LabelEvent, Query, current_labels
+from app.domain.preferences import LEARNED_FROM, LabelEvent, Query, current_labels
 from app.domain.studies import Participant, Study, StudySettings
+from worker import film_work, method_work
 from worker.records import ATTEMPTS, LEASE, Job, next_queries
 
 CLIPS_AHEAD = 2
@@ -26,8 +27,9 @@ RETRY_AFTER = timedelta(seconds=10)
 def findings(session: Session) -> Iterator[tuple[Job, int]]:
     """Every run that should exist and does not, or must be tried again, with the number of its attempt."""
     runs = {run.workflow_id: run for run in session.scalars(select(Run))}
+    succeeded = {name for name, run in runs.items() if run.status == RunStatus.SUCCEEDED}
     for study in session.scalars(select(Study).order_by(Study.id)).all():
-        for job in (*_missing_clips(session, study), *_stale_models(session, study)):
+        for job in (*_missing_clips(session, study), *_stale_models(session, study, succeeded)):
             attempt = _attempt_due(runs.get(job.finding), now())
             if attempt is not None:
                 yield job, attempt
@@ -60,9 +62,14 @@ def short_of_queries(session: Session) -> list[int]:
     return [
         participant.id
         for study in session.scalars(select(Study)).all()
-        for participant in session.scalars(select(Participant).where(Participant.study_id == study.id)).all()
+        for participant in session.scalars(_present(study)).all()
         if next_queries(session, participant.id, study.settings)[1] > 0
     ]
+
+
+def _present(study: Study) -> Select[Participant]:
+    """Everybody in the study who has not withdrawn."""
+    return select(Participant).where(Participant.study_id == study.id, Participant.withdrawn_at.is_(None))
 
 
 def _attempt_due(run: Run | None, moment: datetime) -> int | None:
@@ -96,9 +103,9 @@ def scenario_seed(study_seed: int, index: int) -> int:
     return 10_000_000 + study_seed % 90_000 * 1_000 + index
 
 
-def _stale_models(session: Session, study: Study) -> list[Job]:
+def _stale_models(session: Session, study: Study, succeeded: Collection[str]) -> list[Job]:
     jobs = []
-    for participant in session.scalars(select(Participant).where(Participant.study_id == study.id)).all():
+    for participant in session.scalars(_present(study)).all():
         count = len(current_labels(session, participant.id))
         if count == 0:
             continue
@@ -108,10 +115,24 @@ def _stale_models(session: Session, study: Study) -> list[Job]:
             name = f"reward/participant-{participant.id}/labels-{reward}{suffix}"
             jobs.append(Job(name, RunKind.REWARD, study.id, participant.id, reward))
             milestone = filter_due(study.settings, count)
-            if milestone and _succeeded(session, name):
+            if milestone and name in succeeded:
                 ending = suffix if milestone == study.settings.labels_per_participant else ""
                 name = f"filter/participant-{participant.id}/labels-{milestone}{ending}"
                 jobs.append(Job(name, RunKind.FILTER, study.id, participant.id, milestone))
+        if suffix:
+            jobs += _missing_from_evaluation(study, participant, f"labels-{reward}{suffix}", succeeded)
+    return jobs
+
+
+def _missing_from_evaluation(
+    study: Study, participant: Participant, ending: str, succeeded: Collection[str]
+) -> list[Job]:
+    """What is to be trained, filmed or packed for somebody who has given all labels."""
+    if f"reward/participant-{participant.id}/{ending}" not in succeeded:
+        return []
+    jobs = method_work.due(study, participant, ending)
+    if f"filter/participant-{participant.id}/{ending}" in succeeded:
+        jobs += film_work.due(study, participant, ending, succeeded)
     return jobs
 
 
@@ -127,12 +148,8 @@ def filter_due(settings: StudySettings, answered: int) -> int:
     return max((milestone for milestone in settings.milestones if milestone <= answered), default=0)
 
 
-def _succeeded(session: Session, finding: str) -> bool:
-    run = session.scalar(select(Run).where(Run.workflow_id == finding))
-    return run is not None and run.status == RunStatus.SUCCEEDED
-
-
 def _last_answer(session: Session, participant_id: int) -> str:
     """Makes the last model's name new when the participant changes an answer after the last one."""
-    events = select(func.max(LabelEvent.id)).join(Query).where(Query.participant_id == participant_id)
+    events = select(func.max(LabelEvent.id)).join(Query)
+    events = events.where(Query.participant_id == participant_id, Query.purpose.in_(LEARNED_FROM))
     return f"/answer-{session.scalar(events)}"

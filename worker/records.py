@@ -211,6 +211,12 @@ def newest_model(session: Session, participant_id: int, kind: ModelKind) -> Mode
     )
 
 
+def models_of(session: Session, participant_id: int, kind: ModelKind) -> Sequence[Model]:
+    """Every model of a kind, the one with the most labels behind it first, the newest of equals before the others."""
+    theirs = select(Model).where(Model.participant_id == participant_id, Model.kind == kind)
+    return session.scalars(theirs.order_by(Model.label_count.desc(), Model.id.desc())).all()
+
+
 def models_of_others(
     session: Session, participant_id: int, kind: ModelKind, at_least_labels: int, most: int
 ) -> Sequence[Model]:

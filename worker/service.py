@@ -21,7 +21,7 @@ from app.domain.models import RunKind
 from app.errors import AppError
 from app.settings import Settings
 from app.storage import ArtefactStore
-from worker import laboratory, lessons, querying, reconcile, records
+from worker import erasure, laboratory, lessons, querying, reconcile, records
 from worker.compute import Compute, Lane
 from worker.records import Job
 from worker.sim.catalogue import ENVIRONMENTS
@@ -35,7 +35,7 @@ PRESENCE_S = 5.0
 ENGINE_VERSION = "2"
 """Raised when the steps of a workflow change so that a half-finished one could not be resumed."""
 
-QUEUES = {RunKind.CLIPS: 2, RunKind.REWARD: 1, RunKind.FILTER: 1}
+QUEUES = {RunKind.CLIPS: 2, RunKind.REWARD: 1, RunKind.FILTER: 1, RunKind.METHOD: 1, RunKind.FILMS: 1}
 """How many jobs of each kind one worker does at a time."""
 
 
@@ -88,10 +88,14 @@ def _only_one(settings: Settings) -> Iterator[None]:
         yield
 
 
+def engine_file(settings: Settings) -> Path | None:
+    """Where the durable engine keeps its own notes; None when they lie on the PostgreSQL server."""
+    return settings.data_dir.resolve() / "engine.sqlite3" if settings.sqlalchemy_url.startswith("sqlite") else None
+
+
 def _launch_engine(settings: Settings) -> None:
-    url = settings.sqlalchemy_url
-    if url.startswith("sqlite"):
-        url = f"sqlite:///{settings.data_dir.resolve() / 'engine.sqlite3'}"
+    path = engine_file(settings)
+    url = settings.sqlalchemy_url if path is None else f"sqlite:///{path}"
     DBOS(
         config={
             "name": "pbarl-studio",
@@ -111,6 +115,7 @@ class _Rounds:
 
     def __init__(self, settings: Settings, workshop: Workshop) -> None:
         self._worker_name = settings.worker_name
+        self._engine_file = engine_file(settings)
         self._workshop = workshop
         self._place = workshop.place
         self._started: set[str] = set()  # what the engine has been told already
@@ -139,16 +144,24 @@ class _Rounds:
             hungry = set(reconcile.short_of_queries(session))
             lost = reconcile.abandoned(session, self._workshop.in_hand)
             learning_ahead = reconcile.tasks_with_answers(session) - self._warm_tasks
+            withdrawn = erasure.unfinished(session)
         for job, attempt in due:
             self._start(job, reconcile.workflow_name(job.finding, attempt))
         for participant_id in hungry - self._refused:
             self._refill(participant_id)
+        for participant_id in withdrawn:
+            self._erase(participant_id)
         for name in lost:
             log.warning("%s was left behind by another worker; taking it over", name)
             DBOS.resume_workflow(name)
         for name in learning_ahead & set(ENVIRONMENTS):
             self._place.compute.warm_up(Lane.LEARNING, partial(lessons.warm_up, name))
         self._warm_tasks |= learning_ahead
+
+    def _erase(self, participant_id: int) -> None:
+        shop = self._workshop
+        progress = erasure.erase_traces(self._place, participant_id, shop.in_hand, shop.stored, self._engine_file)
+        self._started -= progress.forgotten
 
     def _refill(self, participant_id: int) -> None:
         try:

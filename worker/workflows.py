@@ -18,7 +18,9 @@ from app.domain.studies import Participant, Study
 from app.errors import AppError
 from worker import records
 from worker.clip_work import build_clips
+from worker.film_work import make_films
 from worker.filter_work import train_filter
+from worker.method_work import train_method
 from worker.records import Job
 from worker.reward_work import train_reward
 from worker.workplace import Step, Workplace
@@ -29,7 +31,13 @@ _BODIES: dict[RunKind, Callable[[Workplace, Job, int, Step], None]] = {
     RunKind.CLIPS: build_clips,
     RunKind.REWARD: train_reward,
     RunKind.FILTER: train_filter,
+    RunKind.METHOD: train_method,
+    RunKind.FILMS: make_films,
 }
+
+
+class ParticipantWithdrew(AppError):
+    """The participant has withdrawn, so there is nothing to be done for them."""
 
 
 @DBOS.dbos_class()
@@ -41,6 +49,8 @@ class Workshop(DBOSConfiguredInstance):
         self.place = place
         self.in_hand: set[str] = set()
         """findings that this process is working on"""
+        self.stored: dict[str, set[str]] = {}
+        """artefacts of work that has not succeeded yet, by finding: nothing else may know of them"""
 
     @DBOS.workflow()
     def work(self, arguments: dict[str, Any]) -> None:
@@ -50,21 +60,32 @@ class Workshop(DBOSConfiguredInstance):
         started = time.monotonic()
         try:
             run_id = _step("begin", self._begin, arguments)
-            _BODIES[RunKind(job.kind)](self.place, job, run_id, _step)
+            place = self.place.noting(self.stored.setdefault(job.finding, set()))
+            _BODIES[RunKind(job.kind)](place, job, run_id, _step)
             _step("finish", self._finish, run_id)
+            self.stored.pop(job.finding, None)
             log.info("%s done in %.1f s", job.finding, time.monotonic() - started)
         except AppError as refusal:  # foreseen, and already in words for people
             log.warning("%s: %s", job.finding, refusal.message)
             _step("fail", self._fail, job.finding, refusal.message)
         except Exception as error:  # the worker's edge: one failed job must not stop the others
+            if self._is_pointless(job):
+                log.info("%s is abandoned: the participant has withdrawn", job.finding)
+                return
             log.exception("%s failed", job.finding)
             _step("fail", self._fail, job.finding, f"{type(error).__name__}: {error}")
         finally:
             self.in_hand.discard(job.finding)
 
+    def _is_pointless(self, job: Job) -> bool:
+        with self.place.database.reading() as session:
+            return _has_withdrawn(session, job)
+
     def _begin(self, arguments: dict[str, Any]) -> int:
         job = Job(**arguments)
         with self.place.database.writing() as session:
+            if _has_withdrawn(session, job):
+                raise ParticipantWithdrew
             return records.begin_run(session, job, _seed(session, job))
 
     def _finish(self, run_id: int) -> None:
@@ -78,6 +99,12 @@ class Workshop(DBOSConfiguredInstance):
 
 def _step(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
     return DBOS.run_step({"name": name}, function, *arguments)
+
+
+def _has_withdrawn(session: Session, job: Job) -> bool:
+    if job.participant_id is None:
+        return False
+    return session.get_one(Participant, job.participant_id).withdrawn_at is not None
 
 
 def _seed(session: Session, job: Job) -> int:

@@ -1,0 +1,185 @@
+"""What an evaluation shows: films of the robots in scenarios that nothing else uses, or controllers for a real one.
+
+Three kinds of runs: ``before-after`` (the participant's robot beside the reference, for debriefing and experimenters),
+``trials`` (everything that is rated in video mode), ``controllers`` (one file per letter in physical mode).
+"""
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from app.domain.evaluation import Controller, Film, Trial
+from app.domain.models import ModelKind, RunKind
+from app.domain.protocol import EvaluatedMethod, EvaluationMode
+from app.domain.studies import Participant, Study
+from app.services import evaluating
+from worker import laboratory, method_work, records, rivals
+from worker.compute import Lane
+from worker.filter_work import NothingToLearnFrom
+from worker.laboratory import RecordedClip
+from worker.records import Job
+from worker.workplace import Step, Workplace
+
+AT_A_TIME = 2
+"""Films between two marks of progress."""
+BEFORE_AFTER, TRIALS, CONTROLLERS = "before-after", "trials", "controllers"
+
+
+@dataclass(frozen=True)
+class Robot:
+    """One method as it is shown to one participant."""
+
+    method: str
+    model_id: int | None
+    controller: bytes
+
+
+def due(study: Study, participant: Participant, ending: str, succeeded: Collection[str]) -> list[Job]:
+    """What is to be filmed or packed for somebody whose last filter is there. ``ending``: labels and last answer."""
+    wanted = [BEFORE_AFTER] if study.material is None else []
+    settings = evaluating.settings_of(study)
+    if settings and method_work.all_trained(study, participant, ending, succeeded):
+        wanted.append(TRIALS if settings.mode is EvaluationMode.VIDEO else CONTROLLERS)
+    labels = study.settings.labels_per_participant
+    return [
+        Job(f"films/participant-{participant.id}/{what}/{ending}", RunKind.FILMS, study.id, participant.id, labels)
+        for what in reversed(wanted)  # somebody may be waiting for the trials
+    ]
+
+
+def make_films(place: Workplace, job: Job, run_id: int, step: Step) -> None:
+    """Make what the job names; a killed worker loses two films at most."""
+    what = job.finding.split("/")[2]
+    shots = step("plan", _plan, place, job, what)
+    for first in range(0, len(shots), AT_A_TIME):
+        place.report(run_id, f"{_DOING[what]} {first + 1} of {len(shots)}", first / len(shots))
+        some = shots[first : first + AT_A_TIME]
+        step(f"shots-{first}", _pack if what == CONTROLLERS else _film, place, run_id, job, some)
+
+
+_DOING = {BEFORE_AFTER: "filming before and after,", TRIALS: "filming robot", CONTROLLERS: "packing robot"}
+
+
+def _plan(place: Workplace, job: Job, what: str) -> list[list[Any]]:
+    """[method, scenario] of every film, or [method, letter] of every controller. Draws the evaluation if need be."""
+    with place.database.writing() as session:
+        study, participant = session.get_one(Study, job.study_id), session.get_one(Participant, job.participant)
+        if what == BEFORE_AFTER:
+            methods = (EvaluatedMethod.REFERENCE.value, EvaluatedMethod.PBARL.value)
+            return [
+                [method, scenario] for scenario in evaluating.comparison_scenarios(participant) for method in methods
+            ]
+        evaluating.draw(session, study, participant)
+        letters = {each.letter: each.method for each in evaluating.assignments_of(session, participant.id)}
+        if what == CONTROLLERS:
+            return [[method, letter] for letter, method in letters.items()]
+        return [[letters[each.letter], each.scenario] for each in evaluating.trials_of(session, participant.id)]
+
+
+def _film(place: Workplace, run_id: int, job: Job, shots: list[list[Any]]) -> None:
+    task = _task(place, job)
+    robots = {method: _robot(place, run_id, job, task, method) for method in dict.fromkeys(each[0] for each in shots)}
+    with place.database.reading() as session:
+        missing = [
+            (robots[method], scenario)
+            for method, scenario in shots
+            if evaluating.film_of(session, job.participant, method, scenario, robots[method].model_id) is None
+        ]
+    arguments = [(task, robot.controller, scenario) for robot, scenario in missing]
+    recorded = place.compute.run_all(Lane.CLIPS, place.beat(run_id), laboratory.film, arguments)
+    files = [_stored(place, each) for each in recorded]
+    with place.database.writing() as session:
+        for (robot, scenario), columns in zip(missing, files, strict=True):
+            _save(session, job.participant, robot, scenario, columns)
+        for method, scenario in shots:
+            _show(session, job.participant, method, scenario, robots[method].model_id)
+
+
+def _stored(place: Workplace, recorded: RecordedClip) -> dict[str, Any]:
+    clip = recorded.clip
+    return {
+        "success": recorded.success,
+        "trajectory_sha256": place.store.put(recorded.trajectory),
+        "video_sha256": place.store.put(clip.video),
+        "poster_sha256": place.store.put(clip.poster),
+        "width": clip.width,
+        "height": clip.height,
+        "fps": clip.fps,
+        "duration_ms": clip.duration_ms,
+        "byte_count": len(clip.video),
+    }
+
+
+def _save(session: Session, participant_id: int, robot: Robot, scenario: int, columns: dict[str, Any]) -> None:
+    """Record a film; doing it twice changes nothing."""
+    if evaluating.film_of(session, participant_id, robot.method, scenario, robot.model_id) is None:
+        film = Film(participant_id=participant_id, method=robot.method, model_id=robot.model_id, scenario=scenario)
+        for name, value in columns.items():
+            setattr(film, name, value)
+        session.add(film)
+        session.flush()
+
+
+def _show(session: Session, participant_id: int, method: str, scenario: int, model_id: int | None) -> None:
+    """Give the film to the trial it was made for, unless the participant has begun to watch older ones."""
+    trials = session.scalars(select(Trial).where(Trial.participant_id == participant_id)).all()
+    film = evaluating.film_of(session, participant_id, method, scenario, model_id)
+    if film is None or any(trial.shown_at is not None for trial in trials):
+        return
+    letters = {each.method: each.letter for each in evaluating.assignments_of(session, participant_id)}
+    for trial in trials:
+        if trial.letter == letters.get(method) and trial.scenario == scenario:
+            trial.film_id = film.id
+
+
+def _pack(place: Workplace, run_id: int, job: Job, shots: list[list[Any]]) -> None:
+    task = _task(place, job)
+    with place.database.reading() as session:
+        slug, code = session.get_one(Study, job.study_id).slug, session.get_one(Participant, job.participant).code
+    for method, letter in shots:
+        robot = _robot(place, run_id, job, task, method)
+        packed = rivals.packed(task, slug, code, letter, robot.controller)
+        artefact = place.store.put(packed)
+        with place.database.writing() as session:
+            _keep_controller(session, job.participant, robot, artefact, len(packed))
+
+
+def _keep_controller(session: Session, participant_id: int, robot: Robot, artefact: str, byte_count: int) -> None:
+    """Record a controller; a newer one replaces it until the robot has been started."""
+    theirs = select(Controller).where(Controller.participant_id == participant_id, Controller.method == robot.method)
+    known = session.scalar(theirs)
+    begun = select(Trial.id).where(Trial.participant_id == participant_id, Trial.started_at.is_not(None)).limit(1)
+    if known is None:
+        known = Controller(participant_id=participant_id, method=robot.method)
+        session.add(known)
+    elif session.scalar(begun) is not None:
+        return
+    known.model_id, known.artefact_sha256, known.byte_count = robot.model_id, artefact, byte_count
+
+
+def _robot(place: Workplace, run_id: int, job: Job, task: str, method: str) -> Robot:
+    """The method's newest controller for this participant. Raises NothingToLearnFrom when nothing was ever trained."""
+    beat = place.beat(run_id)
+    if method == EvaluatedMethod.REFERENCE:
+        return Robot(method, None, place.compute.run(Lane.LEARNING, beat, rivals.controller_of_reference, task))
+    if method == EvaluatedMethod.PBARL:
+        with place.database.reading() as session:
+            model = records.newest_model(session, job.participant, ModelKind.FILTER)
+        if model is None:
+            raise NothingToLearnFrom
+        weights = place.store.read(model.artefact_sha256)
+        stored = place.compute.run(Lane.LEARNING, beat, rivals.controller_of_filter, task, weights)
+        return Robot(method, model.id, stored)
+    with place.database.reading() as session:
+        found = method_work.newest(session, job.participant, method)
+    if found is None:
+        raise NothingToLearnFrom
+    return Robot(method, found[0], place.store.read(found[1]))
+
+
+def _task(place: Workplace, job: Job) -> str:
+    with place.database.reading() as session:
+        return session.get_one(Study, job.study_id).task

@@ -1,0 +1,123 @@
+"""What the compute processes do for a blinded evaluation: fit a method that is only evaluated, and write controllers.
+
+Every function takes and returns plain arrays and bytes. A trained method is kept as its controller: one ONNX model from
+observations to actions, so what is evaluated, filmed and run on a robot is one and the same file.
+"""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from worker import laboratory, lessons
+from worker.ml import controller, methods, studio_filter
+from worker.ml.action_filter import FilterWeights
+from worker.ml.checkpoint import Checkpoint
+from worker.ml.controller import Blinded
+from worker.ml.methods import MethodConfig, Setting
+from worker.ml.preference_rl import PolicyAct
+from worker.ml.prefft import FineTuning
+from worker.ml.response_surface import ResponseSurface
+from worker.ml.reward_models import MlpReward, load_reward_model
+from worker.ml.run_controller import Controller
+from worker.ml.studio_filter import Act, FilterProblem
+from worker.trajectory import Trajectory
+
+COMPARED_EPISODES = 2
+"""Episodes of the reference policy in whose observations a controller is compared with the method it was made of."""
+
+
+@dataclass(frozen=True)
+class Rival:
+    """A method to be fitted for one participant."""
+
+    task: str
+    method: str
+    reward: bytes
+    action_reward: bytes
+    """a reward model of the same labels on states and actions; empty where the method does not need one"""
+    labels: int
+    seed: int
+    fine_tuning_steps: int
+
+
+@dataclass(frozen=True)
+class FittedRival:
+    """A fitted method."""
+
+    controller: bytes
+    notes: tuple[str, ...]
+    seconds: float
+
+
+def fit(rival: Rival, folder: Path) -> FittedRival:
+    """Fit it on one core, keeping checkpoints in the folder. Raises Abandoned when the folder is removed."""
+    torch.set_num_threads(1)
+    started = time.perf_counter()
+    fitted = methods.fit(rival.method, _setting(rival, Checkpoint(folder)))
+    stored = controller.of_act(fitted.act, observations(rival.task))
+    return FittedRival(stored, fitted.notes, round(time.perf_counter() - started, 1))
+
+
+def controller_of_reference(task: str) -> bytes:
+    """The frozen policy as a controller."""
+    return controller.of_act(PolicyAct(laboratory.reference_policy(task)), observations(task))
+
+
+def controller_of_filter(task: str, weights: bytes) -> bytes:
+    """The frozen policy with somebody's filter behind it as a controller."""
+    policy, family = laboratory.reference_policy(task), laboratory.task(task).modes
+    act = studio_filter.act_of(family, policy, FilterWeights.from_bytes(weights))
+    return controller.of_act(act, observations(task))
+
+
+def packed(task: str, study: str, participant: str, letter: str, model: bytes) -> bytes:
+    """A controller as its operator gets it, by letter."""
+    return controller.write(Blinded(laboratory.task(task), study, participant, letter, model, observations(task)))
+
+
+def drive(task: str, model: bytes, scenarios: Sequence[int]) -> list[Trajectory]:
+    """One rollout per scenario."""
+    return lessons.run_scenarios(task, Controller(model), scenarios, 0.0, 0)
+
+
+def observations(task: str) -> npt.NDArray[np.float32]:
+    """What the reference policy sees in some episodes, (N, D): the same for everybody and every method."""
+    episodes = laboratory.reference_rollouts(task, count=COMPARED_EPISODES)
+    return np.concatenate([each.observations[:-1] for each in episodes]).astype(np.float32)
+
+
+def _setting(rival: Rival, checkpoint: Checkpoint) -> Setting:
+    task = laboratory.task(rival.task)
+    policy = laboratory.reference_policy(rival.task)
+    return Setting(
+        problem=FilterProblem(task, policy, load_reward_model(rival.reward), rival.seed),
+        labels=rival.labels,
+        pool=(),
+        surface=_no_surface,
+        action_reward=lambda: _action_reward(rival),
+        reference=lambda scenarios: _collect(rival.task, policy.mean, scenarios, 0.0, 0),
+        collect=lambda act, scenarios, noise, seed: _collect(rival.task, act, scenarios, noise, seed),
+        make_env=laboratory.environment_class(rival.task),
+        config=MethodConfig(fine_tuning=FineTuning(steps=rival.fine_tuning_steps)),
+        checkpoint=checkpoint,
+    )
+
+
+def _collect(task: str, act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
+    return lessons.run_scenarios(task, act, scenarios, noise, seed)
+
+
+def _action_reward(rival: Rival) -> MlpReward:
+    model = load_reward_model(rival.action_reward)
+    if not isinstance(model, MlpReward):
+        raise TypeError(f"{rival.method} needs a reward model on states and actions, not {type(model).__name__}.")
+    return model
+
+
+def _no_surface() -> ResponseSurface:
+    raise NotImplementedError("The participant's own filter is trained by worker.filter_work.")
