@@ -1,0 +1,185 @@
+"""What the worker does when somebody withdraws while it works for them, with the real engine and its real files."""
+
+import base64
+import threading
+import time
+from collections.abc import Callable, Iterator
+from functools import cache
+from pathlib import Path
+from typing import cast
+
+import pytest
+from dbos import DBOS, SetWorkflowID
+
+from app.db import Database
+from app.domain.models import ModelKind, RunKind
+from app.domain.studies import Participant
+from app.services import withdrawal
+from app.settings import Settings
+from app.storage import ArtefactStore
+from worker import erasure, records, service, workflows
+from worker.compute import Compute
+from worker.reconcile import findings, short_of_queries
+from worker.records import Job
+from worker.workflows import Workshop, as_arguments
+from worker.workplace import Step, Workplace
+
+MARK = b"ERASE-ME-"
+PATIENCE_S = 20.0
+
+
+class Work:
+    """Work for one person that stores a draft, waits to be told to go on, and stores its result."""
+
+    def __init__(self) -> None:
+        self.waits, self.may_go_on = threading.Event(), threading.Event()
+
+    def __call__(self, place: Workplace, job: Job, run_id: int, step: Step) -> None:
+        step("draft", self.draft, place)
+        step("save", self.save, place, run_id)
+
+    def draft(self, place: Workplace) -> str:
+        return place.store.put(MARK + b"draft")
+
+    def save(self, place: Workplace, run_id: int) -> None:
+        self.waits.set()
+        assert self.may_go_on.wait(PATIENCE_S)
+        artefact = place.store.put(MARK + b"late model")
+        with place.database.writing() as session:
+            records.set_labels(session, run_id, 10, "h" * 64)
+            records.save_model(session, run_id, ModelKind.FILTER, artefact, {"mark": MARK.decode()})
+
+
+@pytest.fixture
+def work(monkeypatch: pytest.MonkeyPatch) -> Work:
+    work = Work()
+    monkeypatch.setitem(workflows._BODIES, RunKind.FILTER, work)
+    return work
+
+
+@cache
+def the_workshop() -> Workshop:
+    """The engine knows one workshop per process."""
+    return Workshop(cast("Workplace", None))
+
+
+@pytest.fixture
+def workshop(settings: Settings, database: Database, store: ArtefactStore) -> Iterator[Workshop]:
+    """A worker's engine on the data directory."""
+    workshop, compute = the_workshop(), Compute(1)
+    workshop.place = Workplace(database, store, compute)
+    service._launch_engine(settings)
+    yield workshop
+    DBOS.destroy(destroy_registry=False)
+    compute.close()
+
+
+@pytest.fixture
+def job(participant: Participant) -> Job:
+    return Job(f"filter/participant-{participant.id}/{MARK.decode()}", RunKind.FILTER, 1, participant.id, 10)
+
+
+def start(workshop: Workshop, job: Job) -> None:
+    with SetWorkflowID(f"{job.finding}#1"):
+        DBOS.enqueue_workflow(RunKind.FILTER, workshop.work, as_arguments(job))
+
+
+def withdraw(database: Database, store: ArtefactStore, participant_id: int) -> None:
+    with database.writing() as session:
+        withdrawal.withdraw(session, store, session.get_one(Participant, participant_id), actor="P01")
+
+
+def erase(workshop: Workshop, settings: Settings, participant_id: int) -> bool:
+    engine = service.engine_file(settings)
+    place = workshop.place
+    return erasure.erase_traces(place, participant_id, workshop.in_hand, workshop.stored, engine).finished
+
+
+def until(condition: Callable[[], bool]) -> bool:
+    """Whether it became true in time."""
+    deadline = time.monotonic() + PATIENCE_S
+    pause = threading.Event()
+    while not condition():
+        if time.monotonic() > deadline:
+            return False
+        pause.wait(0.05)
+    return True
+
+
+def traces(folder: Path) -> list[str]:
+    """Files that hold the mark, as it is or as the engine writes it."""
+    written = [MARK, *(base64.b64encode(b"x" * offset + MARK)[4:-4] for offset in range(3))]
+    return [
+        str(path.relative_to(folder))
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and any(each in path.read_bytes() for each in written)
+    ]
+
+
+def test_work_under_way_is_abandoned_and_neither_draft_nor_late_result_nor_note_is_left(
+    workshop: Workshop, work: Work, job: Job, participant: Participant, settings: Settings
+) -> None:
+    place = workshop.place
+    start(workshop, job)
+    assert work.waits.wait(PATIENCE_S)
+    assert any("engine" in name for name in traces(settings.data_dir)), "the engine keeps inputs: something to erase"
+    withdraw(place.database, place.store, participant.id)
+    assert not erase(workshop, settings, participant.id), "it is still being worked on"
+    with place.database.reading() as session:
+        assert erasure.unfinished(session) == [participant.id]
+    work.may_go_on.set()
+    assert until(lambda: erase(workshop, settings, participant.id))
+    assert traces(settings.data_dir) == []
+    assert DBOS.list_workflows() == []
+    with place.database.reading() as session:
+        assert erasure.unfinished(session) == []
+        assert session.get_one(Participant, participant.id).erased_at is not None
+
+
+def test_finished_work_is_forgotten_and_its_drafts_are_erased(
+    workshop: Workshop, work: Work, job: Job, participant: Participant, settings: Settings
+) -> None:
+    place = workshop.place
+    work.may_go_on.set()
+    start(workshop, job)
+    assert until(lambda: [each.status for each in DBOS.list_workflows()] == ["SUCCESS"])
+    withdraw(place.database, place.store, participant.id)
+    assert traces(settings.data_dir) != [], "the draft is known to the engine alone"
+    assert until(lambda: erase(workshop, settings, participant.id))
+    assert traces(settings.data_dir) == []
+
+
+def test_work_that_begins_after_the_withdrawal_does_nothing(
+    workshop: Workshop, work: Work, job: Job, participant: Participant, settings: Settings
+) -> None:
+    place = workshop.place
+    withdraw(place.database, place.store, participant.id)
+    start(workshop, job)
+    assert until(lambda: erase(workshop, settings, participant.id))
+    assert not work.waits.is_set()
+    assert traces(settings.data_dir) == []
+
+
+def test_what_the_worker_keeps_of_others_stays(
+    workshop: Workshop, work: Work, job: Job, participant: Participant, settings: Settings
+) -> None:
+    place = workshop.place
+    with place.database.writing() as session:
+        other = Participant(study_id=participant.study_id, number=99, token_sha256="o" * 64, seed=1)
+        session.add(other)
+    work.may_go_on.set()
+    start(workshop, Job("filter/of-another", RunKind.FILTER, participant.study_id, other.id, 10))
+    assert until(lambda: [each.status for each in DBOS.list_workflows()] == ["SUCCESS"])
+    withdraw(place.database, place.store, participant.id)
+    assert until(lambda: erase(workshop, settings, participant.id))
+    assert [each.workflow_id for each in DBOS.list_workflows()] == ["filter/of-another#1"]
+    assert len(traces(settings.data_dir)) == 3, "the other's draft, model, and row"
+
+
+def test_nothing_is_due_for_somebody_who_has_withdrawn(
+    database: Database, store: ArtefactStore, participant: Participant
+) -> None:
+    withdraw(database, store, participant.id)
+    with database.reading() as session:
+        assert participant.id not in short_of_queries(session)
+        assert participant.id not in {job.participant_id for job, _ in findings(session)}
