@@ -1,24 +1,30 @@
 """Clips: every behaviour of one scenario of a study's pool, rolled out and filmed."""
 
+from typing import Any
+
 from app.domain.studies import Study
 from worker import laboratory, records
 from worker.compute import Lane
 from worker.records import Job
+from worker.sim.render import RenderedClip
 from worker.workplace import Step, Workplace
 
+WHOLE = "whole"
+"""In the name of a finding: whole episodes of the scenario's rollouts are missing, for the introduction."""
 AT_A_TIME = 2
 """Two clips already make a pair that can be labelled."""
 
 
 def build_clips(place: Workplace, job: Job, run_id: int, step: Step) -> None:
-    """Film what is still missing of the scenario that the job names."""
-    scenario = int(job.finding.rsplit("-", 1)[1])
+    """Film what is still missing of the scenario that the job names: clips, or whole episodes."""
+    what, number = job.finding.rsplit("/", 1)[1].rsplit("-", 1)
+    film = _film_whole if what == WHOLE else _film
     with place.database.reading() as session:
         count = session.get_one(Study, job.study_id).settings.behaviours_per_scenario
     for first in range(0, count, AT_A_TIME):
         which = list(range(first, min(first + AT_A_TIME, count)))
         place.report(run_id, f"filming behaviours {which[0] + 1} to {which[-1] + 1} of {count}", first / count)
-        step(f"film-{first}", _film, place, run_id, job.study_id, scenario, which)
+        step(f"film-{first}", film, place, run_id, job.study_id, int(number), which)
 
 
 def _film(place: Workplace, run_id: int, study_id: int, scenario: int, which: list[int]) -> None:
@@ -36,16 +42,34 @@ def _film(place: Workplace, run_id: int, study_id: int, scenario: int, which: li
             "trajectory_sha256": place.store.put(each.trajectory),
             "success": each.success,
         }
-        clip = {
-            "first_step": 0,
-            "step_count": settings.clip_steps,
-            "video_sha256": place.store.put(each.clip.video),
-            "poster_sha256": place.store.put(each.clip.poster),
-            "width": each.clip.width,
-            "height": each.clip.height,
-            "fps": each.clip.fps,
-            "duration_ms": each.clip.duration_ms,
-            "byte_count": len(each.clip.video),
-        }
+        clip = _stored(place, each.clip, settings.clip_steps)
         with place.database.writing() as session:
             records.save_clip(session, study_id, rollout, clip)
+
+
+def _film_whole(place: Workplace, run_id: int, study_id: int, scenario: int, which: list[int]) -> None:
+    """The same rollouts again, from beginning to end."""
+    with place.database.reading() as session:
+        steps = session.get_one(Study, study_id).whole_clip_steps or 0
+        rollouts = records.rollouts_of(session, study_id, scenario, which)
+    shots = [(place.store.read(rollout.trajectory_sha256), 0, steps) for rollout in rollouts]
+    filmed = place.compute.run_all(Lane.CLIPS, place.beat(run_id), laboratory.film_again, shots)
+    for rollout, each in zip(rollouts, filmed, strict=True):
+        clip = _stored(place, each, steps)
+        with place.database.writing() as session:
+            records.save_clip(session, study_id, {"scenario": scenario, "behaviour": rollout.behaviour}, clip)
+
+
+def _stored(place: Workplace, clip: RenderedClip, steps: int) -> dict[str, Any]:
+    """The clip's columns, once its files are stored."""
+    return {
+        "first_step": 0,
+        "step_count": steps,
+        "video_sha256": place.store.put(clip.video),
+        "poster_sha256": place.store.put(clip.poster),
+        "width": clip.width,
+        "height": clip.height,
+        "fps": clip.fps,
+        "duration_ms": clip.duration_ms,
+        "byte_count": len(clip.video),
+    }

@@ -16,10 +16,11 @@ from sqlalchemy.orm import Session, contains_eager, joinedload
 
 from app.domain.clips import Clip, Rollout
 from app.domain.preferences import Label, Query, Response, current_labels
+from app.domain.studies import Study
 from app.errors import AppError
 from app.storage import ArtefactStore
 from worker.ml import acquisition
-from worker.ml.segments import SegmentPairs
+from worker.ml.segments import SegmentPairs, Stretch
 from worker.trajectory import Array, OutdatedTrajectory, Trajectory
 
 
@@ -50,7 +51,7 @@ class Preferences:
     targets: Array
     """(N,) in {0, 1/2, 1}"""
     label_count: int
-    """How many answers were given, those without a target included."""
+    """How many labels were given, those without a target included."""
     label_hash: str
 
 
@@ -83,20 +84,32 @@ def load_preferences(session: Session, store: ArtefactStore, participant_id: int
 
 
 def segment_pairs(store: ArtefactStore, pairs: Sequence[tuple[Clip, Clip]]) -> SegmentPairs:
-    """The segments shown by one or more pairs of clips, left first. All clips of a study are equally long."""
-    first, count = pairs[0][0].first_step, pairs[0][0].step_count
-    return SegmentPairs.cut([(shown(store, left), shown(store, right)) for left, right in pairs], first, count)
+    """The segments shown by one or more pairs of clips, left first; whole trajectories may be among them."""
+    return SegmentPairs.of([(stretch(store, left), stretch(store, right)) for left, right in pairs])
+
+
+def stretch(store: ArtefactStore, clip: Clip) -> Stretch:
+    """What a clip shows."""
+    return Stretch(shown(store, clip), clip.first_step, clip.step_count)
 
 
 def pool_clips(session: Session, study_id: int) -> Sequence[Clip]:
-    """Every clip of the study's pool with its rollout."""
-    return session.scalars(
-        select(Clip)
-        .join(Rollout)
-        .where(Rollout.study_id == study_id)
-        .order_by(Clip.id)
-        .options(contains_eager(Clip.rollout))
-    ).all()
+    """Every clip of the study's pool with its rollout; of imported clips all, whatever their length."""
+    study = session.get_one(Study, study_id)
+    return _clips(session, study, study.settings.clip_steps)
+
+
+def whole_clips(session: Session, study_id: int) -> Sequence[Clip]:
+    """Clips of whole episodes with their rollouts; of imported clips all."""
+    study = session.get_one(Study, study_id)
+    return _clips(session, study, study.whole_clip_steps)
+
+
+def _clips(session: Session, study: Study, step_count: int | None) -> Sequence[Clip]:
+    of_study = select(Clip).join(Rollout).where(Rollout.study_id == study.id)
+    if study.material is None:
+        of_study = of_study.where(Clip.step_count == step_count)
+    return session.scalars(of_study.order_by(Clip.id).options(contains_eager(Clip.rollout))).all()
 
 
 def matched_pairs(clips: Sequence[Clip]) -> list[tuple[Clip, Clip]]:

@@ -151,6 +151,11 @@ def film(name: str, controller: bytes, scenario: int) -> RecordedClip:
     return RecordedClip(target.getvalue(), trajectory.success, renderer().render_clip(trajectory, 0, len(trajectory)))
 
 
+def film_again(trajectory: bytes, first_step: int, step_count: int) -> RenderedClip:
+    """Another stretch of a rollout that was recorded before."""
+    return renderer().render_clip(Trajectory.load(io.BytesIO(trajectory)), first_step, step_count)
+
+
 @lru_cache(maxsize=4)
 def reference_rollouts(
     name: str, first: int = REFERENCE_SCENARIOS, count: int = REFERENCE_COUNT

@@ -16,6 +16,7 @@ from app.domain.models import Run, RunKind, RunStatus
 from app.domain.preferences import LEARNED_FROM, LabelEvent, Query, current_labels
 from app.domain.studies import Participant, Study, StudySettings
 from worker import film_work, method_work
+from worker.clip_work import WHOLE
 from worker.records import ATTEMPTS, LEASE, Job, next_queries
 
 CLIPS_AHEAD = 2
@@ -84,18 +85,30 @@ def _attempt_due(run: Run | None, moment: datetime) -> int | None:
 
 
 def _missing_clips(session: Session, study: Study) -> list[Job]:
-    settings = study.settings
-    made = dict(
-        session.execute(
-            select(Rollout.scenario, func.count(Clip.id))
-            .join(Clip)
-            .where(Rollout.study_id == study.id, Clip.step_count == settings.clip_steps)
-            .group_by(Rollout.scenario)
-        ).all()
+    """Clips of every scenario; of the first ones also whole episodes, as soon as they were rolled out."""
+    if study.material is not None:
+        return []  # brought along by the study
+    settings, jobs = study.settings, []
+    clips = _clips_by_scenario(session, study, settings.clip_steps)
+    whole = _clips_by_scenario(session, study, study.whole_clip_steps)
+    for index in range(settings.pool_scenarios):
+        seed = scenario_seed(study.seed, index)
+        if clips.get(seed, 0) < settings.behaviours_per_scenario:
+            jobs.append(Job(f"clips/study-{study.id}/scenario-{seed}", RunKind.CLIPS, study.id))
+        elif index < settings.introduction_scenarios and whole.get(seed, 0) < settings.behaviours_per_scenario:
+            jobs.append(Job(f"clips/study-{study.id}/{WHOLE}-{seed}", RunKind.CLIPS, study.id))
+    return jobs[:CLIPS_AHEAD]
+
+
+def _clips_by_scenario(session: Session, study: Study, step_count: int | None) -> dict[int, int]:
+    """How many clips of this length there are of each scenario."""
+    counted = (
+        select(Rollout.scenario, func.count(Clip.id))
+        .join(Clip)
+        .where(Rollout.study_id == study.id, Clip.step_count == step_count)
+        .group_by(Rollout.scenario)
     )
-    wanted = [scenario_seed(study.seed, index) for index in range(settings.pool_scenarios)]
-    missing = [seed for seed in wanted if made.get(seed, 0) < settings.behaviours_per_scenario]
-    return [Job(f"clips/study-{study.id}/scenario-{seed}", RunKind.CLIPS, study.id) for seed in missing[:CLIPS_AHEAD]]
+    return dict(session.execute(counted).all())
 
 
 def scenario_seed(study_seed: int, index: int) -> int:

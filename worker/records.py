@@ -15,7 +15,7 @@ from sqlalchemy.sql.base import ExecutableOption
 from app.db import now
 from app.domain.clips import Clip, Rollout
 from app.domain.models import Bundle, Model, ModelKind, Run, RunKind, RunStatus, WorkerPresence
-from app.domain.preferences import LabelEvent, Query
+from app.domain.preferences import LabelEvent, Purpose, Query
 from app.domain.studies import Participant, StudySettings
 
 ATTEMPTS = 3
@@ -99,6 +99,12 @@ def save_clip(session: Session, study_id: int, rollout: dict[str, Any], clip: di
         session.add(Clip(rollout_id=known.id, **clip))
 
 
+def rollouts_of(session: Session, study_id: int, scenario: int, behaviours: Sequence[int]) -> Sequence[Rollout]:
+    """What was recorded of these behaviours of a scenario, in their order."""
+    mine = select(Rollout).where(Rollout.study_id == study_id, Rollout.scenario == scenario)
+    return session.scalars(mine.where(Rollout.behaviour.in_(behaviours)).order_by(Rollout.behaviour)).all()
+
+
 def save_model(session: Session, run_id: int, kind: ModelKind, artefact_sha256: str, metrics: dict[str, Any]) -> Model:
     """Record the result of a run; a repeat returns the model that is already there."""
     known = session.scalar(select(Model).where(Model.run_id == run_id))
@@ -166,24 +172,61 @@ def unanswered(session: Session, participant_id: int, *options: ExecutableOption
 
 def next_queries(session: Session, participant_id: int, settings: StudySettings) -> tuple[int, int]:
     """The next free ordinal, and how many queries to make so that the participant neither waits nor gets too many."""
-    made = session.scalar(select(func.count(Query.id)).where(Query.participant_id == participant_id)) or 0
-    newest = session.scalar(select(func.max(Query.ordinal)).where(Query.participant_id == participant_id)) or 0
-    waiting = len(unanswered(session, participant_id))
-    return newest + 1, max(0, min(QUERIES_AHEAD - waiting, settings.labels_per_participant - made))
+    free = free_ordinals(session, participant_id, settings)
+    return (free[0] if free else settings.practice_pairs + settings.question_count + 1), len(free)
 
 
-def save_queries(session: Session, participant_id: int, ordinal: int, rows: list[dict[str, Any]]) -> None:
-    """Add queries, the first of them at this ordinal; nothing happens when somebody else has been faster."""
-    newest = session.scalar(select(func.max(Query.ordinal)).where(Query.participant_id == participant_id)) or 0
-    if newest + 1 == ordinal:
-        session.add_all(Query(participant_id=participant_id, **row) for row in rows)
+def free_ordinals(session: Session, participant_id: int, settings: StudySettings) -> list[int]:
+    """The next places in the participant's plan without a query, as many as should be waiting."""
+    taken = set(session.scalars(select(Query.ordinal).where(Query.participant_id == participant_id)))
+    places = range(1, settings.practice_pairs + settings.question_count + 1)
+    if len(taken) >= len(places):
+        return []
+    room = QUERIES_AHEAD - len(unanswered(session, participant_id))
+    return [place for place in places if place not in taken][: max(0, room)]
+
+
+def save_queries(session: Session, participant_id: int, rows: list[dict[str, Any]]) -> None:
+    """Add queries at ordinals that are still free: somebody else may have been faster.
+
+    A row with ``repeats_ordinal`` asks the query of that place again, which is there or in an earlier row; if it has
+    gone meanwhile, this row and those after it are left to the next round.
+    """
+    known = dict(session.execute(select(Query.ordinal, Query.id).where(Query.participant_id == participant_id)).all())
+    for row in rows:
+        if row["ordinal"] in known:
+            continue
+        columns = {name: value for name, value in row.items() if name != "repeats_ordinal"}
+        asked_again = row.get("repeats_ordinal")
+        if asked_again is not None:
+            if asked_again not in known:
+                return
+            columns["repeats_query_id"] = known[asked_again]
+        query = Query(participant_id=participant_id, **columns)
+        session.add(query)
+        session.flush()
+        known[query.ordinal] = query.id
 
 
 def drop_unseen_queries(session: Session, participant_id: int, keep: int) -> None:
-    """Forget queries nobody has seen, the next few excepted, so that a newer model can choose others."""
-    for query in unanswered(session, participant_id)[keep:]:
-        if query.served_at is None:
+    """Forget pairs nobody has seen, the next few excepted, so that a newer model can choose others for their places.
+
+    Their repetitions go with them; practice, introduction and catch pairs were not chosen by a model and stay.
+    """
+    later = unanswered(session, participant_id)[keep:]
+    held = {query.repeats_query_id for query in later if query.served_at is not None}
+    chosen = [
+        query
+        for query in later
+        if query.served_at is None and query.purpose == Purpose.PREFERENCE and query.id not in held
+    ]
+    gone = {query.id for query in chosen}
+    for query in later:
+        if query.repeats_query_id in gone:
             session.delete(query)
+    session.flush()  # what refers to others goes first
+    for query in chosen:
+        session.delete(query)
 
 
 def save_predictions(session: Session, model_id: int, probabilities: dict[int, float]) -> None:

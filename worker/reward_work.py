@@ -1,8 +1,10 @@
 """Reward models: learn from everything one participant has said, then choose and predict what comes next."""
 
+from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from app.domain.models import Model, ModelKind
+from app.domain.preferences import Query
 from app.domain.studies import Participant, Strategy, Study
 from worker import dataset, lessons, querying, records
 from worker.compute import Lane
@@ -29,6 +31,7 @@ def _fit(place: Workplace, run_id: int, participant_id: int) -> None:
         earlier = earlier_models(session, participant, study) if study.settings.pooled_prior else []
         preferences = dataset.load_preferences(session, place.store, participant_id)
         pool = dataset.pool_pairs(session, place.store, participant.study_id)
+        notes = _notes(session, participant_id)
     if preferences.pairs is None:
         return  # nothing but "can't tell" so far: there is nothing to learn from
     place.report(run_id, f"learning from {preferences.label_count} labels", 0.2)
@@ -45,9 +48,23 @@ def _fit(place: Workplace, run_id: int, participant_id: int) -> None:
         [place.store.read(model.artefact_sha256) for model in earlier],
     )
     artefact = place.store.put(stored)
+    metrics["notes"] = notes
     with place.database.writing() as session:
         records.set_labels(session, run_id, preferences.label_count, preferences.label_hash)
         records.save_model(session, run_id, ModelKind.REWARD, artefact, metrics)
+
+
+def _notes(session: Session, participant_id: int) -> list[str]:
+    """What should be known about the pairs this participant was given."""
+    substitutes = select(func.count(Query.id)).where(
+        Query.participant_id == participant_id, Query.strategy == querying.NO_OBVIOUS_PAIR
+    )
+    count = session.scalar(substitutes) or 0
+    if not count:
+        return []
+    return [
+        f"{count} catch pairs could not be had: the pool had no pair with an obvious answer. Repeats took the place."
+    ]
 
 
 def earlier_models(session: Session, participant: Participant, study: Study) -> list[Model]:

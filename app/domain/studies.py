@@ -108,14 +108,31 @@ class StudySettings(BaseModel):
 
     @model_validator(mode="after")
     def _enough_pairs(self) -> "StudySettings":
-        per_scenario = self.behaviours_per_scenario * (self.behaviours_per_scenario - 1) // 2
-        if self.pool_scenarios * per_scenario < self.labels_per_participant:
+        pairs = self.pool_scenarios * self.pairs_per_scenario
+        short = self.labels_per_participant - self.introduction_count + self.practice_pairs + self.catch_pairs
+        if pairs < max(self.labels_per_participant, short):
+            also = "" if pairs < self.labels_per_participant else " with practice and catch pairs"
             raise ValueError(
                 f"{self.pool_scenarios} scenarios with {self.behaviours_per_scenario} behaviours give "
-                f"{self.pool_scenarios * per_scenario} different pairs, fewer than the "
-                f"{self.labels_per_participant} labels asked for. Add scenarios or behaviours."
+                f"{pairs} different pairs, fewer than the "
+                f"{max(self.labels_per_participant, short)} labels asked for{also}. Add scenarios or behaviours."
             )
         return self
+
+    @property
+    def pairs_per_scenario(self) -> int:
+        """Different pairs of clips of one scenario."""
+        return self.behaviours_per_scenario * (self.behaviours_per_scenario - 1) // 2
+
+    @property
+    def introduction_count(self) -> int:
+        """Labels on whole trajectories; never more than there are labels."""
+        return min(self.introduction_pairs, self.labels_per_participant)
+
+    @property
+    def introduction_scenarios(self) -> int:
+        """As many scenarios are filmed whole as the introduction needs."""
+        return -(-self.introduction_count // self.pairs_per_scenario)
 
     @property
     def question_count(self) -> int:
@@ -168,6 +185,11 @@ class Study(Base):
     def settings(self) -> StudySettings:
         """The settings, validated."""
         return StudySettings.model_validate(self.stored_settings)
+
+    @property
+    def whole_clip_steps(self) -> int | None:
+        """Steps of a clip of a whole episode; None for a task that is not simulated here."""
+        return {str(name): steps for name, steps in LONGEST_CLIP_STEPS.items()}.get(self.task)
 
 
 class Deviation(Base):

@@ -14,7 +14,7 @@ from sqlalchemy.orm import Session
 from app.db import now
 from app.domain.clips import Clip, Rollout
 from app.domain.models import Bundle, Model, ModelKind, Run, RunKind, RunStatus, WorkerPresence
-from app.domain.preferences import LabelEvent, Query, Response
+from app.domain.preferences import LEARNED_FROM, LabelEvent, Query, Response
 from app.domain.studies import Participant, Study
 from app.services import accuracy, results
 
@@ -227,7 +227,7 @@ def _hits(answers: Iterable[_Answer]) -> Sequence[bool]:
 
 
 def _answers(session: Session, participant_ids: Sequence[int]) -> dict[int, list[_Answer]]:
-    """The answers that count, by participant, in the order of the queries."""
+    """The labels that count, by participant, in the order of the queries."""
     newest = (
         select(LabelEvent.query_id, func.max(LabelEvent.revision).label("revision"))
         .join(Query, Query.id == LabelEvent.query_id)
@@ -239,6 +239,7 @@ def _answers(session: Session, participant_ids: Sequence[int]) -> dict[int, list
         select(Query.participant_id, LabelEvent.response, Query.predicted_right, LabelEvent.response_time_ms)
         .join(LabelEvent, LabelEvent.query_id == Query.id)
         .join(newest, (newest.c.query_id == LabelEvent.query_id) & (newest.c.revision == LabelEvent.revision))
+        .where(Query.purpose.in_(LEARNED_FROM))
         .order_by(Query.participant_id, Query.ordinal)
     )
     answers: dict[int, list[_Answer]] = defaultdict(list)
@@ -297,7 +298,10 @@ def _pool(session: Session, study: Study) -> Pool:
 
 
 def _clips_wanted(study: Study) -> int:
-    return study.settings.pool_scenarios * study.settings.behaviours_per_scenario
+    """Clips of every scenario, and of the first ones whole episodes for the introduction."""
+    settings = study.settings
+    whole = 0 if study.whole_clip_steps in (None, settings.clip_steps) else settings.introduction_scenarios
+    return (settings.pool_scenarios + whole) * settings.behaviours_per_scenario
 
 
 def _newest_reward_model(session: Session, participant: Participant) -> Model | None:

@@ -45,7 +45,7 @@ def test_the_answer_to_an_answer_is_the_next_pair_and_the_two_after(taking_part:
     assert turn["pair"] == shown["following"][0]
     assert turn["following"][0] == shown["following"][1]
     assert len(turn["following"]) == 2
-    assert turn["following"]["query_id"] == taking_part.queries[2].id
+    assert turn["following"][0]["query_id"] == taking_part.queries[2].id
     assert (turn["answered"], turn["wanted"]) == (1, 10)
 
 

@@ -76,7 +76,7 @@ def test_two_workers_refilling_at_once_make_the_queries_once(
     }
     for _ in range(2):
         with place.database.writing() as session:
-            records.save_queries(session, participant.id, 1, [row])
+            records.save_queries(session, participant.id, [row])
     assert len(queries_of(place.database, participant)) == 1
 
 
