@@ -17,7 +17,7 @@ from tqdm import tqdm
 from app.db import Database
 from app.domain.clips import Clip
 from app.domain.models import Bundle, Model, Run, RunKind, RunStatus
-from app.domain.preferences import Query
+from app.domain.preferences import LEARNED_FROM, Query
 from app.domain.studies import Study, StudySettings, TaskName
 from app.services import accounts, enrolment, studies
 from app.storage import ArtefactStore
@@ -101,16 +101,22 @@ class Rehearsal:
         self, visitor: Visitor, teacher: "_Teacher", outcome: Outcome, settings: StudySettings
     ) -> None:
         visitor.come_in()
-        labels = settings.labels_per_participant
-        with tqdm(total=labels, desc=f"{outcome.code} {outcome.taste.name}", unit="label") as bar:
-            while outcome.labels < labels:
+        pairs = settings.practice_pairs + settings.question_count
+        with tqdm(total=pairs, desc=f"{outcome.code} {outcome.taste.name}", unit="pair") as bar:
+            for _ in range(pairs):
                 query_id = wait_until(PATIENCE_S, "no pair to label", visitor.query_id)
                 time.sleep(self.pace_s)
                 outcome.save_seconds.append(visitor.answer(teacher.answer(query_id)))
-                outcome.labels += 1
                 bar.update()
+                if not self._is_label(query_id):
+                    continue
+                outcome.labels += 1
                 if outcome.labels % settings.retrain_every_labels == 0:
                     wait_until(PATIENCE_S, "no reward model", lambda: self._has_learned(outcome) or None)
+
+    def _is_label(self, query_id: int) -> bool:
+        with self.database.reading() as session:
+            return session.get_one(Query, query_id).purpose in LEARNED_FROM
 
     def _has_learned(self, outcome: Outcome) -> bool:
         """People are slower than a retraining; whoever answers at once would never meet a model's prediction."""

@@ -13,6 +13,7 @@ import httpx2
 from app.errors import AppError
 
 _QUERY = re.compile(r"/p/queries/(\d+)/label")
+_BREAK = re.compile(r"/p/break$")
 
 
 class WentAstray(AppError):
@@ -59,8 +60,10 @@ class Visitor:
         return response.content
 
     def query_id(self) -> int | None:
-        """The query on the page, after loading the page anew; None while there is none."""
+        """The query on the page, after loading the page anew; None while there is none. Breaks are not needed."""
         self._open("/p/next")
+        if rest := self._page.form_to(_BREAK):
+            self._send(rest.target.group(0), rest.fields)
         form = self._page.form_to(_QUERY)
         return None if form is None else int(form.target.group(1))
 
