@@ -14,7 +14,7 @@ from app.settings import Settings
 from app.storage import ArtefactStore
 from worker import benchmark, exploration, laboratory, pretraining, rehearsal, service
 from worker.contest import INDIRECT_USERS, OPPOSED_USERS, PAPER_USERS
-from worker.ml import reward_training
+from worker.ml import acquisition, reward_training
 from worker.ml.methods import METHODS
 from worker.ml.teachers import TASTES, Manner, Taste
 from worker.own_studio import OwnStudio
@@ -83,6 +83,7 @@ def _add_benchmark(commands: _Commands) -> None:
     command.add_argument("--labels", type=int, help="200; the paper's offline training has 5000")
     command.add_argument("--scenarios", type=int, help="unseen ones; 500")
     command.add_argument("--reward", choices=get_args(reward_training.Kind))
+    command.add_argument("--rule", choices=get_args(acquisition.Rule), help="which pairs are asked; entropy")
     command.add_argument("--form", choices=["calibrated", "paper"], help="of the costs")
     command.add_argument("--prefft-steps", type=int, help="environment steps of PrefFT; 100000 as in the paper")
     command.add_argument("--pbrl-steps", type=int, help="environment steps of PbRL-HRI; 260000")
@@ -121,6 +122,7 @@ def _benchmark(options: argparse.Namespace) -> int:
         labels=options.labels,
         scenarios=options.scenarios,
         reward=options.reward,
+        rule=options.rule,
         form=options.form,
         prefft_steps=options.prefft_steps,
         pbrl_steps=options.pbrl_steps,

@@ -34,8 +34,10 @@ from worker.sim.costs import CostForm, preference_rewards
 from worker.trajectory import Trajectory
 
 POOL_FIRST = 10_000_000
-SMALLEST_POOL = 36
-"""scenarios"""
+SMALLEST_POOL = 48
+"""scenarios, as in a study"""
+CHOOSE_EVERY = 10
+"""labels between two models that choose what is asked, as in a study"""
 PAIRS_PER_SCENARIO = BEHAVIOURS_PER_SCENARIO * (BEHAVIOURS_PER_SCENARIO - 1) // 2
 TARGETS = {"left": 0.0, "right": 1.0, "equal": 0.5}
 Floats = npt.NDArray[np.float64]
@@ -53,6 +55,8 @@ class Terms:
     scenarios: int = 500
     reward: reward_training.Kind = "structured"
     form: CostForm = "calibrated"
+    rule: acquisition.Rule = "entropy"
+    """which pairs are asked; the studio's default, for every method alike"""
     smallest_pool: int = SMALLEST_POOL
     filter: FilterConfig = field(default_factory=FilterConfig)
     methods: MethodConfig = field(default_factory=MethodConfig)
@@ -145,7 +149,7 @@ class _Bench:
         self.pool = shelf.behaviours(terms.pool)
         self.clip_steps = min(USUAL_CLIP_STEPS.get(TaskName(cell.task), 60), self.task.episode_steps)
         self.rows = acquisition.matched_pairs([each.scenario for each in self.pool])
-        self.everything = self._cut(self.rows)
+        self.scale = SignalScale.of(self._cut(self.rows))
         self.labelled, self.targets = self._label()
         self.reward = self._kept_reward(cell.path(terms, work).with_name(f"reward-seed{cell.seed}.safetensors"))
 
@@ -169,14 +173,32 @@ class _Bench:
         return lessons.run_scenarios(self.cell.task, act, scenarios, noise, seed)
 
     def _label(self) -> tuple[SegmentPairs, Floats]:
-        """Pairs chosen at random and what the scripted user says about them; the same for every method."""
+        """What is asked and what the scripted user says about it; the same for every method."""
         rng = np.random.default_rng([self.cell.seed, 7])
         rewards = np.array([self._true_rewards(each)[: self.clip_steps] for each in self.pool])
         teacher = ScriptedTeacher.calibrated(Manner(), rewards[self.rows])
-        choice = acquisition.choose(self.terms.labels, len(self.rows), rng)
-        chosen = np.where(choice.swapped[:, None], self.rows[choice.indices][:, ::-1], self.rows[choice.indices])
-        answers = [teacher.answer(rewards[left], rewards[right], rng) for left, right in chosen]
-        return self._cut(chosen), np.array([TARGETS[answer] for answer in answers])
+        asked, targets = np.empty((0, 2), np.int64), np.empty(0)
+        left_over = self.rows
+        while len(asked) < self.terms.labels:
+            rule, scores = self._scores(left_over, asked, targets)
+            count = self.terms.labels - len(asked)
+            if self.terms.rule != "uniform":
+                count = min(count, CHOOSE_EVERY)
+            choice = acquisition.choose(count, len(left_over), rng, rule=rule, scores=scores)
+            chosen = np.where(choice.swapped[:, None], left_over[choice.indices][:, ::-1], left_over[choice.indices])
+            answers = [TARGETS[teacher.answer(rewards[left], rewards[right], rng)] for left, right in chosen]
+            asked, targets = np.concatenate([asked, chosen]), np.concatenate([targets, answers])
+            left_over = np.delete(left_over, choice.indices, axis=0)
+        return self._cut(asked), targets
+
+    def _scores(
+        self, candidates: npt.NDArray[np.int64], asked: npt.NDArray[np.int64], targets: Floats
+    ) -> tuple[acquisition.Rule, Floats | None]:
+        """The first labels are chosen at random, later ones by a structured model of those before."""
+        if self.terms.rule == "uniform" or not len(asked):
+            return "uniform", None
+        model = reward_training.fit(self._cut(asked), targets, "structured", self.cell.seed, scale=self.scale).model
+        return self.terms.rule, acquisition.score(self.terms.rule, model.member_probabilities(self._cut(candidates)))
 
     def _cut(self, rows: npt.NDArray[np.int64]) -> SegmentPairs:
         return SegmentPairs.cut([(self.pool[left], self.pool[right]) for left, right in rows], 0, self.clip_steps)
@@ -210,6 +232,6 @@ class _Bench:
             self.targets,
             kind,
             self.cell.seed,
-            scale=SignalScale.of(self.everything),
+            scale=self.scale,
             reference=laboratory.reference_rollouts(self.cell.task),
         ).model

@@ -72,8 +72,8 @@ class Fitting:
     def find_mode(self, pool: Sequence[Trajectory]) -> FilterDraft:
         """The person's execution mode, as far as held-out scenarios allow it."""
         surface = ResponseSurface.load(surface_file(self.task), self.problem.task.modes)
-        draft = studio_filter.choose_mode(self.problem, surface, pool)
-        return studio_filter.gate_mode(self.problem, draft, self._gate_reference(), self.collect, self.progress)
+        reference = self._gate_reference()
+        return studio_filter.find_mode(self.problem, surface, pool, reference, self.collect, self.progress)
 
     def train_residual(self, draft: FilterDraft) -> FilterDraft:
         """The residual action encoder around the mode."""

@@ -11,7 +11,8 @@ from worker.behaviours import Behaviour
 from worker.sim.rollout import rollout
 from worker.trajectory import Trajectory
 
-BEHAVIOURS_PER_SCENARIO = 4
+BEHAVIOURS_PER_SCENARIO = 6
+"""As in a study (StudySettings.behaviours_per_scenario)."""
 
 
 class Shelf:

@@ -17,7 +17,7 @@ SHY = Taste("shy", (1.0, 3.0, 2.0, 2.0, 1.0, 1.0))
 TINY = replace(
     with_options(PROFILES["quick"], labels=12, scenarios=3, printed_steps=5),
     smallest_pool=2,
-    filter=FilterConfig(gates=(1.0,), gate_scenarios=3, round_rollouts=()),
+    filter=FilterConfig(mode_attempts=1, gates=(), gate_scenarios=3, round_rollouts=()),
 )
 
 
@@ -94,8 +94,8 @@ def test_the_quick_profile_does_everything_a_little() -> None:
     assert (full.labels, full.scenarios, full.methods.fine_tuning.steps) == (200, 500, 100_000)
     assert quick.methods.fine_tuning.steps < 5_000
     assert set(Selection().methods) == set(METHODS)
-    assert len(full.pool) == 36
-    assert len(with_options(full, labels=5000).pool) == 834
+    assert len(full.pool) == 48
+    assert len(with_options(full, labels=5000).pool) == 334
 
 
 def test_users_are_named_or_given_by_their_weights() -> None:

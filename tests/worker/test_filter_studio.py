@@ -21,7 +21,13 @@ FAMILY = invented.TASK.modes
 SPEED = SIGNALS.index("speed_m_s")
 STEPS = 15
 CONFIG = FilterConfig(
-    gate_scenarios=6, round_rollouts=(6,), round_noise=(0.3,), value_steps=150, adapter_steps=100, gates=(1.0, 0.4)
+    gate_scenarios=6,
+    round_rollouts=(6,),
+    round_noise=(0.3,),
+    value_steps=150,
+    adapter_steps=100,
+    mode_attempts=2,
+    gates=(0.4,),
 )
 
 
@@ -115,17 +121,30 @@ def test_the_whole_fit_moves_the_robot_where_the_person_wants_it(
     assert draft.weights.gate == 1.0
     shares = [share for _, share in told]
     assert shares == sorted(shares)
-    assert set(draft.seconds) == {"mode", "gate_mode", "residual_rollouts", "residual_learning", "gate_residual"}
+    assert set(draft.seconds) == {"mode", "residual_rollouts", "residual_learning", "gate_residual"}
     assert pickle.loads(pickle.dumps(draft)).weights.mode == draft.weights.mode  # noqa: S301
 
 
 def test_a_mode_that_fails_the_task_is_turned_off(reference: list[Trajectory], surface: ResponseSurface) -> None:
     plain = min(each.signals[:, SPEED].mean() for each in reference)
-    draft = studio_filter.choose_mode(problem(-1.0, reference), surface, [])
-    gated = studio_filter.gate_mode(problem(-1.0, reference), draft, reference, World(slowest=0.99 * plain).collect)
-    assert gated.weights == FilterWeights()
-    assert [trial.gate for trial in gated.trials] == [1.0, 0.4]
-    assert "off" in gated.notes[0]
+    world = World(slowest=0.99 * plain)
+    found = studio_filter.find_mode(problem(-1.0, reference, mode_attempts=1), surface, [], reference, world.collect)
+    assert found.weights == FilterWeights()
+    assert [trial.gate for trial in found.trials] == [1.0, 0.4]
+    assert "off" in found.notes[0]
+
+
+def test_a_mode_that_fails_teaches_the_search_to_find_one_that_does_not(
+    reference: list[Trajectory], surface: ResponseSurface
+) -> None:
+    """The world forbids more than the surface knows: whoever is much slower than the reference fails."""
+    plain = min(each.signals[:, SPEED].mean() for each in reference)
+    world = World(slowest=0.55 * plain)
+    found = studio_filter.find_mode(problem(-1.0, reference, mode_attempts=4), surface, [], reference, world.collect)
+    assert found.trials[0].success_change < -0.9, "the first attempt must fail for the second to learn"
+    assert found.trials[-1].success_change == 0.0
+    assert found.trials[-1].preference > 0.0
+    assert (found.weights.gate, found.notes) == (1.0, ())
 
 
 def test_a_filter_that_presses_too_hard_is_turned_off(reference: list[Trajectory], surface: ResponseSurface) -> None:
@@ -133,25 +152,23 @@ def test_a_filter_that_presses_too_hard_is_turned_off(reference: list[Trajectory
         episodes = World().collect(act, scenarios, noise, seed)
         return [replace(each, contact_force_n=np.full(STEPS, 30.0, np.float32)) for each in episodes]
 
-    draft = studio_filter.choose_mode(problem(-1.0, reference), surface, [])
-    assert studio_filter.gate_mode(problem(-1.0, reference), draft, reference, pressing).weights == FilterWeights()
+    found = studio_filter.find_mode(problem(-1.0, reference), surface, [], reference, pressing)
+    assert found.weights == FilterWeights()
 
 
 def test_somebody_who_has_said_nothing_yet_costs_no_rollouts(
     reference: list[Trajectory], surface: ResponseSurface
 ) -> None:
     world = World()
-    draft = studio_filter.choose_mode(problem(0.0, reference), surface, [])
-    gated = studio_filter.gate_mode(problem(0.0, reference), draft, reference, world.collect)
-    assert gated.weights == FilterWeights()
-    assert "do not yet say" in gated.notes[0]
+    found = studio_filter.find_mode(problem(0.0, reference), surface, [], reference, world.collect)
+    assert found.weights == FilterWeights()
+    assert "do not yet say" in found.notes[0]
     assert world.asked == []
 
 
-def test_the_first_acceptable_gate_ends_the_search(reference: list[Trajectory], surface: ResponseSurface) -> None:
+def test_the_first_acceptable_mode_ends_the_search(reference: list[Trajectory], surface: ResponseSurface) -> None:
     world = World()
-    draft = studio_filter.choose_mode(problem(-1.0, reference), surface, [])
-    studio_filter.gate_mode(problem(-1.0, reference), draft, reference, world.collect)
+    studio_filter.find_mode(problem(-1.0, reference), surface, [], reference, world.collect)
     assert world.asked == [6]
 
 

@@ -107,3 +107,26 @@ def test_a_surface_of_other_axes_is_refused(surface: ResponseSurface) -> None:
 def test_there_are_no_constant_and_all_first_second_and_pure_third_orders() -> None:
     assert monomials(np.zeros(2)).tolist() == [0.0] * 7
     assert monomials(np.array([2.0, 3.0])).tolist() == [2, 3, 4, 6, 9, 8, 27]
+
+
+def test_rollouts_of_one_mode_change_what_is_expected_of_its_neighbours_and_hardly_more(
+    surface: ResponseSurface,
+) -> None:
+    tried, near, far = [0.4, -0.6, 0, 0, 0], [0.35, -0.55, 0, 0, 0], [-0.4, 0.2, 0, 0, 0]
+    modes, observed = np.array([tried, near, far]), np.full(80, -0.3)
+    before = surface.predict(modes)[1]
+    after = surface.with_observed(modes[0], np.zeros((80, len(SIGNALS))), observed).predict(modes)[1]
+    assert after[0] == pytest.approx(-0.3, abs=0.1)
+    assert after[1] < before[1] - 0.1
+    assert abs(after[2] - before[2]) < 0.5 * abs(after[1] - before[1])
+
+
+def test_it_learns_from_new_rollouts_as_if_it_had_had_them_from_the_start() -> None:
+    rng = np.random.default_rng(3)
+    modes, deltas, success = FAMILY.sample(300, rng), rng.standard_normal((300, len(SIGNALS))), np.zeros(300)
+    modes[-20:] = modes[-1]
+    outliers = np.quantile(deltas, [0.005, 0.995], axis=0)
+    deltas = np.clip(deltas, *outliers)
+    whole = fit(FAMILY, modes, deltas, success)
+    later = fit(FAMILY, modes[:-20], deltas[:-20], success[:-20]).with_observed(modes[-1], deltas[-20:], success[-20:])
+    np.testing.assert_allclose(later.coefficients, whole.coefficients, atol=0.02)

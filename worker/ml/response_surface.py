@@ -5,7 +5,7 @@ same scenario. Given a person's weights on the signals, their best mode is then 
 """
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations_with_replacement
 from pathlib import Path
 from typing import Self
@@ -42,16 +42,30 @@ class ResponseSurface:
     """(A,) range of the modes it was fitted on"""
     high: Floats
     axes: tuple[str, ...]
+    gram: Floats
+    """(M, M) of the rollouts it was fitted to, ridge included: how sure it is in which direction"""
 
     def predict(self, modes: npt.ArrayLike) -> tuple[Floats, Floats]:
         """(..., A) -> changes of the summed signals (..., S) and of the success probability (...)."""
         changes = monomials(np.asarray(modes, np.float64)) @ self.coefficients
         return changes[..., :-1], changes[..., -1]
 
+    def with_observed(self, mode: Floats, signal_deltas: Floats, success_deltas: Floats) -> Self:
+        """The surface after N more paired rollouts of one mode (A,), by recursive least squares.
+
+        signal_deltas (N, S) and success_deltas (N,) as in fit(). Nearby modes are predicted anew, too; others hardly.
+        """
+        outcomes = np.concatenate([signal_deltas, np.asarray(success_deltas, np.float64)[:, None]], axis=1)
+        features = monomials(mode)
+        gram = self.gram + len(outcomes) * np.outer(features, features)
+        moments = self.gram @ self.coefficients + np.outer(features, outcomes.sum(axis=0))
+        coefficients = np.asarray(np.linalg.solve(gram, moments), np.float64)
+        return replace(self, coefficients=coefficients, gram=gram)
+
     def to_bytes(self) -> bytes:
         """One safetensors file."""
         config = {"axes": list(self.axes), "kind": "response surface", "signals": list(SIGNALS)}
-        tensors = {"coefficients": self.coefficients, "low": self.low, "high": self.high}
+        tensors = {"coefficients": self.coefficients, "low": self.low, "high": self.high, "gram": self.gram}
         return save(
             {name: np.ascontiguousarray(array, np.float32) for name, array in tensors.items()},
             metadata={"config": json.dumps(config, sort_keys=True)},
@@ -66,7 +80,7 @@ class ResponseSurface:
                 "This response surface was fitted for other signals or axes; run `python -m worker explore --task ...`."
             )
         tensors = {name: array.astype(np.float64) for name, array in load(stored).items()}
-        return cls(tensors["coefficients"], tensors["low"], tensors["high"], family.names)
+        return cls(tensors["coefficients"], tensors["low"], tensors["high"], family.names, tensors["gram"])
 
     def save(self, path: Path) -> None:
         """Write to_bytes() to a file."""
@@ -101,6 +115,7 @@ def fit(family: ModeFamily, modes: Floats, signal_deltas: Floats, success_deltas
         np.array([axis.low for axis in family.axes]),
         np.array([axis.high for axis in family.axes]),
         family.names,
+        gram,
     )
 
 
