@@ -16,10 +16,11 @@ from sqlalchemy.orm import Session
 
 from app.db import now
 from app.domain.clips import Clip, Rollout
+from app.domain.evaluation import Film, Rating, Trial
 from app.domain.models import Bundle, Model, ModelKind, Run, RunKind, RunStatus
 from app.domain.preferences import LabelEvent, Query, Response
 from app.domain.studies import Participant, Study, StudySettings
-from app.services import enrolment, studies
+from app.services import enrolment, evaluating, studies
 from app.storage import ArtefactStore
 
 FPS = 10
@@ -171,6 +172,47 @@ def make_bundle(session: Session, store: ArtefactStore, model: Model, content: b
     session.add(bundle)
     session.flush()
     return bundle
+
+
+def make_film(
+    session: Session,
+    store: ArtefactStore,
+    participant: Participant,
+    method: str,
+    model: Model | None = None,
+    scenario: int | None = None,
+) -> Film:
+    """A method in a scenario, filmed; usually the first of those in which people see before and after."""
+    number = session.scalar(select(func.count(Film.id))) or 0
+    video, poster = moving_picture(1000 + number)
+    film = Film(
+        participant_id=participant.id,
+        method=method,
+        model_id=model.id if model else None,
+        scenario=evaluating.comparison_scenarios(participant)[0] if scenario is None else scenario,
+        success=True,
+        trajectory_sha256=store.put(f"trajectory of film {number}".encode()),
+        video_sha256=store.put(video),
+        poster_sha256=store.put(poster),
+        width=WIDTH,
+        height=HEIGHT,
+        fps=FPS,
+        duration_ms=1000 * FRAMES // FPS,
+        byte_count=len(video),
+    )
+    session.add(film)
+    session.flush()
+    return film
+
+
+def make_rated_trials(session: Session, participant: Participant, count: int) -> None:
+    """More trials of the participant, with a rating each."""
+    known = session.scalar(select(func.count(Trial.id)).where(Trial.participant_id == participant.id)) or 0
+    for ordinal in range(known + 1, known + count + 1):
+        trial = Trial(participant_id=participant.id, ordinal=ordinal, letter="A", repetition=ordinal, scenario=ordinal)
+        session.add(trial)
+        session.flush()
+        session.add(Rating(trial_id=trial.id, revision=1, satisfaction=4, personalisation=3, client_uuid=str(uuid4())))
 
 
 def filter_metrics(scenarios: int = 100) -> dict[str, Any]:

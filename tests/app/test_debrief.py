@@ -1,0 +1,84 @@
+"""The person's own robot before and after, what it learned, and honesty while it is still being made."""
+
+from typing import Any
+
+import pytest
+
+from app.domain.models import Model, ModelKind
+from app.domain.participation import StageRecord
+from app.domain.preferences import Query
+from app.domain.protocol import Stage
+from app.domain.studies import Participant, Study
+from app.services import debrief
+from app.storage import ArtefactStore
+from tests import factories
+from tests.app.conftest import TakingPart
+
+
+@pytest.fixture
+def at_debrief(taking_part: TakingPart) -> TakingPart:
+    """The participant after the last pair, in a study with a debrief."""
+    with taking_part.database.writing() as session:
+        study = session.get_one(Study, taking_part.study.id)
+        study.stored_settings = {**study.stored_settings, "debrief": True}
+        for query in taking_part.queries[:10]:
+            factories.make_label(session, session.get_one(Query, query.id))
+    return taking_part
+
+
+def add_filter(at: TakingPart, metrics: dict[str, Any]) -> Model:
+    with at.database.writing() as session:
+        return factories.make_model(session, at.study, at.participant, ModelKind.FILTER, metrics)
+
+
+def test_while_nothing_is_there_it_says_so_and_holds_nobody_up(at_debrief: TakingPart) -> None:
+    page = at_debrief.browser.get("/p/debrief").text
+    assert "still being made" in page
+    assert "<video" not in page
+    assert at_debrief.browser.post("/p/debrief").headers["location"] == "/p/next"
+    assert at_debrief.browser.get("/p/next").headers["location"] == "/p/finished"
+
+
+def test_before_and_after_are_shown_side_by_side_in_one_scenario(at_debrief: TakingPart, store: ArtefactStore) -> None:
+    model = add_filter(at_debrief, factories.filter_metrics())
+    with at_debrief.database.writing() as session:
+        before = factories.make_film(session, store, at_debrief.participant, "reference")
+        elsewhere = factories.make_film(session, store, at_debrief.participant, "pbarl", model, scenario=99)
+    assert "now it is being filmed" in at_debrief.browser.get("/p/debrief").text
+    with at_debrief.database.writing() as session:
+        after = factories.make_film(session, store, at_debrief.participant, "pbarl", model)
+    page = at_debrief.browser.get("/p/debrief").text
+    assert page.index(before.video_sha256) < page.index(after.video_sha256)
+    assert elsewhere.video_sha256 not in page
+
+
+def test_what_is_certain_is_said_in_plain_words_and_nothing_else(at_debrief: TakingPart) -> None:
+    add_filter(at_debrief, factories.filter_metrics())
+    page = at_debrief.browser.get("/p/debrief").text
+    assert "It moves more slowly (41 % less)." in page
+    assert "It presses less hard (63 % less)." in page
+    assert "It takes more time on its way to you." in page
+    assert "touches you" not in page, "its interval holds zero"
+
+
+def test_a_robot_that_learned_nothing_certain_is_not_made_more_of(at_debrief: TakingPart) -> None:
+    metrics = factories.filter_metrics()
+    for cost in metrics["evaluation"]["costs"].values():
+        cost |= {"low": -1.0, "high": 1.0}
+    add_filter(at_debrief, metrics)
+    assert "much like the robot before" in at_debrief.browser.get("/p/debrief").text
+
+
+def test_metrics_that_cannot_be_read_are_no_lesson(at_debrief: TakingPart) -> None:
+    model = add_filter(at_debrief, {"evaluation": "nonsense"})
+    with at_debrief.database.reading() as session:
+        assert debrief.learned(session, session.get_one(Participant, model.participant_id)) is None
+
+
+def test_the_debrief_can_be_seen_again_after_the_end(at_debrief: TakingPart) -> None:
+    at_debrief.browser.post("/p/debrief")
+    assert 'href="/p/debrief"' in at_debrief.browser.get("/p/finished").text
+    assert at_debrief.browser.get("/p/debrief").status_code == 200
+    with at_debrief.database.reading() as session:
+        stages = {record.stage for record in session.query(StageRecord)}
+    assert Stage.DEBRIEF in stages
