@@ -12,11 +12,13 @@ from app.db import Database
 from app.settings import Settings
 from app.storage import ArtefactStore
 from app.web import (
+    evaluation,
     experimenter,
     joining,
     live,
     login,
     media,
+    operator,
     participant,
     participant_consent,
     participant_ending,
@@ -37,6 +39,7 @@ PARTICIPANT_PARTS = (
     participant_consent,
     participant_forms,
     participant_pairs,
+    evaluation,
     participant_ending,
     withdrawing,
     participant,
@@ -69,7 +72,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.state.templates = make_environment(app.url_path_for)
     app.add_middleware(Guard, https=settings.secure_cookies, refuse=error_page)
     add_error_pages(app)
-    for part in (login, experimenter, media, *PARTICIPANT_PARTS):
+    for part in (login, experimenter, operator, media, *PARTICIPANT_PARTS):
         app.include_router(part.router)
     app.mount("/static", StaticFiles(directory=ROOT / "static"), name="static")
 

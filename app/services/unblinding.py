@@ -74,6 +74,17 @@ def methods_by_letter(session: Session, study: Study) -> dict[tuple[int, str], s
     return {(each.participant_id, each.letter): each.method for each in _assignments(session, study)}
 
 
+def key_of(session: Session, study: Study) -> Sequence[tuple[str, dict[str, str]]]:
+    """Per participant, by code, the method of each letter. Raises StillBlinded before the study is unblinded."""
+    if is_blinded(study):
+        raise StillBlinded
+    people = select(Participant).where(Participant.study_id == study.id).order_by(Participant.number)
+    by_person = {person.id: (person.code, dict[str, str]()) for person in session.scalars(people)}
+    for each in _assignments(session, study):
+        by_person[each.participant_id][1][each.letter] = each.method
+    return [(code, dict(sorted(letters.items()))) for code, letters in by_person.values() if letters]
+
+
 def shown_name(study: Study, assignments: Sequence[Assignment], letter: str) -> str:
     """What to call a robot on an experimenter's page: its letter, with its method once the study is unblinded."""
     if is_blinded(study):

@@ -10,6 +10,7 @@ from sqlalchemy import or_, select
 from sqlalchemy.orm import Session
 
 from app.domain.clips import Clip, Rollout
+from app.domain.evaluation import Film
 from app.errors import AppError
 from app.services import browser_sessions
 from app.web.deps import EXPERIMENTER_COOKIE, PARTICIPANT_COOKIE, ReadingSession, Sha256, StudioDep
@@ -26,15 +27,20 @@ class ClipNotFound(AppError):
 
 
 def _may_watch(request: Request, session: ReadingSession, sha256: Sha256) -> None:
-    """A participant may watch the clips of their own study, an experimenter all. Raises ClipNotFound."""
+    """A participant may watch the clips of their own study and their own films, an experimenter all.
+
+    Raises ClipNotFound.
+    """
     clips = select(Clip.id).join(Rollout).where(or_(Clip.video_sha256 == sha256, Clip.poster_sha256 == sha256))
+    films = select(Film.id).where(or_(Film.video_sha256 == sha256, Film.poster_sha256 == sha256))
     if not _experimenter_asks(request, session):
         cookie = request.cookies.get(PARTICIPANT_COOKIE)
         participant = browser_sessions.participant_of(session, cookie) if cookie else None
         if participant is None:
             raise ClipNotFound
         clips = clips.where(Rollout.study_id == participant.study_id)
-    if session.scalar(clips.limit(1)) is None:
+        films = films.where(Film.participant_id == participant.id)
+    if session.scalar(clips.limit(1)) is None and session.scalar(films.limit(1)) is None:
         raise ClipNotFound
 
 

@@ -252,3 +252,60 @@ break-go-on = Weiter
 break-key = Die Eingabetaste geht weiter
 
 ## Bewertung (Vorsilbe evaluation-)
+
+evaluation-progress = Bewertete Roboter
+evaluation-count = { $rated } von { $wanted } bewertet
+evaluation-robot = Roboter { $letter }
+evaluation-film = Roboter { $letter } bei der Arbeit
+evaluation-repetition = { $number }. von { $count } Malen mit diesem Roboter.
+evaluation-satisfaction = Wie zufrieden sind Sie mit diesem Roboter insgesamt?
+evaluation-satisfaction-low = überhaupt nicht zufrieden
+evaluation-satisfaction-high = völlig zufrieden
+evaluation-personalisation = Wie sehr ist das, was er tut, auf Sie persönlich zugeschnitten?
+evaluation-personalisation-low = überhaupt nicht auf mich zugeschnitten
+evaluation-personalisation-high = völlig auf mich zugeschnitten
+evaluation-save = Speichern und weiter
+evaluation-save-change = Änderung speichern
+evaluation-changing = Sie ändern Ihre letzte Bewertung.
+evaluation-keep = So lassen, wie es war
+evaluation-change-last = Meine letzte Bewertung ändern (Roboter { $letter })
+evaluation-rate-now = Bitte bewerten Sie, was der Roboter eben getan hat.
+evaluation-watch-first = Bitte einmal bis zum Ende ansehen, dann bewerten
+evaluation-now-rate = Sie können jetzt bewerten
+evaluation-keys = Tasten: 1 bis 5, zweimal, dann Enter. Die Rücktaste nimmt eine zurück.
+evaluation-saving = Wird gespeichert …
+evaluation-not-saved = Noch nicht gespeichert. Neuer Versuch …
+evaluation-refused = Das wurde nicht gespeichert, weil der Roboter auf dieser Seite nicht mehr an der Reihe ist. Die Seite wird neu geladen …
+evaluation-unplayable = Dieser Film konnte nicht geladen werden.
+evaluation-load-again = Noch einmal laden
+evaluation-play = Abspielen
+evaluation-pause = Anhalten
+evaluation-position = Stelle im Film
+evaluation-position-value = { $seconds } von { $total } Sekunden
+evaluation-speed = Geschwindigkeit
+evaluation-speed-value = { $rate }-fache Echtzeit
+evaluation-coming = Als Nächstes kommt Roboter { $letter }
+evaluation-coming-text = Bitte warten Sie einen Moment, bis er gestartet wird. Diese Seite geht von selbst weiter.
+evaluation-moving = Roboter { $letter } bewegt sich, bitte schauen Sie zu
+evaluation-moving-text = Sobald er fertig ist, werden Sie nach Ihrer Meinung gefragt.
+evaluation-waiting-title = Ihre Roboter werden vorbereitet
+evaluation-waiting-text = Sie lernen aus Ihren Antworten. Wenn sie fertig sind, sehen Sie jeden bei der Arbeit und bewerten ihn. Sie kennen sie nur unter Buchstaben.
+evaluation-waiting-progress = Wie weit Ihre Roboter sind
+evaluation-step-learning = Aus Ihren Antworten wird gelernt
+evaluation-step-training = Die Roboter werden trainiert
+evaluation-step-filming = Die Roboter werden gefilmt
+evaluation-step-packing = Die Roboter werden bereitgestellt
+evaluation-robots-ready = { $ready } von { $count } Robotern sind trainiert; { $percent } % der ganzen Arbeit sind getan.
+evaluation-minutes-left =
+    { $minutes ->
+        [one] Noch etwa eine Minute, länger, wenn andere vor Ihnen sind.
+       *[other] Noch etwa { $minutes } Minuten, länger, wenn andere vor Ihnen sind.
+    }
+evaluation-may-close = Sie können diese Seite schließen: Ihre Antworten sind sicher gespeichert, und die Arbeit geht ohne Sie weiter. Ihr Link bringt Sie hierher zurück. Wenn Sie die Seite offen lassen, geht sie von selbst weiter.
+evaluation-trouble = Etwas ist schiefgegangen. Es wird noch einmal versucht, und die Person, von der Sie den Link haben, kann es sehen. Nichts von Ihnen ist verloren.
+evaluation-done-title = Alle Roboter sind bewertet
+evaluation-done-text =
+    { $count ->
+        [one] Ihre Bewertung ist sicher gespeichert. Vielen Dank.
+       *[other] Ihre { $count } Bewertungen sind sicher gespeichert. Vielen Dank.
+    }

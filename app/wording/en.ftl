@@ -254,3 +254,60 @@ break-go-on = Go on
 break-key = Enter goes on
 
 ## Evaluation (prefix evaluation-)
+
+evaluation-progress = Robots you have rated
+evaluation-count = { $rated } of { $wanted } rated
+evaluation-robot = Robot { $letter }
+evaluation-film = Robot { $letter } at work
+evaluation-repetition = Time { $number } of { $count } with this robot.
+evaluation-satisfaction = How satisfied are you with this robot, overall?
+evaluation-satisfaction-low = not satisfied at all
+evaluation-satisfaction-high = totally satisfied
+evaluation-personalisation = How personalised to you is what it does?
+evaluation-personalisation-low = not personalised at all
+evaluation-personalisation-high = totally personalised
+evaluation-save = Save and go on
+evaluation-save-change = Save the change
+evaluation-changing = You are changing your last rating.
+evaluation-keep = Leave it as it was
+evaluation-change-last = Change my last rating (Robot { $letter })
+evaluation-rate-now = Please rate what the robot has just done.
+evaluation-watch-first = Watch it once to the end, then rate
+evaluation-now-rate = You can rate now
+evaluation-keys = Keys: 1 to 5, twice, then Enter. Backspace takes one back.
+evaluation-saving = Saving …
+evaluation-not-saved = Not saved yet. Trying again …
+evaluation-refused = This was not saved, because the robot on this page is no longer the one to rate. Loading the page again …
+evaluation-unplayable = This film could not be loaded.
+evaluation-load-again = Load it again
+evaluation-play = Play
+evaluation-pause = Pause
+evaluation-position = Position in the film
+evaluation-position-value = { $seconds } of { $total } seconds
+evaluation-speed = Speed
+evaluation-speed-value = { $rate } times real time
+evaluation-coming = Robot { $letter } is next
+evaluation-coming-text = Please wait a moment until the operator starts it. This page goes on by itself.
+evaluation-moving = Robot { $letter } is moving, please watch
+evaluation-moving-text = You will be asked about it as soon as it is done.
+evaluation-waiting-title = Your robots are being prepared
+evaluation-waiting-text = They are trained on your answers. When they are ready you will watch each of them at work and rate it. You will know them by letters only.
+evaluation-waiting-progress = How far your robots are
+evaluation-step-learning = Learning from your answers
+evaluation-step-training = Training the robots
+evaluation-step-filming = Filming the robots
+evaluation-step-packing = Getting the robots ready
+evaluation-robots-ready = { $ready } of { $count } robots are trained; { $percent } % of everything is done.
+evaluation-minutes-left =
+    { $minutes ->
+        [one] About a minute to go, longer if others are before you.
+       *[other] About { $minutes } minutes to go, longer if others are before you.
+    }
+evaluation-may-close = You may close this page: your answers are safely stored, and the work goes on without you. Your link brings you back here. If you leave the page open, it goes on by itself.
+evaluation-trouble = Something went wrong. It is being tried again, and the person who sent you the link can see it. Nothing of yours is lost.
+evaluation-done-title = All robots are rated
+evaluation-done-text =
+    { $count ->
+        [one] Your rating is safely stored. Thank you.
+       *[other] Your { $count } ratings are safely stored. Thank you.
+    }
