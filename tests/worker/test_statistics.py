@@ -1,0 +1,179 @@
+"""The paper's tests exactly, and the right ones beside them: as scipy, statsmodels, and paper and pencil have them."""
+
+import io
+from itertools import combinations
+
+import numpy as np
+import pandas as pd
+import pytest
+import statsmodels.formula.api as formulas
+from scipy import stats
+from statsmodels.stats.multitest import multipletests
+
+from worker.analysis.effect_sizes import d_z_interval, holm, rank_biserial, rank_biserial_interval
+from worker.analysis.statistics import (
+    SCALES,
+    mixed_model,
+    paired_differences,
+    paired_t,
+    rating_report,
+    two_sample_t,
+    wilcoxon,
+)
+
+METHODS = ("reference", "prefft", "pbarl")
+
+
+def ratings(people: int = 8, trials: int = 3, seed: int = 1) -> pd.DataFrame:
+    """Invented ratings of three methods, as they come out of a CSV file."""
+    rng, lines = np.random.default_rng(seed), ["participant,method,repetition,satisfaction,personalisation"]
+    for person in range(people):
+        level = rng.normal(0, 0.6)
+        for method, mean in zip(METHODS, (2.6, 3.0, 3.9), strict=True):
+            for repetition in range(1, trials + 1):
+                said = np.clip(np.round(mean + level + rng.normal(0, 0.8, 2)), 1, 5).astype(int)
+                lines.append(f"P{person + 1:02d},{method},{repetition},{said[0]},{said[1]}")
+    return pd.read_csv(io.StringIO("\n".join(lines)))
+
+
+@pytest.mark.parametrize("scale", SCALES)
+@pytest.mark.parametrize("seed", range(3))
+def test_the_papers_test_is_scipys_independent_t_test_on_all_ratings(scale: str, seed: int) -> None:
+    rows = ratings(seed=seed)
+    report = rating_report(rows, METHODS, ["two_sample_t"])
+    for comparison in report["scales"][scale]["comparisons"]:
+        first, second = (rows[rows.method == comparison[side]][scale] for side in ("first", "second"))
+        outcome, got = stats.ttest_ind(second, first), comparison["two_sample_t"]
+        assert (got["n_first"], got["n_second"], got["degrees_of_freedom"]) == (24, 24, 46)
+        assert (got["statistic"], got["p"]) == pytest.approx((outcome.statistic, outcome.pvalue))
+        assert got["star"] == (outcome.pvalue < 0.01)
+
+
+@pytest.mark.parametrize("scale", SCALES)
+@pytest.mark.parametrize("seed", range(3))
+def test_paired_tests_are_scipys_on_the_means_of_each_person(scale: str, seed: int) -> None:
+    rows = ratings(seed=seed)
+    means = rows.groupby(["participant", "method"])[scale].mean().unstack()
+    comparisons = rating_report(rows, METHODS, [])["scales"][scale]["comparisons"]
+    t_tests = [stats.ttest_rel(means[each["second"]], means[each["first"]]) for each in comparisons]
+    for comparison, outcome in zip(comparisons, t_tests, strict=True):
+        got, differences = comparison["paired_t"], means[comparison["second"]] - means[comparison["first"]]
+        assert (got["statistic"], got["p"]) == pytest.approx((outcome.statistic, outcome.pvalue))
+        assert got["d_z"] == pytest.approx(differences.mean() / differences.std())
+        signed = stats.wilcoxon(differences.round(12))
+        assert comparison["wilcoxon"]["p"] == pytest.approx(signed.pvalue)
+    corrected = multipletests([outcome.pvalue for outcome in t_tests], method="holm")[1]
+    assert [each["paired_t"]["p_holm"] for each in comparisons] == pytest.approx(list(corrected))
+
+
+@pytest.mark.parametrize("scale", SCALES)
+def test_the_mixed_model_is_statsmodels_with_the_participant_as_random_effect(scale: str) -> None:
+    rows = ratings()
+    fit = formulas.mixedlm(f"{scale} ~ C(method, Treatment('reference'))", rows, groups=rows.participant).fit()
+    report = rating_report(rows, METHODS, ["mixed_model"])["scales"][scale]
+    by_hand = {name.rpartition("[T.")[2].rstrip("]"): name for name in fit.params.index if "[T." in name}
+    for comparison in report["comparisons"]:
+        if comparison["first"] == "reference":
+            name, got = by_hand[comparison["second"]], comparison["mixed_model"]
+            assert got["difference"] == pytest.approx(fit.params[name], abs=1e-5)
+            assert got["standard_error"] == pytest.approx(fit.bse[name], rel=1e-3)
+            assert got["p"] == pytest.approx(fit.pvalues[name], rel=1e-2)
+            assert got["planned"]
+    assert report["mixed_model"]["converged"] == fit.converged
+    assert report["mixed_model"]["n"] == 8
+
+
+def test_a_paired_t_test_by_hand() -> None:
+    got = paired_t(np.array([1.0, 2.0, 3.0]))  # mean 2, sd 1, so t = 2 / (1 / sqrt 3) and d_z = 2
+    assert got["statistic"] == pytest.approx(2 * 3**0.5)
+    assert (got["n"], got["difference"], got["d_z"]) == (3, 2, pytest.approx(2))
+    assert (got["low"], got["high"]) == pytest.approx((2 - 4.302653 / 3**0.5, 2 + 4.302653 / 3**0.5))
+
+
+def test_a_signed_rank_test_by_hand() -> None:
+    got = wilcoxon(np.array([-1.0, 2.0, 3.0, 4.0, 5.0, 0.0]))  # ranks 1 against 2 + 3 + 4 + 5
+    assert (got["n"], got["n_without_ties"], got["statistic"]) == (6, 5, 1)
+    assert got["rank_biserial"] == pytest.approx((14 - 1) / 15)
+    assert got["smallest_p"] == pytest.approx(2 / 2**5)
+
+
+def test_a_two_sample_t_test_by_hand() -> None:
+    got = two_sample_t(np.array([1.0, 2.0, 3.0]), np.array([3.0, 4.0, 5.0]))  # pooled variance 1, so t = 2 / sqrt(2/3)
+    assert got["statistic"] == pytest.approx(2 / (2 / 3) ** 0.5)
+    assert (got["degrees_of_freedom"], got["star"]) == (4, False)
+
+
+def test_the_interval_of_an_effect_size_holds_it_as_often_as_it_says() -> None:
+    rng, n, true = np.random.default_rng(0), 8, 0.8
+    samples = rng.normal(true, 1, (400, n))
+    statistics = samples.mean(axis=1) / samples.std(axis=1, ddof=1) * n**0.5
+    held = [low <= true <= high for low, high in (d_z_interval(float(t), n) for t in statistics)]
+    assert 0.92 <= np.mean(held) <= 0.98
+
+
+@pytest.mark.parametrize(("t", "n"), [(0.0, 3), (-3.0, 8), (60.0, 4), (30.0, 200)])
+def test_the_interval_of_an_effect_size_is_where_the_noncentral_t_says(t: float, n: int) -> None:
+    low, high = d_z_interval(t, n)
+    assert stats.nct.cdf(t, n - 1, high * n**0.5) == pytest.approx(0.025, abs=1e-6)
+    assert stats.nct.sf(t, n - 1, low * n**0.5) == pytest.approx(0.025, abs=1e-6)
+
+
+def test_people_who_all_agree_give_no_interval_of_certainty() -> None:
+    assert rank_biserial(np.array([1.0, 2.0, 1.0])) == 1
+    assert rank_biserial_interval(1.0, 3) == (None, None)
+
+
+def test_holm_by_hand() -> None:
+    assert holm([0.04, 0.01, 0.03]) == pytest.approx([0.06, 0.03, 0.06])
+
+
+def test_too_few_people_give_reasons_instead_of_numbers() -> None:
+    report = rating_report(ratings(people=2), METHODS, ["paired_t"])
+    for comparison in report["scales"]["satisfaction"]["comparisons"]:
+        assert "2 people" in comparison["paired_t"]["not_computable"]
+        assert "3 are needed" in comparison["wilcoxon"]["not_computable"]
+        assert "5 are needed" in comparison["mixed_model"]["not_computable"]
+        assert "p" in comparison["two_sample_t"], "the paper's test sees twelve independent ratings here"
+
+
+def test_nothing_rated_yet_is_no_error() -> None:
+    report = rating_report(ratings().iloc[:0], METHODS, ["paired_t"])
+    assert report["ratings"] == 0
+    assert report["scales"]["satisfaction"]["means"][0]["mean"] is None
+    for comparison in report["scales"]["satisfaction"]["comparisons"]:
+        assert all("not_computable" in comparison[test] for test in ("two_sample_t", "paired_t", "wilcoxon"))
+
+
+def test_equal_differences_have_no_spread_to_test_with() -> None:
+    assert "same difference" in paired_t(np.full(5, 1.0))["not_computable"]
+    assert "differently" in wilcoxon(np.zeros(5))["not_computable"]
+    assert "no spread" in two_sample_t(np.full(4, 2.0), np.full(4, 3.0))["not_computable"]
+
+
+def test_a_model_without_differences_between_people_says_so() -> None:
+    rows = ratings(people=6)
+    rows["satisfaction"] = [1, 2, 3, 2, 3, 4, 3, 4, 5] * 6  # everybody says exactly the same
+    fit = mixed_model(rows, "satisfaction", "method", METHODS)
+    assert any("between people was estimated as zero" in note for note in fit["notes"])
+
+
+def test_somebody_who_rated_only_one_of_two_methods_is_left_out_of_their_comparison() -> None:
+    rows = ratings()
+    rows = rows[~((rows.participant == "P03") & (rows.method == "prefft"))]
+    assert len(paired_differences(rows, "satisfaction", "method", "reference", "prefft")) == 7
+    assert len(paired_differences(rows, "satisfaction", "method", "reference", "pbarl")) == 8
+
+
+def test_letters_are_not_compared_while_they_hide_methods() -> None:
+    rows = ratings().rename(columns={"method": "letter"})
+    report = rating_report(rows, METHODS, ["paired_t"], by="letter", compare=False)
+    assert [scale["comparisons"] for scale in report["scales"].values()] == [[], []]
+    assert report["scales"]["satisfaction"]["means"][0]["ratings"] == 24
+
+
+def test_every_pair_of_methods_is_compared_once_second_minus_first() -> None:
+    report = rating_report(ratings(), METHODS, [])["scales"]["satisfaction"]
+    assert [(each["first"], each["second"]) for each in report["comparisons"]] == list(combinations(METHODS, 2))
+    means = {each["group"]: each["mean"] for each in report["means"]}
+    for each in report["comparisons"]:
+        assert each["two_sample_t"]["difference"] == pytest.approx(means[each["second"]] - means[each["first"]])

@@ -1,0 +1,69 @@
+"""Effect sizes of paired differences with 95 % intervals, and Holm's correction."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+from scipy import optimize, stats
+
+from worker.analysis.agreement import Z_95
+
+Floats = npt.NDArray[np.float64]
+
+_TAIL = 0.025
+
+
+def d_z_interval(t: float, n: int) -> tuple[float, float]:
+    """Exact interval of Cohen's d_z = t / sqrt(n): the noncentral t distributions in whose tails this t just lies.
+
+    Steiger & Fouladi (1997). ``n``: number of pairs.
+    """
+    return _noncentrality(t, n - 1, 1 - _TAIL) / n**0.5, _noncentrality(t, n - 1, _TAIL) / n**0.5
+
+
+def _noncentrality(t: float, degrees_of_freedom: int, share_below: float) -> float:
+    """The noncentrality under which so large a share of t values lies below this one."""
+
+    def excess(noncentrality: float) -> float:
+        return float(stats.nct.cdf(t, degrees_of_freedom, noncentrality)) - share_below
+
+    # Outwards in small steps: far from t the distribution function underflows, and scipy answers NaN.
+    step = 0.25 * (1 + abs(t)) * (1 if excess(t) > 0 else -1)
+    inner, outer = t, t + step
+    while excess(outer) * excess(inner) > 0:
+        inner, outer = outer, outer + step
+    return float(optimize.brentq(excess, *sorted((inner, outer)), xtol=1e-9))
+
+
+def rank_biserial(differences: Floats) -> float:
+    """Matched-pairs rank-biserial correlation: favourable minus unfavourable share of ranks. (P,) -> [-1, 1]
+
+    Kerby (2014). Zeros are dropped, as in Wilcoxon's test. Raises ValueError when nothing is left.
+    """
+    moved = differences[differences != 0]
+    if len(moved) == 0:
+        raise ValueError("All differences are zero.")
+    ranks = stats.rankdata(np.abs(moved))
+    return float((ranks * np.sign(moved)).sum() / ranks.sum())
+
+
+def rank_biserial_interval(correlation: float, n: int) -> tuple[float | None, float | None]:
+    """Approximate interval: Fisher's z with the signed-rank statistic's standard error, as R's effectsize has it.
+
+    (None, None) when all n differences point the same way: the approximation then claims certainty from few people.
+    """
+    if abs(correlation) >= 1:
+        return None, None
+    error = (n * (n + 1) * (2 * n + 1) / 6) ** 0.5 / (n * (n + 1) / 2)
+    middle = np.arctanh(correlation)
+    return float(np.tanh(middle - Z_95 * error)), float(np.tanh(middle + Z_95 * error))
+
+
+def holm(p_values: Sequence[float]) -> list[float]:
+    """Holm's (1979) step-down p values in the order given."""
+    order = sorted(range(len(p_values)), key=lambda index: p_values[index])
+    corrected, largest = [0.0] * len(p_values), 0.0
+    for place, index in enumerate(order):
+        largest = max(largest, min(1.0, p_values[index] * (len(p_values) - place)))
+        corrected[index] = largest
+    return corrected
