@@ -31,7 +31,7 @@ def _fit(place: Workplace, run_id: int, participant_id: int) -> None:
         earlier = earlier_models(session, participant, study) if study.settings.pooled_prior else []
         preferences = dataset.load_preferences(session, place.store, participant_id)
         pool = dataset.pool_pairs(session, place.store, participant.study_id)
-        notes = _notes(session, participant_id)
+        notes = notes_on_pairs(session, participant_id)
     if preferences.pairs is None:
         return  # nothing but "can't tell" so far: there is nothing to learn from
     place.report(run_id, f"learning from {preferences.label_count} labels", 0.2)
@@ -54,7 +54,7 @@ def _fit(place: Workplace, run_id: int, participant_id: int) -> None:
         records.save_model(session, run_id, ModelKind.REWARD, artefact, metrics)
 
 
-def _notes(session: Session, participant_id: int) -> list[str]:
+def notes_on_pairs(session: Session, participant_id: int) -> list[str]:
     """What should be known about the pairs this participant was given."""
     substitutes = select(func.count(Query.id)).where(
         Query.participant_id == participant_id, Query.strategy == querying.NO_OBVIOUS_PAIR

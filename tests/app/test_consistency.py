@@ -1,0 +1,148 @@
+"""How far a person's answers can be trusted, from the answers alone."""
+
+from dataclasses import replace
+from itertools import count
+
+import pytest
+
+from app.domain.preferences import Purpose, Response
+from app.services import consistency
+from app.services.consistency import Answer, Consistency
+
+LEFT, RIGHT, EQUAL, SKIP = Response.LEFT, Response.RIGHT, Response.EQUAL, Response.SKIP
+numbers = count(1)
+
+
+def answer(response: Response = LEFT, **columns: object) -> Answer:
+    """One answer to a pair of clips of its own."""
+    number = next(numbers)
+    usual = Answer(number, number, Purpose.PREFERENCE, response, 10 * number, 10 * number + 1)
+    return replace(usual, **columns)  # type: ignore[arg-type]
+
+
+def again(before: Answer, response: Response, *, swapped: bool = False) -> Answer:
+    """The same pair asked again."""
+    sides = (before.left_clip_id, before.right_clip_id)
+    left, right = sides[::-1] if swapped else sides
+    return answer(
+        response, purpose=Purpose.REPEAT, repeats_query_id=before.query_id, left_clip_id=left, right_clip_id=right
+    )
+
+
+def asked_twice(*said: tuple[Response, Response], swapped: bool = False) -> list[Answer]:
+    firsts = [answer(first) for first, _ in said]
+    return [*firsts, *(again(each, second, swapped=swapped) for each, (_, second) in zip(firsts, said, strict=True))]
+
+
+def of(answers: list[Answer]) -> Consistency:
+    return consistency.consistency(answers)
+
+
+def test_the_same_clip_on_the_other_side_is_the_same_answer() -> None:
+    judged = of(asked_twice((LEFT, RIGHT), (RIGHT, LEFT), swapped=True))
+    assert judged.repeats.agreement is not None
+    assert judged.repeats.agreement.value == 1.0
+    assert judged.repeats.swapped == judged.repeats.agreement
+    assert judged.repeats.unswapped is None
+
+
+def test_who_answers_by_side_agrees_with_themselves_only_where_the_sides_stayed() -> None:
+    judged = of(asked_twice(*[(LEFT, LEFT)] * 5) + asked_twice(*[(LEFT, LEFT)] * 5, swapped=True)).repeats
+    assert judged.unswapped is not None
+    assert judged.swapped is not None
+    assert (judged.unswapped.value, judged.swapped.value) == (1.0, 0.0)
+
+
+def test_cant_tell_is_no_answer_to_agree_with_and_equal_is_one() -> None:
+    judged = of(asked_twice((SKIP, LEFT), (LEFT, SKIP), (EQUAL, EQUAL), (LEFT, EQUAL))).repeats
+    assert judged.asked == 4
+    assert judged.agreement is not None
+    assert (judged.agreement.correct, judged.agreement.scored) == (1, 2)
+    assert judged.decided is None
+
+
+def test_kappa_is_one_without_contradiction_and_nought_at_chance() -> None:
+    agreeing = of(asked_twice(*[(LEFT, LEFT), (RIGHT, RIGHT)] * 5)).repeats.kappa
+    assert agreeing is not None
+    assert agreeing.value == 1.0
+    tossing = of(asked_twice(*[(LEFT, LEFT), (LEFT, RIGHT), (RIGHT, RIGHT), (RIGHT, LEFT)] * 5)).repeats.kappa
+    assert tossing is not None
+    assert tossing.value == pytest.approx(0.0)
+    assert tossing.low < 0.0 < tossing.high
+
+
+def test_kappa_of_a_worked_example() -> None:
+    """16 of 20 alike, one in ten answers equal: e = .1^2 + .9^2 / 2 = .415, kappa = (.8 - .415) / .585."""
+    said = [(LEFT, LEFT)] * 14 + [(EQUAL, EQUAL)] * 2 + [(LEFT, RIGHT)] * 4
+    found = of(asked_twice(*said)).repeats.kappa
+    assert found is not None
+    assert found.value == pytest.approx(0.385 / 0.585)
+    assert found.high - found.value == pytest.approx(1.959964 * (0.8 * 0.2 / 20) ** 0.5 / 0.585)
+
+
+def test_nobody_who_always_says_equal_gets_a_kappa() -> None:
+    assert of(asked_twice(*[(EQUAL, EQUAL)] * 6)).repeats.kappa is None
+
+
+def test_the_ceiling_is_how_often_the_best_model_could_be_right() -> None:
+    said = [(LEFT, LEFT)] * 82 + [(LEFT, RIGHT)] * 18
+    ceiling = of(asked_twice(*said)).repeats.ceiling
+    assert ceiling is not None
+    assert ceiling.value == pytest.approx(0.9)  # .9^2 + .1^2 = .82
+    assert 0.5 <= ceiling.low < 0.9 < ceiling.high <= 1.0
+
+
+def test_only_the_worse_side_of_a_catch_pair_is_an_error() -> None:
+    caught = [answer(said, purpose=Purpose.CATCH, expected=LEFT) for said in (LEFT, RIGHT, EQUAL, SKIP)]
+    errors = of(caught).catch_errors
+    assert errors is not None
+    assert (errors.correct, errors.scored) == (1, 3)
+
+
+def test_always_left_is_a_side_bias_and_a_straight_line() -> None:
+    judged = of([answer(LEFT) for _ in range(20)])
+    assert judged.left is not None
+    assert judged.left.low > 0.5
+    assert judged.longest_run == 20
+    assert {"side_bias", "straight_line"} <= set(judged.flags)
+
+
+def test_left_and_right_in_turn_raise_no_flag() -> None:
+    assert of([answer(side, response_time_ms=6000, clip_ms=6000) for side in [LEFT, RIGHT] * 15]).flags == []
+
+
+def test_an_answer_before_half_of_the_clip_is_too_fast_but_not_at_double_speed() -> None:
+    quick = answer(response_time_ms=2000, clip_ms=6000)
+    judged = of([quick, replace(quick, playback_rate=2.0), answer(response_time_ms=7000, clip_ms=6000), answer()])
+    assert judged.too_fast is not None
+    assert (judged.too_fast.correct, judged.too_fast.scored) == (1, 3)
+
+
+def test_who_gets_slower_with_every_answer_is_seen_to() -> None:
+    times = [int(6000 * 1.01**place) for place in range(60)]
+    judged = of([answer(response_time_ms=time, clip_ms=6000) for time in times])
+    assert judged.slowing is not None
+    assert judged.slowing.per_hundred.value == pytest.approx(170.5, abs=2.0)  # 1.01^100 - 1
+    assert "slowing" in judged.flags
+
+
+def test_less_agreement_in_the_second_half_is_there_to_be_seen() -> None:
+    judged = of(asked_twice(*[(LEFT, LEFT)] * 4, *[(LEFT, RIGHT)] * 4))
+    assert judged.early_agreement is not None
+    assert judged.late_agreement is not None
+    assert (judged.early_agreement.value, judged.late_agreement.value) == (1.0, 0.0)
+
+
+def test_practice_is_left_out_of_everything() -> None:
+    practice = [answer(LEFT, purpose=Purpose.PRACTICE, response_time_ms=1, clip_ms=6000) for _ in range(30)]
+    assert of(practice) == of([])
+
+
+def test_nothing_said_is_nothing_known() -> None:
+    judged = of([])
+    assert (judged.repeats.agreement, judged.repeats.kappa, judged.catch_errors, judged.left) == (None,) * 4
+    assert (judged.too_fast, judged.slowing, judged.longest_run, judged.flags) == (None, None, 0, [])
+
+
+def test_the_balance_counts_every_kind_of_answer() -> None:
+    assert of([answer(LEFT), answer(LEFT), answer(SKIP)]).balance == {LEFT: 2, RIGHT: 0, EQUAL: 0, SKIP: 1}
