@@ -125,7 +125,7 @@ def change_report(evaluations: pd.DataFrame, participants: Sequence[str]) -> Res
     pooled {name: {people, mean, low, high, reference}}. ``success``: share; ``preference``: standard deviations of the
     reference's return, as the person's own reward model sees it; C_*: the paper's costs per episode.
     """
-    rows = []
+    rows: list[Result] = []
     for code in participants:
         theirs = evaluations[(evaluations["participant"] == code) & evaluations["newest"].astype(bool)]
         if len(theirs):

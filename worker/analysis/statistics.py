@@ -8,6 +8,7 @@ Layout of what ``rating_report`` returns, which is ``contents["ratings"]`` of a 
     groups, participants, ratings       the groups in their order; how many people and ratings there are
     explanation                         the sentence on why two kinds of tests stand side by side
     scales.<scale>.means[]              group, ratings, participants, mean, sd, participant_mean, low, high
+    scales.<scale>.people[]             participant, means {group: that person's mean}
     scales.<scale>.comparisons[]        first, second, and a result for each of TESTS
     scales.<scale>.mixed_model          the fit behind the last: converged, notes, variances, n
 
@@ -79,10 +80,11 @@ def _scale_report(
     rows: pd.DataFrame, scale: str, by: str, groups: Sequence[str], planned: Collection[str], compare: bool
 ) -> Result:
     means = [_mean_of(rows[rows[by] == group], scale, group) for group in groups]
+    people = _people(rows, scale, by)
     if not compare:
-        return {"means": means, "comparisons": [], "mixed_model": None}
+        return {"means": means, "people": people, "comparisons": [], "mixed_model": None}
     fit = mixed_model(rows, scale, by, groups)
-    comparisons = [
+    comparisons: list[Result] = [
         {"first": first, "second": second, **_tests(rows, scale, by, first, second)}
         for first, second in combinations(groups, 2)
     ]
@@ -93,7 +95,15 @@ def _scale_report(
     for comparison in comparisons:
         for test in TESTS:
             comparison[test]["planned"] = test in planned
-    return {"means": means, "comparisons": comparisons, "mixed_model": fit}
+    return {"means": means, "people": people, "comparisons": comparisons, "mixed_model": fit}
+
+
+def _people(rows: pd.DataFrame, scale: str, by: str) -> list[Result]:
+    means = rows.groupby(["participant", by])[scale].mean()
+    found: dict[str, dict[str, float]] = {}
+    for (participant, group), mean in means.items():
+        found.setdefault(str(participant), {})[str(group)] = float(mean)
+    return [{"participant": participant, "means": theirs} for participant, theirs in found.items()]
 
 
 def _mean_of(rows: pd.DataFrame, scale: str, group: str) -> Result:

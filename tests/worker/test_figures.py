@@ -1,0 +1,129 @@
+"""Figures are the same bytes every time, keep text as text, and never tell what is blinded."""
+
+from typing import Any
+
+import pytest
+
+from tests.worker.test_statistics import METHODS, ratings
+from worker.analysis import figures
+from worker.analysis.answers import answer_report, change_report
+from worker.analysis.report import Tables, make_report
+from worker.analysis.statistics import rating_report
+
+QUERY_COLUMNS = (
+    "participant",
+    "ordinal",
+    "purpose",
+    "repeats_ordinal",
+    "sides_swapped",
+    "response",
+    "predicted_right",
+    "response_time_ms",
+)
+
+
+@pytest.fixture(scope="module")
+def contents() -> dict[str, Any]:
+    evaluations = [
+        {
+            "participant": f"P{number:02d}",
+            "label_count": 200,
+            "scenarios": 100,
+            "newest": True,
+            "measure": measure,
+            "reference": 2.0,
+            "filtered": 2.0 + 0.1 * number,
+            "delta": 0.1 * number,
+            "low": 0.0,
+            "high": 0.3,
+        }
+        for number in range(1, 5)
+        for measure in ("success", "preference", "C_d", "C_v")
+    ]
+    queries = [
+        {
+            **dict.fromkeys(QUERY_COLUMNS),
+            "participant": f"P{number:02d}",
+            "ordinal": ordinal,
+            "purpose": "preference",
+            "response": "left",
+            "predicted_right": 0.2 if ordinal % 4 else 0.9,
+        }
+        for number in (1, 2)
+        for ordinal in range(1, 41)
+    ]
+    tables = Tables(
+        participants=[f"P{number:02d}" for number in range(1, 5)],
+        ratings=[{**row, "counts": True} for row in ratings().to_dict("records")],
+        queries=queries,
+        evaluations=evaluations,
+        groups=METHODS,
+        planned=["paired_t"],
+    )
+    return make_report(tables)[0]
+
+
+def test_every_figure_is_drawn_and_is_the_same_bytes_every_time(contents: dict[str, Any]) -> None:
+    first, second = figures.all_figures(contents), figures.all_figures(contents)
+    assert set(first) == {
+        "ratings",
+        "ratings_of_each_person",
+        "learning_curves",
+        "success_against_preference",
+        "cost_changes",
+    }
+    assert first == second
+
+
+def test_text_in_svg_is_text_and_png_has_300_dpi(contents: dict[str, Any]) -> None:
+    files = figures.all_figures(contents)["ratings"]
+    assert b"Satisfaction</text>" in files["svg"]
+    assert b">PbARL</text>" in files["svg"]
+    width = int.from_bytes(files["png"][16:20])
+    assert width > 6 * figures.DPI
+
+
+def test_significant_comparisons_have_a_star_and_others_say_so(contents: dict[str, Any]) -> None:
+    svg = figures.all_figures(contents)["ratings"]["svg"].decode()
+    stars = [
+        comparison["two_sample_t"]["star"]
+        for scale in contents["ratings"]["scales"].values()
+        for comparison in scale["comparisons"]
+    ]
+    assert svg.count(">*</text>") == sum(stars)
+    assert svg.count(">n.s.</text>") == len(stars) - sum(stars)
+
+
+def test_figures_of_a_blinded_study_know_letters_only() -> None:
+    rows = ratings().assign(letter=lambda each: each.method.map(dict(zip(METHODS, "ABC", strict=True))))
+    report = rating_report(rows, "ABC", [], by="letter", compare=False)
+    nothing = rows.iloc[:0].assign(newest=True, measure="")
+    contents = {
+        "ratings": report,
+        "answers": answer_report(nothing.reindex(columns=list(QUERY_COLUMNS)), []),
+        "change": change_report(nothing, []),
+    }
+    drawn = figures.all_figures(contents)
+    assert set(drawn) == {"ratings", "ratings_of_each_person"}
+    for files in drawn.values():
+        assert b"Robot" in files["svg"]
+        assert not any(name.encode() in files["svg"] for name in ("PbARL", "PrefFT", "Pre-trained"))
+
+
+def test_a_study_without_anything_has_no_figures() -> None:
+    contents, files = make_report(
+        Tables(
+            [],
+            [],
+            [],
+            [],
+            [],
+            columns={
+                "queries": QUERY_COLUMNS,
+                "evaluations": ["participant", "newest", "measure"],
+                "ratings": ["participant", "method", "satisfaction", "personalisation"],
+            },
+        )
+    )
+    assert files == {}
+    assert contents["ratings"]["ratings"] == 0

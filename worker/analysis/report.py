@@ -1,0 +1,57 @@
+"""One report: tables in, contents and figures out. The one function that the worker's processes run.
+
+Contents (stored as Report.contents): ``version``, ``blinded``, ``planned``, ``ratings`` (see statistics), ``answers``
+and ``change`` (see answers). Figures by name, each as SVG and PNG (see figures).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import pandas as pd
+
+from worker.analysis import answers, figures, statistics
+
+VERSION = 1
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Tables:
+    """The exported tables that a report is made from, and what the study says about them."""
+
+    participants: Sequence[str]
+    """codes of everybody who takes part and has not withdrawn"""
+    ratings: Sequence[Row]
+    queries: Sequence[Row]
+    evaluations: Sequence[Row]
+    groups: Sequence[str]
+    """methods in their order, or letters while blinded; empty in a study without evaluation"""
+    blinded: bool = False
+    planned: Sequence[str] = ()
+    columns: dict[str, Sequence[str]] = field(default_factory=dict)
+    """of each table by name: an empty table has no rows to read them from"""
+
+
+def make_report(tables: Tables) -> tuple[dict[str, Any], dict[str, dict[str, bytes]]]:
+    """The contents, and the figures as {name: {format: file}}."""
+    contents = {
+        "version": VERSION,
+        "blinded": tables.blinded,
+        "planned": list(tables.planned),
+        "ratings": statistics.rating_report(
+            _frame(tables, "ratings"),
+            tables.groups,
+            tables.planned,
+            by="letter" if tables.blinded else "method",
+            compare=not tables.blinded,
+        ),
+        "answers": answers.answer_report(_frame(tables, "queries"), tables.participants),
+        "change": answers.change_report(_frame(tables, "evaluations"), tables.participants),
+    }
+    return contents, figures.all_figures(contents)
+
+
+def _frame(tables: Tables, name: str) -> pd.DataFrame:
+    frame = pd.DataFrame(getattr(tables, name), columns=tables.columns.get(name))
+    return frame if name != "ratings" or frame.empty else frame[frame["counts"].astype(bool)]
