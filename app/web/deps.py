@@ -23,6 +23,8 @@ from app.web.turns import Turns
 
 PARTICIPANT_COOKIE = "studio_participant"
 EXPERIMENTER_COOKIE = "studio_experimenter"
+LANGUAGE_COOKIE = "studio_language"
+"""The language a participant has chosen in this browser, for pages that cannot tell who is asking."""
 
 
 class LinkNeeded(AppError):

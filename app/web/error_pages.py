@@ -1,6 +1,7 @@
 """Every error as a page a person can do something with, or as a problem (RFC 9457) for scripts."""
 
 import logging
+import re
 from collections.abc import Mapping
 from http import HTTPStatus
 
@@ -11,9 +12,10 @@ from sqlalchemy.exc import OperationalError
 from starlette.exceptions import HTTPException
 
 from app.errors import AppError
-from app.web.deps import LoginNeeded, NotYet, PasswordChangeDue
+from app.web.deps import LANGUAGE_COOKIE, LoginNeeded, NotYet, PasswordChangeDue
 from app.web.guard import HEADERS
 from app.web.templating import page
+from app.web.wording import Wording, preferred
 
 log = logging.getLogger("app.web")
 
@@ -41,7 +43,7 @@ def wants_json(request: Request) -> bool:
 
 def error_page(request: Request, error: AppError) -> Response:
     """The page or problem for an error of ours."""
-    return _answer(request, error.status, error.message)
+    return _answer(request, error.status, error.message, key=type(error).__name__)
 
 
 def add_error_pages(app: FastAPI) -> None:
@@ -73,37 +75,63 @@ def add_error_pages(app: FastAPI) -> None:
     @app.exception_handler(HTTPException)
     def of_the_framework(request: Request, error: HTTPException) -> Response:
         status = HTTPStatus(error.status_code)
-        return _answer(request, status, _MESSAGES.get(status, "This request could not be understood."), error.headers)
+        message = _MESSAGES.get(status, "This request could not be understood.")
+        key = "PageNotFound" if status is HTTPStatus.NOT_FOUND else "NotUnderstood"
+        return _answer(request, status, message, error.headers, key)
 
     @app.exception_handler(RequestValidationError)
     def not_valid(request: Request, error: RequestValidationError) -> Response:
         places = {str(each["loc"][0]) for each in error.errors() if each["loc"]}
         if "path" in places:
-            return _answer(request, HTTPStatus.NOT_FOUND, _MESSAGES[HTTPStatus.NOT_FOUND])
+            return _answer(request, HTTPStatus.NOT_FOUND, _MESSAGES[HTTPStatus.NOT_FOUND], key="PageNotFound")
         fields = sorted({str(each["loc"][-1]) for each in error.errors() if each["loc"]})
         message = f"Something in this form is missing or not valid: {', '.join(fields)}. Please go back and check it."
-        return _answer(request, HTTPStatus.UNPROCESSABLE_ENTITY, message)
+        return _answer(request, HTTPStatus.UNPROCESSABLE_ENTITY, message, key="NotUnderstood")
 
     @app.exception_handler(OperationalError)
     def database_busy(request: Request, error: OperationalError) -> Response:
         log.error("the database did not answer: %s", error.orig)
         message = "The database is busy or not ready. Nothing was saved; please try again in a moment."
-        return _answer(request, HTTPStatus.SERVICE_UNAVAILABLE, message, {"retry-after": "2"})
+        return _answer(request, HTTPStatus.SERVICE_UNAVAILABLE, message, {"retry-after": "2"}, "DatabaseBusy")
 
     @app.exception_handler(Exception)
     def unforeseen(request: Request, _error: Exception) -> Response:
         # The server logs the traceback; this tells the person that nothing they did was lost silently.
         message = "This is our fault, and it is in the log. Nothing was saved by this step; please try again."
-        return _answer(request, HTTPStatus.INTERNAL_SERVER_ERROR, message, HEADERS)  # made outside of the guard
+        # made outside of the guard, so it brings the headers itself
+        return _answer(request, HTTPStatus.INTERNAL_SERVER_ERROR, message, HEADERS, "Unforeseen")
 
 
-def _answer(request: Request, status: HTTPStatus, message: str, headers: Mapping[str, str] | None = None) -> Response:
+def _answer(
+    request: Request, status: HTTPStatus, message: str, headers: Mapping[str, str] | None = None, key: str = ""
+) -> Response:
+    """``key``: the name of what happened, under which participants are told in their own language."""
     title = _TITLES.get(status, "That did not work")
+    wording = _wording(request)
+    if wording is not None:
+        title, message = _for_participants(wording, status, message, key)
     answer: Response
     if wants_json(request):
         problem = {"title": title, "status": status, "detail": message}
         answer = JSONResponse(problem, status, media_type="application/problem+json")
     else:
-        answer = page(request, "error.html", {"title": title, "message": message, "status": int(status)}, status)
+        context = {"title": title, "message": message, "status": int(status), "wording": wording}
+        answer = page(request, "error.html", context, status)
     answer.headers.update(headers or {})
     return answer
+
+
+def _wording(request: Request) -> Wording | None:
+    """On the participants' pages: the language last chosen in this browser, else the one it asks for."""
+    if not request.url.path.startswith(("/p/", "/join/")):
+        return None
+    return Wording(preferred(request.cookies.get(LANGUAGE_COOKIE) or request.headers.get("accept-language", "")))
+
+
+def _for_participants(wording: Wording, status: HTTPStatus, message: str, key: str) -> tuple[str, str]:
+    name = "error-" + "-".join(word.lower() for word in re.findall("[A-Z][a-z]*", key))
+    title = f"error-title-{status.value}"
+    return (
+        wording(title if title in wording else "error-title-other"),
+        wording(name) if name in wording else message,
+    )

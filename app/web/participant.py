@@ -10,7 +10,15 @@ from app.domain.protocol import Language, Stage
 from app.domain.studies import Participant
 from app.services import browser_sessions, enrolment, querying, stages
 from app.web import participant_pairs
-from app.web.deps import PARTICIPANT_COOKIE, CurrentParticipant, StudioDep, Token, WritingSession, set_cookie
+from app.web.deps import (
+    LANGUAGE_COOKIE,
+    PARTICIPANT_COOKIE,
+    CurrentParticipant,
+    StudioDep,
+    Token,
+    WritingSession,
+    set_cookie,
+)
 from app.web.error_pages import wants_json
 from app.web.participant_pages import ADDRESSES, back_from, go, has_reached, participant_page
 
@@ -49,11 +57,13 @@ def finish_instructions(request: Request, participant: AtInstructions, session: 
 
 @router.post("/language", name="choose_language")
 def choose_language(
-    request: Request, participant: CurrentParticipant, language: Annotated[Language, Form()]
+    request: Request, participant: CurrentParticipant, studio: StudioDep, language: Annotated[Language, Form()]
 ) -> Response:
     """From now on every page in this language, on every device."""
     participant.language = language
-    return go(request, "show_next")
+    response = go(request, "show_next")
+    set_cookie(response, studio.settings, LANGUAGE_COOKIE, language, timedelta(days=studio.settings.session_days))
+    return response
 
 
 # The last one: every other address below /p/ goes before a token.

@@ -83,6 +83,8 @@ instructions-equal = Gleich: Für mich sind beide gleich gut
 instructions-skip = Weiß nicht: Ich konnte es nicht beurteilen; dieses Paar zählt nicht
 instructions-replay = Von vorn abspielen
 instructions-undo = Letzte Antwort zurücknehmen
+instructions-space = Leer
+instructions-player = Anhalten und weiter; mit den Schaltflächen unter den Filmen gehen Sie schrittweise und ändern die Geschwindigkeit
 instructions-taste = Es gibt keine richtige Antwort; nur Ihr eigener Geschmack zählt. Ein Tastendruck antwortet und bringt das nächste Paar. Die Schaltflächen bewirken dasselbe wie die Tasten.
 instructions-start = Mit dem Vergleichen beginnen
 instructions-practice = Mit der Übung beginnen
@@ -90,7 +92,7 @@ instructions-practice = Mit der Übung beginnen
 ## Zum Schluss: der eigene Roboter
 
 debrief-title = Das ist Ihr Roboter
-debrief-lead = Links der Roboter, wie ihn alle kennenlernen, rechts der, der aus Ihren Antworten gelernt hat. Beide lösen dieselbe Aufgabe in derselben Situation, die für beide neu war.
+debrief-lead = „Vorher“ ist der Roboter, wie ihn alle kennenlernen; „Ihr Roboter“ hat aus Ihren Antworten gelernt. Beide lösen dieselbe Aufgabe in derselben Situation, die für beide neu war.
 debrief-before = Vorher
 debrief-before-alt = Der Roboter, bevor er von Ihnen gelernt hat
 debrief-after = Ihr Roboter
@@ -106,16 +108,16 @@ debrief-learned-how = Verglichen mit dem Roboter vorher, über { $count } Situat
 debrief-learned-nothing = Über { $count } Situationen, die neu für ihn waren, bewegt er sich ganz ähnlich wie der Roboter vorher. Entweder mochten Sie jenen, oder Ihre Antworten zogen in verschiedene Richtungen; beides ist in Ordnung.
 debrief-C_d-less = Er ist eher bei Ihnen.
 debrief-C_d-more = Er lässt sich auf dem Weg zu Ihnen mehr Zeit.
-debrief-C_v-less = Er bewegt sich langsamer ({ $percent } % weniger).
-debrief-C_v-more = Er bewegt sich schneller ({ $percent } % mehr).
-debrief-C_f-less = Er berührt Sie seltener, wo er nicht soll ({ $percent } % weniger).
-debrief-C_f-more = Er berührt Sie unterwegs öfter ({ $percent } % mehr).
-debrief-C_hf-less = Er drückt weniger stark ({ $percent } % weniger).
-debrief-C_hf-more = Er drückt stärker ({ $percent } % mehr).
-debrief-C_fd-less = Er verschüttet weniger auf Sie ({ $percent } % weniger).
-debrief-C_fd-more = Er verschüttet mehr auf Sie ({ $percent } % mehr).
-debrief-C_fdv-less = Was er bringt, kommt langsamer zu Ihnen ({ $percent } % weniger).
-debrief-C_fdv-more = Was er bringt, kommt schneller zu Ihnen ({ $percent } % mehr).
+debrief-C_v-less = Er bewegt sich langsamer ({ $percent } % weniger).
+debrief-C_v-more = Er bewegt sich schneller ({ $percent } % mehr).
+debrief-C_f-less = Er berührt Sie seltener, wo er nicht soll ({ $percent } % weniger).
+debrief-C_f-more = Er berührt Sie unterwegs öfter ({ $percent } % mehr).
+debrief-C_hf-less = Er drückt weniger stark ({ $percent } % weniger).
+debrief-C_hf-more = Er drückt stärker ({ $percent } % mehr).
+debrief-C_fd-less = Er verschüttet weniger auf Sie ({ $percent } % weniger).
+debrief-C_fd-more = Er verschüttet mehr auf Sie ({ $percent } % mehr).
+debrief-C_fdv-less = Was er bringt, kommt langsamer zu Ihnen ({ $percent } % weniger).
+debrief-C_fdv-more = Was er bringt, kommt schneller zu Ihnen ({ $percent } % mehr).
 debrief-done = Abschließen
 
 ## Das Ende
@@ -167,12 +169,32 @@ join-link-copy = Kopieren
 
 ## Was schiefgehen kann
 
-error-link-needed-title = Wer sind Sie?
+error-title-401 = Wer sind Sie?
+error-title-403 = Das ist nicht erlaubt
+error-title-404 = Hier ist nichts
+error-title-409 = Das passt nicht mehr
+error-title-500 = Etwas ist kaputtgegangen
+error-title-503 = Einen Moment bitte
+error-title-other = Das hat nicht geklappt
+error-number = Fehler { $status }
 error-link-needed = Wir können nicht erkennen, wer Sie sind. Bitte öffnen Sie Ihren persönlichen Link noch einmal: Sie machen genau dort weiter, wo Sie waren.
-error-link-not-valid-title = Hier ist nichts
 error-link-not-valid = Dieser Link ist nicht gültig. Vielleicht wurde er durch einen neueren ersetzt; bitte fragen Sie die Person, von der Sie ihn haben.
-error-joining-closed-title = Hier ist nichts
 error-joining-closed = An dieser Studie kann man über diese Adresse nicht (mehr) teilnehmen. Bitte fragen Sie die Menschen, von denen Sie sie haben.
+error-not-yet = Etwas anderes kommt zuerst. Sie werden dorthin gebracht.
+error-query-not-found = Dieses Paar gibt es für Sie nicht. Bitte machen Sie mit dem Paar weiter, das Ihnen gezeigt wird.
+error-query-not-shown = Dieses Paar wurde Ihnen noch nicht gezeigt. Bitte machen Sie mit dem Paar weiter, das Ihnen gezeigt wird.
+error-answer-misdirected = Diese Antwort wurde schon zu einem anderen Paar gegeben. Bitte laden Sie die Seite neu und antworten Sie noch einmal.
+error-undo-too-late = Nur Ihre letzte Antwort lässt sich zurücknehmen, und dies ist eine frühere.
+error-trial-not-found = Diesen Roboter gibt es für Sie nicht zu bewerten. Bitte machen Sie mit dem weiter, der Ihnen gezeigt wird.
+error-trial-not-shown = Diesen Roboter haben Sie noch nicht gesehen. Bitte machen Sie mit dem weiter, der Ihnen gezeigt wird.
+error-rated-already = Dieser Roboter ist schon bewertet, und diese Bewertung zählt. Die letzte Bewertung können Sie noch ändern.
+error-correction-too-late = Nur die letzte Bewertung lässt sich ändern, und dies ist eine frühere.
+error-rating-misdirected = Diese Bewertung wurde schon zu einem anderen Roboter abgegeben. Bitte laden Sie die Seite neu und bewerten Sie noch einmal.
+error-foreign-form = Diese Anfrage kam von einer anderen Website und wurde abgelehnt. Bitte benutzen Sie die Seiten dieser Website.
+error-page-not-found = Unter dieser Adresse gibt es keine Seite.
+error-not-understood = Etwas in diesem Formular fehlt oder ist nicht gültig. Bitte gehen Sie zurück und prüfen Sie es.
+error-database-busy = Die Datenbank ist beschäftigt oder noch nicht bereit. Es wurde nichts gespeichert; bitte versuchen Sie es gleich noch einmal.
+error-unforeseen = Das ist unser Fehler, und er steht im Protokoll. Bei diesem Schritt wurde nichts gespeichert; bitte versuchen Sie es noch einmal.
 
 ## Paare (Vorsilbe pair-)
 
@@ -295,7 +317,7 @@ evaluation-step-learning = Aus Ihren Antworten wird gelernt
 evaluation-step-training = Die Roboter werden trainiert
 evaluation-step-filming = Die Roboter werden gefilmt
 evaluation-step-packing = Die Roboter werden bereitgestellt
-evaluation-robots-ready = { $ready } von { $count } Robotern sind trainiert; { $percent } % der ganzen Arbeit sind getan.
+evaluation-robots-ready = { $ready } von { $count } Robotern sind trainiert; { $percent } % der ganzen Arbeit sind getan.
 evaluation-minutes-left =
     { $minutes ->
         [one] Noch etwa eine Minute, länger, wenn andere vor Ihnen sind.

@@ -85,6 +85,8 @@ instructions-equal = Equal: both are as good for me
 instructions-skip = Can’t tell: I could not judge; this pair is left out
 instructions-replay = Replay from the start
 instructions-undo = Undo the last answer
+instructions-space = space
+instructions-player = Pause and go on; the buttons below the clips step and change the speed
 instructions-taste = There is no right answer; only your own taste counts. One press answers and brings the next pair. The buttons do the same as the keys.
 instructions-start = Start comparing
 instructions-practice = Start with practice
@@ -92,7 +94,7 @@ instructions-practice = Start with practice
 ## Debrief
 
 debrief-title = This is your robot
-debrief-lead = On the left the robot as everybody meets it, on the right the one that has learned from your answers. Both do the same task in the same situation, one that neither has met before.
+debrief-lead = “Before” is the robot as everybody meets it, “Your robot” has learned from your answers. Both do the same task in the same situation, one that was new to both.
 debrief-before = Before
 debrief-before-alt = The robot before it learned from you
 debrief-after = Your robot
@@ -108,16 +110,16 @@ debrief-learned-how = Compared with the robot before, over { $count } situations
 debrief-learned-nothing = Over { $count } situations it had not met, it moves much like the robot before. Either you liked that one, or your answers pulled in several directions; both are fine.
 debrief-C_d-less = It is with you sooner.
 debrief-C_d-more = It takes more time on its way to you.
-debrief-C_v-less = It moves more slowly ({ $percent } % less).
-debrief-C_v-more = It moves more quickly ({ $percent } % more).
-debrief-C_f-less = It touches you less where it should not ({ $percent } % less).
-debrief-C_f-more = It touches you more on its way ({ $percent } % more).
-debrief-C_hf-less = It presses less hard ({ $percent } % less).
-debrief-C_hf-more = It presses harder ({ $percent } % more).
-debrief-C_fd-less = It spills less on you ({ $percent } % less).
-debrief-C_fd-more = It spills more on you ({ $percent } % more).
-debrief-C_fdv-less = What it brings comes to you more slowly ({ $percent } % less).
-debrief-C_fdv-more = What it brings comes to you more quickly ({ $percent } % more).
+debrief-C_v-less = It moves more slowly ({ $percent } % less).
+debrief-C_v-more = It moves more quickly ({ $percent } % more).
+debrief-C_f-less = It touches you less where it should not ({ $percent } % less).
+debrief-C_f-more = It touches you more on its way ({ $percent } % more).
+debrief-C_hf-less = It presses less hard ({ $percent } % less).
+debrief-C_hf-more = It presses harder ({ $percent } % more).
+debrief-C_fd-less = It spills less on you ({ $percent } % less).
+debrief-C_fd-more = It spills more on you ({ $percent } % more).
+debrief-C_fdv-less = What it brings comes to you more slowly ({ $percent } % less).
+debrief-C_fdv-more = What it brings comes to you more quickly ({ $percent } % more).
 debrief-done = Finish
 
 ## The end
@@ -169,12 +171,32 @@ join-link-copy = Copy
 
 ## What can go wrong
 
-error-link-needed-title = Who are you?
+error-title-401 = Who are you?
+error-title-403 = That is not allowed
+error-title-404 = Nothing here
+error-title-409 = That no longer fits
+error-title-500 = Something broke
+error-title-503 = A moment, please
+error-title-other = That did not work
+error-number = Error { $status }
 error-link-needed = We cannot tell who you are. Please open your personal link again: you go on exactly where you were.
-error-link-not-valid-title = Nothing here
 error-link-not-valid = This link is not valid. It may have been replaced by a newer one; please ask the person who sent it to you.
-error-joining-closed-title = Nothing here
 error-joining-closed = This study cannot be joined by this address (any more). Please ask the people who gave it to you.
+error-not-yet = Something else comes first. You are taken there.
+error-query-not-found = There is no such pair for you. Please go on with the pair you are shown.
+error-query-not-shown = This pair has not been shown to you yet. Please go on with the pair you are shown.
+error-answer-misdirected = This answer was already given to another pair. Please reload the page and answer again.
+error-undo-too-late = Only your newest answer can be taken back, and this is an older one.
+error-trial-not-found = There is no such robot for you to rate. Please go on with the one you are shown.
+error-trial-not-shown = You have not seen this robot yet. Please go on with the one you are shown.
+error-rated-already = This robot has a rating already, and that is the one which counts. The last rating can still be changed.
+error-correction-too-late = Only the last rating can be changed, and this is an earlier one.
+error-rating-misdirected = This rating was already given to another robot. Please reload the page and rate again.
+error-foreign-form = This request came from another website and was refused. Please use the pages of this site.
+error-page-not-found = There is no page at this address.
+error-not-understood = Something in this form is missing or not valid. Please go back and check it.
+error-database-busy = The database is busy or not ready. Nothing was saved; please try again in a moment.
+error-unforeseen = This is our fault, and it is in the log. Nothing was saved by this step; please try again.
 
 ## Pairs (prefix pair-)
 
@@ -297,7 +319,7 @@ evaluation-step-learning = Learning from your answers
 evaluation-step-training = Training the robots
 evaluation-step-filming = Filming the robots
 evaluation-step-packing = Getting the robots ready
-evaluation-robots-ready = { $ready } of { $count } robots are trained; { $percent } % of everything is done.
+evaluation-robots-ready = { $ready } of { $count } robots are trained; { $percent } % of everything is done.
 evaluation-minutes-left =
     { $minutes ->
         [one] About a minute to go, longer if others are before you.

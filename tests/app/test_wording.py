@@ -5,6 +5,7 @@ import re
 from pathlib import Path
 
 import pytest
+from fastapi.testclient import TestClient
 from fluent.syntax import ast
 
 from app.domain.protocol import Language
@@ -84,3 +85,20 @@ def test_numbers_are_written_as_the_language_writes_them() -> None:
 )
 def test_without_a_choice_the_browser_is_asked(asked: str, given: str) -> None:
     assert wording.preferred(asked) == given
+
+
+@pytest.mark.parametrize(
+    ("address", "headers", "said"),
+    [
+        ("/p/next", {"Accept-Language": "de"}, "Wer sind Sie?"),
+        ("/p/" + "x" * 43, {"Accept-Language": "de-AT"}, "Dieser Link ist nicht gültig"),
+        ("/p/nowhere", {"Cookie": "studio_language=de"}, "Hier ist nichts"),
+        ("/join/" + "x" * 30, {"Accept-Language": "de"}, "nicht (mehr) teilnehmen"),
+        ("/p/next", {}, "Who are you?"),
+        ("/studies/none", {"Accept-Language": "de", "Accept": "application/json"}, "log in"),
+    ],
+)
+def test_what_went_wrong_is_said_to_participants_in_their_language(
+    client: TestClient, address: str, headers: dict[str, str], said: str
+) -> None:
+    assert said in client.get(address, headers=headers).text
