@@ -16,11 +16,12 @@ from sqlalchemy.orm import Session
 
 from app.db import now
 from app.domain.clips import Clip, Rollout
-from app.domain.evaluation import Film, Rating, Trial
+from app.domain.evaluation import Controller, Film, Rating, Trial
 from app.domain.models import Bundle, Model, ModelKind, Run, RunKind, RunStatus
 from app.domain.preferences import LabelEvent, Query, Response
+from app.domain.protocol import EvaluationMode, Stage
 from app.domain.studies import Participant, Study, StudySettings
-from app.services import enrolment, evaluating, studies
+from app.services import enrolment, evaluating, stages, studies
 from app.storage import ArtefactStore
 
 FPS = 10
@@ -205,6 +206,41 @@ def make_film(
     return film
 
 
+def make_controller(session: Session, store: ArtefactStore, participant: Participant, method: str) -> Controller:
+    """A method packed for a robot."""
+    content = f"PK a robot of {participant.code} that acts as {method}".encode()
+    controller = Controller(
+        participant_id=participant.id, method=method, artefact_sha256=store.put(content), byte_count=len(content)
+    )
+    session.add(controller)
+    session.flush()
+    return controller
+
+
+def answer_everything(session: Session, store: ArtefactStore, study: Study, participant: Participant) -> None:
+    """Every pair answered, so that the evaluation is next."""
+    for query in make_queries(session, store, participant, study.settings.question_count):
+        make_label(session, query)
+
+
+def make_robots(session: Session, store: ArtefactStore, study: Study, participant: Participant) -> Sequence[Trial]:
+    """The evaluation drawn, and everything there that it shows: films or controllers. Returns the trials."""
+    settings = study.settings.evaluation
+    if settings is None:
+        raise ValueError("This study evaluates nothing.")
+    evaluating.draw(session, study, participant)
+    methods = {each.letter: each.method for each in evaluating.assignments_of(session, participant.id)}
+    trials = evaluating.trials_of(session, participant.id)
+    if settings.mode is EvaluationMode.PHYSICAL:
+        for method in methods.values():
+            make_controller(session, store, participant, method)
+        return trials
+    for trial in trials:
+        trial.film = make_film(session, store, participant, methods[trial.letter], scenario=trial.scenario)
+    session.flush()
+    return trials
+
+
 def make_rated_trials(session: Session, participant: Participant, count: int) -> None:
     """More trials of the participant, with a rating each."""
     known = session.scalar(select(func.count(Trial.id)).where(Trial.participant_id == participant.id)) or 0
@@ -213,6 +249,20 @@ def make_rated_trials(session: Session, participant: Participant, count: int) ->
         session.add(trial)
         session.flush()
         session.add(Rating(trial_id=trial.id, revision=1, satisfaction=4, personalisation=3, client_uuid=str(uuid4())))
+
+
+def finish_everything(session: Session, participant: Participant, study: Study) -> None:
+    """Everything that the participant is asked is done; their queries are there."""
+    participant.study = study
+    participant.consented_at = participant.instructed_at = now()
+    participant.consent_version = study.settings.consent_version
+    for query in session.scalars(select(Query).where(Query.participant_id == participant.id)).all():
+        make_label(session, query)
+    if study.settings.evaluation is not None:
+        make_rated_trials(session, participant, study.settings.evaluation.trial_count)
+    for stage in (Stage.DEMOGRAPHICS, Stage.QUESTIONNAIRE, Stage.DEBRIEF):
+        stages.finish(session, participant, stage)
+        session.flush()
 
 
 def filter_metrics(scenarios: int = 100) -> dict[str, Any]:

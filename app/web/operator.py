@@ -155,7 +155,7 @@ def _desk_page(
     settings = evaluating.settings_of(study)
     context: dict[str, Any] = {
         "study": study,
-        "participant": participant,
+        "code": participant.code,
         "experimenter": experimenter,
         "desk": operating.desk_of(session, studio.store, study, participant),
         "trials_each": settings.trials if settings else 0,
