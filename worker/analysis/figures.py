@@ -164,7 +164,7 @@ def ratings_of_each_person(contents: Mapping[str, Any]) -> Figure | None:
             axes.spines["left"].set_bounds(1, 5)
             axes.set_title(scale.capitalize())
         figure.axes[0].set_ylabel("Mean rating of each person")
-        _legend_of_means(figure.axes[1], "lower right")
+        _legend_of_means(figure.axes[1])
     return figure
 
 
@@ -177,10 +177,10 @@ def _line_of(axes: Axes, groups: Sequence[str], means: Mapping[str, float], shif
     )
 
 
-def _legend_of_means(axes: Axes, place: str) -> None:
+def _legend_of_means(axes: Axes) -> None:
     axes.plot([], [], "o-", color=GREY, markerfacecolor="white", markersize=4, linewidth=0.9, label="each person")
     axes.plot([], [], "D-", color=LINE_COLOURS[2], markersize=5, linewidth=2, label="mean, 95 % interval")
-    axes.legend(loc=place, fontsize=7.5)
+    axes.legend(loc="lower right", fontsize=7.5)
 
 
 def _mean_mark(axes: Axes, place: int, each: Mapping[str, Any]) -> None:
@@ -238,7 +238,7 @@ def success_against_preference(contents: Mapping[str, Any]) -> Figure | None:
         axes = figure.subplots()
         axes.axhline(0, color=INK, linewidth=0.8)
         axes.axvline(0, color=INK, linewidth=0.8)
-        for code, preference, success in people:
+        for _, preference, success in people:
             x, y = preference["delta"], success["delta"] * 100
             axes.plot([preference["low"], preference["high"]], [y, y], color=GREY, linewidth=0.9, zorder=2)
             axes.plot([x, x], [success["low"] * 100, success["high"] * 100], color=GREY, linewidth=0.9, zorder=2)
@@ -246,6 +246,7 @@ def success_against_preference(contents: Mapping[str, Any]) -> Figure | None:
         axes.set_xlabel("Change of preference (SD of the reference's return,\nas the person's own model sees it)")
         axes.set_ylabel("Change of success (percentage points)")
         axes.margins(0.12)
+        figure.draw_without_rendering()  # settles the layout, and with it what is where
         _label(axes, [(code, x["delta"], y["delta"] * 100) for code, x, y in people])
     return figure
 
@@ -253,10 +254,9 @@ def success_against_preference(contents: Mapping[str, Any]) -> Figure | None:
 def _label(axes: Axes, points: Sequence[tuple[str, float, float]]) -> None:
     """Name the points, each at the first place beside it that no other name has taken. Sizes in typographic points."""
     taken: list[tuple[float, float]] = []
-    to_points = axes.transData.frozen()
-    scale = 72 / axes.get_figure(root=True).dpi  # type: ignore[union-attr]
+    scale = 72 / float(mpl.rcParams["figure.dpi"])
     for code, x, y in sorted(points, key=lambda each: (each[1], each[2])):
-        at = np.array(to_points.transform((x, y))) * scale
+        at = np.array(axes.transData.transform((x, y))) * scale
         width = 5.5 * len(code)
         places = ((6, 5), (6, -12), (-6 - width, 5), (-6 - width, -12), (6, 16), (6, -23), (-6 - width, 16))
         free = [
@@ -296,7 +296,7 @@ def cost_changes(contents: Mapping[str, Any]) -> Figure | None:
         axes.spines["left"].set_visible(False)
         axes.plot([], [], "o", color="white", markeredgecolor=GREY, markersize=4.5, label="each person")
         axes.plot([], [], "D", color=LINE_COLOURS[2], markersize=6.5, label="mean")
-        axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=2, borderaxespad=0)
+        axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=2, borderaxespad=0.2)
     return figure
 
 
