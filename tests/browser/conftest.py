@@ -1,10 +1,19 @@
-"""Chromium for the browser tests, one for all of them."""
+"""Chromium for the browser tests, one for all of them, and a participant with a link to open in it."""
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 
 import pytest
-from playwright.sync_api import Browser, sync_playwright
+from axe_playwright_python.sync_playwright import Axe
+from playwright.sync_api import Browser, BrowserContext, Page, expect, sync_playwright
+from sqlalchemy import select
+
+from app.db import Database
+from app.domain.preferences import LabelEvent, current_answers
+from app.domain.studies import Participant, Study
+from app.storage import ArtefactStore
+from tests import factories
 
 
 @pytest.fixture(scope="session")
@@ -17,3 +26,84 @@ def chromium() -> Iterator[Browser]:
         browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox", "--disable-gpu"])
         yield browser
         browser.close()
+
+
+NewPage = Callable[..., Page]
+SETTLED = """() => Promise.all(
+    document.getAnimations()
+        .filter((each) => each.effect.getComputedTiming().endTime !== Infinity)
+        .map((each) => each.finished.catch(() => null))
+)"""
+"""Waits until every transition on the page has ended."""
+
+
+@dataclass
+class Invited:
+    """A participant with a link, and queries waiting."""
+
+    address: str
+    token: str
+    participant: Participant
+    study: Study
+    database: Database
+
+    @property
+    def link(self) -> str:
+        """The personal link."""
+        return f"{self.address}/p/{self.token}"
+
+    def events(self) -> list[LabelEvent]:
+        """Everything stored about this participant's answers, in its order."""
+        with self.database.reading() as session:
+            return list(session.scalars(select(LabelEvent).order_by(LabelEvent.id)))
+
+    def responses(self) -> list[str]:
+        """The answers that count."""
+        with self.database.reading() as session:
+            return [label.response.value for label in current_answers(session, self.participant.id)]
+
+
+@pytest.fixture
+def invited(database: Database, store: ArtefactStore, address: str, request: pytest.FixtureRequest) -> Invited:
+    """Ready to compare, in a study of usual settings; ``indirect`` parametrisation gives False, or other settings."""
+    param = getattr(request, "param", {})
+    with database.writing() as session:
+        study = factories.make_study(session, **(param or {}))
+        participant, token = factories.make_participant(session, study, ready=param is not False)
+        factories.make_queries(session, store, participant, 12)
+    return Invited(address, token, participant, study, database)
+
+
+@pytest.fixture
+def new_page(chromium: Browser) -> Iterator[NewPage]:
+    """Opens a fresh browser profile; fails the test on any error its scripts raise."""
+    contexts: list[BrowserContext] = []
+    errors: list[str] = []
+
+    def open_page(**options: object) -> Page:
+        context = chromium.new_context(**{"viewport": {"width": 1366, "height": 768}, **options})  # type: ignore[arg-type]
+        contexts.append(context)
+        page = context.new_page()
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.on("console", lambda message: errors.append(message.text) if "Content Security" in message.text else None)
+        return page
+
+    yield open_page
+    for context in contexts:
+        context.close()
+    assert errors == []
+
+
+def wait_ready(page: Page, answered: int) -> None:
+    """Until this many answers are given and the next pair plays."""
+    expect(page.locator("[data-count]")).to_have_text(f"{answered} of 10")
+    expect(page.locator("[data-phase=ready]")).to_be_visible(timeout=15_000)
+
+
+def serious_findings(page: Page) -> list[str]:
+    """What axe finds wrong for people who use assistive technology, once nothing fades or moves any more."""
+    page.evaluate(SETTLED)  # a button that is still fading in has the contrast of no state a person reads
+    violations = Axe().run(page).response["violations"]
+    return [
+        f"{each['id']}: {each['nodes'][0]['html']}" for each in violations if each["impact"] in ("serious", "critical")
+    ]

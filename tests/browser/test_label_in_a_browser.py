@@ -1,101 +1,15 @@
 """A participant labels in a real browser, from the personal link to the thanks; the experimenter looks on."""
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-
 import pytest
-from axe_playwright_python.sync_playwright import Axe
-from playwright.sync_api import Browser, BrowserContext, Page, Route, expect
-from sqlalchemy import select
+from playwright.sync_api import Route, expect
 
-from app.db import Database
-from app.domain.preferences import LabelEvent, current_labels
-from app.domain.studies import Participant, Study
 from app.storage import ArtefactStore
 from tests import factories
+from tests.browser.conftest import Invited, NewPage, serious_findings, wait_ready
 
 pytestmark = pytest.mark.browser
 
 KEYS = {"left": "ArrowLeft", "right": "ArrowRight", "equal": "ArrowDown", "skip": "s"}
-NewPage = Callable[..., Page]
-SETTLED = """() => Promise.all(
-    document.getAnimations()
-        .filter((each) => each.effect.getComputedTiming().endTime !== Infinity)
-        .map((each) => each.finished.catch(() => null))
-)"""
-"""Waits until every transition on the page has ended."""
-
-
-@dataclass
-class Invited:
-    """A participant with a link, and queries waiting."""
-
-    address: str
-    token: str
-    participant: Participant
-    study: Study
-    database: Database
-
-    @property
-    def link(self) -> str:
-        """The personal link."""
-        return f"{self.address}/p/{self.token}"
-
-    def events(self) -> list[LabelEvent]:
-        """Everything stored about this participant's answers, in its order."""
-        with self.database.reading() as session:
-            return list(session.scalars(select(LabelEvent).order_by(LabelEvent.id)))
-
-    def responses(self) -> list[str]:
-        """The answers that count."""
-        with self.database.reading() as session:
-            return [label.response.value for label in current_labels(session, self.participant.id)]
-
-
-@pytest.fixture
-def invited(database: Database, store: ArtefactStore, address: str, request: pytest.FixtureRequest) -> Invited:
-    """Ready to compare unless the test is marked otherwise by ``indirect`` parametrisation."""
-    ready = getattr(request, "param", True)
-    with database.writing() as session:
-        study = factories.make_study(session)
-        participant, token = factories.make_participant(session, study, ready=ready)
-        factories.make_queries(session, store, participant, 12)
-    return Invited(address, token, participant, study, database)
-
-
-@pytest.fixture
-def new_page(chromium: Browser) -> Iterator[NewPage]:
-    """Opens a fresh browser profile; fails the test on any error its scripts raise."""
-    contexts: list[BrowserContext] = []
-    errors: list[str] = []
-
-    def open_page(**options: object) -> Page:
-        context = chromium.new_context(**{"viewport": {"width": 1366, "height": 768}, **options})  # type: ignore[arg-type]
-        contexts.append(context)
-        page = context.new_page()
-        page.on("pageerror", lambda error: errors.append(str(error)))
-        page.on("console", lambda message: errors.append(message.text) if "Content Security" in message.text else None)
-        return page
-
-    yield open_page
-    for context in contexts:
-        context.close()
-    assert errors == []
-
-
-def wait_ready(page: Page, answered: int) -> None:
-    """Until this many answers are given and the next pair plays."""
-    expect(page.locator("[data-count]")).to_have_text(f"{answered} of 10")
-    expect(page.locator("[data-phase=ready]")).to_be_visible(timeout=15_000)
-
-
-def serious_findings(page: Page) -> list[str]:
-    """What axe finds wrong for people who use assistive technology, once nothing fades or moves any more."""
-    page.evaluate(SETTLED)  # a button that is still fading in has the contrast of no state a person reads
-    violations = Axe().run(page).response["violations"]
-    return [
-        f"{each['id']}: {each['nodes'][0]['html']}" for each in violations if each["impact"] in ("serious", "critical")
-    ]
 
 
 @pytest.mark.parametrize("invited", [False], indirect=True)
