@@ -15,6 +15,8 @@ from app.web.templating import ROOT
 from app.web.wording import Wording, built_in_texts, variables_of, wording_for
 
 TEMPLATES = sorted((ROOT / "templates" / "participant").glob("*.html"))
+NAMES_FOR_CODE = r"{% block (page|page_data|body_class|sheet_class|width) %}.*?{% endblock %}"
+DATA = r"data-[\w-]+(=\"[^\"]*\")?"
 SAID = re.compile(r"""say\(\s*["']([a-zA-Z0-9_-]+)["']\s*[,)]""")
 
 
@@ -39,6 +41,15 @@ def test_no_message_is_broken_or_there_twice(language: Language) -> None:
 def test_pages_ask_for_messages_that_exist(template: Path) -> None:
     known = built_in_texts(Language.ENGLISH)
     assert [key for key in SAID.findall(template.read_text(encoding="utf-8")) if key not in known] == []
+
+
+@pytest.mark.parametrize("template", TEMPLATES, ids=lambda path: path.name)
+def test_no_page_has_words_of_its_own(template: Path) -> None:
+    text = template.read_text(encoding="utf-8")
+    for no_words in (NAMES_FOR_CODE, r"{#.*?#}|{%.*?%}|{{.*?}}", r"<(svg|kbd).*?</\1>", DATA):
+        text = re.sub(no_words, "", text, flags=re.DOTALL)
+    spoken = re.findall(r"(?:aria-label|title|placeholder|alt)=\"([^\"]*)\"", text)
+    assert re.findall(r"[A-Za-z]{2,}", " ".join([re.sub(r"<[^>]*>", " ", text), *spoken])) == []
 
 
 def test_the_study_speaks_first_and_in_every_language_until_it_says_otherwise() -> None:
