@@ -230,3 +230,34 @@ def test_after_some_answers_a_break_is_offered_once_and_enter_goes_on(invited: I
     wait_ready(page, 2)
     for kind in ("break_begun", "break_over"):
         assert [event.detail for event in events(invited, kind)] == [{"answered": 2}]
+
+
+@pytest.mark.parametrize(("width", "height"), [(1366, 768), (390, 844)])
+@pytest.mark.parametrize("invited", [{"practice_pairs": 1, "language": "de"}], indirect=True)
+def test_practice_fits_the_screen_in_the_longer_language_too(
+    invited: Invited, new_page: NewPage, width: int, height: int
+) -> None:
+    with invited.database.writing() as session:
+        session.scalars(select(Query).order_by(Query.ordinal)).first().purpose = Purpose.PRACTICE  # type: ignore[union-attr]
+    page = new_page(viewport={"width": width, "height": height}, has_touch=width < 900, is_mobile=width < 900)
+    page.goto(invited.link)
+    expect(page.locator("[data-phase=ready]")).to_be_visible()
+    root = "document.documentElement"
+    assert page.evaluate(f"[{root}.scrollWidth - innerWidth, {root}.scrollHeight - innerHeight]") == [0, 0]
+    for box in [each.bounding_box() for each in page.locator("video, button:visible, input:visible").all()]:
+        assert box is not None
+        assert box["x"] >= 0
+        assert box["x"] + box["width"] <= width
+        assert box["y"] + box["height"] <= height
+
+
+def test_without_script_the_clips_have_the_browser_s_controls_and_the_rest_stays_away(
+    invited: Invited, new_page: NewPage
+) -> None:
+    page = new_page(java_script_enabled=False)
+    page.goto(invited.link)
+    assert page.locator("video[controls]").count() == 2
+    expect(page.locator("[data-player]")).to_be_hidden()
+    expect(page.get_by_role("dialog")).to_be_hidden()
+    page.get_by_role("button", name="Equal").click()
+    assert invited.responses() == ["equal"]
