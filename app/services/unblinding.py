@@ -8,9 +8,19 @@ from sqlalchemy.orm import Session
 
 from app.db import now
 from app.domain.evaluation import Assignment, Rating, Trial
+from app.domain.protocol import EvaluatedMethod
 from app.domain.studies import Participant, Study
 from app.errors import AppError
 from app.services import audit
+
+NAMES = {
+    EvaluatedMethod.REFERENCE: "pre-trained policy",
+    EvaluatedMethod.PREFFT: "PrefFT",
+    EvaluatedMethod.PREFFT_ANCHORED: "PrefFT, anchored",
+    EvaluatedMethod.PBARL: "PbARL",
+    EvaluatedMethod.PBARL_PRINTED: "PbARL as printed",
+}
+"""What people call the methods, once they may know."""
 
 
 class ConfirmationDiffers(AppError):

@@ -14,7 +14,7 @@ from app.domain.people import Experimenter
 from app.domain.studies import Participant, Study
 from app.services import audit, enrolment, evaluating, operating, studies, unblinding
 from app.services.operating import LONGEST_REASON, ReasonMissing
-from app.services.unblinding import ConfirmationDiffers
+from app.services.unblinding import NAMES, ConfirmationDiffers
 from app.web.deps import (
     ActingExperimenter,
     Code,
@@ -179,6 +179,7 @@ def _unblinding_page(
         "rated": rated,
         "wanted": wanted,
         "key": [] if unblinding.is_blinded(study) else unblinding.key_of(session, study),
+        "names": NAMES,
         "error": error,
     }
     status = HTTPStatus.UNPROCESSABLE_ENTITY if error else HTTPStatus.OK

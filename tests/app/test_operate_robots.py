@@ -218,14 +218,14 @@ def test_unblinding_needs_the_studys_short_name_and_is_logged_with_what_was_rate
     refused = laboratory.operator.post(path, data={"typed": "yes"})
     assert refused.status_code == 422
     assert "Nothing was unblinded" in refused.text
-    assert "prefft" not in refused.text
+    assert "PrefFT" not in refused.text
     with laboratory.database.reading() as session:
         assert session.get_one(Study, laboratory.study.id).unblinded_at is None
     laboratory.operator.post(path, data={"typed": laboratory.study.slug})
     laboratory.operator.post(path, data={"typed": laboratory.study.slug})
     assert laboratory.audit()[-1] == "study unblinded: feeding-at-home (1 of 9 trials rated)"
     assert len([line for line in laboratory.audit() if "unblinded" in line]) == 1
-    assert "prefft" in laboratory.operator.get(path).text
+    assert "PrefFT" in laboratory.operator.get(path).text
 
 
 def test_asking_for_the_key_of_a_blinded_study_is_refused(laboratory: Laboratory) -> None:
