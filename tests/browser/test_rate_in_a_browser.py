@@ -1,4 +1,4 @@
-"""Robots are watched and rated in a real browser, by keyboard alone; an operator and a participant follow each other."""
+"""Robots are watched and rated in a real browser, by keyboard alone; operator and participant follow each other."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
