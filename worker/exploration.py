@@ -88,7 +88,8 @@ def _joined(files: list[Path]) -> Differences:
 
 def _fit(task: str, scenarios: int, found: Differences) -> dict[str, Any]:
     family = laboratory.task(task).modes
-    surface = response_surface.fit(family, found.modes, found.signals, found.success)
+    successes = found.reference_success.repeat(MODES_PER_SCENARIO) + found.success
+    surface = response_surface.fit(family, found.modes, found.signals, successes)
     surface.save(surface_file(task))
     predicted, _ = surface.predict(found.modes)
     residual = ((found.signals - predicted) ** 2).mean(axis=0)
@@ -99,7 +100,7 @@ def _fit(task: str, scenarios: int, found: Differences) -> dict[str, Any]:
         "modes_per_scenario": MODES_PER_SCENARIO,
         "axes": {axis.name: [axis.low, axis.high] for axis in family.axes},
         "reference_success": float(found.reference_success.mean()),
-        "mode_success": float(found.reference_success.repeat(MODES_PER_SCENARIO).mean() + found.success.mean()),
+        "mode_success": float(successes.mean()),
         "explained_share": {
             name: round(float(1 - residual[column] / spread[column]), 3)
             for column, name in enumerate(SIGNALS)

@@ -74,7 +74,7 @@ def surface() -> ResponseSurface:
     for mode in modes:
         act = _mode_act(mode)
         deltas.append(world.collect(act, [0], 0.0, 0)[0].signals.sum(axis=0) - plain)
-    return response_surface.fit(FAMILY, modes, np.array(deltas), np.zeros(60))
+    return response_surface.fit(FAMILY, modes, np.array(deltas), np.ones(60))
 
 
 def _mode_act(mode: np.ndarray) -> studio_filter.Act:

@@ -97,7 +97,7 @@ def setting(action_reward: MlpReward) -> Setting:
         problem=FilterProblem(invented.TASK, POLICY, REWARD, 0, config),
         labels=33,
         pool=collect(POLICY.mean, range(4), 0.3, 0),
-        surface=lambda: response_surface.fit(family, modes, deltas, np.zeros(30)),
+        surface=lambda: response_surface.fit(family, modes, deltas, np.ones(30)),
         action_reward=lambda: action_reward,
         reference=lambda scenarios: collect(POLICY.mean, scenarios, 0.0, 0),
         collect=collect,

@@ -22,8 +22,7 @@ def surface() -> ResponseSurface:
     deltas = 0.01 * rng.standard_normal((600, len(SIGNALS)))
     deltas[:, SPEED] += 2 * modes[:, 0] + 0.5 * modes[:, 0] ** 2 + 3 * modes[:, 1]
     deltas[:, HEIGHT] -= modes[:, 2]
-    success = -0.6 * np.maximum(modes[:, 1], 0.0) + 0.02 * rng.standard_normal(600)
-    return fit(FAMILY, modes, deltas, success)
+    return fit(FAMILY, modes, deltas, rng.random(600) < 0.98 - 1.2 * np.maximum(modes[:, 1], 0.0))
 
 
 def likes(**weights: float) -> np.ndarray:
@@ -76,7 +75,7 @@ def test_what_the_members_disagree_about_is_not_gambled_on(surface: ResponseSurf
     chosen = best_mode(surface, members, seed=0)
     bold = best_mode(surface, members.mean(axis=0), seed=0)
     assert chosen[2] > 0.4
-    assert abs(surface.predict(chosen)[0][SPEED]) < 0.1 < 0.5 < surface.predict(bold)[0][SPEED]
+    assert abs(surface.predict(chosen)[0][SPEED]) < 0.1 < 0.4 < surface.predict(bold)[0][SPEED]
 
 
 def test_one_crash_does_not_bend_the_surface() -> None:
@@ -113,20 +112,25 @@ def test_rollouts_of_one_mode_change_what_is_expected_of_its_neighbours_and_hard
     surface: ResponseSurface,
 ) -> None:
     tried, near, far = [0.4, -0.6, 0, 0, 0], [0.35, -0.55, 0, 0, 0], [-0.4, 0.2, 0, 0, 0]
-    modes, observed = np.array([tried, near, far]), np.full(80, -0.3)
+    modes, observed = np.array([tried, near, far]), np.array([1.0, 0.0] * 40)
     before = surface.predict(modes)[1]
     after = surface.with_observed(modes[0], np.zeros((80, len(SIGNALS))), observed).predict(modes)[1]
-    assert after[0] == pytest.approx(-0.3, abs=0.1)
-    assert after[1] < before[1] - 0.1
+    assert after[0] < -0.25
+    assert after[1] < before[1] - 0.2
     assert abs(after[2] - before[2]) < 0.5 * abs(after[1] - before[1])
 
 
 def test_it_learns_from_new_rollouts_as_if_it_had_had_them_from_the_start() -> None:
     rng = np.random.default_rng(3)
-    modes, deltas, success = FAMILY.sample(300, rng), rng.standard_normal((300, len(SIGNALS))), np.zeros(300)
+    modes, deltas, success = (
+        FAMILY.sample(300, rng),
+        rng.standard_normal((300, len(SIGNALS))),
+        (rng.random(300) < 0.8).astype(np.float64),
+    )
     modes[-20:] = modes[-1]
     outliers = np.quantile(deltas, [0.005, 0.995], axis=0)
     deltas = np.clip(deltas, *outliers)
     whole = fit(FAMILY, modes, deltas, success)
     later = fit(FAMILY, modes[:-20], deltas[:-20], success[:-20]).with_observed(modes[-1], deltas[-20:], success[-20:])
     np.testing.assert_allclose(later.coefficients, whole.coefficients, atol=0.02)
+    np.testing.assert_allclose(later.predict(modes)[1], whole.predict(modes)[1], atol=0.05)

@@ -122,8 +122,8 @@ Learn = Callable[[FilterProblem, FilterDraft, Sequence[Sequence[Trajectory]]], F
 """One round of residual learning from all rollouts so far."""
 
 SCENARIO_BLOCKS = {"gate": 2_000_000, "residual": 3_000_000, "evaluation": 4_000_000, "recording": 5_000_000}
-"""First scenario of each purpose. Others: exploration 100_000, test of the policy 1_000_000, what is rated or shown before
-and after 6_000_000 (app.services.evaluating), clips from 10_000_000."""
+"""First scenario of each purpose. Others: exploration 100_000, test of the policy 1_000_000, what is rated or shown
+before and after 6_000_000 (app.services.evaluating), clips from 10_000_000."""
 
 
 def scenarios_for(purpose: str, count: int, skip: int = 0) -> range:
@@ -217,7 +217,7 @@ def find_mode(
         trials.append(trial)
         if _acceptable(problem, trial, reference):
             return _with_mode(named, 1.0, trials, started)
-        surface = surface.with_observed(mode, *_changes(reference, filtered))
+        surface = surface.with_observed(mode, _signal_changes(reference, filtered), _successes(filtered))
     if not trials:
         return _without_mode("The labels do not yet say clearly what to change; the mode is off.", trials, started)
     for gate in problem.config.gates:
@@ -335,16 +335,21 @@ def _try(
     filtered = collect(act, scenarios, 0.0, problem.seed)
     before, after = problem.reward.returns(reference), problem.reward.returns(filtered)
     unit = max(float(before.std()), 1e-9)
-    success = float(_changes(reference, filtered)[1].mean())
+    success = float((_successes(filtered) - _successes(reference)).mean())
     trial = Trial(gate, residual_share, float((after - before).mean()) / unit, success, _p95_force_n(filtered))
     return trial, filtered
 
 
-def _changes(reference: Sequence[Trajectory], filtered: Sequence[Trajectory]) -> tuple[Floats, Floats]:
-    """Of the summed signals (N, S) and of success (N,), scenario by scenario."""
-    pairs = list(zip(reference, filtered, strict=True))
-    signals = [after.signals.sum(axis=0, dtype=np.float64) - before.signals.sum(axis=0) for before, after in pairs]
-    return np.array(signals), np.array([float(after.success) - float(before.success) for before, after in pairs])
+def _signal_changes(reference: Sequence[Trajectory], filtered: Sequence[Trajectory]) -> Floats:
+    """(N, S) of the summed signals, scenario by scenario."""
+    pairs = zip(reference, filtered, strict=True)
+    return np.array(
+        [after.signals.sum(axis=0, dtype=np.float64) - before.signals.sum(axis=0) for before, after in pairs]
+    )
+
+
+def _successes(trajectories: Sequence[Trajectory]) -> Floats:
+    return np.array([float(each.success) for each in trajectories])
 
 
 def _acceptable(problem: FilterProblem, trial: Trial, reference: Sequence[Trajectory]) -> bool:
