@@ -1,4 +1,4 @@
-"""How a person comes into a study: the personal link, consent, instructions."""
+"""How a person comes into a study: the personal link."""
 
 import hashlib
 import secrets
@@ -7,7 +7,6 @@ from http import HTTPStatus
 from sqlalchemy import delete, func, select
 from sqlalchemy.orm import Session, joinedload
 
-from app.db import now
 from app.domain.people import BrowserSession
 from app.domain.studies import Participant, Study
 from app.errors import AppError
@@ -69,25 +68,6 @@ def find_by_code(session: Session, study: Study, code: str) -> Participant:
     if participant is None or participant.code != code:
         raise ParticipantNotFound
     return participant
-
-
-def consent(participant: Participant, version: str) -> None:
-    """Store that this person agreed, to which text and when. The first agreement to a version is the one kept."""
-    if participant.consented_at is None or participant.consent_version != version:
-        participant.consented_at, participant.consent_version = now(), version
-
-
-def has_consented(participant: Participant) -> bool:
-    """Whether the person agreed to the text the study uses now."""
-    return participant.consented_at is not None and (
-        participant.consent_version == participant.study.settings.consent_version
-    )
-
-
-def instruct(participant: Participant) -> None:
-    """Store that the instructions were read."""
-    if participant.instructed_at is None:
-        participant.instructed_at = now()
 
 
 def _new_token() -> str:
