@@ -56,6 +56,17 @@ def test_disagreement_prefers_what_members_disagree_about_but_never_excludes_a_p
     assert min(float(draw.propensities[0]) for draw in draws) >= 0.3 / 20 - 1e-9
 
 
+def test_what_was_drawn_at_random_is_marked_and_really_was() -> None:
+    """Whoever measures a model on what it chose to ask measures it where it is worst."""
+    rng = np.random.default_rng(5)
+    draws = [choose(1, 20, rng, rule="disagreement", scores=SCORES, random_share=0.3) for _ in range(4000)]
+    random = np.array([draw.indices[0] for draw in draws if draw.at_random[0]])
+    assert len(random) == pytest.approx(0.3 * 4000, rel=0.1)
+    counts = np.bincount(random, minlength=20)
+    assert counts.min() > 0.5 * counts.mean(), "all candidates alike"
+    assert choose(5, 20, rng).at_random.all()
+
+
 def test_members_that_agree_do_not_disagree() -> None:
     scores = disagreement(np.array([[0.9, 0.1], [0.9, 0.9]]))
     assert scores[0] == 0.0 < scores[1]

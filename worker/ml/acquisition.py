@@ -36,6 +36,8 @@ class Choice:
     """(K,) probability of each choice at the moment it was made, given the choices before it"""
     swapped: npt.NDArray[np.bool_]
     """(K,) True: the candidate's second clip goes to the left"""
+    at_random: npt.NDArray[np.bool_]
+    """(K,) True: drawn uniformly, whatever the rule: answers to these measure a model without bias"""
 
 
 def matched_pairs(scenarios: npt.ArrayLike, behaviours: npt.ArrayLike | None = None) -> Indices:
@@ -123,12 +125,13 @@ def choose(
     count = min(count, candidates)
     remaining = np.ones(candidates, bool)
     indices, propensities = np.zeros(count, np.int64), np.zeros(count)
+    at_random = np.ones(count, bool) if rule == "uniform" else rng.random(count) < random_share
     for turn in range(count):
-        probability = _mixture(preference, remaining, random_share)
-        indices[turn] = rng.choice(candidates, p=probability)
-        propensities[turn] = probability[indices[turn]]
+        uniform, sharp = _chances(preference, remaining)
+        indices[turn] = rng.choice(candidates, p=uniform if at_random[turn] else sharp)
+        propensities[turn] = (random_share * uniform + (1.0 - random_share) * sharp)[indices[turn]]
         remaining[indices[turn]] = False
-    return Choice(indices, propensities, balanced_sides(count, rng))
+    return Choice(indices, propensities, balanced_sides(count, rng), at_random)
 
 
 def balanced_sides(count: int, rng: np.random.Generator) -> npt.NDArray[np.bool_]:
@@ -144,10 +147,8 @@ def _standardised(scores: Floats) -> Floats:
     return standardised
 
 
-def _mixture(preference: Floats, remaining: npt.NDArray[np.bool_], random_share: float) -> Floats:
-    uniform = remaining / remaining.sum()
+def _chances(preference: Floats, remaining: npt.NDArray[np.bool_]) -> tuple[Floats, Floats]:
+    """(M,) of a uniform draw and (M,) of one by the rule."""
     pull = np.where(remaining, SHARPNESS * preference, -np.inf)
     sharp = np.exp(pull - pull.max())
-    mixture: Floats = random_share * uniform + (1 - random_share) * sharp / sharp.sum()
-    normalised: Floats = mixture / mixture.sum()  # rng.choice insists on a sum of exactly 1
-    return normalised
+    return remaining / remaining.sum(), sharp / sharp.sum()
