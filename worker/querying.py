@@ -128,6 +128,8 @@ class _Choosing:
                 row = self._again(slot.repeats_ordinal, slot.swapped, REPEAT)
             else:
                 row = own[slot.ordinal]
+            if row is None and slot.purpose is Purpose.CATCH:
+                continue  # made as soon as the pool has one
             if row is None:
                 break
             rows.append({"purpose": slot.purpose, "ordinal": slot.ordinal, **row})
@@ -179,13 +181,18 @@ class _Choosing:
         return self._one_of([pairs[row] for row in rows], PRACTICE, rng)
 
     def _catch(self, slot: Slot, rng: np.random.Generator) -> dict[str, Any] | None:
-        """A pair with an obvious answer; where the pool has none, an earlier pair again: nothing is invented."""
+        """A pair with an obvious answer; where the pool has none, an earlier pair again: nothing is invented.
+
+        While the pool is growing the place stays free, unless there is nothing else to go on with.
+        """
         store = self._place.store
         candidates = [
             (pair, answer)
             for pair in self._unused(self._clips)
             if (answer := pair_plan.obvious_answer(*(dataset.stretch(store, clip) for clip in pair))) is not None
         ]
+        if not candidates and self._may_yet_come():
+            return None
         if not candidates:
             log.warning("participant %d: no pair with an obvious answer in the pool", self._participant.id)
             asked = self._labels_before(slot.ordinal)
@@ -194,6 +201,12 @@ class _Choosing:
         swapped = bool(rng.integers(2))
         expected = answer if not swapped else {"left": "right", "right": "left"}[answer]
         return _columns(pair, swapped, OBVIOUS, 1.0 / len(candidates)) | {"expected": expected}
+
+    def _may_yet_come(self) -> bool:
+        settings = self._study.settings
+        wanted = settings.pool_scenarios * settings.behaviours_per_scenario
+        growing = self._study.material is None and len(self._clips) < wanted
+        return growing and bool(records.unanswered(self._session, self._participant.id))
 
     def _labels_before(self, ordinal: int) -> list[int]:
         """Places of earlier labels on clips that no repeat has asked again, the newest few left out where possible."""

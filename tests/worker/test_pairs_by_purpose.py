@@ -176,6 +176,29 @@ def test_a_pool_without_an_obvious_pair_gives_repeats_instead_and_a_note(
     assert note.startswith("3 catch pairs could not be had")
 
 
+def test_a_catch_pair_waits_for_the_pool_to_grow_and_nobody_waits_for_it(
+    place: Workplace, study: Study, participant: Participant, settle: Callable[..., None]
+) -> None:
+    settle(catch_pairs=3)
+    for scenario in range(3):
+        add_runs(place, study, scenario, (True, True, True, True))
+    querying.refill_queries(place, participant.id)
+    with place.database.writing() as session:
+        waiting = records.unanswered(session, participant.id)
+        for query in waiting[:-1]:
+            session.add(LabelEvent(query_id=query.id, revision=1, response="left", client_uuid=f"{query.id}"))
+        plan = pair_plan.plan(session.get_one(Study, study.id).settings, participant.seed)
+    querying.refill_queries(place, participant.id)
+    caught = [slot.ordinal for slot in plan if slot.purpose is Purpose.CATCH]
+    made = [query.ordinal for query in queries_of(place, participant)]
+    assert caught[0] not in made
+    assert max(made) > caught[0]
+    add_runs(place, study, 3, (True, True, False, False))
+    querying.refill_queries(place, participant.id)
+    purposes = {query.ordinal: query.purpose for query in queries_of(place, participant)}
+    assert purposes[caught[0]] == Purpose.CATCH
+
+
 def test_only_labels_are_learned_from_counted_and_fingerprinted(
     place: Workplace, study: Study, participant: Participant, settle: Callable[..., None]
 ) -> None:
