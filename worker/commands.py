@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import TypeAlias, get_args
 
 from app.db import Database
-from app.domain.studies import Method, RewardKind, Strategy, StudySettings
+from app.domain.protocol import EvaluationSettings
+from app.domain.studies import PAPER_PROTOCOL, Method, RewardKind, Strategy, StudySettings
 from app.settings import Settings
 from app.storage import ArtefactStore
 from worker import benchmark, exploration, laboratory, pretraining, rehearsal, service
@@ -151,6 +152,8 @@ def _add_rehearsal(commands: _Commands) -> None:
         "--omega", nargs=6, type=float, action="append", default=[], help="somebody with these six weights; repeatable"
     )
     rehearse.add_argument("--labels", type=int, default=200, help="labels per participant")
+    rehearse.add_argument("--paper", action="store_true", help="the paper's whole protocol, robots rated in the end")
+    rehearse.add_argument("--fine-tuning-steps", type=int, default=100_000, help="of PrefFT, with --paper")
     rehearse.add_argument("--retrain-every", type=int, default=10)
     rehearse.add_argument("--clip-scenarios", type=int, help="size of the pool; default: just enough pairs")
     rehearse.add_argument("--method", type=Method, choices=list(Method), default=Method.STUDIO)
@@ -225,12 +228,17 @@ def _manner(options: argparse.Namespace) -> Manner:
 def _settings(options: argparse.Namespace) -> StudySettings:
     behaviours = StudySettings.model_fields["behaviours_per_scenario"].default
     pairs_per_scenario = behaviours * (behaviours - 1) // 2
-    return StudySettings(
-        labels_per_participant=options.labels,
-        retrain_every_labels=options.retrain_every,
-        pool_scenarios=options.clip_scenarios or -(-options.labels // pairs_per_scenario),
-        method=options.method,
-        reward_kind=options.reward,
-        strategy=options.strategy,
-        pooled_prior=options.pooled_prior,
-    )
+    chosen = {
+        "labels_per_participant": options.labels,
+        "retrain_every_labels": options.retrain_every,
+        "pool_scenarios": options.clip_scenarios or -(-options.labels // pairs_per_scenario),
+        "method": options.method,
+        "reward_kind": options.reward,
+        "strategy": options.strategy,
+        "pooled_prior": options.pooled_prior,
+    }
+    if not options.paper:
+        return StudySettings(**chosen)
+    chosen["introduction_pairs"] = min(PAPER_PROTOCOL.introduction_pairs, options.labels)
+    chosen["evaluation"] = EvaluationSettings(fine_tuning_steps=options.fine_tuning_steps)
+    return StudySettings(**{**PAPER_PROTOCOL.model_dump(), **chosen})

@@ -128,6 +128,11 @@ def shown(store: ArtefactStore, clip: Clip) -> Trajectory:
     return _trajectory(store.path(clip.rollout.trajectory_sha256))
 
 
+def stored_trajectory(store: ArtefactStore, sha256: str) -> Trajectory:
+    """A trajectory by the hash of its file."""
+    return _trajectory(store.path(sha256))
+
+
 @lru_cache(maxsize=1024)
 def _trajectory(path: Path) -> Trajectory:
     try:

@@ -11,20 +11,24 @@ from typing import Any
 
 import numpy as np
 from sqlalchemy import func, select
-from sqlalchemy.orm import Session
+from sqlalchemy.orm import Session, joinedload
 from tqdm import tqdm
 
 from app.db import Database
 from app.domain.clips import Clip
+from app.domain.evaluation import Trial
 from app.domain.models import Bundle, Model, Run, RunKind, RunStatus
 from app.domain.preferences import LEARNED_FROM, Query
+from app.domain.protocol import EvaluationMode
 from app.domain.studies import Study, StudySettings, TaskName
 from app.services import accounts, enrolment, studies
 from app.storage import ArtefactStore
 from worker import dataset, laboratory
+from worker.ml.scripted_ratings import RatingManner, ScriptedRater
 from worker.ml.teachers import Manner, ScriptedTeacher, Taste
 from worker.own_studio import PATIENCE_S, wait_until
 from worker.sim.costs import preference_rewards
+from worker.trajectory import Trajectory
 from worker.visitor import Visitor
 
 CALIBRATION_PAIRS = 200
@@ -47,6 +51,10 @@ class Outcome:
     bundle: bytes = b""
     bundle_seconds: float = 0.0
     """from the last label to the finished bundle"""
+    ratings: dict[str, list[tuple[int, int]]] = field(default_factory=dict)
+    """satisfaction and personalisation of every trial, by method, in the order in which the methods were met"""
+    waited_for_robots_seconds: float = 0.0
+    """from the finished bundle to the first robot to rate"""
 
 
 def summary(outcomes: Sequence[Outcome]) -> str:
@@ -62,7 +70,22 @@ def summary(outcomes: Sequence[Outcome]) -> str:
             f"{success['reference']:>6.1%} {success['delta']:>+6.1%} {preference['delta']:>+7.2f} sd {each.gate:>5.2f} "
             f"{middle:>9.0f} / {late:<6.0f} {len(each.bundle) / 1024:>4.0f} kB in {each.bundle_seconds:.0f} s"
         )
-    return "\n".join(lines)
+    return "\n".join([*lines, *_rating_lines(outcomes)])
+
+
+def _rating_lines(outcomes: Sequence[Outcome]) -> list[str]:
+    """Mean satisfaction / personalisation per method."""
+    methods = sorted({method for each in outcomes for method in each.ratings})
+    if not methods:
+        return []
+    lines = ["", "ratings (satisfaction / personalisation), in the order of the alphabet"]
+    for each in outcomes:
+        means = [np.mean(each.ratings[method], axis=0) for method in methods]
+        shown = "  ".join(
+            f"{method} {mean[0]:.1f} / {mean[1]:.1f}" for method, mean in zip(methods, means, strict=True)
+        )
+        lines.append(f"{each.code:<4} {each.taste.name:<10} {shown}  ({each.waited_for_robots_seconds:.0f} s waited)")
+    return lines
 
 
 @dataclass(frozen=True)
@@ -83,9 +106,10 @@ class Rehearsal:
             study = studies.create_study(session, "Rehearsal", settings, seed=seed, task=TaskName(task))
             enrolled = [enrolment.add_participant(session, study) for _ in tastes]
             password = accounts.create_first_experimenter(session)
-        outcomes = []
+        outcomes, teachers = [], []
         for (participant, token), taste in zip(enrolled, tastes, strict=True):
             teacher = _Teacher(self.database, self.store, study, taste, manner, seed + participant.number)
+            teachers.append(teacher)
             outcome = Outcome(participant.id, participant.code, taste)
             with Visitor(self.base_url, f"/p/{token}") as visitor:
                 self._answer_everything(visitor, teacher, outcome, settings)
@@ -95,7 +119,25 @@ class Rehearsal:
             experimenter.log_in(accounts.FIRST_EXPERIMENTER, password or "")
             for outcome in outcomes:
                 self._await_bundle(outcome, study, experimenter)
+        for (_, token), teacher, outcome in zip(enrolled, teachers, outcomes, strict=True):
+            with Visitor(self.base_url, f"/p/{token}") as visitor:
+                self._rate_robots(visitor, teacher, outcome, settings)
+                visitor.go_to_the_end()
         return outcomes
+
+    def _rate_robots(self, visitor: Visitor, teacher: "_Teacher", outcome: Outcome, settings: StudySettings) -> None:
+        """Everything between the last pair and the last rating; a physical robot needs an operator, who is not here."""
+        evaluation = settings.evaluation
+        if evaluation is None or evaluation.mode is not EvaluationMode.VIDEO:
+            return
+        came = time.monotonic()
+        for number in range(evaluation.trial_count):
+            trial_id = wait_until(PATIENCE_S, "no robot to rate", visitor.trial_id)
+            if number == 0:
+                outcome.waited_for_robots_seconds = time.monotonic() - came
+            method, rating = teacher.rate(trial_id)
+            visitor.rate(*rating)
+            outcome.ratings.setdefault(method, []).append(rating)
 
     def _answer_everything(
         self, visitor: Visitor, teacher: "_Teacher", outcome: Outcome, settings: StudySettings
@@ -166,6 +208,21 @@ class _Teacher:
         self._taste, self._manner = taste, manner
         self._rng = np.random.default_rng(seed)
         self._teacher: ScriptedTeacher | None = None
+        self._rater: ScriptedRater | None = None
+
+    def rate(self, trial_id: int) -> tuple[str, tuple[int, int]]:
+        """What this user says about the robot of a trial, and which method it really was."""
+        with self._database.reading() as session:
+            trial = session.scalars(select(Trial).where(Trial.id == trial_id).options(joinedload(Trial.film))).one()
+            if trial.film is None:
+                raise ValueError(f"Trial {trial_id} has no film.")
+            watched = dataset.stored_trajectory(self._store, trial.film.trajectory_sha256)
+            if self._rater is None:
+                episodes = [dataset.shown(self._store, clip) for clip in dataset.pool_clips(session, self._study_id)]
+                seen = np.array([self._true_rewards(each).sum() for each in episodes])
+                self._rater = ScriptedRater(seen, RatingManner(), self._rng)
+        value = float(self._true_rewards(watched).sum())
+        return trial.film.method, self._rater.rate(value, watched.success)
 
     def answer(self, query_id: int) -> str:
         """What this user says about the query."""
@@ -185,13 +242,16 @@ class _Teacher:
         return ScriptedTeacher.calibrated(self._manner, np.array(rewards))
 
     def _rewards(self, clip: Clip) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
-        shown = dataset.shown(self._store, clip)
         steps = slice(clip.first_step, clip.first_step + clip.step_count)
+        return self._true_rewards(dataset.shown(self._store, clip))[steps]
+
+    def _true_rewards(self, shown: Trajectory) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+        """r^H of every step."""
         taste = self._taste
         rewards = preference_rewards(
             self._task, shown.costs, shown.signals, taste.omega, "calibrated", taste.per_signal
         )
-        return np.asarray(rewards, np.float64)[steps]
+        return np.asarray(rewards, np.float64)
 
 
 def _prequential_accuracy(session: Session, participant_id: int) -> float | None:

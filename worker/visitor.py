@@ -14,6 +14,10 @@ from app.errors import AppError
 
 _QUERY = re.compile(r"/p/queries/(\d+)/label")
 _BREAK = re.compile(r"/p/break$")
+_RATING = re.compile(r"/p/evaluation/trials/(\d+)/rating")
+_END = "/p/finished"
+_MOST_PAGES = 12
+"""Forms between the pairs and the end."""
 
 
 class WentAstray(AppError):
@@ -75,6 +79,29 @@ class Visitor:
         started = time.perf_counter()
         self._send(form.target.group(0), {**form.fields, "response": response})
         return time.perf_counter() - started
+
+    def trial_id(self) -> int | None:
+        """The trial to be rated on the page, after loading it anew; None while the robots are prepared."""
+        self._open("/p/next")
+        form = self._page.form_to(_RATING)
+        return None if form is None else int(form.target.group(1))
+
+    def rate(self, satisfaction: int, personalisation: int) -> None:
+        """Give a rating and go on."""
+        form = self._page.form_to(_RATING)
+        if form is None:
+            raise WentAstray(f"There is no robot to rate on {self._page.address}.")
+        points = {"satisfaction": str(satisfaction), "personalisation": str(personalisation)}
+        self._send(form.target.group(0), {**form.fields, **points})
+
+    def go_to_the_end(self) -> None:
+        """Through whatever forms are left, as they are."""
+        self._open("/p/next")
+        for _ in range(_MOST_PAGES):
+            if self._page.address.endswith(_END):
+                return
+            self._send_first({})
+        raise WentAstray(f"The way to the end ended at {self._page.address}.")
 
     def _send_first(self, filled_in: dict[str, str]) -> None:
         """Send the page's first form with these fields filled in, the others as they are."""

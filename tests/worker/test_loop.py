@@ -61,10 +61,17 @@ def outcome(studio: OwnStudio, database: Database) -> Outcome:
     rehearsal = Rehearsal(database, store, studio.settings.base_url)
     manner = Manner(mistakes=0.1, equal_share=0.1, skip_share=0.1)
     (outcome,) = rehearsal.run("feeding", [TASTES["cautious"]], settings, manner, seed=1)
+    assert wait_for(lambda: _has_films(database)), "nobody was filmed before and after"
     for killer in killers:
         killer.join()
         assert killer.killed, f"the worker was never caught in the middle of {killer.kind}"
     return outcome
+
+
+def _has_films(database: Database) -> bool:
+    with database.reading() as session:
+        done = select(Run.id).where(Run.kind == RunKind.FILMS, Run.status == RunStatus.SUCCEEDED)
+        return session.scalar(done) is not None
 
 
 class _Killer(threading.Thread):
@@ -115,7 +122,7 @@ def test_every_run_succeeded_at_its_first_attempt_although_the_worker_was_killed
 ) -> None:
     with database.reading() as session:
         runs = session.scalars(select(Run)).all()
-    assert {run.kind for run in runs} == {RunKind.CLIPS, RunKind.REWARD, RunKind.FILTER}
+    assert {run.kind for run in runs} == {RunKind.CLIPS, RunKind.REWARD, RunKind.FILTER, RunKind.FILMS}
     assert [(run.workflow_id, run.error) for run in runs if run.status != RunStatus.SUCCEEDED] == []
     assert {run.attempt for run in runs} == {1}
 
