@@ -55,8 +55,8 @@ def test_before_and_after_are_shown_side_by_side_in_one_scenario(at_debrief: Tak
 def test_what_is_certain_is_said_in_plain_words_and_nothing_else(at_debrief: TakingPart) -> None:
     add_filter(at_debrief, factories.filter_metrics())
     page = at_debrief.browser.get("/p/debrief").text
-    assert "It moves more slowly (41 % less)." in page
-    assert "It presses less hard (63 % less)." in page
+    assert "It moves more slowly (41\N{NO-BREAK SPACE}% less)." in page
+    assert "It presses less hard (63\N{NO-BREAK SPACE}% less)." in page
     assert "It takes more time on its way to you." in page
     assert "touches you" not in page, "its interval holds zero"
 
