@@ -24,6 +24,7 @@ from app.web import (
     participant_ending,
     participant_forms,
     participant_pairs,
+    results,
     withdrawing,
 )
 from app.web.deps import Studio
@@ -72,7 +73,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.state.templates = make_environment(app.url_path_for)
     app.add_middleware(Guard, https=settings.secure_cookies, refuse=error_page)
     add_error_pages(app)
-    for part in (login, experimenter, operator, media, *PARTICIPANT_PARTS):
+    for part in (login, experimenter, operator, results, media, *PARTICIPANT_PARTS):
         app.include_router(part.router)
     app.mount("/static", StaticFiles(directory=ROOT / "static"), name="static")
 

@@ -15,7 +15,7 @@ from app.domain.clips import Clip, Rollout
 from app.domain.models import Run, RunKind, RunStatus
 from app.domain.preferences import LEARNED_FROM, LabelEvent, Query, current_labels
 from app.domain.studies import Participant, Study, StudySettings
-from worker import film_work, method_work
+from worker import film_work, method_work, report_work
 from worker.clip_work import WHOLE
 from worker.records import ATTEMPTS, LEASE, Job, next_queries
 
@@ -30,7 +30,8 @@ def findings(session: Session) -> Iterator[tuple[Job, int]]:
     runs = {run.workflow_id: run for run in session.scalars(select(Run))}
     succeeded = {name for name, run in runs.items() if run.status == RunStatus.SUCCEEDED}
     for study in session.scalars(select(Study).order_by(Study.id)).all():
-        for job in (*_missing_clips(session, study), *_stale_models(session, study, succeeded)):
+        jobs = (*_missing_clips(session, study), *_stale_models(session, study, succeeded))
+        for job in (*jobs, *report_work.due(session, study)):
             attempt = _attempt_due(runs.get(job.finding), now())
             if attempt is not None:
                 yield job, attempt

@@ -35,7 +35,15 @@ PRESENCE_S = 5.0
 ENGINE_VERSION = "2"
 """Raised when the steps of a workflow change so that a half-finished one could not be resumed."""
 
-QUEUES = {RunKind.CLIPS: 2, RunKind.REWARD: 1, RunKind.FILTER: 1, RunKind.METHOD: 1, RunKind.FILMS: 1}
+QUEUES = {
+    RunKind.CLIPS: 2,
+    RunKind.REWARD: 1,
+    RunKind.FILTER: 1,
+    RunKind.METHOD: 1,
+    RunKind.FILMS: 1,
+    RunKind.REPORT: 1,
+    RunKind.EXPORT: 1,
+}
 """How many jobs of each kind one worker does at a time."""
 
 

@@ -20,7 +20,8 @@ Answer = Callable[[Clip, Clip, Response], Query]
 def found(database: Database) -> Callable[[], dict[str, int]]:
     def look() -> dict[str, int]:
         with database.reading() as session:
-            return {job.finding: attempt for job, attempt in reconcile.findings(session)}
+            found = reconcile.findings(session)
+            return {job.finding: attempt for job, attempt in found if job.kind is not RunKind.REPORT}
 
     return look
 

@@ -44,6 +44,9 @@ FEWEST_PAIRED = 3
 FEWEST_FOR_MODEL = 5
 """People in a mixed model: the spread between people cannot be told from fewer."""
 
+OPTIMISERS = ["bfgs", "lbfgs", "cg", "powell"]
+"""statsmodels' own three, tried in turn until one converges, and one more that needs no gradient."""
+
 EXPLANATION = (
     "The paper's test counts every rating as if a different person had given it, although several come from the same "
     "person and resemble each other; the paired tests and the mixed model compare each person with themselves and "
@@ -257,8 +260,11 @@ def _fit(rows: pd.DataFrame, scale: str, by: str, groups: Sequence[str]) -> tupl
     design = np.column_stack([np.ones(len(rows)), *(_floats(rows[by] == group) for group in groups[1:])])
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        fit = MixedLM(_floats(rows[scale]), design, groups=rows["participant"].to_numpy()).fit(reml=True)
-    notes = list(dict.fromkeys(str(each.message).split("\n")[0] for each in caught))
+        fit = MixedLM(_floats(rows[scale]), design, groups=rows["participant"].to_numpy()).fit(
+            reml=True, method=OPTIMISERS
+        )
+    messages = dict.fromkeys(str(each.message).split("\n")[0] for each in caught)
+    notes = [message for message in messages if not message.startswith("Retrying")]
     if float(np.asarray(fit.cov_re)[0, 0]) < 1e-6:
         notes.append("The spread between people was estimated as zero: the model then is a regression on all ratings.")
     return fit, notes
@@ -283,6 +289,7 @@ def _contrast(fit: Any, groups: Sequence[str], first: str, second: str) -> Resul
         "statistic": plain(np.squeeze(outcome.tvalue)),
         "p": plain(np.squeeze(outcome.pvalue)),
         "converged": bool(fit.converged),
+        "n": len(fit.model.group_labels),
     }
 
 

@@ -1,0 +1,41 @@
+"""The newest report of a study, as the worker has left it."""
+
+from http import HTTPStatus
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from app.domain.models import Report, Run, RunKind, RunStatus
+from app.domain.studies import Study
+from app.errors import AppError
+from app.storage import ArtefactStore
+
+FORMATS = {"svg": "image/svg+xml", "png": "image/png"}
+
+
+class FigureNotFound(AppError):
+    """There is no such figure. A newer report may have replaced it; the page of results shows what there is."""
+
+    status = HTTPStatus.NOT_FOUND
+
+
+def newest(session: Session, study: Study) -> Report | None:
+    """The report to show; None before the first."""
+    return session.scalar(select(Report).where(Report.study_id == study.id).order_by(Report.id.desc()).limit(1))
+
+
+def figure(session: Session, store: ArtefactStore, study: Study, name: str, kind: str) -> bytes:
+    """One figure of the newest report. Raises FigureNotFound."""
+    report = newest(session, study)
+    sha256 = report.figures.get(name, {}).get(kind) if report is not None else None
+    if sha256 is None or not store.has(sha256):
+        raise FigureNotFound
+    return store.read(sha256)
+
+
+def run_in_hand(session: Session, study: Study) -> Run | None:
+    """The run that makes a newer report, or the failure that keeps it from being made."""
+    run = session.scalar(
+        select(Run).where(Run.study_id == study.id, Run.kind == RunKind.REPORT).order_by(Run.id.desc()).limit(1)
+    )
+    return run if run is not None and run.status != RunStatus.SUCCEEDED else None

@@ -1,0 +1,237 @@
+"""Results: what the newest report says, its figures, and the data as files."""
+
+from collections.abc import AsyncIterator, Iterator, Mapping
+from http import HTTPStatus
+from typing import Annotated, Any, Literal
+
+from fastapi import APIRouter, Path, Request
+from fastapi.concurrency import iterate_in_threadpool
+from fastapi.responses import FileResponse, RedirectResponse, Response, StreamingResponse
+from sqlalchemy.orm import Session
+
+from app.domain.people import Role
+from app.domain.studies import Study
+from app.errors import AppError
+from app.services import (
+    audit,
+    evaluating,
+    export_requests,
+    export_tables,
+    exporting,
+    reports,
+    roles,
+    studies,
+    unblinding,
+)
+from app.services.export_requests import ExportKind
+from app.web import task_words
+from app.web.deps import (
+    ActingExperimenter,
+    CurrentExperimenter,
+    ReadingSession,
+    RowId,
+    Slug,
+    Studio,
+    StudioDep,
+    WritingSession,
+)
+from app.web.templating import page
+
+router = APIRouter(prefix="/studies/{slug}")
+
+TableName = Annotated[str, Path(pattern=r"^[a-z]{1,40}$")]
+FileKind = Literal["csv", "jsonl"]
+MEDIA_TYPES = {"csv": "text/csv; charset=utf-8", "jsonl": "application/x-ndjson"}
+LINES_AT_ONCE = 200
+METHOD_NAMES = {
+    "reference": "Pre-trained policy",
+    "prefft": "PrefFT",
+    "prefft_anchored": "PrefFT, anchored",
+    "pbarl": "PbARL",
+    "pbarl_printed": "PbARL as printed",
+}
+TESTS = {
+    "two_sample_t": "The paper\N{RIGHT SINGLE QUOTATION MARK}s two-sample t-test",
+    "paired_t": "Paired t-test",
+    "wilcoxon": "Wilcoxon signed-rank",
+    "mixed_model": "Linear mixed model",
+}
+FIGURES = {
+    "ratings": ("Mean ratings, as in the paper", ""),
+    "ratings_of_each_person": (
+        "The same ratings, person by person",
+        "Each line is one person: their mean rating of each robot. Diamonds: mean over people, 95 % interval.",
+    ),
+    "learning_curves": (
+        "How well the models foresaw the answers",
+        "Every answer was predicted by a model that had not seen it.",
+    ),
+    "success_against_preference": (
+        "What the filters change",
+        "One point per person with 95 % intervals: right is more preferred, up is more often successful.",
+    ),
+    "cost_changes": (
+        "The paper\N{RIGHT SINGLE QUOTATION MARK}s costs",
+        "One circle per person; costs that the reference does not have are left out.",
+    ),
+}
+
+
+class TableNotFound(AppError):
+    """There is no table of this name. The page of exports lists them all."""
+
+    status = HTTPStatus.NOT_FOUND
+
+
+@router.get("/results", name="show_results")
+def show_results(
+    request: Request, slug: Slug, experimenter: CurrentExperimenter, session: ReadingSession, studio: StudioDep
+) -> Response:
+    """Tables, tests and figures of the newest report."""
+    study = studies.find_study(session, slug)
+    context = results_context(session, study) | {"experimenter": experimenter}
+    return page(request, "experimenter/results.html", context)
+
+
+def results_context(session: Session, study: Study) -> dict[str, Any]:
+    """What the page shows."""
+    report = reports.newest(session, study)
+    return {
+        "study": study,
+        "settings": study.settings,
+        "report": report,
+        "contents": report.contents if report else None,
+        "run": reports.run_in_hand(session, study),
+        "blinded": unblinding.is_blinded(study),
+        "evaluated": evaluating.settings_of(study) is not None,
+        "words": task_words.words_of(study.task),
+        "name_of": _name_of,
+        "p_value": _p_value,
+        "two_decimals": _two_decimals,
+        "tests": TESTS,
+        "figures": {name: FIGURES[name] for name in FIGURES if report is not None and name in report.figures},
+    }
+
+
+@router.get("/results/figures/{name}.{kind}", name="show_figure")
+def show_figure(
+    slug: Slug,
+    name: Annotated[str, Path(pattern=r"^[a-z_]{1,60}$")],
+    kind: Literal["svg", "png"],
+    _experimenter: CurrentExperimenter,
+    session: ReadingSession,
+    studio: StudioDep,
+) -> Response:
+    """One figure of the newest report."""
+    study = studies.find_study(session, slug)
+    content = reports.figure(session, studio.store, study, name, kind)
+    # An SVG file styles itself; opened by itself it must not be able to do anything else.
+    policy = "default-src 'none'; style-src 'unsafe-inline'; sandbox"
+    headers = {"content-security-policy": policy, "content-disposition": f'inline; filename="{slug}-{name}.{kind}"'}
+    return Response(content, media_type=reports.FORMATS[kind], headers=headers)
+
+
+@router.get("/export", name="show_exports")
+def show_exports(
+    request: Request, slug: Slug, experimenter: CurrentExperimenter, session: ReadingSession, studio: StudioDep
+) -> Response:
+    """Every table, the whole as one file, and the archive."""
+    study = studies.find_study(session, slug)
+    context = {
+        "study": study,
+        "experimenter": experimenter,
+        "blinded": unblinding.is_blinded(study),
+        "tables": export_tables.TABLES,
+        "provenance": exporting.provenance_of(session, study),
+        "may_export": roles.may(experimenter, Role.EXPERIMENTER),
+        "exports": [
+            (export, export_requests.run_of(session, export)) for export in export_requests.of_study(session, study)
+        ],
+    }
+    return page(request, "experimenter/export.html", context)
+
+
+@router.post("/export/files/{kind}", name="request_export")
+def request_export(
+    request: Request, slug: Slug, kind: ExportKind, experimenter: ActingExperimenter, session: WritingSession
+) -> Response:
+    """Ask the worker for a file."""
+    roles.require(experimenter, Role.EXPERIMENTER)
+    export_requests.request(session, studies.find_study(session, slug), kind, experimenter.name)
+    return RedirectResponse(request.app.url_path_for("show_exports", slug=slug), HTTPStatus.SEE_OTHER)
+
+
+@router.get("/export/files/{export_id}.zip", name="download_export")
+def download_export(
+    slug: Slug, export_id: RowId, experimenter: ActingExperimenter, session: WritingSession, studio: StudioDep
+) -> Response:
+    """A finished file."""
+    roles.require(experimenter, Role.EXPERIMENTER)
+    study = studies.find_study(session, slug)
+    export = export_requests.find(session, studio.store, study, export_id)
+    audit.record(session, experimenter.name, f"{export.kind} export downloaded", f"{slug}/{export_id}")
+    filename = f"{slug}-{export.kind}-{export.requested_at:%Y%m%dT%H%M}.zip"
+    path = studio.store.path(export.artefact_sha256 or "")
+    return FileResponse(path, media_type="application/zip", filename=filename)
+
+
+@router.get("/export/{table}.{kind}", name="download_table")
+def download_table(
+    slug: Slug,
+    table: TableName,
+    kind: FileKind,
+    experimenter: ActingExperimenter,
+    session: WritingSession,
+    studio: StudioDep,
+) -> Response:
+    """One table, as the database is now, sent while it is read."""
+    roles.require(experimenter, Role.EXPERIMENTER)
+    study = studies.find_study(session, slug)
+    if table not in export_tables.BY_NAME:
+        raise TableNotFound
+    audit.record(session, experimenter.name, "table exported", f"{slug}/{table}.{kind}")
+    provenance = exporting.provenance_of(session, study)
+    lock = "not-locked" if study.lock_hash is None else study.lock_hash[:8]
+    name = f"{slug}-{table}-{lock}-{provenance.exported_at:%Y%m%dT%H%M%S}.{kind}"
+    headers = {"content-disposition": f'attachment; filename="{name}"'}
+    lines = _lines(studio, slug, export_tables.BY_NAME[table], kind, provenance)
+    return StreamingResponse(lines, media_type=MEDIA_TYPES[kind], headers=headers)
+
+
+async def _lines(
+    studio: Studio, slug: str, table: exporting.Table, kind: FileKind, provenance: exporting.Provenance
+) -> AsyncIterator[str]:
+    """The file in handfuls of lines; the request's own session is over by now."""
+    write = exporting.csv_lines if kind == "csv" else exporting.json_lines
+    async with studio.turns.reading() as session:
+        study = studies.find_study(session, slug)
+        async for lines in iterate_in_threadpool(_handfuls(write(table, session, study, provenance))):
+            yield lines
+
+
+def _handfuls(lines: Iterator[str]) -> Iterator[str]:
+    waiting: list[str] = []
+    for line in lines:
+        waiting.append(line)
+        if len(waiting) == LINES_AT_ONCE:
+            yield "".join(waiting)
+            waiting = []
+    yield "".join(waiting)
+
+
+def _name_of(group: str) -> str:
+    """What a method, or a letter, is called."""
+    return METHOD_NAMES.get(group, f"Robot {group}")
+
+
+def _p_value(result: Mapping[str, Any], key: str = "p") -> str:
+    """A p value as papers print it."""
+    value = result.get(key)
+    if value is None:
+        return "\N{EN DASH}"
+    return "< .001" if value < 0.001 else f"{value:.3f}".removeprefix("0")
+
+
+def _two_decimals(value: float) -> str:
+    """A difference or an effect size as papers print it."""
+    return f"{value:+.2f}".replace("-", "\N{MINUS SIGN}")

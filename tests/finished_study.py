@@ -1,0 +1,115 @@
+"""A study that is over: pairs answered, filters evaluated, robots rated, forms filled in; small and invented."""
+
+from datetime import timedelta
+from random import Random
+from uuid import NAMESPACE_URL, uuid5
+
+from sqlalchemy.orm import Session
+
+from app.db import now
+from app.domain.clips import Clip
+from app.domain.evaluation import Rating, Trial
+from app.domain.models import ModelKind
+from app.domain.participation import ConsentRecord, FormAnswer, ParticipantEvent, StageRecord
+from app.domain.preferences import Purpose, Query, Response
+from app.domain.protocol import EvaluationSettings
+from app.domain.studies import Participant, Study
+from app.services import evaluating
+from app.storage import ArtefactStore
+from tests import factories
+
+MEANS = {"reference": 2.6, "prefft": 3.0, "pbarl": 4.1}
+
+
+def make_finished_study(
+    session: Session, store: ArtefactStore, people: int = 8, labels: int = 12, *, unblinded: bool = True
+) -> Study:
+    """The study, with participants P01, P02, ..."""
+    study = factories.make_study(
+        session, "Feeding, finished", labels_per_participant=10, evaluation=EvaluationSettings()
+    )
+    study.unblinded_at = now() if unblinded else None
+    clips = [factories.make_clip(session, store, study) for _ in range(6)]
+    for _ in range(people):
+        person, _ = factories.make_participant(session, study)
+        random = Random(person.number)  # noqa: S311
+        _answer(session, person, clips, labels, random)
+        _forms(session, person)
+        _evaluate(session, study, person, random)
+        _rate(session, study, person, random)
+    return study
+
+
+def _answer(session: Session, person: Participant, clips: list[Clip], labels: int, random: Random) -> None:
+    first = None
+    for number in range(labels):
+        left, right = random.sample(clips, 2)
+        predicted = None if number < 3 else random.uniform(0.05, 0.95)
+        query = factories.make_query(session, person, left, right, predicted)
+        says = Response.RIGHT if random.random() < (predicted or 0.5) else Response.LEFT
+        factories.make_label(
+            session, query, says, timedelta(minutes=labels - number), response_time_ms=3000 + 100 * number
+        )
+        first = first or (query, left, right, says)
+    if first is None:
+        return
+    earlier, left, right, said = first
+    query = factories.make_query(session, person, right, left)
+    query.purpose, query.repeats_query_id = Purpose.REPEAT, earlier.id
+    other = {Response.LEFT: Response.RIGHT, Response.RIGHT: Response.LEFT}
+    factories.make_label(session, query, other[said], response_time_ms=2500)
+    _change_of_mind(session, earlier)
+
+
+def _change_of_mind(session: Session, query: Query) -> None:
+    factories.make_label(session, query, Response.EQUAL, response_time_ms=9000)
+
+
+def _forms(session: Session, person: Participant) -> None:
+    session.add(ConsentRecord(participant_id=person.id, version="1", language="en", text="I agree.\nReally."))
+    session.add(StageRecord(participant_id=person.id, stage="consent", finished_at=now()))
+    session.add(FormAnswer(participant_id=person.id, form="demographics", item="age", value=str(20 + person.number)))
+    text = '=HYPERLINK("http://example.com")' if person.number == 1 else 'nice, "really" nice'
+    session.add(FormAnswer(participant_id=person.id, form="questionnaire", item="comments", value=text))
+    session.add(ParticipantEvent(participant_id=person.id, kind="break_begun", detail={"answered": 5}))
+
+
+def _evaluate(session: Session, study: Study, person: Participant, random: Random) -> None:
+    metrics = factories.filter_metrics()
+    gain, loss = random.uniform(0.3, 1.2), random.uniform(-0.06, 0.02)
+    metrics["evaluation"]["preference"] = {"delta": gain, "low": gain - 0.2, "high": gain + 0.2}
+    metrics["evaluation"]["success"] = {
+        "reference": 0.95,
+        "filter": 0.95 + loss,
+        "delta": loss,
+        "low": loss - 0.04,
+        "high": loss + 0.04,
+    }
+    for cost in metrics["evaluation"]["costs"].values():
+        cost["delta"] *= random.uniform(0.2, 1.6)
+    factories.make_model(session, study, person, ModelKind.REWARD, factories.reward_metrics())
+    factories.make_model(session, study, person, ModelKind.FILTER, metrics)
+
+
+def _rate(session: Session, study: Study, person: Participant, random: Random) -> None:
+    evaluating.draw(session, study, person)
+    methods = {each.letter: each.method for each in evaluating.assignments_of(session, person.id)}
+    level = random.gauss(0, 0.5)
+    for trial in evaluating.trials_of(session, person.id):
+        trial.shown_at = now()
+        scores = [min(5, max(1, round(MEANS[methods[trial.letter]] + level + random.gauss(0, 0.7)))) for _ in range(2)]
+        session.add(_rating(trial, 1, *scores))
+        if trial.ordinal == 1:
+            session.add(_rating(trial, 2, scores[0], 6 - scores[1]))
+    session.flush()
+
+
+def _rating(trial: Trial, revision: int, satisfaction: int, personalisation: int) -> Rating:
+    return Rating(
+        trial_id=trial.id,
+        revision=revision,
+        satisfaction=satisfaction,
+        personalisation=personalisation,
+        client_uuid=str(uuid5(NAMESPACE_URL, f"{trial.id}/{revision}")),
+        response_time_ms=4000,
+    )

@@ -1,0 +1,169 @@
+"""Reports are made when something is newer, not too often, and know letters only until somebody unblinds."""
+
+import io
+from collections.abc import Callable
+from datetime import timedelta
+from typing import Any
+
+import pandas as pd
+import pytest
+from scipy import stats
+from sqlalchemy import select
+
+from app.db import Database, now
+from app.domain.models import Report, Run, RunKind, RunStatus
+from app.domain.studies import Participant, Study
+from app.services import export_tables, exporting, withdrawal
+from app.storage import ArtefactStore
+from tests import factories
+from tests.finished_study import make_finished_study
+from worker import reconcile, records, report_work
+from worker.analysis import figures
+from worker.compute import Compute
+from worker.records import Job
+from worker.workplace import Workplace
+
+
+class Here(Compute):
+    """Computes where it is asked, not in other processes."""
+
+    def __init__(self) -> None:
+        super().__init__(1)
+
+    def run(self, lane: Any, beat: Any, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+        """The function's result."""
+        return function(*args, **kwargs)
+
+
+@pytest.fixture
+def place(database: Database, store: ArtefactStore) -> Workplace:
+    return Workplace(database, store, Here())
+
+
+@pytest.fixture(autouse=True)
+def _small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(figures, "DPI", 30)
+
+
+@pytest.fixture
+def finished(database: Database, store: ArtefactStore) -> Study:
+    with database.writing() as session:
+        return make_finished_study(session, store, people=5, labels=6)
+
+
+def due(place: Workplace, study: Study) -> list[Job]:
+    with place.database.reading() as session:
+        return report_work.due(session, session.get_one(Study, study.id))
+
+
+def make_report(place: Workplace, study: Study) -> Report:
+    """Make the report that is due, as the worker would."""
+    (job,) = due(place, study)
+    with place.database.writing() as session:
+        run_id = records.begin_run(session, job, seed=1)
+    report_work.make(place, job, run_id, lambda _name, function, *arguments: function(*arguments))
+    with place.database.writing() as session:
+        records.finish_run(session, run_id)
+        return session.scalars(select(Report)).one()
+
+
+def age(place: Workplace, by: timedelta) -> None:
+    with place.database.writing() as session:
+        for report in session.scalars(select(Report)):
+            report.created_at = now() - by
+
+
+def test_an_empty_study_has_no_report(place: Workplace) -> None:
+    with place.database.writing() as session:
+        study = factories.make_study(session)
+    assert due(place, study) == []
+
+
+def test_reports_are_found_by_the_reconciler_and_only_while_something_is_newer(
+    place: Workplace, finished: Study
+) -> None:
+    with place.database.reading() as session:
+        assert RunKind.REPORT in {job.kind for job, _ in reconcile.findings(session)}
+    make_report(place, finished)
+    age(place, timedelta(hours=1))
+    assert due(place, finished) == []
+
+
+def test_a_new_rating_makes_a_new_report_but_not_at_once(place: Workplace, finished: Study) -> None:
+    first = make_report(place, finished)
+    with place.database.writing() as session:
+        factories.make_rated_trials(session, session.scalars(select(Participant)).first(), 1)  # type: ignore[arg-type]
+    assert due(place, finished) == []
+    age(place, report_work.AT_MOST_EVERY)
+    second = make_report(place, finished)
+    assert (second.id, second.basis) != (first.id, first.basis)
+    with place.database.reading() as session:
+        runs = session.scalars(select(Run).where(Run.kind == RunKind.REPORT)).all()
+        assert [run.id for run in runs] == [second.run_id], "older reports go with their runs"
+
+
+def test_one_report_is_made_at_a_time(place: Workplace, finished: Study) -> None:
+    with place.database.writing() as session:
+        factories.make_run(session, finished, kind=RunKind.REPORT, status=RunStatus.RUNNING)
+    assert due(place, finished) == []
+
+
+def test_pictures_of_an_older_report_go_with_it(place: Workplace, finished: Study) -> None:
+    old = {each["svg"] for each in make_report(place, finished).figures.values()}
+    with place.database.writing() as session:
+        session.get_one(Study, finished.id).unblinded_at = None
+    age(place, timedelta(minutes=1))
+    new = {each["svg"] for each in make_report(place, finished).figures.values()}
+    assert [sha256 for sha256 in old - new if place.store.has(sha256)] == []
+    assert all(place.store.has(sha256) for sha256 in new)
+
+
+def test_a_blinded_report_has_letters_and_no_tests(place: Workplace) -> None:
+    with place.database.writing() as session:
+        study = make_finished_study(session, place.store, people=4, unblinded=False)
+    report = make_report(place, study)
+    assert report.contents["ratings"]["groups"] == ["A", "B", "C"]
+    assert report.contents["ratings"]["scales"]["satisfaction"]["comparisons"] == []
+    text = repr(report.contents) + "".join(
+        place.store.read(each["svg"]).decode() for name, each in report.figures.items() if name.startswith("ratings")
+    )
+    assert not any(name in text for name in ("pbarl", "prefft", "PbARL", "PrefFT", "Pre-trained"))
+
+
+def test_somebody_who_withdraws_while_a_report_is_made_is_in_no_report(place: Workplace, finished: Study) -> None:
+    (job,) = due(place, finished)
+    with place.database.writing() as session:
+        run_id = records.begin_run(session, job, seed=1)
+
+    class Meanwhile(Here):
+        def run(self, lane: Any, beat: Any, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+            with place.database.writing() as session:
+                person = session.scalars(select(Participant)).first()
+                assert person is not None
+                withdrawal.withdraw(session, place.store, person, "the person")
+            return function(*args, **kwargs)
+
+    other = Workplace(place.database, place.store, Meanwhile())
+    stored = report_work._make(other, finished.id, run_id)
+    with place.database.reading() as session:
+        assert session.scalars(select(Report)).all() == []
+    assert not any(place.store.has(sha256) for sha256 in stored)
+
+
+def test_numbers_of_the_report_are_those_of_the_exported_csv(place: Workplace, finished: Study) -> None:
+    report = make_report(place, finished)
+    with place.database.reading() as session:
+        study = session.get_one(Study, finished.id)
+        provenance = exporting.provenance_of(session, study)
+        lines = exporting.csv_lines(export_tables.BY_NAME["ratings"], session, study, provenance)
+        table = pd.read_csv(io.StringIO("".join(lines)))
+    table = table[table.counts]
+    assert len(table) == 5 * 9
+    for scale in ("satisfaction", "personalisation"):
+        means = table.groupby(["participant", "method"])[scale].mean().unstack()
+        for comparison in report.contents["ratings"]["scales"][scale]["comparisons"]:
+            first, second = comparison["first"], comparison["second"]
+            paper = stats.ttest_ind(table[table.method == second][scale], table[table.method == first][scale])
+            paired = stats.ttest_rel(means[second], means[first])
+            assert comparison["two_sample_t"]["p"] == pytest.approx(paper.pvalue)
+            assert comparison["paired_t"]["p"] == pytest.approx(paired.pvalue)
