@@ -1,7 +1,7 @@
 """The operator's desk: letters only, one trial after the other, repeats with a reason; and unblinding on purpose."""
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import pytest
@@ -16,7 +16,7 @@ from app.domain.models import ModelKind
 from app.domain.people import AuditEvent
 from app.domain.protocol import EvaluationMode, EvaluationSettings
 from app.domain.studies import Participant, Study
-from app.services import unblinding
+from app.services import export_tables, unblinding
 from app.storage import ArtefactStore
 from tests import factories
 
@@ -66,9 +66,11 @@ class Laboratory:
 
 
 @pytest.fixture
-def laboratory(database: Database, store: ArtefactStore, experimenter: TestClient) -> Laboratory:
+def laboratory(
+    database: Database, store: ArtefactStore, experimenter: TestClient, request: pytest.FixtureRequest
+) -> Laboratory:
     with database.writing() as session:
-        settings = EvaluationSettings(mode=EvaluationMode.PHYSICAL)
+        settings = EvaluationSettings(mode=getattr(request, "param", EvaluationMode.PHYSICAL))
         study = factories.make_study(session, evaluation=settings)
         participant, _ = factories.make_participant(session, study)
         factories.answer_everything(session, store, study, participant)
@@ -159,27 +161,31 @@ def test_the_desk_is_for_those_who_are_logged_in(laboratory: Laboratory, new_bro
 
 # -- blindness --------------------------------------------------------------------------------------------------------
 
-WHEN = re.compile(rb"just now|\d+ (min|h|days) ago")
-DOWNLOADS_OF_LETTERS = "/controllers/"
+WHEN = re.compile(rb"just now|\d+ (min|h|days) ago|\d{4}-\d\d-\d\dT[\d:.]+\+00:00")
+PARAMETER = re.compile(r"{(\w+)(?::\w+)?}")
+
+
+def addresses(application: FastAPI, laboratory: Laboratory) -> Iterator[str]:
+    """Every address below /studies that can be looked at or downloaded, endless streams and letters' files excepted."""
+    single = {"slug": laboratory.study.slug, "code": laboratory.participant.code, "version": "1", "letter": "A"}
+    tables = [{"table": table.name, "kind": kind} for table in export_tables.TABLES for kind in ("csv", "jsonl")]
+    for route in iter_route_contexts(application.routes):
+        path = route.path or ""
+        if "GET" not in (route.methods or ()) or not path.startswith("/studies") or path.endswith("/live"):
+            continue
+        if "/controllers/" in path or "/links/" in path or "/export/files/" in path or "/figures/" in path:
+            continue
+        for more in tables if "{table}" in path else [{}]:
+            yield PARAMETER.sub(lambda name, more=more: {**single, **more}[name[1]], path)  # type: ignore[misc]
 
 
 def pages(application: FastAPI, laboratory: Laboratory) -> dict[str, bytes]:
-    """Every address below /studies that can be looked at, with what it answers."""
-    found = {}
-    values = {"slug": laboratory.study.slug, "code": laboratory.participant.code, "version": "1", "letter": "A"}
-    for route in iter_route_contexts(application.routes):
-        if route.path is None or "GET" not in (route.methods or ()) or not route.path.startswith("/studies"):
-            continue
-        if route.path.endswith("/live") or not set(re.findall(r"{(\w+)", route.path)) <= values.keys():
-            continue
-        path = route.path.format(**values)
-        if DOWNLOADS_OF_LETTERS not in path:
-            found[path] = WHEN.sub(b"", laboratory.operator.get(path).content)
-    return found
+    """What every address answers; times are left out."""
+    return {path: WHEN.sub(b"", laboratory.operator.get(path).content) for path in addresses(application, laboratory)}
 
 
 def exchange(laboratory: Laboratory) -> None:
-    """Another key: the methods behind A and C change places, and nothing else does."""
+    """Another key: the methods behind A and C change places, with their films, and nothing else does."""
     with laboratory.database.writing() as session:
         first, _, last = session.scalars(select(Assignment).order_by(Assignment.letter)).all()
         methods = first.method, last.method
@@ -188,13 +194,20 @@ def exchange(laboratory: Laboratory) -> None:
         last.method = methods[0]
         session.flush()
         first.method = methods[1]
+        trials = session.scalars(select(Trial).order_by(Trial.ordinal)).all()
+        for one, other in zip(trials[:3], trials[6:], strict=True):
+            one.film_id, other.film_id = other.film_id, one.film_id
 
 
-def test_no_page_of_a_blinded_study_would_look_otherwise_under_another_key(
+@pytest.mark.parametrize("laboratory", EvaluationMode, indirect=True)
+def test_no_page_or_file_of_a_blinded_study_would_look_otherwise_under_another_key(
     studio_app: FastAPI, laboratory: Laboratory
 ) -> None:
+    for ordinal in range(1, 10):
+        laboratory.rate(ordinal)
     before = pages(studio_app, laboratory)
     assert f"{laboratory.base}/operate" in before
+    assert f"/studies/{laboratory.study.slug}/export/ratings.csv" in before
     assert f"/studies/{laboratory.study.slug}/unblind" in before
     exchange(laboratory)
     after = pages(studio_app, laboratory)
