@@ -23,7 +23,7 @@ from sqlalchemy.orm import Session
 from app.db import Database
 from app.domain.studies import USUAL_CLIP_STEPS, Study, StudySettings, TaskName
 from app.errors import AppError
-from app.services import accounts, enrolment, studies
+from app.services import accounts, enrolment, export_tables, exporting, studies
 from app.settings import Settings
 
 GRACE_S = 20.0
@@ -82,6 +82,14 @@ def participant_link(settings: Settings) -> int:
             raise AppError("There is no study yet. Start the studio once, or create a study on the dashboard.")
         _, token = enrolment.add_participant(session, study)
     _say(f"{settings.base_url}/p/{token}")
+    return 0
+
+
+def dictionary(_settings: Settings) -> int:
+    """Write the data dictionary of all exports to docs/protocol.md."""
+    path = Path(__file__).resolve().parents[1] / "docs" / "protocol.md"
+    path.write_text(exporting.dictionary_markdown(export_tables.TABLES))
+    _say(f"Wrote {path}")
     return 0
 
 
@@ -246,6 +254,7 @@ _COMMANDS: dict[str, Callable[[Settings], int]] = {
     "migrate": migrate,
     "reset-password": reset_password,
     "link": participant_link,
+    "dictionary": dictionary,
 }
 
 if __name__ == "__main__":

@@ -40,6 +40,20 @@ class ArtefactStore:
         _sync_directory(target.parent)
         return sha256
 
+    def take(self, path: Path) -> str:
+        """Move a finished file into the store and return its hash; for files too large to hold in memory.
+
+        The file must lie on the same disk, below unfinished() for instance.
+        """
+        sha256 = hash_of_file(path)
+        target = self.path(sha256)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("rb") as stream:
+            os.fsync(stream.fileno())
+        path.replace(target)
+        _sync_directory(target.parent)
+        return sha256
+
     def path(self, sha256: str) -> Path:
         """Where the artefact lies or would lie. Raises ArtefactMissing for anything that is not a hash."""
         if not _SHA256.fullmatch(sha256):
@@ -67,6 +81,12 @@ class ArtefactStore:
     def delete(self, sha256: str) -> None:
         """Remove the artefact if it is there."""
         self.path(sha256).unlink(missing_ok=True)
+
+
+def hash_of_file(path: Path) -> str:
+    """SHA-256 of a file's content, read in pieces."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def _sync_directory(directory: Path) -> None:

@@ -21,7 +21,7 @@ from app.errors import AppError
 from app.storage import ArtefactStore
 from worker.ml import acquisition
 from worker.ml.segments import SegmentPairs, Stretch
-from worker.trajectory import Array, OutdatedTrajectory, Trajectory
+from worker.trajectory import SIGNALS, Array, OutdatedTrajectory, Trajectory
 
 
 class RecordedByAnOlderVersion(AppError):
@@ -126,6 +126,11 @@ def pool_pairs(session: Session, store: ArtefactStore, study_id: int) -> Segment
 def shown(store: ArtefactStore, clip: Clip) -> Trajectory:
     """The whole trajectory that a clip shows a stretch of."""
     return _trajectory(store.path(clip.rollout.trajectory_sha256))
+
+
+def signal_names(study: Study) -> Sequence[str]:
+    """Names, with units, of the columns of signals in the study's trajectories."""
+    return SIGNALS if study.material is None else list(study.material["signals"])
 
 
 def stored_trajectory(store: ArtefactStore, sha256: str) -> Trajectory:

@@ -15,7 +15,7 @@ from app.domain.clips import Clip, Rollout
 from app.domain.models import Run, RunKind, RunStatus
 from app.domain.preferences import LEARNED_FROM, LabelEvent, Query, current_labels
 from app.domain.studies import Participant, Study, StudySettings
-from worker import film_work, method_work, report_work
+from worker import export_work, film_work, method_work, report_work
 from worker.clip_work import WHOLE
 from worker.records import ATTEMPTS, LEASE, Job, next_queries
 
@@ -31,7 +31,7 @@ def findings(session: Session) -> Iterator[tuple[Job, int]]:
     succeeded = {name for name, run in runs.items() if run.status == RunStatus.SUCCEEDED}
     for study in session.scalars(select(Study).order_by(Study.id)).all():
         jobs = (*_missing_clips(session, study), *_stale_models(session, study, succeeded))
-        for job in (*jobs, *report_work.due(session, study)):
+        for job in (*jobs, *report_work.due(session, study), *export_work.due(session, study)):
             attempt = _attempt_due(runs.get(job.finding), now())
             if attempt is not None:
                 yield job, attempt

@@ -16,7 +16,7 @@ from sqlalchemy.orm import Session
 from app.domain.models import RunKind
 from app.domain.studies import Participant, Study
 from app.errors import AppError
-from worker import records, report_work
+from worker import export_work, records, report_work
 from worker.clip_work import build_clips
 from worker.film_work import make_films
 from worker.filter_work import train_filter
@@ -34,6 +34,7 @@ _BODIES: dict[RunKind, Callable[[Workplace, Job, int, Step], None]] = {
     RunKind.METHOD: train_method,
     RunKind.FILMS: make_films,
     RunKind.REPORT: report_work.make,
+    RunKind.EXPORT: export_work.make,
 }
 
 

@@ -3,10 +3,11 @@
 import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any, Protocol
 
 from app.db import Database
-from app.storage import ArtefactStore
+from app.storage import ArtefactStore, hash_of_file
 from worker import records
 from worker.compute import Compute
 from worker.trajectory import Trajectory
@@ -34,6 +35,11 @@ class NotingStore(ArtefactStore):
         """Store the bytes and return their hash, noted before the first of them is written."""
         self._noted.add(hashlib.sha256(content).hexdigest())
         return super().put(content)
+
+    def take(self, path: Path) -> str:
+        """Move the file into the store, noted before it is there."""
+        self._noted.add(hash_of_file(path))
+        return super().take(path)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,196 @@
+"""Every table as a file: complete, explained, harmless in a spreadsheet, and silent about what is blinded."""
+
+import csv
+import io
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from fastapi.testclient import TestClient
+from sqlalchemy import select
+
+from app.db import Database, now
+from app.domain.people import AuditEvent, Experimenter, Role
+from app.domain.studies import Deviation, Participant, Study
+from app.services import export_tables, exporting, withdrawal
+from app.storage import ArtefactStore
+from tests.finished_study import make_finished_study
+
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+Table = list[dict[str, str]]
+
+
+@pytest.fixture
+def study(database: Database, store: ArtefactStore) -> Study:
+    with database.writing() as session:
+        return make_finished_study(session, store, people=2, labels=5)
+
+
+@pytest.fixture
+def download(experimenter: TestClient, study: Study) -> Callable[[str], Table]:
+    def fetch(table: str) -> Table:
+        answer = experimenter.get(f"/studies/{study.slug}/export/{table}.csv")
+        assert answer.status_code == 200
+        assert answer.headers["content-type"].startswith("text/csv")
+        return list(csv.DictReader(io.StringIO(answer.text)))
+
+    return fetch
+
+
+@pytest.mark.parametrize("table", [table.name for table in export_tables.TABLES])
+def test_every_table_has_the_columns_of_its_dictionary_in_both_formats(
+    experimenter: TestClient, study: Study, table: str
+) -> None:
+    names = [column.name for column in export_tables.BY_NAME[table].all_columns]
+    rows = experimenter.get(f"/studies/{study.slug}/export/{table}.csv").text.splitlines()
+    assert rows[0].split(",") == names
+    lines = experimenter.get(f"/studies/{study.slug}/export/{table}.jsonl").text.splitlines()
+    assert all(list(json.loads(line)) == names for line in lines)
+    assert lines or table == "deviations"
+
+
+@pytest.mark.parametrize("table", export_tables.TABLES, ids=lambda table: table.name)
+def test_values_are_of_the_kind_that_the_dictionary_says(
+    database: Database, study: Study, table: exporting.Table
+) -> None:
+    kinds: dict[str, tuple[type, ...]] = {
+        "text": (str,),
+        "integer": (int,),
+        "number": (int, float),
+        "boolean": (bool,),
+        "time": (str,),
+        "json": (dict,),
+    }
+    with database.reading() as session:
+        provenance = exporting.provenance_of(session, study)
+        for row in exporting.records(table, session, study, provenance):
+            for column in table.all_columns:
+                value = row[column.name]
+                assert value is None or isinstance(value, kinds[column.kind.value]), (column.name, value)
+
+
+def test_the_dictionary_in_the_documentation_is_up_to_date() -> None:
+    assert (DOCS / "protocol.md").read_text() == exporting.dictionary_markdown(export_tables.TABLES), (
+        "run: python -m app dictionary"
+    )
+
+
+def test_every_column_says_what_it_means() -> None:
+    assert [row for row in exporting.dictionary(export_tables.TABLES) if len(row["meaning"]) < 4] == []
+
+
+def test_formulas_that_participants_write_do_not_run_in_a_spreadsheet(
+    experimenter: TestClient, study: Study, download: Callable[[str], Table]
+) -> None:
+    values = {row["value"] for row in download("forms") if row["item"] == "comments"}
+    assert values == {'\'=HYPERLINK("http://example.com")', 'nice, "really" nice'}
+    lines = experimenter.get(f"/studies/{study.slug}/export/forms.jsonl").text
+    assert '"=HYPERLINK(\\"http://example.com\\")"' in lines, "other formats have the words as they were written"
+
+
+@pytest.mark.parametrize("text", ["=1+1", "+1", "-1", "@SUM(A1)", "\tx", "\rx"])
+def test_whatever_a_spreadsheet_would_run_is_defused(text: str) -> None:
+    assert exporting.defused(text) == "'" + text
+
+
+def test_negative_numbers_stay_numbers(download: Callable[[str], Table]) -> None:
+    assert any(float(row["delta"]) < 0 for row in download("evaluations"))
+
+
+def test_answers_that_no_longer_count_are_there_and_marked(download: Callable[[str], Table]) -> None:
+    first = [row for row in download("labels") if (row["participant"], row["ordinal"]) == ("P01", "1")]
+    assert [row["superseded"] for row in first] == ["true", "false"]
+    counting = next(row for row in download("queries") if (row["participant"], row["ordinal"]) == ("P01", "1"))
+    assert (counting["response"], counting["revisions"]) == ("equal", "2")
+
+
+def test_a_corrected_rating_counts_once(download: Callable[[str], Table]) -> None:
+    ratings = [row for row in download("ratings") if (row["participant"], row["order"]) == ("P01", "1")]
+    assert [(row["revision"], row["counts"]) for row in ratings] == [("1", "false"), ("2", "true")]
+
+
+def test_until_unblinding_no_file_says_which_letter_is_which_method(
+    database: Database, study: Study, experimenter: TestClient, download: Callable[[str], Table]
+) -> None:
+    assert {row["method"] for row in download("ratings")} == {"reference", "prefft", "pbarl"}
+    with database.writing() as session:
+        session.get_one(Study, study.id).unblinded_at = None
+    assert {row["method"] for row in download("ratings")} == {""}
+    assert {row["success"] for row in download("ratings")} == {""}
+    for table in export_tables.TABLES:
+        text = experimenter.get(f"/studies/{study.slug}/export/{table.name}.jsonl").text
+        assert '"reference"' not in text or table.name in ("evaluations", "models")
+        assert "prefft" not in text
+
+
+def test_every_row_says_whether_the_study_was_locked_and_how_it_deviated(
+    database: Database, study: Study, download: Callable[[str], Table]
+) -> None:
+    assert {(row["lock_hash"], row["deviations"]) for row in download("ratings")} == {("not locked", "none")}
+    with database.writing() as session:
+        session.get_one(Study, study.id).lock_hash = "ab" * 32
+        change = {"labels_per_participant": 10}
+        session.add(Deviation(study_id=study.id, actor="experimenter", reason="too long", before=change, after=change))
+    (row, *_) = download("ratings")
+    assert row["lock_hash"] == "ab" * 32
+    assert row["deviations"].endswith(": too long")
+    assert row["software_version"] == exporting.software_version()
+    assert download("deviations")[0]["reason"] == "too long"
+
+
+def test_who_withdrew_is_a_tombstone_and_nothing_else(
+    database: Database, store: ArtefactStore, study: Study, download: Callable[[str], Table]
+) -> None:
+    with database.writing() as session:
+        person = session.scalars(select(Participant).where(Participant.number == 1)).one()
+        withdrawal.withdraw(session, store, person, "P01")
+    tombstone = next(row for row in download("participants") if row["participant"] == "P01")
+    kept = {name for name, value in tombstone.items() if value} - {column.name for column in exporting.PROVENANCE}
+    assert kept == {"participant", "status", "withdrawn_at"}
+    for table in export_tables.TABLES:
+        if table.name not in ("participants", "clips", "deviations"):
+            assert {row["participant"] for row in download(table.name)} == {"P02"}
+
+
+def test_an_export_is_remembered(database: Database, study: Study, download: Callable[[str], Table]) -> None:
+    download("ratings")
+    with database.reading() as session:
+        acts = session.scalars(select(AuditEvent.subject).where(AuditEvent.action == "table exported")).all()
+    assert acts == [f"{study.slug}/ratings.csv"]
+
+
+def test_who_may_only_look_may_not_export(database: Database, study: Study, experimenter: TestClient) -> None:
+    with database.writing() as session:
+        session.scalars(select(Experimenter)).one().role = Role.READER
+    answer = experimenter.get(f"/studies/{study.slug}/export/ratings.csv")
+    assert (answer.status_code, "role of experimenter" in answer.text) == (403, True)
+    page = experimenter.get(f"/studies/{study.slug}/export")
+    assert page.status_code == 200
+    assert "ratings.csv" not in page.text
+
+
+def test_a_table_that_there_is_not_has_a_page_that_says_so(study: Study, experimenter: TestClient) -> None:
+    answer = experimenter.get(f"/studies/{study.slug}/export/secrets.csv")
+    assert (answer.status_code, "no table of this name" in answer.text) == (404, True)
+
+
+def test_strangers_get_nothing(client: TestClient, study: Study) -> None:
+    assert client.get(f"/studies/{study.slug}/export/ratings.csv").status_code == 303
+    assert client.get(f"/studies/{study.slug}/results").status_code == 303
+
+
+def test_a_file_is_asked_for_once_and_downloaded_when_it_is_there(
+    database: Database, store: ArtefactStore, study: Study, experimenter: TestClient
+) -> None:
+    from app.domain.models import Export
+
+    for _ in range(2):
+        assert experimenter.post(f"/studies/{study.slug}/export/files/data").status_code == 303
+    assert "waiting for the worker" in experimenter.get(f"/studies/{study.slug}/export").text
+    with database.writing() as session:
+        (export,) = session.scalars(select(Export)).all()
+        assert (export.kind, export.requested_by) == ("data", "experimenter")
+        export.artefact_sha256, export.byte_count, export.finished_at = store.put(b"PK"), 2, now()
+    assert experimenter.get(f"/studies/{study.slug}/export/files/{export.id}.zip").content == b"PK"
+    assert experimenter.get(f"/studies/{study.slug}/export/files/99.zip").status_code == 404

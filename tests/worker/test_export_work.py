@@ -1,0 +1,210 @@
+"""The whole data of a study as one file that pandas, R's arrow and other learning libraries read."""
+
+import csv
+import io
+import json
+import re
+import sys
+import types
+import zipfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from sqlalchemy import select
+
+from app.db import Database
+from app.domain.clips import Clip
+from app.domain.models import Export
+from app.domain.preferences import Query, Response
+from app.domain.studies import Participant, Study
+from app.services import export_requests, export_tables
+from app.services.export_requests import ExportKind
+from app.storage import ArtefactStore
+from worker import dataset, export_work, reconcile, records
+from worker.compute import Compute
+from worker.records import Job
+from worker.trajectory import SIGNALS
+from worker.workplace import Workplace
+
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+AddClips = Callable[..., list[Clip]]
+Answer = Callable[[Clip, Clip, Response], Query]
+SAID = (Response.LEFT, Response.RIGHT, Response.EQUAL, Response.SKIP)
+
+
+@pytest.fixture
+def place(database: Database, store: ArtefactStore) -> Workplace:
+    return Workplace(database, store, Compute(1))
+
+
+@pytest.fixture
+def pairs(add_clips: AddClips, answer: Answer) -> list[tuple[Clip, Clip]]:
+    """Four answered pairs, one of each kind of answer."""
+    clips = add_clips(1)
+    shown = [(clips[0], clips[1]), (clips[2], clips[1]), (clips[2], clips[3]), (clips[3], clips[0])]
+    for (left, right), response in zip(shown, SAID, strict=True):
+        answer(left, right, response)
+    return shown
+
+
+def make_export(place: Workplace, study: Study, kind: ExportKind = ExportKind.DATA) -> zipfile.ZipFile:
+    with place.database.writing() as session:
+        export_requests.request(session, session.get_one(Study, study.id), kind, "experimenter")
+    with place.database.reading() as session:
+        (job,) = export_work.due(session, session.get_one(Study, study.id))
+        assert job.finding in {each.finding for each, _ in reconcile.findings(session)}
+    with place.database.writing() as session:
+        run_id = records.begin_run(session, job, seed=1)
+    export_work.make(place, job, run_id, lambda _name, function, *arguments: function(*arguments))
+    with place.database.reading() as session:
+        export = session.scalars(select(Export).order_by(Export.id.desc())).first()
+        assert export is not None
+        assert export_work.due(session, session.get_one(Study, study.id)) == []
+    assert export.artefact_sha256 is not None
+    return zipfile.ZipFile(io.BytesIO(place.store.read(export.artefact_sha256)))
+
+
+def test_all_formats_have_the_same_rows(place: Workplace, study: Study, pairs: list[tuple[Clip, Clip]]) -> None:
+    archive = make_export(place, study)
+    for table in export_tables.TABLES:
+        plain = list(csv.DictReader(io.TextIOWrapper(archive.open(f"csv/{table.name}.csv"))))
+        lines = archive.read(f"jsonl/{table.name}.jsonl").decode().splitlines()
+        frame = pd.read_parquet(io.BytesIO(archive.read(f"parquet/{table.name}.parquet")))
+        assert len(plain) == len(lines) == len(frame)
+        assert list(frame.columns) == [column.name for column in table.all_columns]
+    frame = pd.read_parquet(io.BytesIO(archive.read("parquet/queries.parquet")))
+    assert list(frame["response"]) == ["left", "right", "equal", "skip"]
+    assert str(frame["answered_at"].dtype).startswith("datetime64")
+
+
+def test_the_file_explains_itself(place: Workplace, study: Study, pairs: list[tuple[Clip, Clip]]) -> None:
+    archive = make_export(place, study)
+    assert "not locked" in archive.read("README.md").decode()
+    about = json.loads(archive.read("provenance.json"))
+    assert (about["lock_hash"], about["deviations"], about["settings"]) == ("not locked", [], study.stored_settings)
+    described = {
+        (row["table"], row["column"]) for row in csv.DictReader(io.TextIOWrapper(archive.open("dictionary.csv")))
+    }
+    assert described == {(table.name, column.name) for table in export_tables.TABLES for column in table.all_columns}
+    assert archive.testzip() is None
+
+
+def test_nobody_learns_from_an_export_that_somebody_withdrew_from(
+    place: Workplace, study: Study, participant: Participant, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from app.services import withdrawal
+
+    write = export_work.write_data
+
+    def withdrawing(*arguments: Any) -> None:
+        write(*arguments)
+        with place.database.writing() as session:
+            withdrawal.withdraw(session, place.store, session.get_one(Participant, participant.id), "P01")
+
+    monkeypatch.setattr(export_work, "write_data", withdrawing)
+    with place.database.writing() as session:
+        export = export_requests.request(session, session.get_one(Study, study.id), ExportKind.DATA, "experimenter")
+        job = Job(export_requests.finding(export), export_work.RunKind.EXPORT, study.id)
+        run_id = records.begin_run(session, job, seed=1)
+    with pytest.raises(export_work.SomebodyWithdrew):
+        export_work._make(place, export.id, run_id)
+    assert list(place.store.root.glob("??/*")) == []
+    assert list(place.store.unfinished(0).parent.iterdir()) == []
+
+
+# --- other libraries ---
+
+
+@dataclass(frozen=True)
+class TrajectoryWithRew:
+    """What imitation.data.types.TrajectoryWithRew checks."""
+
+    obs: Any
+    acts: Any
+    infos: Any
+    terminal: bool
+    rews: Any
+
+    def __post_init__(self) -> None:
+        assert len(self.obs) == len(self.acts) + 1
+        assert self.rews.shape == (len(self.acts),)
+
+
+@pytest.fixture
+def snippet(
+    place: Workplace,
+    study: Study,
+    pairs: list[tuple[Clip, Clip]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> Iterator[Callable[[str], dict[str, Any]]]:
+    """Runs one piece of code of docs/arrays.md beside the exported files; gives what it has made."""
+    make_export(place, study).extract("pairs/P01.npz", tmp_path)
+    monkeypatch.chdir(tmp_path)
+    module = types.ModuleType("imitation.data.types")
+    module.TrajectoryWithRew = TrajectoryWithRew  # type: ignore[attr-defined]
+    for name in ("imitation", "imitation.data"):
+        monkeypatch.setitem(sys.modules, name, types.ModuleType(name))
+    monkeypatch.setitem(sys.modules, "imitation.data.types", module)
+
+    def run(name: str) -> dict[str, Any]:
+        code = re.search(rf"```python {name}\n(.*?)```", (DOCS / "arrays.md").read_text(), re.DOTALL)
+        assert code is not None
+        exec(code[1], made)  # noqa: S102  (our own documentation)
+        return made
+
+    made: dict[str, Any] = {}
+    yield run
+    made["file"].close()
+
+
+def test_arrays_have_the_documented_layout(
+    place: Workplace, study: Study, pairs: list[tuple[Clip, Clip]], tmp_path: Path
+) -> None:
+    file = np.load(io.BytesIO(make_export(place, study).read("pairs/P01.npz")), allow_pickle=False)
+    documented = set(re.findall(r"^\| `(\w+)`(?:, `(\w+)`)?", (DOCS / "arrays.md").read_text(), re.MULTILINE))
+    assert set(file) == {name for names in documented for name in names if name}
+    count, steps = 3, 20
+    assert file["observations"].shape == (count, 2, steps, 28)
+    assert file["actions"].shape == (count, 2, steps, 7)
+    assert file["signals"].shape == (count, 2, steps, len(SIGNALS))
+    assert file["masks"].shape == (count, 2, steps)
+    assert list(file["signal_names"]) == list(SIGNALS)
+    assert list(file["targets"]) == [0.0, 1.0, 0.5], "left, right, equal; can't tell is left out"
+    left, right = (dataset.shown(place.store, _with_rollout(place, clip)) for clip in pairs[1])
+    assert np.array_equal(file["signals"][1, 0], left.signals[:20])
+    assert np.array_equal(file["actions"][1, 1], right.actions[:20])
+    assert json.loads(str(file["about"]))["participant"] == "P01"
+
+
+def _with_rollout(place: Workplace, clip: Clip) -> Clip:
+    with place.database.reading() as session:
+        return next(each for each in dataset.pool_clips(session, 1) if each.id == clip.id)
+
+
+def test_imitation_reads_preferences_for_the_first_fragment(snippet: Callable[[str], dict[str, Any]]) -> None:
+    made = snippet("imitation")
+    assert list(made["preferences"]) == [1.0, 0.0, 0.5], "left was preferred first: the first fragment, so 1"
+    assert made["preferences"].dtype == np.float32
+    first, second = made["fragments"][0]
+    assert np.array_equal(first.acts, made["file"]["actions"][0, 0])
+    assert np.array_equal(second.obs[-1], made["file"]["last_observations"][0, 1])
+
+
+def test_b_pref_reads_labels_for_the_second_segment(snippet: Callable[[str], dict[str, Any]]) -> None:
+    made = snippet("b-pref")
+    assert made["labels"].tolist() == [[0], [1], [-1]]
+    assert made["sa_t_1"].shape == made["sa_t_2"].shape == (3, 20, 35)
+    assert np.array_equal(made["act_2"], made["file"]["actions"][:, 1])
+
+
+def test_the_preference_transformer_reads_one_hot_labels(snippet: Callable[[str], dict[str, Any]]) -> None:
+    made = snippet("preference-transformer")["batch"]
+    assert made["labels"].tolist() == [[1, 0], [0, 1], [0.5, 0.5]]
+    assert made["observations_2"].shape == (3, 20, 28)
+    assert made["timestep_1"][0, 0] == 1

@@ -1,0 +1,75 @@
+"""Preference pairs as plain arrays, one .npz file per participant, for other learning libraries (docs/arrays.md)."""
+
+import io
+import json
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from sqlalchemy.orm import Session
+
+from app.domain.preferences import Label
+from app.domain.studies import Participant, Study
+from app.storage import ArtefactStore
+from worker import dataset
+from worker.ml.segments import SegmentPairs, Stretch
+from worker.trajectory import Array
+
+LAYOUT = 1
+"""Version of the layout in docs/arrays.md."""
+
+
+def arrays_of(session: Session, store: ArtefactStore, study: Study, participant: Participant) -> bytes | None:
+    """The participant's labels as one .npz file; None when nothing with a target was said."""
+    labels = dataset.labels_with_clips(session, participant.id)
+    said = [(each, target) for each in labels if (target := dataset.target_of(each.response)) is not None]
+    if not said:
+        return None
+    stretches = [_stretches(store, label) for label, _ in said]
+    pairs = SegmentPairs.of(stretches)
+    about = {
+        "layout": LAYOUT,
+        "study": study.slug,
+        "participant": participant.code,
+        "lock_hash": study.lock_hash,
+        "target": "P(right preferred); left is index 0 of the second axis, right is index 1",
+    }
+    file = io.BytesIO()
+    np.savez_compressed(
+        file,
+        allow_pickle=False,
+        observations=pairs.observations,
+        last_observations=_last_observations(stretches),
+        actions=pairs.actions,
+        signals=pairs.signals,
+        masks=pairs.shown,
+        targets=np.array([value for _, value in said], np.float32),
+        ordinals=np.array([label.query.ordinal for label, _ in said], np.int64),
+        purposes=_texts([label.query.purpose for label, _ in said]),
+        responses=_texts([label.response.value for label, _ in said]),
+        clip_ids=np.array([_clip_ids(label) for label, _ in said]),
+        signal_names=_texts(dataset.signal_names(study)),
+        about=np.array(json.dumps(about)),
+    )
+    return file.getvalue()
+
+
+def _stretches(store: ArtefactStore, label: Label) -> tuple[Stretch, Stretch]:
+    return dataset.stretch(store, label.query.left_clip), dataset.stretch(store, label.query.right_clip)
+
+
+def _last_observations(pairs: Sequence[tuple[Stretch, Stretch]]) -> Array:
+    """(N, 2, D) what was observed after the last step that was shown."""
+    return np.array(
+        [[side.trajectory.observations[side.first_step + side.step_count] for side in pair] for pair in pairs],
+        np.float32,
+    )
+
+
+def _clip_ids(label: Label) -> list[str]:
+    return [label.query.left_clip.video_sha256, label.query.right_clip.video_sha256]
+
+
+def _texts(values: Sequence[str]) -> npt.NDArray[Any]:
+    return np.array(list(values), dtype=str)
