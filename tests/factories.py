@@ -34,6 +34,9 @@ def make_study(session: Session, name: str = "Feeding at home", **settings: Any)
     usual = {
         "labels_per_participant": 10,
         "pool_scenarios": 4,
+        "behaviours_per_scenario": 4,
+        "strategy": "uniform",
+        "random_share": 0.5,
         "filter_milestones": (),
         "answer_after_first_play": False,
     }

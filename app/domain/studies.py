@@ -5,7 +5,7 @@ from enum import StrEnum
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
-from sqlalchemy import ForeignKey, String, Text, UniqueConstraint
+from sqlalchemy import ForeignKey, String, Text, UniqueConstraint, false
 from sqlalchemy.orm import Mapped, mapped_column, relationship
 
 from app.db import Base, now
@@ -73,10 +73,10 @@ class StudySettings(BaseModel):
         le=max(LONGEST_CLIP_STEPS.values()),
         description="Control steps shown, from the start (10 Hz).",
     )
-    pool_scenarios: int = Field(default=36, ge=1, le=500)
-    behaviours_per_scenario: int = Field(default=4, ge=2, le=8)
-    strategy: Strategy = Strategy.UNIFORM
-    random_share: float = Field(default=0.5, ge=0.1, le=1.0, description="Share of queries always drawn uniformly.")
+    pool_scenarios: int = Field(default=48, ge=1, le=500)
+    behaviours_per_scenario: int = Field(default=6, ge=2, le=8)
+    strategy: Strategy = Strategy.ENTROPY
+    random_share: float = Field(default=0.3, ge=0.1, le=1.0, description="Share of queries always drawn uniformly.")
     reward_kind: RewardKind = RewardKind.STRUCTURED
     pooled_prior: bool = Field(default=False, description="Start from earlier participants' weights; structured only.")
     method: Method = Method.STUDIO
@@ -147,6 +147,7 @@ class StudySettings(BaseModel):
 
 
 PAPER_PROTOCOL = StudySettings(
+    strategy=Strategy.UNIFORM,
     demographics=PAPER_DEMOGRAPHICS,
     practice_pairs=1,
     introduction_pairs=10,
@@ -206,6 +207,10 @@ class Deviation(Base):
     after: Mapped[dict[str, Any]]
 
 
+PREVIEW_NUMBERS = 900_000
+"""Previews are counted from here, so that they take no participant's number: the numbers balance the evaluation."""
+
+
 class Participant(Base):
     """One person in one study, known by a code. The link's token is stored only as a hash."""
 
@@ -230,6 +235,8 @@ class Participant(Base):
     panel_id: Mapped[str | None] = mapped_column(String(120))
     """Who this is at the recruitment panel; the same id comes back to the same participant."""
     panel_parameters: Mapped[dict[str, Any] | None]
+    is_preview: Mapped[bool] = mapped_column(default=False, server_default=false())
+    """An experimenter looking at the study as a participant would: never counted, never exported, never learned from."""
     completed_at: Mapped[datetime | None]
     withdrawn_at: Mapped[datetime | None]
     """Everything else about the person is erased then; this row stays as the tombstone."""
@@ -240,5 +247,5 @@ class Participant(Base):
 
     @property
     def code(self) -> str:
-        """The name used on pages and in files, such as P07."""
+        """The name used on pages and in files, such as P07; those of previews begin at PREVIEW_NUMBERS."""
         return f"P{self.number:02d}"

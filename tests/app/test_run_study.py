@@ -28,7 +28,7 @@ def typed(browser: TestClient, **changes: str) -> dict[str, str]:
         "task": "feeding",
         "method": "studio",
         "reward_kind": "structured",
-        "strategy": "uniform",
+        "strategy": "entropy",
     }
     return form | {"name": "Pilot"} | changes
 
