@@ -270,7 +270,7 @@ def models_of_others(
     study = select(Participant.study_id).where(Participant.id == participant_id).scalar_subquery()
     others = session.scalars(
         select(Participant.id)
-        .where(Participant.study_id == study, Participant.id != participant_id)
+        .where(Participant.study_id == study, Participant.id != participant_id, Participant.is_preview.is_(False))
         .order_by(Participant.id)
     )
     newest = [newest_model(session, other, kind) for other in others]

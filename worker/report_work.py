@@ -49,7 +49,7 @@ def _name(study_id: int, basis: str) -> str:
 
 def basis_of(session: Session, study: Study) -> str | None:
     """Fingerprint of everything a report is made from; None while there is nothing to report."""
-    people = select(Participant.id).where(Participant.study_id == study.id)
+    people = select(Participant.id).where(Participant.study_id == study.id, Participant.is_preview.is_(False))
     newest = [
         session.scalar(select(func.max(LabelEvent.id)).join(Query).where(Query.participant_id.in_(people))),
         session.scalar(select(func.max(Rating.id)).join(Trial).where(Trial.participant_id.in_(people))),

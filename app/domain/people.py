@@ -31,6 +31,8 @@ class Experimenter(Base):
     must_change_password: Mapped[bool] = mapped_column(default=True)
     role: Mapped[str] = mapped_column(String(20), default=Role.OWNER, server_default=Role.OWNER)
     created_at: Mapped[datetime] = mapped_column(default=now)
+    disabled_at: Mapped[datetime | None]
+    """No login and no token of this account is good any more."""
 
 
 class ApiToken(Base):

@@ -144,7 +144,7 @@ def study_lines(session: Session) -> Sequence[StudyLine]:
     counted = session.execute(select(Rollout.study_id, func.count(Clip.id)).join(Clip).group_by(Rollout.study_id))
     clips = {study_id: count for study_id, count in counted}  # noqa: C416  (a typed row is not a typed pair)
     people: dict[int, list[Participant]] = defaultdict(list)
-    for participant in session.scalars(select(Participant)):
+    for participant in session.scalars(select(Participant).where(Participant.is_preview.is_(False))):
         people[participant.study_id].append(participant)
     lines = []
     for study in session.scalars(select(Study).order_by(Study.id.desc())):
@@ -167,9 +167,8 @@ def study_lines(session: Session) -> Sequence[StudyLine]:
 
 def study_overview(session: Session, study: Study) -> StudyOverview:
     """One study: its pool and a row per participant."""
-    people = session.scalars(
-        select(Participant).where(Participant.study_id == study.id).order_by(Participant.number)
-    ).all()
+    everybody = select(Participant).where(Participant.study_id == study.id, Participant.is_preview.is_(False))
+    people = session.scalars(everybody.order_by(Participant.number)).all()
     return StudyOverview(study, _pool(session, study), _rows(session, study, people))
 
 

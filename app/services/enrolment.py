@@ -8,7 +8,7 @@ from sqlalchemy import delete, func, select
 from sqlalchemy.orm import Session, joinedload
 
 from app.domain.people import BrowserSession
-from app.domain.studies import Participant, Study
+from app.domain.studies import PREVIEW_NUMBERS, Participant, Study
 from app.errors import AppError
 from app.services import audit
 
@@ -27,15 +27,29 @@ class ParticipantNotFound(AppError):
 
 def add_participant(session: Session, study: Study, actor: str = audit.SYSTEM) -> tuple[Participant, str]:
     """Add a person to the study. The token of the personal link is returned here and nowhere else: its hash is kept."""
+    return _add(session, study, actor, preview=False)
+
+
+def add_preview(session: Session, study: Study, actor: str) -> tuple[Participant, str]:
+    """Somebody who looks at the study as a participant would; marked as such and counted nowhere."""
+    return _add(session, study, actor, preview=True)
+
+
+def _add(session: Session, study: Study, actor: str, *, preview: bool) -> tuple[Participant, str]:
     session.scalar(select(Study.id).where(Study.id == study.id).with_for_update())  # numbers are given one at a time
-    newest = session.scalar(select(func.max(Participant.number)).where(Participant.study_id == study.id))
-    number, token = (newest or 0) + 1, _new_token()
+    like_this = Participant.study_id == study.id, Participant.is_preview.is_(preview)
+    newest = session.scalar(select(func.max(Participant.number)).where(*like_this))
+    number, token = (newest or (PREVIEW_NUMBERS if preview else 0)) + 1, _new_token()
     participant = Participant(
-        study_id=study.id, number=number, token_sha256=_hash(token), seed=_participant_seed(study.seed, number)
+        study_id=study.id,
+        number=number,
+        token_sha256=_hash(token),
+        seed=_participant_seed(study.seed, number),
+        is_preview=preview,
     )
     session.add(participant)
     session.flush()
-    audit.record(session, actor, "participant added", f"{study.slug}/{participant.code}")
+    audit.record(session, actor, "preview opened" if preview else "participant added", f"{study.slug}/{participant.code}")
     return participant, token
 
 

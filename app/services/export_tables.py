@@ -24,10 +24,9 @@ SHA256 = "64 hexadecimal digits"
 
 
 def everybody(session: Session, study: Study) -> Sequence[Participant]:
-    """Everybody in the study by number, tombstones included."""
-    return session.scalars(
-        select(Participant).where(Participant.study_id == study.id).order_by(Participant.number)
-    ).all()
+    """Everybody in the study by number, tombstones included; previews are nobody."""
+    people = select(Participant).where(Participant.study_id == study.id, Participant.is_preview.is_(False))
+    return session.scalars(people.order_by(Participant.number)).all()
 
 
 def _present(session: Session, study: Study) -> Sequence[Participant]:

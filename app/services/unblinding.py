@@ -65,13 +65,13 @@ def rated_and_wanted(session: Session, study: Study) -> tuple[int, int]:
     """Trials rated, and trials that all participants are to rate: what unblinding too early would spoil."""
     settings = study.settings.evaluation
     people = select(func.count(Participant.id)).where(
-        Participant.study_id == study.id, Participant.withdrawn_at.is_(None)
+        Participant.study_id == study.id, Participant.withdrawn_at.is_(None), Participant.is_preview.is_(False)
     )
     rated = (
         select(func.count(func.distinct(Rating.trial_id)))
         .join(Trial)
         .join(Participant, Participant.id == Trial.participant_id)
-        .where(Participant.study_id == study.id)
+        .where(Participant.study_id == study.id, Participant.is_preview.is_(False))
     )
     per_person = settings.trial_count if settings else 0
     return session.scalar(rated) or 0, (session.scalar(people) or 0) * per_person
@@ -88,7 +88,8 @@ def key_of(session: Session, study: Study) -> Sequence[tuple[str, dict[str, str]
     """Per participant, by code, the method of each letter. Raises StillBlinded before the study is unblinded."""
     if is_blinded(study):
         raise StillBlinded
-    people = select(Participant).where(Participant.study_id == study.id).order_by(Participant.number)
+    people = select(Participant).where(Participant.study_id == study.id, Participant.is_preview.is_(False))
+    people = people.order_by(Participant.number)
     by_person = {person.id: (person.code, dict[str, str]()) for person in session.scalars(people)}
     for each in _assignments(session, study):
         by_person[each.participant_id][1][each.letter] = each.method
@@ -105,4 +106,4 @@ def shown_name(study: Study, assignments: Sequence[Assignment], letter: str) -> 
 
 def _assignments(session: Session, study: Study) -> Sequence[Assignment]:
     theirs = select(Assignment).join(Participant, Participant.id == Assignment.participant_id)
-    return session.scalars(theirs.where(Participant.study_id == study.id)).all()
+    return session.scalars(theirs.where(Participant.study_id == study.id, Participant.is_preview.is_(False))).all()

@@ -35,7 +35,7 @@ ARTEFACT_COLUMNS: tuple[InstrumentedAttribute[Any], ...] = (
 """Every column that names a file of the artefact store. Report.figures does so too, inside its JSON."""
 
 KEPT_COLUMNS = frozenset(
-    {"id", "study_id", "number", "token_sha256", "seed", "created_at", "withdrawn_at", "erased_at"}
+    {"id", "study_id", "number", "token_sha256", "seed", "created_at", "is_preview", "withdrawn_at", "erased_at"}
 )
 """Of the tombstone: what makes the code, and what lets the old link end at a page that says what happened."""
 

@@ -259,6 +259,7 @@ def upgrade() -> None:
 
     with op.batch_alter_table("experimenter", schema=None) as batch_op:
         batch_op.add_column(sa.Column("role", sa.String(length=20), server_default="owner", nullable=False))
+        batch_op.add_column(sa.Column("disabled_at", sa.DateTime(timezone=True), nullable=True))
 
     with op.batch_alter_table("label_event", schema=None) as batch_op:
         batch_op.add_column(sa.Column("reason", sa.String(length=40), nullable=True))
@@ -273,6 +274,7 @@ def upgrade() -> None:
         batch_op.add_column(sa.Column("language", sa.String(length=8), nullable=True))
         batch_op.add_column(sa.Column("panel_id", sa.String(length=120), nullable=True))
         batch_op.add_column(sa.Column("panel_parameters", sa.JSON(), nullable=True))
+        batch_op.add_column(sa.Column("is_preview", sa.Boolean(), server_default=sa.false(), nullable=False))
         batch_op.add_column(sa.Column("completed_at", sa.DateTime(timezone=True), nullable=True))
         batch_op.add_column(sa.Column("withdrawn_at", sa.DateTime(timezone=True), nullable=True))
         batch_op.add_column(sa.Column("erased_at", sa.DateTime(timezone=True), nullable=True))
@@ -319,6 +321,7 @@ def downgrade() -> None:
         batch_op.drop_column("erased_at")
         batch_op.drop_column("withdrawn_at")
         batch_op.drop_column("completed_at")
+        batch_op.drop_column("is_preview")
         batch_op.drop_column("panel_parameters")
         batch_op.drop_column("panel_id")
         batch_op.drop_column("language")
@@ -333,6 +336,7 @@ def downgrade() -> None:
         batch_op.drop_column("reason")
 
     with op.batch_alter_table("experimenter", schema=None) as batch_op:
+        batch_op.drop_column("disabled_at")
         batch_op.drop_column("role")
 
     with op.batch_alter_table("rating", schema=None) as batch_op:
