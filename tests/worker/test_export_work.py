@@ -19,7 +19,7 @@ from sqlalchemy import select
 
 from app.db import Database
 from app.domain.clips import Clip
-from app.domain.models import Export
+from app.domain.models import Export, RunKind
 from app.domain.preferences import Query, Response
 from app.domain.studies import Participant, Study
 from app.services import export_requests, export_tables
@@ -109,7 +109,7 @@ def test_nobody_learns_from_an_export_that_somebody_withdrew_from(
     monkeypatch.setattr(export_work, "write_data", withdrawing)
     with place.database.writing() as session:
         export = export_requests.request(session, session.get_one(Study, study.id), ExportKind.DATA, "experimenter")
-        job = Job(export_requests.finding(export), export_work.RunKind.EXPORT, study.id)
+        job = Job(export_requests.finding(export), RunKind.EXPORT, study.id)
         run_id = records.begin_run(session, job, seed=1)
     with pytest.raises(export_work.SomebodyWithdrew):
         export_work._make(place, export.id, run_id)
