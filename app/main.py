@@ -12,6 +12,8 @@ from app.db import Database
 from app.settings import Settings
 from app.storage import ArtefactStore
 from app.web import (
+    api,
+    api_pages,
     evaluation,
     experimenter,
     joining,
@@ -25,6 +27,7 @@ from app.web import (
     participant_forms,
     participant_pairs,
     results,
+    study_making,
     withdrawing,
 )
 from app.web.deps import Studio
@@ -73,8 +76,10 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.state.templates = make_environment(app.url_path_for)
     app.add_middleware(Guard, https=settings.secure_cookies, refuse=error_page)
     add_error_pages(app)
-    for part in (login, experimenter, operator, results, media, *PARTICIPANT_PARTS):
+    for part in (login, study_making, experimenter, operator, results, api_pages, media, *PARTICIPANT_PARTS):
         app.include_router(part.router)
+    app.state.api = api.create_api(studio, app.url_path_for, MAX_BODY_BYTES)
+    app.mount(api.PREFIX, app.state.api)
     app.mount("/static", StaticFiles(directory=ROOT / "static"), name="static")
 
     @app.get("/", name="show_start")

@@ -1,0 +1,98 @@
+"""Keys to the API: each has the rights of the account that made it, is shown once, and can be revoked."""
+
+import hashlib
+import secrets
+from collections.abc import Sequence
+from datetime import timedelta
+from http import HTTPStatus
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from app.db import now
+from app.domain.people import ApiToken, Experimenter
+from app.errors import AppError
+from app.services import audit
+
+PREFIX = "pbarl_"
+"""So that people, and programs that search code for secrets, recognise one."""
+LONGEST_NAME = 80
+MOST_TOKENS = 50
+USE_NOTED_EVERY = timedelta(minutes=1)
+
+
+class TokenInvalid(AppError):
+    """This token is not valid. It may have been revoked; make a new one on the page of API tokens."""
+
+    status = HTTPStatus.UNAUTHORIZED
+
+
+class TokenNotFound(AppError):
+    """You have no such token."""
+
+    status = HTTPStatus.NOT_FOUND
+
+
+class TooManyTokens(AppError):
+    """You have very many tokens already. Revoke some that you do not use any more."""
+
+    status = HTTPStatus.CONFLICT
+
+
+def create(session: Session, experimenter: Experimenter, name: str) -> tuple[ApiToken, str]:
+    """A new token and its text, which is returned here and nowhere else: its hash is kept. Raises TooManyTokens."""
+    if len(of_experimenter(session, experimenter)) >= MOST_TOKENS:
+        raise TooManyTokens
+    text = PREFIX + secrets.token_urlsafe(32)
+    token = ApiToken(
+        experimenter_id=experimenter.id, name=name.strip()[:LONGEST_NAME] or "token", token_sha256=_hash(text)
+    )
+    session.add(token)
+    session.flush()
+    audit.record(session, experimenter.name, "API token made", token.name)
+    return token, text
+
+
+def revoke(session: Session, experimenter: Experimenter, token_id: int) -> None:
+    """Make one's own token worthless. Raises TokenNotFound."""
+    token = session.scalar(select(ApiToken).where(ApiToken.id == token_id, ApiToken.experimenter_id == experimenter.id))
+    if token is None:
+        raise TokenNotFound
+    if token.revoked_at is None:
+        token.revoked_at = now()
+        audit.record(session, experimenter.name, "API token revoked", token.name)
+
+
+def of_experimenter(session: Session, experimenter: Experimenter) -> Sequence[ApiToken]:
+    """The tokens that are good, the newest first."""
+    theirs = select(ApiToken).where(ApiToken.experimenter_id == experimenter.id, ApiToken.revoked_at.is_(None))
+    return session.scalars(theirs.order_by(ApiToken.id.desc())).all()
+
+
+def find(session: Session, text: str) -> tuple[ApiToken, Experimenter]:
+    """The token of this text and its account. Raises TokenInvalid, also for accounts that cannot log in now."""
+    row = session.execute(
+        select(ApiToken, Experimenter)
+        .join(Experimenter, Experimenter.id == ApiToken.experimenter_id)
+        .where(ApiToken.token_sha256 == _hash(text), ApiToken.revoked_at.is_(None))
+    ).one_or_none()
+    if row is None:
+        raise TokenInvalid
+    token, experimenter = row
+    if experimenter.must_change_password or experimenter.disabled_at is not None:
+        raise TokenInvalid
+    return token, experimenter
+
+
+def use_is_worth_noting(token: ApiToken) -> bool:
+    """Whether the last use was noted long enough ago."""
+    return token.last_used_at is None or now() - token.last_used_at > USE_NOTED_EVERY
+
+
+def note_use(session: Session, token_id: int) -> None:
+    """Remember that the token was used just now."""
+    session.get_one(ApiToken, token_id).last_used_at = now()
+
+
+def _hash(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()
