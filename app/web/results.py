@@ -51,8 +51,8 @@ METHOD_NAMES = {
     "pbarl_printed": "PbARL as printed",
 }
 TESTS = {
-    "two_sample_t": "The paper\N{RIGHT SINGLE QUOTATION MARK}s two-sample t-test",
-    "paired_t": "Paired t-test",
+    "two_sample_t": "Two-sample t, as in the paper",
+    "paired_t": "Paired t",
     "wilcoxon": "Wilcoxon signed-rank",
     "mixed_model": "Linear mixed model",
 }

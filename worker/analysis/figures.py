@@ -180,7 +180,9 @@ def _line_of(axes: Axes, groups: Sequence[str], means: Mapping[str, float], shif
 def _legend_of_means(axes: Axes) -> None:
     axes.plot([], [], "o-", color=GREY, markerfacecolor="white", markersize=4, linewidth=0.9, label="each person")
     axes.plot([], [], "D-", color=LINE_COLOURS[2], markersize=5, linewidth=2, label="mean, 95 % interval")
-    axes.legend(loc="lower right", fontsize=7.5)
+    figure = axes.get_figure(root=True)
+    if figure is not None:
+        figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=8)
 
 
 def _mean_mark(axes: Axes, place: int, each: Mapping[str, Any]) -> None:
