@@ -236,7 +236,7 @@ class Participant(Base):
     """Who this is at the recruitment panel; the same id comes back to the same participant."""
     panel_parameters: Mapped[dict[str, Any] | None]
     is_preview: Mapped[bool] = mapped_column(default=False, server_default=false())
-    """An experimenter looking at the study as a participant would: never counted, never exported, never learned from."""
+    """An experimenter looking at the study as a participant would: counted, exported and learned from nowhere."""
     completed_at: Mapped[datetime | None]
     withdrawn_at: Mapped[datetime | None]
     """Everything else about the person is erased then; this row stays as the tombstone."""

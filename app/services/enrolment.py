@@ -44,12 +44,13 @@ def _add(session: Session, study: Study, actor: str, *, preview: bool) -> tuple[
         study_id=study.id,
         number=number,
         token_sha256=_hash(token),
-        seed=_participant_seed(study.seed, number),
+        seed=participant_seed(study.seed, number),
         is_preview=preview,
     )
     session.add(participant)
     session.flush()
-    audit.record(session, actor, "preview opened" if preview else "participant added", f"{study.slug}/{participant.code}")
+    act = "preview opened" if preview else "participant added"
+    audit.record(session, actor, act, f"{study.slug}/{participant.code}")
     return participant, token
 
 
@@ -92,6 +93,6 @@ def _hash(token: str) -> str:
     return hashlib.sha256(token.encode()).hexdigest()
 
 
-def _participant_seed(study_seed: int, number: int) -> int:
+def participant_seed(study_seed: int, number: int) -> int:
     """Follows from the study's seed, so that a study can be repeated exactly."""
     return int.from_bytes(hashlib.sha256(f"{study_seed}/participant/{number}".encode()).digest()[:4]) >> 1

@@ -67,7 +67,7 @@ def _free_slug(session: Session, name: str) -> str:
     plain = unicodedata.normalize("NFKD", name).encode("ascii", "ignore").decode().lower()
     base = re.sub(r"[^a-z0-9]+", "-", plain).strip("-")[:60] or "study"
     taken = set(session.scalars(select(Study.slug).where(Study.slug.startswith(base, autoescape=True))))
-    reserved = {"new", "live"}  # our own addresses
+    reserved = {"new", "live", "texts"}  # our own addresses
     number, slug = 1, base
     while slug in taken | reserved:
         number += 1

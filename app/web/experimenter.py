@@ -9,10 +9,8 @@ from fastapi.responses import FileResponse, RedirectResponse, Response
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 from sqlalchemy.orm import Session
 
-from app.domain.people import Experimenter
-from app.domain.studies import TaskName
 from app.services import audit, dashboard, enrolment, publishing, studies
-from app.web import charts, live, study_form, task_words
+from app.web import charts, live, task_words
 from app.web.deps import (
     ActingExperimenter,
     Code,
@@ -64,25 +62,6 @@ async def stream_studies(request: Request, studio: StudioDep, _allowed: MayStrea
 
     async for event in live.redrawn_parts(request, studio, draw):
         yield event
-
-
-@router.get("/new", name="show_new_study")
-def show_new_study(request: Request, experimenter: CurrentExperimenter) -> Response:
-    """The form, filled in with what usually works."""
-    return _form_page(request, experimenter, study_form.form_with_defaults(), {})
-
-
-@router.post("/new", name="create_study")
-def create_study(
-    request: Request, form: study_form.TypedStudy, experimenter: ActingExperimenter, session: WritingSession
-) -> Response:
-    """Open the study, or show the form again with what is wrong with it."""
-    try:
-        name, task, settings = study_form.settings_of(form)
-    except study_form.FormInvalid as invalid:
-        return _form_page(request, experimenter, form, invalid.errors, HTTPStatus.UNPROCESSABLE_ENTITY)
-    study = studies.create_study(session, name, settings, actor=experimenter.name, task=task)
-    return _see(request, "show_study", slug=study.slug)
 
 
 @router.get("/{slug}", name="show_study")
@@ -212,18 +191,6 @@ def download_bundle(
     audit.record(session, experimenter.name, "bundle downloaded", f"{slug}/{code}/{version}")
     filename = f"{slug}-{code}-v{version}.zip"
     return FileResponse(studio.store.path(bundle.artefact_sha256), media_type="application/zip", filename=filename)
-
-
-def _form_page(
-    request: Request,
-    experimenter: Experimenter,
-    form: study_form.StudyForm,
-    errors: Mapping[str, str],
-    status: HTTPStatus = HTTPStatus.OK,
-) -> Response:
-    tasks = [(name, task_words.words_of(name)) for name in TaskName]
-    context = {"experimenter": experimenter, "form": form, "errors": errors, "tasks": tasks}
-    return page(request, "experimenter/new_study.html", context, status)
 
 
 def _list_context(session: Session, studio: Studio) -> dict[str, Any]:

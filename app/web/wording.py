@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from fluent.runtime import FluentBundle, FluentResource
-from fluent.syntax import ast
+from fluent.syntax import FluentSerializer, ast
 from jinja2 import pass_context
 from jinja2.runtime import Context
 
@@ -137,6 +137,12 @@ def broken_texts(own: Mapping[str, str]) -> dict[str, str]:
 def built_in_texts(language: Language) -> dict[str, ast.Message]:
     """Every built-in message of a language, in the order of its file."""
     return {entry.id.name: entry for entry in _resource(language).body if isinstance(entry, ast.Message)}
+
+
+def plain_text(name: str, language: Language) -> str:
+    """A built-in text as a study would write its own: in Fluent, without its name."""
+    written = FluentSerializer().serialize_entry(built_in_texts(language)[name])
+    return "\n".join(line.removeprefix("    ") for line in written.partition("=")[2].strip().split("\n"))
 
 
 def variables_of(node: ast.BaseNode) -> set[str]:

@@ -331,3 +331,7 @@ evaluation-done-text =
         [one] Ihre Bewertung ist sicher gespeichert. Vielen Dank.
        *[other] Ihre { $count } Bewertungen sind sicher gespeichert. Vielen Dank.
     }
+
+## Preview by an experimenter
+
+preview-mark = Vorschau: nichts hiervon wird gezählt

@@ -333,3 +333,7 @@ evaluation-done-text =
         [one] Your rating is safely stored. Thank you.
        *[other] Your { $count } ratings are safely stored. Thank you.
     }
+
+## Preview by an experimenter
+
+preview-mark = Preview: nothing of this is counted

@@ -17,20 +17,7 @@ from app.services import enrolment
 from app.storage import ArtefactStore
 from tests import factories
 from tests.app.conftest import agree
-
-FORM = re.compile(r'name="(\w+)" type="text" value="([^"]*)"')
-
-
-def typed(browser: TestClient, **changes: str) -> dict[str, str]:
-    """What the form for a new study sends when only these fields are changed."""
-    page = browser.get("/studies/new").text
-    form = dict(FORM.findall(page)) | {
-        "task": "feeding",
-        "method": "studio",
-        "reward_kind": "structured",
-        "strategy": "entropy",
-    }
-    return form | {"name": "Pilot"} | changes
+from tests.app.study_pages import typed
 
 
 def test_the_defaults_make_a_study(experimenter: TestClient, database: Database) -> None:
