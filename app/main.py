@@ -12,6 +12,7 @@ from app.db import Database
 from app.settings import Settings
 from app.storage import ArtefactStore
 from app.web import (
+    accounts,
     api,
     api_pages,
     evaluation,
@@ -76,7 +77,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.state.templates = make_environment(app.url_path_for)
     app.add_middleware(Guard, https=settings.secure_cookies, refuse=error_page)
     add_error_pages(app)
-    for part in (login, study_making, experimenter, operator, results, api_pages, media, *PARTICIPANT_PARTS):
+    for part in (login, accounts, study_making, experimenter, operator, results, api_pages, media, *PARTICIPANT_PARTS):
         app.include_router(part.router)
     app.state.api = api.create_api(studio, app.url_path_for, MAX_BODY_BYTES)
     app.mount(api.PREFIX, app.state.api)

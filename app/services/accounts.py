@@ -1,19 +1,24 @@
 """Experimenters: their passwords, kept as argon2 hashes, and how they are changed."""
 
 import secrets
+from collections.abc import Sequence
+from dataclasses import dataclass
+from http import HTTPStatus
 
 from argon2 import PasswordHasher
 from argon2.exceptions import VerificationError
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
-from app.domain.people import BrowserSession, Experimenter
+from app.db import now
+from app.domain.people import BrowserSession, Experimenter, Role
 from app.errors import AppError
 from app.services import audit
 
 FIRST_EXPERIMENTER = "experimenter"
 """The name of the account made at the first start."""
 
+LONGEST_NAME = 80
 MIN_PASSWORD_LENGTH = 10
 MAX_PASSWORD_LENGTH = 200
 
@@ -27,7 +32,27 @@ class PasswordUnacceptable(AppError):
 
 
 class ExperimenterNotFound(AppError):
-    """There is no experimenter of that name. Start the studio once to create the first one."""
+    """There is no such account. Start the studio once to create the first one."""
+
+    status = HTTPStatus.NOT_FOUND
+
+
+class NameUnacceptable(AppError):
+    """The name cannot be used for an account."""
+
+
+class OwnerNeeded(AppError):
+    """Nobody would be left to manage accounts. Make somebody else an owner first."""
+
+    status = HTTPStatus.CONFLICT
+
+
+@dataclass(frozen=True)
+class OneTimePassword:
+    """A password that must be changed at the first login, and its hash; the text is shown once and not kept."""
+
+    text: str
+    hash: str
 
 
 def create_first_experimenter(session: Session) -> str | None:
@@ -45,12 +70,75 @@ def reset_password(session: Session, name: str) -> str:
     experimenter = _by_name(session, name)
     if experimenter is None:
         raise ExperimenterNotFound
-    password = _one_time_password()
-    experimenter.password_hash = _hasher().hash(password)
+    one_time = new_one_time_password()
+    use_one_time_password(session, experimenter, one_time, audit.SYSTEM)
+    return one_time.text
+
+
+def new_one_time_password() -> OneTimePassword:
+    """Takes most of a second, so it is made outside of any writing transaction."""
+    text = _one_time_password()
+    return OneTimePassword(text, _hasher().hash(text))
+
+
+def everybody(session: Session) -> Sequence[Experimenter]:
+    """Every account by name."""
+    return session.scalars(select(Experimenter).order_by(Experimenter.name)).all()
+
+
+def find(session: Session, experimenter_id: int) -> Experimenter:
+    """The account. Raises ExperimenterNotFound."""
+    experimenter = session.get(Experimenter, experimenter_id)
+    if experimenter is None:
+        raise ExperimenterNotFound
+    return experimenter
+
+
+def add(session: Session, name: str, role: Role, password: OneTimePassword, actor: str) -> Experimenter:
+    """A new account. Raises NameUnacceptable."""
+    name = " ".join(name.split())
+    if not 1 <= len(name) <= LONGEST_NAME or not name.isprintable():
+        raise NameUnacceptable(f"Give the account a name of at most {LONGEST_NAME} characters.")
+    if _by_name(session, name) is not None:
+        raise NameUnacceptable("There is an account of this name already.")
+    experimenter = Experimenter(name=name, role=role, password_hash=password.hash)
+    session.add(experimenter)
+    session.flush()
+    audit.record(session, actor, "account created", f"{name} ({role})")
+    return experimenter
+
+
+def use_one_time_password(session: Session, experimenter: Experimenter, password: OneTimePassword, actor: str) -> None:
+    """Replace the password by one that must be changed at the next login, and end all logins."""
+    experimenter.password_hash = password.hash
     experimenter.must_change_password = True
     _end_logins(session, experimenter)
-    audit.record(session, audit.SYSTEM, "password reset", name)
-    return password
+    audit.record(session, actor, "password reset", experimenter.name)
+
+
+def change_role(session: Session, experimenter: Experimenter, role: Role, actor: str) -> None:
+    """Give the account another role. Raises OwnerNeeded when nobody would be left to manage accounts."""
+    if role is not Role.OWNER:
+        _leave_an_owner(session, experimenter)
+    if experimenter.role != role:
+        experimenter.role = role
+        audit.record(session, actor, "role changed", f"{experimenter.name} ({role})")
+
+
+def disable(session: Session, experimenter: Experimenter, actor: str) -> None:
+    """Shut the account out at once: logins and tokens. Raises OwnerNeeded when nobody could undo it."""
+    _leave_an_owner(session, experimenter)
+    if experimenter.disabled_at is None:
+        experimenter.disabled_at = now()
+        _end_logins(session, experimenter)
+        audit.record(session, actor, "account disabled", experimenter.name)
+
+
+def enable(session: Session, experimenter: Experimenter, actor: str) -> None:
+    """Let a disabled account in again."""
+    if experimenter.disabled_at is not None:
+        experimenter.disabled_at = None
+        audit.record(session, actor, "account enabled", experimenter.name)
 
 
 def verify(session: Session, name: str, password: str) -> Experimenter:
@@ -61,7 +149,7 @@ def verify(session: Session, name: str, password: str) -> Experimenter:
         _hasher().verify(stored, password)
     except VerificationError as error:
         raise WrongNameOrPassword from error
-    if experimenter is None:
+    if experimenter is None or experimenter.disabled_at is not None:
         raise WrongNameOrPassword
     return experimenter
 
@@ -93,6 +181,14 @@ def set_password(session: Session, experimenter: Experimenter, password_hash: st
 
 def _by_name(session: Session, name: str) -> Experimenter | None:
     return session.scalar(select(Experimenter).where(Experimenter.name == name))
+
+
+def _leave_an_owner(session: Session, experimenter: Experimenter) -> None:
+    others = select(func.count(Experimenter.id)).where(
+        Experimenter.role == Role.OWNER, Experimenter.disabled_at.is_(None), Experimenter.id != experimenter.id
+    )
+    if experimenter.role == Role.OWNER and not session.scalar(others):
+        raise OwnerNeeded
 
 
 def _end_logins(session: Session, experimenter: Experimenter) -> None:

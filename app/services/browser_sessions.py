@@ -46,6 +46,7 @@ def experimenter_of(session: Session, cookie: str) -> Experimenter | None:
         select(Experimenter)
         .join(BrowserSession, BrowserSession.experimenter_id == Experimenter.id)
         .where(BrowserSession.cookie_sha256 == _hash(cookie), BrowserSession.expires_at > now())
+        .where(Experimenter.disabled_at.is_(None))
     )
 
 

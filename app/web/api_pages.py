@@ -9,7 +9,7 @@ from fastapi.responses import RedirectResponse, Response
 
 from app.services import api_tokens
 from app.web import api
-from app.web.deps import ActingExperimenter, CurrentExperimenter, ReadingSession, RowId, WritingSession
+from app.web.deps import CurrentExperimenter, OwnAccount, ReadingSession, RowId, WritingSession
 from app.web.templating import page
 
 router = APIRouter()
@@ -46,7 +46,7 @@ def show_tokens(request: Request, experimenter: CurrentExperimenter, session: Re
 def create_token(
     request: Request,
     name: Annotated[str, Form(min_length=1, max_length=api_tokens.LONGEST_NAME)],
-    experimenter: ActingExperimenter,
+    experimenter: OwnAccount,
     session: WritingSession,
 ) -> Response:
     """Make a token and show it, this one time; there is nothing to come back to, so this is the page itself."""
@@ -58,7 +58,7 @@ def create_token(
 
 @router.post("/tokens/{token_id}/revoke", name="revoke_token")
 def revoke_token(
-    request: Request, token_id: RowId, experimenter: ActingExperimenter, session: WritingSession
+    request: Request, token_id: RowId, experimenter: OwnAccount, session: WritingSession
 ) -> Response:
     """Make a token worthless."""
     api_tokens.revoke(session, experimenter, token_id)

@@ -11,10 +11,10 @@ from fastapi import Depends, Path, Request, Response
 from sqlalchemy.orm import Session
 
 from app.db import Database
-from app.domain.people import Experimenter
+from app.domain.people import Experimenter, Role
 from app.domain.studies import Participant
 from app.errors import AppError
-from app.services import browser_sessions
+from app.services import browser_sessions, roles
 from app.settings import Settings
 from app.storage import ArtefactStore
 from app.web.link_desk import LinkDesk
@@ -124,15 +124,31 @@ def _experimenter(request: Request, session: ReadingSession) -> Experimenter:
     return experimenter_asking(request, session)
 
 
+def _owner(request: Request, session: ReadingSession) -> Experimenter:
+    experimenter = experimenter_asking(request, session)
+    roles.require(experimenter, Role.OWNER)
+    return experimenter
+
+
 def _acting_experimenter(request: Request, session: WritingSession) -> Experimenter:
+    experimenter = experimenter_asking(request, session)
+    roles.require(experimenter, Role.EXPERIMENTER)
+    return experimenter
+
+
+def _own_account(request: Request, session: WritingSession) -> Experimenter:
     return experimenter_asking(request, session)
 
 
 CurrentParticipant = Annotated[Participant, Depends(_participant, scope="function")]
 """In the request's writing session: whatever a participant does leaves a trace, if only that they were here."""
 CurrentExperimenter = Annotated[Experimenter, Depends(_experimenter, scope="function")]
+"""Whoever is logged in, readers included: for looking."""
 ActingExperimenter = Annotated[Experimenter, Depends(_acting_experimenter, scope="function")]
-"""Like CurrentExperimenter, in the request's writing session."""
+"""In the request's writing session; at least an experimenter: for whatever changes something or leaves the studio."""
+CurrentOwner = Annotated[Experimenter, Depends(_owner, scope="function")]
+OwnAccount = Annotated[Experimenter, Depends(_own_account, scope="function")]
+"""In the request's writing session, whatever their role: for what concerns nobody but themselves."""
 
 RowId = Annotated[int, Path(ge=1, le=2**31 - 1)]
 Slug = Annotated[str, Path(pattern=r"^[a-z0-9-]{1,80}$")]
