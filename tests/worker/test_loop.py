@@ -121,7 +121,7 @@ def test_every_run_succeeded_at_its_first_attempt_although_the_worker_was_killed
     outcome: Outcome, database: Database
 ) -> None:
     with database.reading() as session:
-        runs = session.scalars(select(Run)).all()
+        runs = session.scalars(select(Run).where(Run.kind != RunKind.REPORT)).all()  # there is always a newer one
     assert {run.kind for run in runs} == {RunKind.CLIPS, RunKind.REWARD, RunKind.FILTER, RunKind.FILMS}
     assert [(run.workflow_id, run.error) for run in runs if run.status != RunStatus.SUCCEEDED] == []
     assert {run.attempt for run in runs} == {1}
