@@ -17,7 +17,7 @@ from app.db import now
 from app.domain.models import Export, RunKind
 from app.domain.studies import Deviation, Participant, Study
 from app.errors import AppError
-from app.services import export_requests, export_tables, exporting, reports, unblinding
+from app.services import archive, export_requests, export_tables, exporting, reports, unblinding
 from app.services.export_requests import ExportKind
 from app.services.exporting import Kind, Provenance, Table
 from worker import preference_arrays
@@ -59,9 +59,12 @@ def _make(place: Workplace, export_id: int, run_id: int) -> str:
     with _workspace(place) as folder:
         path = folder / "export.zip"
         place.report(run_id, "writing the file", 0.1)
-        write = {ExportKind.DATA: write_data}[kind]
         with place.database.reading() as session:
-            write(session, place, session.get_one(Study, study_id), path)
+            study = session.get_one(Study, study_id)
+            if kind is ExportKind.DATA:
+                write_data(session, place, study, path)
+            else:
+                archive.write(session, place.store, study, path)
         byte_count, sha256 = path.stat().st_size, place.store.take(path)
     with place.database.writing() as session:
         if _gone(session, study_id) != gone:
@@ -89,25 +92,23 @@ def _gone(session: Session, study_id: int) -> Sequence[int]:
 def write_data(session: Session, place: Workplace, study: Study, path: Path) -> None:
     """Tables in three formats, their dictionary, the report with its figures, and preference pairs as arrays."""
     provenance = exporting.provenance_of(session, study)
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as target:
         for table in export_tables.TABLES:
-            _write_table(archive, session, study, table, provenance)
-        archive.writestr("dictionary.csv", exporting.dictionary_csv(export_tables.TABLES))
-        archive.writestr("dictionary.md", exporting.dictionary_markdown(export_tables.TABLES))
-        archive.writestr("provenance.json", _json(_provenance(session, study, provenance)))
-        pictures = _write_report(archive, session, place, study)
-        people = _write_pairs(archive, session, place, study)
-        archive.writestr("README.md", _readme(session, study, provenance, pictures, people))
+            _write_table(target, session, study, table, provenance)
+        target.writestr("dictionary.csv", exporting.dictionary_csv(export_tables.TABLES))
+        target.writestr("dictionary.md", exporting.dictionary_markdown(export_tables.TABLES))
+        target.writestr("provenance.json", _json(_provenance(session, study, provenance)))
+        pictures = _write_report(target, session, place, study)
+        people = _write_pairs(target, session, place, study)
+        target.writestr("README.md", _readme(session, study, provenance, pictures, people))
 
 
-def _write_table(
-    archive: zipfile.ZipFile, session: Session, study: Study, table: Table, provenance: Provenance
-) -> None:
+def _write_table(target: zipfile.ZipFile, session: Session, study: Study, table: Table, provenance: Provenance) -> None:
     for kind, write in (("csv", exporting.csv_lines), ("jsonl", exporting.json_lines)):
-        with archive.open(f"{kind}/{table.name}.{kind}", "w") as stream:
+        with target.open(f"{kind}/{table.name}.{kind}", "w") as stream:
             for line in write(table, session, study, provenance):
                 stream.write(line.encode())
-    with archive.open(f"parquet/{table.name}.parquet", "w") as stream:
+    with target.open(f"parquet/{table.name}.parquet", "w") as stream:
         parquet.write_table(arrow_table(table, session, study, provenance), stream)
 
 
@@ -130,26 +131,26 @@ def _arrow_value(kind: Kind, value: Any) -> Any:
     return json.dumps(value, ensure_ascii=False) if kind is Kind.JSON and value is not None else value
 
 
-def _write_report(archive: zipfile.ZipFile, session: Session, place: Workplace, study: Study) -> list[str]:
+def _write_report(target: zipfile.ZipFile, session: Session, place: Workplace, study: Study) -> list[str]:
     report = reports.newest(session, study)
     if report is None:
         return []
-    archive.writestr("report/report.json", _json({"made_at": report.created_at.isoformat(), **report.contents}))
+    target.writestr("report/report.json", _json({"made_at": report.created_at.isoformat(), **report.contents}))
     for name, formats in sorted(report.figures.items()):
         for kind, sha256 in formats.items():
-            archive.writestr(f"report/{name}.{kind}", place.store.read(sha256))
+            target.writestr(f"report/{name}.{kind}", place.store.read(sha256))
     return sorted(report.figures)
 
 
-def _write_pairs(archive: zipfile.ZipFile, session: Session, place: Workplace, study: Study) -> list[str]:
+def _write_pairs(target: zipfile.ZipFile, session: Session, place: Workplace, study: Study) -> list[str]:
     written = []
     for person in export_tables.everybody(session, study):
         arrays = preference_arrays.arrays_of(session, place.store, study, person)
         if arrays is not None:
-            archive.writestr(f"pairs/{person.code}.npz", arrays)
+            target.writestr(f"pairs/{person.code}.npz", arrays)
             written.append(person.code)
     if (DOCS / "arrays.md").exists():
-        archive.writestr("pairs/README.md", (DOCS / "arrays.md").read_text())
+        target.writestr("pairs/README.md", (DOCS / "arrays.md").read_text())
     return written
 
 

@@ -42,7 +42,7 @@ def create_study(
     if settings.clip_steps > LONGEST_CLIP_STEPS[task]:
         raise ClipsTooLong
     study = Study(
-        slug=_free_slug(session, name),
+        slug=free_slug(session, name),
         name=name,
         task=task,
         stored_settings=settings.model_dump(mode="json"),
@@ -62,7 +62,7 @@ def find_study(session: Session, slug: str) -> Study:
     return study
 
 
-def _free_slug(session: Session, name: str) -> str:
+def free_slug(session: Session, name: str) -> str:
     """A readable address made of the name, with a number behind it when it is taken."""
     plain = unicodedata.normalize("NFKD", name).encode("ascii", "ignore").decode().lower()
     base = re.sub(r"[^a-z0-9]+", "-", plain).strip("-")[:60] or "study"

@@ -1,0 +1,213 @@
+"""A study moves to another installation: everything arrives, or nothing does."""
+
+import hashlib
+import json
+import zipfile
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+from fastapi import FastAPI
+from fastapi.testclient import TestClient
+from sqlalchemy import func, select
+
+from app.db import Base, Database
+from app.domain.models import Run, RunStatus
+from app.domain.preferences import Query
+from app.domain.studies import Participant, Study
+from app.main import create_app
+from app.services import archive, enrolment, export_tables, exporting, withdrawal
+from app.services.archive import ArchiveInvalid
+from app.settings import Settings
+from app.storage import ArtefactStore
+from tests import factories
+from tests.finished_study import make_finished_study
+
+MOMENT = datetime(2026, 1, 31, tzinfo=UTC)
+
+
+@pytest.fixture
+def elsewhere(tmp_path: Path) -> Iterator[FastAPI]:
+    """Another installation, which already holds something: ids there are others."""
+    application = create_app(Settings(_env_file=None, data_dir=tmp_path / "elsewhere", public_url=None))
+    (tmp_path / "elsewhere").mkdir()
+    there: Database = application.state.studio.database
+    Base.metadata.create_all(there.writer)
+    with there.writing() as session:
+        study = factories.make_study(session, "Something else")
+        person, _ = factories.make_participant(session, study)
+        factories.make_queries(session, application.state.studio.store, person, 3)
+    yield application
+    there.dispose()
+
+
+@pytest.fixture
+def study(database: Database, store: ArtefactStore) -> Study:
+    with database.writing() as session:
+        study = make_finished_study(session, store, people=3, labels=5)
+        name = "reward/participant-1/labels-10/answer-2"
+        factories.make_run(session, study, session.get_one(Participant, 1)).workflow_id = name
+        factories.make_run(session, study, status=RunStatus.RUNNING).workflow_id = "clips/study-1/scenario-7"
+        session.flush()
+        gone = session.scalars(select(Participant).where(Participant.number == 3)).one()
+        withdrawal.withdraw(session, store, gone, gone.code)
+        session.refresh(study)
+    return study
+
+
+@pytest.fixture
+def packed(database: Database, store: ArtefactStore, study: Study, tmp_path: Path) -> Path:
+    path = tmp_path / "study.zip"
+    with database.reading() as session:
+        archive.write(session, store, session.get_one(Study, study.id), path)
+    return path
+
+
+def exports(database: Database, slug: str) -> dict[str, str]:
+    """Every table of the study as its CSV file."""
+    with database.reading() as session:
+        study = session.scalars(select(Study).where(Study.slug == slug)).one()
+        provenance = exporting.provenance_of(session, study, MOMENT)
+        return {
+            table.name: "".join(exporting.csv_lines(table, session, study, provenance))
+            for table in export_tables.TABLES
+        }
+
+
+def bring(application: FastAPI, path: Path) -> archive.Imported:
+    studio = application.state.studio
+    with studio.database.writing() as session:
+        return archive.read(session, studio.store, path, "experimenter")
+
+
+def count(database: Database) -> dict[str, int]:
+    with database.reading() as session:
+        return {
+            table.name: session.scalar(select(func.count()).select_from(table)) or 0
+            for table in Base.metadata.sorted_tables
+        }
+
+
+def test_a_study_that_was_imported_exports_the_same(
+    database: Database, elsewhere: FastAPI, study: Study, packed: Path
+) -> None:
+    imported = bring(elsewhere, packed)
+    there = elsewhere.state.studio
+    assert exports(there.database, imported.study.slug) == exports(database, study.slug)
+    with zipfile.ZipFile(packed) as file:
+        for sha256 in json.loads(file.read("manifest.json"))["files"]:
+            assert hashlib.sha256(there.store.read(sha256)).hexdigest() == sha256
+
+
+def test_rows_refer_to_each_other_as_before(elsewhere: FastAPI, study: Study, packed: Path) -> None:
+    imported = bring(elsewhere, packed)
+    with elsewhere.state.studio.database.reading() as session:
+        repeats = session.scalars(
+            select(Query)
+            .join(Participant)
+            .where(Participant.study_id == imported.study.id, Query.repeats_query_id.is_not(None))
+        ).all()
+        assert len(repeats) == 2
+        for repeat in repeats:
+            first = session.get_one(Query, repeat.repeats_query_id)
+            assert (first.participant_id, first.left_clip_id) == (repeat.participant_id, repeat.right_clip_id)
+
+
+def test_what_was_done_is_not_done_again_and_what_was_at_work_is(
+    elsewhere: FastAPI, study: Study, packed: Path
+) -> None:
+    imported = bring(elsewhere, packed)
+    with elsewhere.state.studio.database.reading() as session:
+        runs = {run.workflow_id: run for run in session.scalars(select(Run).where(Run.study_id == imported.study.id))}
+        person = session.scalars(
+            select(Participant).where(Participant.study_id == imported.study.id, Participant.number == 1)
+        ).one()
+    assert person.id != 1, "else this test says nothing"
+    assert any(name.startswith(f"reward/participant-{person.id}/labels-10/answer-") for name in runs)
+    assert runs[f"clips/study-{imported.study.id}/scenario-7"].status == RunStatus.FAILED
+
+
+def test_no_link_works_that_worked_before_and_new_ones_do(
+    database: Database, elsewhere: FastAPI, study: Study, packed: Path, tmp_path: Path
+) -> None:
+    with database.writing() as session:
+        person = session.get_one(Participant, 1)
+        old = enrolment.renew_link(session, study, person, "x")
+        archive.write(session, ArtefactStore(tmp_path / "artefacts"), session.get_one(Study, study.id), packed)
+    with zipfile.ZipFile(packed) as file:
+        text = b"".join(file.read(name) for name in file.namelist() if name.startswith("rows/")).decode()
+    assert "token" not in text
+    assert hashlib.sha256(old.encode()).hexdigest() not in text
+    imported = bring(elsewhere, packed)
+    assert [code for code, _ in imported.tokens] == ["P01", "P02"], "a tombstone needs no link"
+    browser = TestClient(elsewhere, follow_redirects=False)
+    assert browser.get(f"/p/{old}").status_code == 404
+    assert browser.get(f"/p/{imported.tokens[0][1]}").status_code == 303
+
+
+def test_importing_twice_makes_two_studies(elsewhere: FastAPI, study: Study, packed: Path) -> None:
+    slugs = [bring(elsewhere, packed).study.slug for _ in range(2)]
+    assert slugs == [study.slug, f"{study.slug}-2"]
+
+
+def test_a_study_can_be_imported_where_it_is(
+    studio_app: FastAPI, database: Database, study: Study, packed: Path
+) -> None:
+    imported = bring(studio_app, packed)
+    copy, original = (exports(database, slug) for slug in (imported.study.slug, study.slug))
+    assert copy["labels"].replace(f"{study.slug}-2", study.slug) == original["labels"]
+
+
+def _edited(packed: Path, edit: Callable[[str, bytes], bytes | None]) -> Path:
+    target = packed.with_name("edited.zip")
+    with zipfile.ZipFile(packed) as source, zipfile.ZipFile(target, "w") as copy:
+        for name in source.namelist():
+            content = edit(name, source.read(name))
+            if content is not None:
+                copy.writestr(name, content)
+    return target
+
+
+def _with_version_9(name: str, content: bytes) -> bytes:
+    return content.replace(b'"version": 1,', b'"version": 9,') if name == "manifest.json" else content
+
+
+def _with_one_wrong_letter(name: str, content: bytes) -> bytes:
+    return content.replace(b"left", b"lift", 1) if name == "rows/label_event.jsonl" else content
+
+
+def _with_a_damaged_file(name: str, content: bytes) -> bytes:
+    return content[:-1] + b"?" if name.startswith("files/") else content
+
+
+def _without_manifest(name: str, content: bytes) -> bytes | None:
+    return None if name == "manifest.json" else content
+
+
+def _without_clips(name: str, content: bytes) -> bytes | None:
+    if name == "manifest.json":
+        manifest = json.loads(content)
+        del manifest["tables"]["clip"]
+        return json.dumps(manifest).encode()
+    return content
+
+
+@pytest.mark.parametrize(
+    "edit", [_with_version_9, _with_one_wrong_letter, _with_a_damaged_file, _without_manifest, _without_clips]
+)
+def test_what_is_damaged_leaves_nothing_behind(
+    elsewhere: FastAPI, packed: Path, edit: Callable[[str, bytes], bytes | None]
+) -> None:
+    studio = elsewhere.state.studio
+    before = count(studio.database), sorted(studio.store.root.glob("??/*"))
+    with pytest.raises(ArchiveInvalid):
+        bring(elsewhere, _edited(packed, edit))
+    assert (count(studio.database), sorted(studio.store.root.glob("??/*"))) == before
+
+
+def test_any_other_file_is_refused_in_words(elsewhere: FastAPI, tmp_path: Path) -> None:
+    path = tmp_path / "letter.zip"
+    path.write_text("Dear all")
+    with pytest.raises(ArchiveInvalid, match="not an archive"):
+        bring(elsewhere, path)
