@@ -26,6 +26,7 @@ from worker.own_studio import OwnStudio
 from worker.rehearsal import Outcome, Rehearsal
 
 LABELS = 12
+SCENARIOS, BEHAVIOURS = 2, 4
 PATIENCE_S = 300.0
 
 pytestmark = pytest.mark.slow
@@ -51,7 +52,8 @@ def outcome(studio: OwnStudio, database: Database) -> Outcome:
         labels_per_participant=LABELS,
         retrain_every_labels=5,
         filter_milestones=(),
-        pool_scenarios=2,
+        pool_scenarios=SCENARIOS,
+        behaviours_per_scenario=BEHAVIOURS,
         evaluation_scenarios=10,
     )
     killers = [_Killer(studio, database, RunKind.CLIPS), _Killer(studio, database, RunKind.FILTER)]
@@ -113,8 +115,8 @@ def test_the_pool_is_complete_and_without_doubles_although_the_worker_was_killed
     outcome: Outcome, database: Database
 ) -> None:
     with database.reading() as session:
-        assert session.scalar(select(func.count(Clip.id))) == 2 * 4
-        assert session.scalar(select(func.count(Rollout.id))) == 2 * 4
+        assert session.scalar(select(func.count(Clip.id))) == SCENARIOS * BEHAVIOURS
+        assert session.scalar(select(func.count(Rollout.id))) == SCENARIOS * BEHAVIOURS
 
 
 def test_every_run_succeeded_at_its_first_attempt_although_the_worker_was_killed(
