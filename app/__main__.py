@@ -23,8 +23,9 @@ from sqlalchemy.orm import Session
 from app.db import Database
 from app.domain.studies import USUAL_CLIP_STEPS, Study, StudySettings, TaskName
 from app.errors import AppError
-from app.services import accounts, enrolment, export_tables, exporting, studies
+from app.services import accounts, archive, audit, enrolment, export_tables, exporting, studies
 from app.settings import Settings
+from app.storage import ArtefactStore
 
 GRACE_S = 20.0
 FALLS_ALLOWED = 3
@@ -44,6 +45,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     demo = commands.add_parser("demo", help=demo_study.__doc__)
     demo.add_argument("--task", choices=[task.value for task in TaskName], default=TaskName.FEEDING.value)
     demo.set_defaults(act=demo_study)
+    importing = commands.add_parser("import-study", help=import_study.__doc__)
+    importing.add_argument("file", type=Path, help="the archive")
+    importing.set_defaults(act=import_study)
     chosen = vars(parser.parse_args(arguments))
     act, _ = chosen.pop("act"), chosen.pop("command")
     try:
@@ -90,6 +94,21 @@ def dictionary(_settings: Settings) -> int:
     path = Path(__file__).resolve().parents[1] / "docs" / "protocol.md"
     path.write_text(exporting.dictionary_markdown(export_tables.TABLES))
     _say(f"Wrote {path}")
+    return 0
+
+
+def import_study(settings: Settings, file: Path) -> int:
+    """Import an archive of a study and print new personal links of its participants."""
+    migrate(settings)
+    store = ArtefactStore(settings.data_dir / "artefacts")
+    if not file.is_file():
+        raise AppError(f"There is no file {file}.")
+    unpacked = archive.unpack(store, file)
+    with _database(settings).writing() as session:
+        imported = archive.bring_in(session, store, unpacked, audit.SYSTEM)
+        _say(f"Imported: {settings.base_url}/studies/{imported.study.slug}")
+    for code, token in imported.tokens:
+        _say(f"{code},{settings.base_url}/p/{token}")
     return 0
 
 

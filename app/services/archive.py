@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from http import HTTPStatus
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from sqlalchemy import ColumnElement, Table, and_, insert, or_, select, update
 from sqlalchemy.orm import Session
@@ -55,6 +55,15 @@ class Imported:
 
     study: Study
     tokens: Sequence[tuple[str, str]]
+
+
+@dataclass(frozen=True)
+class Unpacked:
+    """An archive that was found to be whole; its files are in the store already."""
+
+    rows: Mapping[str, Sequence[dict[str, Any]]]
+    put: Sequence[str]
+    """hashes of files that were not in the store before"""
 
 
 # --- out ---
@@ -131,21 +140,30 @@ def _artefacts(table_name: str, rows: Sequence[Mapping[str, Any]]) -> Iterator[s
 # --- in ---
 
 
-def read(session: Session, store: ArtefactStore, path: Path, actor: str) -> Imported:
+def read(session: Session, store: ArtefactStore, source: Path | IO[bytes], actor: str) -> Imported:
     """Import what write() has written, completely or not at all. Raises ArchiveInvalid."""
+    return bring_in(session, store, unpack(store, source), actor)
+
+
+def unpack(store: ArtefactStore, source: Path | IO[bytes]) -> Unpacked:
+    """Check everything and store the files: what takes time and needs no database. Raises ArchiveInvalid."""
     try:
-        with zipfile.ZipFile(path) as archive:
+        with zipfile.ZipFile(source) as archive:
             manifest = _manifest(archive)
             rows = {name: _rows(archive, name, manifest) for name in manifest["tables"]}
             _check(rows, manifest)
-            put = _put_files(archive, store, manifest)
+            return Unpacked(rows, _put_files(archive, store, manifest))
     except (zipfile.BadZipFile, KeyError, TypeError, ValueError, EOFError) as error:
         raise ArchiveInvalid from error
+
+
+def bring_in(session: Session, store: ArtefactStore, unpacked: Unpacked, actor: str) -> Imported:
+    """Add the rows; if that fails, the files go as well. Raises ArchiveInvalid."""
     try:
         with session.begin_nested():
-            return _insert(session, rows, actor)
+            return _insert(session, unpacked.rows, actor)
     except Exception as error:
-        for sha256 in set(put) - in_use(session, put):
+        for sha256 in set(unpacked.put) - in_use(session, unpacked.put):
             store.delete(sha256)
         if isinstance(error, AppError):
             raise

@@ -12,6 +12,7 @@ from fastapi import FastAPI
 from fastapi.testclient import TestClient
 from sqlalchemy import func, select
 
+from app.__main__ import import_study
 from app.db import Base, Database
 from app.domain.models import Run, RunStatus
 from app.domain.preferences import Query
@@ -211,3 +212,27 @@ def test_any_other_file_is_refused_in_words(elsewhere: FastAPI, tmp_path: Path) 
     path.write_text("Dear all")
     with pytest.raises(ArchiveInvalid, match="not an archive"):
         bring(elsewhere, path)
+
+
+def test_an_archive_is_imported_on_a_page_and_leads_to_the_new_links(
+    experimenter: TestClient, database: Database, study: Study, packed: Path
+) -> None:
+    answer = experimenter.post("/import", files={"file": ("study.zip", packed.read_bytes(), "application/zip")})
+    assert answer.status_code == 303
+    links = experimenter.get(answer.headers["location"]).text
+    assert f"{study.slug}-2" in answer.headers["location"]
+    assert links.count("/p/") >= 2
+
+
+def test_a_page_says_why_a_file_was_refused(experimenter: TestClient) -> None:
+    answer = experimenter.post("/import", files={"file": ("letter.zip", b"Dear all", "application/zip")})
+    assert answer.status_code == 422
+    assert "not an archive of a study" in answer.text
+
+
+def test_a_study_is_imported_by_a_command(packed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    settings = Settings(_env_file=None, data_dir=tmp_path / "by command", database_url=None)
+    assert import_study(settings, packed) == 0
+    said = capsys.readouterr().out
+    assert "/studies/feeding-finished" in said
+    assert "P01,http" in said
