@@ -17,6 +17,8 @@ from app.web import (
     api_pages,
     evaluation,
     experimenter,
+    importing,
+    invitations,
     joining,
     live,
     login,
@@ -39,6 +41,18 @@ from app.web.templating import ROOT, make_environment
 from app.web.turns import Turns
 
 MAX_BODY_BYTES = 256 * 1024
+EXPERIMENTER_PARTS = (
+    login,
+    accounts,
+    study_making,
+    invitations,
+    experimenter,
+    operator,
+    results,
+    importing,
+    api_pages,
+    media,
+)
 PARTICIPANT_PARTS = (
     joining,
     participant_consent,
@@ -77,7 +91,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.state.templates = make_environment(app.url_path_for)
     app.add_middleware(Guard, https=settings.secure_cookies, refuse=error_page)
     add_error_pages(app)
-    for part in (login, accounts, study_making, experimenter, operator, results, api_pages, media, *PARTICIPANT_PARTS):
+    for part in (*EXPERIMENTER_PARTS, *PARTICIPANT_PARTS):
         app.include_router(part.router)
     app.state.api = api.create_api(studio, app.url_path_for, MAX_BODY_BYTES)
     app.mount(api.PREFIX, app.state.api)

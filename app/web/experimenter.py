@@ -4,7 +4,7 @@ from collections.abc import AsyncIterator, Mapping
 from http import HTTPStatus
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Depends, Form, Path, Request
+from fastapi import APIRouter, Depends, Request
 from fastapi.responses import FileResponse, RedirectResponse, Response
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 from sqlalchemy.orm import Session
@@ -23,7 +23,6 @@ from app.web.deps import (
     WritingSession,
     experimenter_asking,
 )
-from app.web.link_desk import Link
 from app.web.templating import fragment, page
 
 router = APIRouter(prefix="/studies")
@@ -31,8 +30,6 @@ router = APIRouter(prefix="/studies")
 LIST_PARTS = ("machine", "study_list")
 STUDY_PARTS = ("machine", "pool", "participants")
 PARTICIPANT_PARTS = ("machine", "participant_summary", "accuracy", "filters", "weights", "runs")
-
-MAX_NEW_PARTICIPANTS = 50
 
 
 def _may_stream(request: Request, studio: StudioDep) -> None:
@@ -84,57 +81,6 @@ async def stream_study(
 
     async for event in live.redrawn_parts(request, studio, draw):
         yield event
-
-
-@router.post("/{slug}/participants", name="add_participants")
-def add_participants(
-    request: Request,
-    slug: Slug,
-    count: Annotated[int, Form(ge=1, le=MAX_NEW_PARTICIPANTS)],
-    experimenter: ActingExperimenter,
-    session: WritingSession,
-    studio: StudioDep,
-) -> Response:
-    """Add people to the study and lead to their links."""
-    study = studies.find_study(session, slug)
-    added = [enrolment.add_participant(session, study, experimenter.name) for _ in range(count)]
-    links = [Link(participant.code, _link(request, studio, token)) for participant, token in added]
-    return _see(request, "show_links", slug=slug, key=studio.link_desk.leave(experimenter.id, links))
-
-
-@router.post("/{slug}/participants/{code}/link", name="renew_link")
-def renew_link(
-    request: Request,
-    slug: Slug,
-    code: Code,
-    experimenter: ActingExperimenter,
-    session: WritingSession,
-    studio: StudioDep,
-) -> Response:
-    """Replace a participant's link; the old one stops working."""
-    study = studies.find_study(session, slug)
-    participant = enrolment.find_by_code(session, study, code)
-    token = enrolment.renew_link(session, study, participant, experimenter.name)
-    links = [Link(participant.code, _link(request, studio, token))]
-    return _see(request, "show_links", slug=slug, key=studio.link_desk.leave(experimenter.id, links))
-
-
-@router.get("/{slug}/links/{key}", name="show_links")
-def show_links(
-    request: Request,
-    slug: Slug,
-    key: Annotated[str, Path(pattern=r"^[A-Za-z0-9_-]{10,40}$")],
-    experimenter: CurrentExperimenter,
-    session: ReadingSession,
-    studio: StudioDep,
-) -> Response:
-    """New links, for as long as the desk keeps them."""
-    context = {
-        "study": studies.find_study(session, slug),
-        "experimenter": experimenter,
-        "links": studio.link_desk.pick_up(experimenter.id, key),
-    }
-    return page(request, "experimenter/links.html", context)
 
 
 @router.post("/{slug}/runs/{run_id}/retry", name="retry_run")
@@ -227,12 +173,6 @@ def _participant_context(session: Session, studio: Studio, slug: str, code: str)
 
 def _draw(request: Request, parts: tuple[str, ...], context: Mapping[str, Any]) -> Mapping[str, str]:
     return {name: fragment(request, f"experimenter/_{name}.html", context) for name in parts}
-
-
-def _link(request: Request, studio: Studio, token: str) -> str:
-    """The link to send: under the public address if one is set, else under the one the experimenter uses."""
-    base = studio.settings.public_url or str(request.base_url)
-    return f"{base.rstrip('/')}{request.app.url_path_for('open_link', token=token)}"
 
 
 def _see(request: Request, name: str, **parameters: str) -> RedirectResponse:
