@@ -109,6 +109,7 @@ class FilterDraft:
     value: Mapping[str, Array] = field(default_factory=dict)
     """state of the action value, so that a later round goes on from it"""
     trials: tuple[Trial, ...] = ()
+    """in their order, except that the chosen mode's comes after the other modes'"""
     notes: tuple[str, ...] = ()
     seconds: Mapping[str, float] = field(default_factory=dict)
 
@@ -195,38 +196,44 @@ def find_mode(
     collect: Collect,
     progress: Progress = lambda stage, share: None,
 ) -> FilterDraft:
-    """The mode with the best predicted learned return that really keeps the task, its forces, and its promise.
+    """The mode with the best learned return of those tried that keep the task and its forces.
 
-    The best mode lies where the surface knows least, and is the one whose success is most likely overestimated. It is
-    therefore tried on the held-out scenarios of ``reference``, and when it is not acceptable the surface learns from
-    the trial and the search goes on. When no attempt succeeds, the last mode is weakened; at worst it is switched off.
+    The best predicted mode lies where the surface knows least, and is the one whose success and return are most likely
+    overestimated. It is therefore tried on the held-out scenarios of ``reference``, the surface learns from the trial,
+    and the search goes on from there. When no attempt is acceptable the last mode is weakened; at worst it is off.
     ``pool``: rollouts of many modes, used only when the reward is not linear in the signals.
     """
     started = time.perf_counter()
     wishes = problem.reward.signal_weights(pool)
-    trials: list[Trial] = []
+    tried: list[tuple[Trial, Floats]] = []
     for attempt in range(problem.config.mode_attempts):
         progress("searching the person's way of doing the task", 0.1 * attempt)
         mode = best_mode(surface, wishes, problem.seed)
-        if not mode.any():
+        if not mode.any() or any(np.array_equal(mode, earlier) for _, earlier in tried):
             break
-        named = problem.task.modes.named(mode)
-        act = act_of(problem.task.modes, problem.policy, FilterWeights(mode=named))
         progress(f"checking mode {attempt + 1} on held-out scenarios", 0.03 + 0.1 * attempt)
-        trial, filtered = _try(problem, act, 1.0, 0.0, reference, collect)
-        trials.append(trial)
-        if _acceptable(problem, trial, reference):
-            return _with_mode(named, 1.0, trials, started)
-        surface = surface.with_observed(mode, _signal_changes(reference, filtered), _successes(filtered))
-    if not trials:
-        return _without_mode("The labels do not yet say clearly what to change; the mode is off.", trials, started)
-    for gate in problem.config.gates:
+        trial, driven = _try(problem, _act_in(problem, mode), 1.0, 0.0, reference, collect)
+        tried.append((trial, mode))
+        surface = surface.with_observed(mode, _signal_changes(reference, driven), _successes(driven))
+    if not tried:
+        return _without_mode("The labels do not yet say clearly what to change; the mode is off.", [], started)
+    accepted = [each for each in tried if _acceptable(problem, each[0], reference)]
+    for gate in problem.config.gates if not accepted else ():
         progress(f"checking the mode at {gate:.0%} on held-out scenarios", 0.32)
-        trial, _ = _try(problem, replace(act, gate=gate), gate, 0.0, reference, collect)
-        trials.append(trial)
-        if _acceptable(problem, trial, reference):
-            return _with_mode(named, gate, trials, started)
-    return _without_mode("No mode was better while keeping the task and the forces; the mode is off.", trials, started)
+        act = replace(_act_in(problem, tried[-1][1]), gate=gate)
+        weakened = _try(problem, act, gate, 0.0, reference, collect)[0], tried[-1][1]
+        tried.append(weakened)
+        if _acceptable(problem, weakened[0], reference):
+            accepted = [weakened]
+            break
+    trials = [trial for trial, _ in tried]
+    if not accepted:
+        note = "No mode was better while keeping the task and the forces; the mode is off."
+        return _without_mode(note, trials, started)
+    chosen, mode = max(accepted, key=lambda each: each[0].preference)
+    weights = FilterWeights(mode=problem.task.modes.named(mode), gate=chosen.gate)
+    ordered = (*(trial for trial in trials if trial is not chosen), chosen)
+    return FilterDraft(weights, trials=ordered).timed("mode", started)
 
 
 def train_residual(
@@ -301,7 +308,7 @@ def gate_residual(
         weights = draft.weights.changed(residual_share=share)
         act = act_of(problem.task.modes, problem.policy, weights)
         trials.append(_try(problem, act, weights.gate, share, reference, collect)[0])
-    without = draft.trials[-1:]  # the mode alone, which was the last to be tried and was accepted
+    without = draft.trials[-1:]  # the mode alone, where one was accepted
     acceptable = [trial for trial in (*trials, *without) if _acceptable(problem, trial, reference)]
     share = max(acceptable, key=lambda trial: trial.preference).residual_share if acceptable else 0.0
     weights = draft.weights.changed(residual_share=share)
@@ -314,8 +321,8 @@ def gate_residual(
 # -- inside ------------------------------------------------------------------------------------------------------------
 
 
-def _with_mode(mode: Mapping[str, float], gate: float, trials: Sequence[Trial], started: float) -> FilterDraft:
-    return FilterDraft(FilterWeights(mode=mode, gate=gate), trials=tuple(trials)).timed("mode", started)
+def _act_in(problem: FilterProblem, mode: Floats) -> FilterAct:
+    return act_of(problem.task.modes, problem.policy, FilterWeights(mode=problem.task.modes.named(mode)))
 
 
 def _without_mode(note: str, trials: Sequence[Trial], started: float) -> FilterDraft:
