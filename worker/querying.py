@@ -162,10 +162,12 @@ class _Choosing:
             scores=scores,
             random_share=settings.random_share,
         )
-        strategy = Strategy.UNIFORM if scores is None else settings.strategy
+        drawn = zip(choice.indices, choice.swapped, choice.propensities, choice.at_random, strict=True)
         return [
-            _columns(pairs[index], bool(swapped), strategy, float(propensity))
-            for index, swapped, propensity in zip(choice.indices, choice.swapped, choice.propensities, strict=True)
+            _columns(
+                pairs[index], bool(swapped), Strategy.UNIFORM if at_random else settings.strategy, float(propensity)
+            )
+            for index, swapped, propensity, at_random in drawn
         ]
 
     def _introduction(self, rng: np.random.Generator) -> dict[str, Any] | None:

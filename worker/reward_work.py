@@ -6,7 +6,8 @@ from sqlalchemy.orm import Session
 from app.domain.models import Model, ModelKind
 from app.domain.preferences import Query
 from app.domain.studies import Participant, Strategy, Study
-from worker import dataset, lessons, querying, records
+from app.services import advisor
+from worker import dataset, insight, lessons, querying, records
 from worker.compute import Lane
 from worker.records import Job
 from worker.workplace import Step, Workplace
@@ -48,10 +49,11 @@ def _fit(place: Workplace, run_id: int, participant_id: int) -> None:
         [place.store.read(model.artefact_sha256) for model in earlier],
     )
     artefact = place.store.put(stored)
-    metrics["notes"] = notes
+    metrics |= {"notes": notes, **insight.insight(place, participant_id, stored)}
     with place.database.writing() as session:
         records.set_labels(session, run_id, preferences.label_count, preferences.label_hash)
         records.save_model(session, run_id, ModelKind.REWARD, artefact, metrics)
+        advisor.note(session, session.get_one(Study, participant.study_id), participant)
 
 
 def notes_on_pairs(session: Session, participant_id: int) -> list[str]:

@@ -15,7 +15,7 @@ from app.db import now
 from app.domain.clips import Clip, Rollout
 from app.domain.models import Bundle, Model, ModelKind, Run, RunKind, RunStatus, WorkerPresence
 from app.domain.preferences import LEARNED_FROM, LabelEvent, Query, Response
-from app.domain.studies import Participant, Study
+from app.domain.studies import Participant, Strategy, Study
 from app.services import accuracy, results
 
 WORKER_SILENCE = timedelta(seconds=15)
@@ -111,6 +111,7 @@ class _Answer:
     response: Response
     predicted_right: float | None
     response_time_ms: int | None
+    drawn_at_random: bool
 
 
 def machine(session: Session, data_dir: Path) -> Machine:
@@ -216,8 +217,13 @@ def _stage(participant: Participant, answered: int, wanted: int) -> Stage:
 
 
 def _hits(answers: Iterable[_Answer]) -> Sequence[bool]:
-    """Whether each predicted answer that prefers a side was foreseen."""
-    decided = [answer for answer in answers if answer.response in (Response.LEFT, Response.RIGHT)]
+    """Whether each predicted answer that prefers a side was foreseen; only on pairs that were drawn at random.
+
+    What a model chose to ask is where it is worst: on that, every way of choosing well would look bad.
+    """
+    decided = [
+        answer for answer in answers if answer.drawn_at_random and answer.response in (Response.LEFT, Response.RIGHT)
+    ]
     return [
         (answer.predicted_right > 0.5) == (answer.response is Response.RIGHT)
         for answer in decided
@@ -235,17 +241,23 @@ def _answers(session: Session, participant_ids: Sequence[int]) -> dict[int, list
         .subquery()
     )
     rows = session.execute(
-        select(Query.participant_id, LabelEvent.response, Query.predicted_right, LabelEvent.response_time_ms)
+        select(
+            Query.participant_id,
+            LabelEvent.response,
+            Query.predicted_right,
+            LabelEvent.response_time_ms,
+            Query.strategy == Strategy.UNIFORM,
+        )
         .join(LabelEvent, LabelEvent.query_id == Query.id)
         .join(newest, (newest.c.query_id == LabelEvent.query_id) & (newest.c.revision == LabelEvent.revision))
         .where(Query.purpose.in_(LEARNED_FROM))
         .order_by(Query.participant_id, Query.ordinal)
     )
     answers: dict[int, list[_Answer]] = defaultdict(list)
-    for participant_id, response, predicted_right, response_time_ms in rows:
+    for participant_id, response, predicted_right, response_time_ms, at_random in rows:
         if response is None:  # taken back
             continue
-        answers[participant_id].append(_Answer(Response(response), predicted_right, response_time_ms))
+        answers[participant_id].append(_Answer(Response(response), predicted_right, response_time_ms, at_random))
     return answers
 
 

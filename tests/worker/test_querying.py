@@ -131,7 +131,7 @@ def test_a_strategy_needs_a_model_and_until_then_pairs_are_random(
     save_reward_model(place, participant)
     querying.refill_queries(place, participant.id)
     chosen = queries_of(place.database, participant)[3:]
-    assert {query.strategy for query in chosen} == {strategy}
+    assert {query.strategy for query in chosen} == {strategy, "uniform"}, "a share is always drawn at random"
     assert len({query.propensity for query in chosen[:1]} | {1 / 15}) == 2, "not every pair was equally likely"
 
 
@@ -143,7 +143,7 @@ def test_contested_pairs_are_found_with_the_paper_s_users_before_others_have_ans
     add_clips(2)
     querying.refill_queries(place, participant.id)
     queries = queries_of(place.database, participant)
-    assert {query.strategy for query in queries} == {Strategy.CONTESTED}
+    assert {query.strategy for query in queries} == {Strategy.CONTESTED, "uniform"}
     assert all(query.propensity >= 0.5 / 12 for query in queries), "half of the chance is spread over all pairs"
 
 

@@ -1,0 +1,53 @@
+"""When more answers hardly pay: said after three retrainings, taken back when it is no longer so, noted once."""
+
+from collections.abc import Sequence
+
+import pytest
+from sqlalchemy import select
+
+from app.db import Database
+from app.domain.models import Model, ModelKind
+from app.domain.people import AuditEvent
+from app.services import advisor
+from tests import factories
+
+
+def models(regrets: Sequence[float | None]) -> list[Model]:
+    return [
+        Model(label_count=10 * (place + 1), metrics={} if regret is None else {"advice": {"expected_regret": regret}})
+        for place, regret in enumerate(regrets)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("regrets", "since"),
+    [
+        ([1.0, 0.1, 0.1], None),
+        ([1.0, 0.1, 0.1, 0.1], 40),
+        ([0.1, 0.1, 0.1, 0.1, 0.1], 30),
+        ([0.1, 0.1, 0.1, 0.9], None),
+        ([0.1, 0.3, 0.1, 0.1, 0.1], 50),
+        ([None, 0.1, None, 0.1, 0.1], 50),
+    ],
+)
+def test_three_small_regrets_in_a_row_are_enough(regrets: list[float | None], since: int | None) -> None:
+    advice = advisor.advice_of(models(regrets))
+    assert advice is not None
+    assert (advice.enough_since, advice.regret) == (since, regrets[-1])
+
+
+def test_nothing_is_said_of_models_without_a_regret() -> None:
+    assert advisor.advice_of(models([None, None])) is None
+    assert advisor.advice_of([]) is None
+
+
+def test_it_is_noted_once(database: Database) -> None:
+    with database.writing() as session:
+        study = factories.make_study(session, "Pilot")
+        participant, _ = factories.make_participant(session, study)
+        for labels in (10, 20, 30, 40):
+            metrics = {"advice": {"expected_regret": 0.05}}
+            factories.make_model(session, study, participant, ModelKind.REWARD, metrics, labels=labels)
+            advisor.note(session, study, participant)
+        noted = session.scalars(select(AuditEvent.subject).where(AuditEvent.action.startswith("more answers"))).all()
+    assert noted == ["pilot/P01 after 30 answers"]

@@ -1,0 +1,80 @@
+"""What a reward model says beside its predictions: the clips it likes, and whether more labels would still pay."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from app.db import Database
+from app.domain.clips import Clip
+from app.domain.studies import Participant, Strategy
+from app.storage import ArtefactStore
+from tests.worker import test_querying
+from worker import dataset, insight, querying
+from worker.compute import Compute
+from worker.exploration import surface_file
+from worker.laboratory import task
+from worker.ml.advice import expected_regret
+from worker.ml.response_surface import ResponseSurface
+from worker.ml.reward_models import StructuredReward
+from worker.trajectory import SIGNALS
+from worker.workplace import Workplace
+
+AddClips = Callable[..., list[Clip]]
+
+
+@pytest.fixture
+def place(database: Database, store: ArtefactStore) -> Workplace:
+    return Workplace(database, store, Compute(1))
+
+
+def test_clips_are_ranked_by_what_the_model_likes(
+    place: Workplace, participant: Participant, add_clips: AddClips
+) -> None:
+    add_clips(1)
+    add_clips(2)
+    likes_one_signal = StructuredReward(np.tile(np.eye(len(SIGNALS))[2], (8, 1)))
+    ranking = insight.insight(place, participant.id, likes_one_signal.to_bytes())["ranking"]
+    with place.database.reading() as session:
+        clips = dataset.pool_clips(session, participant.study_id)
+        sums = {
+            (clip.rollout.scenario, clip.rollout.behaviour): dataset.shown(place.store, clip).signals[:, 2].sum()
+            for clip in clips
+        }
+    assert [(scenario, behaviour) for scenario, behaviour, _ in ranking] == sorted(sums, key=lambda name: -sums[name])
+    returns = np.array([value for *_, value in ranking])
+    assert returns.mean() == pytest.approx(0.0, abs=1e-3)
+    assert returns.std() == pytest.approx(1.0, abs=1e-2)
+
+
+@pytest.fixture(scope="module")
+def surface() -> ResponseSurface:
+    return ResponseSurface.load(surface_file("feeding"), task("feeding").modes)
+
+
+def test_somebody_who_is_known_for_certain_leaves_nothing_to_gain(surface: ResponseSurface) -> None:
+    wish = np.random.default_rng(1).standard_normal(len(SIGNALS))
+    assert expected_regret(surface, np.tile(wish, (8, 1))) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_the_less_is_known_the_more_could_be_gained(surface: ResponseSurface) -> None:
+    rng = np.random.default_rng(2)
+    wish, doubt = rng.standard_normal(len(SIGNALS)), rng.standard_normal((8, len(SIGNALS)))
+    regrets = [expected_regret(surface, wish + spread * doubt) for spread in (0.05, 0.5, 5.0)]
+    assert 0.0 <= regrets[0] < regrets[1] < regrets[2]
+
+
+def test_a_share_of_the_pairs_is_drawn_at_random_and_stored_as_such(
+    place: Workplace, participant: Participant, add_clips: AddClips
+) -> None:
+    """Only these measure a model without bias."""
+    test_querying.settle_on(place, Strategy.CONTESTED)
+    for scenario in (1, 2, 3, 4):
+        add_clips(scenario)
+    querying.refill_queries(place, participant.id)
+    queries = test_querying.queries_of(place.database, participant)
+    uniform = [query for query in queries if query.strategy == Strategy.UNIFORM]
+    chosen = [query for query in queries if query.strategy == Strategy.CONTESTED]
+    assert uniform
+    assert len(uniform) + len(chosen) == len(queries)
+    assert np.mean([query.propensity for query in chosen]) > np.mean([query.propensity for query in uniform])
