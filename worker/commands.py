@@ -13,7 +13,7 @@ from app.domain.protocol import EvaluationSettings
 from app.domain.studies import PAPER_PROTOCOL, Method, RewardKind, Strategy, StudySettings
 from app.settings import Settings
 from app.storage import ArtefactStore
-from worker import benchmark, exploration, laboratory, pretraining, rehearsal, service
+from worker import benchmark, exploration, import_work, laboratory, pretraining, rehearsal, service
 from worker.contest import INDIRECT_USERS, OPPOSED_USERS, PAPER_USERS
 from worker.ml import acquisition, reward_training
 from worker.ml.methods import METHODS
@@ -46,6 +46,18 @@ _Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 def _add_service(commands: _Commands) -> None:
     serve = commands.add_parser("run", help=service.run.__doc__)
     serve.set_defaults(act=lambda _options: service.run(Settings()))
+
+    clips = commands.add_parser("import-clips", help="make a study of your own recordings (docs/own_clips.md)")
+    clips.add_argument("path", type=Path, help="folder or zip file")
+    clips.set_defaults(act=_import_clips)
+
+
+def _import_clips(options: argparse.Namespace) -> int:
+    settings = Settings()
+    database = Database(settings.sqlalchemy_url)
+    slug = import_work.import_clips(database, ArtefactStore(settings.data_dir / "artefacts"), options.path)
+    sys.stdout.write(f"Imported: {settings.base_url}/studies/{slug}\n")
+    return 0
 
 
 def _add_training(commands: _Commands) -> None:

@@ -21,12 +21,15 @@ from app.errors import AppError
 from app.storage import ArtefactStore
 from worker.ml import acquisition
 from worker.ml.segments import SegmentPairs, Stretch
-from worker.trajectory import SIGNALS, Array, OutdatedTrajectory, Trajectory
+from worker.trajectory import SIGNALS, Array, OutdatedTrajectory, Recorded, Recording, Trajectory
 
 
 class RecordedByAnOlderVersion(AppError):
     """This study's clips were recorded by an older version in another simulation. Make a new study to go on."""
 
+
+IMPORTED = "imported"
+"""In a rollout's mode: it was recorded elsewhere, and this says where it came from."""
 
 _TARGETS = {Response.LEFT: 0.0, Response.EQUAL: 0.5, Response.RIGHT: 1.0, Response.SKIP: None}
 
@@ -89,8 +92,9 @@ def segment_pairs(store: ArtefactStore, pairs: Sequence[tuple[Clip, Clip]]) -> S
 
 
 def stretch(store: ArtefactStore, clip: Clip) -> Stretch:
-    """What a clip shows."""
-    return Stretch(shown(store, clip), clip.first_step, clip.step_count)
+    """What a clip shows, simulated here or recorded elsewhere."""
+    trajectory = _recorded(store.path(clip.rollout.trajectory_sha256), IMPORTED in clip.rollout.mode)
+    return Stretch(trajectory, clip.first_step, clip.step_count)
 
 
 def pool_clips(session: Session, study_id: int) -> Sequence[Clip]:
@@ -124,18 +128,27 @@ def pool_pairs(session: Session, store: ArtefactStore, study_id: int) -> Segment
 
 
 def shown(store: ArtefactStore, clip: Clip) -> Trajectory:
-    """The whole trajectory that a clip shows a stretch of."""
+    """The whole simulated trajectory that a clip shows a stretch of."""
     return _trajectory(store.path(clip.rollout.trajectory_sha256))
 
 
 def signal_names(study: Study) -> Sequence[str]:
     """Names, with units, of the columns of signals in the study's trajectories."""
-    return SIGNALS if study.material is None else list(study.material["signals"])
+    return SIGNALS if study.material is None else [each["name"] for each in study.material["signals"]]
 
 
 def stored_trajectory(store: ArtefactStore, sha256: str) -> Trajectory:
     """A trajectory by the hash of its file."""
     return _trajectory(store.path(sha256))
+
+
+def _recorded(path: Path, imported: bool) -> Recorded:
+    return _recording(path) if imported else _trajectory(path)
+
+
+@lru_cache(maxsize=1024)
+def _recording(path: Path) -> Recording:
+    return Recording.load(io.BytesIO(path.read_bytes()))
 
 
 @lru_cache(maxsize=1024)

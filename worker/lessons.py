@@ -15,7 +15,7 @@ from worker.ml.reward_training import SignalScale
 from worker.ml.segments import SegmentPairs
 from worker.ml.studio_filter import Act, noisy
 from worker.sim.rollout import rollout
-from worker.trajectory import Array, Trajectory
+from worker.trajectory import SIGNALS, Array, Trajectory
 
 
 def warm_up(task: str) -> None:
@@ -39,11 +39,14 @@ def fit_reward(
     pool: SegmentPairs,
     seed: int,
     earlier: Sequence[bytes] = (),
+    recorded_signals: Sequence[str] | None = None,
 ) -> tuple[bytes, dict[str, Any]]:
     """The stored reward model and its metrics.
 
     ``pool``: pairs like those that are asked, for the scale of signals; ``earlier``: models of others for
-    a pooled prior. Raises ValueError for a kind there is not.
+    a pooled prior; ``recorded_signals``: what the signals are called when the clips were recorded elsewhere. Then there
+    is no reference policy to normalise over, and what the person was shown takes its place.
+    Raises ValueError for a kind there is not.
     """
     if kind not in get_args(reward_training.Kind):
         raise ValueError(f"There is no reward model of the kind {kind!r}.")
@@ -55,8 +58,9 @@ def fit_reward(
         cast(reward_training.Kind, kind),
         seed,
         scale=scale,
-        reference=reference_rollouts(task),
+        reference=reference_rollouts(task) if recorded_signals is None else (),
         prior=prior,
+        signal_names=SIGNALS if recorded_signals is None else recorded_signals,
     )
     return fitted.model.to_bytes(), {**fitted.metrics, "pooled_from": len(earlier)}
 

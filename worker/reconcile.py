@@ -129,11 +129,11 @@ def _stale_models(session: Session, study: Study, succeeded: Collection[str]) ->
             name = f"reward/participant-{participant.id}/labels-{reward}{suffix}"
             jobs.append(Job(name, RunKind.REWARD, study.id, participant.id, reward))
             milestone = filter_due(study.settings, count)
-            if milestone and name in succeeded:
+            if milestone and name in succeeded and study.material is None:  # no simulator, no filter
                 ending = suffix if milestone == study.settings.labels_per_participant else ""
                 name = f"filter/participant-{participant.id}/labels-{milestone}{ending}"
                 jobs.append(Job(name, RunKind.FILTER, study.id, participant.id, milestone))
-        if suffix:
+        if suffix and study.material is None:
             jobs += _missing_from_evaluation(study, participant, f"labels-{reward}{suffix}", succeeded)
     return jobs
 

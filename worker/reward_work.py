@@ -33,6 +33,7 @@ def _fit(place: Workplace, run_id: int, participant_id: int) -> None:
         preferences = dataset.load_preferences(session, place.store, participant_id)
         pool = dataset.pool_pairs(session, place.store, participant.study_id)
         notes = notes_on_pairs(session, participant_id)
+        recorded_signals = None if study.material is None else dataset.signal_names(study)
     if preferences.pairs is None:
         return  # nothing but "can't tell" so far: there is nothing to learn from
     place.report(run_id, f"learning from {preferences.label_count} labels", 0.2)
@@ -47,6 +48,7 @@ def _fit(place: Workplace, run_id: int, participant_id: int) -> None:
         pool,
         participant.seed,
         [place.store.read(model.artefact_sha256) for model in earlier],
+        recorded_signals,
     )
     artefact = place.store.put(stored)
     metrics |= {"notes": notes, **insight.insight(place, participant_id, stored)}

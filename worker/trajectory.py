@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import IO, Self
+from typing import IO, Protocol, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -41,6 +41,68 @@ BODIES = ("broad", "slim")
 """The two shapes of the person's body."""
 SKIN_TONES = 6
 """Skin tones are numbered from 0, the lightest, to 5, the darkest."""
+
+
+class Recorded(Protocol):
+    """What preferences are learned from, wherever it was recorded: T steps of signals, observations and actions."""
+
+    @property
+    def signals(self) -> Array:
+        """(T, S) what was measured; the columns are the study's"""
+        ...
+
+    @property
+    def observations(self) -> Array:
+        """(T + 1, D), D may be 0"""
+        ...
+
+    @property
+    def actions(self) -> Array:
+        """(T, A), A may be 0"""
+        ...
+
+    @property
+    def success(self) -> bool:
+        """Whether the whole of it succeeded"""
+        ...
+
+    def __len__(self) -> int:
+        """T"""
+        ...
+
+
+@dataclass(frozen=True)
+class Recording:
+    """An episode that was recorded elsewhere. Raises ValueError when arrays disagree about T, or are not finite."""
+
+    signals: Array
+    observations: Array
+    actions: Array
+    success: bool
+
+    def __post_init__(self) -> None:
+        steps = len(self.signals)
+        _require_shape("signals", self.signals, (steps, None))
+        _require_shape("observations", self.observations, (steps + 1, None))
+        _require_shape("actions", self.actions, (steps, None))
+        for name in ("signals", "observations", "actions"):
+            if not np.isfinite(getattr(self, name)).all():
+                raise ValueError(f"{name} has values that are missing or not finite.")
+
+    def __len__(self) -> int:
+        return len(self.signals)
+
+    def save(self, target: Path | IO[bytes]) -> None:
+        """Write every array and value to one compressed .npz file."""
+        arrays = {field.name: np.asarray(getattr(self, field.name)) for field in fields(self)}
+        np.savez_compressed(target, allow_pickle=False, **arrays)
+
+    @classmethod
+    def load(cls, source: Path | IO[bytes]) -> Self:
+        """Read what save() wrote. Raises KeyError for another file."""
+        with np.load(source, allow_pickle=False) as stored:
+            arrays = {name: stored[name] for name in ("signals", "observations", "actions")}
+            return cls(**arrays, success=bool(stored["success"]))
 
 
 class OutdatedTrajectory(ValueError):

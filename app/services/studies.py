@@ -46,7 +46,7 @@ def create_study(
         name=name,
         task=task,
         stored_settings=settings.model_dump(mode="json"),
-        seed=secrets.randbelow(_SEED_LIMIT) if seed is None else seed,
+        seed=new_seed() if seed is None else seed,
     )
     session.add(study)
     session.flush()
@@ -60,6 +60,11 @@ def find_study(session: Session, slug: str) -> Study:
     if study is None:
         raise StudyNotFound
     return study
+
+
+def new_seed() -> int:
+    """A seed for a study, drawn."""
+    return secrets.randbelow(_SEED_LIMIT)
 
 
 def free_slug(session: Session, name: str) -> str:

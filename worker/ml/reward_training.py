@@ -65,6 +65,7 @@ def fit(
     prior: Prior | None = None,
     mlp: MlpTraining | None = None,
     transformer: TransformerTraining | None = None,
+    signal_names: Sequence[str] = SIGNALS,
 ) -> FitResult:
     """Fit an ensemble to N pairs and their targets P(right preferred) in {0, 1/2, 1}.
 
@@ -72,15 +73,15 @@ def fit(
     is shaky below about 30 labels.
     ``reference``: rollouts of the reference policy to normalise over; the labelled segments when missing.
     ``prior``: of the structured kind's weights, N(0, I) when missing.
+    ``signal_names``: what the columns of the pairs' signals are called.
     Raises ValueError for targets outside {0, 1/2, 1} or a count that differs from the pairs'.
     """
     started = time.perf_counter()
     answers = _checked(pairs, targets)
     metrics: dict[str, Any] = {"kind": kind, "trained_on": len(pairs), "seed": seed}
     if kind == "structured":
-        model, found = _fit_structured(
-            pairs, answers, seed, scale or SignalScale.of(pairs), prior or Prior.standard(len(SIGNALS))
-        )
+        known = prior or Prior.standard(len(signal_names))
+        model, found = _fit_structured(pairs, answers, seed, scale or SignalScale.of(pairs), known, signal_names)
     elif kind == "mlp":
         model, found = fit_mlp(pairs, answers, seed, mlp or MlpTraining())
     else:
@@ -125,7 +126,7 @@ def _normalised_over_segments(model: RewardModel, pairs: SegmentPairs) -> Reward
 
 
 def _fit_structured(
-    pairs: SegmentPairs, answers: Floats, seed: int, scale: SignalScale, prior: Prior
+    pairs: SegmentPairs, answers: Floats, seed: int, scale: SignalScale, prior: Prior, signal_names: Sequence[str]
 ) -> tuple[RewardModel, dict[str, Any]]:
     features = pairs.signal_differences() / scale.spread
     mean, covariance = posterior(features, answers, prior)
@@ -133,7 +134,7 @@ def _fit_structured(
     deviation = 1.96 * np.sqrt(np.diag(covariance))
     weights = {
         name: {"mean": float(value), "low": float(value - margin), "high": float(value + margin)}
-        for name, value, margin in zip(SIGNALS, mean, deviation, strict=True)
+        for name, value, margin in zip(signal_names, mean, deviation, strict=True)
     }
     return StructuredReward(members, most_per_step=scale.most_per_step), {
         "weights": weights,

@@ -7,7 +7,7 @@ from typing import NamedTuple, Self
 import numpy as np
 import numpy.typing as npt
 
-from worker.trajectory import Trajectory
+from worker.trajectory import Recorded
 
 Array = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
@@ -17,7 +17,7 @@ LEFT, RIGHT = 0, 1
 class Stretch(NamedTuple):
     """What is shown of a trajectory: steps first_step .. first_step + step_count."""
 
-    trajectory: Trajectory
+    trajectory: Recorded
     first_step: int
     step_count: int
 
@@ -57,7 +57,7 @@ class SegmentPairs:
 
     @classmethod
     def cut(
-        cls, pairs: Sequence[tuple[Trajectory, Trajectory]], first_step: int = 0, step_count: int | None = None
+        cls, pairs: Sequence[tuple[Recorded, Recorded]], first_step: int = 0, step_count: int | None = None
     ) -> Self:
         """The same stretch of both trajectories of every pair. (left, right) each."""
         if not pairs:

@@ -1,7 +1,9 @@
 """Frames to an MP4 that every browser plays: H.264, yuv420p, index before the pictures."""
 
+import io
 import tempfile
 from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 
 import av
@@ -47,3 +49,34 @@ def encode_poster(frame: Frame) -> bytes:
     """One RGB frame (height, width, 3) as JPEG."""
     poster: bytes = iio.imwrite("<bytes>", frame, extension=".jpg", quality=84, optimize=True)
     return poster
+
+
+@dataclass(frozen=True)
+class PlayableVideo:
+    """A video that every browser plays, with what pages need to know of it."""
+
+    video: bytes
+    poster: bytes
+    width: int
+    height: int
+    fps: int
+    duration_ms: int
+
+
+def playable(content: bytes) -> PlayableVideo:
+    """Any video as H.264 in MP4; left as it is when it is that already. Raises ValueError when it cannot be read."""
+    try:
+        with av.open(io.BytesIO(content), "r") as container:
+            stream = container.streams.video[0]
+            usual = (stream.codec_context.name, stream.codec_context.pix_fmt) == ("h264", "yuv420p")
+            is_mp4 = "mp4" in container.format.name
+            fps = round(float(stream.average_rate or 0))
+            frames = [np.asarray(each.to_ndarray(format="rgb24"), np.uint8) for each in container.decode(stream)]
+    except (av.FFmpegError, IndexError) as error:
+        raise ValueError(f"not a video that can be read ({error})") from error
+    if not frames or fps < 1:
+        raise ValueError("a video without frames")
+    frames = [frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2] for frame in frames]  # yuv420p wants even
+    height, width = frames[0].shape[:2]
+    video = content if usual and is_mp4 else encode_mp4(frames, width, height, fps)
+    return PlayableVideo(video, encode_poster(frames[0]), width, height, fps, round(1000 * len(frames) / fps))

@@ -1,0 +1,222 @@
+"""A lab without our simulator: own recordings become a study in which people are asked and models learn."""
+
+import io
+import json
+import re
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from sqlalchemy import func, select
+
+from app.db import Database
+from app.domain.clips import Clip, Rollout
+from app.domain.models import Model, ModelKind, RunKind
+from app.domain.preferences import Query, Response
+from app.domain.studies import Participant, Study
+from app.services import enrolment
+from app.storage import ArtefactStore
+from tests import factories
+from worker import dataset, preference_arrays, querying, reconcile, records
+from worker.compute import Compute
+from worker.import_work import ClipsInvalid, import_clips
+from worker.ml.reward_models import StructuredReward, load_reward_model
+from worker.records import Job
+from worker.reward_work import train_reward
+from worker.sim.video import playable
+from worker.workplace import Workplace
+
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+WAYS = ("slow_far", "slow_near", "fast_far", "fast_near")
+
+
+class Here(Compute):
+    """Computes where it is asked, not in other processes."""
+
+    def run(self, lane: Any, beat: Any, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+        """The function's result."""
+        return function(*args, **kwargs)
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The worked example of the documentation."""
+    root = tmp_path / "my-clips"
+    (root / "videos").mkdir(parents=True)
+    for number, name in enumerate(f"{way}_{scenario}" for scenario in (1, 2) for way in WAYS):
+        (root / "videos" / f"{name}.mp4").write_bytes(factories.moving_picture(number)[0])
+    monkeypatch.chdir(root)
+    code = re.search(r"```python example\n(.*?)```", (DOCS / "own_clips.md").read_text(), re.DOTALL)
+    assert code is not None
+    exec(code[1], {})  # noqa: S102  (our own documentation)
+    return root
+
+
+@pytest.fixture
+def place(database: Database, store: ArtefactStore) -> Workplace:
+    return Workplace(database, store, Here(1))
+
+
+@pytest.fixture
+def own(place: Workplace, folder: Path) -> Study:
+    slug = import_clips(place.database, place.store, folder)
+    with place.database.reading() as session:
+        return session.scalars(select(Study).where(Study.slug == slug)).one()
+
+
+def edit(folder: Path, change: Callable[[dict[str, Any]], None]) -> None:
+    manifest = json.loads((folder / "manifest.json").read_text())
+    change(manifest)
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+
+
+def test_the_documented_example_becomes_a_study(place: Workplace, own: Study) -> None:
+    assert (own.slug, own.task) == ("handover-with-our-arm", "handover")
+    assert own.settings.labels_per_participant == 12
+    assert own.material is not None
+    assert [each["unit"] for each in own.material["signals"]] == ["m/s", "m"]
+    with place.database.reading() as session:
+        clips = dataset.pool_clips(session, own.id)
+        assert len(clips) == 8
+        assert len(dataset.matched_pairs(clips)) == 12
+        assert all(place.store.has(clip.video_sha256) and place.store.has(clip.poster_sha256) for clip in clips)
+        assert clips[0].rollout.mode["imported"]["label"] == "slow, far"
+
+
+def test_the_same_as_a_zip_file(place: Workplace, folder: Path) -> None:
+    path = folder.parent / "my-clips.zip"
+    with zipfile.ZipFile(path, "w") as archive:
+        for file in folder.rglob("*.*"):
+            archive.write(file, Path("my-clips") / file.relative_to(folder))
+    assert import_clips(place.database, place.store, path) == "handover-with-our-arm"
+
+
+def test_nothing_is_simulated_for_it(place: Workplace, own: Study) -> None:
+    with place.database.reading() as session:
+        assert list(reconcile.findings(session)) == []
+
+
+def test_people_are_asked_and_a_reward_model_learns_what_they_want_in_the_labs_own_signals(
+    place: Workplace, own: Study
+) -> None:
+    person = _answer_everything(place, own)
+    with place.database.reading() as session:
+        due = [job for job, _ in reconcile.findings(session) if job.kind is RunKind.REWARD]
+        assert len(due) == 1
+    _train(place, due[0])
+    with place.database.reading() as session:
+        model = session.scalars(select(Model).where(Model.kind == ModelKind.REWARD)).one()
+    assert set(model.metrics["weights"]) == {"speed_m_s", "distance_m"}
+    assert model.metrics["weights"]["speed_m_s"]["mean"] < 0, "this person likes it slow"
+    learned = load_reward_model(place.store.read(model.artefact_sha256))
+    assert isinstance(learned, StructuredReward)
+    assert learned.weights.shape[1] == 2
+    with place.database.writing() as session:
+        factories.make_run(session, own, session.get_one(Participant, person)).workflow_id = due[0].finding + "/x"
+        run = session.scalars(select(Model.run_id)).one()
+        records.finish_run(session, run)
+    with place.database.reading() as session:
+        kinds = {job.kind for job, _ in reconcile.findings(session)}
+    assert kinds <= {RunKind.REPORT}, "no filter, no method, no film: there is no simulator to make them in"
+
+
+def _answer_everything(place: Workplace, own: Study) -> int:
+    """A person who prefers the slower clip, and what is near where both are equally fast."""
+    with place.database.writing() as session:
+        participant, _ = enrolment.add_participant(session, own)
+        person = participant.id
+    for _ in range(3):
+        querying.refill_queries(place, person)
+        with place.database.writing() as session:
+            for query in records.unanswered(session, person, *dataset.CLIPS_AND_ROLLOUTS):
+                left, right = (
+                    dataset.stretch(place.store, clip).cut("signals").sum(axis=0)
+                    for clip in (query.left_clip, query.right_clip)
+                )
+                says = Response.LEFT if tuple(left) < tuple(right) else Response.RIGHT
+                factories.make_label(session, query, says, response_time_ms=900)
+    with place.database.reading() as session:
+        assert session.scalar(select(func.count(Query.id))) == 12
+    return person
+
+
+def _train(place: Workplace, job: Job) -> None:
+    with place.database.writing() as session:
+        run_id = records.begin_run(session, job, seed=5)
+    train_reward(place, job, run_id, lambda _name, function, *arguments: function(*arguments))
+
+
+def test_exports_hold_the_labs_own_signals_and_actions(place: Workplace, own: Study) -> None:
+    person = _answer_everything(place, own)
+    with place.database.reading() as session:
+        stored = preference_arrays.arrays_of(session, place.store, own, session.get_one(Participant, person))
+    assert stored is not None
+    file = np.load(io.BytesIO(stored))
+    assert list(file["signal_names"]) == ["speed_m_s", "distance_m"]
+    assert file["signals"].shape == (12, 2, 20, 2)
+    assert (file["actions"].shape[-1], file["observations"].shape[-1]) == (1, 0)
+
+
+def test_npz_files_are_read_as_well(place: Workplace, folder: Path) -> None:
+    signals = np.full((20, 2), 0.5, np.float32)
+    np.savez(folder / "trajectories" / "one.npz", signals=signals, actions=np.zeros((20, 1)))
+    edit(folder, lambda manifest: manifest["clips"][0].update(trajectory="trajectories/one.npz"))
+    import_clips(place.database, place.store, folder)
+    with place.database.reading() as session:
+        clip = dataset.pool_clips(session, 1)[0]
+        assert np.array_equal(dataset.stretch(place.store, clip).cut("signals"), signals)
+
+
+def test_videos_that_browsers_cannot_play_are_converted(tmp_path: Path) -> None:
+    import av
+
+    path = tmp_path / "old.avi"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("mpeg4", rate=10)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        for value in range(10):
+            frame = av.VideoFrame.from_ndarray(np.full((48, 64, 3), 20 * value, np.uint8), format="rgb24")
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    made = playable(path.read_bytes())
+    with av.open(io.BytesIO(made.video), "r") as container:
+        assert container.streams.video[0].codec_context.name == "h264"
+    assert (made.width, made.height, made.fps, made.duration_ms) == (64, 48, 10, 1000)
+
+
+WRONG: list[tuple[str, Callable[[dict[str, Any]], None], str]] = [
+    ("no such file", lambda m: m["clips"][0].update(video="videos/none.mp4"), "no file videos/none.mp4"),
+    ("outside", lambda m: m["clips"][0].update(video="../../secret.mp4"), "no file"),
+    ("another rate", lambda m: m.update(rate_hz=5), "same stretch of time"),
+    ("unknown signal", lambda m: m["signals"][0].update(name="force_n"), "column force_n is missing"),
+    ("alone", lambda m: m["clips"][0].update(scenario=9), "Scenario 9 has one clip only"),
+    ("too many labels", lambda m: m["settings"].update(labels_per_participant=50), "12 pairs"),
+    ("evaluation", lambda m: m["settings"].update(evaluation={}), "evaluation need the simulator"),
+    ("unknown key", lambda m: m.update(secret=1), "secret"),
+    ("no video", lambda m: m["clips"][0].update(video="manifest.json"), "not a video"),
+]
+
+
+@pytest.mark.parametrize(("change", "words"), [each[1:] for each in WRONG], ids=[each[0] for each in WRONG])
+def test_what_is_wrong_is_said_and_nothing_is_imported(
+    place: Workplace, folder: Path, change: Callable[[dict[str, Any]], None], words: str
+) -> None:
+    edit(folder, change)
+    with pytest.raises(ClipsInvalid, match=re.escape(words)):
+        import_clips(place.database, place.store, folder)
+    with place.database.reading() as session:
+        assert session.scalar(select(func.count(Study.id))) == 0
+        assert session.scalar(select(func.count(Rollout.id))) == 0
+        assert session.scalar(select(func.count(Clip.id))) == 0
+    assert list(place.store.root.glob("??/*")) == []
+
+
+@pytest.mark.parametrize("cell", ["nan", "", "inf", "fast"])
+def test_numbers_that_are_none_are_refused(place: Workplace, folder: Path, cell: str) -> None:
+    path = folder / "trajectories" / "slow_far_1.csv"
+    path.write_text(path.read_text().replace("0.1,0.51", f"{cell},0.51", 1))
+    with pytest.raises(ClipsInvalid, match=re.escape("trajectories/slow_far_1.csv")):
+        import_clips(place.database, place.store, folder)
