@@ -5,7 +5,6 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
-from enum import StrEnum
 from pathlib import Path
 
 from sqlalchemy import func, select
@@ -13,24 +12,17 @@ from sqlalchemy.orm import Session
 
 from app.db import now
 from app.domain.clips import Clip, Rollout
+from app.domain.evaluation import Film, Rating, Trial
 from app.domain.models import Bundle, Model, ModelKind, Run, RunKind, RunStatus, WorkerPresence
+from app.domain.participation import StageRecord
 from app.domain.preferences import LEARNED_FROM, LabelEvent, Query, Response
 from app.domain.studies import Participant, Strategy, Study
-from app.services import accuracy, results
+from app.services import accuracy, results, watching
 
 WORKER_SILENCE = timedelta(seconds=15)
 DISK_LOW_BYTES = 2 * 1024**3
 RECENT_CLIPS = 8
 ACTIVE_WITHIN = timedelta(seconds=60)
-
-
-class Stage(StrEnum):
-    """Where a participant is."""
-
-    INVITED = "invited"
-    READING = "reading the instructions"
-    COMPARING = "comparing"
-    FINISHED = "finished"
 
 
 @dataclass(frozen=True)
@@ -59,7 +51,8 @@ class ParticipantRow:
     """One participant in one line."""
 
     participant: Participant
-    stage: Stage
+    stage: str
+    """In words, see watching."""
     active: bool
     answered: int
     wanted: int
@@ -67,6 +60,7 @@ class ParticipantRow:
     run: Run | None
     """What the worker is doing for them, or what failed; None when nothing is to be said."""
     newest_filter: results.FilterVersion | None
+    watched: watching.Watched
 
 
 @dataclass(frozen=True)
@@ -89,6 +83,9 @@ class StudyOverview:
     study: Study
     pool: Pool
     rows: Sequence[ParticipantRow]
+    stage_counts: Sequence[tuple[str, int]]
+    answers_today: int
+    disk_use_bytes: int
 
 
 @dataclass(frozen=True)
@@ -136,6 +133,15 @@ def fingerprint(session: Session) -> str:
         select(func.max(Run.finished_at)).scalar_subquery(),
         select(func.count(Run.id)).where(Run.status == RunStatus.RETRY).scalar_subquery(),
         select(func.max(Study.id)).scalar_subquery(),
+        select(func.max(StageRecord.id)).scalar_subquery(),
+        select(func.max(StageRecord.finished_at)).scalar_subquery(),
+        select(func.max(Participant.completed_at)).scalar_subquery(),
+        select(func.max(Participant.withdrawn_at)).scalar_subquery(),
+        select(func.max(Rating.id)).scalar_subquery(),
+        select(func.max(Trial.shown_at)).scalar_subquery(),
+        select(func.max(Trial.started_at)).scalar_subquery(),
+        select(func.max(Trial.finished_at)).scalar_subquery(),
+        select(func.max(Film.id)).scalar_subquery(),
     )
     return repr(tuple(session.execute(select(*newest)).one()))
 
@@ -170,7 +176,15 @@ def study_overview(session: Session, study: Study) -> StudyOverview:
     """One study: its pool and a row per participant."""
     everybody = select(Participant).where(Participant.study_id == study.id, Participant.is_preview.is_(False))
     people = session.scalars(everybody.order_by(Participant.number)).all()
-    return StudyOverview(study, _pool(session, study), _rows(session, study, people))
+    rows = _rows(session, study, people)
+    return StudyOverview(
+        study,
+        _pool(session, study),
+        rows,
+        watching.stage_counts({row.participant.id: row.stage for row in rows}),
+        watching.answers_today(session, study),
+        watching.disk_use(session, study),
+    )
 
 
 def participant_detail(session: Session, study: Study, participant: Participant) -> ParticipantDetail:
@@ -192,28 +206,23 @@ def participant_detail(session: Session, study: Study, participant: Participant)
 def _rows(session: Session, study: Study, people: Sequence[Participant]) -> Sequence[ParticipantRow]:
     ids = [person.id for person in people]
     answers, versions, runs = _answers(session, ids), _versions(session, ids), _noteworthy_runs(session, ids)
-    wanted = study.settings.labels_per_participant
+    settings = study.settings
+    given = {person: len(theirs) for person, theirs in answers.items()}
+    where, wanted = watching.where_they_are(session, settings, people, given), settings.labels_per_participant
     return [
         ParticipantRow(
             participant=person,
-            stage=_stage(person, len(answers[person.id]), wanted),
+            stage=where[person.id],
             active=person.last_seen_at is not None and now() - person.last_seen_at < ACTIVE_WITHIN,
             answered=len(answers[person.id]),
             wanted=wanted,
             curve=accuracy.curve(_hits(answers[person.id])),
             run=runs.get(person.id),
             newest_filter=versions[person.id][0] if versions[person.id] else None,
+            watched=watching.watched(session, person.id),
         )
         for person in people
     ]
-
-
-def _stage(participant: Participant, answered: int, wanted: int) -> Stage:
-    if answered >= wanted:
-        return Stage.FINISHED
-    if participant.instructed_at is not None:
-        return Stage.COMPARING
-    return Stage.READING if participant.consented_at is not None else Stage.INVITED
 
 
 def _hits(answers: Iterable[_Answer]) -> Sequence[bool]:

@@ -75,9 +75,9 @@ def test_a_reader_may_change_nothing(studio_app: FastAPI, database: Database, lo
     before = rows(database)
     found = list(addresses_that_change(studio_app))
     assert {"/studies/new", "/studies/pilot/lock", "/studies/pilot/participants", "/accounts"} <= set(found)
-    answers = {
-        path: reader.post(path, data={"typed": "pilot", "count": "1", "name": "x"}).status_code for path in found
-    }
+    sent = {"typed": "pilot", "count": "1", "name": "x"}
+    file = {"file": ("study.zip", b"PK")}
+    answers = {path: reader.post(path, data=sent, files=file).status_code for path in found}
     assert answers == dict.fromkeys(found, 403)
     assert rows(database) == before
 

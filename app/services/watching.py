@@ -1,0 +1,137 @@
+"""What an experimenter should know about each participant while the study runs.
+
+Flags ask for a look; they change nothing, and nothing is ever deleted or left out because of them.
+"""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import timedelta
+from itertools import pairwise
+from statistics import median
+
+from sqlalchemy import func, select
+from sqlalchemy.orm import Session, joinedload
+
+from app.db import now
+from app.domain.clips import Clip, Rollout
+from app.domain.evaluation import Controller, Film
+from app.domain.models import Bundle, Export, Model, ModelKind
+from app.domain.participation import StageRecord
+from app.domain.preferences import LabelEvent, Purpose, Query, current_answers
+from app.domain.protocol import Stage
+from app.domain.studies import Participant, Study, StudySettings
+from app.services import advisor, stages
+from app.services.advisor import Advice
+from app.services.consistency import Consistency, answers_of, consistency
+
+INVITED, FINISHED, WITHDRAWN = "invited", "finished", "withdrawn"
+STAGES_IN_WORDS: Mapping[Stage, str] = {
+    Stage.CONSENT: "reading the consent",
+    Stage.DEMOGRAPHICS: "first questions",
+    Stage.INSTRUCTIONS: "reading the instructions",
+    Stage.PRACTICE: "practising",
+    Stage.PAIRS: "comparing",
+    Stage.EVALUATION: "rating robots",
+    Stage.QUESTIONNAIRE: "last questions",
+    Stage.DEBRIEF: "debrief",
+}
+BREAK_S = 120.0
+"""A longer gap between two answers was a break and says nothing about the pace."""
+
+
+@dataclass(frozen=True)
+class Watched:
+    """One participant's answers, judged."""
+
+    consistency: Consistency
+    pace_s: float | None
+    """Median time from one answer to the next."""
+    advice: Advice | None
+
+
+@dataclass(frozen=True)
+class StageTime:
+    """How long somebody was in a stage."""
+
+    stage: str
+    record: StageRecord
+
+
+def watched(session: Session, participant_id: int) -> Watched:
+    """Everything that is said about the answers of one participant."""
+    labels = current_answers(session, participant_id, joinedload(Query.left_clip), joinedload(Query.right_clip))
+    moments = sorted(label.event.created_at for label in labels if label.query.purpose != Purpose.PRACTICE)
+    gaps = [(later - earlier).total_seconds() for earlier, later in pairwise(moments)]
+    working = [gap for gap in gaps if gap <= BREAK_S]
+    theirs = select(Model).where(Model.participant_id == participant_id, Model.kind == ModelKind.REWARD)
+    models = session.scalars(theirs.order_by(Model.label_count, Model.id)).all()
+    return Watched(
+        consistency=consistency(answers_of(labels)),
+        pace_s=median(working) if len(working) >= 3 else None,
+        advice=advisor.advice_of(models),
+    )
+
+
+def where_they_are(
+    session: Session, settings: StudySettings, people: Sequence[Participant], answered: Mapping[int, int]
+) -> dict[int, str]:
+    """In words, by participant id. ``answered``: labels given, by participant id."""
+    records = session.scalars(
+        select(StageRecord).where(StageRecord.participant_id.in_([person.id for person in people]))
+    )
+    entered: dict[int, list[StageRecord]] = {person.id: [] for person in people}
+    for record in records:
+        entered[record.participant_id].append(record)
+    return {person.id: _where(settings, person, answered.get(person.id, 0), entered[person.id]) for person in people}
+
+
+def stage_counts(where: Mapping[int, str]) -> Sequence[tuple[str, int]]:
+    """How many are in each stage, in the order of the stages; stages without anybody are left out."""
+    counted = Counter(where.values())
+    order = (INVITED, *STAGES_IN_WORDS.values(), FINISHED, WITHDRAWN)
+    return [(stage, counted[stage]) for stage in order if counted[stage]]
+
+
+def stage_times(session: Session, participant: Participant) -> Sequence[StageTime]:
+    """When the participant came into each stage, in the order of the stages."""
+    theirs = select(StageRecord).where(StageRecord.participant_id == participant.id)
+    by_stage = {Stage(record.stage): record for record in session.scalars(theirs)}
+    return [StageTime(words, by_stage[stage]) for stage, words in STAGES_IN_WORDS.items() if stage in by_stage]
+
+
+def disk_use(session: Session, study: Study) -> int:
+    """Bytes of the study's videos, bundles and exports; trajectories and models come on top and are small."""
+    people = select(Participant.id).where(Participant.study_id == study.id)
+    sums = (
+        select(func.sum(Clip.byte_count)).join(Rollout).where(Rollout.study_id == study.id),
+        select(func.sum(Film.byte_count)).where(Film.participant_id.in_(people)),
+        select(func.sum(Controller.byte_count)).where(Controller.participant_id.in_(people)),
+        select(func.sum(Bundle.byte_count)).where(Bundle.participant_id.in_(people)),
+        select(func.sum(Export.byte_count)).where(Export.study_id == study.id),
+    )
+    return sum(session.scalar(each) or 0 for each in sums)
+
+
+def answers_today(session: Session, study: Study) -> int:
+    """Answers of the last 24 hours."""
+    people = select(Participant.id).where(Participant.study_id == study.id, Participant.is_preview.is_(False))
+    given = select(func.count(LabelEvent.id)).join(Query).where(Query.participant_id.in_(people))
+    return session.scalar(given.where(LabelEvent.created_at > now() - timedelta(days=1))) or 0
+
+
+def _where(settings: StudySettings, person: Participant, answered: int, records: Sequence[StageRecord]) -> str:
+    if person.withdrawn_at is not None:
+        return WITHDRAWN
+    if person.completed_at is not None:
+        return FINISHED
+    way = stages.stages_of(settings)
+    known = {Stage(record.stage): record for record in records}
+    latest = next((stage for stage in reversed(way) if stage in known), None)
+    if latest is not None and latest is not Stage.PAIRS and known[latest].finished_at is None:
+        return INVITED if latest is Stage.CONSENT and person.last_seen_at is None else STAGES_IN_WORDS[latest]
+    if answered >= settings.labels_per_participant and way[-1] is Stage.PAIRS:
+        return FINISHED
+    if person.instructed_at is not None:
+        return STAGES_IN_WORDS[Stage.PAIRS]
+    return STAGES_IN_WORDS[Stage.INSTRUCTIONS] if person.consented_at is not None else INVITED
