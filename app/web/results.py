@@ -64,7 +64,7 @@ FIGURES = {
     ),
     "learning_curves": (
         "How well the models foresaw the answers",
-        "Every answer was predicted by a model that had not seen it.",
+        "Every answer was predicted by a model that had not seen it; pairs drawn at random only.",
     ),
     "success_against_preference": (
         "What the filters change",

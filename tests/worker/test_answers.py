@@ -9,6 +9,7 @@ from statsmodels.stats.proportion import proportion_confint
 from worker.analysis.answers import answer_report, change_report, kappa, test_retest
 
 COLUMNS = (
+    "strategy",
     "participant",
     "ordinal",
     "purpose",
@@ -20,8 +21,8 @@ COLUMNS = (
 )
 
 
-def queries(*rows: tuple[object, ...]) -> pd.DataFrame:
-    return pd.DataFrame(list(rows), columns=list(COLUMNS))
+def queries(*rows: tuple[object, ...], strategy: str = "uniform") -> pd.DataFrame:
+    return pd.DataFrame([(strategy, *row) for row in rows], columns=list(COLUMNS))
 
 
 def test_accuracy_has_wilsons_interval_and_leaves_out_what_has_no_right_answer() -> None:
@@ -34,6 +35,12 @@ def test_accuracy_has_wilsons_interval_and_leaves_out_what_has_no_right_answer()
     )
     assert (person["labels"], person["left"], person["skip"]) == (7, 3, 1)
     assert person["median_response_ms"] == 2000
+
+
+def test_pairs_that_a_model_chose_do_not_count_for_its_accuracy() -> None:
+    row = ("P01", 1, "preference", None, None, "right", 0.9, 2000)
+    (person,) = answer_report(queries(row, strategy="entropy"), ["P01"])["participants"]
+    assert (person["labels"], person["accuracy"]["scored"]) == (1, 0)
 
 
 def test_practice_and_repeats_are_no_labels() -> None:

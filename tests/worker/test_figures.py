@@ -11,6 +11,7 @@ from worker.analysis.report import Tables, make_report
 from worker.analysis.statistics import rating_report
 
 QUERY_COLUMNS = (
+    "strategy",
     "participant",
     "ordinal",
     "purpose",
@@ -46,6 +47,7 @@ def contents() -> dict[str, Any]:
             "participant": f"P{number:02d}",
             "ordinal": ordinal,
             "purpose": "preference",
+            "strategy": "uniform",
             "response": "left",
             "predicted_right": 0.2 if ordinal % 4 else 0.9,
         }

@@ -21,6 +21,8 @@ WINDOW = 30
 """Answers in the running accuracy, as on the dashboard."""
 FIRST_POINT = 5
 LEARNED_FROM = ("introduction", "preference")
+AT_RANDOM = "uniform"
+"""Strategy of pairs that count for accuracy: those a model chose are the ones it is worst at."""
 _TARGETS = {"left": 0.0, "equal": 0.5, "right": 1.0}
 _MIRRORED = {"left": "right", "right": "left"}
 
@@ -28,6 +30,7 @@ _MIRRORED = {"left": "right", "right": "left"}
 def answer_report(queries: pd.DataFrame, participants: Sequence[str]) -> Result:
     """Per participant and pooled.
 
+    Accuracy is over pairs that were drawn at random, whatever else the study asks.
     participants[]: participant, labels, left, right, equal, skip, median_response_ms, working_minutes, accuracy
     {correct, scored, accuracy, low, high} and curve [[scored, accuracy], ...], test_retest {...}; pooled: mean_accuracy
     with its t interval over people, accuracy of all answers together, test_retest of all repeats together.
@@ -49,7 +52,7 @@ def answer_report(queries: pd.DataFrame, participants: Sequence[str]) -> Result:
 
 def _participant(answered: pd.DataFrame, code: str) -> Result:
     labels = answered[answered["purpose"].isin(LEARNED_FROM)].sort_values("ordinal")
-    said = labels[labels["response"] != "skip"]
+    said = labels[(labels["response"] != "skip") & (labels["strategy"] == AT_RANDOM)]
     targets = np.array([_TARGETS[response] for response in said["response"]])
     predicted = said["predicted_right"].to_numpy(np.float64, na_value=np.nan)
     counts = labels["response"].value_counts()

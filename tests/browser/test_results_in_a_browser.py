@@ -1,0 +1,72 @@
+"""Results, exports and the API's documentation in a browser: for everybody, at every size, from this origin only."""
+
+import pytest
+from playwright.sync_api import Page
+from sqlalchemy import select
+
+from app.db import Database
+from app.domain.models import Report
+from app.domain.people import Experimenter
+from app.services import api_tokens
+from app.storage import ArtefactStore
+from tests import factories
+from tests.browser.conftest import NewPage, serious_findings
+from tests.finished_study import make_finished_study
+from worker import report_work
+from worker.analysis import figures
+from worker.analysis.report import make_report
+
+pytestmark = pytest.mark.browser
+
+SIZES = ((390, 844, "dark"), (1366, 768, "light"))
+
+
+@pytest.fixture
+def address_of_study(database: Database, store: ArtefactStore, address: str, monkeypatch: pytest.MonkeyPatch) -> str:
+    """A finished study with its report; the address of its pages."""
+    monkeypatch.setattr(figures, "DPI", 40)
+    with database.writing() as session:
+        study = make_finished_study(session, store, people=5, labels=8)
+        contents, files = make_report(report_work.tables_of(session, study))
+        stored = {name: {kind: store.put(file) for kind, file in each.items()} for name, each in files.items()}
+        run = factories.make_run(session, study, kind="report")
+        session.add(Report(study_id=study.id, run_id=run.id, basis="", contents=contents, figures=stored))
+    return f"{address}/studies/{study.slug}"
+
+
+@pytest.mark.parametrize(("width", "height", "theme"), SIZES)
+def test_pages_of_results_have_no_serious_findings_and_fit(
+    new_page: NewPage,
+    address: str,
+    address_of_study: str,
+    experimenter_cookie: str,
+    database: Database,
+    width: int,
+    height: int,
+    theme: str,
+) -> None:
+    with database.writing() as session:
+        api_tokens.create(session, session.scalars(select(Experimenter)).one(), "a notebook")
+    page = new_page(viewport={"width": width, "height": height}, color_scheme=theme)
+    page.context.add_cookies([{"name": "studio_experimenter", "value": experimenter_cookie, "url": address}])
+    elsewhere: list[str] = []
+    page.on("request", lambda request: elsewhere.append(request.url) if not request.url.startswith(address) else None)
+    for path in (
+        f"{address_of_study}/results",
+        f"{address_of_study}/export",
+        f"{address}/tokens",
+        f"{address}/api/docs",
+    ):
+        page.goto(path)
+        assert serious_findings(page) == [], path
+        assert page.evaluate("document.documentElement.scrollWidth") <= width, path
+    page.goto(f"{address_of_study}/results")
+    assert _broken_pictures(page) == []
+    assert elsewhere == []
+
+
+def _broken_pictures(page: Page) -> list[str]:
+    broken: list[str] = page.evaluate(
+        "Promise.all([...document.images].map((each) => each.decode().then(() => null, () => each.src)))"
+    )
+    return [each for each in broken if each]
