@@ -101,6 +101,8 @@ class ParticipantDetail:
     weights: Sequence[results.Weight]
     runs: Sequence[Run]
     """The newest first."""
+    liked: watching.Liked | None
+    stage_times: Sequence[watching.StageTime]
 
 
 @dataclass(frozen=True)
@@ -192,14 +194,17 @@ def participant_detail(session: Session, study: Study, participant: Participant)
     answers = _answers(session, [participant.id])[participant.id]
     times = sorted(answer.response_time_ms for answer in answers if answer.response_time_ms is not None)
     counts = Counter(answer.response for answer in answers)
+    model = _newest_reward_model(session, participant)
     return ParticipantDetail(
         study=study,
         row=_rows(session, study, [participant])[0],
         counts={response: counts[response] for response in Response},
         median_response_ms=times[len(times) // 2] if times else None,
         versions=_versions(session, [participant.id])[participant.id],
-        weights=results.learned_weights(_newest_reward_model(session, participant)),
+        weights=results.learned_weights(model),
         runs=session.scalars(select(Run).where(Run.participant_id == participant.id).order_by(Run.id.desc())).all(),
+        liked=watching.liked_clips(session, study, model),
+        stage_times=watching.stage_times(session, participant),
     )
 
 

@@ -36,6 +36,8 @@ STAGES_IN_WORDS: Mapping[Stage, str] = {
     Stage.QUESTIONNAIRE: "last questions",
     Stage.DEBRIEF: "debrief",
 }
+RANKED_CLIPS = 3
+"""At either end of a ranking."""
 BREAK_S = 120.0
 """A longer gap between two answers was a break and says nothing about the pace."""
 
@@ -48,6 +50,22 @@ class Watched:
     pace_s: float | None
     """Median time from one answer to the next."""
     advice: Advice | None
+
+
+@dataclass(frozen=True)
+class RankedClip:
+    """A clip with its learned return, in standard deviations over the clips of the study."""
+
+    clip: Clip
+    learned_return: float
+
+
+@dataclass(frozen=True)
+class Liked:
+    """The ends of a ranking, the best and the worst of them first."""
+
+    best: Sequence[RankedClip]
+    worst: Sequence[RankedClip]
 
 
 @dataclass(frozen=True)
@@ -71,6 +89,22 @@ def watched(session: Session, participant_id: int) -> Watched:
         pace_s=median(working) if len(working) >= 3 else None,
         advice=advisor.advice_of(models),
     )
+
+
+def liked_clips(session: Session, study: Study, model: Model | None) -> Liked | None:
+    """What a reward model likes best and least of the study's clips; None while it has not said."""
+    ranking = (model.metrics.get("ranking") or []) if model is not None else []
+    if len(ranking) < 2:
+        return None
+    few = min(RANKED_CLIPS, len(ranking) // 2)
+    of_study = select(Clip, Rollout).join(Rollout).where(Rollout.study_id == study.id).order_by(Clip.step_count.desc())
+    clips = {(rollout.scenario, rollout.behaviour): clip for clip, rollout in session.execute(of_study)}
+    ranked = [
+        RankedClip(clips[scenario, behaviour], learned_return)
+        for scenario, behaviour, learned_return in (*ranking[:few], *ranking[-few:])
+        if (scenario, behaviour) in clips
+    ]
+    return Liked(ranked[:few], list(reversed(ranked[few:])))
 
 
 def where_they_are(

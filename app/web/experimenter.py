@@ -9,7 +9,7 @@ from fastapi.responses import FileResponse, RedirectResponse, Response
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 from sqlalchemy.orm import Session
 
-from app.services import audit, dashboard, enrolment, publishing, studies
+from app.services import audit, dashboard, debrief, enrolment, publishing, studies
 from app.web import charts, live, task_words
 from app.web.deps import (
     ActingExperimenter,
@@ -29,7 +29,7 @@ router = APIRouter(prefix="/studies")
 
 LIST_PARTS = ("machine", "study_list")
 STUDY_PARTS = ("machine", "pool", "participants")
-PARTICIPANT_PARTS = ("machine", "participant_summary", "accuracy", "filters", "weights", "runs")
+PARTICIPANT_PARTS = ("machine", "participant_summary", "trust", "accuracy", "filters", "liked", "weights", "runs")
 
 
 def _may_stream(request: Request, studio: StudioDep) -> None:
@@ -159,11 +159,13 @@ def _study_context(session: Session, studio: Studio, slug: str) -> dict[str, Any
 
 def _participant_context(session: Session, studio: Studio, slug: str, code: str) -> dict[str, Any]:
     study = studies.find_study(session, slug)
-    detail = dashboard.participant_detail(session, study, enrolment.find_by_code(session, study, code))
+    participant = enrolment.find_by_code(session, study, code)
+    detail = dashboard.participant_detail(session, study, participant)
     return {
         "study": study,
         "settings": study.settings,
         "detail": detail,
+        "films": debrief.before_and_after(session, participant),
         "machine": dashboard.machine(session, studio.settings.data_dir),
         "chart": charts.accuracy_chart(detail.row.curve, study.settings.labels_per_participant),
         "interval": charts.interval,
