@@ -22,7 +22,8 @@ def surface() -> ResponseSurface:
     deltas = 0.01 * rng.standard_normal((600, len(SIGNALS)))
     deltas[:, SPEED] += 2 * modes[:, 0] + 0.5 * modes[:, 0] ** 2 + 3 * modes[:, 1]
     deltas[:, HEIGHT] -= modes[:, 2]
-    return fit(FAMILY, modes, deltas, rng.random(600) < 0.98 - 1.2 * np.maximum(modes[:, 1], 0.0))
+    success = rng.random(600) < 0.98 - 1.2 * np.maximum(modes[:, 1], 0.0)
+    return fit(FAMILY, modes, deltas, success.astype(np.float64))
 
 
 def likes(**weights: float) -> np.ndarray:
