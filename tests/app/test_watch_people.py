@@ -1,0 +1,152 @@
+"""What the experimenter is told about people: where they are, their pace, what deserves a look, what is liked."""
+
+from datetime import timedelta
+
+import pytest
+from fastapi.testclient import TestClient
+
+from app.db import Database, now
+from app.domain.clips import Clip, Rollout
+from app.domain.models import ModelKind
+from app.domain.participation import StageRecord
+from app.domain.preferences import Purpose, Response
+from app.domain.protocol import Stage
+from app.domain.studies import Participant, Study
+from app.services import dashboard, watching
+from app.storage import ArtefactStore
+from tests import factories
+
+
+@pytest.fixture
+def study(database: Database) -> Study:
+    with database.writing() as session:
+        return factories.make_study(
+            session, "Pilot", labels_per_participant=20, pool_scenarios=6, evaluation={}, repeated_pairs=4, debrief=True
+        )
+
+
+@pytest.fixture
+def participant(study: Study, database: Database) -> Participant:
+    with database.writing() as session:
+        return factories.make_participant(session, study)[0]
+
+
+def overview(database: Database, study: Study) -> dashboard.StudyOverview:
+    with database.reading() as session:
+        return dashboard.study_overview(session, study)
+
+
+class TestWherePeopleAre:
+    """In words, from what has been done."""
+
+    @pytest.mark.parametrize(
+        ("stage", "words"),
+        [(Stage.EVALUATION, "rating robots"), (Stage.DEBRIEF, "debrief"), (Stage.PAIRS, "comparing")],
+    )
+    def test_the_stage_that_was_entered_last_is_where_somebody_is(
+        self, study: Study, participant: Participant, database: Database, stage: Stage, words: str
+    ) -> None:
+        with database.writing() as session:
+            session.add(StageRecord(participant_id=participant.id, stage=Stage.CONSENT, finished_at=now()))
+            session.add(StageRecord(participant_id=participant.id, stage=stage))
+        assert overview(database, study).stage_counts == [(words, 1)]
+
+    def test_all_labels_given_is_not_finished_while_the_evaluation_is_to_come(
+        self, study: Study, participant: Participant, database: Database, store: ArtefactStore
+    ) -> None:
+        with database.writing() as session:
+            for query in factories.make_queries(session, store, participant, 20):
+                factories.make_label(session, query)
+        assert overview(database, study).stage_counts == [("comparing", 1)]
+
+    @pytest.mark.parametrize(("column", "words"), [("completed_at", "finished"), ("withdrawn_at", "withdrawn")])
+    def test_who_is_through_or_gone_is_counted_apart(
+        self, study: Study, participant: Participant, database: Database, column: str, words: str
+    ) -> None:
+        with database.writing() as session:
+            setattr(session.get_one(Participant, participant.id), column, now())
+            factories.make_participant(session, study, ready=False)
+        assert overview(database, study).stage_counts == [("invited", 1), (words, 1)]
+
+
+def test_the_pace_leaves_breaks_out(participant: Participant, database: Database, store: ArtefactStore) -> None:
+    with database.writing() as session:
+        moments = [3600, 3590, 3580, 3570, 60, 50]
+        for query, ago_s in zip(factories.make_queries(session, store, participant, 6), moments, strict=True):
+            factories.make_label(session, query, ago=timedelta(seconds=ago_s))
+    with database.reading() as session:
+        pace_s = watching.watched(session, participant.id).pace_s
+    assert pace_s == pytest.approx(10.0, abs=0.5)
+
+
+def test_flags_and_the_noise_ceiling_stand_beside_the_accuracy(
+    experimenter: TestClient, participant: Participant, database: Database, store: ArtefactStore
+) -> None:
+    """Somebody who always says left, and says it again when asked again."""
+    with database.writing() as session:
+        queries = factories.make_queries(session, store, participant, 20)
+        for query in queries:
+            query.predicted_right = 0.2
+            factories.make_label(session, query, Response.LEFT, response_time_ms=5000)
+        for query in queries[:4]:
+            left, right = (session.get_one(Clip, each) for each in (query.left_clip_id, query.right_clip_id))
+            again = factories.make_query(session, participant, left, right)
+            again.purpose, again.repeats_query_id = Purpose.REPEAT, query.id
+            factories.make_label(session, again, Response.LEFT, response_time_ms=5000)
+    page = experimenter.get("/studies/pilot").text
+    assert "prefers a side" in page
+    assert "same answer in a row" in page
+    assert "of at most&nbsp;100" in page
+    detail = experimenter.get("/studies/pilot/participants/P01").text
+    assert "Prefers one side of the screen" in detail
+    assert "of 4 pairs asked twice" in detail
+
+
+def test_answers_to_pairs_a_model_chose_do_not_count_for_the_accuracy(
+    study: Study, participant: Participant, database: Database, store: ArtefactStore
+) -> None:
+    with database.writing() as session:
+        for number, query in enumerate(factories.make_queries(session, store, participant, 12)):
+            query.strategy = "uniform" if number < 6 else "entropy"
+            query.predicted_right = 0.1 if number < 6 else 0.9
+            factories.make_label(session, query, Response.LEFT)
+    (row,) = overview(database, study).rows
+    assert row.curve.overall is not None
+    assert (row.curve.overall.correct, row.curve.overall.scored) == (6, 6)
+
+
+def test_the_clips_the_model_likes_best_and_least_are_shown(
+    experimenter: TestClient, study: Study, participant: Participant, database: Database, store: ArtefactStore
+) -> None:
+    with database.writing() as session:
+        clips = [factories.make_clip(session, store, study) for _ in range(8)]
+        rollouts = [session.get_one(Rollout, clip.rollout_id) for clip in clips]
+        ranking = [[rollout.scenario, rollout.behaviour, 2.0 - place] for place, rollout in enumerate(rollouts)]
+        metrics = factories.reward_metrics() | {"ranking": ranking}
+        factories.make_model(session, study, participant, ModelKind.REWARD, metrics)
+    page = experimenter.get("/studies/pilot/participants/P01").text
+    liked, _, least = page.partition("Liked least")
+    assert [clip.video_sha256 in liked for clip in clips] == [True] * 3 + [False] * 5
+    assert [clip.video_sha256 in least for clip in clips] == [False] * 5 + [True] * 3
+
+
+@pytest.mark.parametrize(("advisor", "shown"), [("show", True), ("log", False)])
+def test_the_advice_is_shown_only_where_the_study_wants_it(
+    experimenter: TestClient, database: Database, advisor: str, shown: bool
+) -> None:
+    with database.writing() as session:
+        study = factories.make_study(session, "Advised", advisor=advisor)
+        person, _ = factories.make_participant(session, study)
+        for labels in (10, 20, 30):
+            metrics = {"advice": {"expected_regret": 0.1}}
+            factories.make_model(session, study, person, ModelKind.REWARD, metrics, labels=labels)
+    assert ("enough answers" in experimenter.get("/studies/advised").text) is shown
+
+
+def test_somebody_erased_keeps_a_row_and_nothing_to_press(
+    experimenter: TestClient, participant: Participant, database: Database
+) -> None:
+    experimenter.post("/studies/pilot/participants/P01/erase", data={"typed": "P01"})
+    page = experimenter.get("/studies/pilot").text
+    assert "erased" in page
+    assert experimenter.get("/studies/pilot/participants/P01").status_code == 200
