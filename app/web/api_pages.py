@@ -57,9 +57,7 @@ def create_token(
 
 
 @router.post("/tokens/{token_id}/revoke", name="revoke_token")
-def revoke_token(
-    request: Request, token_id: RowId, experimenter: OwnAccount, session: WritingSession
-) -> Response:
+def revoke_token(request: Request, token_id: RowId, experimenter: OwnAccount, session: WritingSession) -> Response:
     """Make a token worthless."""
     api_tokens.revoke(session, experimenter, token_id)
     return RedirectResponse(request.app.url_path_for("show_tokens"), HTTPStatus.SEE_OTHER)
