@@ -210,14 +210,12 @@ def _rehearse(options: argparse.Namespace) -> int:
             database = Database(studio.settings.sqlalchemy_url)
             store = ArtefactStore(directory / "artefacts")
             rehearsed = rehearsal.Rehearsal(database, store, studio.settings.base_url, options.pace)
-            outcomes = rehearsed.run(options.task, _tastes(options), _settings(options), _manner(options), options.seed)
+            done = rehearsed.run(options.task, _tastes(options), _settings(options), _manner(options), options.seed)
             database.dispose()
-        for each in outcomes:
-            target = directory / f"{each.code}-{each.taste.name}.zip"
-            target.write_bytes(each.bundle)
-        sys.stdout.write(rehearsal.summary(outcomes) + "\n")
+        rehearsal.write(done, directory / "rehearsed")
+        sys.stdout.write(rehearsal.summary(done) + "\n")
         if options.directory:
-            sys.stdout.write(f"Bundles and logs are in {directory}\n")
+            sys.stdout.write(f"Figures, tables, bundles and numbers are in {directory / 'rehearsed'}\n")
     return 0
 
 

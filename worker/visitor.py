@@ -56,6 +56,14 @@ class Visitor:
         if "/password" in self._page.address:
             self._send_first({"current": password, "new": chosen, "again": chosen})
 
+    def fill_in(self, path: str, **filled_in: str) -> None:
+        """Open the page at this address and send its form to the same address."""
+        self._open(path)
+        form = self._page.form_to(re.compile(rf"{re.escape(path)}$"))
+        if form is None:
+            raise WentAstray(f"There is no form to {path} on {self._page.address}.")
+        self._send(form.target.group(0), {**form.fields, **filled_in})
+
     def download(self, path: str) -> bytes:
         """The bytes behind an address."""
         response = self._client.get(path)
@@ -131,7 +139,7 @@ class _Form:
 
 
 class _Page(HTMLParser):
-    """The forms of a page with the fields a person would leave as they are; boxes are ticked."""
+    """The forms of a page with the fields a person would leave as they are; boxes are ticked, nothing is chosen."""
 
     def __init__(self, address: str, text: str) -> None:
         super().__init__()
@@ -151,5 +159,7 @@ class _Page(HTMLParser):
         named = {name: value or "" for name, value in attrs}
         if tag == "form" and named.get("method", "").lower() == "post":
             self.forms.append((named.get("action", ""), {}))
+        elif tag == "input" and named.get("type") == "radio" and "checked" not in named:
+            return
         elif tag in {"input", "button"} and self.forms and named.get("name"):
             self.forms[-1][1].setdefault(named["name"], named.get("value", "on"))

@@ -62,7 +62,7 @@ def outcome(studio: OwnStudio, database: Database) -> Outcome:
     store = ArtefactStore(studio.settings.data_dir / "artefacts")
     rehearsal = Rehearsal(database, store, studio.settings.base_url)
     manner = Manner(mistakes=0.1, equal_share=0.1, skip_share=0.1)
-    (outcome,) = rehearsal.run("feeding", [TASTES["cautious"]], settings, manner, seed=1)
+    (outcome,) = rehearsal.run("feeding", [TASTES["cautious"]], settings, manner, seed=1).outcomes
     assert wait_for(lambda: _has_films(database)), "nobody was filmed before and after"
     for killer in killers:
         killer.join()

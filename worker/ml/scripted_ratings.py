@@ -43,9 +43,13 @@ class ScriptedRater:
 
     def rate(self, preference_return: float, success: bool) -> tuple[int, int]:
         """Satisfaction and personalisation, 1 to 5 each."""
-        share = float(np.searchsorted(self._seen, preference_return)) / len(self._seen)
+        share = self.share(preference_return)
         weight = self._manner.success_share
         return self._points((1 - weight) * share + weight * success), self._points(share)
+
+    def share(self, preference_return: float) -> float:
+        """q: the share of what was seen that is worse."""
+        return float(np.searchsorted(self._seen, preference_return)) / len(self._seen)
 
     def _points(self, share: float) -> int:
         felt = share + self._bias + float(self._rng.normal(0.0, self._manner.noise))
