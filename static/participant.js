@@ -23,16 +23,6 @@ for (const button of document.querySelectorAll("[data-copy]")) {
   });
 }
 
-for (const button of document.querySelectorAll("[data-play-both]")) {
-  const films = [...document.querySelectorAll("[data-films] video")];
-  button.hidden = false;
-  button.addEventListener("click", () => {
-    for (const film of films) film.currentTime = 0;
-    for (const film of films) film.play().catch(() => {}); // its own controls still work
-    button.textContent = button.dataset.again;
-  });
-}
-
 for (const form of document.querySelectorAll("form[data-once]")) {
   form.addEventListener("submit", (event) => {
     if (form.dataset.sent) event.preventDefault();
