@@ -167,6 +167,14 @@ def _add_rehearsal(commands: _Commands) -> None:
     rehearse.add_argument("--paper", action="store_true", help="the paper's whole protocol, robots rated in the end")
     rehearse.add_argument("--fine-tuning-steps", type=int, default=100_000, help="of PrefFT, with --paper")
     rehearse.add_argument("--retrain-every", type=int, default=10)
+    milestones = StudySettings.model_fields["filter_milestones"].default
+    rehearse.add_argument(
+        "--milestones",
+        nargs="*",
+        type=int,
+        default=list(milestones),
+        help="labels after which a filter is trained early",
+    )
     rehearse.add_argument("--clip-scenarios", type=int, help="size of the pool; default: just enough pairs")
     rehearse.add_argument("--method", type=Method, choices=list(Method), default=Method.STUDIO)
     rehearse.add_argument("--reward", type=RewardKind, choices=list(RewardKind), default=RewardKind.STRUCTURED)
@@ -241,6 +249,7 @@ def _settings(options: argparse.Namespace) -> StudySettings:
     chosen = {
         "labels_per_participant": options.labels,
         "retrain_every_labels": options.retrain_every,
+        "filter_milestones": tuple(options.milestones),
         "pool_scenarios": options.clip_scenarios or -(-options.labels // pairs_per_scenario),
         "method": options.method,
         "reward_kind": options.reward,
