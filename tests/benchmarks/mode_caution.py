@@ -17,27 +17,12 @@ from worker.ml.response_surface import ResponseSurface
 from worker.ml.reward_training import SignalScale
 from worker.ml.segments import SegmentPairs
 from worker.ml.teachers import OMEGA, Manner, ScriptedTeacher, User
-from worker.sim.costs import SPEED_SCALE_M_S, base_weights, preference_rewards
+from worker.sim.costs import preference_rewards, signal_weights
 from worker.sim.rollout import rollout
-from worker.trajectory import COSTS, SIGNALS
 
 TASK = laboratory.task("feeding")
 CLIP_STEPS, SEEDS, SCENARIOS = 60, 6, 36
 TARGETS = {"left": 0.0, "right": 1.0, "equal": 0.5}
-SIGNAL_OF = dict(
-    zip(
-        COSTS,
-        (
-            "distance_m",
-            "speed_squared_m2_s2",
-            "force_away_n",
-            "high_force_n",
-            "spilled_on_person",
-            "intake_speed_m_s",
-        ),
-        strict=True,
-    )
-)
 
 
 def main() -> None:
@@ -69,18 +54,9 @@ def main() -> None:
                 for caution, found in gains.items():
                     with patch.object(response_surface, "CAUTION", caution):
                         mode = response_surface.best_mode(surface, model.signal_weights([]), seed)
-                    found.append(float(surface.predict(mode)[0] @ true_weights(user)) / unit)
+                    found.append(float(surface.predict(mode)[0] @ signal_weights(TASK, OMEGA[user])) / unit)
         cells = (f"{caution:g}: {np.mean(each):+.1f} (worst {min(each):+.1f})" for caution, each in gains.items())
         sys.stdout.write(f"{count:4d} labels  " + "   ".join(cells) + "\n")
-
-
-def true_weights(user: User) -> np.ndarray:
-    """(S,) the user's preference reward per unit of each signal."""
-    weights = np.zeros(len(SIGNALS))
-    for name, weight, omega in zip(COSTS, base_weights(TASK, "calibrated"), OMEGA[user], strict=True):
-        unit = SPEED_SCALE_M_S if name == "C_v" else 1.0
-        weights[SIGNALS.index(SIGNAL_OF[name])] -= weight * omega / unit
-    return weights
 
 
 if __name__ == "__main__":

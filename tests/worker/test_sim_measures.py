@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from worker.sim.costs import base_weights, cost_items, preference_rewards
+from worker.sim.costs import base_weights, cost_items, preference_rewards, signal_weights
 from worker.sim.feeding import FEEDING
 from worker.sim.measures import Outcome, StepMeasures, TaskReward
 from worker.trajectory import COSTS, SIGNALS
@@ -175,3 +175,13 @@ def test_omega_scales_one_items_share() -> None:
     costs, signals = one_step(C_d=0.4, C_fd=1.0)
     omega = [1, 1, 1, 1, 5, 1]
     assert preference_rewards(FEEDING, costs, signals, omega, "paper")[0] == pytest.approx(-5.4)
+
+
+def test_a_persons_reward_is_linear_in_the_measured_signals() -> None:
+    signals = replace(STILL, force_away_n=3.0, speed_squared_m2_s2=0.2, target_m=np.array([0.3, 0.0, 1.2])).signals()
+    costs = replace(STILL, force_away_n=3.0, speed_squared_m2_s2=0.2, target_m=np.array([0.3, 0.0, 1.2])).costs()
+    omega, more = [1, 3, 2, 1, 1, 5], {"tilt_rad": 0.3, "lateral_offset_m": -2.0}
+    for task in (FEEDING, replace(FEEDING, pieces=32)):
+        measured = np.array([list(signals.values())])
+        paid = preference_rewards(task, np.array([list(costs.values())]), measured, omega, per_signal=more)
+        assert measured @ signal_weights(task, omega, more) == pytest.approx(paid)

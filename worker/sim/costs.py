@@ -43,6 +43,34 @@ def base_weights(task: Task, form: CostForm = "calibrated") -> FloatArray:
     return weights
 
 
+SIGNAL_OF: Mapping[str, str] = MappingProxyType(
+    {
+        "C_d": "distance_m",
+        "C_v": "speed_squared_m2_s2",
+        "C_f": "force_away_n",
+        "C_hf": "high_force_n",
+        "C_fd": "spilled_on_person",
+        "C_fdv": "intake_speed_m_s",
+    }
+)
+"""Which signal each calibrated item is a multiple of."""
+
+
+def signal_weights(
+    task: Task, omega: npt.ArrayLike = 1.0, per_signal: Mapping[str, float] = MappingProxyType({})
+) -> FloatArray:
+    """(S,) such that summed signals @ weights is the summed calibrated preference_rewards() of the same person."""
+    items = base_weights(task) * np.asarray(omega, np.float64)
+    items[_SPEED] /= SPEED_SCALE_M_S
+    items[_PIECES] *= PIECES_AT_WEIGHT_ONE / task.pieces
+    weights = np.zeros(len(SIGNALS))
+    for name, weight in zip(COSTS, items, strict=True):
+        weights[SIGNALS.index(SIGNAL_OF[name])] -= weight
+    for name, cost in per_signal.items():
+        weights[SIGNALS.index(name)] -= cost
+    return weights
+
+
 def cost_items(task: Task, costs: Array, signals: Array, form: CostForm = "calibrated") -> FloatArray:
     """The six unweighted items of a form: costs (..., 6) and signals (..., S) of a trajectory -> (..., 6)."""
     items = np.array(costs, np.float64)

@@ -1,0 +1,45 @@
+"""Exploring what modes change: at random, and where people would want to go."""
+
+from pathlib import Path
+
+import numpy as np
+
+from worker import exploration, laboratory
+from worker.exploration import BLOCK, MODES_PER_SCENARIO, Block
+from worker.ml.response_surface import ResponseSurface
+
+FEEDING = laboratory.task("feeding")
+
+
+def sought(number: int, work: Path) -> list[Block]:
+    surface = ResponseSurface.load(exploration.surface_file("feeding"), FEEDING.modes)
+    return exploration.sought_blocks(FEEDING, surface, number, work)
+
+
+def test_modes_that_people_want_lie_at_the_edges_where_random_modes_are_rare(tmp_path: Path) -> None:
+    axes = FEEDING.modes.axes
+    low, high = np.array([axis.low for axis in axes]), np.array([axis.high for axis in axes])
+    wanted = np.concatenate([block.modes.reshape(-1, len(axes)) for block in sought(0, tmp_path)])
+    random = FEEDING.modes.sample(len(wanted), np.random.default_rng(0))
+    assert (wanted >= low - 1e-6).all()
+    assert (wanted <= high + 1e-6).all()
+
+    def near_an_edge(modes: np.ndarray) -> float:
+        return float((np.minimum(modes - low, high - modes) < 0.05 * (high - low)).mean())
+
+    assert near_an_edge(wanted) > 3 * near_an_edge(random)
+
+
+def test_every_round_seeks_anew_and_the_same_again_when_repeated(tmp_path: Path) -> None:
+    first, again, second = sought(0, tmp_path), sought(0, tmp_path), sought(1, tmp_path)
+    assert all(np.array_equal(one.modes, other.modes) for one, other in zip(first, again, strict=True))
+    assert {block.first for block in first}.isdisjoint(block.first for block in second)
+
+
+def test_a_block_that_was_run_in_other_modes_is_run_again(tmp_path: Path) -> None:
+    modes = FEEDING.modes.sample(BLOCK * MODES_PER_SCENARIO, np.random.default_rng(0)).reshape(BLOCK, -1, 5)
+    block = Block("feeding", 1, modes, tmp_path / "block.npz")
+    assert not block.is_there()
+    np.savez(block.file, modes=modes.reshape(-1, 5))
+    assert block.is_there()
+    assert not Block("feeding", 1, modes + 0.1, block.file).is_there()
