@@ -16,8 +16,9 @@ from app.domain.evaluation import Film, Rating, Trial
 from app.domain.models import Bundle, Model, ModelKind, Run, RunKind, RunStatus, WorkerPresence
 from app.domain.participation import StageRecord
 from app.domain.preferences import LEARNED_FROM, LabelEvent, Query, Response
+from app.domain.protocol import Stage
 from app.domain.studies import Participant, Strategy, Study
-from app.services import accuracy, results, watching
+from app.services import accuracy, results, stages, watching
 
 WORKER_SILENCE = timedelta(seconds=15)
 DISK_LOW_BYTES = 2 * 1024**3
@@ -33,6 +34,15 @@ class Machine:
     worker_alive: bool
     disk_free_bytes: int
     disk_low: bool
+
+
+@dataclass(frozen=True)
+class Job:
+    """A run that deserves a line: at work, about to be tried again, or failed and not made good since."""
+
+    run: Run
+    code: str | None
+    """Whom it is for; None: the whole study."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +66,8 @@ class ParticipantRow:
     active: bool
     answered: int
     wanted: int
+    counts: Mapping[Response, int]
+    """Answers by kind."""
     curve: accuracy.Curve
     run: Run | None
     """What the worker is doing for them, or what failed; None when nothing is to be said."""
@@ -74,6 +86,8 @@ class StudyLine:
     labels_wanted: int
     clips: int
     clips_wanted: int
+    failed: int
+    """Runs that failed and wait for somebody."""
 
 
 @dataclass(frozen=True)
@@ -84,6 +98,8 @@ class StudyOverview:
     pool: Pool
     rows: Sequence[ParticipantRow]
     stage_counts: Sequence[tuple[str, int]]
+    jobs: Sequence[Job]
+    """Failures first, then the newest first."""
     answers_today: int
     disk_use_bytes: int
 
@@ -94,11 +110,11 @@ class ParticipantDetail:
 
     study: Study
     row: ParticipantRow
-    counts: Mapping[Response, int]
     median_response_ms: int | None
     versions: Sequence[results.FilterVersion]
     """The newest first."""
     weights: Sequence[results.Weight]
+    taste: results.Taste | None
     runs: Sequence[Run]
     """The newest first."""
     liked: watching.Liked | None
@@ -164,14 +180,25 @@ def study_lines(session: Session) -> Sequence[StudyLine]:
             StudyLine(
                 study=study,
                 participants=len(given),
-                finished=sum(count >= wanted for count in given),
+                finished=_finished(study, people[study.id], given),
                 labels=sum(given),
                 labels_wanted=wanted * len(given),
                 clips=clips.get(study.id, 0),
                 clips_wanted=_clips_wanted(study),
+                failed=sum(job.run.status == RunStatus.FAILED for job in _jobs(session, study)),
             )
         )
     return lines
+
+
+def _finished(study: Study, people: Sequence[Participant], given: Sequence[int]) -> int:
+    """How many are through with everything; where comparing is all, with comparing."""
+    settings = study.settings
+    comparing_is_all = stages.stages_of(settings)[-1] is Stage.PAIRS
+    return sum(
+        person.completed_at is not None or (comparing_is_all and count >= settings.labels_per_participant)
+        for person, count in zip(people, given, strict=True)
+    )
 
 
 def study_overview(session: Session, study: Study) -> StudyOverview:
@@ -184,6 +211,7 @@ def study_overview(session: Session, study: Study) -> StudyOverview:
         _pool(session, study),
         rows,
         watching.stage_counts({row.participant.id: row.stage for row in rows}),
+        _jobs(session, study),
         watching.answers_today(session, study),
         watching.disk_use(session, study),
     )
@@ -193,15 +221,14 @@ def participant_detail(session: Session, study: Study, participant: Participant)
     """One participant: answers, models, filters, runs."""
     answers = _answers(session, [participant.id])[participant.id]
     times = sorted(answer.response_time_ms for answer in answers if answer.response_time_ms is not None)
-    counts = Counter(answer.response for answer in answers)
     model = _newest_reward_model(session, participant)
     return ParticipantDetail(
         study=study,
         row=_rows(session, study, [participant])[0],
-        counts={response: counts[response] for response in Response},
         median_response_ms=times[len(times) // 2] if times else None,
         versions=_versions(session, [participant.id])[participant.id],
         weights=results.learned_weights(model),
+        taste=results.taste(model),
         runs=session.scalars(select(Run).where(Run.participant_id == participant.id).order_by(Run.id.desc())).all(),
         liked=watching.liked_clips(session, study, model),
         stage_times=watching.stage_times(session, participant),
@@ -221,6 +248,7 @@ def _rows(session: Session, study: Study, people: Sequence[Participant]) -> Sequ
             active=person.last_seen_at is not None and now() - person.last_seen_at < ACTIVE_WITHIN,
             answered=len(answers[person.id]),
             wanted=wanted,
+            counts=_counts(answers[person.id]),
             curve=accuracy.curve(_hits(answers[person.id])),
             run=runs.get(person.id),
             newest_filter=versions[person.id][0] if versions[person.id] else None,
@@ -228,6 +256,11 @@ def _rows(session: Session, study: Study, people: Sequence[Participant]) -> Sequ
         )
         for person in people
     ]
+
+
+def _counts(answers: Iterable[_Answer]) -> Mapping[Response, int]:
+    counted = Counter(answer.response for answer in answers)
+    return {response: counted[response] for response in Response}
 
 
 def _hits(answers: Iterable[_Answer]) -> Sequence[bool]:
@@ -305,8 +338,34 @@ def _noteworthy(runs: Sequence[Run]) -> Run | None:
     working = [run for run in runs if run.status in (RunStatus.RUNNING, RunStatus.RETRY)]
     if working:
         return working[-1]
-    newest_of_kind = {run.kind: run for run in runs}
-    return next((run for run in newest_of_kind.values() if run.status == RunStatus.FAILED), None)
+    newest = {_work_of(run): run for run in runs}
+    return next((run for run in newest.values() if run.status == RunStatus.FAILED), None)
+
+
+def _jobs(session: Session, study: Study) -> Sequence[Job]:
+    """Of everybody still in the study, and of the study itself."""
+    runs = session.execute(
+        select(Run, Participant)
+        .outerjoin(Participant, Participant.id == Run.participant_id)
+        .where(Run.study_id == study.id, Participant.is_preview.is_not(True), Participant.withdrawn_at.is_(None))
+        .order_by(Run.id)
+    )
+    newest: dict[tuple[str, str | None], Job] = {}
+    working: list[Job] = []
+    for run, participant in runs:
+        job = Job(run, participant.code if participant is not None else None)
+        newest[_work_of(run), job.code] = job
+        if run.status in (RunStatus.RUNNING, RunStatus.RETRY):
+            working.append(job)
+    failed = [job for job in newest.values() if job.run.status == RunStatus.FAILED]
+    return [*sorted(failed, key=lambda job: -job.run.id), *reversed(working)]
+
+
+def _work_of(run: Run) -> str:
+    """What a later run of the same work makes good: of films and methods each has its own, and so has every export."""
+    if run.kind in (RunKind.METHOD, RunKind.FILMS):
+        return run.workflow_id.rpartition("/")[0]
+    return run.workflow_id if run.kind == RunKind.EXPORT else run.kind
 
 
 def _pool(session: Session, study: Study) -> Pool:

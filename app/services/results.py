@@ -1,6 +1,6 @@
 """What the worker measured, read from the metrics of its models. Anything missing is None, never a guess."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from enum import StrEnum
@@ -52,6 +52,16 @@ class Weight:
     mean: float
     low: float
     high: float
+
+
+@dataclass(frozen=True)
+class Taste:
+    """What a reward model, of whatever kind, thinks of the paper's six costs in the study's clips."""
+
+    weights: Sequence[Weight]
+    """The strongest first; positive: liked."""
+    explained: float
+    """Share of what the model thinks of the clips that these costs account for."""
 
 
 @dataclass(frozen=True)
@@ -109,8 +119,14 @@ class _Weight(_Metrics):
     high: float
 
 
+class _Costs(_Metrics):
+    weights: dict[str, _Weight]
+    explained: float
+
+
 class _Reward(_Metrics):
     weights: dict[str, _Weight] = Field(default_factory=dict)
+    costs: _Costs | None = None
 
 
 def filter_version(model: Model, bundle: Bundle | None) -> FilterVersion:
@@ -138,7 +154,16 @@ def learned_weights(model: Model | None) -> Sequence[Weight]:
     """The weights of the newest reward model, the strongest first; empty when it has none to show."""
     if model is None:
         return []
-    weights = _read(_Reward, model.metrics).weights
+    return _strongest_first(_read(_Reward, model.metrics).weights)
+
+
+def taste(model: Model | None) -> Taste | None:
+    """What the newest reward model thinks of the six costs; None when it has not said."""
+    costs = _read(_Reward, model.metrics).costs if model is not None else None
+    return None if costs is None else Taste(_strongest_first(costs.weights), costs.explained)
+
+
+def _strongest_first(weights: Mapping[str, _Weight]) -> Sequence[Weight]:
     found = [Weight(name, weight.mean, weight.low, weight.high) for name, weight in weights.items()]
     return sorted(found, key=lambda weight: -abs(weight.mean))
 

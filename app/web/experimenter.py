@@ -28,8 +28,8 @@ from app.web.templating import fragment, page
 router = APIRouter(prefix="/studies")
 
 LIST_PARTS = ("machine", "study_list")
-STUDY_PARTS = ("machine", "pool", "participants")
-PARTICIPANT_PARTS = ("machine", "participant_summary", "trust", "accuracy", "filters", "liked", "weights", "runs")
+STUDY_PARTS = ("machine", "jobs", "pool", "participants")
+PARTICIPANT_PARTS = ("machine", "participant_summary", "trust", "accuracy", "weights", "liked", "filters", "runs")
 
 
 def _may_stream(request: Request, studio: StudioDep) -> None:

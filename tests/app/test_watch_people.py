@@ -7,7 +7,7 @@ from fastapi.testclient import TestClient
 
 from app.db import Database, now
 from app.domain.clips import Clip, Rollout
-from app.domain.models import ModelKind
+from app.domain.models import ModelKind, RunKind, RunStatus
 from app.domain.participation import StageRecord
 from app.domain.preferences import Purpose, Response
 from app.domain.protocol import Stage
@@ -141,6 +141,70 @@ def test_the_advice_is_shown_only_where_the_study_wants_it(
             metrics = {"advice": {"expected_regret": 0.1}}
             factories.make_model(session, study, person, ModelKind.REWARD, metrics, labels=labels)
     assert ("enough answers" in experimenter.get("/studies/advised").text) is shown
+    assert ("more answers could gain" in experimenter.get("/studies/advised/participants/P01").text) is shown
+
+
+def test_what_was_learned_is_said_in_words_about_the_six_costs_whatever_the_model(
+    experimenter: TestClient, study: Study, participant: Participant, database: Database
+) -> None:
+    weights = {
+        "C_v": {"mean": -0.6, "low": -0.8, "high": -0.4},
+        "C_hf": {"mean": 0.3, "low": 0.1, "high": 0.5},
+        "C_d": {"mean": 0.1, "low": -0.2, "high": 0.4},
+    }
+    with database.writing() as session:
+        factories.make_model(
+            session, study, participant, ModelKind.REWARD, {"costs": {"weights": weights, "explained": 0.5}}
+        )
+    page = " ".join(experimenter.get("/studies/pilot/participants/P01").text.split())
+    assert "Dislikes speed of the spoon. Likes high force at the mouth. About the rest" in page
+    assert "account for 50 %" in page
+
+
+def test_answers_to_either_side_are_counted_beside_the_pace(
+    experimenter: TestClient, participant: Participant, database: Database, store: ArtefactStore
+) -> None:
+    with database.writing() as session:
+        said = [Response.LEFT, Response.LEFT, Response.RIGHT, Response.SKIP]
+        for query, response in zip(factories.make_queries(session, store, participant, 4), said, strict=True):
+            factories.make_label(session, query, response)
+    assert "2 left, 1 right, 1 can\N{RIGHT SINGLE QUOTATION MARK}t tell" in experimenter.get("/studies/pilot").text
+
+
+def test_every_job_that_failed_or_is_at_work_is_listed_with_its_error_and_a_button(
+    experimenter: TestClient, study: Study, participant: Participant, database: Database
+) -> None:
+    failed = {"status": RunStatus.FAILED, "error": "The disk was full."}
+    with database.writing() as session:
+        for method, columns in (("prefft", failed), ("pbarl", {})):
+            run = factories.make_run(session, study, participant, kind=RunKind.METHOD, **columns)
+            run.workflow_id = f"method/participant-1/{method}/labels"
+        factories.make_run(session, study, kind=RunKind.REPORT, status=RunStatus.FAILED, error="A bad day.")
+        factories.make_run(session, study, kind=RunKind.REPORT)
+        factories.make_run(session, study, kind=RunKind.CLIPS, status=RunStatus.RUNNING, stage="clip 3")
+    jobs = overview(database, study).jobs
+    assert [(job.run.kind, job.code) for job in jobs] == [("method", "P01"), ("clips", None)]
+    page = experimenter.get("/studies/pilot").text.partition('id="jobs-title"')[2]
+    assert "The disk was full." in page
+    assert f"/studies/pilot/runs/{jobs[0].run.id}/retry" in page
+    assert "A bad day." not in page
+    assert "1 failed job<" in experimenter.get("/studies").text
+
+
+def test_finished_on_the_list_of_studies_are_those_who_are_through_with_everything(
+    study: Study, participant: Participant, database: Database, store: ArtefactStore
+) -> None:
+    def finished() -> int:
+        with database.reading() as session:
+            return dashboard.study_lines(session)[0].finished
+
+    with database.writing() as session:
+        for query in factories.make_queries(session, store, participant, 20):
+            factories.make_label(session, query)
+    assert finished() == 0, "the evaluation is still to come"
+    with database.writing() as session:
+        session.get_one(Participant, participant.id).completed_at = now()
+    assert finished() == 1
 
 
 def test_somebody_erased_keeps_a_row_and_nothing_to_press(

@@ -47,6 +47,29 @@ def test_clips_are_ranked_by_what_the_model_likes(
     assert returns.std() == pytest.approx(1.0, abs=1e-2)
 
 
+def test_what_a_model_thinks_of_the_six_costs_is_found_whatever_it_was_learned_from(rng: np.random.Generator) -> None:
+    costs = rng.standard_normal((60, 6)) * (1.0, 10.0, 0.1, 5.0, 1.0, 0.0)
+    wishes = np.array([0.0, -0.3, 0.0, -0.2, 0.0, 0.0]) + 0.02 * rng.standard_normal((6, 6))
+    found = insight.weights_of_costs(costs, wishes @ costs.T)
+    weights = found["weights"]
+    assert list(weights) == ["C_d", "C_v", "C_f", "C_hf", "C_fd"], "the last one is the same in all clips"
+    assert [name for name, each in weights.items() if each["high"] < 0] == ["C_v", "C_hf"]
+    assert weights["C_v"]["mean"] < weights["C_hf"]["mean"]
+    assert found["explained"] > 0.95
+
+
+def test_a_model_that_wants_something_else_explains_little_by_the_costs(rng: np.random.Generator) -> None:
+    costs, returns = rng.standard_normal((200, 6)), rng.standard_normal((8, 200))
+    found = insight.weights_of_costs(costs, returns)
+    assert found["explained"] < 0.2
+    assert np.mean([each["low"] < 0 < each["high"] for each in found["weights"].values()]) > 0.6
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(5)
+
+
 @pytest.fixture(scope="module")
 def surface() -> ResponseSurface:
     return ResponseSurface.load(surface_file("feeding"), task("feeding").modes)
