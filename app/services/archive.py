@@ -2,6 +2,7 @@
 
     manifest.json          format, version, and what every other file must hash to
     rows/<table>.jsonl     rows with the ids they had; of links of participants and of joining nothing
+    rows/<table>.sealed    instead, for what says which letter hides which method, while a study is blinded
     files/<sha256>         artefacts under the hash of their content
 
 Tables are found by their foreign keys, so a new one belongs to it by itself. On import ids are given anew, everything
@@ -9,11 +10,13 @@ is checked before anything is kept, and participants get new links. What can be 
 it, and neither are browsers' sessions, previews and the audit log of the installation.
 """
 
+import base64
 import hashlib
 import json
 import re
 import uuid
 import zipfile
+import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
@@ -29,7 +32,7 @@ from app.domain.models import Export, Report, Run, RunKind, RunStatus
 from app.domain.people import BrowserSession
 from app.domain.studies import Participant, Study, StudySettings
 from app.errors import AppError
-from app.services import audit, enrolment, exporting, studies
+from app.services import audit, enrolment, exporting, studies, unblinding
 from app.services.withdrawal import ARTEFACT_COLUMNS, in_use
 from app.storage import ArtefactStore
 
@@ -37,6 +40,8 @@ FORMAT, VERSION = "pbarl-studio-archive", 1
 LEFT_OUT = {each.__tablename__ for each in (BrowserSession, Report, Export)}
 SECRETS = {"study": {"join_token"}, "participant": {"token_sha256"}}
 """Columns that never leave: with them somebody could answer in somebody else's name."""
+KEY_TABLES = {"assignment", "trial"}
+"""Letters with their methods, and with their films."""
 _REMADE = (RunKind.REPORT, RunKind.EXPORT)
 _PLACES = {"participant": "participant", "study": "study", "answer": "label_event"}
 """What the numbers in names of runs are ids of: reward/participant-12/labels-200/answer-345."""
@@ -77,8 +82,9 @@ def write(session: Session, store: ArtefactStore, study: Study, path: Path) -> N
         for table, condition in _tables_of(study.id):
             rows = [_as_stored(table, row) for row in session.execute(_select(table, condition)).mappings()]
             content = "".join(json.dumps(row, ensure_ascii=False) + "\n" for row in rows).encode()
-            archive.writestr(f"rows/{table.name}.jsonl", content)
-            tables[table.name] = {"rows": len(rows), "sha256": hashlib.sha256(content).hexdigest()}
+            sealed = table.name in KEY_TABLES and unblinding.is_blinded(study)
+            archive.writestr(_place(table.name, sealed), _seal(content) if sealed else content)
+            tables[table.name] = {"rows": len(rows), "sha256": hashlib.sha256(content).hexdigest(), "sealed": sealed}
             for sha256 in sorted(set(_artefacts(table.name, rows)) - files.keys()):
                 if store.has(sha256):  # what was lost long ago must not keep the rest from being saved
                     stored = store.read(sha256)
@@ -95,6 +101,22 @@ def write(session: Session, store: ArtefactStore, study: Study, path: Path) -> N
             "files": files,
         }
         archive.writestr("manifest.json", json.dumps(manifest, indent=2))
+
+
+def _place(table_name: str, sealed: bool) -> str:
+    return f"rows/{table_name}.{'sealed' if sealed else 'jsonl'}"
+
+
+def _seal(content: bytes) -> bytes:
+    """Nobody reads this by accident, nor finds it by searching. It is no secret from those who want to know."""
+    return base64.b64encode(zlib.compress(content))
+
+
+def _unseal(content: bytes) -> bytes:
+    try:
+        return zlib.decompress(base64.b64decode(content, validate=True))
+    except zlib.error as error:
+        raise ArchiveInvalid from error
 
 
 def _tables_of(study_id: int) -> Iterator[tuple[Table, ColumnElement[bool]]]:
@@ -188,7 +210,9 @@ def _rows(archive: zipfile.ZipFile, name: str, manifest: Mapping[str, Any]) -> l
     table = Base.metadata.tables.get(name)
     if table is None or name in LEFT_OUT:
         raise ArchiveInvalid(f"This archive holds a table that this version does not know: {name[:40]}.")
-    content = archive.read(f"rows/{name}.jsonl")
+    sealed = bool(manifest["tables"][name].get("sealed"))
+    content = archive.read(_place(name, sealed))
+    content = _unseal(content) if sealed else content
     if hashlib.sha256(content).hexdigest() != manifest["tables"][name]["sha256"]:
         raise ArchiveInvalid(f"The table {name} in this archive is damaged. Nothing was imported.")
     rows = [json.loads(line) for line in content.decode().splitlines()]

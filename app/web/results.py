@@ -18,6 +18,7 @@ from app.services import (
     export_requests,
     export_tables,
     exporting,
+    locking,
     reports,
     roles,
     studies,
@@ -137,16 +138,17 @@ def show_exports(
 ) -> Response:
     """Every table, the whole as one file, and the archive."""
     study = studies.find_study(session, slug)
+    exports = [(export, export_requests.run_of(session, export)) for export in export_requests.of_study(session, study)]
     context = {
         "study": study,
         "experimenter": experimenter,
+        "deviations": len(locking.deviations(session, study)),
+        "waiting": any(export.finished_at is None for export, _ in exports),
+        "exports": exports,
         "blinded": unblinding.is_blinded(study),
         "tables": export_tables.TABLES,
         "provenance": exporting.provenance_of(session, study),
         "may_export": roles.may(experimenter, Role.EXPERIMENTER),
-        "exports": [
-            (export, export_requests.run_of(session, export)) for export in export_requests.of_study(session, study)
-        ],
     }
     return page(request, "experimenter/export.html", context)
 

@@ -18,7 +18,7 @@ from app.domain.models import Run, RunStatus
 from app.domain.preferences import Query
 from app.domain.studies import Participant, Study
 from app.main import create_app
-from app.services import archive, enrolment, export_tables, exporting, withdrawal
+from app.services import archive, enrolment, export_tables, exporting, unblinding, withdrawal
 from app.services.archive import ArchiveInvalid
 from app.settings import Settings
 from app.storage import ArtefactStore
@@ -99,6 +99,27 @@ def test_a_study_that_was_imported_exports_the_same(
     with zipfile.ZipFile(packed) as file:
         for sha256 in json.loads(file.read("manifest.json"))["files"]:
             assert hashlib.sha256(there.store.read(sha256)).hexdigest() == sha256
+
+
+def test_the_archive_of_a_blinded_study_shows_no_key_and_arrives_with_it(
+    database: Database, store: ArtefactStore, elsewhere: FastAPI, study: Study, tmp_path: Path
+) -> None:
+    path = tmp_path / "blinded.zip"
+    with database.writing() as session:
+        session.get_one(Study, study.id).unblinded_at = None
+        session.flush()
+        archive.write(session, store, session.get_one(Study, study.id), path)
+    with zipfile.ZipFile(path) as file:
+        readable = {name: file.read(name) for name in file.namelist() if name.endswith((".jsonl", ".sealed"))}
+    assert "rows/assignment.sealed" in readable
+    assert [name for name, content in readable.items() if b'"letter"' in content] == []
+    imported = bring(elsewhere, path)
+    with elsewhere.state.studio.database.writing() as session:
+        session.get_one(Study, imported.study.id).unblinded_at = MOMENT
+        there = unblinding.key_of(session, session.get_one(Study, imported.study.id))
+    with database.writing() as session:
+        session.get_one(Study, study.id).unblinded_at = MOMENT
+        assert there == unblinding.key_of(session, session.get_one(Study, study.id))
 
 
 def test_rows_refer_to_each_other_as_before(elsewhere: FastAPI, study: Study, packed: Path) -> None:
