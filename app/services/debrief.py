@@ -14,6 +14,7 @@ from app.services import evaluating, results
 
 MOST_LESSONS = 4
 """More would not be read."""
+MOST_PERCENT = 100
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,13 @@ class Lesson:
     more: bool
     percent: int
     """By how much, of what it was before."""
+
+    @property
+    def direction(self) -> str:
+        """less, more, or much: more than double is a multiple of little, and its percentage would only frighten."""
+        if not self.more:
+            return "less"
+        return "much" if self.percent > MOST_PERCENT else "more"
 
 
 @dataclass(frozen=True)

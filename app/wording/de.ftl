@@ -108,16 +108,22 @@ debrief-learned-how = Verglichen mit dem Roboter vorher, über { $count } Situat
 debrief-learned-nothing = Über { $count } Situationen, die neu für ihn waren, bewegt er sich ganz ähnlich wie der Roboter vorher. Entweder mochten Sie jenen, oder Ihre Antworten zogen in verschiedene Richtungen; beides ist in Ordnung.
 debrief-C_d-less = Er ist eher bei Ihnen.
 debrief-C_d-more = Er lässt sich auf dem Weg zu Ihnen mehr Zeit.
+debrief-C_d-much = Er lässt sich auf dem Weg zu Ihnen viel mehr Zeit.
 debrief-C_v-less = Er bewegt sich langsamer ({ $percent } % weniger).
 debrief-C_v-more = Er bewegt sich schneller ({ $percent } % mehr).
+debrief-C_v-much = Er bewegt sich viel schneller.
 debrief-C_f-less = Er berührt Sie seltener, wo er nicht soll ({ $percent } % weniger).
 debrief-C_f-more = Er berührt Sie unterwegs öfter ({ $percent } % mehr).
+debrief-C_f-much = Er berührt Sie unterwegs viel öfter.
 debrief-C_hf-less = Er drückt weniger stark ({ $percent } % weniger).
 debrief-C_hf-more = Er drückt stärker ({ $percent } % mehr).
+debrief-C_hf-much = Er drückt viel stärker.
 debrief-C_fd-less = Er verschüttet weniger auf Sie ({ $percent } % weniger).
 debrief-C_fd-more = Er verschüttet mehr auf Sie ({ $percent } % mehr).
+debrief-C_fd-much = Er verschüttet viel mehr auf Sie.
 debrief-C_fdv-less = Was er bringt, kommt langsamer zu Ihnen ({ $percent } % weniger).
 debrief-C_fdv-more = Was er bringt, kommt schneller zu Ihnen ({ $percent } % mehr).
+debrief-C_fdv-much = Was er bringt, kommt viel schneller zu Ihnen.
 debrief-done = Abschließen
 
 ## Das Ende

@@ -110,16 +110,22 @@ debrief-learned-how = Compared with the robot before, over { $count } situations
 debrief-learned-nothing = Over { $count } situations it had not met, it moves much like the robot before. Either you liked that one, or your answers pulled in several directions; both are fine.
 debrief-C_d-less = It is with you sooner.
 debrief-C_d-more = It takes more time on its way to you.
+debrief-C_d-much = It takes much more time on its way to you.
 debrief-C_v-less = It moves more slowly ({ $percent } % less).
 debrief-C_v-more = It moves more quickly ({ $percent } % more).
+debrief-C_v-much = It moves much more quickly.
 debrief-C_f-less = It touches you less where it should not ({ $percent } % less).
 debrief-C_f-more = It touches you more on its way ({ $percent } % more).
+debrief-C_f-much = It touches you much more on its way.
 debrief-C_hf-less = It presses less hard ({ $percent } % less).
 debrief-C_hf-more = It presses harder ({ $percent } % more).
+debrief-C_hf-much = It presses much harder.
 debrief-C_fd-less = It spills less on you ({ $percent } % less).
 debrief-C_fd-more = It spills more on you ({ $percent } % more).
+debrief-C_fd-much = It spills much more on you.
 debrief-C_fdv-less = What it brings comes to you more slowly ({ $percent } % less).
 debrief-C_fdv-more = What it brings comes to you more quickly ({ $percent } % more).
+debrief-C_fdv-much = What it brings comes to you much more quickly.
 debrief-done = Finish
 
 ## The end

@@ -61,6 +61,16 @@ def test_what_is_certain_is_said_in_plain_words_and_nothing_else(at_debrief: Tak
     assert "touches you" not in page, "its interval holds zero"
 
 
+def test_a_multiple_of_almost_nothing_is_called_much_and_not_a_percentage(at_debrief: TakingPart) -> None:
+    metrics = factories.filter_metrics()
+    spilled = {"reference": 0.01, "filter": 0.27, "delta": 0.26, "low": 0.2, "high": 0.3}
+    metrics["evaluation"]["costs"]["C_fd"] = spilled
+    add_filter(at_debrief, metrics)
+    page = at_debrief.browser.get("/p/debrief").text
+    assert "It spills much more on you." in page
+    assert "2,600" not in page
+
+
 def test_a_robot_that_learned_nothing_certain_is_not_made_more_of(at_debrief: TakingPart) -> None:
     metrics = factories.filter_metrics()
     for cost in metrics["evaluation"]["costs"].values():

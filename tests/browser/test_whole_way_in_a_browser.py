@@ -163,7 +163,7 @@ def test_the_whole_way_with_the_keyboard_alone_and_back_to_the_panel(
     expect(page.get_by_text("still being made")).to_be_visible()
     study.give_robot()
     at(page, "debrief")  # goes on by itself
-    page.wait_for_function("[...document.querySelectorAll('video')].every((video) => video.currentTime > 0)")
+    expect(page.get_by_role("slider")).to_have_attribute("aria-valuetext", re.compile("^0.[1-9]"))
     page.keyboard.press("Space")
     expect(page.get_by_role("button", name="Play", exact=True)).to_be_visible()
     page.keyboard.press(",")
