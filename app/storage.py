@@ -4,10 +4,12 @@ import hashlib
 import os
 import re
 import tempfile
+import time
 from pathlib import Path
 
 from app.errors import AppError
 
+_WRITING = ".writing-"
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 
 
@@ -26,9 +28,10 @@ class ArtefactStore:
         sha256 = hashlib.sha256(content).hexdigest()
         target = self.path(sha256)
         if target.exists():
+            target.touch()  # wanted again: whoever clears away what nobody refers to shall not take it for old
             return sha256
         target.parent.mkdir(parents=True, exist_ok=True)
-        descriptor, temporary = tempfile.mkstemp(dir=target.parent, prefix=".writing-")
+        descriptor, temporary = tempfile.mkstemp(dir=target.parent, prefix=_WRITING)
         try:
             with os.fdopen(descriptor, "wb") as stream:
                 stream.write(content)
@@ -73,6 +76,18 @@ class ArtefactStore:
     def has(self, sha256: str) -> bool:
         """Whether the artefact is there."""
         return self.path(sha256).exists()
+
+    def older_than(self, seconds: float) -> set[str]:
+        """The artefacts that nobody has put here for so long. Half-written files of that age are removed."""
+        newest_s, old = time.time() - seconds, set()
+        for path in self.root.glob("??/*"):
+            if path.stat().st_mtime >= newest_s:
+                continue
+            if path.name.startswith(_WRITING):
+                path.unlink(missing_ok=True)
+            else:
+                old.add(path.name)
+        return old
 
     def unfinished(self, participant_id: int) -> Path:
         """A folder for what long trainings for one person keep until they are done; it may not exist."""

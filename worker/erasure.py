@@ -80,6 +80,12 @@ def erase_traces(
     return Progress(finished=True, forgotten=frozenset(jobs))
 
 
+def drafts() -> set[str]:
+    """Artefacts that the engine alone knows: results of steps of unfinished work."""
+    unfinished_work = DBOS.list_workflows(status=sorted(_ACTIVE), load_input=False, load_output=False)
+    return {sha256 for workflow in unfinished_work for sha256 in _artefacts_of_steps(workflow.workflow_id)}
+
+
 def _workflows(participant_id: int, study_id: int) -> Iterator[tuple[str, tuple[Job, str]]]:
     """Names, jobs and states of every workflow that was for this person, or for the whole study's data."""
     for workflow in DBOS.list_workflows(load_input=True, load_output=False):

@@ -21,7 +21,7 @@ from app.domain.models import RunKind
 from app.errors import AppError
 from app.settings import Settings
 from app.storage import ArtefactStore
-from worker import erasure, laboratory, lessons, querying, reconcile, records
+from worker import erasure, laboratory, lessons, orphans, querying, reconcile, records
 from worker.compute import Compute, Lane
 from worker.records import Job
 from worker.sim.catalogue import ENVIRONMENTS
@@ -32,6 +32,7 @@ log = logging.getLogger("worker")
 
 ROUND_S = 0.5
 PRESENCE_S = 5.0
+CLEARING_S = 24 * 3600.0
 ENGINE_VERSION = "2"
 """Raised when the steps of a workflow change so that a half-finished one could not be resumed."""
 
@@ -128,6 +129,7 @@ class _Rounds:
         self._place = workshop.place
         self._started: set[str] = set()  # what the engine has been told already
         self._signed_at = -math.inf
+        self._cleared_at = -math.inf
         self._warm_tasks: set[str] = set()
         self._refused: set[int] = set()
 
@@ -137,6 +139,7 @@ class _Rounds:
             try:
                 self._sign()
                 self._round()
+                self._clear_away()
             except OperationalError as error:
                 log.warning("the database could not be reached, trying again: %s", error.orig)
 
@@ -145,6 +148,12 @@ class _Rounds:
             with self._place.database.writing() as session:
                 records.sign_presence(session, self._worker_name)
             self._signed_at = time.monotonic()
+
+    def _clear_away(self) -> None:
+        """At the start and once a day."""
+        if time.monotonic() - self._cleared_at >= CLEARING_S:
+            orphans.clear_away(self._place, erasure.drafts() | set().union(*self._workshop.stored.values()))
+            self._cleared_at = time.monotonic()
 
     def _round(self) -> None:
         with self._place.database.reading() as session:

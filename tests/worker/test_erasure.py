@@ -1,6 +1,7 @@
 """What the worker does when somebody withdraws while it works for them, with the real engine and its real files."""
 
 import base64
+import hashlib
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -134,6 +135,16 @@ def test_work_under_way_is_abandoned_and_neither_draft_nor_late_result_nor_note_
     with place.database.reading() as session:
         assert erasure.unfinished(session) == []
         assert session.get_one(Participant, participant.id).erased_at is not None
+
+
+def test_drafts_of_work_under_way_are_known_as_long_as_it_is_under_way(
+    workshop: Workshop, work: Work, job: Job, participant: Participant
+) -> None:
+    start(workshop, job)
+    assert work.waits.wait(PATIENCE_S)
+    assert until(lambda: erasure.drafts() == {hashlib.sha256(MARK + b"draft").hexdigest()})
+    work.may_go_on.set()
+    assert until(lambda: erasure.drafts() == set())
 
 
 def test_finished_work_is_forgotten_and_its_drafts_are_erased(

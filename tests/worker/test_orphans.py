@@ -1,0 +1,60 @@
+"""What a killed worker has stored and never written down does not fill the disk for ever; nothing else is lost."""
+
+import os
+import time
+from pathlib import Path
+from typing import cast
+
+import pytest
+
+from app.db import Database
+from app.domain.models import ModelKind
+from app.domain.studies import Participant, Study
+from app.storage import ArtefactStore
+from tests import factories
+from worker import orphans
+from worker.compute import Compute
+from worker.workplace import Workplace
+
+TWO_DAYS_S = 2 * 24 * 3600
+
+
+def age(path: Path) -> None:
+    long_ago = time.time() - TWO_DAYS_S
+    os.utime(path, (long_ago, long_ago))
+
+
+@pytest.fixture
+def place(database: Database, store: ArtefactStore) -> Workplace:
+    return Workplace(database, store, cast("Compute", None))
+
+
+def stored(place: Workplace, content: bytes) -> str:
+    """An artefact that was stored two days ago."""
+    sha256 = place.store.put(content)
+    age(place.store.path(sha256))
+    return sha256
+
+
+def test_old_files_that_nobody_refers_to_go_and_all_others_stay(place: Workplace, participant: Participant) -> None:
+    lost, promised, wanted_again = (stored(place, name) for name in (b"lost", b"promised", b"wanted again"))
+    fresh = place.store.put(b"just stored")
+    place.store.put(b"wanted again")
+    with place.database.writing() as session:
+        study = session.get_one(Study, participant.study_id)
+        model = factories.make_model(session, study, participant, ModelKind.REWARD, factories.reward_metrics())
+        model.artefact_sha256 = used = stored(place, b"a model")
+    assert orphans.clear_away(place, {promised}) == 1
+    assert not place.store.has(lost)
+    assert all(place.store.has(each) for each in (promised, wanted_again, fresh, used))
+    assert orphans.clear_away(place, {promised}) == 0
+
+
+def test_what_was_never_written_to_its_end_goes_as_well(place: Workplace) -> None:
+    folder = place.store.path(place.store.put(b"whole")).parent
+    old, young = folder / ".writing-old", folder / ".writing-young"
+    for path in (old, young):
+        path.write_bytes(b"half")
+    age(old)
+    orphans.clear_away(place, ())
+    assert (old.exists(), young.exists()) == (False, True)

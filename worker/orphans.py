@@ -1,0 +1,28 @@
+"""Files that nobody refers to: a worker was killed after it had stored a result and before it could write that down."""
+
+import logging
+from collections.abc import Collection
+from datetime import timedelta
+
+from app.services import withdrawal
+from worker.workplace import Workplace
+
+log = logging.getLogger("worker")
+
+OLD_ENOUGH = timedelta(days=1)
+"""Younger ones may be results that are about to be written down, by whoever."""
+
+
+def clear_away(place: Workplace, promised: Collection[str]) -> int:
+    """Delete what no row refers to and nobody has asked for in a day; returns how many files that were.
+
+    ``promised``: drafts of unfinished work, which will be referred to. Nothing can be written down meanwhile.
+    """
+    old = place.store.older_than(OLD_ENOUGH.total_seconds()) - set(promised)
+    with place.database.writing() as session:
+        orphans = old - withdrawal.in_use(session, old)
+        for sha256 in orphans:
+            place.store.delete(sha256)
+    if orphans:
+        log.info("%d stored files that nobody refers to any more are cleared away", len(orphans))
+    return len(orphans)
