@@ -109,6 +109,7 @@ def results_context(session: Session, study: Study) -> dict[str, Any]:
         "name_of": _name_of,
         "p_value": _p_value,
         "two_decimals": _two_decimals,
+        "statistic": _statistic,
         "tests": TESTS,
         "figures": {name: FIGURES[name] for name in FIGURES if report is not None and name in report.figures},
     }
@@ -236,4 +237,13 @@ def _p_value(result: Mapping[str, Any], key: str = "p") -> str:
 
 def _two_decimals(value: float) -> str:
     """A difference or an effect size as papers print it."""
-    return f"{value:+.2f}".replace("-", "\N{MINUS SIGN}")
+    return _plain(value, sign="+") if round(value, 2) else "0.00"
+
+
+def _statistic(value: float) -> str:
+    """A test statistic as papers print it."""
+    return _plain(value, sign="-") if round(value, 2) else "0.00"
+
+
+def _plain(value: float, sign: str) -> str:
+    return f"{value:{sign}.2f}".replace("-", "\N{MINUS SIGN}")
