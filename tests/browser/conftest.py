@@ -101,9 +101,15 @@ def wait_ready(page: Page, answered: int) -> None:
 
 
 def serious_findings(page: Page) -> list[str]:
-    """What axe finds wrong for people who use assistive technology, once nothing fades or moves any more."""
-    page.evaluate(SETTLED)  # a button that is still fading in has the contrast of no state a person reads
-    violations = Axe().run(page).response["violations"]
-    return [
-        f"{each['id']}: {each['nodes'][0]['html']}" for each in violations if each["impact"] in ("serious", "critical")
-    ]
+    """What axe finds wrong in either theme for people who use assistive technology, once nothing moves any more."""
+    found = []
+    for scheme in ("light", "dark", None):
+        page.emulate_media(color_scheme=scheme or "null")
+        page.evaluate(SETTLED)  # a button that is still fading in has the contrast of no state a person reads
+        violations = Axe().run(page).response["violations"] if scheme else []
+        found += [
+            f"{scheme}: {each['id']}: {each['nodes'][0]['html']}"
+            for each in violations
+            if each["impact"] in ("serious", "critical")
+        ]
+    return found
