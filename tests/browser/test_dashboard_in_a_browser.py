@@ -22,7 +22,7 @@ pytestmark = pytest.mark.browser
 def study(database: Database, store: ArtefactStore, password: str) -> Study:
     """A study with something of everything."""
     with database.writing() as session:
-        study = factories.make_study(session, "Pilot")
+        study = factories.make_study(session, "Pilot", evaluation={"mode": "physical"})
         participant, _ = factories.make_participant(session, study)
         left, right = (factories.make_clip(session, store, study) for _ in range(2))
         for number in range(8):
@@ -58,7 +58,7 @@ def test_an_open_page_updates_itself_and_keeps_what_the_person_does(
     page.goto("/studies/pilot")
     expect(page.locator("[data-live-state]")).to_have_text("live")
     page.get_by_label("How many participants to add").fill("7")
-    link = page.get_by_role("link", name="P01")
+    link = page.get_by_role("rowheader").get_by_role("link", name="P01")
     link.focus()
     with database.writing() as session:
         factories.make_participant(session, study)
@@ -96,18 +96,50 @@ def test_links_can_be_made_and_copied(page: Page) -> None:
     assert len(page.evaluate("navigator.clipboard.readText()").splitlines()) == 2
 
 
+def test_new_links_and_their_sheet_shut_nobody_out(page: Page) -> None:
+    page.goto("/studies/pilot")
+    page.get_by_label("How many participants to add").fill("3")
+    page.get_by_role("button", name="Add participants").click()
+    expect(page.get_by_role("heading", name="Personal links")).to_be_visible()
+    for scheme in ("light", "dark"):
+        page.emulate_media(color_scheme="dark" if scheme == "dark" else "light")
+        for size in ((1366, 768), (390, 844)):
+            page.set_viewport_size({"width": size[0], "height": size[1]})
+            assert Axe().run(page).response["violations"] == []
+            assert page.evaluate("document.documentElement.scrollWidth - innerWidth") <= 0
+        page.get_by_role("link", name="Sheet with QR codes").click()
+        assert Axe().run(page).response["violations"] == []
+        page.get_by_role("link", name="Back to the links").click()
+
+
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize(
-    "path", ["/studies", "/studies/new", "/studies/pilot", "/studies/pilot/participants/P01", "/password", "/nowhere"]
-)
-def test_no_page_shuts_anybody_out(page: Page, path: str, scheme: str) -> None:
+def test_no_page_shuts_anybody_out(page: Page, scheme: str) -> None:
     page.emulate_media(color_scheme="dark" if scheme == "dark" else "light")
-    page.goto(path)
-    for size in ((1366, 768), (390, 844)):
-        page.set_viewport_size({"width": size[0], "height": size[1]})
-        violations = Axe().run(page).response["violations"]
-        assert [(each["id"], each["nodes"][0]["html"]) for each in violations] == []
-        assert page.evaluate("document.documentElement.scrollWidth - innerWidth") <= 0
+    for path in (
+        "/studies",
+        "/studies/new",
+        "/studies/new?preset=paper",
+        "/studies/texts",
+        "/studies/pilot",
+        "/studies/pilot/settings",
+        "/studies/pilot/lock",
+        "/studies/pilot/joining",
+        "/studies/pilot/unblind",
+        "/studies/pilot/participants/P01",
+        "/studies/pilot/participants/P01/erase",
+        "/studies/pilot/participants/P01/operate",
+        "/import",
+        "/accounts",
+        "/password",
+        "/nowhere",
+    ):
+        page.goto(path)
+        page.evaluate("document.querySelectorAll('details').forEach((each) => (each.open = true))")
+        for size in ((1366, 768), (390, 844)):
+            page.set_viewport_size({"width": size[0], "height": size[1]})
+            violations = Axe().run(page).response["violations"]
+            assert [(each["id"], each["nodes"][0]["html"]) for each in violations] == [], path
+            assert page.evaluate("document.documentElement.scrollWidth - innerWidth") <= 0, path
 
 
 def test_a_task_is_chosen_with_the_keyboard_alone(page: Page) -> None:

@@ -17,7 +17,7 @@ from worker.laboratory import task
 from worker.ml.advice import expected_regret
 from worker.ml.response_surface import ResponseSurface
 from worker.ml.reward_models import StructuredReward
-from worker.trajectory import SIGNALS
+from worker.trajectory import COSTS, SIGNALS
 from worker.workplace import Workplace
 
 AddClips = Callable[..., list[Clip]]
@@ -63,6 +63,22 @@ def test_a_model_that_wants_something_else_explains_little_by_the_costs(rng: np.
     found = insight.weights_of_costs(costs, returns)
     assert found["explained"] < 0.2
     assert np.mean([each["low"] < 0 < each["high"] for each in found["weights"].values()]) > 0.6
+
+
+def test_a_model_says_what_it_thinks_of_the_costs_of_the_studys_clips(
+    place: Workplace, participant: Participant, add_clips: AddClips
+) -> None:
+    fears_spilling = StructuredReward(np.tile(-np.eye(len(SIGNALS))[SIGNALS.index("spilled_on_person")], (8, 1)))
+    add_clips(1)
+    assert "costs" not in insight.insight(place, participant.id, fears_spilling.to_bytes()), "too few clips to tell"
+    for scenario in (2, 3, 4, 5):
+        add_clips(scenario)
+    with place.database.reading() as session:
+        clips = dataset.pool_clips(session, participant.study_id)
+        assert len(clips) >= insight.FEWEST_CLIPS
+    found = insight.insight(place, participant.id, fears_spilling.to_bytes())["costs"]
+    assert list(found["weights"]) == list(COSTS)
+    assert 0.0 <= found["explained"] <= 1.0
 
 
 @pytest.fixture
