@@ -89,6 +89,10 @@ def test_a_reader_sees_studies_and_is_offered_no_new_one(database: Database, log
     for path in ("/studies", "/studies/pilot", "/studies/pilot/lock", "/studies/pilot/settings"):
         assert reader.get(path).status_code == 200
     assert 'class="role-reader"' in reader.get("/studies/pilot").text
+    settings = reader.get("/studies/pilot/settings").text
+    assert 'value="Pilot"' in settings
+    assert "disabled" in settings
+    assert ">Save<" not in settings
 
 
 @pytest.mark.parametrize("role", [Role.EXPERIMENTER, Role.READER])
