@@ -13,7 +13,7 @@ from sqlalchemy.orm import Session
 from app.db import now
 from app.domain.clips import Clip, Rollout
 from app.domain.models import Run, RunKind, RunStatus
-from app.domain.preferences import LEARNED_FROM, LabelEvent, Query, current_labels
+from app.domain.preferences import LEARNED_FROM, LabelEvent, Query, count_labels
 from app.domain.studies import Participant, Study, StudySettings
 from worker import export_work, film_work, method_work, report_work
 from worker.clip_work import WHOLE
@@ -120,7 +120,7 @@ def scenario_seed(study_seed: int, index: int) -> int:
 def _stale_models(session: Session, study: Study, succeeded: Collection[str]) -> list[Job]:
     jobs = []
     for participant in session.scalars(_present(study)).all():
-        count = len(current_labels(session, participant.id))
+        count = count_labels(session, participant.id)
         if count == 0:
             continue
         suffix = _last_answer(session, participant.id) if count >= study.settings.labels_per_participant else ""

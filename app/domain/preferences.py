@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from enum import StrEnum
 
-from sqlalchemy import CheckConstraint, ForeignKey, String, UniqueConstraint, func, select
+from sqlalchemy import CheckConstraint, ForeignKey, String, Subquery, UniqueConstraint, func, select
 from sqlalchemy.orm import Mapped, Session, mapped_column, relationship
 from sqlalchemy.sql.base import ExecutableOption
 
@@ -137,16 +137,30 @@ def current_answers(session: Session, participant_id: int, *options: ExecutableO
     return _answered(session, participant_id, tuple(Purpose), options)
 
 
+def count_labels(session: Session, participant_id: int) -> int:
+    """How many current_labels there are, counted by the database: the worker asks for it all the time."""
+    newest = _newest(participant_id)
+    counting = (
+        select(func.count())
+        .select_from(LabelEvent)
+        .join(newest, (newest.c.query_id == LabelEvent.query_id) & (newest.c.revision == LabelEvent.revision))
+        .join(Query, Query.id == LabelEvent.query_id)
+        .where(LabelEvent.response.is_not(None), Query.purpose.in_(LEARNED_FROM))
+    )
+    return session.scalar(counting) or 0
+
+
+def _newest(participant_id: int) -> Subquery:
+    """The newest revision of every answered query of a participant."""
+    revisions = select(LabelEvent.query_id, func.max(LabelEvent.revision).label("revision"))
+    theirs = revisions.join(Query, Query.id == LabelEvent.query_id).where(Query.participant_id == participant_id)
+    return theirs.group_by(LabelEvent.query_id).subquery()
+
+
 def _answered(
     session: Session, participant_id: int, purposes: Sequence[Purpose], options: Sequence[ExecutableOption]
 ) -> Sequence[Label]:
-    newest = (
-        select(LabelEvent.query_id, func.max(LabelEvent.revision).label("revision"))
-        .join(Query, Query.id == LabelEvent.query_id)
-        .where(Query.participant_id == participant_id)
-        .group_by(LabelEvent.query_id)
-        .subquery()
-    )
+    newest = _newest(participant_id)
     rows = session.execute(
         select(Query, LabelEvent)
         .join(LabelEvent, LabelEvent.query_id == Query.id)

@@ -2,6 +2,7 @@
 
 from uuid import uuid4
 
+from app.domain.preferences import count_labels
 from tests.app.conftest import TakingPart
 
 
@@ -58,3 +59,17 @@ def test_the_last_answer_of_the_study_can_be_taken_back_too(taking_part: TakingP
     answer = taking_part.browser.post(f"/p/queries/{last.id}/undo", data={"client_uuid": str(uuid4())})
     assert answer.headers["location"] == "/p/next"
     assert taking_part.turn().json()["pair"]["query_id"] == last.id
+
+
+def test_what_was_taken_back_is_not_counted_and_what_was_answered_again_counts_once(taking_part: TakingPart) -> None:
+    def counted() -> int:
+        with taking_part.database.reading() as session:
+            return count_labels(session, taking_part.participant.id)
+
+    taking_part.turn()
+    taking_part.answer(taking_part.queries[0], "left")
+    assert counted() == 1
+    taking_part.undo(taking_part.queries[0])
+    assert counted() == 0
+    taking_part.answer(taking_part.queries[0], "right")
+    assert counted() == 1
