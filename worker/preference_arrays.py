@@ -11,6 +11,7 @@ from sqlalchemy.orm import Session
 
 from app.domain.preferences import Label
 from app.domain.studies import Participant, Study
+from app.services import exporting
 from app.storage import ArtefactStore
 from worker import dataset
 from worker.ml.segments import SegmentPairs, Stretch
@@ -33,6 +34,7 @@ def arrays_of(session: Session, store: ArtefactStore, study: Study, participant:
         "study": study.slug,
         "participant": participant.code,
         "lock_hash": study.lock_hash,
+        "deviations": exporting.provenance_of(session, study).deviations,
         "target": "P(right preferred); left is index 0 of the second axis, right is index 1",
     }
     file = io.BytesIO()

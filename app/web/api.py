@@ -231,15 +231,23 @@ def download_bundle(
 @router.get("/studies/{slug}/report", tags=["reports"])
 def show_report(slug: Slug, _caller: Caller, session: ReadingSession) -> answers.ReportAnswer:
     """Statistics of the newest report, and where its figures are."""
-    report = reports.newest(session, studies.find_study(session, slug))
+    study = studies.find_study(session, slug)
+    report = reports.newest(session, study)
     if report is None:
         raise NoReportYet
     figures = {
         name: {kind: f"{PREFIX}/studies/{slug}/report/figures/{name}.{kind}" for kind in formats}
         for name, formats in report.figures.items()
     }
-    blinded = bool(report.contents.get("blinded"))
-    return answers.ReportAnswer(made_at=report.created_at, blinded=blinded, contents=report.contents, figures=figures)
+    provenance = exporting.provenance_of(session, study)
+    return answers.ReportAnswer(
+        made_at=report.created_at,
+        lock_hash=provenance.lock_hash,
+        deviations=provenance.deviations,
+        blinded=bool(report.contents.get("blinded")),
+        contents=report.contents,
+        figures=figures,
+    )
 
 
 @router.get(

@@ -111,6 +111,8 @@ class ReportAnswer(BaseModel):
     """The newest report: its statistics (layout in worker/analysis/statistics.py and answers.py) and figures."""
 
     made_at: datetime
+    lock_hash: str = Field(description="As in every export; “not locked” while the study is not.")
+    deviations: str = Field(examples=["none"])
     blinded: bool
     contents: dict[str, Any]
     figures: dict[str, dict[str, str]] = Field(

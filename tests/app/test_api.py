@@ -154,6 +154,7 @@ def test_the_newest_report_and_its_figures(call: Call, database: Database, store
         )
     report = call(f"/studies/{study.slug}/report").json()
     assert report["contents"]["x"] == 1
+    assert (report["lock_hash"], report["deviations"]) == ("not locked", "none")
     figure = call(report["figures"]["ratings"]["svg"].removeprefix("/api/v1"))
     assert (figure.content, figure.headers["content-type"]) == (b"<svg/>", "image/svg+xml")
 

@@ -179,7 +179,8 @@ def test_arrays_have_the_documented_layout(
     left, right = (dataset.shown(place.store, _with_rollout(place, clip)) for clip in pairs[1])
     assert np.array_equal(file["signals"][1, 0], left.signals[:20])
     assert np.array_equal(file["actions"][1, 1], right.actions[:20])
-    assert json.loads(str(file["about"]))["participant"] == "P01"
+    about = json.loads(str(file["about"]))
+    assert (about["participant"], about["lock_hash"], about["deviations"]) == ("P01", None, "none")
 
 
 def _with_rollout(place: Workplace, clip: Clip) -> Clip:
