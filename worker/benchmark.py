@@ -24,10 +24,10 @@ from worker.analysis.pareto import pareto_svg
 from worker.analysis.table_files import METHOD, to_csv, to_markdown
 from worker.compute import Compute, Lane
 from worker.contest import INDIRECT_USERS, OPPOSED_USERS, PAPER_USERS, Cell, Terms
+from worker.ml.filter_problem import FilterConfig, scenarios_for
 from worker.ml.methods import METHODS, MethodConfig
 from worker.ml.pbrl_hri import FromScratch
 from worker.ml.prefft import FineTuning
-from worker.ml.studio_filter import FilterConfig, scenarios_for
 from worker.ml.teachers import Taste, random_taste
 from worker.shelf import Shelf, policy_mark
 from worker.sim.catalogue import ENVIRONMENTS

@@ -21,13 +21,13 @@ import torch
 from app.domain.studies import USUAL_CLIP_STEPS, TaskName
 from worker import laboratory, lessons
 from worker.exploration import surface_file
-from worker.ml import acquisition, methods, reward_training, studio_filter
+from worker.ml import acquisition, filter_problem, methods, reward_training
+from worker.ml.filter_problem import FilterConfig, FilterProblem
 from worker.ml.methods import MethodConfig, Setting
 from worker.ml.response_surface import ResponseSurface
 from worker.ml.reward_models import MlpReward, RewardModel, load_reward_model
 from worker.ml.reward_training import SignalScale
 from worker.ml.segments import SegmentPairs
-from worker.ml.studio_filter import FilterConfig, FilterProblem
 from worker.ml.teachers import INDIRECT, OPPOSED, TASTES, Manner, ScriptedTeacher, Taste, User
 from worker.shelf import BEHAVIOURS_PER_SCENARIO, Shelf, policy_mark
 from worker.sim.costs import CostForm, preference_rewards
@@ -69,7 +69,7 @@ class Terms:
     @property
     def unseen(self) -> range:
         """Scenarios of the evaluation."""
-        return studio_filter.scenarios_for("evaluation", self.scenarios)
+        return filter_problem.scenarios_for("evaluation", self.scenarios)
 
     def directory(self, work: Path) -> Path:
         """Where cells under these terms are kept."""
@@ -169,7 +169,7 @@ class _Bench:
             config=self.terms.methods,
         )
 
-    def _collect(self, act: studio_filter.Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
+    def _collect(self, act: filter_problem.Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
         return lessons.run_scenarios(self.cell.task, act, scenarios, noise, seed)
 
     def _label(self) -> tuple[SegmentPairs, Floats]:

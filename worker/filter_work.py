@@ -6,7 +6,7 @@ from app.errors import AppError
 from worker import dataset, lessons, personalisation, records
 from worker.compute import Lane
 from worker.ml.bundle import Provenance
-from worker.ml.studio_filter import FilterDraft
+from worker.ml.filter_problem import FilterDraft
 from worker.personalisation import Fitting
 from worker.records import Job
 from worker.workplace import Step, Workplace

@@ -9,11 +9,11 @@ import numpy.typing as npt
 
 from worker.laboratory import environment, reference_policy, reference_rollouts
 from worker.ml import reward_training
+from worker.ml.filter_problem import Act, noisy
 from worker.ml.pooled_prior import prior_of
 from worker.ml.reward_models import RewardModel, load_reward_model
 from worker.ml.reward_training import SignalScale
 from worker.ml.segments import SegmentPairs
-from worker.ml.studio_filter import Act, noisy
 from worker.sim.rollout import rollout
 from worker.trajectory import SIGNALS, Array, Trajectory
 

@@ -19,7 +19,7 @@ from worker import dataset, lessons, records, rivals
 from worker.analysis.evaluation import evaluate
 from worker.compute import Lane
 from worker.filter_work import NothingToLearnFrom
-from worker.ml import studio_filter
+from worker.ml import filter_problem
 from worker.ml.checkpoint import share_done
 from worker.ml.reward_models import load_reward_model
 from worker.records import Job
@@ -137,7 +137,7 @@ def _save(place: Workplace, run_id: int, job: Job, method: str, reward: str, tra
     started = time.perf_counter()
     with place.database.reading() as session:
         study = session.get_one(Study, job.study_id)
-    scenarios = studio_filter.scenarios_for("evaluation", study.settings.evaluation_scenarios)
+    scenarios = filter_problem.scenarios_for("evaluation", study.settings.evaluation_scenarios)
     model = place.store.read(str(trained["artefact"]))
 
     def beat_at(share: float) -> Callable[[], None]:

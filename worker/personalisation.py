@@ -17,12 +17,12 @@ from worker import laboratory, lessons
 from worker.analysis.evaluation import evaluate
 from worker.compute import Compute, Lane
 from worker.exploration import surface_file
-from worker.ml import bundle, printed_filter, studio_filter
+from worker.ml import bundle, filter_problem, mode_search, printed_filter, residual_learning
 from worker.ml.action_filter import FilterWeights
 from worker.ml.bundle import BundleContents, Provenance, Recording
+from worker.ml.filter_problem import Act, FilterAct, FilterConfig, FilterDraft, FilterProblem, Progress, Trial
 from worker.ml.response_surface import ResponseSurface
 from worker.ml.reward_models import load_reward_model
-from worker.ml.studio_filter import Act, FilterAct, FilterConfig, FilterDraft, FilterProblem, Progress, Trial
 from worker.trajectory import Trajectory
 
 CHUNK = 10
@@ -73,20 +73,20 @@ class Fitting:
         """The person's execution mode, as far as held-out scenarios allow it."""
         surface = ResponseSurface.load(surface_file(self.task), self.problem.task.modes)
         reference = self._gate_reference()
-        return studio_filter.find_mode(self.problem, surface, pool, reference, self.collect, self.progress)
+        return mode_search.find_mode(self.problem, surface, pool, reference, self.collect, self.progress)
 
     def train_residual(self, draft: FilterDraft) -> FilterDraft:
         """The residual action encoder around the mode."""
-        return studio_filter.train_residual(self.problem, draft, self.collect, self.progress, self._learn)
+        return residual_learning.train_residual(self.problem, draft, self.collect, self.progress, self._learn)
 
     def gate_residual(self, draft: FilterDraft) -> FilterDraft:
         """As much of the residual as held-out scenarios allow."""
         reference = self._gate_reference()
-        return studio_filter.gate_residual(self.problem, draft, reference, self.collect, self.progress)
+        return residual_learning.gate_residual(self.problem, draft, reference, self.collect, self.progress)
 
     def fit_printed(self) -> FilterDraft:
         """The paper's PbARL as printed, on transitions of the frozen policy. Not gated: it is what it is."""
-        transitions = self._reference(studio_filter.scenarios_for("residual", PRINTED_ROLLOUTS))
+        transitions = self._reference(filter_problem.scenarios_for("residual", PRINTED_ROLLOUTS))
         self.progress("training the printed action encoder", 0.1)
         return self.compute.run(Lane.LEARNING, self.beat, printed_filter.fit_printed, self.problem, transitions)
 
@@ -94,7 +94,7 @@ class Fitting:
         """Export, drive through unseen scenarios, pack. ``weights``: the reward model's own, shown on the dashboard."""
         started = time.perf_counter()
         self.progress("driving the filter through unseen scenarios", 0.88)
-        act = studio_filter.act_of(self.problem.task.modes, self.problem.policy, draft.weights)
+        act = filter_problem.act_of(self.problem.task.modes, self.problem.policy, draft.weights)
         evaluation, filtered = self._evaluate(act)
         metrics: dict[str, Any] = {
             "evaluation": evaluation,
@@ -120,7 +120,7 @@ class Fitting:
         return Finished(draft.weights.to_bytes(), bundle.write(contents), metrics)
 
     def _evaluate(self, act: FilterAct) -> tuple[dict[str, Any], list[Trajectory]]:
-        scenarios = studio_filter.scenarios_for("evaluation", self.settings.evaluation_scenarios)
+        scenarios = filter_problem.scenarios_for("evaluation", self.settings.evaluation_scenarios)
         filtered = self.collect(act, scenarios, 0.0, self.seed)
         reference, reward = self._reference(scenarios), self.problem.reward
         return evaluate(reference, filtered, reward.returns(reference), reward.returns(filtered)), filtered
@@ -133,10 +133,10 @@ class Fitting:
         return [trajectory for part in parts for trajectory in part]
 
     def _learn(self, problem: FilterProblem, draft: FilterDraft, rounds: Sequence[Sequence[Trajectory]]) -> FilterDraft:
-        return self.compute.run(Lane.LEARNING, self.beat, studio_filter.learn_round, problem, draft, rounds)
+        return self.compute.run(Lane.LEARNING, self.beat, residual_learning.learn_round, problem, draft, rounds)
 
     def _gate_reference(self) -> Sequence[Trajectory]:
-        return self._reference(studio_filter.scenarios_for("gate", self.problem.config.gate_scenarios))
+        return self._reference(filter_problem.scenarios_for("gate", self.problem.config.gate_scenarios))
 
     def _reference(self, scenarios: range) -> Sequence[Trajectory]:
         """The frozen policy's rollouts: the same for everybody, so they are made once per worker."""

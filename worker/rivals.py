@@ -14,17 +14,17 @@ import numpy.typing as npt
 import torch
 
 from worker import laboratory, lessons
-from worker.ml import controller, methods, studio_filter
+from worker.ml import controller, filter_problem, methods
 from worker.ml.action_filter import FilterWeights
 from worker.ml.checkpoint import Checkpoint
 from worker.ml.controller import Blinded
+from worker.ml.filter_problem import Act, FilterProblem
 from worker.ml.methods import MethodConfig, Setting
 from worker.ml.preference_rl import PolicyAct
 from worker.ml.prefft import FineTuning
 from worker.ml.response_surface import ResponseSurface
 from worker.ml.reward_models import MlpReward, load_reward_model
 from worker.ml.run_controller import Controller
-from worker.ml.studio_filter import Act, FilterProblem
 from worker.trajectory import Trajectory
 
 COMPARED_EPISODES = 2
@@ -71,7 +71,7 @@ def controller_of_reference(task: str) -> bytes:
 def controller_of_filter(task: str, weights: bytes) -> bytes:
     """The frozen policy with somebody's filter behind it as a controller."""
     policy, family = laboratory.reference_policy(task), laboratory.task(task).modes
-    act = studio_filter.act_of(family, policy, FilterWeights.from_bytes(weights))
+    act = filter_problem.act_of(family, policy, FilterWeights.from_bytes(weights))
     return controller.of_act(act, observations(task))
 
 

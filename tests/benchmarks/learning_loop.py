@@ -29,7 +29,7 @@ from worker.analysis.agreement import prequential
 from worker.analysis.evaluation import evaluate
 from worker.behaviours import Behaviour
 from worker.exploration import surface_file
-from worker.ml import acquisition, printed_filter, reward_training, studio_filter
+from worker.ml import acquisition, filter_problem, printed_filter, reward_training, studio_filter
 from worker.ml.response_surface import ResponseSurface
 from worker.ml.reward_training import SignalScale
 from worker.ml.segments import SegmentPairs
@@ -69,11 +69,11 @@ class Bench:
         self.clips = self.behaviours(POOL_FIRST, options.pool_scenarios)
         self.test_clips = self.behaviours(TEST_POOL_FIRST, 60)
         self.normalising = self.collect(self.policy.mean, range(2_000_000_000, 2_000_000_040), 0.0, 0)
-        config = studio_filter.FilterConfig()
+        config = filter_problem.FilterConfig()
         self.gate_reference = self.collect(
-            self.policy.mean, studio_filter.scenarios_for("gate", config.gate_scenarios), 0.0, 0
+            self.policy.mean, filter_problem.scenarios_for("gate", config.gate_scenarios), 0.0, 0
         )
-        self.unseen = studio_filter.scenarios_for("evaluation", options.evaluation)
+        self.unseen = filter_problem.scenarios_for("evaluation", options.evaluation)
         self.reference = self.collect(self.policy.mean, self.unseen, 0.0, 0)
 
     def run(self) -> dict[str, Any]:
@@ -122,12 +122,12 @@ class Bench:
         kind: reward_training.Kind = "mlp" if self.options.method == "printed" else self.options.reward
         scale = SignalScale.of(SegmentPairs.cut(self.pairs_of(self.clips), 0, self.options.clip_steps))
         reward = reward_training.fit(labelled, targets, kind, seed, scale=scale, reference=self.normalising)
-        problem = studio_filter.FilterProblem(self.task, self.policy, reward.model, seed, self.config())
+        problem = filter_problem.FilterProblem(self.task, self.policy, reward.model, seed, self.config())
         if self.options.method == "printed":
             draft = printed_filter.fit_printed(problem, self.reference)
         else:
             draft = studio_filter.fit_studio(problem, self.surface, self.clips, self.gate_reference, self.collect)
-        act = studio_filter.act_of(self.task.modes, self.policy, draft.weights)
+        act = filter_problem.act_of(self.task.modes, self.policy, draft.weights)
         fitted_s = time.perf_counter() - started
         filtered = self.collect(act, self.unseen, 0.0, 0)
         before, after = reward.model.returns(self.reference), reward.model.returns(filtered)
@@ -149,11 +149,11 @@ class Bench:
             "evaluation": evaluation,
         }, filtered
 
-    def config(self) -> studio_filter.FilterConfig:
+    def config(self) -> filter_problem.FilterConfig:
         """The default, with the residual left out when asked."""
         if self.options.no_residual:
-            return studio_filter.FilterConfig(round_rollouts=())
-        return studio_filter.FilterConfig(preference_weight=self.options.preference_weight)
+            return filter_problem.FilterConfig(round_rollouts=())
+        return filter_problem.FilterConfig(preference_weight=self.options.preference_weight)
 
     def label(self, user: User, seed: int) -> tuple[SegmentPairs, Floats, dict[str, Any]]:
         """Scripted labels with a model refitted every ten, predicting each label before it is given."""
@@ -207,8 +207,8 @@ class Bench:
         ]
         return self._cached(("behaviours", first, scenarios), lambda: list(self.pool.map(_behave, jobs, chunksize=8)))
 
-    def collect(self, act: studio_filter.Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
-        """See studio_filter.Collect."""
+    def collect(self, act: filter_problem.Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
+        """See filter_problem.Collect."""
         job = partial(_roll, self.task.name, act, noise, seed)
         return list(self.pool.map(job, scenarios, chunksize=max(1, len(scenarios) // (4 * self.options.processes))))
 
@@ -280,8 +280,8 @@ def _behave(job: tuple[str, int, Behaviour]) -> Trajectory:
     return rollout(laboratory.environment(task), act, scenario, reference)
 
 
-def _roll(task: str, act: studio_filter.Act, noise: float, seed: int, scenario: int) -> Trajectory:
-    noisy = studio_filter.noisy(act, noise, seed, scenario)
+def _roll(task: str, act: filter_problem.Act, noise: float, seed: int, scenario: int) -> Trajectory:
+    noisy = filter_problem.noisy(act, noise, seed, scenario)
     return rollout(laboratory.environment(task), noisy, scenario, laboratory.reference_policy(task).mean)
 
 

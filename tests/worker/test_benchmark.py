@@ -9,8 +9,8 @@ import pytest
 from worker import benchmark, commands, contest
 from worker.benchmark import PROFILES, Selection, with_options
 from worker.contest import OPPOSED_USERS, PAPER_USERS, Cell, Terms
+from worker.ml.filter_problem import FilterConfig
 from worker.ml.methods import METHODS
-from worker.ml.studio_filter import FilterConfig
 from worker.ml.teachers import Taste
 
 SHY = Taste("shy", (1.0, 3.0, 2.0, 2.0, 1.0, 1.0))

@@ -20,11 +20,11 @@ from worker.ml.action_filter import FilterWeights, build, state_of
 from worker.ml.adapter import ResidualAdapter
 from worker.ml.best_of_n import BestOfN
 from worker.ml.controller import Blinded
+from worker.ml.filter_problem import Act, act_of
 from worker.ml.pbarl_printed import PrintedEncoder
 from worker.ml.policy_module import FrozenPolicy
 from worker.ml.preference_rl import PolicyAct
 from worker.ml.run_controller import Controller
-from worker.ml.studio_filter import Act, act_of
 
 POLICY = invented.small_policy()
 FROZEN = FrozenPolicy(POLICY.weights)

@@ -25,7 +25,7 @@ from worker import reconcile, records
 from worker.compute import Compute, Lane
 from worker.film_work import make_films
 from worker.method_work import train_method
-from worker.ml import prefft, studio_filter
+from worker.ml import filter_problem, prefft
 from worker.ml.action_filter import FilterWeights
 from worker.ml.reward_models import StructuredReward
 from worker.records import Job
@@ -231,7 +231,7 @@ def test_repeats_and_catch_pairs_after_the_last_label_ask_for_nothing_new(
 
 def test_scenarios_of_trials_and_comparisons_are_used_by_nothing_else() -> None:
     ours = [evaluating.TRIAL_SCENARIOS, evaluating.COMPARISON_SCENARIOS]
-    others = [range(first, first + 1_000_000) for first in studio_filter.SCENARIO_BLOCKS.values()]
+    others = [range(first, first + 1_000_000) for first in filter_problem.SCENARIO_BLOCKS.values()]
     pool = range(reconcile.scenario_seed(0, 0), reconcile.scenario_seed(89_999, 999))
     spans = sorted([*ours, *others, pool], key=lambda span: span.start)
     assert all(one.stop <= other.start for one, other in itertools.pairwise(spans))

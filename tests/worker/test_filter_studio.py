@@ -9,11 +9,12 @@ import pytest
 import torch
 
 from tests.worker import invented
-from worker.ml import response_surface, studio_filter
+from worker.ml import filter_problem, mode_search, residual_learning, response_surface, studio_filter
 from worker.ml.action_filter import FilterWeights
+from worker.ml.filter_problem import FilterConfig, FilterDraft, FilterProblem, act_of, noisy
+from worker.ml.residual_learning import learn_round
 from worker.ml.response_surface import ResponseSurface
 from worker.ml.reward_models import StructuredReward
-from worker.ml.studio_filter import FilterConfig, FilterDraft, FilterProblem, act_of, learn_round, noisy
 from worker.trajectory import SIGNALS, Trajectory
 
 POLICY = invented.small_policy()
@@ -38,12 +39,12 @@ class World:
         self.slowest = slowest
         self.asked: list[int] = []
 
-    def collect(self, act: studio_filter.Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
-        """See studio_filter.Collect."""
+    def collect(self, act: filter_problem.Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
+        """See filter_problem.Collect."""
         self.asked.append(len(scenarios))
         return [self._episode(noisy(act, noise, seed, scenario), scenario) for scenario in scenarios]
 
-    def _episode(self, act: studio_filter.Act, scenario: int) -> Trajectory:
+    def _episode(self, act: filter_problem.Act, scenario: int) -> Trajectory:
         rng = np.random.default_rng(scenario)
         seen = invented.observations(STEPS + 1, rng)
         actions = np.clip([act(each) for each in seen[:-1]], -1, 1).astype(np.float32)
@@ -62,7 +63,7 @@ def reward(weight: float) -> StructuredReward:
 
 @pytest.fixture(scope="module")
 def reference() -> list[Trajectory]:
-    return World().collect(POLICY.mean, studio_filter.scenarios_for("gate", 6), 0.0, 0)
+    return World().collect(POLICY.mean, filter_problem.scenarios_for("gate", 6), 0.0, 0)
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +78,7 @@ def surface() -> ResponseSurface:
     return response_surface.fit(FAMILY, modes, np.array(deltas), np.ones(60))
 
 
-def _mode_act(mode: np.ndarray) -> studio_filter.Act:
+def _mode_act(mode: np.ndarray) -> filter_problem.Act:
     values = mode.astype(np.float32)
 
     def act(observation: np.ndarray) -> np.ndarray:
@@ -128,7 +129,7 @@ def test_the_whole_fit_moves_the_robot_where_the_person_wants_it(
 def test_a_mode_that_fails_the_task_is_turned_off(reference: list[Trajectory], surface: ResponseSurface) -> None:
     plain = min(each.signals[:, SPEED].mean() for each in reference)
     world = World(slowest=0.99 * plain)
-    found = studio_filter.find_mode(problem(-1.0, reference, mode_attempts=1), surface, [], reference, world.collect)
+    found = mode_search.find_mode(problem(-1.0, reference, mode_attempts=1), surface, [], reference, world.collect)
     assert found.weights == FilterWeights()
     assert [trial.gate for trial in found.trials] == [1.0, 0.4]
     assert "off" in found.notes[0]
@@ -140,7 +141,7 @@ def test_a_mode_that_fails_teaches_the_search_to_find_one_that_does_not(
     """The world forbids more than the surface knows: whoever is much slower than the reference fails."""
     plain = min(each.signals[:, SPEED].mean() for each in reference)
     world = World(slowest=0.55 * plain)
-    found = studio_filter.find_mode(problem(-1.0, reference, mode_attempts=4), surface, [], reference, world.collect)
+    found = mode_search.find_mode(problem(-1.0, reference, mode_attempts=4), surface, [], reference, world.collect)
     assert found.trials[0].success_change < -0.9, "the first attempt must fail for the second to learn"
     assert found.trials[-1].success_change == 0.0
     assert found.trials[-1].preference > 0.0
@@ -148,11 +149,11 @@ def test_a_mode_that_fails_teaches_the_search_to_find_one_that_does_not(
 
 
 def test_a_filter_that_presses_too_hard_is_turned_off(reference: list[Trajectory], surface: ResponseSurface) -> None:
-    def pressing(act: studio_filter.Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
+    def pressing(act: filter_problem.Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
         episodes = World().collect(act, scenarios, noise, seed)
         return [replace(each, contact_force_n=np.full(STEPS, 30.0, np.float32)) for each in episodes]
 
-    found = studio_filter.find_mode(problem(-1.0, reference), surface, [], reference, pressing)
+    found = mode_search.find_mode(problem(-1.0, reference), surface, [], reference, pressing)
     assert found.weights == FilterWeights()
 
 
@@ -160,7 +161,7 @@ def test_somebody_who_has_said_nothing_yet_costs_no_rollouts(
     reference: list[Trajectory], surface: ResponseSurface
 ) -> None:
     world = World()
-    found = studio_filter.find_mode(problem(0.0, reference), surface, [], reference, world.collect)
+    found = mode_search.find_mode(problem(0.0, reference), surface, [], reference, world.collect)
     assert found.weights == FilterWeights()
     assert "do not yet say" in found.notes[0]
     assert world.asked == []
@@ -171,7 +172,7 @@ def test_of_the_modes_that_keep_the_task_the_best_is_taken(
 ) -> None:
     plain = min(each.signals[:, SPEED].mean() for each in reference)
     world = World(slowest=0.55 * plain)
-    found = studio_filter.find_mode(problem(-1.0, reference, mode_attempts=6), surface, [], reference, world.collect)
+    found = mode_search.find_mode(problem(-1.0, reference, mode_attempts=6), surface, [], reference, world.collect)
     kept = [trial.preference for trial in found.trials if trial.success_change == 0.0]
     assert len(kept) > 1, "several attempts must succeed for one to be better"
     assert found.trials[-1].preference == max(kept) > 0.0
@@ -182,7 +183,7 @@ def test_a_residual_that_does_not_help_is_left_out_and_said_so(reference: list[T
     wrong = learn_round(
         problem(1.0, reference), FilterDraft(FilterWeights()), [World().collect(POLICY.mean, range(6), 0.3, 0)]
     )
-    gated = studio_filter.gate_residual(problem(-1.0, reference), wrong, reference, World().collect)
+    gated = residual_learning.gate_residual(problem(-1.0, reference), wrong, reference, World().collect)
     assert gated.weights.residual_share == 0.0
     assert "residual" in gated.notes[0]
 
@@ -206,5 +207,5 @@ def test_noise_belongs_to_the_scenario_and_not_to_the_order() -> None:
 
 
 def test_no_two_purposes_share_a_scenario() -> None:
-    blocks = [set(studio_filter.scenarios_for(purpose, 1000)) for purpose in studio_filter.SCENARIO_BLOCKS]
+    blocks = [set(filter_problem.scenarios_for(purpose, 1000)) for purpose in filter_problem.SCENARIO_BLOCKS]
     assert len(set.union(*blocks)) == 1000 * len(blocks)

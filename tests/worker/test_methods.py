@@ -11,14 +11,14 @@ import pytest
 import torch
 
 from tests.worker import invented
-from worker.ml import methods, pbrl_hri, preference_rl, prefft, response_surface, studio_filter
+from worker.ml import filter_problem, methods, pbrl_hri, preference_rl, prefft, response_surface
 from worker.ml.action_filter import load_state
 from worker.ml.best_of_n import BestOfN, fit_best_of_n
+from worker.ml.filter_problem import FilterConfig, FilterProblem, noisy
 from worker.ml.methods import METHODS, MethodConfig, Setting
 from worker.ml.pbrl_hri import FromScratch
 from worker.ml.prefft import FineTuning
 from worker.ml.reward_models import MlpReward, StructuredReward
-from worker.ml.studio_filter import FilterConfig, FilterProblem, noisy
 from worker.ml.value import ActionValue
 from worker.trajectory import SIGNALS, Trajectory
 
@@ -48,12 +48,12 @@ class World(gymnasium.Env[Any, Any]):
         return self._seen[self._step], 0.0, False, self._step == STEPS, {"signals": signals}
 
 
-def collect(act: studio_filter.Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
-    """See studio_filter.Collect; the same world."""
+def collect(act: filter_problem.Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
+    """See filter_problem.Collect; the same world."""
     return [_episode(noisy(act, noise, seed, scenario), scenario) for scenario in scenarios]
 
 
-def _episode(act: studio_filter.Act, scenario: int) -> Trajectory:
+def _episode(act: filter_problem.Act, scenario: int) -> Trajectory:
     rng = np.random.default_rng(scenario)
     seen = invented.observations(STEPS + 1, rng)
     actions = np.clip([act(each) for each in seen[:-1]], -1, 1).astype(np.float32)

@@ -10,12 +10,12 @@ from torch import Tensor
 from tests.worker import invented
 from worker.ml import pbarl_printed
 from worker.ml.action_filter import build
+from worker.ml.filter_problem import FilterProblem
 from worker.ml.network_training import MlpTraining, TransformerTraining
 from worker.ml.pbarl_printed import PrintedConfig, PrintedEncoder, reconstruction_loss
 from worker.ml.printed_filter import fit_printed
 from worker.ml.reward_models import StructuredReward
 from worker.ml.reward_training import fit
-from worker.ml.studio_filter import FilterProblem
 from worker.trajectory import SIGNALS
 
 POLICY = invented.small_policy()

@@ -5,7 +5,7 @@ import pytest
 
 from worker import personalisation
 from worker.ml.action_filter import FilterWeights
-from worker.ml.studio_filter import FilterDraft, Trial
+from worker.ml.filter_problem import FilterDraft, Trial
 
 
 def test_a_draft_comes_back_as_it_was_stored() -> None:

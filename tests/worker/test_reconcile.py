@@ -165,6 +165,6 @@ def test_queries_are_made_ahead_but_never_more_than_planned(
 
 
 def test_pool_scenarios_never_meet_the_ones_filters_are_evaluated_on() -> None:
-    from worker.ml.studio_filter import SCENARIO_BLOCKS
+    from worker.ml.filter_problem import SCENARIO_BLOCKS
 
     assert max(SCENARIO_BLOCKS.values()) + 1_000_000 <= reconcile.scenario_seed(0, 0)

@@ -21,12 +21,12 @@ from onnx import ModelProto, NodeProto, TensorProto, helper
 
 from worker.ml import run_controller
 from worker.ml.bundle import described_space
+from worker.ml.filter_problem import Act, FilterAct
 from worker.ml.onnx_export import LARGEST_DIFFERENCE, ExportDiffers
 from worker.ml.policies import GaussianPolicy
 from worker.ml.policy_onnx import policy_to_onnx
 from worker.ml.preference_rl import PolicyAct
 from worker.ml.run_controller import INPUT, OUTPUT, Controller
-from worker.ml.studio_filter import Act, FilterAct
 from worker.spaces import CONTROL_STEP_S, JOINT_ACTION
 from worker.tasks import Task
 

@@ -15,9 +15,10 @@ import gymnasium
 import numpy as np
 import numpy.typing as npt
 
-from worker.ml import pbrl_hri, prefft, studio_filter
+from worker.ml import filter_problem, pbrl_hri, prefft, studio_filter
 from worker.ml.best_of_n import fit_best_of_n
 from worker.ml.checkpoint import Checkpoint
+from worker.ml.filter_problem import Act, Collect, FilterDraft, FilterProblem
 from worker.ml.pbarl_printed import BETAS, OTHER_TASKS_BETAS, PrintedConfig
 from worker.ml.pbrl_hri import FromScratch
 from worker.ml.preference_rl import Env, MakeEnv, PolicyAct, learned
@@ -25,7 +26,6 @@ from worker.ml.prefft import TIED, FineTuning
 from worker.ml.printed_filter import fit_printed
 from worker.ml.response_surface import ResponseSurface
 from worker.ml.reward_models import MlpReward
-from worker.ml.studio_filter import Act, Collect, FilterDraft, FilterProblem
 from worker.trajectory import Trajectory
 
 Array = npt.NDArray[np.float32]
@@ -33,7 +33,7 @@ Array = npt.NDArray[np.float32]
 
 @dataclass(frozen=True)
 class MethodConfig:
-    """How much each method may do; what studio_filter may do is in the problem's FilterConfig."""
+    """How much each method may do; what the studio's filter may do is in the problem's FilterConfig."""
 
     printed_steps: int = 3_000
     """the paper: 1.5e7"""
@@ -102,7 +102,7 @@ def fit_reference(setting: Setting) -> tuple[Act, tuple[str, ...]]:
 def fit_pbarl(setting: Setting) -> tuple[Act, tuple[str, ...]]:
     """The studio's default: mode, gate, residual encoder, gate."""
     problem = setting.problem
-    gate = setting.reference(studio_filter.scenarios_for("gate", problem.config.gate_scenarios))
+    gate = setting.reference(filter_problem.scenarios_for("gate", problem.config.gate_scenarios))
     draft = studio_filter.fit_studio(problem, setting.surface(), setting.pool, gate, setting.collect)
     weights = draft.weights
     mode = ", ".join(f"{axis} {value:+.2f}" for axis, value in weights.mode.items()) or "off"
@@ -113,7 +113,7 @@ def fit_pbarl(setting: Setting) -> tuple[Act, tuple[str, ...]]:
 def fit_as_printed(setting: Setting, list_length: int) -> tuple[Act, tuple[str, ...]]:
     """The paper's objective with a list of n actions; no gate, as the paper has none."""
     problem = replace(setting.problem, reward=setting.action_reward())
-    rollouts = setting.reference(studio_filter.scenarios_for("residual", setting.config.printed_rollouts))
+    rollouts = setting.reference(filter_problem.scenarios_for("residual", setting.config.printed_rollouts))
     config = PrintedConfig(
         list_length=list_length,
         betas=BETAS.get(problem.task.name, OTHER_TASKS_BETAS),
@@ -142,7 +142,7 @@ def fit_prefft(setting: Setting, tie_weight: float) -> tuple[Act, tuple[str, ...
 def fit_pbrl_hri(setting: Setting) -> tuple[Act, tuple[str, ...]]:
     """SAC from scratch on the distance and the learned reward."""
     problem, config = setting.problem, setting.config.from_scratch
-    reference = setting.reference(studio_filter.scenarios_for("gate", problem.config.gate_scenarios))
+    reference = setting.reference(filter_problem.scenarios_for("gate", problem.config.gate_scenarios))
     reward = pbrl_hri.sketchy(reference, learned(problem.reward))
     policy = pbrl_hri.train(setting.make_env, problem.policy, reward, problem.task.observation, config, problem.seed)
     return PolicyAct(policy), (f"SAC from scratch for {config.steps} steps.",)
@@ -151,7 +151,7 @@ def fit_pbrl_hri(setting: Setting) -> tuple[Act, tuple[str, ...]]:
 def fit_best_of(setting: Setting) -> tuple[Act, tuple[str, ...]]:
     """The most valuable of n samples in every step."""
     problem, config = setting.problem, setting.config
-    scenarios = studio_filter.scenarios_for("residual", config.value_rollouts)
+    scenarios = filter_problem.scenarios_for("residual", config.value_rollouts)
     rollouts = setting.collect(PolicyAct(problem.policy), scenarios, config.value_noise, problem.seed)
     act = fit_best_of_n(problem.policy, problem.reward, rollouts, config.candidates, config.value_steps, problem.seed)
     return act, (f"n = {config.candidates} samples and the mean, ranked by value.",)
@@ -175,7 +175,7 @@ METHODS: Mapping[str, FitMethod] = {
 
 def _exported(problem: FilterProblem, draft: FilterDraft) -> Act:
     """What is evaluated is what would be shipped: the ONNX file."""
-    return studio_filter.act_of(problem.task.modes, problem.policy, draft.weights)
+    return filter_problem.act_of(problem.task.modes, problem.policy, draft.weights)
 
 
 class _Meter:

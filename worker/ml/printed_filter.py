@@ -5,8 +5,8 @@ from collections.abc import Sequence
 
 from worker.ml.action_filter import FilterWeights, state_of
 from worker.ml.candidate_ranking import ranker_at
+from worker.ml.filter_problem import FilterDraft, FilterProblem, Progress
 from worker.ml.pbarl_printed import BETAS, OTHER_TASKS_BETAS, PrintedConfig, train
-from worker.ml.studio_filter import FilterDraft, FilterProblem, Progress
 from worker.ml.value import Transitions
 from worker.trajectory import Trajectory
 
