@@ -12,7 +12,7 @@ from sqlalchemy.exc import OperationalError
 from starlette.exceptions import HTTPException
 
 from app.errors import AppError
-from app.web.deps import LANGUAGE_COOKIE, LoginNeeded, NotYet, PasswordChangeDue
+from app.web.deps import LANGUAGE_COOKIE, PARTICIPANT_COOKIE, LoginNeeded, NotYet, PasswordChangeDue
 from app.web.guard import HEADERS
 from app.web.templating import page
 from app.web.wording import Wording, preferred
@@ -115,7 +115,10 @@ def _answer(
         problem = {"title": title, "status": status, "detail": message}
         answer = JSONResponse(problem, status, media_type="application/problem+json")
     else:
+        known = wording is not None and PARTICIPANT_COOKIE in request.cookies and status != HTTPStatus.UNAUTHORIZED
+        onward_path = request.app.url_path_for("show_next") if known else None
         context = {"title": title, "message": message, "status": int(status), "wording": wording}
+        context |= {"onward_path": onward_path}
         answer = page(request, "error.html", context, status)
     answer.headers.update(headers or {})
     return answer

@@ -183,6 +183,7 @@ error-title-500 = Etwas ist kaputtgegangen
 error-title-503 = Einen Moment bitte
 error-title-other = Das hat nicht geklappt
 error-number = Fehler { $status }
+error-onward = Weiter, wo ich war
 error-link-needed = Wir können nicht erkennen, wer Sie sind. Bitte öffnen Sie Ihren persönlichen Link noch einmal: Sie machen genau dort weiter, wo Sie waren.
 error-link-not-valid = Dieser Link ist nicht gültig. Vielleicht wurde er durch einen neueren ersetzt; bitte fragen Sie die Person, von der Sie ihn haben.
 error-joining-closed = An dieser Studie kann man über diese Adresse nicht (mehr) teilnehmen. Bitte fragen Sie die Menschen, von denen Sie sie haben.

@@ -185,6 +185,7 @@ error-title-500 = Something broke
 error-title-503 = A moment, please
 error-title-other = That did not work
 error-number = Error { $status }
+error-onward = Go on where I was
 error-link-needed = We cannot tell who you are. Please open your personal link again: you go on exactly where you were.
 error-link-not-valid = This link is not valid. It may have been replaced by a newer one; please ask the person who sent it to you.
 error-joining-closed = This study cannot be joined by this address (any more). Please ask the people who gave it to you.

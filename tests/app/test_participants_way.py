@@ -293,3 +293,8 @@ def test_the_evaluated_pairs_do_not_come_before_their_time_to_a_script(whole_way
     assert answer.status_code == 303
     with whole_way.database.reading() as session:
         assert session.scalars(select(Query)).all() == []
+
+
+def test_who_goes_astray_is_led_back_and_a_stranger_is_not(whole_way: OnTheWay, client: TestClient) -> None:
+    assert 'href="/p/next"' in whole_way.browser.get("/p/no-such-page", headers={"accept": "text/html"}).text
+    assert 'href="/p/next"' not in client.get("/p/no-such-page", headers={"accept": "text/html"}).text
