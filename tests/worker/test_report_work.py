@@ -67,10 +67,12 @@ def make_report(place: Workplace, study: Study) -> Report:
         return session.scalars(select(Report)).one()
 
 
-def age(place: Workplace, by: timedelta) -> None:
+def age(place: Workplace, by: timedelta, took: timedelta = timedelta(0)) -> None:
     with place.database.writing() as session:
         for report in session.scalars(select(Report)):
             report.created_at = now() - by
+            run = session.get_one(Run, report.run_id)
+            run.started_at, run.finished_at = now() - took, now()
 
 
 def test_an_empty_study_has_no_report(place: Workplace) -> None:
@@ -100,6 +102,17 @@ def test_a_new_rating_makes_a_new_report_but_not_at_once(place: Workplace, finis
     with place.database.reading() as session:
         runs = session.scalars(select(Run).where(Run.kind == RunKind.REPORT)).all()
         assert [run.id for run in runs] == [second.run_id], "older reports go with their runs"
+
+
+def test_on_a_busy_machine_reports_do_not_keep_people_s_models_waiting(place: Workplace, finished: Study) -> None:
+    make_report(place, finished)
+    with place.database.writing() as session:
+        factories.make_rated_trials(session, session.scalars(select(Participant)).first(), 1)  # type: ignore[arg-type]
+    slow = timedelta(seconds=30)
+    age(place, report_work.REST * slow - timedelta(seconds=1), slow)
+    assert due(place, finished) == []
+    age(place, report_work.REST * slow, slow)
+    assert len(due(place, finished)) == 1
 
 
 def test_one_report_is_made_at_a_time(place: Workplace, finished: Study) -> None:
