@@ -1,8 +1,8 @@
 """Processes for heavy work: simulation and training run there, the durable engine only waits for them.
 
-Several lanes, so that a training never stands behind a queue of videos, and nobody's pairs wait for a fine-tuning that
-takes minutes. The processes are polite (niced), single-threaded,
-and die with their parent even when that is killed outright.
+Several lanes, so that a training never stands behind a queue of videos, nobody's pairs wait for a fine-tuning that
+takes minutes, and a reward model, whose person is answering, never for somebody else's filter. The processes are polite
+(niced), single-threaded, and die with their parent even when that is killed outright.
 """
 
 import logging
@@ -29,12 +29,15 @@ class Lane(StrEnum):
     """Which processes do the work."""
 
     CLIPS = "clips"
+    REWARDS = "rewards"
+    """Seconds each, one at a time: somebody is answering, and the next pairs are chosen by the newest model."""
     LEARNING = "learning"
+    """Filters and reports: a minute or so."""
     PATIENT = "patient"
     """Trainings of many minutes: one at a time on one core, and only with what the others leave."""
 
 
-_NICENESS = {Lane.CLIPS: 5, Lane.LEARNING: 5, Lane.PATIENT: 15}
+_NICENESS = {Lane.CLIPS: 5, Lane.REWARDS: 5, Lane.LEARNING: 5, Lane.PATIENT: 15}
 
 
 class ComputeLost(RuntimeError):
@@ -49,7 +52,7 @@ class Compute:
     """Process pools, one per lane, started when first needed and replaced when one of their processes dies."""
 
     def __init__(self, processes: int) -> None:
-        self._sizes = {Lane.CLIPS: processes, Lane.LEARNING: processes, Lane.PATIENT: 1}
+        self._sizes = {Lane.CLIPS: processes, Lane.REWARDS: 1, Lane.LEARNING: processes, Lane.PATIENT: 1}
         self._pools: dict[Lane, ProcessPoolExecutor] = {}
         self._closing = threading.Event()
 

@@ -38,7 +38,7 @@ def _fit(place: Workplace, run_id: int, participant_id: int) -> None:
         return  # nothing but "can't tell" so far: there is nothing to learn from
     place.report(run_id, f"learning from {preferences.label_count} labels", 0.2)
     stored, metrics = place.compute.run(
-        Lane.LEARNING,
+        Lane.REWARDS,
         place.beat(run_id),
         lessons.fit_reward,
         task,

@@ -172,7 +172,8 @@ class _Rounds:
             log.warning("%s was left behind by another worker; taking it over", name)
             DBOS.resume_workflow(name)
         for name in learning_ahead & set(ENVIRONMENTS):
-            self._place.compute.warm_up(Lane.LEARNING, partial(lessons.warm_up, name))
+            for lane in (Lane.REWARDS, Lane.LEARNING):
+                self._place.compute.warm_up(lane, partial(lessons.warm_up, name))
         self._warm_tasks |= learning_ahead
 
     def _erase(self, participant_id: int) -> None:

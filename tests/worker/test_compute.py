@@ -1,5 +1,6 @@
 """Heavy work runs in processes that may die, and must die with their worker."""
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -57,6 +58,22 @@ def test_a_killed_process_is_reported_and_replaced(compute: Compute) -> None:
     with pytest.raises(ComputeLost, match="memory"):
         compute.run(Lane.CLIPS, nothing, die)
     assert compute.run(Lane.CLIPS, nothing, square, 3) == 9
+
+
+def test_who_is_answering_does_not_wait_for_somebody_else_s_filter(tmp_path: Path) -> None:
+    compute = Compute(1)
+    started = tmp_path / "started"
+
+    def train() -> None:
+        with contextlib.suppress(Interrupted):
+            compute.run(Lane.LEARNING, nothing, wait_forever, started)
+
+    thread = threading.Thread(target=train)
+    thread.start()
+    assert compute.run(Lane.REWARDS, nothing, square, 3) == 9
+    compute.close()
+    thread.join(timeout=60)
+    assert not thread.is_alive()
 
 
 def test_stopping_interrupts_whoever_waits_with_nothing_that_could_be_recorded_as_an_outcome(tmp_path: Path) -> None:
