@@ -21,6 +21,8 @@ class Task:
     calibrated_speed_weight: float
     """Weight of the calibrated speed cost with which the reference person (omega = 1) is content with the shipped
     policy's own speed; measured by tests/benchmarks/speed_cost_weight.py, to be repeated for a new policy."""
+    speed_counts_near: bool = True
+    """Whether the calibrated speed cost counts within 20 cm of the target; not where motion there is the service."""
     episode_steps: int = 100
     pieces: int = 8
     """of food or water in the usual portion"""

@@ -9,6 +9,7 @@ import pytest
 from worker.sim.costs import base_weights, cost_items, preference_rewards, signal_weights
 from worker.sim.feeding import FEEDING
 from worker.sim.measures import Outcome, StepMeasures, TaskReward
+from worker.sim.scratching import SCRATCHING
 from worker.trajectory import COSTS, SIGNALS
 
 STILL = StepMeasures(
@@ -154,6 +155,15 @@ def test_the_calibrated_form_charges_speed_squared() -> None:
     assert preference_rewards(FEEDING, costs, signals)[0] == pytest.approx(-FEEDING.calibrated_speed_weight * 0.8)
 
 
+def test_strokes_are_the_service_and_only_the_approach_to_an_itch_is_charged_for_its_speed() -> None:
+    away = one_step(C_v=0.4, speed_squared_m2_s2=0.16)
+    strokes = one_step(C_v=0.4, speed_squared_m2_s2=0.16, near_speed_squared_m2_s2=0.16)
+    assert cost_items(SCRATCHING, *away, "calibrated")[0, 1] == pytest.approx(0.8)
+    assert cost_items(SCRATCHING, *strokes, "calibrated")[0, 1] == 0.0
+    assert cost_items(FEEDING, *strokes, "calibrated")[0, 1] == pytest.approx(0.8)
+    assert cost_items(SCRATCHING, *strokes, "paper")[0, 1] == pytest.approx(0.4)
+
+
 def test_the_calibrated_form_counts_eighths_of_the_portion_however_many_pieces_it_has() -> None:
     costs, signals = one_step(C_fd=4.0, C_fdv=8.0)
     finer = replace(FEEDING, pieces=32)
@@ -181,7 +191,7 @@ def test_a_persons_reward_is_linear_in_the_measured_signals() -> None:
     signals = replace(STILL, force_away_n=3.0, speed_squared_m2_s2=0.2, target_m=np.array([0.3, 0.0, 1.2])).signals()
     costs = replace(STILL, force_away_n=3.0, speed_squared_m2_s2=0.2, target_m=np.array([0.3, 0.0, 1.2])).costs()
     omega, more = [1, 3, 2, 1, 1, 5], {"tilt_rad": 0.3, "lateral_offset_m": -2.0}
-    for task in (FEEDING, replace(FEEDING, pieces=32)):
+    for task in (FEEDING, replace(FEEDING, pieces=32), SCRATCHING):
         measured = np.array([list(signals.values())])
         paid = preference_rewards(task, np.array([list(costs.values())]), measured, omega, per_signal=more)
         assert measured @ signal_weights(task, omega, more) == pytest.approx(paid)

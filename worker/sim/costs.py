@@ -5,7 +5,8 @@
 * ``paper``: C_d, C_v, C_f, C_hf, C_fd, C_fdv as measured, with the benchmark's weights 1, .25, .01, .05, 1, 1. With
   these, even a person who fears speed prefers to be fed faster, because time spent far away costs more.
 * ``calibrated``: the speed item is speed^2 / 0.2 m/s, weighted so that the reference person is content with the
-  policy's own speed; omegas then pull in different directions. Food and water are counted in eighths of the portion, or
+  policy's own speed; omegas then pull in different directions. While an itch is scratched, motion near it is the
+  service and does not count. Food and water are counted in eighths of the portion, or
   dividing the same water into more pellets would make it a greater evil. The other three items are unchanged.
 """
 
@@ -33,6 +34,7 @@ PIECES_AT_WEIGHT_ONE = 8
 _SPEED = COSTS.index("C_v")
 _PIECES = [COSTS.index("C_fd"), COSTS.index("C_fdv")]
 _SPEED_SQUARED = SIGNALS.index("speed_squared_m2_s2")
+_NEAR_SPEED_SQUARED = SIGNALS.index("near_speed_squared_m2_s2")
 
 
 def base_weights(task: Task, form: CostForm = "calibrated") -> FloatArray:
@@ -53,7 +55,7 @@ SIGNAL_OF: Mapping[str, str] = MappingProxyType(
         "C_fdv": "intake_speed_m_s",
     }
 )
-"""Which signal each calibrated item is a multiple of."""
+"""Which signal each calibrated item is a multiple of; the speed near the target is left out where it does not count."""
 
 
 def signal_weights(
@@ -66,6 +68,8 @@ def signal_weights(
     weights = np.zeros(len(SIGNALS))
     for name, weight in zip(COSTS, items, strict=True):
         weights[SIGNALS.index(SIGNAL_OF[name])] -= weight
+    if not task.speed_counts_near:
+        weights[_NEAR_SPEED_SQUARED] -= weights[_SPEED_SQUARED]
     for name, cost in per_signal.items():
         weights[SIGNALS.index(name)] -= cost
     return weights
@@ -76,7 +80,11 @@ def cost_items(task: Task, costs: Array, signals: Array, form: CostForm = "calib
     items = np.array(costs, np.float64)
     if form == "calibrated":
         items[..., _PIECES] *= PIECES_AT_WEIGHT_ONE / task.pieces
-        items[..., _SPEED] = np.asarray(signals, np.float64)[..., _SPEED_SQUARED] / SPEED_SCALE_M_S
+        measured = np.asarray(signals, np.float64)
+        counted = measured[..., _SPEED_SQUARED]
+        if not task.speed_counts_near:
+            counted = counted - measured[..., _NEAR_SPEED_SQUARED]
+        items[..., _SPEED] = counted / SPEED_SCALE_M_S
     return items
 
 
