@@ -149,7 +149,8 @@ class _Bench:
         self.pool = shelf.behaviours(terms.pool)
         self.clip_steps = min(USUAL_CLIP_STEPS.get(TaskName(cell.task), 60), self.task.episode_steps)
         self.rows = acquisition.matched_pairs([each.scenario for each in self.pool])
-        self.scale = SignalScale.of(self._cut(self.rows))
+        episode_means = [each.signals.mean(axis=0, dtype=np.float64) for each in self.pool]
+        self.scale = SignalScale.of(self._cut(self.rows), episode_means)
         self.labelled, self.targets = self._label()
         self.reward = self._kept_reward(cell.path(terms, work).with_name(f"reward-seed{cell.seed}.safetensors"))
 

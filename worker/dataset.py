@@ -20,6 +20,7 @@ from app.domain.studies import Study
 from app.errors import AppError
 from app.storage import ArtefactStore
 from worker.ml import acquisition
+from worker.ml.reward_training import SignalScale
 from worker.ml.segments import SegmentPairs, Stretch
 from worker.trajectory import SIGNALS, Array, OutdatedTrajectory, Recorded, Recording, Trajectory
 
@@ -122,9 +123,12 @@ def matched_pairs(clips: Sequence[Clip]) -> list[tuple[Clip, Clip]]:
     return [(clips[first], clips[second]) for first, second in rows]
 
 
-def pool_pairs(session: Session, store: ArtefactStore, study_id: int) -> SegmentPairs:
-    """The segments of every pair that the study's pool can offer."""
-    return segment_pairs(store, matched_pairs(pool_clips(session, study_id)))
+def signal_scale(session: Session, store: ArtefactStore, study_id: int) -> SignalScale:
+    """What the signals are like in the study's pool: in the clips that can be asked about, and in their episodes."""
+    clips = pool_clips(session, study_id)
+    episodes = [stretch(store, clip).trajectory for clip in clips]
+    means = [each.signals.mean(axis=0, dtype=np.float64) for each in episodes]
+    return SignalScale.of(segment_pairs(store, matched_pairs(clips)), means)
 
 
 def shown(store: ArtefactStore, clip: Clip) -> Trajectory:

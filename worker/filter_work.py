@@ -52,7 +52,7 @@ def _choose_reward(place: Workplace, run_id: int, job: Job) -> str:
     place.report(run_id, "learning a reward model on states and actions", 0.05)
     with place.database.reading() as session:
         preferences = dataset.load_preferences(session, place.store, job.participant)
-        pool = dataset.pool_pairs(session, place.store, job.study_id)
+        scale = dataset.signal_scale(session, place.store, job.study_id)
     if preferences.pairs is None:
         raise NothingToLearnFrom
     stored, _ = place.compute.run(
@@ -63,7 +63,7 @@ def _choose_reward(place: Workplace, run_id: int, job: Job) -> str:
         RewardKind.MLP.value,
         preferences.pairs,
         preferences.targets,
-        pool,
+        scale,
         model.seed,
     )
     return place.store.put(stored)

@@ -36,21 +36,20 @@ def fit_reward(
     kind: str,
     pairs: SegmentPairs,
     targets: Array,
-    pool: SegmentPairs,
+    scale: SignalScale,
     seed: int,
     earlier: Sequence[bytes] = (),
     recorded_signals: Sequence[str] | None = None,
 ) -> tuple[bytes, dict[str, Any]]:
     """The stored reward model and its metrics.
 
-    ``pool``: pairs like those that are asked, for the scale of signals; ``earlier``: models of others for
+    ``scale``: what the signals are like in the study's pool; ``earlier``: models of others for
     a pooled prior; ``recorded_signals``: what the signals are called when the clips were recorded elsewhere. Then there
     is no reference policy to normalise over, and what the person was shown takes its place.
     Raises ValueError for a kind there is not.
     """
     if kind not in get_args(reward_training.Kind):
         raise ValueError(f"There is no reward model of the kind {kind!r}.")
-    scale = SignalScale.of(pool)
     prior = prior_of([_model(each) for each in earlier], scale.spread)
     fitted = reward_training.fit(
         pairs,

@@ -112,7 +112,7 @@ def _action_reward(place: Workplace, run_id: int, job: Job, reward: str, folder:
         if study.settings.reward_kind is RewardKind.MLP:
             return place.store.read(reward)
         preferences = dataset.load_preferences(session, place.store, job.participant)
-        pool = dataset.pool_pairs(session, place.store, job.study_id)
+        scale = dataset.signal_scale(session, place.store, job.study_id)
     if kept.exists():
         return kept.read_bytes()
     if preferences.pairs is None:
@@ -126,7 +126,7 @@ def _action_reward(place: Workplace, run_id: int, job: Job, reward: str, folder:
         RewardKind.MLP.value,
         preferences.pairs,
         preferences.targets,
-        pool,
+        scale,
         seed,
     )
     kept.write_bytes(stored)

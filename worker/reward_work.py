@@ -31,7 +31,7 @@ def _fit(place: Workplace, run_id: int, participant_id: int) -> None:
         task, kind = study.task, study.settings.reward_kind
         earlier = earlier_models(session, participant, study) if study.settings.pooled_prior else []
         preferences = dataset.load_preferences(session, place.store, participant_id)
-        pool = dataset.pool_pairs(session, place.store, participant.study_id)
+        scale = dataset.signal_scale(session, place.store, participant.study_id)
         notes = notes_on_pairs(session, participant_id)
         recorded_signals = None if study.material is None else dataset.signal_names(study)
     if preferences.pairs is None:
@@ -45,7 +45,7 @@ def _fit(place: Workplace, run_id: int, participant_id: int) -> None:
         kind.value,
         preferences.pairs,
         preferences.targets,
-        pool,
+        scale,
         participant.seed,
         [place.store.read(model.artefact_sha256) for model in earlier],
         recorded_signals,

@@ -1,5 +1,7 @@
 """Reward models: the right form of Eq. (2), all kinds, normalisation, storage."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -216,15 +218,48 @@ def test_nobody_is_rewarded_for_more_of_a_signal_than_was_ever_shown() -> None:
     assert costs == pytest.approx(np.full(8, -20.0)), "costs go on counting"
 
 
+def test_nobody_is_rewarded_for_less_of_a_signal_than_was_ever_shown_and_may_make_good_on_the_way() -> None:
+    weights = np.zeros((8, len(SIGNALS)))
+    weights[:, SIGNALS.index("speed_m_s")] = -1.0
+    model = StructuredReward(weights, least_per_step=np.full(len(SIGNALS), 0.1))
+    calm, still, late = (np.zeros((10, len(SIGNALS)), np.float32) for _ in range(3))
+    calm[:, SIGNALS.index("speed_m_s")] = 0.1
+    late[9, SIGNALS.index("speed_m_s")] = 1.0
+    states, actions = np.zeros((10, 4), np.float32), np.zeros((10, 7), np.float32)
+    paid = [model.episode_rewards(each, states, actions).sum(axis=1) for each in (calm, still, late)]
+    for each in paid:
+        assert each == pytest.approx(np.full(8, -1.0)), "a robot that does nothing is not better than the calmest shown"
+
+
+def test_whole_episodes_count_as_shown_beside_the_clips(labelled: tuple[SegmentPairs, np.ndarray]) -> None:
+    clips = SignalScale.of(labelled[0])
+    longer = SignalScale.of(labelled[0], [clips.least_per_step - 1.0, clips.most_per_step - 0.5])
+    assert (longer.least_per_step < clips.least_per_step).all()
+    np.testing.assert_array_equal(longer.most_per_step, clips.most_per_step)
+
+
+def test_slow_clips_that_show_less_of_the_task_done_are_not_a_wish_that_it_is_not_done() -> None:
+    """Whoever likes calm clips prefers those in which less has been delivered by their end."""
+    shown = invented.pairs(100, np.random.default_rng(1))
+    speed, undelivered = SIGNALS.index("speed_m_s"), SIGNALS.index("undelivered")
+    signals = shown.signals.copy()
+    signals[..., undelivered] = 2.0 - signals[..., speed] + 0.02 * np.random.default_rng(2).random(signals.shape[:-1])
+    confounded = replace(shown, signals=signals)
+    learned = fit(confounded, invented.answers_of(shown, DISLIKES_SPEED), "structured", 0).metrics["weights"]
+    assert learned["speed_m_s"]["high"] < 0.0
+    assert learned["undelivered"]["mean"] == 0.0
+
+
 def test_what_was_shown_is_rewarded_as_it_was_learned_and_the_limit_survives_storage(
     labelled: tuple[SegmentPairs, np.ndarray],
 ) -> None:
     again = load_reward_model(fit(*labelled, "structured", 0).model.to_bytes())
     assert isinstance(again, StructuredReward)
+    assert again.least_per_step is not None
     assert again.most_per_step is not None
     pairs = labelled[0]
-    signals, states, actions = np.abs(pairs.signals[0, 0]), pairs.observations[0, 0], pairs.actions[0, 0]
-    usual = np.where(signals.mean(axis=0) <= again.most_per_step, signals, 0.0)
+    states, actions = pairs.observations[0, 0], pairs.actions[0, 0]
+    usual = np.tile((again.least_per_step + again.most_per_step) / 2, (len(actions), 1)).astype(np.float32)
     np.testing.assert_allclose(
         again.episode_rewards(usual, states, actions).sum(axis=1),
         again.step_rewards(usual, states, actions).sum(axis=1),

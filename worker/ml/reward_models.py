@@ -172,9 +172,9 @@ class RewardModel(ABC):
 class StructuredReward(RewardModel):
     """Linear in the measured signals: r = w . signals. Members are samples of the weights' posterior.
 
-    Within an episode nobody is rewarded for more of a signal than was ever shown, while costs go on counting: a weight
-    that is slightly too large by chance would otherwise pay for any amount (a policy trained on such a reward pressed
-    on the person with 227 N; docs/method.md, section 2).
+    Within an episode nobody is rewarded for more of a signal than was ever shown, nor for less, while costs go on
+    counting: a policy trained on such a reward would otherwise leave everything that people have judged (one pressed on
+    the person with 227 N, another stayed far away and did nothing; docs/method.md, section 2).
     """
 
     kind: ClassVar[str] = "structured"
@@ -182,8 +182,10 @@ class StructuredReward(RewardModel):
     """(E, S), reward per unit of each signal"""
     normalisation: Normalisation = RAW
     temperature: float = 1.0
+    least_per_step: Floats | None = None
     most_per_step: Floats | None = None
-    """(S,) the largest mean of each signal over the steps of one clip; None: not known, and not limited"""
+    """(S,) the smallest and the largest mean of each signal over the steps of what was shown; None: not known, and not
+    limited"""
 
     def raw_rewards(self, signals: Array, observations: Array, actions: Array) -> Floats:
         """See RewardModel; observations and actions are not used."""
@@ -191,27 +193,41 @@ class StructuredReward(RewardModel):
         return rewards
 
     def episode_rewards(self, signals: Array, observations: Array, actions: Array) -> Floats:
-        """See RewardModel; what exceeds ``most_per_step`` over the whole episode is worth nothing more."""
-        if self.most_per_step is None:
-            return self.step_rewards(signals, observations, actions)
-        totals = np.cumsum(signals, axis=0, dtype=np.float64)
-        beyond = np.maximum(totals - self.most_per_step * len(totals), 0.0)
-        undeserved = np.diff(beyond, axis=0, prepend=0.0) @ np.maximum(self.weights, 0.0).T
-        raw = self.raw_rewards(signals, observations, actions) - undeserved.T
-        return self.normalised(raw)
+        """See RewardModel; what is beyond the limits over the whole episode is worth nothing more."""
+        undeserved = self._undeserved(np.cumsum(signals, axis=0, dtype=np.float64))
+        each_step = np.diff(undeserved, axis=0, prepend=np.zeros((1, self.size)))
+        return self.normalised(self.raw_rewards(signals, observations, actions) - each_step.T)
+
+    def _undeserved(self, totals: Floats) -> Floats:
+        """What linear rewards pay for being beyond the limits, from the beginning to each step. totals (T, S) -> (T, E)
+
+        More than an episode's most is beyond the limit as soon as it is reached; less than the least at any time, and
+        made good again by what comes later.
+        """
+        paid = np.zeros((len(totals), self.size))
+        steps = np.arange(1, len(totals) + 1)[:, None]
+        if self.most_per_step is not None:
+            beyond = np.maximum(totals - self.most_per_step * len(totals), 0.0)
+            paid += beyond @ np.maximum(self.weights, 0.0).T
+        if self.least_per_step is not None:
+            missing = np.maximum(self.least_per_step * steps - totals, 0.0)
+            paid += missing @ np.maximum(-self.weights, 0.0).T
+        return paid
 
     def tensors(self) -> dict[str, Array]:
         """See RewardModel."""
-        known = {} if self.most_per_step is None else {"most_per_step": self.most_per_step.astype(np.float32)}
+        limits = {"least_per_step": self.least_per_step, "most_per_step": self.most_per_step}
+        known = {name: limit.astype(np.float32) for name, limit in limits.items() if limit is not None}
         return {"weights": self.weights.astype(np.float32)} | known
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, Array], config: Mapping[str, Any]) -> Self:
         """See RewardModel."""
-        most = tensors.get("most_per_step")
-        return cls(
-            tensors["weights"].astype(np.float64), most_per_step=None if most is None else most.astype(np.float64)
+        least, most = (
+            None if limit is None else limit.astype(np.float64)
+            for limit in (tensors.get("least_per_step"), tensors.get("most_per_step"))
         )
+        return cls(tensors["weights"].astype(np.float64), least_per_step=least, most_per_step=most)
 
     def signal_weights(self, reference: Sequence[Trajectory] = ()) -> Floats:
         """(E, S) normalised reward per unit of each signal; exact for this kind."""

@@ -24,8 +24,13 @@ MEMBERS = 8
 NEWTON_STEPS = 15
 LONGEST_NEWTON_STEP = 3.0
 CALIBRATION_FOLDS = 5
-MOST_QUANTILE = 0.99
-"""Of the clips' mean signals: the single wildest clip does not say what is usual."""
+OUTLIER_SHARE = 0.01
+"""Of the mean signals at either end: the single wildest clip does not say what is usual."""
+NEVER_WANTED = ("undelivered", "spilled", "spilled_on_person", "high_force_n")
+"""Signals that nobody wants more of. Their weights are never positive: that the task gets done takes longer than a
+clip, and slow clips, which show less of it done, must not be read as a wish that it is not done."""
+_PINNED = 1e6
+"""Prior precision of a weight that is held at 0."""
 _SMALLEST_SPREAD = 1e-6
 
 
@@ -43,15 +48,27 @@ class SignalScale:
 
     spread: Floats
     """(S,) root mean square of the summed differences of a pair; a column that never differs has 1"""
+    least_per_step: Floats
     most_per_step: Floats
-    """(S,) the largest mean of each signal over the steps of one clip, outliers excepted"""
+    """(S,) the smallest and the largest mean of each signal over the steps of one clip or episode, outliers excepted"""
 
     @classmethod
-    def of(cls, pairs: SegmentPairs) -> "SignalScale":
-        """From pairs like those that are asked."""
+    def of(cls, pairs: SegmentPairs, episode_means: npt.ArrayLike = ()) -> "SignalScale":
+        """From pairs like those that are asked, and the mean signals of whole episodes like those behind them, (N, S).
+
+        Both count as shown: an episode goes on after its clip, most often with less motion.
+        """
         shown = pairs.shown[..., None]
-        means = pairs.signals.mean(axis=2, dtype=np.float64, where=shown).reshape(-1, pairs.signals.shape[-1])
-        return cls(_spread_of(pairs.signal_differences()), np.quantile(means, MOST_QUANTILE, axis=0))
+        width = pairs.signals.shape[-1]
+        means = pairs.signals.mean(axis=2, dtype=np.float64, where=shown).reshape(-1, width)
+        bounds = [_usual(each) for each in (means, np.reshape(episode_means, (-1, width))) if len(each)]
+        least, most = np.min([low for low, _ in bounds], axis=0), np.max([high for _, high in bounds], axis=0)
+        return cls(_spread_of(pairs.signal_differences()), least, most)
+
+
+def _usual(means: Floats) -> tuple[Floats, Floats]:
+    low, high = np.quantile(means, [OUTLIER_SHARE, 1.0 - OUTLIER_SHARE], axis=0)
+    return low, high
 
 
 def fit(
@@ -129,47 +146,65 @@ def _fit_structured(
     pairs: SegmentPairs, answers: Floats, seed: int, scale: SignalScale, prior: Prior, signal_names: Sequence[str]
 ) -> tuple[RewardModel, dict[str, Any]]:
     features = pairs.signal_differences() / scale.spread
-    mean, covariance = posterior(features, answers, prior)
+    costs = [column for column, name in enumerate(signal_names) if name in NEVER_WANTED]
+    mean, covariance = posterior(features, answers, prior, costs)
     members = _antithetic(mean, covariance, np.random.default_rng(seed)) / scale.spread
     deviation = 1.96 * np.sqrt(np.diag(covariance))
     weights = {
         name: {"mean": float(value), "low": float(value - margin), "high": float(value + margin)}
         for name, value, margin in zip(signal_names, mean, deviation, strict=True)
     }
-    return StructuredReward(members, most_per_step=scale.most_per_step), {
+    return StructuredReward(members, least_per_step=scale.least_per_step, most_per_step=scale.most_per_step), {
         "weights": weights,
         "weights_unit": "log odds per standard deviation of a pair",
-        "held_out": _held_out(features, answers, seed, prior),
+        "held_out": _held_out(features, answers, seed, prior, costs),
     }
 
 
-def _held_out(features: Floats, answers: Floats, seed: int, prior: Prior) -> HeldOut:
+def _held_out(features: Floats, answers: Floats, seed: int, prior: Prior, costs: Sequence[int]) -> HeldOut:
     """Log odds of every pair under members fitted without its fold."""
     rng = np.random.default_rng(seed)
     fold = rng.permutation(len(answers)) % CALIBRATION_FOLDS
     logits = np.zeros((MEMBERS, len(answers)))
     for each in range(min(CALIBRATION_FOLDS, len(answers))):
         inside = fold == each
-        mean, covariance = posterior(features[~inside], answers[~inside], prior)
+        mean, covariance = posterior(features[~inside], answers[~inside], prior, costs)
         logits[:, inside] = _antithetic(mean, covariance, rng) @ features[inside].T
     return HeldOut(logits, answers)
 
 
-def posterior(features: Floats, answers: Floats, prior: Prior | None = None) -> tuple[Floats, Floats]:
+def posterior(
+    features: Floats, answers: Floats, prior: Prior | None = None, costs: Sequence[int] = ()
+) -> tuple[Floats, Floats]:
     """Laplace approximation of p(w | labels): its mean (S,) and covariance (S, S). The prior is N(0, I) when missing.
 
-    features (N, S) standardised differences right minus left; answers (N,) in {0, 1/2, 1}. Newton's method with steps
-    of bounded length: separable data then move towards the prior's shoulder instead of overflowing.
+    features (N, S) standardised differences right minus left; answers (N,) in {0, 1/2, 1}; ``costs``: columns whose
+    mean weight must not be positive. Those that would be are held at 0, and the others fitted anew.
     """
     known = prior or Prior.standard(features.shape[1])
-    precision = np.asarray(np.linalg.inv(known.covariance), np.float64)
-    weights: Floats = known.mean.copy()
+    pinned: set[int] = set()
+    while True:
+        weights, covariance = _laplace(features, answers, known, sorted(pinned))
+        wrong = {column for column in costs if weights[column] > 0.0} - pinned
+        if not wrong:
+            return weights, covariance
+        pinned |= wrong
+
+
+def _laplace(features: Floats, answers: Floats, prior: Prior, pinned: Sequence[int]) -> tuple[Floats, Floats]:
+    """Newton's method with steps of bounded length: separable data then move towards the prior's shoulder instead of
+    overflowing."""
+    precision, mean = np.asarray(np.linalg.inv(prior.covariance), np.float64), prior.mean.copy()
+    precision[pinned, pinned] += _PINNED
+    mean[pinned] = 0.0
+    weights: Floats = mean.copy()
     for _ in range(NEWTON_STEPS):
-        gradient, hessian = _gradient_and_hessian(features, answers, weights, known.mean, precision)
+        gradient, hessian = _gradient_and_hessian(features, answers, weights, mean, precision)
         step = np.asarray(np.linalg.solve(hessian, gradient), np.float64)
         length = max(float(np.linalg.norm(step)), 1e-12)
         weights = weights - min(1.0, LONGEST_NEWTON_STEP / length) * step
-    hessian = _gradient_and_hessian(features, answers, weights, known.mean, precision)[1]
+    weights[pinned] = 0.0
+    hessian = _gradient_and_hessian(features, answers, weights, mean, precision)[1]
     return weights, np.asarray(np.linalg.inv(hessian), np.float64)
 
 
