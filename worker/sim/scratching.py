@@ -95,7 +95,7 @@ SCRATCHING = Task(
     calibrated_speed_weight=1.27,
     speed_counts_near=False,
 )
-"""Strokes are what the person asked for, so only the approach's speed is a cost. With strokes counted no weight made the
+"""Strokes are what the person asked for, so only the approach's speed is a cost. With strokes counted, no weight made
 paper's users differ: quick strokes take the tip away from the itch, and all three wanted the same slow ones. The weight
 makes the reference person content with the speed of the approach (speed_far and speed_near scaled together).
 """
