@@ -1,7 +1,9 @@
 """Which weight of the calibrated speed cost makes the reference person content with the policy's own speed.
 
-All actions are scaled by one factor; the weight is chosen so that the mean preference return of omega = 1 does not
-change to first order at factor 1. Run: python -m tests.benchmarks.speed_cost_weight --task feeding    (about a minute)
+All actions are scaled by one factor (where motion near the target is the service, only those of the approach). The
+weight is chosen so that the mean preference return of omega = 1 does not change to first order at factor 1.
+
+    python -m tests.benchmarks.speed_cost_weight --task feeding                                       (about a minute)
 """
 
 import argparse
@@ -12,7 +14,7 @@ import numpy as np
 from worker import laboratory
 from worker.sim.catalogue import ENVIRONMENTS
 from worker.sim.costs import BASE_WEIGHTS, cost_items
-from worker.sim.rollout import rollout
+from worker.sim.rollout import Act, rollout
 from worker.trajectory import COSTS
 
 FACTORS = (0.8, 0.9, 1.0, 1.1, 1.2)
@@ -24,12 +26,12 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--task", choices=ENVIRONMENTS, default="feeding")
     task = parser.parse_args().task
-    policy, env = laboratory.reference_policy(task), laboratory.environment(task)
+    env = laboratory.environment(task)
     sums = np.zeros((len(FACTORS), len(COSTS)))
     for row, factor in enumerate(FACTORS):
         successes = 0
         for scenario in SCENARIOS:
-            episode = rollout(env, lambda seen, scale=factor: scale * policy.mean(seen), scenario)  # type: ignore[misc]
+            episode = rollout(env, scaled(task, factor), scenario)
             sums[row] += cost_items(laboratory.task(task), episode.costs, episode.signals, "calibrated").sum(0) / len(
                 SCENARIOS
             )
@@ -45,6 +47,16 @@ def main() -> None:
         f"\nweight  {-others / slopes[speed]:.3f}  ({-distance_only / slopes[speed]:.3f} from distance alone)\n"
     )
     env.close()
+
+
+def scaled(task: str, factor: float) -> Act:
+    """The reference policy, faster or slower where its speed is a cost."""
+    described = laboratory.task(task)
+    if described.speed_counts_near:
+        policy = laboratory.reference_policy(task)
+        return lambda seen: factor * policy.mean(seen)
+    mode = described.modes.vector({"speed_far": float(np.log(factor)), "speed_near": float(np.log(factor))})
+    return laboratory.act_in_mode(task, np.array(mode))
 
 
 if __name__ == "__main__":
