@@ -3,6 +3,7 @@
 from app.domain.models import ModelKind
 from app.domain.studies import Method, Participant, RewardKind, Study
 from app.errors import AppError
+from app.services.exporting import provenance_of
 from worker import dataset, lessons, personalisation, records
 from worker.compute import Lane
 from worker.ml.bundle import Provenance
@@ -92,6 +93,7 @@ def _publish(place: Workplace, run_id: int, job: Job, reward: str, draft: str) -
         model = records.newest_model(session, job.participant, ModelKind.REWARD)
         version = records.next_version(session, job.participant)
         run = records.seen_labels(session, run_id)
+        export = provenance_of(session, study)
     provenance = Provenance(
         study=study.name,
         participant=participant.code,
@@ -100,6 +102,8 @@ def _publish(place: Workplace, run_id: int, job: Job, reward: str, draft: str) -
         label_hash=run.label_hash,
         seed=participant.seed,
         created_at=run.started_at.isoformat(timespec="seconds"),
+        lock_hash=export.lock_hash,
+        deviations=export.deviations,
     )
     finished = fitting.finish(_draft(place, draft), provenance, model.metrics.get("weights") if model else None)
     model_artefact, bundle_artefact = place.store.put(finished.filter_weights), place.store.put(finished.bundle)

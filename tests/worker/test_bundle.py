@@ -52,7 +52,7 @@ def contents() -> BundleContents:
                 "tilt_rad": {"mean": 0.1, "low": -0.4, "high": 0.6},
             },
         },
-        provenance=Provenance("demo", "P07", 3, 200, "ab" * 32, 11, "2026-01-02T03:04:05Z"),
+        provenance=Provenance("demo", "P07", 3, 200, "ab" * 32, 11, "2026-01-02T03:04:05Z", "cd" * 32, "none"),
     )
 
 
@@ -99,6 +99,7 @@ def test_everything_promised_is_inside_and_nothing_else(written: bytes) -> None:
 
 def test_an_undamaged_bundle_gives_its_manifest(written: bytes) -> None:
     manifest = bundle.verify(written)
+    assert (manifest["lock_hash"], manifest["deviations"]) == ("cd" * 32, "none")
     assert manifest["labels"] == {"count": 200, "sha256": "ab" * 32}
     assert [field["name"] for field in manifest["observation"]["fields"]] == [
         field.name for field in invented.TASK.observation.fields

@@ -71,6 +71,9 @@ class Provenance:
     seed: int
     created_at: str
     """ISO 8601, UTC"""
+    lock_hash: str
+    deviations: str
+    """fingerprint of the locked settings and plan, and what was changed afterwards, in words as in every export"""
 
 
 @dataclass(frozen=True)
@@ -138,6 +141,8 @@ def _manifest(contents: BundleContents) -> dict[str, Any]:
         "schema_version": SCHEMA_VERSION,
         "task": contents.task.name,
         "study": provenance.study,
+        "lock_hash": provenance.lock_hash,
+        "deviations": provenance.deviations,
         "participant": provenance.participant,
         "version": provenance.version,
         "created_at": provenance.created_at,

@@ -92,7 +92,7 @@ SCRATCHING = Task(
             Axis("hesitate", 0.0, 0.8, "how long the tip waits before it touches the skin"),
         ),
     ),
-    calibrated_speed_weight=1.27,
+    calibrated_speed_weight=1.41,
     speed_counts_near=False,
 )
 """Strokes are what the person asked for, so only the approach's speed is a cost. With strokes counted, no weight made
