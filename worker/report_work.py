@@ -6,7 +6,7 @@ participant. Old reports go when a new one is there.
 
 import hashlib
 from collections.abc import Collection, Sequence
-from datetime import timedelta
+from datetime import datetime, timedelta
 from typing import Any
 
 from sqlalchemy import delete, func, select
@@ -33,7 +33,7 @@ RUNS_AT_ONCE = (RunStatus.RUNNING, RunStatus.RETRY)
 def due(session: Session, study: Study) -> list[Job]:
     """The report that is missing, unless one has just been made or is being made."""
     last = session.scalar(select(Report).where(Report.study_id == study.id).order_by(Report.id.desc()).limit(1))
-    if last is not None and now() - last.created_at < max(AT_MOST_EVERY, REST * _took(session, last)):
+    if last is not None and now() < _rested(session, study, last):
         return []
     basis = basis_of(session, study)
     if basis is None or (last is not None and last.basis == basis):
@@ -45,9 +45,13 @@ def due(session: Session, study: Study) -> list[Job]:
     return [Job(name, RunKind.REPORT, study.id)]
 
 
-def _took(session: Session, report: Report) -> timedelta:
-    run = session.get_one(Run, report.run_id)
-    return run.finished_at - run.started_at if run.finished_at else timedelta(0)
+def _rested(session: Session, study: Study, last: Report) -> datetime:
+    """From when on a newer report may be made; at once when somebody has unblinded the study and is waiting for it."""
+    if study.unblinded_at is not None and study.unblinded_at > last.created_at:
+        return study.unblinded_at
+    run = session.get_one(Run, last.run_id)
+    took = run.finished_at - run.started_at if run.finished_at else timedelta(0)
+    return last.created_at + max(AT_MOST_EVERY, REST * took)
 
 
 def _name(study_id: int, basis: str) -> str:

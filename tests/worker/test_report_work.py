@@ -115,6 +115,16 @@ def test_on_a_busy_machine_reports_do_not_keep_people_s_models_waiting(place: Wo
     assert len(due(place, finished)) == 1
 
 
+def test_whoever_unblinds_a_study_does_not_wait_for_the_next_round(place: Workplace) -> None:
+    with place.database.writing() as session:
+        study = make_finished_study(session, place.store, people=3, labels=6, unblinded=False)
+    make_report(place, study)
+    assert due(place, study) == []
+    with place.database.writing() as session:
+        session.get_one(Study, study.id).unblinded_at = now()
+    assert len(due(place, study)) == 1
+
+
 def test_one_report_is_made_at_a_time(place: Workplace, finished: Study) -> None:
     with place.database.writing() as session:
         factories.make_run(session, finished, kind=RunKind.REPORT, status=RunStatus.RUNNING)
