@@ -107,6 +107,7 @@ def test_a_new_rating_makes_a_new_report_but_not_at_once(place: Workplace, finis
 def test_on_a_busy_machine_reports_do_not_keep_people_s_models_waiting(place: Workplace, finished: Study) -> None:
     make_report(place, finished)
     with place.database.writing() as session:
+        session.get_one(Study, finished.id).unblinded_at = now() - timedelta(days=1)
         factories.make_rated_trials(session, session.scalars(select(Participant)).first(), 1)  # type: ignore[arg-type]
     slow = timedelta(seconds=30)
     age(place, report_work.REST * slow - timedelta(seconds=1), slow)
