@@ -27,6 +27,7 @@ AT_MOST_EVERY = timedelta(seconds=20)
 """While people answer, something is newer all the time."""
 REST = 6
 """Times as long as the last one took: on a busy machine people's models would wait for it, in the same lane."""
+LONGEST_REST = timedelta(minutes=1)
 RUNS_AT_ONCE = (RunStatus.RUNNING, RunStatus.RETRY)
 
 
@@ -51,7 +52,7 @@ def _rested(session: Session, study: Study, last: Report) -> datetime:
         return study.unblinded_at
     run = session.get_one(Run, last.run_id)
     took = run.finished_at - run.started_at if run.finished_at else timedelta(0)
-    return last.created_at + max(AT_MOST_EVERY, REST * took)
+    return last.created_at + max(AT_MOST_EVERY, min(REST * took, LONGEST_REST))
 
 
 def _name(study_id: int, basis: str) -> str:

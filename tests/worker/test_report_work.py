@@ -109,11 +109,13 @@ def test_on_a_busy_machine_reports_do_not_keep_people_s_models_waiting(place: Wo
     with place.database.writing() as session:
         session.get_one(Study, finished.id).unblinded_at = now() - timedelta(days=1)
         factories.make_rated_trials(session, session.scalars(select(Participant)).first(), 1)  # type: ignore[arg-type]
-    slow = timedelta(seconds=30)
+    slow, very_slow = timedelta(seconds=9), timedelta(minutes=9)
     age(place, report_work.REST * slow - timedelta(seconds=1), slow)
     assert due(place, finished) == []
     age(place, report_work.REST * slow, slow)
     assert len(due(place, finished)) == 1
+    age(place, report_work.LONGEST_REST, very_slow)
+    assert len(due(place, finished)) == 1, "somebody wants to see the end of it"
 
 
 def test_whoever_unblinds_a_study_does_not_wait_for_the_next_round(place: Workplace) -> None:
