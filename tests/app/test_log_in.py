@@ -173,7 +173,7 @@ def test_there_is_only_one_first_experimenter(password: str, database: Database)
 
 
 def test_resetting_an_unknown_account_says_so(database: Database) -> None:
-    with database.writing() as session, pytest.raises(accounts.ExperimenterNotFound, match="no experimenter"):
+    with database.writing() as session, pytest.raises(accounts.ExperimenterNotFound, match="no such account"):
         accounts.reset_password(session, "nobody")
 
 

@@ -61,7 +61,7 @@ def test_the_task_is_named_on_the_list_and_on_the_page_of_the_study(
     experimenter: TestClient, study: Study, title: str
 ) -> None:
     assert f"{title} · since" in shown(experimenter, "/studies")
-    assert f"Task {title}" in shown(experimenter, "/studies/pilot")
+    assert f"{title} · “" in shown(experimenter, "/studies/pilot"), "above everything, beside the question"
 
 
 @pytest.mark.parametrize("task", ["dressing"])

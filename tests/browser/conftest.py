@@ -1,4 +1,4 @@
-"""Chromium for the browser tests, one for all of them, and a participant with a link to open in it."""
+"""Chromium for the browser tests, one for each file, and a participant with a link to open in it."""
 
 import shutil
 from collections.abc import Callable, Iterator
@@ -16,9 +16,13 @@ from app.storage import ArtefactStore
 from tests import factories
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def chromium() -> Iterator[Browser]:
-    """The system's Chromium, without a window."""
+    """The system's Chromium, without a window.
+
+    Not for the whole session: while Playwright is there, an event loop counts as running, in which other tests of the
+    same process cannot start the worker's engine.
+    """
     path = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
     if path is None:
         pytest.fail("The browser tests need Chromium: install your system's package 'chromium'.")
