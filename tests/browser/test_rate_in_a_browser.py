@@ -96,6 +96,7 @@ def test_the_last_rating_is_changed_by_keyboard(invite: Callable[..., Invited], 
     page.get_by_role("link", name="Change my last rating (Robot A)").press("Enter")
     expect(page.get_by_text("You are changing your last rating")).to_be_visible()
     expect(page.get_by_label("4").first).to_be_checked()
+    expect(page.get_by_text("Keys: 1 to 5")).to_be_visible()  # said by the script, which listens from then on
     page.keyboard.press("Backspace")
     rate(page, "1")
     expect(page.get_by_role("heading", name="Robot B")).to_be_visible()
