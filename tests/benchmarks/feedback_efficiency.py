@@ -15,7 +15,7 @@ import json
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -145,7 +145,7 @@ class Bench:
         right = (predicted > 0.5) == wants
         teacher, rng = ScriptedTeacher.calibrated(Manner(), sides), np.random.default_rng([chain.seed, 8])
         said = np.array([TARGETS[teacher.answer(left, right, rng)] for left, right in sides])
-        plain = fitted.model.with_temperature(1.0).probability_right(self.unseen_segments)
+        plain = replace(fitted.model, temperature=1.0).probability_right(self.unseen_segments)
         return Measured(
             task=self.task.name,
             user=chain.user,

@@ -1,5 +1,7 @@
 """The Preference Transformer: what it may look at, what it can learn that others cannot, how it scores candidates."""
 
+from dataclasses import replace
+
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -99,7 +101,7 @@ def test_steps_are_weighed_by_preference_attention_and_count_one_each_in_the_mea
 
 
 def test_it_survives_storage_bit_for_bit() -> None:
-    model, shown = of_random_weights().with_temperature(1.7), invented.pairs(3, np.random.default_rng(3), STEPS)
+    model, shown = replace(of_random_weights(), temperature=1.7), invented.pairs(3, np.random.default_rng(3), STEPS)
     again = load_reward_model(model.to_bytes())
     np.testing.assert_array_equal(again.member_probabilities(shown), model.member_probabilities(shown))
     assert again.to_bytes() == model.to_bytes()

@@ -177,7 +177,7 @@ def test_weights_on_signals_are_exact_for_the_structured_kind_and_close_for_netw
     pool = [invented.trajectory(rng) for _ in range(60)]
     predicted = np.array([each.signals.sum(0) for each in pool]) @ model.signal_weights(pool).mean(axis=0)
     if model.kind == "structured":
-        differences = np.diff(predicted) - np.diff(model.returns(pool))
+        differences = np.diff(predicted) - np.diff(replace(model, undone_column=None).returns(pool))
         assert np.abs(differences).max() < 0.05 * np.abs(np.diff(predicted)).max()
     else:
         assert np.isfinite(predicted).all()
@@ -202,13 +202,13 @@ def test_segments_are_cut_at_the_same_steps_on_both_sides() -> None:
 
 def test_nobody_is_rewarded_for_more_of_a_signal_than_was_ever_shown() -> None:
     weights = np.zeros((8, len(SIGNALS)))
-    weights[:, SIGNALS.index("force_away_n")] = 0.5  # liked by chance
+    weights[:, SIGNALS.index("force_at_target_n")] = 0.5
     weights[:, SIGNALS.index("distance_m")] = -1.0
     most = np.full(len(SIGNALS), 0.1)
     model = StructuredReward(weights, most_per_step=most)
     usual, extreme = np.zeros((10, len(SIGNALS)), np.float32), np.zeros((10, len(SIGNALS)), np.float32)
-    usual[:, SIGNALS.index("force_away_n")] = 0.1
-    extreme[:, SIGNALS.index("force_away_n")] = 3.0
+    usual[:, SIGNALS.index("force_at_target_n")] = 0.1
+    extreme[:, SIGNALS.index("force_at_target_n")] = 3.0
     states, actions = np.zeros((10, 4), np.float32), np.zeros((10, 7), np.float32)
     paid = model.episode_rewards(usual, states, actions).sum(axis=1)
     assert paid == pytest.approx(np.full(8, 10 * 0.1 * 0.5))
@@ -248,6 +248,21 @@ def test_slow_clips_that_show_less_of_the_task_done_are_not_a_wish_that_it_is_no
     learned = fit(confounded, invented.answers_of(shown, DISLIKES_SPEED), "structured", 0).metrics["weights"]
     assert learned["speed_m_s"]["high"] < 0.0
     assert learned["undelivered"]["mean"] == 0.0
+
+
+def test_an_episode_that_leaves_the_task_undone_earns_nothing(
+    model: RewardModel, labelled: tuple[SegmentPairs, np.ndarray]
+) -> None:
+    model = load_reward_model(model.to_bytes())
+    pairs, undelivered = labelled[0], SIGNALS.index("undelivered")
+    states, actions, signals = pairs.observations[0, 0], pairs.actions[0, 0], pairs.signals[0, 0].copy()
+    signals[:, undelivered] = 1.0
+    never_served = model.episode_rewards(signals, states, actions)
+    signals[-1, undelivered] = 0.0
+    served_at_last = model.episode_rewards(signals, states, actions)
+    assert never_served.max() == 0.0 < served_at_last.max()
+    costs = served_at_last[:, :-1] < 0.0
+    np.testing.assert_array_equal(never_served[:, :-1][costs], served_at_last[:, :-1][costs], "costs go on counting")
 
 
 def test_what_was_shown_is_rewarded_as_it_was_learned_and_the_limit_survives_storage(

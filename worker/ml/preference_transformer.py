@@ -16,7 +16,7 @@ do). A candidate action at a state takes the place of the last action of the his
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from worker.ml.reward_models import RAW, Array, Floats, Normalisation, RewardModel
+from worker.ml.reward_models import Array, Floats, RewardModel
 from worker.ml.segments import LEFT, RIGHT, Mask, SegmentPairs
 
 Weights = Mapping[str, Tensor]
@@ -48,8 +48,6 @@ class PreferenceTransformer(RewardModel):
     scale: Array
     heads: int
     stride: int
-    normalisation: Normalisation = RAW
-    temperature: float = 1.0
 
     def raw_rewards(self, signals: Array, observations: Array, actions: Array) -> Floats:
         """See RewardModel; the signals are not used. The axis before the last is time, from an episode's start."""
@@ -112,14 +110,6 @@ class PreferenceTransformer(RewardModel):
     def size(self) -> int:
         """See RewardModel."""
         return len(self.weights["embed"])
-
-    def with_normalisation(self, normalisation: Normalisation) -> Self:
-        """See RewardModel."""
-        return replace(self, normalisation=normalisation)
-
-    def with_temperature(self, temperature: float) -> Self:
-        """See RewardModel."""
-        return replace(self, temperature=temperature)
 
 
 def new_weights(inputs: int, members: int, width: int, layers: int, generator: torch.Generator) -> dict[str, Tensor]:

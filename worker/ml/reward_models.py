@@ -47,6 +47,7 @@ RAW = Normalisation()
 """Not normalised yet."""
 
 
+@dataclass(frozen=True, kw_only=True)
 class RewardModel(ABC):
     """E members, each a function of a step and, for one kind, of the steps before it.
 
@@ -54,9 +55,11 @@ class RewardModel(ABC):
     """
 
     kind: ClassVar[str]
-    normalisation: Normalisation
-    temperature: float
+    normalisation: Normalisation = RAW
+    temperature: float = 1.0
     """Log odds are divided by it before they are read as probabilities."""
+    undone_column: int | None = None
+    """the signal that is above 0 for as long as the task is not done; None: no signal says so"""
 
     @abstractmethod
     def raw_rewards(self, signals: Array, observations: Array, actions: Array) -> Floats:
@@ -76,7 +79,17 @@ class RewardModel(ABC):
         return np.clip(rewards, -CLIP, CLIP)
 
     def episode_rewards(self, signals: Array, observations: Array, actions: Array) -> Floats:
-        """Normalised and clipped rewards of one episode from its start. (T, S), (T, D), (T, 7) -> (E, T)"""
+        """Normalised and clipped rewards of one whole episode. (T, S), (T, D), (T, 7) -> (E, T)
+
+        No step of an episode that ends with the task undone is worth more than a usual step of the reference policy:
+        clips end before tasks do, so labels hardly say how much more anybody minds not being served at all.
+        """
+        rewards = self._earned(signals, observations, actions)
+        undone = self.undone_column is not None and signals[-1, self.undone_column] > 0.0
+        return np.minimum(rewards, 0.0) if undone else rewards
+
+    def _earned(self, signals: Array, observations: Array, actions: Array) -> Floats:
+        """What the episode is worth whether or not the task gets done, as episode_rewards()."""
         return self.step_rewards(signals, observations, actions)
 
     def returns(self, trajectories: Sequence[Trajectory]) -> Floats:
@@ -112,7 +125,7 @@ class RewardModel(ABC):
             self.raw_rewards(each.signals, each.observations[: len(each)], each.actions).reshape(self.size, -1)
             for each in reference
         ]
-        return self.with_normalisation(Normalisation.over(np.concatenate(raw, axis=1)))
+        return replace(self, normalisation=Normalisation.over(np.concatenate(raw, axis=1)))
 
     def signal_weights(self, reference: Sequence[Trajectory]) -> Floats:
         """(E, S) every member's reward per unit of each signal: what the response surface of modes is searched with.
@@ -152,20 +165,13 @@ class RewardModel(ABC):
             "offset": self.normalisation.offset,
             "scale": self.normalisation.scale,
             "temperature": self.temperature,
+            "undone_column": self.undone_column,
         }
 
     @classmethod
     @abstractmethod
     def from_tensors(cls, tensors: Mapping[str, Array], config: Mapping[str, Any]) -> Self:
         """What tensors() and config() describe, in raw units."""
-
-    @abstractmethod
-    def with_normalisation(self, normalisation: Normalisation) -> Self:
-        """The same model in other units."""
-
-    @abstractmethod
-    def with_temperature(self, temperature: float) -> Self:
-        """The same model, more or less sure of itself."""
 
 
 @dataclass(frozen=True)
@@ -180,8 +186,6 @@ class StructuredReward(RewardModel):
     kind: ClassVar[str] = "structured"
     weights: Floats
     """(E, S), reward per unit of each signal"""
-    normalisation: Normalisation = RAW
-    temperature: float = 1.0
     least_per_step: Floats | None = None
     most_per_step: Floats | None = None
     """(S,) the smallest and the largest mean of each signal over the steps of what was shown; None: not known, and not
@@ -192,7 +196,7 @@ class StructuredReward(RewardModel):
         rewards: Floats = np.moveaxis(np.asarray(signals, np.float64) @ self.weights.T, -1, 0)
         return rewards
 
-    def episode_rewards(self, signals: Array, observations: Array, actions: Array) -> Floats:
+    def _earned(self, signals: Array, observations: Array, actions: Array) -> Floats:
         """See RewardModel; what is beyond the limits over the whole episode is worth nothing more."""
         undeserved = self._undeserved(np.cumsum(signals, axis=0, dtype=np.float64))
         each_step = np.diff(undeserved, axis=0, prepend=np.zeros((1, self.size)))
@@ -238,14 +242,6 @@ class StructuredReward(RewardModel):
         """See RewardModel."""
         return len(self.weights)
 
-    def with_normalisation(self, normalisation: Normalisation) -> Self:
-        """See RewardModel."""
-        return replace(self, normalisation=normalisation)
-
-    def with_temperature(self, temperature: float) -> Self:
-        """See RewardModel."""
-        return replace(self, temperature=temperature)
-
 
 @dataclass(frozen=True)
 class MlpReward(RewardModel):
@@ -259,8 +255,6 @@ class MlpReward(RewardModel):
     layers: tuple[tuple[Array, Array], ...]
     offset: Array
     scale: Array
-    normalisation: Normalisation = RAW
-    temperature: float = 1.0
 
     def raw_rewards(self, signals: Array, observations: Array, actions: Array) -> Floats:
         """See RewardModel; the signals are not used."""
@@ -293,14 +287,6 @@ class MlpReward(RewardModel):
         """See RewardModel."""
         return len(self.layers[0][0])
 
-    def with_normalisation(self, normalisation: Normalisation) -> Self:
-        """See RewardModel."""
-        return replace(self, normalisation=normalisation)
-
-    def with_temperature(self, temperature: float) -> Self:
-        """See RewardModel."""
-        return replace(self, temperature=temperature)
-
 
 def load_reward_model(stored: bytes) -> RewardModel:
     """Read what to_bytes() wrote. Raises ValueError for a file that is something else."""
@@ -310,9 +296,12 @@ def load_reward_model(stored: bytes) -> RewardModel:
     kinds: tuple[type[RewardModel], ...] = (StructuredReward, MlpReward, PreferenceTransformer)
     for kind in kinds:
         if config.get("kind") == kind.kind:
-            model = kind.from_tensors(load(stored), config)
-            model = model.with_normalisation(Normalisation(float(config["offset"]), float(config["scale"])))
-            return model.with_temperature(float(config.get("temperature", 1.0)))
+            return replace(
+                kind.from_tensors(load(stored), config),
+                normalisation=Normalisation(float(config["offset"]), float(config["scale"])),
+                temperature=float(config.get("temperature", 1.0)),
+                undone_column=config.get("undone_column"),
+            )
     raise ValueError(f"Not a reward model: {config!r}.")
 
 

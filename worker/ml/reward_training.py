@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -26,9 +26,11 @@ LONGEST_NEWTON_STEP = 3.0
 CALIBRATION_FOLDS = 5
 OUTLIER_SHARE = 0.01
 """Of the mean signals at either end: the single wildest clip does not say what is usual."""
-NEVER_WANTED = ("undelivered", "spilled", "spilled_on_person", "high_force_n")
+UNDONE = "undelivered"
+NEVER_WANTED = (UNDONE, "spilled", "spilled_on_person", "high_force_n", "force_away_n", "action_change_squared")
 """Signals that nobody wants more of. Their weights are never positive: that the task gets done takes longer than a
-clip, and slow clips, which show less of it done, must not be read as a wish that it is not done."""
+clip, and slow clips, which show less of it done, must not be read as a wish that it is not done. What is rare in clips
+or about the same in all, like jerks and touches in passing, would else be liked by chance, and then sought."""
 _PINNED = 1e6
 """Prior precision of a weight that is held at 0."""
 _SMALLEST_SPREAD = 1e-6
@@ -105,7 +107,8 @@ def fit(
         model, found = fit_transformer(pairs, answers, seed, transformer or TransformerTraining())
     held_out: HeldOut = found.pop("held_out")
     temperature = calibration.fit_temperature(held_out)
-    model = model.with_temperature(temperature)
+    undone = signal_names.index(UNDONE) if UNDONE in signal_names else None
+    model = replace(model, temperature=temperature, undone_column=undone)
     model = model.normalised_over(reference) if reference else _normalised_over_segments(model, pairs)
     metrics.update(found, calibration=calibration.report(held_out, temperature))
     metrics["training_accuracy"] = _accuracy(model, pairs, answers)
@@ -136,7 +139,7 @@ def _accuracy(model: RewardModel, pairs: SegmentPairs, answers: Floats) -> float
 
 def _normalised_over_segments(model: RewardModel, pairs: SegmentPairs) -> RewardModel:
     raw = model.raw_rewards(pairs.signals, pairs.observations, pairs.actions)
-    return model.with_normalisation(Normalisation.over(raw[:, pairs.shown]))
+    return replace(model, normalisation=Normalisation.over(raw[:, pairs.shown]))
 
 
 # -- structured: Bayesian logistic regression --------------------------------------------------------------------------

@@ -109,6 +109,8 @@ class Water:
 
     def drink(self, mouth_m: FloatArray, cup_m: FloatArray, rotation: FloatArray) -> None:
         """Take what is at the mouth and outside the cup. To be called after every physics step: pellets are quick."""
+        if not self._to_drink:
+            return
         reached = self._world.near(mouth_m.tolist(), DRUNK_WITHIN_M)
         for name in [name for name in self._to_drink if name in reached]:
             place = np.array(self._world.position(name))
@@ -131,6 +133,9 @@ class Water:
 
     def _look(self, cup_m: FloatArray, rotation: FloatArray) -> int:
         """Read where every pellet is; returns how many have left the cup for good."""
+        if not self._present:
+            self.in_cup = 0
+            return 0
         self._positions = self._world.positions(self.names)
         self._positions[[name not in self._present for name in self.names]] = np.nan
         for index in np.flatnonzero(self._positions[:, 2] < FLOOR_M).tolist():
