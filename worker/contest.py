@@ -98,7 +98,7 @@ def run_cell(cell: Cell, terms: Terms, work: Path) -> Path:
     """Label, fit, evaluate; the result is written to a file that is either complete or absent."""
     torch.set_num_threads(1)
     shelf = Shelf(cell.task, work / "rollouts")
-    bench = _Bench(cell, terms, shelf, work)
+    bench = Bench(cell, terms, shelf, work)
     started = time.perf_counter()
     fitted = methods.fit(cell.method, bench.setting())
     wall_s = time.perf_counter() - started
@@ -140,7 +140,7 @@ def _write(target: Path, record: dict[str, Any], driven: Sequence[Trajectory], l
     return target
 
 
-class _Bench:
+class Bench:
     """A user's labels, what was learned from them, and everything that a method may ask for."""
 
     def __init__(self, cell: Cell, terms: Terms, shelf: Shelf, work: Path) -> None:

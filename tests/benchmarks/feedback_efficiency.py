@@ -5,8 +5,11 @@
 Scripted users answer (5 % mistakes, 10 % "equal") matched pairs of real rollouts of a pool's behaviours. Measured on
 pairs of other scenarios: how often the model prefers what the user truly prefers, on all of them and on contested ones
 (where at least one of the paper's three users prefers the other clip), and the expected calibration error against
-answers like those it learned from. Rollouts and finished chains are kept under data/; repeat the command to go on, and
-with more --minutes to do more. The pool of the default size has 1020 pairs: --pool-scenarios 850 for 5000 labels.
+answers like those it learned from. And what the person gets: the execution mode that a study's search would pick for
+this reward model, with its change of the true preference and of success as the response surface has them; for some
+numbers of labels the mode is also driven through unseen scenarios. Rollouts and finished chains are kept under data/;
+repeat the command to go on, and with more --minutes to do more. The pool of the default size has 1020 pairs:
+--pool-scenarios 850 --most-labels 5000 for 5000 labels.
 """
 
 import argparse
@@ -26,14 +29,19 @@ import torch
 from tqdm import tqdm
 
 from tests.benchmarks.pool_rollouts import Pool, pool_rollouts
-from worker import laboratory
+from worker import laboratory, lessons
+from worker.exploration import surface_file
 from worker.ml import acquisition, calibration, reward_training
+from worker.ml.filter_problem import scenarios_for
 from worker.ml.pooled_prior import Prior
+from worker.ml.response_surface import ResponseSurface, best_mode
 from worker.ml.reward_models import RewardModel
 from worker.ml.reward_training import SignalScale
 from worker.ml.teachers import TASTES, Manner, ScriptedTeacher, Taste, User, random_taste
+from worker.ml.trials import signal_changes, successes
 from worker.sim.catalogue import ENVIRONMENTS
-from worker.sim.costs import preference_rewards
+from worker.sim.costs import preference_rewards, signal_weights
+from worker.trajectory import Array, Trajectory
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -48,6 +56,16 @@ NEW_PEOPLE, EARLIER_PEOPLE = range(6), range(100, 112)
 """Numbers of people drawn from one population: those who are measured, and those who came before them."""
 RULES: tuple[acquisition.Rule, ...] = ("uniform", "disagreement", "entropy", "information_gain", "contested")
 TARGETS = {"left": 0.0, "right": 1.0, "equal": 0.5}
+DRIVEN = {
+    ("structured", "entropy", 50),
+    ("structured", "entropy", 200),
+    ("mlp", "uniform", 200),
+    ("mlp", "uniform", 5000),
+}
+"""What named users' modes are driven for: model, rule, labels."""
+DRIVEN_SCENARIOS = 100
+CLIPS_BEHIND_WISHES = 400
+"""whose returns say what a network wants of the signals"""
 
 
 @dataclass(frozen=True)
@@ -74,6 +92,13 @@ class Measured:
     labels: int
     accuracy: float
     contested_accuracy: float | None
+    gain_percent: float
+    """of the true preference by the mode this model leads to, in % of the reference's; from the response surface"""
+    success_points: float
+    """change of success by that mode, likewise"""
+    driven_gain_percent: float | None
+    driven_success_points: float | None
+    """the same in DRIVEN_SCENARIOS unseen scenarios"""
     calibration_error: float
     calibration_error_uncalibrated: float
     temperature: float
@@ -91,6 +116,10 @@ class Bench:
         self.pairs, self.unseen_pairs = self.pool.pairs(), self.unseen.pairs()
         self.unseen_segments = self.unseen.segments(self.unseen_pairs)
         self.scale = SignalScale.of(self.pool.segments(self.pairs))
+        self.surface = ResponseSurface.load(surface_file(task), self.task.modes)
+        few = slice(CLIPS_BEHIND_WISHES)
+        parts = zip(self.pool.signals[few], self.pool.observations[few], self.pool.actions[few], strict=True)
+        self.wish_clips = [_Clip(*arrays) for arrays in parts]
 
     def measure(self, chain: Chain) -> Iterator[Measured]:
         """Answer, fit, choose, and so on."""
@@ -146,6 +175,10 @@ class Bench:
         teacher, rng = ScriptedTeacher.calibrated(Manner(), sides), np.random.default_rng([chain.seed, 8])
         said = np.array([TARGETS[teacher.answer(left, right, rng)] for left, right in sides])
         plain = replace(fitted.model, temperature=1.0).probability_right(self.unseen_segments)
+        mode = best_mode(self.surface, fitted.model.signal_weights(self.wish_clips), chain.seed)
+        gain, success = self._promised(chain.user, mode)
+        driven = chain.user in NAMED and (chain.model, chain.rule, count) in DRIVEN and not chain.pooled
+        driven_gain, driven_success = self._driven(chain.user, mode) if driven else (None, None)
         return Measured(
             task=self.task.name,
             user=chain.user,
@@ -156,11 +189,43 @@ class Bench:
             labels=count,
             accuracy=float(right.mean()),
             contested_accuracy=float(right[contested].mean()) if contested.any() else None,
+            gain_percent=gain,
+            success_points=success,
+            driven_gain_percent=driven_gain,
+            driven_success_points=driven_success,
             calibration_error=calibration.expected_calibration_error(predicted, said),
             calibration_error_uncalibrated=calibration.expected_calibration_error(plain, said),
             temperature=fitted.model.temperature,
             fit_seconds=fitted.metrics["fit_seconds"],
         )
+
+    def _promised(self, user: str, mode: Floats) -> tuple[float, float]:
+        """Gain in % and change of success in points by the response surface."""
+        changes, success = self.surface.predict(mode)
+        return self._percent(user, float(changes @ self._true_weights(user))), 100 * float(success)
+
+    def _driven(self, user: str, mode: Floats) -> tuple[float, float]:
+        """The same in unseen scenarios."""
+        name, reference = self.task.name, self.driven_reference
+        scenarios = [each.scenario for each in reference]
+        filtered = lessons.run_scenarios(name, laboratory.act_in_mode(name, mode), scenarios, 0.0, 0)
+        change = signal_changes(reference, filtered).mean(axis=0) @ self._true_weights(user)
+        return self._percent(user, float(change)), 100 * float((successes(filtered) - successes(reference)).mean())
+
+    @cached_property
+    def driven_reference(self) -> list[Trajectory]:
+        """The reference policy in the scenarios in which modes are driven."""
+        policy = laboratory.reference_policy(self.task.name)
+        scenarios = scenarios_for("evaluation", DRIVEN_SCENARIOS)
+        return lessons.run_scenarios(self.task.name, policy.mean, scenarios, 0.0, 0)
+
+    def _percent(self, user: str, change: float) -> float:
+        sums = np.mean([each.signals.sum(axis=0) for each in laboratory.reference_rollouts(self.task.name)], axis=0)
+        return 100 * change / abs(float(sums @ self._true_weights(user)))
+
+    def _true_weights(self, user: str) -> Floats:
+        taste = _taste(user)
+        return signal_weights(self.task, taste.omega, taste.per_signal)
 
     @cached_property
     def prior(self) -> Prior:
@@ -186,6 +251,19 @@ class Bench:
         returns = self.rewards(user, self.unseen).sum(-1)
         wants: npt.NDArray[np.bool_] = returns[self.unseen_pairs[:, 1]] > returns[self.unseen_pairs[:, 0]]
         return wants
+
+
+@dataclass(frozen=True)
+class _Clip:
+    """What a reward model reads of a clip."""
+
+    signals: Array
+    observations: Array
+    actions: Array
+    success: bool = False
+
+    def __len__(self) -> int:
+        return len(self.actions)
 
 
 def _taste(user: str) -> Taste:
@@ -253,12 +331,35 @@ def report(rows: Sequence[dict[str, Any]]) -> str:
     for title, chosen in accuracies:
         lines += [f"### {title}: accuracy on all unseen pairs", "", *_table(chosen, "accuracy"), ""]
         lines += [f"### {title}: accuracy on contested pairs", "", *_table(chosen, "contested_accuracy"), ""]
+    for title, chosen in accuracies[:3]:
+        lines += [
+            f"### {title}: true preference gained, % of the reference's",
+            "",
+            *_table(chosen, "gain_percent", 1),
+            "",
+        ]
+        lines += [f"### {title}: change of success, points", "", *_table(chosen, "success_points", 1), ""]
+    lines += ["### Promised and driven: gain of true preference in %, change of success in points", ""]
+    lines += [*_driven(rows), ""]
     lines += ["### Expected calibration error without temperature", ""]
     lines += [*_table(uniform, "calibration_error_uncalibrated"), "", "### Expected calibration error as shipped", ""]
     return (
         "\n".join([*lines, *_table(uniform, "calibration_error"), "", "### Seconds per fit", "", *_seconds(uniform)])
         + "\n"
     )
+
+
+def _driven(rows: Sequence[dict[str, Any]]) -> list[str]:
+    lines = [
+        "| user | model | rule | labels | gain, promised | driven | success, promised | driven |",
+        "|---" * 8 + "|",
+    ]
+    for row in rows:
+        if row["driven_gain_percent"] is not None:
+            figures = ("gain_percent", "driven_gain_percent", "success_points", "driven_success_points")
+            names = " | ".join(str(row[name]) for name in ("user", "model", "strategy", "labels"))
+            lines.append(f"| {names} | " + " | ".join(f"{row[name]:+.1f}" for name in figures) + " |")
+    return lines
 
 
 def _seconds(rows: Sequence[dict[str, Any]]) -> list[str]:

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from worker.ml.action_filter import FilterWeights
 from worker.ml.filter_problem import Collect, FilterAct, FilterDraft, FilterProblem, Progress, Trial, act_of
-from worker.ml.response_surface import ResponseSurface, best_mode
+from worker.ml.response_surface import CAUTION, ResponseSurface, best_mode
 from worker.ml.trials import acceptable, signal_changes, successes, try_on
 from worker.trajectory import Trajectory
 
@@ -28,24 +28,28 @@ def find_mode(
 
     The best predicted mode lies where the surface knows least, and is the one whose success and return are most likely
     overestimated. It is therefore tried on the held-out scenarios of ``reference``, the surface learns from the trial,
-    and the search goes on from there. When no attempt is acceptable the last mode is weakened; at worst it is off.
+    and the search goes on from there, more careful about success with every trial that was not acceptable. When no
+    attempt is acceptable the last mode is weakened; at worst it is off.
     ``pool``: rollouts of many modes, used only when the reward is not linear in the signals.
     """
     started = time.perf_counter()
     wishes = problem.reward.signal_weights(pool)
     tried: list[tuple[Trial, Floats]] = []
+    accepted: list[tuple[Trial, Floats]] = []
     for attempt in range(problem.config.mode_attempts):
         progress("searching the person's way of doing the task", 0.1 * attempt)
-        mode = best_mode(surface, wishes, problem.seed)
+        rejected = len(tried) - len(accepted)
+        mode = best_mode(surface, wishes, problem.seed, success_caution=CAUTION * (1 + rejected))
         if not mode.any() or any(np.array_equal(mode, earlier) for _, earlier in tried):
             break
         progress(f"checking mode {attempt + 1} on held-out scenarios", 0.03 + 0.1 * attempt)
         trial, driven = try_on(problem, _act_in(problem, mode), 1.0, 0.0, reference, collect)
         tried.append((trial, mode))
+        if acceptable(problem, trial, reference):
+            accepted.append((trial, mode))
         surface = surface.with_observed(mode, signal_changes(reference, driven), successes(driven))
     if not tried:
         return _without_mode("The labels do not yet say clearly what to change; the mode is off.", [], started)
-    accepted = [each for each in tried if acceptable(problem, each[0], reference)]
     for gate in problem.config.gates if not accepted else ():
         progress(f"checking the mode at {gate:.0%} on held-out scenarios", 0.32)
         act = replace(_act_in(problem, tried[-1][1]), gate=gate)

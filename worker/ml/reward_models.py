@@ -19,7 +19,7 @@ from safetensors.numpy import load, save
 
 from worker.ml.bradley_terry import preference_logits, probability_right
 from worker.ml.segments import LEFT, RIGHT, SegmentPairs
-from worker.trajectory import Trajectory
+from worker.trajectory import Recorded, Trajectory
 
 Array = npt.NDArray[np.float32]
 Floats = npt.NDArray[np.float64]
@@ -127,7 +127,7 @@ class RewardModel(ABC):
         ]
         return replace(self, normalisation=Normalisation.over(np.concatenate(raw, axis=1)))
 
-    def signal_weights(self, reference: Sequence[Trajectory]) -> Floats:
+    def signal_weights(self, reference: Sequence[Recorded]) -> Floats:
         """(E, S) every member's reward per unit of each signal: what the response surface of modes is searched with.
 
         For a model that is not linear in the signals: the ridge regression of each member's episode returns on the
@@ -141,7 +141,7 @@ class RewardModel(ABC):
         weights: Floats = np.linalg.solve(gram, features.T @ (returns - returns.mean(axis=0))).T / scale
         return np.where(sums.std(axis=0) > 1e-9, weights, 0.0)
 
-    def _member_returns(self, trajectory: Trajectory) -> Floats:
+    def _member_returns(self, trajectory: Recorded) -> Floats:
         """(E,)"""
         steps = len(trajectory)
         rewards = self.step_rewards(trajectory.signals, trajectory.observations[:steps], trajectory.actions)
@@ -233,7 +233,7 @@ class StructuredReward(RewardModel):
         )
         return cls(tensors["weights"].astype(np.float64), least_per_step=least, most_per_step=most)
 
-    def signal_weights(self, reference: Sequence[Trajectory] = ()) -> Floats:
+    def signal_weights(self, reference: Sequence[Recorded] = ()) -> Floats:
         """(E, S) normalised reward per unit of each signal; exact for this kind."""
         return self.weights / self.normalisation.scale
 

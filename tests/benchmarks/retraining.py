@@ -1,0 +1,142 @@
+"""Seconds from the last label to a bundle, stage by stage, as a study's worker does it.
+
+    python -m tests.benchmarks.retraining --output docs/results/retraining
+
+Per task: 200 answers of a scripted user, then twice what the worker does after a milestone: reward model, mode,
+residual, gates, 100 unseen scenarios, ONNX export, bundle. The first time the worker has just started and also makes
+the reference policy's rollouts, which all later ones share. Run it alone on the machine: these are plain seconds.
+"""
+
+import argparse
+import csv
+import os
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from app.domain.studies import StudySettings
+from worker import lessons
+from worker.compute import Compute, Lane
+from worker.contest import Bench, Cell, Terms
+from worker.ml.bundle import Provenance
+from worker.ml.teachers import TASTES
+from worker.personalisation import Fitting
+from worker.shelf import Shelf
+from worker.sim.catalogue import ENVIRONMENTS
+from worker.trajectory import Trajectory
+
+STAGES = ("reward", "mode", "residual", "gates", "evaluation_and_bundle")
+PROVENANCE = Provenance("benchmark", "P01", 1, 200, "", 0, "2000-01-01T00:00:00+00:00", "", "none")
+
+
+def main() -> None:
+    """Measure every task and user that was asked for."""
+    options = _options()
+    rows: list[dict[str, Any]] = []
+    for task in tqdm(options.tasks, unit="task"):
+        for user in options.users:
+            rows += _measured(task, user, options)
+    sys.stdout.write(_markdown(rows))
+    if options.output:
+        options.output.with_suffix(".md").write_text(_page(rows, options))
+        with options.output.with_suffix(".csv").open("w", newline="") as stream:
+            writer = csv.DictWriter(stream, list(rows[0]), lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(rows)
+
+
+def _measured(task: str, user: str, options: argparse.Namespace) -> list[dict[str, Any]]:
+    shelf = Shelf(task, options.work_directory / "rollouts")
+    bench = Bench(Cell(task, TASTES[user], "pbarl", 0), Terms(), shelf, options.work_directory)
+    compute = Compute(options.processes)
+    references: dict[tuple[str, range], list[Trajectory]] = {}
+    try:
+        compute.run(Lane.REWARDS, _no_beat, lessons.warm_up, task)  # as a worker does while clips are filmed
+        runs = [_run(task, user, bench, compute, references, after) for after in ("the start", "others")]
+    finally:
+        compute.close()
+    return runs
+
+
+def _run(
+    task: str,
+    user: str,
+    bench: Bench,
+    compute: Compute,
+    references: dict[tuple[str, range], list[Trajectory]],
+    after: str,
+) -> dict[str, Any]:
+    marks = [time.perf_counter()]
+
+    def mark() -> None:
+        marks.append(time.perf_counter())
+
+    answers = (bench.labelled, bench.targets.astype(np.float32), bench.scale, 0)
+    reward, _ = compute.run(Lane.REWARDS, _no_beat, lessons.fit_reward, task, "structured", *answers)
+    mark()
+    fitting = Fitting(
+        task, compute, _no_beat, reward, 0, StudySettings(), progress=lambda stage, share: None, references=references
+    )
+    draft = fitting.find_mode(bench.pool)
+    mark()
+    draft = fitting.train_residual(draft)
+    mark()
+    draft = fitting.gate_residual(draft)
+    mark()
+    finished = fitting.finish(draft, PROVENANCE, None)
+    mark()
+    seconds = {name: round(marks[index + 1] - marks[index], 1) for index, name in enumerate(STAGES)}
+    evaluation = finished.metrics["evaluation"]
+    return {
+        "task": task,
+        "user": user,
+        "after": after,
+        "modes_tried": sum(trial.residual_share == 0.0 for trial in draft.trials),
+        **seconds,
+        "seconds": round(marks[-1] - marks[0], 1),
+        "success_delta": round(evaluation["success"]["delta"], 3),
+    }
+
+
+def _no_beat() -> None:
+    """Nobody watches."""
+
+
+def _markdown(rows: list[dict[str, Any]]) -> str:
+    names = list(rows[0])
+    lines = ["| " + " | ".join(name.replace("_", " ") for name in names) + " |", "|---" * len(names) + "|"]
+    lines += ["| " + " | ".join(str(row[name]) for name in names) + " |" for row in rows]
+    return "\n".join(lines) + "\n"
+
+
+def _page(rows: list[dict[str, Any]], options: argparse.Namespace) -> str:
+    load = ", ".join(f"{value:.1f}" for value in os.getloadavg())
+    return f"""# From the last label to the bundle, in seconds
+
+    python -m tests.benchmarks.retraining --output docs/results/retraining
+
+200 scripted answers; {options.processes} processes of one thread on {os.cpu_count()} cores; load averages at the end
+{load}. After "the start" the worker has just begun and also makes the reference policy's rollouts; after "others"
+is what everybody else waits for. The same as numbers: [retraining.csv](retraining.csv).
+
+{_markdown(rows)}"""
+
+
+def _options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--tasks", nargs="+", choices=ENVIRONMENTS, default=list(ENVIRONMENTS))
+    parser.add_argument("--users", nargs="+", choices=TASTES, default=["cautious", "impatient"])
+    parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument(
+        "--work-directory", type=Path, default=Path("data/benchmark"), help="of the benchmark's rollouts"
+    )
+    parser.add_argument("--output", type=Path, help="path without ending of the page and the table")
+    return parser.parse_args()
+
+
+if __name__ == "__main__":
+    main()
