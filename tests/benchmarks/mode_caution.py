@@ -6,14 +6,13 @@ About two minutes.
 """
 
 import sys
-from unittest.mock import patch
 
 import numpy as np
 
 from worker import laboratory
 from worker.exploration import surface_file
-from worker.ml import acquisition, response_surface, reward_training
-from worker.ml.response_surface import ResponseSurface
+from worker.ml import acquisition, reward_training
+from worker.ml.response_surface import ResponseSurface, best_mode
 from worker.ml.reward_training import SignalScale
 from worker.ml.segments import SegmentPairs
 from worker.ml.teachers import OMEGA, Manner, ScriptedTeacher, User
@@ -52,8 +51,7 @@ def main() -> None:
                 model = reward_training.fit(shown.take(chosen), targets, "structured", seed, scale=scale).model
                 unit = abs(rewards[user].sum(axis=1).mean()) / 100
                 for caution, found in gains.items():
-                    with patch.object(response_surface, "CAUTION", caution):
-                        mode = response_surface.best_mode(surface, model.signal_weights([]), seed)
+                    mode = best_mode(surface, model.signal_weights([]), seed, caution=caution)
                     found.append(float(surface.predict(mode)[0] @ signal_weights(TASK, OMEGA[user])) / unit)
         cells = (f"{caution:g}: {np.mean(each):+.1f} (worst {min(each):+.1f})" for caution, each in gains.items())
         sys.stdout.write(f"{count:4d} labels  " + "   ".join(cells) + "\n")

@@ -44,7 +44,7 @@ class Collect(Protocol):
 
 @dataclass(frozen=True)
 class FilterConfig:
-    """Counts and tolerances; the defaults fit two cores and about a minute (docs/results/feeding_loop.md)."""
+    """Counts and tolerances; the defaults fit two cores and about a minute (docs/results/retraining.md)."""
 
     mode_attempts: int = 3
     """modes tried on held-out scenarios at full strength, each chosen knowing what came of those before"""

@@ -163,14 +163,15 @@ def best_mode(
     *,
     tolerance: float = SUCCESS_TOLERANCE,
     penalty: float = SUCCESS_PENALTY,
+    caution: float = CAUTION,
     success_caution: float = CAUTION,
 ) -> Floats:
     """(A,) the mode with the best predicted return for these weights on the signals, (S,) or (E, S) for E members.
 
-    With members the return counts as their mean less their standard deviation: what few labels leave open is then not
-    gambled on (docs/method.md has what this gains). The chance of success is taken ``success_caution`` of its standard
-    deviations lower. Random search with two local refinements; the mode 0 is always among the candidates and wins ties,
-    so that somebody for whom nothing is better keeps the reference policy.
+    With members the return counts as their mean less ``caution`` of their standard deviations: what few labels leave
+    open is then not gambled on (docs/method.md has what this gains). The chance of success is taken ``success_caution``
+    of its standard deviations lower. Random search with two local refinements; the mode 0 is always among the
+    candidates and wins ties, so that somebody for whom nothing is better keeps the reference policy.
     """
     rng = np.random.default_rng(seed)
     width = surface.high - surface.low
@@ -182,7 +183,7 @@ def best_mode(
     def value(modes: Floats) -> Floats:
         signals, success = surface.predict(modes, success_caution)
         returns = signals @ members.T / unit
-        worth: Floats = returns.mean(axis=-1) - CAUTION * returns.std(axis=-1)
+        worth: Floats = returns.mean(axis=-1) - caution * returns.std(axis=-1)
         return worth - penalty * np.maximum(-success - tolerance, 0.0)
 
     for spread in (0.2, 0.05):
