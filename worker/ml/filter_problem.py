@@ -48,6 +48,8 @@ class FilterConfig:
 
     mode_attempts: int = 3
     """modes tried on held-out scenarios at full strength, each chosen knowing what came of those before"""
+    modes_to_choose_from: int = 2
+    """acceptable ones after which no further is tried"""
     gates: tuple[float, ...] = (0.6, 0.3)
     """strengths at which the last of them is tried when none at full strength was acceptable"""
     gate_scenarios: int = 80
@@ -55,16 +57,17 @@ class FilterConfig:
     """largest accepted loss of success on the gate's scenarios, as a share of episodes"""
     force_limit_n: float = 10.0
     """largest accepted force on the person: 95 of 100 episodes must stay below it (or below the reference's own)"""
-    round_rollouts: tuple[int, ...] = (100, 60)
+    round_rollouts: tuple[int, ...] = (60, 50, 50, 50)
     """rollouts of the current filter before each round of residual learning; () leaves the residual out"""
-    round_noise: tuple[float, ...] = (0.25, 0.18)
-    value_steps: int = 1500
-    adapter_steps: int = 400
+    round_noise: tuple[float, ...] = (0.25, 0.2, 0.2, 0.18)
+    value_steps: int = 3000
+    adapter_steps: int = 500
     batch: int = 96
-    preference_weight: float = 0.3
+    preference_weight: float = 1.0
     """lambda: weight of the normalised value against squared distance in policy standard deviations"""
     kl_weight: float = 1e-3
     residual_shares: tuple[float, ...] = (1.0, 0.5)
+    """tried in this order until one is acceptable and better than the mode alone"""
     evaluation_scenarios: int = 200
 
 

@@ -40,7 +40,8 @@ def find_mode(
         progress("searching the person's way of doing the task", 0.1 * attempt)
         rejected = len(tried) - len(accepted)
         mode = best_mode(surface, wishes, problem.seed, success_caution=CAUTION * (1 + rejected))
-        if not mode.any() or any(np.array_equal(mode, earlier) for _, earlier in tried):
+        known = any(np.array_equal(mode, earlier) for _, earlier in tried)
+        if not mode.any() or known or len(accepted) == problem.config.modes_to_choose_from:
             break
         progress(f"checking mode {attempt + 1} on held-out scenarios", 0.03 + 0.1 * attempt)
         trial, driven = try_on(problem, _act_in(problem, mode), 1.0, 0.0, reference, collect)

@@ -92,22 +92,24 @@ def gate_residual(
     collect: Collect,
     progress: Progress = lambda stage, share: None,
 ) -> FilterDraft:
-    """Keep the share of the residual with the best learned return among those that keep the task; possibly none."""
+    """Keep the largest share of the residual that keeps the task and is better than the mode alone; possibly none."""
     if not draft.weights.encoder:
         return draft
     started = time.perf_counter()
-    trials: list[Trial] = []
+    without = [trial for trial in draft.trials[-1:] if acceptable(problem, trial, reference)]
+    to_beat = without[0].preference if without else 0.0
+    kept, trials = 0.0, list[Trial]()
     for share in problem.config.residual_shares:
         progress(f"checking {share:.0%} of the residual on held-out scenarios", 0.75 + 0.1 * len(trials))
         weights = draft.weights.changed(residual_share=share)
         act = act_of(problem.task.modes, problem.policy, weights)
         trials.append(try_on(problem, act, weights.gate, share, reference, collect)[0])
-    without = draft.trials[-1:]  # the mode alone, where one was accepted
-    accepted = [trial for trial in (*trials, *without) if acceptable(problem, trial, reference)]
-    share = max(accepted, key=lambda trial: trial.preference).residual_share if accepted else 0.0
-    weights = draft.weights.changed(residual_share=share)
+        if acceptable(problem, trials[-1], reference) and trials[-1].preference > to_beat:
+            kept = share
+            break
+    weights = draft.weights.changed(residual_share=kept)
     notes = draft.notes
-    if share == 0.0:
+    if kept == 0.0:
         notes = (*notes, "The residual did not help on held-out scenarios and is off.")
     return replace(draft, weights=weights, trials=(*draft.trials, *trials), notes=notes).timed("gate_residual", started)
 
@@ -180,7 +182,7 @@ def _ascend(
     sample = torch.randint(len(observations), (400,), generator=generator)
     near = bases.take(sample)
     unit = spread_within_states(value, observations[sample], near.actions, near.deviations, generator)
-    optimiser = torch.optim.Adam(networks.adapter.parameters(), 1e-3)
+    optimiser = torch.optim.Adam(networks.adapter.parameters(), 1e-3, fused=True)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, config.adapter_steps, 5e-5)
     for _ in range(config.adapter_steps):
         rows = torch.randint(len(observations), (config.batch,), generator=generator)

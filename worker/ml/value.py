@@ -74,8 +74,16 @@ class ActionValue(nn.Module):
 
     def forward(self, observations: Tensor, actions: Tensor) -> Tensor:
         """(..., D), (..., 7) -> (...)"""
+        return self.of_inputs(self.inputs(observations, actions))
+
+    def inputs(self, observations: Tensor, actions: Tensor) -> Tensor:
+        """(..., D), (..., 7) -> (..., D + 7): what the network reads, the same for all copies of it"""
         seen = ((observations - self.offset) * self.scale).clamp(-OBSERVATION_CLIP, OBSERVATION_CLIP)
-        value: Tensor = self.body(torch.cat([seen, actions], -1))[..., 0]
+        return torch.cat([seen, actions], -1)
+
+    def of_inputs(self, inputs: Tensor) -> Tensor:
+        """(..., D + 7) -> (...)"""
+        value: Tensor = self.body(inputs)[..., 0]
         return value
 
 
@@ -93,26 +101,27 @@ def evaluate_filter(
     Episodes end by time limit only, so every step is bootstrapped. ``target`` follows by Polyak averaging.
     Returns the mean squared error of the last hundred steps.
     """
-    optimiser = torch.optim.Adam(value.parameters(), 1e-3)
+    optimiser = torch.optim.Adam(value.parameters(), 1e-3, fused=True)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps, 1e-4)
     with torch.no_grad():
         next_actions = torch.cat([actor(part) for part in torch.split(data.next_observations, 8192)])
-    losses = []
-    for _ in range(steps):
+        here = value.inputs(data.observations, data.actions)
+        following = value.inputs(data.next_observations, next_actions)
+    slow, fast = list[Tensor](target.parameters()), list[Tensor](value.parameters())
+    losses = torch.zeros(steps)
+    for step in range(steps):
         rows = _rows(len(data), newest, generator)
         with torch.no_grad():
-            future = target(data.next_observations[rows], next_actions[rows])
-            wanted = (1.0 - DISCOUNT) * data.rewards[rows] + DISCOUNT * future
-        loss = functional.mse_loss(value(data.observations[rows], data.actions[rows]), wanted)
+            wanted = (1.0 - DISCOUNT) * data.rewards[rows] + DISCOUNT * target.of_inputs(following[rows])
+        loss = functional.mse_loss(value.of_inputs(here[rows]), wanted)
         optimiser.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         optimiser.step()
         schedule.step()
         with torch.no_grad():
-            for slow, fast in zip(target.parameters(), value.parameters(), strict=True):
-                slow.lerp_(fast, POLYAK)
-        losses.append(float(loss.detach()))
-    return float(np.mean(losses[-100:]))
+            torch._foreach_lerp_(slow, fast, POLYAK)
+        losses[step] = loss.detach()
+    return float(losses[-100:].mean())
 
 
 @torch.no_grad()
