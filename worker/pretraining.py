@@ -7,8 +7,9 @@ from typing import Any
 from tqdm import tqdm
 
 from worker import laboratory
-from worker.ml import sac
+from worker.ml import reference_training
 from worker.ml.demonstrations import Demonstrate
+from worker.ml.sac import SacConfig
 from worker.sim.scripted_drinking import scripted_pouring
 
 TRAINING: Mapping[str, Mapping[str, Any]] = {
@@ -38,7 +39,7 @@ DEMONSTRATORS: Mapping[str, Callable[[], Demonstrate]] = {"drinking": scripted_p
 
 def pretrain(task: str, seed: int, directory: Path) -> int:
     """Train a task's reference policy by SAC, or resume a training that was interrupted (ten to twenty minutes)."""
-    config = sac.SacConfig(laboratory.task(task).observation, seed=seed, **TRAINING.get(task, {}))
+    config = SacConfig(laboratory.task(task).observation, seed=seed, **TRAINING.get(task, {}))
     with tqdm(total=config.total_steps, unit="step", smoothing=0.05) as bar:
 
         def progress(steps: int, figures: dict[str, Any]) -> None:
@@ -47,5 +48,7 @@ def pretrain(task: str, seed: int, directory: Path) -> int:
 
         command = f"python -m worker pretrain --task {task} --seed {seed}"
         demonstrate = DEMONSTRATORS[task]() if task in DEMONSTRATORS else None
-        sac.pretrain(laboratory.environment_class(task), config, directory, progress, command, demonstrate)
+        reference_training.pretrain(
+            laboratory.environment_class(task), config, directory, progress, command, demonstrate
+        )
     return 0

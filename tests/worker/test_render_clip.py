@@ -10,10 +10,10 @@ import pytest
 from tests.worker.waving import itching_trajectory, pouring_trajectory, waving_trajectory
 from worker.sim import layers
 from worker.sim.arm import Tool
-from worker.sim.bullet import Shape
 from worker.sim.camera import scene_camera
 from worker.sim.catalogue import ENVIRONMENTS
 from worker.sim.feeding import SPOON, FeedingEnv
+from worker.sim.geometry import Shape
 from worker.sim.highlight import Highlight
 from worker.sim.human import RIGHT
 from worker.sim.jaco import JACO

@@ -7,10 +7,10 @@ import pytest
 
 from worker.sim import arm_look, body_look, chair_look, head_look, human, limb_look, tool_look
 from worker.sim.arm import Tool
-from worker.sim.bullet import Shape
 from worker.sim.colours import COMPLEXIONS, Palette, ramps
 from worker.sim.drinking import CUP
 from worker.sim.feeding import SPOON
+from worker.sim.geometry import Shape
 from worker.sim.human import BODY_SHAPES, BROAD, BodyShape
 from worker.sim.jaco import JACO
 from worker.sim.meshes import Mesh, ball, curve, gradient, joined, openness, panel, surface, tube, without_hidden

@@ -8,9 +8,10 @@ import pytest
 
 import worker
 from worker.ml.policies import GaussianPolicy
-from worker.sim.bullet import Bullet, rotation_of
+from worker.sim.bullet import Bullet
 from worker.sim.feeding import FEEDING, SPOON, START, FeedingEnv
 from worker.sim.food import BALLS
+from worker.sim.geometry import rotation_of
 from worker.sim.jaco import JACO
 
 EPISODE_STEPS = FEEDING.episode_steps

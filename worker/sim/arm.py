@@ -11,7 +11,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from worker.sim.bullet import IDENTITY, Bullet, Link, Shape, capsule_between, compose, quaternion_of_euler
+from worker.sim.bullet import Bullet, Link
+from worker.sim.geometry import IDENTITY, Shape, capsule_between, compose, quaternion_of_euler
 
 FloatArray = npt.NDArray[np.float64]
 Point = tuple[float, float, float]

@@ -15,7 +15,8 @@ import numpy.typing as npt
 
 from worker.sim import human
 from worker.sim.arm import Robot, Start, Tool, start_postures
-from worker.sim.bullet import Bullet, Contact, Link, Shape, capsule_between, rotation_of
+from worker.sim.bullet import Bullet, Contact, Link
+from worker.sim.geometry import Shape, capsule_between, rotation_of
 from worker.sim.human import Impairment, Person
 from worker.sim.jaco import JACO
 from worker.sim.measures import Outcome, StepMeasures, TaskReward

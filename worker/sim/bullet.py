@@ -1,26 +1,18 @@
-"""The one place that talks to pybullet: a private client, bodies by name, SI units, xyzw quaternions.
+"""The physics engine: a private client that is stepped, bodies by name, SI units, xyzw quaternions.
 
-One `Bullet` is one DIRECT client. A simulation steps it; a renderer opens further clients and only sets poses.
+One `Bullet` is one DIRECT client. Renderers open clients of their own (drawing).
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-from worker.sim.quiet import silenced_stderr
+from worker.sim.engine import pybullet
+from worker.sim.geometry import IDENTITY, FloatArray, Shape, Vector
 
-with silenced_stderr():  # the engine greets with its build time, in every process
-    import pybullet
-
-FloatArray = npt.NDArray[np.float64]
-Vector = Sequence[float] | FloatArray
-IDENTITY = (0.0, 0.0, 0.0, 1.0)
 GRAVITY_M_S2 = 9.81
 CONTACT_MARGIN_M = 0.001
 """Boxes of bodies that are further apart are not compared. The engine's own 2 cm would pair every pellet in a cup with
@@ -31,23 +23,6 @@ MOST_REMOVED = 100
 
 _SHAPES = {"sphere": pybullet.GEOM_SPHERE, "capsule": pybullet.GEOM_CAPSULE, "box": pybullet.GEOM_BOX}
 _JOINTS = {"revolute": pybullet.JOINT_REVOLUTE, "fixed": pybullet.JOINT_FIXED}
-
-
-@dataclass(frozen=True)
-class Shape:
-    """One primitive in its body's frame; a capsule lies along z and ``length_m`` excludes its round caps."""
-
-    kind: Literal["sphere", "capsule", "box"]
-    radius_m: float = 0.01
-    length_m: float = 0.0
-    half_extents_m: tuple[float, float, float] = (0.01, 0.01, 0.01)
-    position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    quaternion: tuple[float, float, float, float] = IDENTITY
-
-    @classmethod
-    def box(cls, centre_m: tuple[float, float, float], size_m: tuple[float, float, float]) -> "Shape":
-        """A box by its whole edge lengths."""
-        return cls("box", half_extents_m=(size_m[0] / 2, size_m[1] / 2, size_m[2] / 2), position_m=centre_m)
 
 
 class Contact(NamedTuple):
@@ -73,43 +48,6 @@ class Link:
     axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
     """of the joint, in its own frame"""
     centre_of_mass_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-
-
-def rotation_of(quaternion: Vector) -> FloatArray:
-    """The (3, 3) rotation matrix of an xyzw quaternion."""
-    return np.array(pybullet.getMatrixFromQuaternion(quaternion)).reshape(3, 3)
-
-
-def compose(
-    origin_m: Vector, quaternion: Vector, inner_m: Vector, inner_quaternion: Vector
-) -> tuple[tuple[float, float, float], tuple[float, float, float, float]]:
-    """A frame given in another frame, seen from outside."""
-    position, turn = pybullet.multiplyTransforms(
-        list(origin_m), list(quaternion), list(inner_m), list(inner_quaternion)
-    )
-    return tuple(position), tuple(turn)
-
-
-def quaternion_of_euler(euler_rad: Vector) -> tuple[float, float, float, float]:
-    """The xyzw quaternion of roll, pitch, yaw about fixed x, y, z axes."""
-    return tuple(pybullet.getQuaternionFromEuler(list(euler_rad)))
-
-
-def capsule_between(start_m: Vector, end_m: Vector, radius_m: float) -> Shape:
-    """A capsule whose axis runs from start to end, both in the body's frame."""
-    (x0, y0, z0), (x1, y1, z1) = start_m, end_m
-    x, y, z = x1 - x0, y1 - y0, z1 - z0
-    length = math.sqrt(x * x + y * y + z * z)
-    # The shortest turn that takes the z axis to the capsule's; for one that points straight down any half turn will do.
-    turn = (-y, x, 0.0, length + z) if length + z > 1e-9 * length else (1.0, 0.0, 0.0, 0.0)
-    norm = math.sqrt(sum(part * part for part in turn))
-    return Shape(
-        "capsule",
-        radius_m,
-        length,
-        position_m=((x0 + x1) / 2, (y0 + y1) / 2, (z0 + z1) / 2),
-        quaternion=(turn[0] / norm, turn[1] / norm, turn[2] / norm, turn[3] / norm),
-    )
 
 
 class Bullet:
@@ -473,94 +411,3 @@ def _as_arrays(shapes: tuple[Shape, ...]) -> dict[str, Any]:
         "collisionFramePositions": [list(shape.position_m) for shape in shapes],
         "collisionFrameOrientations": [list(shape.quaternion) for shape in shapes],
     }
-
-
-class Drawing(NamedTuple):
-    """What the software renderer saw: both arrays share memory with the engine's answer."""
-
-    rgba: npt.NDArray[np.uint8]
-    """(height, width, 4)"""
-    depth: npt.NDArray[np.float32]
-    """(height, width) in [0, 1], the normalised device depth"""
-
-
-class DrawingClient:
-    """A client that only draws: meshes that share one palette texture, placed by name, no physics."""
-
-    def __init__(self, palettes: Sequence[Path]) -> None:
-        """`palettes` are image files of one size, read at once; the first one is worn until repaint()."""
-        self._client: int | None = pybullet.connect(pybullet.DIRECT)
-        self._textures = [pybullet.loadTexture(str(palette), physicsClientId=self._client) for palette in palettes]
-        self._worn = 0
-        self._bodies: dict[str, int] = {}
-
-    def close(self) -> None:
-        """Disconnect. Closing twice is fine."""
-        if self._client is not None and pybullet.isConnected(self._client):
-            pybullet.disconnect(self._client)
-        self._client = None
-
-    def add_mesh(
-        self, name: str, vertices_m: FloatArray, normals: FloatArray, texture: FloatArray, faces: npt.NDArray[np.int32]
-    ) -> None:
-        """Add a mesh of V vertices (V, 3), normals (V, 3), texture coordinates (V, 2) and triangles (F, 3)."""
-        shape = pybullet.createVisualShape(
-            pybullet.GEOM_MESH,
-            vertices=vertices_m.tolist(),
-            normals=normals.tolist(),
-            uvs=texture.tolist(),
-            indices=faces.ravel().tolist(),
-            rgbaColor=[1, 1, 1, 1],
-            physicsClientId=self._client,
-        )
-        body = pybullet.createMultiBody(0.0, -1, shape, physicsClientId=self._client)
-        self._bodies[name] = body
-        self._paint(name)
-
-    def repaint(self, palette: int) -> None:
-        """Give every mesh the colours of another palette."""
-        if palette != self._worn:
-            self._worn = palette
-            for name in self._bodies:
-                self._paint(name)
-
-    def _paint(self, name: str) -> None:
-        texture = self._textures[self._worn]
-        pybullet.changeVisualShape(self._bodies[name], -1, textureUniqueId=texture, physicsClientId=self._client)
-
-    def place(self, name: str, position_m: Vector, quaternion: Vector = IDENTITY) -> None:
-        """Put a mesh somewhere else."""
-        pybullet.resetBasePositionAndOrientation(
-            self._bodies[name], position_m, quaternion, physicsClientId=self._client
-        )
-
-    def draw(
-        self,
-        width: int,
-        height: int,
-        view: Sequence[float],
-        projection: Sequence[float],
-        light_direction: Sequence[float],
-        ambient: float,
-        diffuse: float,
-        specular: float,
-    ) -> Drawing:
-        """Draw without shadows; matrices are 16 numbers, column by column, as OpenGL wants them."""
-        _, _, rgba, depth, _ = pybullet.getCameraImage(
-            width,
-            height,
-            view,
-            projection,
-            shadow=0,
-            lightDirection=light_direction,
-            lightColor=(1.0, 1.0, 1.0),
-            lightAmbientCoeff=ambient,
-            lightDiffuseCoeff=diffuse,
-            lightSpecularCoeff=specular,
-            renderer=pybullet.ER_TINY_RENDERER,
-            flags=pybullet.ER_NO_SEGMENTATION_MASK,
-            physicsClientId=self._client,
-        )
-        return Drawing(
-            np.asarray(rgba, np.uint8).reshape(height, width, 4), np.asarray(depth, np.float32).reshape(height, width)
-        )

@@ -19,7 +19,8 @@ from worker.sim.assistive import (
     Motion,
     Reward,
 )
-from worker.sim.bullet import IDENTITY, Bullet, Vector, rotation_of
+from worker.sim.bullet import Bullet
+from worker.sim.geometry import IDENTITY, Vector, rotation_of
 from worker.sim.human import Impairment
 from worker.sim.jaco import JACO, PI
 from worker.sim.measures import Outcome, StepMeasures, TaskReward

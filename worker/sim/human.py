@@ -13,7 +13,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from worker.sim.bullet import quaternion_of_euler
+from worker.sim.geometry import quaternion_of_euler
 from worker.trajectory import BODIES, SKIN_TONES
 
 FloatArray = npt.NDArray[np.float64]

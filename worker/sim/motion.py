@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from worker.sim.arm import Robot, Tool, transform
-from worker.sim.bullet import rotation_of
+from worker.sim.geometry import rotation_of
 from worker.sim.human import BODY_SHAPES, FACE_IN_HEAD, BodyShape
 from worker.sim.solids import Array, smooth_step
 from worker.spaces import CONTROL_STEP_S

@@ -9,7 +9,7 @@ import numpy as np
 from worker.sim import arm_look, body_look, chair_look, head_look, human, limb_look, room_look
 from worker.sim.arm import Robot, Tool
 from worker.sim.arm_look import Grip
-from worker.sim.bullet import rotation_of
+from worker.sim.geometry import rotation_of
 from worker.sim.human import BodyShape
 from worker.sim.meshes import Mesh, ball
 from worker.sim.motion import quaternions

@@ -9,9 +9,10 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from worker.sim.bullet import IDENTITY, DrawingClient
 from worker.sim.camera import Camera, Rectangle, flat
 from worker.sim.colours import Palette
+from worker.sim.drawing import DrawingClient
+from worker.sim.geometry import IDENTITY
 from worker.sim.meshes import Mesh
 from worker.sim.solids import Array
 from worker.trajectory import SKIN_TONES

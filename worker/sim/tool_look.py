@@ -7,8 +7,8 @@ import numpy as np
 
 from worker.sim.arm import Tool
 from worker.sim.arm_look import Detail, Grip
-from worker.sim.bullet import Shape, rotation_of
 from worker.sim.drinking import CUP_BASE_RADIUS_M, CUP_HEIGHT_M, CUP_RIM_RADIUS_M, HELD_BEFORE_HAND_M
+from worker.sim.geometry import Shape, rotation_of
 from worker.sim.meshes import Mesh, curve, joined, surface, tube
 from worker.sim.scratching import SCRATCHER_LENGTH_M, TIP_RADIUS_M
 from worker.sim.solids import Array, box

@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from worker.sim.bullet import Bullet, Shape, quaternion_of_euler
+from worker.sim.bullet import Bullet
+from worker.sim.geometry import Shape, quaternion_of_euler
 from worker.sim.measures import Outcome
 
 FloatArray = npt.NDArray[np.float64]

@@ -14,7 +14,8 @@ import numpy.typing as npt
 
 from worker.sim import human
 from worker.sim.assistive import HEAD_SHAPES, PERSON, STILL_SHAPES, arm_shapes
-from worker.sim.bullet import IDENTITY, Bullet, Link, Shape, capsule_between, compose
+from worker.sim.bullet import Bullet, Link
+from worker.sim.geometry import IDENTITY, Shape, capsule_between, compose
 from worker.sim.human import BODY_SHAPES, Person
 
 FloatArray = npt.NDArray[np.float64]
