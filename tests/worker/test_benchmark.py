@@ -17,7 +17,7 @@ SHY = Taste("shy", (1.0, 3.0, 2.0, 2.0, 1.0, 1.0))
 TINY = replace(
     with_options(PROFILES["quick"], labels=12, scenarios=3, printed_steps=5),
     smallest_pool=2,
-    filter=FilterConfig(mode_attempts=1, gates=(), gate_scenarios=3, round_rollouts=()),
+    filter=FilterConfig(mode_attempts=1, gates=(), gate_scenarios=3, residual_rounds=0),
 )
 
 

@@ -57,18 +57,25 @@ class FilterConfig:
     """largest accepted loss of success on the gate's scenarios, as a share of episodes"""
     force_limit_n: float = 10.0
     """largest accepted force on the person: 95 of 100 episodes must stay below it (or below the reference's own)"""
-    round_rollouts: tuple[int, ...] = (60, 50, 50, 50)
-    """rollouts of the current filter before each round of residual learning; () leaves the residual out"""
-    round_noise: tuple[float, ...] = (0.25, 0.2, 0.2, 0.18)
+    residual_rounds: int = 4
+    """of residual learning; 0 leaves the residual out"""
+    residual_rollouts: int = 50
+    """of the current filter before each round"""
+    residual_noise: float = 0.1
+    """standard deviation of what is added to their actions"""
     value_steps: int = 3000
     adapter_steps: int = 500
     batch: int = 96
-    preference_weight: float = 1.0
+    preference_weight: float = 0.5
     """lambda: weight of the normalised value against squared distance in policy standard deviations"""
     kl_weight: float = 1e-3
     residual_shares: tuple[float, ...] = (1.0, 0.5)
     """tried in this order until one is acceptable and better than the mode alone"""
     evaluation_scenarios: int = 200
+
+    def bolder(self, factor: float) -> "FilterConfig":
+        """The same with so many times the weight of the value."""
+        return replace(self, preference_weight=factor * self.preference_weight)
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,13 @@
 """The second stage of the studio's filter: PbARL's action encoder as a residual around the mode, and its gate."""
 
 import copy
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -26,6 +29,7 @@ from worker.ml.trials import acceptable, try_on
 from worker.ml.value import ActionValue, Transitions, evaluate_filter, spread_within_states
 from worker.trajectory import Trajectory
 
+Floats = npt.NDArray[np.float64]
 Learn = Callable[[FilterProblem, FilterDraft, Sequence[Sequence[Trajectory]]], FilterDraft]
 """One round of residual learning from all rollouts so far."""
 
@@ -39,15 +43,24 @@ def train_residual(
 ) -> FilterDraft:
     """Rounds of: roll out the current filter with noise, learn its value, move its actions up that value.
 
+    When a round has clearly made the learned return worse, its step is taken back, and from then on steps are half as
+    bold.
     ``learn``: learn_round(), or something that calls it in another process.
     """
     rounds: list[list[Trajectory]] = []
-    for number in range(len(problem.config.round_rollouts)):
-        share = 0.35 + 0.35 * number / len(problem.config.round_rollouts)
+    kept, best = draft, np.array([-1e9])
+    for number in range(problem.config.residual_rounds):
+        share = 0.35 + 0.35 * number / problem.config.residual_rounds
         progress(f"rolling out the filter, round {number + 1}", share)
         started = time.perf_counter()
         rounds.append(collect(*residual_rollouts(problem, draft, number)))
         draft = draft.timed("residual_rollouts", started)
+        returns = problem.reward.returns(rounds[-1])
+        if not _clearly_below(returns, best):
+            kept, best = draft, returns
+        else:
+            draft = replace(draft, weights=kept.weights)
+            problem = replace(problem, config=problem.config.bolder(0.5))
         progress(f"training the action encoder, round {number + 1}", share + 0.1)
         draft = (learn or learn_round)(problem, draft, rounds)
     return draft
@@ -57,8 +70,18 @@ def residual_rollouts(problem: FilterProblem, draft: FilterDraft, number: int) -
     """What ``collect`` is asked for before round ``number``."""
     config = problem.config
     act = act_of(problem.task.modes, problem.policy, draft.weights)
-    scenarios = scenarios_for("residual", config.round_rollouts[number], 1000 * number)
-    return act, scenarios, config.round_noise[number], problem.seed + number
+    return (
+        act,
+        scenarios_for("residual", config.residual_rollouts, 1000 * number),
+        config.residual_noise,
+        problem.seed + number,
+    )
+
+
+def _clearly_below(returns: Floats, best: Floats) -> bool:
+    """Whether one mean is below another by more than the standard error of their difference; (N,), (M,)"""
+    error = math.hypot(returns.std() / len(returns) ** 0.5, best.std() / len(best) ** 0.5)
+    return float(best.mean() - returns.mean()) > error
 
 
 def learn_round(problem: FilterProblem, draft: FilterDraft, rounds: Sequence[Sequence[Trajectory]]) -> FilterDraft:
