@@ -209,3 +209,24 @@ def test_noise_belongs_to_the_scenario_and_not_to_the_order() -> None:
 def test_no_two_purposes_share_a_scenario() -> None:
     blocks = [set(filter_problem.scenarios_for(purpose, 1000)) for purpose in filter_problem.SCENARIO_BLOCKS]
     assert len(set.union(*blocks)) == 1000 * len(blocks)
+
+
+def test_a_round_that_made_it_worse_is_taken_back_and_the_next_step_is_half_as_bold(
+    reference: list[Trajectory],
+) -> None:
+    """Somebody dislikes speed; the first step of a careless learner makes the robot as fast as it can be."""
+    slow, fast = FilterWeights(mode={"speed_far": -0.5}), FilterWeights(mode={"speed_far": 0.5})
+    boldness, came_from = [], []
+
+    def careless(asked: FilterProblem, draft: FilterDraft, rounds: Sequence[Sequence[Trajectory]]) -> FilterDraft:
+        boldness.append(asked.config.preference_weight)
+        came_from.append(draft.weights)
+        return replace(draft, weights=fast if len(rounds) == 1 else draft.weights)
+
+    dislikes_speed = problem(-1.0, reference, residual_rounds=3, preference_weight=1.0)
+    found = residual_learning.train_residual(
+        dislikes_speed, FilterDraft(slow), World().collect, lambda stage, share: None, careless
+    )
+    assert came_from == [slow, slow, slow]
+    assert boldness == [1.0, 0.5, 0.5]
+    assert found.weights == slow
