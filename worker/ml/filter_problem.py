@@ -66,7 +66,7 @@ class FilterConfig:
     value_steps: int = 3000
     adapter_steps: int = 500
     batch: int = 96
-    preference_weight: float = 0.5
+    preference_weight: float = 0.3
     """lambda: weight of the normalised value against squared distance in policy standard deviations"""
     kl_weight: float = 1e-3
     residual_shares: tuple[float, ...] = (1.0, 0.5)

@@ -48,8 +48,8 @@ class FineTuning:
     """of the KL divergence from the frozen policy, in units of the spread of Q; 0 is the paper's PrefFT"""
 
 
-TIED = 2 / 7
-"""The tie_weight of prefft_anchored: as strong as in the studio's residual, which has the mean over seven joints."""
+TIED = 1.0
+"""The tie_weight of prefft_anchored: as strong as in the studio's residual (1 / (7 / 2 * 0.3))."""
 
 
 def fine_tune(
