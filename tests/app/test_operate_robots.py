@@ -161,7 +161,8 @@ def test_the_desk_is_for_those_who_are_logged_in(laboratory: Laboratory, new_bro
 
 # -- blindness --------------------------------------------------------------------------------------------------------
 
-WHEN = re.compile(rb"just now|\d+ (min|h|days) ago|\d{4}-\d\d-\d\dT[\d:.]+\+00:00")
+OF_THE_MOMENT = re.compile(rb"just now|\d+ (min|h|days) ago|\d{4}-\d\d-\d\dT[\d:.]+\+00:00|[\d.]+ [kMG]?B free")
+"""Times, and how much of the disk others leave free."""
 PARAMETER = re.compile(r"{(\w+)(?::\w+)?}")
 
 
@@ -180,8 +181,9 @@ def addresses(application: FastAPI, laboratory: Laboratory) -> Iterator[str]:
 
 
 def pages(application: FastAPI, laboratory: Laboratory) -> dict[str, bytes]:
-    """What every address answers; times are left out."""
-    return {path: WHEN.sub(b"", laboratory.operator.get(path).content) for path in addresses(application, laboratory)}
+    """What every address answers; what changes by itself is left out."""
+    answers = {path: laboratory.operator.get(path).content for path in addresses(application, laboratory)}
+    return {path: OF_THE_MOMENT.sub(b"", content) for path, content in answers.items()}
 
 
 def exchange(laboratory: Laboratory) -> None:
