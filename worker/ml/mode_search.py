@@ -37,11 +37,12 @@ def find_mode(
     tried: list[tuple[Trial, Floats]] = []
     accepted: list[tuple[Trial, Floats]] = []
     for attempt in range(problem.config.mode_attempts):
+        if len(accepted) == problem.config.modes_to_choose_from:
+            break
         progress("searching the person's way of doing the task", 0.1 * attempt)
         rejected = len(tried) - len(accepted)
         mode = best_mode(surface, wishes, problem.seed, success_caution=CAUTION * (1 + rejected))
-        known = any(np.array_equal(mode, earlier) for _, earlier in tried)
-        if not mode.any() or known or len(accepted) == problem.config.modes_to_choose_from:
+        if not mode.any() or any(np.array_equal(mode, earlier) for _, earlier in tried):
             break
         progress(f"checking mode {attempt + 1} on held-out scenarios", 0.03 + 0.1 * attempt)
         trial, driven = try_on(problem, _act_in(problem, mode), 1.0, 0.0, reference, collect)

@@ -48,7 +48,8 @@ def train_residual(
     ``learn``: learn_round(), or something that calls it in another process.
     """
     rounds: list[list[Trajectory]] = []
-    kept, best = draft, np.array([-1e9])
+    kept = draft
+    earned: Floats | None = None
     for number in range(problem.config.residual_rounds):
         share = 0.35 + 0.35 * number / problem.config.residual_rounds
         progress(f"rolling out the filter, round {number + 1}", share)
@@ -56,8 +57,8 @@ def train_residual(
         rounds.append(collect(*residual_rollouts(problem, draft, number)))
         draft = draft.timed("residual_rollouts", started)
         returns = problem.reward.returns(rounds[-1])
-        if not _clearly_below(returns, best):
-            kept, best = draft, returns
+        if earned is None or not _clearly_below(returns, earned):
+            kept, earned = draft, returns
         else:
             draft = replace(draft, weights=kept.weights)
             problem = replace(problem, config=problem.config.bolder(0.5))
@@ -78,10 +79,10 @@ def residual_rollouts(problem: FilterProblem, draft: FilterDraft, number: int) -
     )
 
 
-def _clearly_below(returns: Floats, best: Floats) -> bool:
+def _clearly_below(returns: Floats, earlier: Floats) -> bool:
     """Whether one mean is below another by more than the standard error of their difference; (N,), (M,)"""
-    error = math.hypot(returns.std() / len(returns) ** 0.5, best.std() / len(best) ** 0.5)
-    return float(best.mean() - returns.mean()) > error
+    error = math.hypot(returns.std() / len(returns) ** 0.5, earlier.std() / len(earlier) ** 0.5)
+    return float(earlier.mean() - returns.mean()) > error
 
 
 def learn_round(problem: FilterProblem, draft: FilterDraft, rounds: Sequence[Sequence[Trajectory]]) -> FilterDraft:
