@@ -133,7 +133,8 @@ def _fill_shelves(compute: Compute, processes: int, missing: Sequence[Cell], ter
     for task in dict.fromkeys(cell.task for cell in missing):
         gate = scenarios_for("gate", terms.filter.gate_scenarios)
         jobs += [(task, work, "behaviours", chunk) for chunk in _chunks(terms.pool)]
-        jobs += [(task, work, "reference", chunk) for part in (terms.unseen, gate) for chunk in _chunks(part)]
+        unseen = [terms.unseen(seed) for seed in dict.fromkeys(cell.seed for cell in missing)]
+        jobs += [(task, work, "reference", chunk) for part in (*unseen, gate) for chunk in _chunks(part)]
     _in_parallel(compute, processes, "shared rollouts", fill_shelf, jobs)
 
 
@@ -288,8 +289,8 @@ def _header(terms: Terms, cells: Cells, tastes: dict[str, Taste], command: str) 
         f'{terms.labels} scripted labels per user and seed (5 % mistakes, 10 % "equal") on',
         f"{len(terms.pool)} scenarios, pairs chosen by `{terms.rule}`, reward model `{terms.reward}`, costs in the",
         f"`{terms.form}` form.",
-        f"Every method is driven through {terms.scenarios} scenarios from {terms.unseen.start}: no clip, surface, gate",
-        "or training uses them; how settings were chosen is in docs/method.md, section 6.",
+        f"Every method is driven through {terms.scenarios} scenarios per seed, from {terms.unseen(0).start} on: no",
+        "clip, surface, gate or training uses them; how settings were chosen is in docs/method.md, section 6.",
         f"Environment steps: PrefFT {methods.fine_tuning.steps}, PbRL-HRI {methods.from_scratch.steps};",
         f"gradient steps of printed PbARL {methods.printed_steps}. Weights of the users: {weights}.",
         f"{versions}. Frozen policies: {marks}.",

@@ -66,10 +66,9 @@ class Terms:
         """Scenarios of the clips that are compared."""
         return range(POOL_FIRST, POOL_FIRST + max(self.smallest_pool, -(-self.labels // PAIRS_PER_SCENARIO)))
 
-    @property
-    def unseen(self) -> range:
-        """Scenarios of the evaluation."""
-        return filter_problem.scenarios_for("evaluation", self.scenarios)
+    def unseen(self, seed: int) -> range:
+        """Scenarios of the evaluation; every seed has its own, so that another seed confirms with fresh ones."""
+        return filter_problem.scenarios_for("evaluation", self.scenarios, skip=seed * self.scenarios)
 
     def directory(self, work: Path) -> Path:
         """Where cells under these terms are kept."""
@@ -102,10 +101,11 @@ def run_cell(cell: Cell, terms: Terms, work: Path) -> Path:
     started = time.perf_counter()
     fitted = methods.fit(cell.method, bench.setting())
     wall_s = time.perf_counter() - started
+    unseen = terms.unseen(cell.seed)
     if cell.method == "reference":
-        driven = shelf.reference(terms.unseen)
+        driven = shelf.reference(unseen)
     else:
-        driven = lessons.run_scenarios(cell.task, fitted.act, terms.unseen, 0.0, 0)
+        driven = lessons.run_scenarios(cell.task, fitted.act, unseen, 0.0, 0)
     record = {
         **{name: getattr(cell, name) for name in ("task", "method", "seed")},
         "taste": asdict(cell.taste),

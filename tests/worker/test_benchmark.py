@@ -83,6 +83,11 @@ def test_an_interrupted_benchmark_runs_what_is_missing_and_nothing_else(work: Pa
     assert "pbarl_n1" in [row["method"] for row in rows(tmp_path / "table1.csv")]
 
 
+def test_every_seed_is_judged_in_scenarios_of_its_own() -> None:
+    terms = Terms(scenarios=30)
+    assert len({scenario for seed in range(3) for scenario in terms.unseen(seed)}) == 3 * 30
+
+
 def test_the_reference_policy_comes_first_and_a_seed_is_finished_before_the_next() -> None:
     cells = Selection(["prefft", "pbarl"], ["feeding"], list(PAPER_USERS.values()), seeds=2).cells()
     assert [cell.method for cell in cells[:4]] == ["reference"] * 3 + ["pbarl"]

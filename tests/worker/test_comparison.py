@@ -74,7 +74,7 @@ def test_the_reference_policy_does_not_differ_from_itself() -> None:
     assert [row[f"success_delta{end}"] for end in ("", "_low", "_high")] == [0.0, 0.0, 0.0]
 
 
-def test_seeds_are_averaged_before_anything_else() -> None:
+def test_the_episodes_of_all_seeds_count_alike() -> None:
     other = run("neutral", "pbarl", (8, 0, 0), seed=1)
     by_name = {
         (row["user"], row["method"]): row
@@ -84,6 +84,48 @@ def test_seeds_are_averaged_before_anything_else() -> None:
     assert (row["seeds"], row["scenarios"]) == (2, N)
     assert row["true_preference_delta"] == pytest.approx(6.0)
     assert row["success"] == pytest.approx(1.0 - 1 / N)
+
+
+def test_every_episode_of_another_seed_narrows_the_interval() -> None:
+    """Seeds have scenarios of their own, so two seeds are twice as many episodes."""
+    second = [run("neutral", "reference", seed=1), run("neutral", "pbarl", (4, 1, -2), lost=2, seed=1)]
+
+    def width(runs: Sequence[Run]) -> float:
+        row = next(row for row in table_rows(pooled(runs)) if (row["user"], row["method"]) == ("neutral", "pbarl"))
+        return float(row["true_preference_high"] - row["true_preference_low"])
+
+    assert width([*RUNS, *second]) == pytest.approx(width(RUNS) / 2**0.5, rel=0.02)
+
+
+def test_methods_and_users_are_compared_in_the_seeds_they_share() -> None:
+    """An unfinished second seed of one user must not be set against the first of another."""
+    lucky = [run("neutral", "reference", seed=1), run("neutral", "pbarl", (100, 0, 0), seed=1)]
+    before, after = (pooled(runs) for runs in (RUNS, [*RUNS, *lucky]))
+    assert comparison.against(after, "pbarl", "prefft") == comparison.against(before, "pbarl", "prefft")
+    advantages = [
+        next(row["own_advantage"] for row in rows if row["trained_for"] == row["judged_by"] == "neutral")
+        for rows in (comparison.personalisation_rows(cells, "pbarl", [USERS]) for cells in (before, after))
+    ]
+    assert advantages[1] == pytest.approx(advantages[0])
+
+
+def test_the_page_shows_each_seed_alone() -> None:
+    assert "seed by seed" not in to_markdown(pooled(RUNS), [USERS], "")
+    second = [
+        run("neutral", "reference", seed=1),
+        run("cautious", "reference", seed=1),
+        run("neutral", "pbarl", (3, 1, 0), seed=1),
+        run("cautious", "pbarl", (5, 2, 0), seed=1),
+    ]
+    page = to_markdown(pooled([*RUNS, *second]), [USERS], "")
+    table = page.split("seed by seed")[1]
+    unit = abs(HARDNESS.mean() - 20.0)
+    line = next(line for line in table.splitlines() if line.startswith("| feeding, neutral"))
+    assert f"{100 * (4 - 5) / unit:+.1f} [" in line  # first seed: the impatient user's filter is better
+    assert f"{100 * (3 - 5) / unit:+.1f} [" in line  # second: the cautious user's
+    assert next(line for line in table.splitlines() if line.startswith("| feeding, impatient")).endswith(
+        "| - | - | - |"
+    )
 
 
 def test_a_run_whose_reference_is_missing_waits_for_it() -> None:

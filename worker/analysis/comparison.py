@@ -1,12 +1,12 @@
 """Methods against each other: the rows of the paper's Table I and of the personalisation matrix, with intervals.
 
-Every difference is to the reference policy in the same scenarios with the same seed of labels. Where there are several
-seeds, each scenario counts with its mean over them. Intervals are 95 % and cover the choice of scenarios only.
+Every difference is to the reference policy in the same scenarios. Every seed has labels, trainings and scenarios of its
+own, and where there are several all their episodes count alike. Intervals are 95 %, over scenarios only.
 Success and its changes are shares (0.05 is five points), preference is the learned return, true preference the return
 of r^H, gains are shares of the reference policy's own true return.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -48,20 +48,32 @@ class Run:
 
 @dataclass(frozen=True)
 class Pooled:
-    """The runs of one method for one user, seed by seed beside the reference policy's; means over seeds."""
+    """The runs of one method for one user beside the reference policy's, seed by seed in ascending order."""
 
     runs: tuple[Run, ...]
     references: tuple[Run, ...]
 
+    @property
+    def seeds(self) -> set[int]:
+        """Of labels, trainings and scenarios."""
+        return {run.seed for run in self.runs}
+
+    def of(self, seeds: Collection[int]) -> "Pooled":
+        """The runs with these seeds only."""
+        runs, references = (
+            tuple(run for run in all_runs if run.seed in seeds) for all_runs in (self.runs, self.references)
+        )
+        return Pooled(runs, references)
+
     def both(self, what: str) -> tuple[Floats, Floats]:
-        """The reference policy's and the method's values per scenario, (N,) or (N, 6) each."""
-        before, after = (np.mean([getattr(run, what) for run in runs], axis=0) for runs in (self.references, self.runs))
+        """The reference policy's and the method's values per episode, (seeds N,) or (seeds N, 6) each."""
+        before, after = (np.concatenate([getattr(run, what) for run in runs]) for runs in (self.references, self.runs))
         return before, after
 
     def true_of(self, judge: str) -> tuple[Floats, Floats]:
         """The same for the true returns of somebody."""
         before, after = (
-            np.mean([run.true_returns[judge] for run in runs], axis=0) for runs in (self.references, self.runs)
+            np.concatenate([run.true_returns[judge] for run in runs]) for runs in (self.references, self.runs)
         )
         return before, after
 
@@ -86,6 +98,12 @@ def pooled(runs: Iterable[Run]) -> Cells:
     return cells
 
 
+def one_by_one(cells: Cells) -> dict[int, Cells]:
+    """The same for each seed alone."""
+    seeds = sorted(set[int]().union(*(cell.seeds for cell in cells.values())))
+    return {seed: {name: cell.of({seed}) for name, cell in cells.items() if seed in cell.seeds} for seed in seeds}
+
+
 def table_rows(cells: Cells) -> list[Row]:
     """The columns of docs/results/table1.csv."""
     return [_table_row(task, user, method, cell) for (task, user, method), cell in cells.items()]
@@ -94,7 +112,7 @@ def table_rows(cells: Cells) -> list[Row]:
 def _table_row(task: str, user: str, method: str, cell: Pooled) -> Row:
     before, after = cell.both("success")
     row: Row = {"task": task, "user": user, "method": method, "labels": cell.runs[0].labels}
-    row |= {"seeds": len(cell.runs), "scenarios": len(after)}
+    row |= {"seeds": len(cell.runs), "scenarios": len(cell.runs[0].success)}
     low, high = wilson_interval(float(after.sum()), len(after))
     row |= _named("success", float(after.mean()), low, high)
     change = success_change(before, after)
@@ -135,12 +153,19 @@ def spent_rows(cells: Cells) -> list[Row]:
 
 
 def against(cells: Cells, method: str, rival: str) -> list[Row]:
-    """Per task and user: the method's preference minus the rival's, learned and true, paired by scenario."""
+    """Per task and user: the method's preference minus the rival's, learned and true, paired by scenario.
+
+    Seeds that only one of them has been run with are left out.
+    """
     rows = []
     for task, user, name in cells:
         if name != method or (task, user, rival) not in cells:
             continue
         mine, other = cells[task, user, method], cells[task, user, rival]
+        shared = mine.seeds & other.seeds
+        if not shared:
+            continue
+        mine, other = mine.of(shared), other.of(shared)
         row: Row = {"task": task, "user": user}
         change = mean_change(other.both("preference")[1], mine.both("preference")[1])
         row |= _named("preference", change["delta"], change["low"], change["high"])
@@ -155,7 +180,7 @@ def personalisation_rows(cells: Cells, method: str, groups: Sequence[Sequence[st
     """The columns of docs/results/personalisation.csv: whose filter serves whom.
 
     ``groups``: users who are compared with each other. A user's own advantage is over the best filter of somebody else
-    in the group, chosen on the very same scenarios, which favours the others.
+    in the group, chosen on the very same scenarios, which favours the others, and in the seeds that all of them have.
     """
     rows = []
     for task in dict.fromkeys(task for task, _, _ in cells):
@@ -175,9 +200,10 @@ def _matrix_row(task: str, trained_for: str, judge: str, cell: Pooled, others: S
     row |= _named("gain", gain["delta"], gain["low"], gain["high"])
     row["success_delta"] = success_change(*cell.both("success"))["delta"]
     row |= dict.fromkeys(("own_advantage", "own_advantage_low", "own_advantage_high"), "")
-    if trained_for == judge and others:
-        best = max((each.true_of(judge)[1] for each in others), key=lambda returns: float(returns.mean()))
-        advantage = mean_change(best / unit, after / unit)
+    shared = cell.seeds.intersection(*(each.seeds for each in others))
+    if trained_for == judge and others and shared:
+        best = max((each.of(shared).true_of(judge)[1] for each in others), key=lambda returns: float(returns.mean()))
+        advantage = mean_change(best / unit, cell.of(shared).true_of(judge)[1] / unit)
         row |= _named("own_advantage", advantage["delta"], advantage["low"], advantage["high"])
     return row
 

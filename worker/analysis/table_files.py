@@ -5,7 +5,16 @@ import io
 from collections.abc import Sequence
 from typing import Any
 
-from worker.analysis.comparison import Cells, Row, against, cost_rows, personalisation_rows, spent_rows, table_rows
+from worker.analysis.comparison import (
+    Cells,
+    Row,
+    against,
+    cost_rows,
+    one_by_one,
+    personalisation_rows,
+    spent_rows,
+    table_rows,
+)
 from worker.analysis.published import published
 from worker.trajectory import COSTS
 
@@ -35,6 +44,7 @@ def to_markdown(cells: Cells, groups: Sequence[Sequence[str]], header: str) -> s
         _spent(cells),
         _costs(cells),
         _matrices(cells, groups),
+        _seeds(cells, groups),
         _notes(cells),
     ]
     return "\n\n".join(part for part in parts if part) + "\n"
@@ -175,6 +185,37 @@ def _matrices(cells: Cells, groups: Sequence[Sequence[str]]) -> str:
         lines.append("| own advantage | " + " | ".join(_advantage(row) for row in own) + " | |")
         parts.append("\n".join(lines))
     return "\n\n".join(parts)
+
+
+def _seeds(cells: Cells, groups: Sequence[Sequence[str]]) -> str:
+    """What one seed says, another confirms or not: the diagonals of the matrices for each alone."""
+    found = {
+        (row["task"], row["trained_for"], seed): row
+        for seed, of_seed in one_by_one(cells).items()
+        for row in personalisation_rows(of_seed, METHOD, groups)
+        if row["trained_for"] == row["judged_by"]
+    }
+    seeds = sorted({seed for _, _, seed in found})
+    if len(seeds) < 2:
+        return ""
+    lines = [
+        f"## `{METHOD}`, seed by seed",
+        "Other labels, other trainings and other scenarios. Own gain in true return, % of the reference policy's; own"
+        " filter beyond the best of somebody else's; change of success in points.",
+        "",
+        "| task, user |" + "".join(f" seed {seed}: gain | advantage | success |" for seed in seeds),
+        "|---" * (1 + 3 * len(seeds)) + "|",
+    ]
+    for task, user in dict.fromkeys((task, user) for task, user, _ in found):
+        of_user = [found.get((task, user, seed)) for seed in seeds]
+        parts = [
+            f"{_change(row, 'gain', 100)} | {_advantage(row)} | {100 * row['success_delta']:+.1f}"
+            if row
+            else "- | - | -"
+            for row in of_user
+        ]
+        lines.append(f"| {task}, {user} | " + " | ".join(parts) + " |")
+    return "\n".join(lines)
 
 
 def _notes(cells: Cells) -> str:
