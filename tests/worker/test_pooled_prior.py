@@ -16,14 +16,14 @@ def test_the_covariance_is_shrunk_towards_its_diagonal_and_never_singular() -> N
     weights = np.array([[1.0, 1.0], [2.0, 2.0], [3.0, 3.0]])
     prior = Prior.pooled(weights)
     np.testing.assert_allclose(prior.mean, [2.0, 2.0])
-    np.testing.assert_allclose(prior.covariance, [[1.05, 0.7], [0.7, 1.05]])
+    np.testing.assert_allclose(prior.covariance, [[1.8, 0.7], [0.7, 1.8]])
     assert np.linalg.eigvalsh(prior.covariance).min() > 0.0
 
 
 def test_too_few_people_are_no_prior() -> None:
     prior = Prior.pooled(np.ones((2, 3)))
     np.testing.assert_array_equal(prior.mean, np.zeros(3))
-    np.testing.assert_array_equal(prior.covariance, np.eye(3))
+    np.testing.assert_array_equal(prior.covariance, 16.0 * np.eye(3))
 
 
 def test_without_labels_the_posterior_is_the_prior() -> None:

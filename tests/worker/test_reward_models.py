@@ -9,6 +9,7 @@ import torch
 from tests.worker import invented
 from worker.ml import bradley_terry, reward_training
 from worker.ml.network_training import MlpTraining, TransformerTraining
+from worker.ml.pooled_prior import DEVIATION
 from worker.ml.reward_models import CLIP, RewardModel, StructuredReward, load_reward_model, stored_config
 from worker.ml.reward_training import SignalScale, fit, posterior
 from worker.ml.segments import SegmentPairs
@@ -66,7 +67,7 @@ def test_equation_2_as_printed_learns_the_reversed_preference() -> None:
     assert right_form > 0 > as_printed
 
 
-def test_the_structured_fit_minimises_the_right_form_of_equation_2_with_a_normal_prior(
+def test_the_structured_fit_minimises_the_right_form_of_equation_2_for_people_who_slip_with_a_normal_prior(
     labelled: tuple[SegmentPairs, np.ndarray],
 ) -> None:
     shown, targets = labelled
@@ -74,11 +75,34 @@ def test_the_structured_fit_minimises_the_right_form_of_equation_2_with_a_normal
     mean, covariance = posterior(features, targets)
     weights = torch.tensor(mean, requires_grad=True)
     logits = torch.tensor(features) @ weights
-    loss = bradley_terry.preference_loss(logits, torch.tensor(targets)) * len(targets) + 0.5 * (weights**2).sum()
-    loss.backward()  # type: ignore[no-untyped-call]
+    said, y = 0.05 + 0.9 * torch.sigmoid(logits), torch.tensor(targets)
+    surprise = -(y * said.log() + (1 - y) * (1 - said).log()).sum()
+    (surprise + 0.5 * (weights**2).sum() / DEVIATION**2).backward()  # type: ignore[no-untyped-call]
     assert weights.grad is not None
-    assert float(weights.grad.abs().max()) < 1e-6
+    assert float(weights.grad.abs().max()) < 1e-5
     assert np.linalg.eigvalsh(covariance).min() > 0
+
+
+def test_slips_on_easy_pairs_do_not_outweigh_careful_answers(labelled: tuple[SegmentPairs, np.ndarray]) -> None:
+    """Somebody who minds speed only has three times named the clip that is far too fast."""
+    shown, targets = labelled
+    easiest = np.argsort(-np.abs(shown.signal_differences()[:, SIGNALS.index("speed_m_s")]))[:3]
+    slipped = targets.copy()
+    slipped[easiest] = 1.0 - slipped[easiest]
+    unseen = invented.pairs(300, np.random.default_rng(2))
+    truth = invented.answers_of(unseen, DISLIKES_SPEED) > 0.5
+    careful, careless = (
+        float(((fit(shown, said, "structured", 0).model.probability_right(unseen) > 0.5) == truth).mean())
+        for said in (targets, slipped)
+    )
+    assert careless > careful - 0.02
+
+
+def test_weights_stay_finite_when_a_few_answers_can_be_explained_perfectly() -> None:
+    shown = invented.pairs(12, np.random.default_rng(4))
+    model = fit(shown, invented.answers_of(shown, 1e3 * DISLIKES_SPEED), "structured", 0).model
+    assert isinstance(model, StructuredReward)
+    assert np.isfinite(model.weights).all()
 
 
 def test_all_kinds_rank_what_they_were_told(model: RewardModel, labelled: tuple[SegmentPairs, np.ndarray]) -> None:

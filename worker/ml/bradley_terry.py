@@ -24,6 +24,24 @@ def probability_right(logits: npt.NDArray[np.floating]) -> npt.NDArray[np.float6
     return probability
 
 
+LAPSES = 0.1
+"""Share of answers that say nothing, as Christiano et al. (2017) assume. Without it a few slips of the finger on easy
+pairs weigh as much as many careful answers (docs/results/reward_prior.md)."""
+
+
+def probability_of_answer(probability: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
+    """P(the answer is "right") of people who answer at random LAPSES of the time, from P(right preferred)."""
+    answered: npt.NDArray[np.float64] = LAPSES / 2 + (1.0 - LAPSES) * np.asarray(probability, np.float64)
+    return answered
+
+
+def slope_of_answer(probability: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
+    """Derivative of probability_of_answer() by the log odds that right is preferred."""
+    preferred = np.asarray(probability, np.float64)
+    slope: npt.NDArray[np.float64] = (1.0 - LAPSES) * preferred * (1.0 - preferred)
+    return slope
+
+
 def preference_loss(logits: Tensor, targets: Tensor, weights: Tensor | None = None) -> Tensor:
     """Mean cross-entropy, Eq. (2) in the right form: y log P[right] + (1 - y) log P[left].
 

@@ -15,10 +15,13 @@ from worker.ml.reward_models import RewardModel, StructuredReward
 
 Floats = npt.NDArray[np.float64]
 
+DEVIATION = 4.0
+"""Of every weight when nobody is known: wide, because a narrow prior spreads what is wanted over all signals that go
+along with it (docs/results/reward_prior.md)."""
 FEWEST_PEOPLE = 3
-"""With fewer the prior is N(0, I) as without anybody."""
+"""With fewer the prior is the one without anybody."""
 SHARED, OWN, FLOOR = 0.7, 0.3, 0.05
-"""Shares of the covariance and of its diagonal, and what is added to every variance."""
+"""Shares of the covariance and of its diagonal, and of the variance without anybody."""
 
 
 @dataclass(frozen=True)
@@ -32,17 +35,18 @@ class Prior:
 
     @classmethod
     def standard(cls, size: int) -> Self:
-        """N(0, I)"""
-        return cls(np.zeros(size), np.eye(size))
+        """N(0, DEVIATION^2 I)"""
+        return cls(np.zeros(size), DEVIATION**2 * np.eye(size))
 
     @classmethod
     def pooled(cls, weights: npt.ArrayLike) -> Self:
-        """From the weights of P people, (P, S): their mean, .7 covariance + .3 diagonal + .05 I."""
+        """From the weights of P people, (P, S): their mean, .7 covariance + .3 diagonal + .05 of standard()."""
         given = np.asarray(weights, np.float64)
+        usual = cls.standard(given.shape[-1])
         if len(given) < FEWEST_PEOPLE:
-            return cls.standard(given.shape[-1])
+            return usual
         covariance = np.cov(given, rowvar=False)
-        shrunk = SHARED * covariance + OWN * np.diag(np.diag(covariance)) + FLOOR * np.eye(given.shape[1])
+        shrunk = SHARED * covariance + OWN * np.diag(np.diag(covariance)) + FLOOR * usual.covariance
         return cls(given.mean(axis=0), shrunk)
 
 

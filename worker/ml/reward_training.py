@@ -7,9 +7,10 @@ from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
+from scipy.optimize import minimize
 
 from worker.ml import calibration
-from worker.ml.bradley_terry import probability_right
+from worker.ml.bradley_terry import probability_of_answer, probability_right, slope_of_answer
 from worker.ml.calibration import HeldOut
 from worker.ml.network_training import MlpTraining, TransformerTraining, fit_mlp, fit_transformer
 from worker.ml.pooled_prior import Prior
@@ -21,8 +22,8 @@ Floats = npt.NDArray[np.float64]
 Kind = Literal["structured", "mlp", "preference_transformer"]
 
 MEMBERS = 8
-NEWTON_STEPS = 15
-LONGEST_NEWTON_STEP = 3.0
+LARGEST_GRADIENT = 1e-6
+"""At what counts as the posterior's mode."""
 CALIBRATION_FOLDS = 5
 OUTLIER_SHARE = 0.01
 """Of the mean signals at either end: the single wildest clip does not say what is usual."""
@@ -91,7 +92,7 @@ def fit(
     ``scale``: of the signals in the pool the pairs come from; from the labelled pairs themselves when missing, which
     is shaky below about 30 labels.
     ``reference``: rollouts of the reference policy to normalise over; the labelled segments when missing.
-    ``prior``: of the structured kind's weights, N(0, I) when missing.
+    ``prior``: of the structured kind's weights, Prior.standard() when missing.
     ``signal_names``: what the columns of the pairs' signals are called.
     Raises ValueError for targets outside {0, 1/2, 1} or a count that differs from the pairs'.
     """
@@ -179,7 +180,7 @@ def _held_out(features: Floats, answers: Floats, seed: int, prior: Prior, costs:
 def posterior(
     features: Floats, answers: Floats, prior: Prior | None = None, costs: Sequence[int] = ()
 ) -> tuple[Floats, Floats]:
-    """Laplace approximation of p(w | labels): its mean (S,) and covariance (S, S). The prior is N(0, I) when missing.
+    """Laplace approximation of p(w | labels): its mean (S,) and covariance (S, S). Prior.standard() when missing.
 
     features (N, S) standardised differences right minus left; answers (N,) in {0, 1/2, 1}; ``costs``: columns whose
     mean weight must not be positive. Those that would be are held at 0, and the others fitted anew.
@@ -195,30 +196,35 @@ def posterior(
 
 
 def _laplace(features: Floats, answers: Floats, prior: Prior, pinned: Sequence[int]) -> tuple[Floats, Floats]:
-    """Newton's method with steps of bounded length: separable data then move towards the prior's shoulder instead of
-    overflowing."""
+    """The mode by a trust region, which overshoots neither on separable data nor where somebody may have slipped."""
     precision, mean = np.asarray(np.linalg.inv(prior.covariance), np.float64), prior.mean.copy()
     precision[pinned, pinned] += _PINNED
     mean[pinned] = 0.0
-    weights: Floats = mean.copy()
-    for _ in range(NEWTON_STEPS):
-        gradient, hessian = _gradient_and_hessian(features, answers, weights, mean, precision)
-        step = np.asarray(np.linalg.solve(hessian, gradient), np.float64)
-        length = max(float(np.linalg.norm(step)), 1e-12)
-        weights = weights - min(1.0, LONGEST_NEWTON_STEP / length) * step
+
+    def loss(weights: Floats) -> tuple[float, Floats]:
+        said = probability_of_answer(probability_right(features @ weights))
+        surprise = -(answers * np.log(said) + (1.0 - answers) * np.log(1.0 - said)).sum()
+        pull = precision @ (weights - mean)
+        gradient = _gradient_and_information(features, answers, weights)[0]
+        return float(surprise + 0.5 * pull @ (weights - mean)), gradient + pull
+
+    def curvature(weights: Floats) -> Floats:
+        return _gradient_and_information(features, answers, weights)[1] + precision
+
+    found = minimize(loss, mean, jac=True, hess=curvature, method="trust-exact", options={"gtol": LARGEST_GRADIENT})
+    weights: Floats = found.x
     weights[pinned] = 0.0
-    hessian = _gradient_and_hessian(features, answers, weights, mean, precision)[1]
-    return weights, np.asarray(np.linalg.inv(hessian), np.float64)
+    return weights, np.asarray(np.linalg.inv(curvature(weights)), np.float64)
 
 
-def _gradient_and_hessian(
-    features: Floats, answers: Floats, weights: Floats, mean: Floats, precision: Floats
-) -> tuple[Floats, Floats]:
-    """Of the summed right form of Eq. (2) plus (w - mean)' precision (w - mean) / 2."""
-    probability = probability_right(features @ weights)
-    gradient: Floats = features.T @ (probability - answers) + precision @ (weights - mean)
-    hessian: Floats = features.T @ (features * (probability * (1 - probability))[:, None]) + precision
-    return gradient, hessian
+def _gradient_and_information(features: Floats, answers: Floats, weights: Floats) -> tuple[Floats, Floats]:
+    """Of the summed right form of Eq. (2) for people who sometimes answer at random: (S,) and Fisher's (S, S)."""
+    preferred = probability_right(features @ weights)
+    said, slope = probability_of_answer(preferred), slope_of_answer(preferred)
+    variance = said * (1.0 - said)
+    gradient: Floats = features.T @ ((said - answers) * slope / variance)
+    information: Floats = features.T @ (features * (slope**2 / variance)[:, None])
+    return gradient, information
 
 
 def _antithetic(mean: Floats, covariance: Floats, rng: np.random.Generator) -> Floats:
