@@ -28,7 +28,7 @@ from worker.ml.filter_problem import FilterConfig, scenarios_for
 from worker.ml.methods import METHODS, MethodConfig
 from worker.ml.pbrl_hri import FromScratch
 from worker.ml.prefft import FineTuning
-from worker.ml.teachers import Taste, random_taste
+from worker.ml.teachers import Manner, Taste, random_taste
 from worker.shelf import Shelf, policy_mark
 from worker.sim.catalogue import ENVIRONMENTS
 from worker.sim.costs import preference_rewards
@@ -286,7 +286,7 @@ def _header(terms: Terms, cells: Cells, tastes: dict[str, Taste], command: str) 
         f"    {command}",
         "",
         f"{len(cells)} cells of task, user and method are finished; seeds {', '.join(map(str, seeds))}.",
-        f'{terms.labels} scripted labels per user and seed (5 % mistakes, 10 % "equal") on',
+        f"{terms.labels} scripted labels per user and seed ({_spoken(terms.manner)}) on",
         f"{len(terms.pool)} scenarios, pairs chosen by `{terms.rule}`, reward model `{terms.reward}`, costs in the",
         f"`{terms.form}` form.",
         f"Every method is driven through {terms.scenarios} scenarios per seed, from {terms.unseen(0).start} on: no",
@@ -296,6 +296,13 @@ def _header(terms: Terms, cells: Cells, tastes: dict[str, Taste], command: str) 
         f"{versions}. Frozen policies: {marks}.",
     ]
     return "\n".join(lines)
+
+
+def _spoken(manner: Manner) -> str:
+    told = [f"{100 * manner.mistakes:g} % mistakes", f'{100 * manner.equal_share:g} % "equal"']
+    if manner.rationality is not None:
+        told.append(f"rationality {manner.rationality:g}")
+    return ", ".join(told)
 
 
 def _replace(path: Path, text: str) -> None:
@@ -310,6 +317,8 @@ def with_options(
     prefft_steps: int | None = None,
     pbrl_steps: int | None = None,
     printed_steps: int | None = None,
+    rationality: float | None = None,
+    mistakes: float | None = None,
     **values: Any,
 ) -> Terms:
     """A profile with what was said on the command line; None leaves a value as it is."""
@@ -320,5 +329,7 @@ def with_options(
         chosen = replace(chosen, from_scratch=replace(chosen.from_scratch, steps=pbrl_steps))
     if printed_steps is not None:
         chosen = replace(chosen, printed_steps=printed_steps)
+    errs = {"rationality": rationality, "mistakes": mistakes}
+    manner = replace(terms.manner, **{name: value for name, value in errs.items() if value is not None})
     given = {name: value for name, value in values.items() if value is not None}
-    return replace(terms, methods=chosen, **given)
+    return replace(terms, methods=chosen, manner=manner, **given)

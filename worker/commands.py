@@ -98,6 +98,12 @@ def _add_benchmark(commands: _Commands) -> None:
     command.add_argument("--reward", choices=get_args(reward_training.Kind))
     command.add_argument("--rule", choices=get_args(acquisition.Rule), help="which pairs are asked; entropy")
     command.add_argument("--form", choices=["calibrated", "paper"], help="of the costs")
+    command.add_argument("--mistakes", type=float, help="share of answers that say the opposite; 0.05")
+    command.add_argument(
+        "--rationality",
+        type=float,
+        help="beta per spread of returns; without it users name the better clip",
+    )
     command.add_argument("--prefft-steps", type=int, help="environment steps of PrefFT; 100000 as in the paper")
     command.add_argument("--pbrl-steps", type=int, help="environment steps of PbRL-HRI; 260000")
     command.add_argument("--printed-steps", type=int, help="gradient steps of the printed method; 3000")
@@ -137,6 +143,8 @@ def _benchmark(options: argparse.Namespace) -> int:
         reward=options.reward,
         rule=options.rule,
         form=options.form,
+        mistakes=options.mistakes,
+        rationality=options.rationality,
         prefft_steps=options.prefft_steps,
         pbrl_steps=options.pbrl_steps,
         printed_steps=options.printed_steps,

@@ -57,6 +57,8 @@ class Terms:
     form: CostForm = "calibrated"
     rule: acquisition.Rule = "entropy"
     """which pairs are asked; the studio's default, for every method alike"""
+    manner: Manner = field(default_factory=Manner)
+    """how the scripted users err; none of them skips"""
     smallest_pool: int = SMALLEST_POOL
     filter: FilterConfig = field(default_factory=FilterConfig)
     methods: MethodConfig = field(default_factory=MethodConfig)
@@ -177,7 +179,7 @@ class Bench:
         """What is asked and what the scripted user says about it; the same for every method."""
         rng = np.random.default_rng([self.cell.seed, 7])
         rewards = np.array([self._true_rewards(each)[: self.clip_steps] for each in self.pool])
-        teacher = ScriptedTeacher.calibrated(Manner(), rewards[self.rows])
+        teacher = ScriptedTeacher.calibrated(self.terms.manner, rewards[self.rows])
         asked, targets = np.empty((0, 2), np.int64), np.empty(0)
         left_over = self.rows
         while len(asked) < self.terms.labels:

@@ -26,7 +26,7 @@ def probability_right(logits: npt.NDArray[np.floating]) -> npt.NDArray[np.float6
 
 LAPSES = 0.1
 """Share of answers that say nothing, as Christiano et al. (2017) assume. Without it a few slips of the finger on easy
-pairs weigh as much as many careful answers (docs/results/reward_prior.md)."""
+pairs weigh as much as many careful answers (docs/results/chosen_modes.md)."""
 
 
 def probability_of_answer(probability: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:

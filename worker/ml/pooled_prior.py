@@ -17,7 +17,7 @@ Floats = npt.NDArray[np.float64]
 
 DEVIATION = 4.0
 """Of every weight when nobody is known: wide, because a narrow prior spreads what is wanted over all signals that go
-along with it (docs/results/reward_prior.md)."""
+along with it (docs/results/chosen_modes.md)."""
 FEWEST_PEOPLE = 3
 """With fewer the prior is the one without anybody."""
 SHARED, OWN, FLOOR = 0.7, 0.3, 0.05
