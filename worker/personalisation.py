@@ -25,7 +25,7 @@ from worker.ml.response_surface import ResponseSurface
 from worker.ml.reward_models import load_reward_model
 from worker.trajectory import Trajectory
 
-CHUNK = 10
+CHUNK = 5
 """Scenarios per call of a compute process: small enough to spread evenly, large enough not to matter."""
 
 

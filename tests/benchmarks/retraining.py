@@ -89,7 +89,7 @@ def _run(
     mark()
     finished = fitting.finish(draft, PROVENANCE, None)
     mark()
-    seconds = {name: round(marks[index + 1] - marks[index], 1) for index, name in enumerate(STAGES)}
+    seconds = {name: round(marks[index + 1] - marks[index], 2) for index, name in enumerate(STAGES)}
     evaluation = finished.metrics["evaluation"]
     return {
         "task": task,

@@ -109,8 +109,7 @@ def evaluate_filter(
         following = value.inputs(data.next_observations, next_actions)
     slow, fast = list[Tensor](target.parameters()), list[Tensor](value.parameters())
     losses = torch.zeros(steps)
-    for step in range(steps):
-        rows = _rows(len(data), newest, generator)
+    for step, rows in enumerate(_batches(steps, len(data), newest, generator)):
         with torch.no_grad():
             wanted = (1.0 - DISCOUNT) * data.rewards[rows] + DISCOUNT * target.of_inputs(following[rows])
         loss = functional.mse_loss(value.of_inputs(here[rows]), wanted)
@@ -135,9 +134,10 @@ def spread_within_states(
     return max(float(values.std(dim=0).mean()), 1e-6)
 
 
-def _rows(total: int, newest: int, generator: torch.Generator) -> Tensor:
+def _batches(steps: int, total: int, newest: int, generator: torch.Generator) -> Tensor:
+    """(steps, BATCH) rows of the data."""
     if newest >= total:
-        return torch.randint(total, (BATCH,), generator=generator)
-    anywhere = torch.randint(total, (BATCH // 2,), generator=generator)
-    recent = torch.randint(total - newest, total, (BATCH - BATCH // 2,), generator=generator)
-    return torch.cat([anywhere, recent])
+        return torch.randint(total, (steps, BATCH), generator=generator)
+    anywhere = torch.randint(total, (steps, BATCH // 2), generator=generator)
+    recent = torch.randint(total - newest, total, (steps, BATCH - BATCH // 2), generator=generator)
+    return torch.cat([anywhere, recent], -1)
