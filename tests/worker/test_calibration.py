@@ -60,3 +60,14 @@ def test_every_fit_reports_its_calibration_and_the_model_uses_it(kind: str) -> N
     plain = replace(fitted.model, temperature=1.0)
     same_side = (fitted.model.logits(shown) > 0) == (plain.logits(shown) > 0)
     assert same_side.all(), "a temperature changes no ranking"
+
+
+def test_slips_do_not_make_a_model_hesitant_that_allows_for_them() -> None:
+    """Sure and right on every pair, but five of a hundred answers were slips."""
+    rng = np.random.default_rng(3)
+    answers = (rng.random(400) < 0.5).astype(float)
+    logits = np.where(answers > 0.5, 6.0, -6.0)[None]
+    slipped = answers.copy()
+    slipped[::20] = 1.0 - slipped[::20]
+    assert calibration.fit_temperature(HeldOut(logits, slipped)) > 1.5
+    assert calibration.fit_temperature(HeldOut(logits, slipped, allows_for_lapses=True)) < 1.2

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from worker.ml.bradley_terry import probability_right
+from worker.ml.bradley_terry import probability_of_answer, probability_right
 
 Floats = npt.NDArray[np.float64]
 
@@ -34,23 +34,27 @@ class HeldOut:
     """(E, N)"""
     answers: Floats
     """(N,) in {0, 1/2, 1}"""
+    allows_for_lapses: bool = False
+    """Whether the model was fitted for people who answer at random now and then. Slips then say nothing about how sure
+    it should be of what is preferred."""
 
     def probabilities(self, temperature: float) -> Floats:
         """P(right), the mean over members, (N,)."""
         mean: Floats = probability_right(self.logits / temperature).mean(axis=0)
         return mean
 
+    def surprise(self, temperature: float) -> float:
+        """Summed cross-entropy of the answers, in nats."""
+        preferred = self.probabilities(temperature)
+        said = probability_of_answer(preferred) if self.allows_for_lapses else preferred
+        return cross_entropy(said, self.answers) * len(self.answers)
+
 
 def fit_temperature(held_out: HeldOut) -> float:
     """The temperature under which the held-out answers are most probable, drawn a little towards 1."""
-    answers = held_out.answers
-    if len(answers) < FEWEST_ANSWERS:
+    if len(held_out.answers) < FEWEST_ANSWERS:
         return 1.0
-    losses = [
-        cross_entropy(held_out.probabilities(float(np.exp(log))), answers) * len(answers)
-        + 0.5 * (log / _LOG_SPREAD) ** 2
-        for log in _LOG_TEMPERATURES
-    ]
+    losses = [held_out.surprise(float(np.exp(log))) + 0.5 * (log / _LOG_SPREAD) ** 2 for log in _LOG_TEMPERATURES]
     return float(np.exp(_LOG_TEMPERATURES[int(np.argmin(losses))]))
 
 

@@ -174,7 +174,7 @@ def _held_out(features: Floats, answers: Floats, seed: int, prior: Prior, costs:
         inside = fold == each
         mean, covariance = posterior(features[~inside], answers[~inside], prior, costs)
         logits[:, inside] = _antithetic(mean, covariance, rng) @ features[inside].T
-    return HeldOut(logits, answers)
+    return HeldOut(logits, answers, allows_for_lapses=True)
 
 
 def posterior(
