@@ -69,5 +69,5 @@ def test_slips_do_not_make_a_model_hesitant_that_allows_for_them() -> None:
     logits = np.where(answers > 0.5, 6.0, -6.0)[None]
     slipped = answers.copy()
     slipped[::20] = 1.0 - slipped[::20]
-    assert calibration.fit_temperature(HeldOut(logits, slipped)) > 1.5
-    assert calibration.fit_temperature(HeldOut(logits, slipped, allows_for_lapses=True)) < 1.2
+    assert fit_temperature(HeldOut(logits, slipped)) > 1.5
+    assert fit_temperature(HeldOut(logits, slipped, allows_for_lapses=True)) < 1.2
