@@ -10,8 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from worker.sim.arm import tool_jacobian
-from worker.sim.assistive import ARM, PERSON, AssistiveEnv
+from worker.sim.assistive import ARM, AssistiveEnv
 from worker.sim.catalogue import ENVIRONMENTS
+from worker.sim.seated_person import PERSON
 
 FloatArray = npt.NDArray[np.float64]
 

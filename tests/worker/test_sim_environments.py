@@ -17,10 +17,11 @@ import worker.sim
 from worker.ml.policies import GaussianPolicy
 from worker.sim import human
 from worker.sim.arm import start_postures
-from worker.sim.assistive import ARM, PERSON, AssistiveEnv, add_person
+from worker.sim.assistive import ARM, AssistiveEnv
 from worker.sim.bullet import Bullet
 from worker.sim.catalogue import ENVIRONMENTS
 from worker.sim.geometry import rotation_of
+from worker.sim.seated_person import PERSON, add_person
 from worker.trajectory import BODIES, SIGNALS
 
 CHECKPOINTS = Path(worker.__file__).parent / "checkpoints"

@@ -15,11 +15,12 @@ import numpy.typing as npt
 
 from worker.sim import human
 from worker.sim.arm import Robot, Start, Tool, start_postures
-from worker.sim.bullet import Bullet, Contact, Link
-from worker.sim.geometry import Shape, capsule_between, rotation_of
+from worker.sim.bullet import Bullet, Contact
+from worker.sim.geometry import rotation_of
 from worker.sim.human import Impairment, Person
 from worker.sim.jaco import JACO
 from worker.sim.measures import Outcome, StepMeasures, TaskReward
+from worker.sim.seated_person import HEAD, PERSON, add_person
 from worker.spaces import CONTROL_STEP_S, JOINT_ACTION, Space
 from worker.tasks import Task
 from worker.trajectory import BODIES
@@ -36,7 +37,7 @@ POSITION_GAIN, MOTOR_FORCE_NM = 0.5, 200.0
 TREMOR_RESPONSE = 0.3
 """Share of the way to the tremor's other side that a heavy head covers in one control step."""
 
-ARM, PERSON, HEAD = "arm", "person", "head"
+ARM = "arm"
 
 
 class Motion(NamedTuple):
@@ -378,36 +379,6 @@ class AssistiveEnv(gymnasium.Env[Any, Any]):
 
     def _drive(self) -> None:
         self._world.drive_joints(ARM, self._command, POSITION_GAIN, MOTOR_FORCE_NM)
-
-
-def add_person(world: Bullet, person: Person, *arms: int, head_apart: bool = False) -> None:
-    """Add the seated person with the arms named (both by default) as an immovable body.
-
-    The head is a link of it, for one body less makes a faster reset, unless it trembles or is wanted apart.
-    """
-    still = (*STILL_SHAPES[person.body.name], *arm_shapes(person, *(arms or (human.RIGHT, human.LEFT))))
-    pivot, turn, head = person.body.neck_pivot_m, human.head_quaternion(person), HEAD_SHAPES[person.body.name]
-    if head_apart or person.impairment == "tremor":
-        world.add_body(PERSON, still)
-        world.add_body(HEAD, head, pivot, turn)
-    else:
-        world.add_chain(PERSON, still, [Link(HEAD, pivot, turn, 0.0, head, "fixed")])
-
-
-def arm_shapes(person: Person, *sides: int) -> tuple[Shape, ...]:
-    """Collision shapes of the person's arms at rest, in the world."""
-    limbs = (limb for side in sides for limb in human.arm_limbs(person.body, person.arms_rad[side], side))
-    return tuple(capsule_between(*limb[1:]) for limb in limbs)
-
-
-STILL_SHAPES = {
-    body.name: tuple(capsule_between(*limb[1:]) for limb in (*body.trunk, *body.legs))
-    for body in human.BODY_SHAPES.values()
-}
-HEAD_SHAPES = {
-    body.name: tuple(Shape("sphere", ball.radius_m, position_m=ball.centre_m) for ball in body.head)
-    for body in human.BODY_SHAPES.values()
-}
 
 
 def _box(space: Space) -> gymnasium.spaces.Box:

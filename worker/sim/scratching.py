@@ -11,12 +11,13 @@ import numpy.typing as npt
 from worker.modes import ApproachModes, Axis
 from worker.sim import human
 from worker.sim.arm import Start, Tool
-from worker.sim.assistive import ARM, MOTOR_FORCE_NM, PERSON, POSITION_GAIN, AssistiveEnv, Motion, Reward
+from worker.sim.assistive import ARM, MOTOR_FORCE_NM, POSITION_GAIN, AssistiveEnv, Motion, Reward
 from worker.sim.bullet import Bullet, Contact
 from worker.sim.geometry import Shape, capsule_between, rotation_of
 from worker.sim.human import ArmRange, Impairment
 from worker.sim.jaco import PI
 from worker.sim.measures import HIGH_FORCE_N, Outcome, StepMeasures, TaskReward
+from worker.sim.seated_person import PERSON
 from worker.sim.yielding_arm import FOREARM, UPPER_ARM, YieldingArm, add_placeholder
 from worker.spaces import SHARED_FIELDS, Field, Space
 from worker.tasks import Task

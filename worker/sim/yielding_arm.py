@@ -13,10 +13,10 @@ import numpy as np
 import numpy.typing as npt
 
 from worker.sim import human
-from worker.sim.assistive import HEAD_SHAPES, PERSON, STILL_SHAPES, arm_shapes
 from worker.sim.bullet import Bullet, Link
 from worker.sim.geometry import IDENTITY, Shape, capsule_between, compose
 from worker.sim.human import BODY_SHAPES, Person
+from worker.sim.seated_person import HEAD_SHAPES, PERSON, STILL_SHAPES, arm_shapes
 
 FloatArray = npt.NDArray[np.float64]
 
