@@ -3,21 +3,15 @@
 Who asks is told by a bearer token, never by a cookie, so no other website can ask in somebody's name.
 """
 
-import logging
-from collections.abc import Mapping
-from datetime import datetime
 from http import HTTPStatus
 from itertools import islice
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Depends, FastAPI, Path, Query, Request
-from fastapi.exceptions import RequestValidationError
-from fastapi.responses import FileResponse, JSONResponse, Response
+from fastapi.responses import FileResponse, Response
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 from sqlalchemy import select
-from sqlalchemy.exc import OperationalError
 from sqlalchemy.orm import Session
-from starlette.exceptions import HTTPException
 
 from app.domain.models import Bundle, Export, Model
 from app.domain.people import Experimenter, Role
@@ -39,8 +33,8 @@ from app.services import (
 from app.services.api_tokens import TokenInvalid
 from app.services.export_requests import ExportKind
 from app.web import api_answers as answers
+from app.web.api_problems import add_problems
 from app.web.deps import Code, ReadingSession, RowId, Slug, Studio, StudioDep, WritingSession
-from app.web.guard import HEADERS
 
 PREFIX = "/api/v1"
 LARGEST_PAGE = 1000
@@ -55,7 +49,6 @@ from one address are answered with 429 for a minute. Until a study is unblinded,
 here as everywhere.
 """
 
-log = logging.getLogger("app.web")
 bearer = HTTPBearer(auto_error=False, description="A token from the page of API tokens.")
 
 
@@ -367,105 +360,6 @@ def create_api(studio: Studio, path_for: Any, max_body_bytes: int) -> FastAPI:
         redirect_slashes=False,
     )
     api.state.studio, api.state.path_for = studio, path_for
-    _add_problems(api)
+    add_problems(api)
     api.include_router(router)
     return api
-
-
-def _add_problems(api: FastAPI) -> None:
-    @api.exception_handler(AppError)
-    def ours(_request: Request, error: AppError) -> Response:
-        return problem(error.status, error.message)
-
-    @api.exception_handler(HTTPException)
-    def of_the_framework(_request: Request, error: HTTPException) -> Response:
-        words = {
-            HTTPStatus.NOT_FOUND: "There is nothing at this address. /api/docs lists what there is.",
-            HTTPStatus.METHOD_NOT_ALLOWED: "This address cannot be used in that way. /api/docs says how.",
-            HTTPStatus.REQUEST_ENTITY_TOO_LARGE: "That was more than we accept at once.",
-        }
-        status = HTTPStatus(error.status_code)
-        return problem(status, words.get(status, "This request could not be understood."), error.headers)
-
-    @api.exception_handler(RequestValidationError)
-    def not_valid(_request: Request, error: RequestValidationError) -> Response:
-        wrong = [
-            f"{'.'.join(str(part) for part in each['loc'][1:]) or 'body'}: {each['msg']}" for each in error.errors()
-        ]
-        status = HTTPStatus.UNPROCESSABLE_ENTITY
-        if any(each["loc"][0] == "path" for each in error.errors()):
-            status = HTTPStatus.NOT_FOUND
-        return problem(status, f"Not valid: {'; '.join(wrong)}.")
-
-    @api.exception_handler(OperationalError)
-    def database_busy(_request: Request, error: OperationalError) -> Response:
-        log.error("the database did not answer: %s", error.orig)
-        message = "The database is busy or not ready. Nothing was saved; please try again in a moment."
-        return problem(HTTPStatus.SERVICE_UNAVAILABLE, message, {"retry-after": "2"})
-
-    @api.exception_handler(Exception)
-    def unforeseen(_request: Request, _error: Exception) -> Response:
-        message = "This is our fault, and it is in the log. Nothing was saved by this step; please try again."
-        return problem(HTTPStatus.INTERNAL_SERVER_ERROR, message, HEADERS)
-
-
-def _place(path: tuple[int | str, ...]) -> str:
-    return ".".join(str(part) for part in path[1:]) or "body"
-
-
-def problem(status: HTTPStatus, detail: str, headers: Mapping[str, str] | None = None) -> Response:
-    """Problem details, RFC 9457."""
-    content = {"title": status.phrase, "status": int(status), "detail": detail}
-    answer = JSONResponse(content, status, media_type="application/problem+json")
-    answer.headers.update(headers or {})
-    if status is HTTPStatus.UNAUTHORIZED:
-        answer.headers["www-authenticate"] = "Bearer"
-    return answer
-
-
-def described(document: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """The operations of an OpenAPI document, as the page of documentation shows them."""
-    return [
-        {
-            "method": method.upper(),
-            "path": PREFIX + path,
-            "tag": operation["tags"][0],
-            "summary": operation.get("description", operation["summary"]),
-            "parameters": operation.get("parameters", []),
-            "takes": _example(document, _schema(operation.get("requestBody", {}))),
-            "gives": _example(document, _answer_schema(operation)),
-        }
-        for path, methods in document["paths"].items()
-        for method, operation in methods.items()
-    ]
-
-
-def _answer_schema(operation: Mapping[str, Any]) -> Mapping[str, Any] | None:
-    return next((_schema(each) for code, each in operation["responses"].items() if code.startswith("2")), None)
-
-
-def _schema(body: Mapping[str, Any]) -> Mapping[str, Any] | None:
-    schema: Mapping[str, Any] | None = body.get("content", {}).get("application/json", {}).get("schema")
-    return schema
-
-
-def _example(document: Mapping[str, Any], schema: Mapping[str, Any] | None) -> Any:
-    """Something that the schema allows: its own examples where it has some."""
-    if schema is None:
-        return None
-    if "$ref" in schema:
-        return _example(document, document["components"]["schemas"][schema["$ref"].rpartition("/")[2]])
-    for known in (schema.get("example"), *schema.get("examples", [])):
-        if known is not None:
-            return known
-    if "anyOf" in schema:
-        return _example(document, schema["anyOf"][0])
-    if "enum" in schema:
-        return schema["enum"][0]
-    if schema.get("type") == "array":
-        return [_example(document, schema["items"])]
-    if "properties" in schema:
-        return {name: _example(document, each) for name, each in schema["properties"].items()}
-    moment = datetime(2026, 1, 31, 9, 30).isoformat() + "Z"  # noqa: DTZ001  (written with its zone)
-    plain = {"integer": 1, "number": 0.5, "boolean": True, "object": {}, "string": ""}
-    return moment if schema.get("format") == "date-time" else plain.get(str(schema.get("type")))

@@ -8,7 +8,7 @@ from fastapi import APIRouter, Form, Request
 from fastapi.responses import RedirectResponse, Response
 
 from app.services import api_tokens
-from app.web import api
+from app.web import api, api_document
 from app.web.deps import CurrentExperimenter, OwnAccount, ReadingSession, RowId, WritingSession
 from app.web.templating import page
 
@@ -19,7 +19,7 @@ router = APIRouter()
 def show_api(request: Request) -> Response:
     """Everything that the API offers, on one page that loads nothing from anywhere else."""
     document = request.app.state.api.openapi()
-    operations = api.described(document)
+    operations = api_document.described(document, api.PREFIX)
     for operation in operations:
         for side in ("takes", "gives"):
             example = operation[side]
