@@ -31,7 +31,7 @@ from worker.ml.prefft import FineTuning
 from worker.ml.teachers import Manner, Taste, random_taste
 from worker.shelf import Shelf, policy_mark
 from worker.sim.catalogue import ENVIRONMENTS
-from worker.sim.costs import preference_rewards
+from worker.sim.costs import preference_rewards, stakes
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
@@ -234,10 +234,13 @@ def _finished(terms: Terms, work: Path) -> Iterator[tuple[dict[str, Any], dict[s
 def _run(record: dict[str, Any], arrays: dict[str, Any], terms: Terms, tastes: dict[str, Taste]) -> Run:
     """r^H is linear in the measured sums, so every user can judge every run."""
     task = laboratory.task(record["task"])
-    true = {
-        name: preference_rewards(task, arrays["costs"], arrays["signals"], taste.omega, terms.form, taste.per_signal)
-        for name, taste in tastes.items()
-    }
+    true, at_stake = (
+        {
+            name: of(task, arrays["costs"], arrays["signals"], taste.omega, terms.form, taste.per_signal)
+            for name, taste in tastes.items()
+        }
+        for of in (preference_rewards, stakes)
+    )
     return Run(
         record["task"],
         record["taste"]["name"],
@@ -247,6 +250,7 @@ def _run(record: dict[str, Any], arrays: dict[str, Any], terms: Terms, tastes: d
         arrays["success"],
         arrays["learned"],
         true,
+        at_stake,
         arrays["costs"],
         record["spent"],
         tuple(record["notes"]),

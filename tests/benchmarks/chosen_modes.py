@@ -4,7 +4,7 @@
 
 Scripted users label a pool as a study asks them to, and the search picks their mode; no filter is trained. The regret
 is what the response surface predicts the best mode of somebody's true weights to gain beyond the picked one, in % of
-the reference policy's return. One choice at a time is changed: the prior's deviation, the share of lapses that the
+what they mind and like under the reference policy. One choice at a time is changed: the prior's deviation, the share of lapses that the
 likelihood allows for, the caution about the members' spread, the rule that picks pairs. Label seeds from 100 on, which
 the tables of the benchmark do not use. Finished rows are kept under data/; repeat the command to go on.
 """
@@ -31,10 +31,11 @@ from worker.exploration import surface_file
 from worker.ml import acquisition, bradley_terry, pooled_prior
 from worker.ml.response_surface import CAUTION, ResponseSurface, best_mode
 from worker.ml.reward_models import RewardModel
-from worker.ml.teachers import TASTES, Manner, User
+from worker.ml.teachers import TASTES, Manner, Taste, User
 from worker.shelf import Shelf
 from worker.sim.catalogue import ENVIRONMENTS
-from worker.sim.costs import signal_weights
+from worker.sim.costs import signal_weights, stakes
+from worker.tasks import Task
 
 Floats = npt.NDArray[np.float64]
 
@@ -105,9 +106,8 @@ def answer(question: Question, work: Path) -> dict[str, Any]:
     pooled_prior.DEVIATION, bradley_terry.LAPSES = question.choice.deviation, question.choice.lapses
     task = laboratory.task(question.task)
     surface = ResponseSurface.load(surface_file(task.name), task.modes)
-    sums = np.mean([each.signals.sum(axis=0) for each in laboratory.reference_rollouts(task.name)], axis=0)
     wishes = np.array([signal_weights(task, TASTES[user].omega, TASTES[user].per_signal) for user in USERS])
-    unit = np.abs(wishes @ sums) / 100
+    unit = np.array([stake(task, TASTES[user]) for user in USERS]) / 100
     terms = Terms(labels=question.labels, rule=question.choice.rule)
     if question.hesitant:
         terms = replace(terms, manner=HESITANT)
@@ -124,6 +124,15 @@ def answer(question: Question, work: Path) -> dict[str, Any]:
     matrix = np.array(gains)
     advantages = [float(matrix[j, j] - np.delete(matrix[:, j], j).max()) for j in range(len(USERS))]
     return {"regrets": regrets, "advantages": advantages, "success": lost}
+
+
+def stake(task: Task, taste: Taste) -> float:
+    """What somebody minds and likes in an episode of the reference policy, in the mean."""
+    reference = laboratory.reference_rollouts(task.name)
+    costs, signals = (
+        np.mean([getattr(each, what).sum(axis=0) for each in reference], axis=0) for what in ("costs", "signals")
+    )
+    return float(stakes(task, costs, signals, taste.omega, per_signal=taste.per_signal))
 
 
 def questions(seeds: int) -> list[Question]:

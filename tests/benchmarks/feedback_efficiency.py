@@ -28,6 +28,7 @@ import numpy.typing as npt
 import torch
 from tqdm import tqdm
 
+from tests.benchmarks.chosen_modes import stake
 from tests.benchmarks.pool_rollouts import Pool, pool_rollouts
 from worker import laboratory, lessons
 from worker.exploration import surface_file
@@ -93,7 +94,8 @@ class Measured:
     accuracy: float
     contested_accuracy: float | None
     gain_percent: float
-    """of the true preference by the mode this model leads to, in % of the reference's; from the response surface"""
+    """of the true preference by the mode this model leads to, in % of what the user minds and likes under the reference
+    policy; from the response surface"""
     success_points: float
     """change of success by that mode, likewise"""
     driven_gain_percent: float | None
@@ -220,8 +222,7 @@ class Bench:
         return lessons.run_scenarios(self.task.name, policy.mean, scenarios, 0.0, 0)
 
     def _percent(self, user: str, change: float) -> float:
-        sums = np.mean([each.signals.sum(axis=0) for each in laboratory.reference_rollouts(self.task.name)], axis=0)
-        return 100 * change / abs(float(sums @ self._true_weights(user)))
+        return 100 * change / stake(self.task, _taste(user))
 
     def _true_weights(self, user: str) -> Floats:
         taste = _taste(user)

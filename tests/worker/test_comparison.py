@@ -45,6 +45,7 @@ def run(user: str, method: str, better: Sequence[float] = (0, 0, 0), seed: int =
         success=success,
         preference=HARDNESS + better[USERS.index(user)],
         true_returns={judge: HARDNESS - 20.0 + gain for judge, gain in zip(USERS, better, strict=True)},
+        stakes={judge: 20.0 - HARDNESS - gain for judge, gain in zip(USERS, better, strict=True)},
         costs=np.tile(HARDNESS[:, None] + 100.0 + better[0], (1, 6)),
         spent={"labels": 200, "environment_steps": 1000, "cpu_s": 4.0 + seed, "wall_s": 5.0},
         notes=("said so",),
@@ -150,6 +151,17 @@ def test_own_advantage_is_over_the_best_of_the_others_and_on_the_diagonal_only()
     unit = abs(HARDNESS.mean() - 20.0)
     assert found["impatient", "impatient"]["own_advantage"] == pytest.approx((8 + 2) / unit)
     assert found["neutral", "cautious"]["own_advantage"] == ""
+
+
+def test_gains_of_somebody_who_also_likes_things_are_shares_of_all_that_matters_to_them() -> None:
+    """Likes and dislikes may cancel out in the return; a share of next to nothing would say nothing."""
+    runs = [
+        replace(each, true_returns={judge: returns + 20.0 for judge, returns in each.true_returns.items()})
+        for each in RUNS
+    ]
+    rows = comparison.personalisation_rows(pooled(runs), "pbarl", [USERS])
+    found = {(row["trained_for"], row["judged_by"]): row for row in rows}
+    assert found["cautious", "cautious"]["gain"] == pytest.approx(6.0 / (20.0 - HARDNESS.mean()))
 
 
 def test_users_of_different_groups_are_not_compared() -> None:

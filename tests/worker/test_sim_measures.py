@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from worker.sim.costs import base_weights, cost_items, preference_rewards, signal_weights
+from worker.sim.costs import base_weights, cost_items, preference_rewards, signal_weights, stakes
 from worker.sim.feeding import FEEDING
 from worker.sim.measures import Outcome, StepMeasures, TaskReward
 from worker.sim.scratching import SCRATCHING
@@ -195,3 +195,11 @@ def test_a_persons_reward_is_linear_in_the_measured_signals() -> None:
         measured = np.array([list(signals.values())])
         paid = preference_rewards(task, np.array([list(costs.values())]), measured, omega, per_signal=more)
         assert measured @ signal_weights(task, omega, more) == pytest.approx(paid)
+
+
+def test_what_is_at_stake_counts_likes_and_dislikes_alike() -> None:
+    costs, signals = one_step(C_d=0.4, C_fd=1.0, lateral_offset_m=0.1)
+    minds = stakes(FEEDING, costs, signals, form="paper")
+    assert minds == pytest.approx(-preference_rewards(FEEDING, costs, signals, form="paper"))
+    likes = {"lateral_offset_m": -8.0}
+    assert stakes(FEEDING, costs, signals, form="paper", per_signal=likes)[0] == pytest.approx(1.4 + 0.8)

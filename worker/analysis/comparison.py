@@ -3,7 +3,8 @@
 Every difference is to the reference policy in the same scenarios. Every seed has labels, trainings and scenarios of its
 own, and where there are several all their episodes count alike. Intervals are 95 %, over scenarios only.
 Success and its changes are shares (0.05 is five points), preference is the learned return, true preference the return
-of r^H, gains are shares of the reference policy's own true return.
+of r^H. Gains are changes of it as shares of what the judge minds and likes in the reference policy's episodes, taken
+positively: for whoever only minds things, of the reference policy's own true return.
 """
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -39,6 +40,8 @@ class Run:
     """(N,) returns of the user's learned reward"""
     true_returns: Mapping[str, Floats]
     """by user: (N,) returns of r^H, the true preference"""
+    stakes: Mapping[str, Floats]
+    """by user: (N,) what they mind and like in these episodes, taken positively (worker.sim.costs.stakes)"""
     costs: Floats
     """(N, 6) summed over the episode"""
     spent: Mapping[str, float]
@@ -76,6 +79,10 @@ class Pooled:
             np.concatenate([run.true_returns[judge] for run in runs]) for runs in (self.references, self.runs)
         )
         return before, after
+
+    def stake_of(self, judge: str) -> float:
+        """What somebody minds and likes in the reference policy's episodes, in the mean."""
+        return float(np.mean([run.stakes[judge] for run in self.references]))
 
 
 Cells = dict[tuple[str, str, str], Pooled]
@@ -194,7 +201,7 @@ def personalisation_rows(cells: Cells, method: str, groups: Sequence[Sequence[st
 
 def _matrix_row(task: str, trained_for: str, judge: str, cell: Pooled, others: Sequence[Pooled]) -> Row:
     before, after = cell.true_of(judge)
-    unit = max(abs(float(before.mean())), 1e-9)
+    unit = max(cell.stake_of(judge), 1e-9)
     gain = mean_change(before / unit, after / unit)
     row: Row = {"task": task, "trained_for": trained_for, "judged_by": judge, "labels": cell.runs[0].labels}
     row |= _named("gain", gain["delta"], gain["low"], gain["high"])

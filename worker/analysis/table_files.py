@@ -171,7 +171,8 @@ def _matrices(cells: Cells, groups: Sequence[Sequence[str]]) -> str:
         gains = {(row["trained_for"], row["judged_by"]): row for row in of_task}
         lines = [
             f"## Whose filter serves whom: {task}",
-            f"Change of the column user's true return under the row user's `{METHOD}`, % of the reference policy's."
+            f"Change of the column user's true return under the row user's `{METHOD}`, % of what the column user minds"
+            " and likes under the reference policy (taken positively: for the paper's users, of its true return)."
             " Last line: the own filter beyond the best of somebody else's in the same group of users.",
             "",
             "| trained for | " + " | ".join(users) + " | success |",
@@ -200,7 +201,7 @@ def _seeds(cells: Cells, groups: Sequence[Sequence[str]]) -> str:
         return ""
     lines = [
         f"## `{METHOD}`, seed by seed",
-        "Other labels, other trainings and other scenarios. Own gain in true return, % of the reference policy's; own"
+        "Other labels, other trainings and other scenarios. Own gain in true return, in % as above; own"
         " filter beyond the best of somebody else's; change of success in points.",
         "",
         "| task, user |" + "".join(f" seed {seed}: gain | advantage | success |" for seed in seeds),

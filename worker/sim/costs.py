@@ -105,3 +105,23 @@ def preference_rewards(
     for name, cost in per_signal.items():
         rewards = rewards - cost * np.asarray(signals, np.float64)[..., SIGNALS.index(name)]
     return rewards
+
+
+def stakes(
+    task: Task,
+    costs: Array,
+    signals: Array,
+    omega: npt.ArrayLike = 1.0,
+    form: CostForm = "calibrated",
+    per_signal: Mapping[str, float] = MappingProxyType({}),
+) -> FloatArray:
+    """How much of what this person minds or likes there is, (...,): r^H with everything counted positively.
+
+    For somebody who only minds things it is -r^H. For somebody who also likes some, r^H may be near 0, and shares of it
+    would say nothing.
+    """
+    weights = np.abs(base_weights(task, form) * np.asarray(omega, np.float64))
+    amounts: FloatArray = cost_items(task, costs, signals, form) @ weights
+    for name, cost in per_signal.items():
+        amounts = amounts + abs(cost) * np.abs(np.asarray(signals, np.float64)[..., SIGNALS.index(name)])
+    return amounts
