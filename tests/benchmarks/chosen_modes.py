@@ -42,7 +42,8 @@ Floats = npt.NDArray[np.float64]
 
 FIRST_SEED = 100
 USERS = tuple(user.value for user in User)
-LABELS = (30, 60, 200)
+HARDLY_ANY = 0.001
+"""Share of lapses. With none at all a sure model finds a slip impossible, and its likelihood has no logarithm."""
 COLUMNS = (
     *("task", "labels", "hesitant", "deviation", "lapses", "caution", "rule", "seed", "user"),
     *("regret_percent", "own_advantage_percent", "success_points"),
@@ -70,11 +71,11 @@ class Choice:
 
 CHOICES = (
     Choice(),
-    Choice(deviation=1.0, lapses=0.0),
+    Choice(deviation=1.0, lapses=HARDLY_ANY),
     Choice(deviation=1.0),
     Choice(deviation=2.0),
     Choice(deviation=6.0),
-    Choice(lapses=0.0),
+    Choice(lapses=HARDLY_ANY),
     Choice(caution=0.0),
     Choice(caution=2.0),
     Choice(rule="uniform"),
