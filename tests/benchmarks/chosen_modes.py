@@ -189,7 +189,7 @@ def _page(found: Sequence[tuple[Question, dict[str, Any]]], seeds: int) -> str:
 
 def _markdown(found: Sequence[tuple[Question, dict[str, Any]]], seeds: int) -> str:
     lines = [
-        f"Means over three users and {seeds} label seed(s); own best: columns in which the own mode serves somebody best.",
+        f"Means over three users and {seeds} label seed(s); own best: users whom their own mode serves best.",
         "`hesitant`: the users name the better clip with probability sigmoid(3 difference / spread).",
         "Every row: [chosen_modes.csv](chosen_modes.csv).",
     ]
