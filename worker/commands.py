@@ -5,6 +5,7 @@ import json
 import sys
 import tempfile
 from collections.abc import Sequence
+from math import isfinite
 from pathlib import Path
 from typing import TypeAlias, get_args
 
@@ -98,10 +99,10 @@ def _add_benchmark(commands: _Commands) -> None:
     command.add_argument("--reward", choices=get_args(reward_training.Kind))
     command.add_argument("--rule", choices=get_args(acquisition.Rule), help="which pairs are asked; entropy")
     command.add_argument("--form", choices=["calibrated", "paper"], help="of the costs")
-    command.add_argument("--mistakes", type=float, help="share of answers that say the opposite; 0.05")
+    command.add_argument("--mistakes", type=_share, help="share of answers that say the opposite; 0.05")
     command.add_argument(
         "--rationality",
-        type=float,
+        type=_positive,
         help="beta per spread of returns; without it users name the better clip",
     )
     command.add_argument("--prefft-steps", type=int, help="environment steps of PrefFT; 100000 as in the paper")
@@ -116,6 +117,22 @@ def _add_benchmark(commands: _Commands) -> None:
     )
     command.add_argument("--report-only", action="store_true", help="run nothing, write the tables from what there is")
     command.set_defaults(act=_benchmark)
+
+
+def _share(text: str) -> float:
+    """A number from 0 to 1."""
+    value = float(text)
+    if not 0.0 <= value <= 1.0:
+        raise argparse.ArgumentTypeError(f"{text} is no share; give a number from 0 to 1.")
+    return value
+
+
+def _positive(text: str) -> float:
+    """A finite number above 0."""
+    value = float(text)
+    if not (value > 0.0 and isfinite(value)):
+        raise argparse.ArgumentTypeError(f"{text} must be a number above 0.")
+    return value
 
 
 def _taste(text: str) -> Taste:
@@ -188,9 +205,11 @@ def _add_rehearsal(commands: _Commands) -> None:
     rehearse.add_argument("--reward", type=RewardKind, choices=list(RewardKind), default=RewardKind.STRUCTURED)
     rehearse.add_argument("--strategy", type=Strategy, choices=list(Strategy), default=Strategy.UNIFORM)
     rehearse.add_argument("--pooled-prior", action="store_true", help="start from those who finished before")
-    rehearse.add_argument("--rationality", type=float, help="log odds per typical difference; default: no doubt at all")
+    rehearse.add_argument(
+        "--rationality", type=_positive, help="log odds per typical difference; default: no doubt at all"
+    )
     rehearse.add_argument("--myopia", type=float, default=1.0, help="below 1 the end of a clip weighs more")
-    rehearse.add_argument("--mistakes", type=float, default=0.05, help="share of answers that say the opposite")
+    rehearse.add_argument("--mistakes", type=_share, default=0.05, help="share of answers that say the opposite")
     rehearse.add_argument("--equal", type=float, default=0.10, help="share of pairs that are called equal")
     rehearse.add_argument("--skip", type=float, default=0.02, help="share of pairs called can't tell")
     rehearse.add_argument("--pace", type=float, default=0.0, help="seconds of thought per pair")

@@ -118,3 +118,12 @@ def test_the_command_can_only_report(tmp_path: Path) -> None:
     arguments = ["benchmark", "--profile", "quick", "--report-only", "--work-directory", str(tmp_path)]
     assert commands.run(arguments) == 0
     assert not (tmp_path / "quick").exists()
+
+
+@pytest.mark.parametrize("wrong", [["--mistakes", "5"], ["--mistakes", "nan"], ["--rationality", "0"]])
+def test_users_who_cannot_err_in_that_way_are_refused_in_words(
+    wrong: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        commands.parser().parse_args(["benchmark", *wrong])
+    assert "number" in capsys.readouterr().err
