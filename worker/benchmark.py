@@ -8,6 +8,7 @@ import json
 import platform
 import sys
 import time
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
@@ -207,7 +208,7 @@ def _report(terms: Terms, work: Path, output: Path, command: str) -> None:
     _replace(output / "table1.csv", to_csv(table_rows(cells)))
     _replace(output / "costs.csv", to_csv(cost_rows(cells)))
     _replace(output / "personalisation.csv", to_csv(personalisation_rows(cells, METHOD, groups)))
-    _replace(output / "table1.md", to_markdown(cells, groups, _header(terms, cells, tastes, command)))
+    _replace(output / "table1.md", to_markdown(cells, groups, _header(terms, cells, tastes, command, _states(found))))
     for task, rows in _by_task(table_rows(cells)):
         _replace(output / f"pareto-{task}.svg", pareto_svg(task, rows))
         close = [row for row in rows if row["success_delta"] >= -CLOSE_POINTS]
@@ -275,7 +276,7 @@ def _by_task(rows: Sequence[Row]) -> list[tuple[str, list[Row]]]:
     return [(task, [row for row in rows if row["task"] == task]) for task in tasks]
 
 
-def _header(terms: Terms, cells: Cells, tastes: dict[str, Taste], command: str) -> str:
+def _header(terms: Terms, cells: Cells, tastes: dict[str, Taste], command: str, states: str) -> str:
     seeds = sorted({run.seed for cell in cells.values() for run in cell.runs})
     versions = f"Python {platform.python_version()}, NumPy {np.__version__}, torch {torch.__version__}"
     marks = ", ".join(f"{task} {policy_mark(task)}" for task in dict.fromkeys(task for task, _, _ in cells))
@@ -298,8 +299,16 @@ def _header(terms: Terms, cells: Cells, tastes: dict[str, Taste], command: str) 
         f"Environment steps: PrefFT {methods.fine_tuning.steps}, PbRL-HRI {methods.from_scratch.steps};",
         f"gradient steps of printed PbARL {methods.printed_steps}. Weights of the users: {weights}.",
         f"{versions}. Frozen policies: {marks}.",
+        states,
     ]
     return "\n".join(lines)
+
+
+def _states(found: Sequence[tuple[dict[str, Any], dict[str, Any], Taste]]) -> str:
+    """Cells do not run again when the code changes, so the page says how many states of it they are from."""
+    counts = Counter(record.get("code", "not recorded") for record, _, _ in found)
+    told = ", ".join(f"{state} ({count} runs)" for state, count in counts.most_common())
+    return f"State of the code under worker/ml and worker/sim, as a hash: {told}."
 
 
 def _spoken(manner: Manner) -> str:

@@ -11,6 +11,7 @@ import platform
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -95,6 +96,17 @@ class Cell:
         return folder / f"{self.method}-seed{self.seed}.npz"
 
 
+@cache
+def code_mark() -> str:
+    """Which state of the learning and simulation a cell was made with: a hash over their sources."""
+    here = Path(__file__).parent
+    sources = sorted([*here.glob("ml/**/*.py"), *here.glob("sim/**/*.py"), Path(__file__)])
+    digest = hashlib.sha256()
+    for source in sources:
+        digest.update(f"{source.relative_to(here).as_posix()}\0".encode() + source.read_bytes())
+    return digest.hexdigest()[:8]
+
+
 def run_cell(cell: Cell, terms: Terms, work: Path) -> Path:
     """Label, fit, evaluate; the result is written to a file that is either complete or absent."""
     torch.set_num_threads(1)
@@ -119,6 +131,7 @@ def run_cell(cell: Cell, terms: Terms, work: Path) -> Path:
             "wall_s": round(wall_s, 2),
         },
         "notes": fitted.notes,
+        "code": code_mark(),
         "versions": {"python": platform.python_version(), "numpy": np.__version__, "torch": torch.__version__},
     }
     return _write(cell.path(terms, work), record, driven, bench.reward.returns(driven))

@@ -54,7 +54,9 @@ def test_the_tables_are_written_from_whatever_is_finished(work: Path, tmp_path: 
     assert {(row["labels"], row["scenarios"], row["seeds"]) for row in table} == {("12", "3", "1")}
     matrix = rows(tmp_path / "personalisation.csv")
     assert len(matrix) == 4
-    assert "shy (1, 3, 2, 2, 1, 1)" in (tmp_path / "table1.md").read_text()
+    page = (tmp_path / "table1.md").read_text()
+    assert "shy (1, 3, 2, 2, 1, 1)" in page
+    assert f"as a hash: {contest.code_mark()} (4 runs)." in page
     assert (tmp_path / "pareto-feeding.svg").read_text().startswith("<svg")
     assert len(rows(tmp_path / "costs.csv")) == 4
 
