@@ -14,7 +14,7 @@ from app.domain.protocol import EvaluationSettings
 from app.domain.studies import PAPER_PROTOCOL, Method, RewardKind, Strategy, StudySettings
 from app.settings import Settings
 from app.storage import ArtefactStore
-from worker import benchmark, exploration, import_work, laboratory, pretraining, rehearsal, service
+from worker import benchmark, exploration, foresight, import_work, laboratory, pretraining, rehearsal, service
 from worker.contest import INDIRECT_USERS, OPPOSED_USERS, PAPER_USERS
 from worker.ml import acquisition, reward_training
 from worker.ml.methods import METHODS
@@ -74,6 +74,13 @@ def _add_training(commands: _Commands) -> None:
     explore.add_argument("--scenarios", type=int, default=exploration.SCENARIOS, help="each in twelve modes")
     explore.add_argument("--processes", type=int, default=2)
     explore.set_defaults(act=_explore)
+
+    foresee = commands.add_parser("foresee", help=foresight.foresee.__doc__)
+    _add_task(foresee)
+    foresee.add_argument("--work-directory", type=Path, help="rollouts; default: foresight/ in the data directory")
+    foresee.add_argument("--scenarios", type=int, default=foresight.SCENARIOS, help="each in six behaviours")
+    foresee.add_argument("--processes", type=int, default=2)
+    foresee.set_defaults(act=_foresee)
 
 
 def _add_benchmark(commands: _Commands) -> None:
@@ -230,6 +237,17 @@ def _explore(options: argparse.Namespace) -> int:
     record = exploration.explore(
         options.task,
         options.work_directory or Settings().data_dir / "explore" / options.task,
+        options.processes,
+        options.scenarios,
+    )
+    sys.stdout.write(json.dumps(record, indent=2) + "\n")
+    return 0
+
+
+def _foresee(options: argparse.Namespace) -> int:
+    record = foresight.foresee(
+        options.task,
+        options.work_directory or Settings().data_dir / "foresight",
         options.processes,
         options.scenarios,
     )

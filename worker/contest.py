@@ -23,10 +23,11 @@ from app.domain.studies import USUAL_CLIP_STEPS, TaskName
 from worker import laboratory, lessons
 from worker.exploration import surface_file
 from worker.ml import acquisition, filter_problem, methods, reward_training
+from worker.ml.candidate_ranking import can_rank
 from worker.ml.filter_problem import FilterConfig, FilterProblem
 from worker.ml.methods import MethodConfig, Setting
 from worker.ml.response_surface import ResponseSurface
-from worker.ml.reward_models import MlpReward, RewardModel, load_reward_model
+from worker.ml.reward_models import RewardModel, load_reward_model
 from worker.ml.reward_training import SignalScale
 from worker.ml.segments import SegmentPairs
 from worker.ml.teachers import INDIRECT, OPPOSED, TASTES, Manner, ScriptedTeacher, Taste, User
@@ -236,11 +237,8 @@ class Bench:
         partial.replace(path)
         return load_reward_model(path.read_bytes())  # as stored, whoever was first
 
-    def _action_reward(self) -> MlpReward:
-        model = self.reward if isinstance(self.reward, MlpReward) else self._fit("mlp")
-        if not isinstance(model, MlpReward):
-            raise TypeError(f"The kind 'mlp' gave {type(model).__name__}.")
-        return model
+    def _action_reward(self) -> RewardModel:
+        return self.reward if can_rank(self.reward) else self._fit("mlp")
 
     def _fit(self, kind: reward_training.Kind) -> RewardModel:
         return reward_training.fit(
@@ -250,4 +248,5 @@ class Bench:
             self.cell.seed,
             scale=self.scale,
             reference=laboratory.reference_rollouts(self.cell.task),
+            predictor=laboratory.signal_predictor(self.cell.task) if kind == "predicted" else None,
         ).model

@@ -12,7 +12,7 @@ from worker import dataset, laboratory
 from worker.exploration import surface_file
 from worker.ml.advice import expected_regret
 from worker.ml.response_surface import ResponseSurface
-from worker.ml.reward_models import RewardModel, load_reward_model
+from worker.ml.reward_models import RewardModel, StructuredReward, load_reward_model
 from worker.ml.segments import LEFT, SegmentPairs, Stretch
 from worker.trajectory import COSTS
 from worker.workplace import Workplace
@@ -100,7 +100,7 @@ def _ranking(names: Sequence[tuple[int, int]], returns: Floats) -> list[list[flo
 
 def _regret(task: str, model: RewardModel) -> float | None:
     """None for reward models that are not linear: their members' wishes are not known."""
-    if model.kind != "structured" or not surface_file(task).exists():
+    if not isinstance(model, StructuredReward) or not surface_file(task).exists():
         return None
     surface = ResponseSurface.load(surface_file(task), laboratory.task(task).modes)
     return expected_regret(surface, model.signal_weights(()))

@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from worker.behaviours import Behaviour, SlowWaves, draw_behaviours
 from worker.ml.policies import GaussianPolicy
+from worker.ml.signal_predictor import SignalPredictor
 from worker.sim.assistive import AssistiveEnv
 from worker.sim.catalogue import ENVIRONMENTS
 from worker.sim.render import ClipRenderer, RenderedClip
@@ -38,6 +39,13 @@ class UnknownTask(ValueError):
 
     def __init__(self, name: str) -> None:
         super().__init__(f"There is no task named {name!r}; this installation knows {', '.join(ENVIRONMENTS)}.")
+
+
+class NoPredictor(ValueError):
+    """Nothing was trained that foresees the task's signals."""
+
+    def __init__(self, task: str) -> None:
+        super().__init__(f"The signals of {task} cannot be foreseen yet: run python -m worker foresee --task {task}.")
 
 
 @dataclass(frozen=True)
@@ -82,6 +90,19 @@ def renderer() -> ClipRenderer:
 def checkpoints(name: str) -> Path:
     """The folder with the task's trained policy and response surface."""
     return CHECKPOINTS / environment_class(name).task.name
+
+
+def predictor_file(name: str) -> Path:
+    """Where a task's predictor of signals is kept; its record lies beside it."""
+    return checkpoints(name) / "signal_predictor.safetensors"
+
+
+@cache
+def signal_predictor(name: str) -> SignalPredictor:
+    """What foresees a task's signals from state and action. Raises NoPredictor for a task that has none."""
+    if not predictor_file(name).exists():
+        raise NoPredictor(name)
+    return SignalPredictor.load(predictor_file(name))
 
 
 @cache

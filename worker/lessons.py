@@ -7,7 +7,7 @@ from typing import Any, cast, get_args
 import numpy as np
 import numpy.typing as npt
 
-from worker.laboratory import environment, reference_policy, reference_rollouts
+from worker.laboratory import environment, reference_policy, reference_rollouts, signal_predictor
 from worker.ml import reward_training
 from worker.ml.filter_problem import Act, noisy
 from worker.ml.pooled_prior import prior_of
@@ -46,7 +46,7 @@ def fit_reward(
     ``scale``: what the signals are like in the study's pool; ``earlier``: models of others for
     a pooled prior; ``recorded_signals``: what the signals are called when the clips were recorded elsewhere. Then there
     is no reference policy to normalise over, and what the person was shown takes its place.
-    Raises ValueError for a kind there is not.
+    Raises ValueError for a kind there is not, and laboratory.NoPredictor where the task's signals cannot be foreseen.
     """
     if kind not in get_args(reward_training.Kind):
         raise ValueError(f"There is no reward model of the kind {kind!r}.")
@@ -60,6 +60,7 @@ def fit_reward(
         reference=reference_rollouts(task) if recorded_signals is None else (),
         prior=prior,
         signal_names=SIGNALS if recorded_signals is None else recorded_signals,
+        predictor=signal_predictor(task) if kind == "predicted" else None,
     )
     return fitted.model.to_bytes(), {**fitted.metrics, "pooled_from": len(earlier)}
 

@@ -104,12 +104,12 @@ def _rival(place: Workplace, run_id: int, job: Job, method: str, reward: str, fo
 
 
 def _action_reward(place: Workplace, run_id: int, job: Job, reward: str, folder: Path) -> bytes:
-    """A reward model on states and actions: the participant's own if it is one, else one of the same labels."""
+    """A reward model that can rate untried actions: the participant's own if it can, else one of the same labels."""
     kept = folder / "action_reward.safetensors"
     with place.database.reading() as session:
         study = session.get_one(Study, job.study_id)
         seed = session.get_one(Participant, job.participant).seed
-        if study.settings.reward_kind is RewardKind.MLP:
+        if study.settings.reward_kind is not RewardKind.STRUCTURED:
             return place.store.read(reward)
         preferences = dataset.load_preferences(session, place.store, job.participant)
         scale = dataset.signal_scale(session, place.store, job.study_id)

@@ -16,6 +16,7 @@ import torch
 from worker import laboratory, lessons
 from worker.ml import controller, filter_problem, methods
 from worker.ml.action_filter import FilterWeights
+from worker.ml.candidate_ranking import can_rank
 from worker.ml.checkpoint import Checkpoint
 from worker.ml.controller import Blinded
 from worker.ml.filter_problem import Act, FilterProblem
@@ -23,7 +24,7 @@ from worker.ml.methods import MethodConfig, Setting
 from worker.ml.preference_rl import PolicyAct
 from worker.ml.prefft import FineTuning
 from worker.ml.response_surface import ResponseSurface
-from worker.ml.reward_models import MlpReward, load_reward_model
+from worker.ml.reward_models import RewardModel, load_reward_model
 from worker.ml.run_controller import Controller
 from worker.trajectory import Trajectory
 
@@ -112,9 +113,9 @@ def _collect(task: str, act: Act, scenarios: Sequence[int], noise: float, seed: 
     return lessons.run_scenarios(task, act, scenarios, noise, seed)
 
 
-def _action_reward(rival: Rival) -> MlpReward:
+def _action_reward(rival: Rival) -> RewardModel:
     model = load_reward_model(rival.action_reward)
-    if not isinstance(model, MlpReward):
+    if not can_rank(model):
         raise TypeError(f"{rival.method} needs a reward model on states and actions, not {type(model).__name__}.")
     return model
 

@@ -45,6 +45,7 @@ class RewardKind(StrEnum):
     """Which reward model learns from the labels."""
 
     STRUCTURED = "structured"
+    PREDICTED = "predicted"
     MLP = "mlp"
     PREFERENCE_TRANSFORMER = "preference_transformer"
 

@@ -55,6 +55,7 @@ RETRAIN_EVERY = 10
 NAMED = ("cautious", "impatient", "slow", "wide")
 NEW_PEOPLE, EARLIER_PEOPLE = range(6), range(100, 112)
 """Numbers of people drawn from one population: those who are measured, and those who came before them."""
+LINEAR = ("structured", "predicted")
 RULES: tuple[acquisition.Rule, ...] = ("uniform", "disagreement", "entropy", "information_gain", "contested")
 TARGETS = {"left": 0.0, "right": 1.0, "equal": 0.5}
 DRIVEN = {
@@ -133,7 +134,7 @@ class Bench:
         stops = [count for count in COUNTS if count <= min(self.most_labels, len(self.pairs))]
         if chain.rule != "uniform" or chain.pooled:
             stops = [count for count in stops if count <= 200]
-        every = [*range(RETRAIN_EVERY, stops[-1], RETRAIN_EVERY)] if chain.model == "structured" else []
+        every = [*range(RETRAIN_EVERY, stops[-1], RETRAIN_EVERY)] if chain.model in LINEAR else []
         for count in sorted({*stops, *every} if chain.rule != "uniform" else stops):
             added = self._choose(chain, count - len(rows), rows, model, rng)
             said = [TARGETS[teacher.answer(left, right, rng)] for left, right in rewards[added]]
@@ -166,7 +167,15 @@ class Bench:
     def _fit(self, chain: Chain, rows: Indices, answers: Floats) -> reward_training.FitResult:
         prior = self.prior if chain.pooled else None
         pairs = self.pool.segments(self.pairs[rows])
-        return reward_training.fit(pairs, answers, chain.model, chain.seed, scale=self.scale, prior=prior)
+        return reward_training.fit(
+            pairs,
+            answers,
+            chain.model,
+            chain.seed,
+            scale=self.scale,
+            prior=prior,
+            predictor=laboratory.signal_predictor(self.task.name) if chain.model == "predicted" else None,
+        )
 
     def _row(self, chain: Chain, count: int, fitted: reward_training.FitResult) -> Measured:
         sides = self.rewards(chain.user, self.unseen)[self.unseen_pairs]
@@ -278,6 +287,8 @@ def chains(seeds: int) -> list[Chain]:
     people = [*NAMED, *(f"person-{number}" for number in NEW_PEOPLE)]
     quick = [Chain(user, "structured", rule, seed=seed) for seed in range(seeds) for user in people for rule in RULES]
     quick += [Chain(user, "structured", pooled=True, seed=seed) for seed in range(seeds) for user in people]
+    foreseen: tuple[acquisition.Rule, ...] = ("uniform", "entropy")
+    quick += [Chain(user, "predicted", rule, seed=seed) for seed in range(seeds) for user in NAMED for rule in foreseen]
     networks: tuple[reward_training.Kind, ...] = ("mlp", "preference_transformer")
     slow = [Chain(user, kind) for user in NAMED for kind in networks]
     slow += [Chain(user, kind, rule) for user in NAMED for rule in RULES[1:] for kind in networks]
@@ -315,8 +326,8 @@ def report(rows: Sequence[dict[str, Any]]) -> str:
     """Markdown tables: means over chains, of users and seeds that every line of a table has."""
     named = [row for row in rows if row["user"] in NAMED and not row["pooled_prior"]]
     uniform = [row for row in named if row["strategy"] == "uniform"]
-    structured = [row for row in named if row["model"] == "structured"]
-    networks = [row for row in named if row["model"] != "structured"]
+    structured = [row for row in named if row["model"] in LINEAR]
+    networks = [row for row in named if row["model"] not in LINEAR]
     drawn = [
         {**row, "strategy": "uniform, pooled prior" if row["pooled_prior"] else row["strategy"]}
         for row in rows
@@ -324,7 +335,7 @@ def report(rows: Sequence[dict[str, Any]]) -> str:
     ]
     accuracies = [
         ("Reward models, pairs at random, named users", uniform),
-        ("Ways of choosing pairs, structured, named users", structured),
+        ("Ways of choosing pairs, linear models, named users", structured),
         ("Ways of choosing pairs and the pooled prior, structured, people of the population", drawn),
         ("Ways of choosing pairs, networks, users finished in time", networks),
     ]

@@ -1,12 +1,15 @@
 """Invented trajectories and policies for tests of the learning code: the right shapes, no physics."""
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
 
+from worker.ml import dense
 from worker.ml.policies import GaussianPolicy
 from worker.ml.segments import SegmentPairs
+from worker.ml.signal_predictor import SignalPredictor
 from worker.sim.feeding import FEEDING
 from worker.trajectory import COSTS, SIGNALS, Trajectory
 
@@ -68,6 +71,19 @@ def trajectory(
         body="broad",
         skin_tone=0,
     )
+
+
+def predictor(seed: int = 0, hidden: int = 8) -> SignalPredictor:
+    """What foresees some signals or other: random weights."""
+    rng = np.random.default_rng(seed)
+    sizes = [D + A, hidden, S]
+    drawn = [
+        array.astype(np.float32)
+        for fan_in, fan_out in pairwise(sizes)
+        for array in (rng.standard_normal((fan_in, fan_out)) / fan_in**0.5, rng.standard_normal((1, fan_out)))
+    ]
+    zeros, ones = np.zeros(D + A, np.float32), np.ones(D + A, np.float32)
+    return SignalPredictor(dense.of_parameters(drawn), zeros, ones, zeros[:S], ones[:S])
 
 
 def pairs(count: int, rng: np.random.Generator, steps: int = 20) -> SegmentPairs:

@@ -15,9 +15,10 @@ from worker.ml.reward_training import SignalScale, fit, posterior
 from worker.ml.segments import SegmentPairs
 from worker.trajectory import SIGNALS
 
-KINDS: tuple[reward_training.Kind, ...] = ("structured", "mlp", "preference_transformer")
+KINDS: tuple[reward_training.Kind, ...] = ("structured", "predicted", "mlp", "preference_transformer")
 QUICK = MlpTraining(steps=100, members=3, hidden=16, learning_rate=5e-3)
 QUICK_TRANSFORMER = TransformerTraining(steps=120, members=2, hidden=16, learning_rate=1e-2, every_nth_step=1)
+PREDICTOR = invented.predictor()
 DISLIKES_SPEED = np.array([-1.0 if name == "speed_m_s" else 0.0 for name in SIGNALS])
 
 
@@ -31,7 +32,7 @@ def labelled() -> tuple[SegmentPairs, np.ndarray]:
 @pytest.fixture(scope="module", params=KINDS)
 def model(request: pytest.FixtureRequest, labelled: tuple[SegmentPairs, np.ndarray]) -> RewardModel:
     """All kinds, fitted."""
-    return fit(*labelled, request.param, 3, mlp=QUICK, transformer=QUICK_TRANSFORMER).model
+    return fit(*labelled, request.param, 3, mlp=QUICK, transformer=QUICK_TRANSFORMER, predictor=PREDICTOR).model
 
 
 @pytest.mark.parametrize(("left", "right"), [(1.0, 0.0), (0.0, 1.0), (0.3, 0.3), (-700.0, 700.0)])
@@ -134,7 +135,8 @@ def test_the_same_seed_gives_the_same_model_and_another_seed_another(
     kind: reward_training.Kind, labelled: tuple[SegmentPairs, np.ndarray]
 ) -> None:
     first, again, other = (
-        fit(*labelled, kind, seed, mlp=QUICK, transformer=QUICK_TRANSFORMER).model.to_bytes() for seed in (5, 5, 6)
+        fit(*labelled, kind, seed, mlp=QUICK, transformer=QUICK_TRANSFORMER, predictor=PREDICTOR).model.to_bytes()
+        for seed in (5, 5, 6)
     )
     assert first == again
     assert first != other
@@ -210,7 +212,7 @@ def test_weights_on_signals_are_exact_for_the_structured_kind_and_close_for_netw
 def test_a_handful_of_one_sided_labels_does_not_break_the_fit() -> None:
     few = invented.pairs(2, np.random.default_rng(0))
     for kind in KINDS:
-        model = fit(few, [1.0, 1.0], kind, 0, mlp=QUICK, transformer=QUICK_TRANSFORMER).model
+        model = fit(few, [1.0, 1.0], kind, 0, mlp=QUICK, transformer=QUICK_TRANSFORMER, predictor=PREDICTOR).model
         assert np.isfinite(model.probability_right(few)).all()
 
 

@@ -5,7 +5,8 @@ past: here a candidate takes the place of the action that was executed at that s
 episode's own history. All candidates of a list share the history, so that only the candidates decide the ranking; the
 preference weights w_t, which need the whole segment, are left out.
 
-The measured signals of the structured kind exist only after an action was executed: it cannot rank.
+The measured signals of the structured kind exist only after an action was executed: it cannot rank. Where all signals
+are predicted it can.
 """
 
 from collections.abc import Callable, Sequence
@@ -16,6 +17,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from worker.ml import preference_transformer
+from worker.ml.predicted_reward import PredictedReward
 from worker.ml.preference_transformer import INPUT_CLIP, PreferenceTransformer
 from worker.ml.reward_models import MlpReward, RewardModel
 from worker.trajectory import Trajectory
@@ -26,16 +28,21 @@ RankerAt = Callable[[Tensor], Ranker]
 """rows (B,) of the steps of all episodes, one episode after the other -> the ranker for candidates at those steps"""
 
 
+def can_rank(reward: RewardModel) -> bool:
+    """Whether ranker_at() takes this model."""
+    return isinstance(reward, (MlpReward, PredictedReward, PreferenceTransformer))
+
+
 def ranker_at(reward: RewardModel, episodes: Sequence[Trajectory]) -> RankerAt:
     """Mean over members. Raises TypeError for a kind that cannot score actions that were never executed."""
-    if isinstance(reward, MlpReward):
-        anywhere = mlp_ranker(reward)
+    if isinstance(reward, (MlpReward, PredictedReward)):
+        anywhere = mlp_ranker(reward) if isinstance(reward, MlpReward) else predicted_ranker(reward)
         return lambda rows: anywhere
     if isinstance(reward, PreferenceTransformer):
         memory = HistoryMemory(reward, episodes)
         return lambda rows: lambda states, actions: memory.rewards(rows, states, actions).mean(0)
     raise TypeError(
-        "The printed method ranks untried actions and needs a reward model of the kind 'mlp' or "
+        "The printed method ranks untried actions and needs a reward model of the kind 'predicted', 'mlp' or "
         "'preference_transformer'."
     )
 
@@ -53,6 +60,17 @@ def mlp_ranker(reward: MlpReward) -> Ranker:
         matrix, bias = layers[-1]
         rewards: Tensor = (hidden @ matrix + bias).tanh().mean(0).reshape(inputs.shape[:-1])
         return rewards
+
+    return rank
+
+
+def predicted_ranker(reward: PredictedReward) -> Ranker:
+    """The weighted signals that are foreseen for an action, mean over members."""
+    weights = reward.weights.mean(axis=0)
+
+    def rank(states: Tensor, actions: Tensor) -> Tensor:
+        foreseen = reward.predictor.predict(states.detach().numpy(), actions.detach().numpy())
+        return torch.from_numpy((foreseen @ weights).astype(np.float32))
 
     return rank
 

@@ -25,7 +25,7 @@ from worker.ml.preference_rl import Env, MakeEnv, PolicyAct, learned
 from worker.ml.prefft import TIED, FineTuning
 from worker.ml.printed_filter import fit_printed
 from worker.ml.response_surface import ResponseSurface
-from worker.ml.reward_models import MlpReward
+from worker.ml.reward_models import RewardModel
 from worker.trajectory import Trajectory
 
 Array = npt.NDArray[np.float32]
@@ -57,7 +57,7 @@ class Setting:
     pool: Sequence[Trajectory]
     """rollouts of many behaviours"""
     surface: Callable[[], ResponseSurface]
-    action_reward: Callable[[], MlpReward]
+    action_reward: Callable[[], RewardModel]
     """a model of the same labels that can score actions which were never executed"""
     reference: Callable[[range], Sequence[Trajectory]]
     """rollouts of the frozen policy's deterministic action in these scenarios"""

@@ -1,7 +1,8 @@
 """Reward models: an ensemble of functions from a control step to how much this person likes it.
 
-Three kinds behind one interface: linear in measured signals, a network on (state, action), and the Preference
-Transformer of preference_transformer, whose reward also depends on what came before. Training lives in reward_training.
+Four kinds behind one interface: linear in measured signals, the same where some have to be predicted
+(predicted_reward), a network on (state, action), and the Preference Transformer of preference_transformer, whose reward
+also depends on what came before. Training lives in reward_training.
 A learned reward has no natural zero or unit (pairs of equal length cannot identify an offset, and the scale grows with
 the labels), so every model is normalised to mean 0 and standard deviation 1 per step over rollouts of the reference
 policy. Probabilities do have a unit: they are calibrated with a temperature (see calibration).
@@ -17,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from safetensors.numpy import load, save
 
+from worker.ml import dense
 from worker.ml.bradley_terry import preference_logits, probability_right
 from worker.ml.segments import LEFT, RIGHT, SegmentPairs
 from worker.trajectory import Recorded, Trajectory
@@ -192,15 +194,24 @@ class StructuredReward(RewardModel):
     limited"""
 
     def raw_rewards(self, signals: Array, observations: Array, actions: Array) -> Floats:
-        """See RewardModel; observations and actions are not used."""
-        rewards: Floats = np.moveaxis(np.asarray(signals, np.float64) @ self.weights.T, -1, 0)
+        """See RewardModel."""
+        return self._linear(self.known_signals(signals, observations, actions))
+
+    def known_signals(self, signals: Array, observations: Array, actions: Array) -> Floats:
+        """What the weights are multiplied with, (..., S): here the signals as measured."""
+        return np.asarray(signals, np.float64)
+
+    def _linear(self, known: Floats) -> Floats:
+        """(..., S) -> (E, ...)"""
+        rewards: Floats = np.moveaxis(known @ self.weights.T, -1, 0)
         return rewards
 
     def _earned(self, signals: Array, observations: Array, actions: Array) -> Floats:
         """See RewardModel; what is beyond the limits over the whole episode is worth nothing more."""
-        undeserved = self._undeserved(np.cumsum(signals, axis=0, dtype=np.float64))
+        known = self.known_signals(signals, observations, actions)
+        undeserved = self._undeserved(np.cumsum(known, axis=0))
         each_step = np.diff(undeserved, axis=0, prepend=np.zeros((1, self.size)))
-        return self.normalised(self.raw_rewards(signals, observations, actions) - each_step.T)
+        return self.normalised(self._linear(known) - each_step.T)
 
     def _undeserved(self, totals: Floats) -> Floats:
         """What linear rewards pay for being beyond the limits, from the beginning to each step. totals (T, S) -> (T, E)
@@ -252,7 +263,7 @@ class MlpReward(RewardModel):
     """
 
     kind: ClassVar[str] = "mlp"
-    layers: tuple[tuple[Array, Array], ...]
+    layers: dense.Layers
     offset: Array
     scale: Array
 
@@ -260,27 +271,19 @@ class MlpReward(RewardModel):
         """See RewardModel; the signals are not used."""
         leading = np.shape(actions)[:-1]
         inputs = np.concatenate([observations, actions], axis=-1).reshape(-1, len(self.offset))
-        hidden = np.clip((inputs - self.offset) / self.scale, -6.0, 6.0)[None]
-        for matrix, bias in self.layers[:-1]:
-            hidden = hidden @ matrix + bias
-            hidden = hidden / (1.0 + np.exp(-np.clip(hidden, -60.0, 60.0)))  # SiLU
-        matrix, bias = self.layers[-1]
-        rewards: Floats = np.tanh(hidden @ matrix + bias)[..., 0].astype(np.float64)
+        standard = np.clip((inputs - self.offset) / self.scale, -6.0, 6.0)[None]
+        rewards: Floats = np.tanh(dense.run(self.layers, standard))[..., 0].astype(np.float64)
         return rewards.reshape(self.size, *leading)
 
     def tensors(self) -> dict[str, Array]:
         """See RewardModel."""
-        named = {"offset": self.offset, "scale": self.scale}
-        for index, (matrix, bias) in enumerate(self.layers):
-            named[f"matrix_{index}"], named[f"bias_{index}"] = matrix, bias
-        return {name: np.ascontiguousarray(array, np.float32) for name, array in named.items()}
+        whole = {"offset": self.offset, "scale": self.scale} | dense.named(self.layers)
+        return {name: np.ascontiguousarray(array, np.float32) for name, array in whole.items()}
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, Array], config: Mapping[str, Any]) -> Self:
         """See RewardModel."""
-        count = sum(name.startswith("matrix_") for name in tensors)
-        layers = tuple((tensors[f"matrix_{index}"], tensors[f"bias_{index}"]) for index in range(count))
-        return cls(layers, tensors["offset"], tensors["scale"])
+        return cls(dense.of_named(tensors), tensors["offset"], tensors["scale"])
 
     @property
     def size(self) -> int:
@@ -290,10 +293,11 @@ class MlpReward(RewardModel):
 
 def load_reward_model(stored: bytes) -> RewardModel:
     """Read what to_bytes() wrote. Raises ValueError for a file that is something else."""
-    from worker.ml.preference_transformer import PreferenceTransformer  # it is built on this module
+    from worker.ml.predicted_reward import PredictedReward  # built on this module, as is the next
+    from worker.ml.preference_transformer import PreferenceTransformer
 
     config = stored_config(stored)
-    kinds: tuple[type[RewardModel], ...] = (StructuredReward, MlpReward, PreferenceTransformer)
+    kinds: tuple[type[RewardModel], ...] = (StructuredReward, PredictedReward, MlpReward, PreferenceTransformer)
     for kind in kinds:
         if config.get("kind") == kind.kind:
             return replace(

@@ -14,12 +14,14 @@ from worker.ml.bradley_terry import probability_of_answer, probability_right, sl
 from worker.ml.calibration import HeldOut
 from worker.ml.network_training import MlpTraining, TransformerTraining, fit_mlp, fit_transformer
 from worker.ml.pooled_prior import Prior
+from worker.ml.predicted_reward import PredictedReward
 from worker.ml.reward_models import Normalisation, RewardModel, StructuredReward
 from worker.ml.segments import SegmentPairs
+from worker.ml.signal_predictor import SignalPredictor
 from worker.trajectory import SIGNALS, Trajectory
 
 Floats = npt.NDArray[np.float64]
-Kind = Literal["structured", "mlp", "preference_transformer"]
+Kind = Literal["structured", "predicted", "mlp", "preference_transformer"]
 
 MEMBERS = 8
 LARGEST_GRADIENT = 1e-6
@@ -86,6 +88,7 @@ def fit(
     mlp: MlpTraining | None = None,
     transformer: TransformerTraining | None = None,
     signal_names: Sequence[str] = SIGNALS,
+    predictor: SignalPredictor | None = None,
 ) -> FitResult:
     """Fit an ensemble to N pairs and their targets P(right preferred) in {0, 1/2, 1}.
 
@@ -94,14 +97,25 @@ def fit(
     ``reference``: rollouts of the reference policy to normalise over; the labelled segments when missing.
     ``prior``: of the structured kind's weights, Prior.standard() when missing.
     ``signal_names``: what the columns of the pairs' signals are called.
-    Raises ValueError for targets outside {0, 1/2, 1} or a count that differs from the pairs'.
+    ``predictor``: of the signals, which the kind "predicted" needs.
+    Raises ValueError for targets outside {0, 1/2, 1}, a count that differs from the pairs', or a missing predictor.
     """
     started = time.perf_counter()
     answers = _checked(pairs, targets)
     metrics: dict[str, Any] = {"kind": kind, "trained_on": len(pairs), "seed": seed}
+    known = prior or Prior.standard(len(signal_names))
+    model: RewardModel
     if kind == "structured":
-        known = prior or Prior.standard(len(signal_names))
         model, found = _fit_structured(pairs, answers, seed, scale or SignalScale.of(pairs), known, signal_names)
+    elif kind == "predicted":
+        if predictor is None:
+            raise ValueError("The kind 'predicted' needs a predictor of the signals.")
+        foreseen = predictor.completed(pairs.signals, pairs.observations, pairs.actions).astype(np.float32)
+        completed = replace(pairs, signals=foreseen)
+        linear, found = _fit_structured(
+            completed, answers, seed, scale or SignalScale.of(completed), known, signal_names
+        )
+        model = PredictedReward.with_predictor(linear, predictor)
     elif kind == "mlp":
         model, found = fit_mlp(pairs, answers, seed, mlp or MlpTraining())
     else:
@@ -148,7 +162,7 @@ def _normalised_over_segments(model: RewardModel, pairs: SegmentPairs) -> Reward
 
 def _fit_structured(
     pairs: SegmentPairs, answers: Floats, seed: int, scale: SignalScale, prior: Prior, signal_names: Sequence[str]
-) -> tuple[RewardModel, dict[str, Any]]:
+) -> tuple[StructuredReward, dict[str, Any]]:
     features = pairs.signal_differences() / scale.spread
     costs = [column for column, name in enumerate(signal_names) if name in NEVER_WANTED]
     mean, covariance = posterior(features, answers, prior, costs)
