@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from app.domain.studies import USUAL_CLIP_STEPS, TaskName
+from app.domain.studies import usual_clip_steps
 from worker import laboratory, lessons
 from worker.exploration import surface_file
 from worker.ml import acquisition, filter_problem, methods, reward_training
@@ -163,7 +163,7 @@ class Bench:
         self.cell, self.terms, self.shelf = cell, terms, shelf
         self.task = laboratory.task(cell.task)
         self.pool = shelf.behaviours(terms.pool)
-        self.clip_steps = min(USUAL_CLIP_STEPS.get(TaskName(cell.task), 60), self.task.episode_steps)
+        self.clip_steps = min(usual_clip_steps(cell.task), self.task.episode_steps)
         self.rows = acquisition.matched_pairs([each.scenario for each in self.pool])
         episode_means = [each.signals.mean(axis=0, dtype=np.float64) for each in self.pool]
         self.scale = SignalScale.of(self._cut(self.rows), episode_means)

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from app.domain.studies import USUAL_CLIP_STEPS, TaskName
+from app.domain.studies import usual_clip_steps
 from worker import laboratory
 from worker.compute import Compute, Lane
 from worker.ml import signal_learning
@@ -48,7 +48,7 @@ def foresee(
     shelf, config = Shelf(task, work_directory), training or PredictorTraining()
     with tqdm(total=config.steps, unit="step", desc="training") as bar:
         predictor = signal_learning.fit(shelf.behaviours(learned_from), 0, config, lambda step: _moved(bar, step))
-    clip_steps = min(USUAL_CLIP_STEPS[TaskName(task)], laboratory.task(task).episode_steps)
+    clip_steps = min(usual_clip_steps(task), laboratory.task(task).episode_steps)
     file = target or laboratory.predictor_file(task)
     predictor.save(file)
     record = {

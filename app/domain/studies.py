@@ -34,6 +34,11 @@ LONGEST_CLIP_STEPS = {TaskName.FEEDING: 100, TaskName.DRINKING: 130, TaskName.SC
 """A whole episode."""
 
 
+def usual_clip_steps(task: str) -> int:
+    """Of a task by its name; a task under construction, which has no row here yet, is shown as long as Feeding."""
+    return {name.value: steps for name, steps in USUAL_CLIP_STEPS.items()}.get(task, USUAL_CLIP_STEPS[TaskName.FEEDING])
+
+
 class Method(StrEnum):
     """How the personal filter is trained."""
 

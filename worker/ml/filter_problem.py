@@ -122,8 +122,8 @@ class FilterDraft:
 
 
 SCENARIO_BLOCKS = {"gate": 2_000_000, "residual": 3_000_000, "evaluation": 4_000_000, "recording": 5_000_000}
-"""First scenario of each purpose. Others: exploration 100_000, test of the policy 1_000_000, what is rated or shown
-before and after 6_000_000 (app.services.evaluating), clips from 10_000_000."""
+"""First scenario of each purpose. Others: exploration 100_000, foresight 200_000, test of the policy 1_000_000, what is
+rated or shown before and after 6_000_000 (app.services.evaluating), clips from 10_000_000."""
 
 
 def scenarios_for(purpose: str, count: int, skip: int = 0) -> range:
