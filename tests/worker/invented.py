@@ -83,7 +83,7 @@ def predictor(seed: int = 0, hidden: int = 8) -> SignalPredictor:
         for array in (rng.standard_normal((fan_in, fan_out)) / fan_in**0.5, rng.standard_normal((1, fan_out)))
     ]
     zeros, ones = np.zeros(D + A, np.float32), np.ones(D + A, np.float32)
-    return SignalPredictor(dense.of_parameters(drawn), zeros, ones, zeros[:S], ones[:S])
+    return SignalPredictor(dense.of_parameters(drawn), zeros, ones, zeros[:S], ones[:S], np.full(S, 9.0, np.float32))
 
 
 def pairs(count: int, rng: np.random.Generator, steps: int = 20) -> SegmentPairs:

@@ -112,9 +112,8 @@ def fit(
             raise ValueError("The kind 'predicted' needs a predictor of the signals.")
         foreseen = predictor.completed(pairs.signals, pairs.observations, pairs.actions).astype(np.float32)
         completed = replace(pairs, signals=foreseen)
-        linear, found = _fit_structured(
-            completed, answers, seed, scale or SignalScale.of(completed), known, signal_names
-        )
+        wider = _wider(scale or SignalScale.of(completed), completed)
+        linear, found = _fit_structured(completed, answers, seed, wider, known, signal_names)
         model = PredictedReward.with_predictor(linear, predictor)
     elif kind == "mlp":
         model, found = fit_mlp(pairs, answers, seed, mlp or MlpTraining())
@@ -129,6 +128,12 @@ def fit(
     metrics["training_accuracy"] = _accuracy(model, pairs, answers)
     metrics["fit_seconds"] = round(time.perf_counter() - started, 4)
     return FitResult(model, metrics)
+
+
+def _wider(measured: SignalScale, foreseen: SegmentPairs) -> SignalScale:
+    """What hardly ever differs in a pool may be foreseen to differ: errors must not be blown up to standard size."""
+    differences = np.sqrt((foreseen.signal_differences() ** 2).mean(axis=0))
+    return replace(measured, spread=np.maximum(measured.spread, differences))
 
 
 def _spread_of(differences: Floats) -> Floats:

@@ -34,6 +34,7 @@ UNSENSED = (
 """Needs sensors on the person, or somebody who counts drops. All other signals follow from the robot's own motion and
 from where the person is, which its policy has to know anyway."""
 _UNSENSED_COLUMNS = [SIGNALS.index(name) for name in UNSENSED]
+_STANDARDS = ("offset", "scale", "mean", "spread", "most")
 INPUT_CLIP = 6.0
 """Standard deviations at which inputs are cut: far from what it has seen a network says anything."""
 
@@ -48,7 +49,8 @@ class SignalPredictor:
     """(D + 7,)"""
     mean: Array
     spread: Array
-    """(S,)"""
+    most: Array
+    """(S,); nothing larger than ``most`` is ever foreseen"""
 
     def predict(self, observations: Array, actions: Array) -> Floats:
         """Expected signals of each step. (..., D), (..., 7) -> (..., S)
@@ -58,7 +60,7 @@ class SignalPredictor:
         inputs = np.concatenate([observations, actions], axis=-1)
         standard = np.clip((inputs - self.offset) / self.scale, -INPUT_CLIP, INPUT_CLIP).astype(np.float32)
         flat = dense.run(self.layers, standard.reshape(-1, standard.shape[-1]))
-        signals: Floats = flat.astype(np.float64) * self.spread + self.mean
+        signals: Floats = np.minimum(flat.astype(np.float64) * self.spread + self.mean, self.most)
         return signals.reshape(*inputs.shape[:-1], -1)
 
     def completed(self, signals: Array, observations: Array, actions: Array) -> Floats:
@@ -69,7 +71,7 @@ class SignalPredictor:
 
     def tensors(self) -> dict[str, Array]:
         """Everything learned, by name."""
-        whole = {"offset": self.offset, "scale": self.scale, "mean": self.mean, "spread": self.spread}
+        whole = {name: getattr(self, name) for name in _STANDARDS}
         return {
             name: np.ascontiguousarray(array, np.float32) for name, array in (whole | dense.named(self.layers)).items()
         }
@@ -77,7 +79,7 @@ class SignalPredictor:
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, Array]) -> Self:
         """What tensors() gave."""
-        return cls(dense.of_named(tensors), *(tensors[name] for name in ("offset", "scale", "mean", "spread")))
+        return cls(dense.of_named(tensors), *(tensors[name] for name in _STANDARDS))
 
     def save(self, path: Path) -> None:
         """Write a safetensors file."""
