@@ -2,12 +2,14 @@
 
 import io
 import json
+import re
 import shutil
 import subprocess
 import sys
 import zipfile
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import onnxruntime
@@ -15,9 +17,10 @@ import pytest
 
 from tests.worker import invented
 from worker.analysis.evaluation import evaluate
-from worker.ml import bundle
+from worker.ml import bundle, reward_training
 from worker.ml.action_filter import FilterWeights, build
 from worker.ml.bundle import BundleContents, BundleDamaged, Provenance, Recording
+from worker.ml.model_card import model_card
 from worker.ml.onnx_export import to_onnx
 from worker.ml.policies import GaussianPolicy
 from worker.ml.policy_onnx import policy_to_onnx
@@ -155,6 +158,13 @@ def test_the_card_names_what_the_labels_are_sure_about_and_nothing_else(unzipped
     card = (unzipped / "MODEL_CARD.md").read_text()
     assert "| speed_m_s | -1.50 [-2.10, -0.90] |" in card
     assert "tilt_rad" not in card
+
+
+@pytest.mark.parametrize("kind", get_args(reward_training.Kind))
+def test_the_card_says_in_words_what_was_learned_from_the_labels(kind: str, unzipped: Path) -> None:
+    manifest = json.loads((unzipped / "manifest.json").read_text())
+    card = model_card(manifest | {"reward_kind": kind})
+    assert re.search(r"Reward model: (linear|an ensemble) ", card)
 
 
 def test_the_bundle_runs_on_its_own_and_confirms_itself(unzipped: Path) -> None:

@@ -49,7 +49,7 @@ def episodes(task: str, count: int) -> list[Trajectory]:
 @pytest.mark.parametrize("task", ENVIRONMENTS)
 def test_what_ships_foresees_the_signals_of_clips_it_has_not_seen(task: str) -> None:
     found = signal_learning.explained(laboratory.signal_predictor(task), episodes(task, 4), steps=60)
-    assert found["distance_m"]["clip"] > 0.95
+    assert found["distance_m"]["clip"] > 0.9
     assert found["speed_squared_m2_s2"]["clip"] > 0.8
     assert found["force_at_target_n" if task != "drinking" else "undelivered"]["clip"] > 0.5
 

@@ -16,6 +16,13 @@ _METHODS = {
     "as it kept the task on held-out scenarios",
     "printed": "PbARL as printed in the paper, with the readings stated in the project's docs/method.md; not gated",
 }
+_REWARDS = {
+    "structured": "linear in the measured signals",
+    "predicted": "linear in the signals; those that need sensors on the person are predicted from observation and "
+    "action by a network in the same file",
+    "mlp": "an ensemble of networks on observation and action",
+    "preference_transformer": "an ensemble of Preference Transformers",
+}
 
 _USE = """## Use
 
@@ -62,7 +69,7 @@ def _what(manifest: Mapping[str, Any]) -> str:
         f" prefers."
         f" Learned from {labels['count']} comparisons of two clips (study {manifest['study']}, seed {manifest['seed']},"
         f" labels sha256 `{labels['sha256'][:12]}`), exported {manifest['created_at']}.\n\n"
-        f"Method: {_METHODS[manifest['method']]}. Reward model: {manifest['reward_kind']}."
+        f"Method: {_METHODS[manifest['method']]}. Reward model: {_REWARDS[manifest['reward_kind']]}."
         f" Control rate: {manifest['control_rate_hz']:g} Hz."
     )
 
