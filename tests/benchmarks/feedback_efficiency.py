@@ -1,6 +1,6 @@
 """How much each reward model and each way of choosing pairs makes of a number of answers.
 
-    python -m tests.benchmarks.feedback_efficiency --task feeding --minutes 11 --output docs/results/feedback_efficiency
+    python -m tests.benchmarks.feedback_efficiency --task feeding
 
 Scripted users answer (5 % mistakes, 10 % "equal") matched pairs of real rollouts of a pool's behaviours. Measured on
 pairs of other scenarios: how often the model prefers what the user truly prefers, on all of them and on contested ones
@@ -8,27 +8,26 @@ pairs of other scenarios: how often the model prefers what the user truly prefer
 answers like those it learned from. And what the person gets: the execution mode that a study's search would pick for
 this reward model, with its change of the true preference and of success as the response surface has them; for some
 numbers of labels the mode is also driven through unseen scenarios. Rollouts and finished chains are kept under data/;
-repeat the command to go on, and with more --minutes to do more. The pool of the default size has 1020 pairs:
---pool-scenarios 850 --most-labels 5000 for 5000 labels.
+repeat the command to go on, and with more --minutes to do more. A pool of 170 scenarios has 1020 pairs.
 """
 
 import argparse
 import csv
 import json
-import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import torch
 from tqdm import tqdm
 
+from tests.benchmarks import feedback_report
 from tests.benchmarks.chosen_modes import stake
+from tests.benchmarks.feedback_report import LINEAR, NAMED
 from tests.benchmarks.pool_rollouts import Pool, pool_rollouts
 from worker import laboratory, lessons
 from worker.exploration import surface_file
@@ -52,11 +51,11 @@ UNSEEN_SCENARIOS = 60
 COUNTS = (10, 25, 50, 100, 200, 1000, 5000)
 RETRAIN_EVERY = 10
 """labels, as in a study; network ensembles, which take seconds, choose anew at every one of COUNTS only"""
-NAMED = ("cautious", "impatient", "slow", "wide")
 NEW_PEOPLE, EARLIER_PEOPLE = range(6), range(100, 112)
 """Numbers of people drawn from one population: those who are measured, and those who came before them."""
-LINEAR = ("structured", "predicted")
 RULES: tuple[acquisition.Rule, ...] = ("uniform", "disagreement", "entropy", "information_gain", "contested")
+AS_IN_A_STUDY: tuple[acquisition.Rule, ...] = ("uniform", "entropy")
+"""rules that are also run with the pooled prior and with foreseen signals: random ones, and the studio's default"""
 TARGETS = {"left": 0.0, "right": 1.0, "equal": 0.5}
 DRIVEN = {
     ("structured", "entropy", 50),
@@ -286,11 +285,18 @@ def chains(seeds: int) -> list[Chain]:
     """What matters most first: when time is up, the rest is left out."""
     people = [*NAMED, *(f"person-{number}" for number in NEW_PEOPLE)]
     quick = [Chain(user, "structured", rule, seed=seed) for seed in range(seeds) for user in people for rule in RULES]
-    quick += [Chain(user, "structured", pooled=True, seed=seed) for seed in range(seeds) for user in people]
-    foreseen: tuple[acquisition.Rule, ...] = ("uniform", "entropy")
-    quick += [Chain(user, "predicted", rule, seed=seed) for seed in range(seeds) for user in NAMED for rule in foreseen]
+    quick += [
+        Chain(user, "structured", rule, pooled=True, seed=seed)
+        for rule in AS_IN_A_STUDY
+        for seed in range(seeds)
+        for user in people
+    ]
+    quick += [
+        Chain(user, "predicted", rule, seed=seed) for seed in range(seeds) for user in NAMED for rule in AS_IN_A_STUDY
+    ]
     networks: tuple[reward_training.Kind, ...] = ("mlp", "preference_transformer")
     slow = [Chain(user, kind) for user in NAMED for kind in networks]
+    slow += [Chain(user, "mlp") for user in people if user not in NAMED]
     slow += [Chain(user, kind, rule) for user in NAMED for rule in RULES[1:] for kind in networks]
     return [*quick, *slow]
 
@@ -311,106 +317,22 @@ def main() -> None:
             with journal.open("a") as stream:
                 stream.write(json.dumps({"chain": name, "rows": done[name]}) + "\n")
     rows = [row for chain in planned for row in done.get(json.dumps([asdict(chain), options.most_labels]), [])]
-    sys.stdout.write(report(rows))
-    if options.output:
-        options.output.with_suffix(".tables.md").write_text(report(rows))
-        with options.output.with_suffix(".csv").open("w", newline="") as stream:
-            writer = csv.DictWriter(stream, list(rows[0]), lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(
-                {name: round(v, 4) if isinstance(v, float) else v for name, v in row.items()} for row in rows
-            )
-
-
-def report(rows: Sequence[dict[str, Any]]) -> str:
-    """Markdown tables: means over chains, of users and seeds that every line of a table has."""
-    named = [row for row in rows if row["user"] in NAMED and not row["pooled_prior"]]
-    uniform = [row for row in named if row["strategy"] == "uniform"]
-    structured = [row for row in named if row["model"] in LINEAR]
-    networks = [row for row in named if row["model"] not in LINEAR]
-    drawn = [
-        {**row, "strategy": "uniform, pooled prior" if row["pooled_prior"] else row["strategy"]}
-        for row in rows
-        if row["user"].startswith("person-")
-    ]
-    accuracies = [
-        ("Reward models, pairs at random, named users", uniform),
-        ("Ways of choosing pairs, linear models, named users", structured),
-        ("Ways of choosing pairs and the pooled prior, structured, people of the population", drawn),
-        ("Ways of choosing pairs, networks, users finished in time", networks),
-    ]
-    lines: list[str] = []
-    for title, chosen in accuracies:
-        lines += [f"### {title}: accuracy on all unseen pairs", "", *_table(chosen, "accuracy"), ""]
-        lines += [f"### {title}: accuracy on contested pairs", "", *_table(chosen, "contested_accuracy"), ""]
-    for title, chosen in accuracies[:3]:
-        lines += [
-            f"### {title}: true preference gained, % of the reference's",
-            "",
-            *_table(chosen, "gain_percent", 1),
-            "",
-        ]
-        lines += [f"### {title}: change of success, points", "", *_table(chosen, "success_points", 1), ""]
-    lines += ["### Promised and driven: gain of true preference in %, change of success in points", ""]
-    lines += [*_driven(rows), ""]
-    lines += ["### Expected calibration error without temperature", ""]
-    lines += [*_table(uniform, "calibration_error_uncalibrated"), "", "### Expected calibration error as shipped", ""]
-    return (
-        "\n".join([*lines, *_table(uniform, "calibration_error"), "", "### Seconds per fit", "", *_seconds(uniform)])
-        + "\n"
-    )
-
-
-def _driven(rows: Sequence[dict[str, Any]]) -> list[str]:
-    lines = [
-        "| user | model | rule | labels | gain, promised | driven | success, promised | driven |",
-        "|---" * 8 + "|",
-    ]
-    for row in rows:
-        if row["driven_gain_percent"] is not None:
-            figures = ("gain_percent", "driven_gain_percent", "success_points", "driven_success_points")
-            names = " | ".join(str(row[name]) for name in ("user", "model", "strategy", "labels"))
-            lines.append(f"| {names} | " + " | ".join(f"{row[name]:+.1f}" for name in figures) + " |")
-    return lines
-
-
-def _seconds(rows: Sequence[dict[str, Any]]) -> list[str]:
-    return _table(rows, "fit_seconds", 2)
-
-
-def _table(rows: Sequence[dict[str, Any]], field: str, digits: int = 3) -> list[str]:
-    lines_of = dict.fromkeys((row["model"], row["strategy"]) for row in rows)
-    chains_of = [
-        {(row["user"], row["seed"]) for row in rows if (row["model"], row["strategy"]) == line} for line in lines_of
-    ]
-    shared = set.intersection(*chains_of) if chains_of else set()
-    kept = [row for row in rows if (row["user"], row["seed"]) in shared and row[field] is not None]
-    counts = sorted({row["labels"] for row in kept})
-    head = "| model | pairs chosen | chains | " + " | ".join(map(str, counts)) + " |"
-    lines = [head, "|---" * (3 + len(counts)) + "|"]
-    for model, strategy in lines_of:
-        mine = [row for row in kept if (row["model"], row["strategy"]) == (model, strategy)]
-        cells = [_cell([row[field] for row in mine if row["labels"] == count], digits) for count in counts]
-        lines.append(f"| {model} | {strategy} | {len(shared)} | " + " | ".join(cells) + " |")
-    return lines
-
-
-def _cell(values: Sequence[float], digits: int) -> str:
-    """Mean and, of several chains, its standard error."""
-    if not values:
-        return "-"
-    mean = f"{np.mean(values):.{digits}f}"
-    return f"{mean} ({np.std(values, ddof=1) / len(values) ** 0.5:.{digits}f})" if len(values) > 1 else mean
+    options.output.mkdir(parents=True, exist_ok=True)
+    with (options.output / f"feedback_efficiency-{options.task}.csv").open("w", newline="") as stream:
+        writer = csv.DictWriter(stream, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows({name: round(v, 4) if isinstance(v, float) else v for name, v in row.items()} for row in rows)
+    feedback_report.write(options.output)
 
 
 def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--task", choices=ENVIRONMENTS, default="feeding")
     parser.add_argument("--seeds", type=int, default=2, help="of the quick chains; those of networks have one")
-    parser.add_argument("--pool-scenarios", type=int, default=170)
-    parser.add_argument("--most-labels", type=int, choices=COUNTS, default=1000)
-    parser.add_argument("--minutes", type=float, default=11.0, help="no chain is begun after that")
-    parser.add_argument("--output", type=Path, help="path without ending of the .csv and the tables")
+    parser.add_argument("--pool-scenarios", type=int, default=850)
+    parser.add_argument("--most-labels", type=int, choices=COUNTS, default=5000)
+    parser.add_argument("--minutes", type=float, default=30.0, help="no chain is begun after that")
+    parser.add_argument("--output", type=Path, default=Path("docs/results"), help="folder of the .csv and the tables")
     return parser.parse_args()
 
 
