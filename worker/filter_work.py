@@ -105,7 +105,7 @@ def _publish(place: Workplace, run_id: int, job: Job, reward: str, draft: str) -
         lock_hash=export.lock_hash,
         deviations=export.deviations,
     )
-    finished = fitting.finish(_draft(place, draft), provenance, model.metrics.get("weights") if model else None)
+    finished = fitting.finish(_draft(place, draft), provenance, model.metrics if model else {})
     model_artefact, bundle_artefact = place.store.put(finished.filter_weights), place.store.put(finished.bundle)
     with place.database.writing() as session:
         saved = records.save_model(session, run_id, ModelKind.FILTER, model_artefact, finished.metrics)

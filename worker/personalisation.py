@@ -6,7 +6,7 @@ Between two stages everything is in one stored draft, so that a worker killed in
 import io
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -90,8 +90,8 @@ class Fitting:
         self.progress("training the printed action encoder", 0.1)
         return self.compute.run(Lane.LEARNING, self.beat, printed_filter.fit_printed, self.problem, transitions)
 
-    def finish(self, draft: FilterDraft, provenance: Provenance, weights: dict[str, Any] | None) -> Finished:
-        """Export, drive through unseen scenarios, pack. ``weights``: the reward model's own, shown on the dashboard."""
+    def finish(self, draft: FilterDraft, provenance: Provenance, learned: Mapping[str, Any]) -> Finished:
+        """Export, drive through unseen scenarios, pack. ``learned``: the reward model's metrics, for the model card."""
         started = time.perf_counter()
         self.progress("driving the filter through unseen scenarios", 0.88)
         act = filter_problem.act_of(self.problem.task.modes, self.problem.policy, draft.weights)
@@ -105,7 +105,8 @@ class Fitting:
             "notes": [*draft.notes, *_warnings(evaluation, self.settings.success_tolerance)],
             "trials": [asdict(trial) for trial in draft.trials],
             "seconds": {**draft.seconds, "evaluation": round(time.perf_counter() - started, 1)},
-            "weights": weights,
+            "weights": learned.get("weights"),
+            "costs": learned.get("costs"),
         }
         contents = BundleContents(
             task=self.problem.task,

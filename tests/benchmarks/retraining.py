@@ -87,7 +87,7 @@ def _run(
     mark()
     draft = fitting.gate_residual(draft)
     mark()
-    finished = fitting.finish(draft, PROVENANCE, None)
+    finished = fitting.finish(draft, PROVENANCE, {})
     mark()
     seconds = {name: round(marks[index + 1] - marks[index], 2) for index, name in enumerate(STAGES)}
     evaluation = finished.metrics["evaluation"]

@@ -54,6 +54,7 @@ def contents() -> BundleContents:
                 "speed_m_s": {"mean": -1.5, "low": -2.1, "high": -0.9},
                 "tilt_rad": {"mean": 0.1, "low": -0.4, "high": 0.6},
             },
+            "costs": {"weights": {"C_d": {"mean": -0.7, "low": -0.8, "high": -0.6}}, "explained": 0.9},
         },
         provenance=Provenance("demo", "P07", 3, 200, "ab" * 32, 11, "2026-01-02T03:04:05Z", "cd" * 32, "none"),
     )
@@ -157,6 +158,8 @@ def test_the_card_states_numbers_with_intervals_limits_and_use(unzipped: Path) -
 def test_the_card_names_what_the_labels_are_sure_about_and_nothing_else(unzipped: Path) -> None:
     card = (unzipped / "MODEL_CARD.md").read_text()
     assert "| speed_m_s | -1.50 [-2.10, -0.90] |" in card
+    assert "| C_d: distance of the tool from its target, m | -0.70 [-0.80, -0.60] |" in card
+    assert "account for 90% of what was learned" in card
     assert "tilt_rad" not in card
 
 

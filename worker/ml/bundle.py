@@ -173,6 +173,7 @@ def _manifest(contents: BundleContents) -> dict[str, Any]:
         "reward_kind": contents.reward.kind,
         "signals": list(SIGNALS),
         "learned_weights": contents.metrics.get("weights"),
+        "learned_costs": contents.metrics.get("costs"),
         "evaluation": contents.metrics.get("evaluation"),
         "notes": list(contents.metrics.get("notes", ())),
         "versions": {

@@ -1,6 +1,6 @@
 """The model card of a bundle: what the filter is, what was measured, and what must not be concluded from it."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 _COSTS = {
@@ -52,7 +52,7 @@ def model_card(manifest: Mapping[str, Any]) -> str:
     sections = [
         _what(manifest),
         _way(manifest),
-        _matters(manifest.get("learned_weights")),
+        _matters(manifest),
         _measured(manifest.get("evaluation")),
         _notes(manifest),
         _USE,
@@ -87,20 +87,43 @@ def _way(manifest: Mapping[str, Any]) -> str:
     return "\n".join([heading, "", "| axis | value | range | meaning |", "|---|---|---|---|", *rows])
 
 
-def _matters(weights: Mapping[str, Mapping[str, float]] | None) -> str:
-    """Which measured signals the labels say something about."""
+def _matters(manifest: Mapping[str, Any]) -> str:
+    """The six costs, and the measured signals about which the labels say something."""
+    parts = [_costs(manifest.get("learned_costs")), _signals(manifest.get("learned_weights"))]
+    said = [part for part in parts if part]
+    return "\n\n".join(["## What matters to this person", *said]) if said else ""
+
+
+def _costs(learned: Mapping[str, Any] | None) -> str:
+    if not learned:
+        return ""
+    introduction = (
+        "Change of the learned return of a clip, in standard deviations, when one of the paper's costs grows by one and"
+        f" the others stay as they are; they account for {learned['explained']:.0%} of what was learned."
+        " 95 % intervals; below 0: disliked."
+    )
+    rows = [(f"{name}: {_COSTS.get(name, '')}", each) for name, each in learned["weights"].items()]
+    return f"{introduction}\n\n{_weights('cost', rows)}"
+
+
+def _signals(weights: Mapping[str, Mapping[str, float]] | None) -> str:
     if not weights:
         return ""
-    clear = {name: each for name, each in weights.items() if each["low"] > 0.0 or each["high"] < 0.0}
-    heading = (
-        "## What matters to this person\n\nLog odds of being preferred per standard deviation between two clips, with"
-        " 95 % intervals; signals about which the labels are undecided are left out."
+    introduction = (
+        "Log odds of being preferred per standard deviation of a signal between two clips, the other signals being"
+        " equal, with 95 % intervals; signals about which the labels are undecided are left out."
     )
+    clear = [(name, each) for name, each in weights.items() if each["low"] > 0.0 or each["high"] < 0.0]
     if not clear:
-        return f"{heading}\n\nSo far the labels are undecided about every signal."
-    ordered = sorted(clear.items(), key=lambda item: -abs(item[1]["mean"]))
-    rows = [f"| {name} | {each['mean']:+.2f} [{each['low']:+.2f}, {each['high']:+.2f}] |" for name, each in ordered]
-    return "\n".join([heading, "", "| signal | weight |", "|---|---|", *rows])
+        return f"{introduction} They are undecided about every single one: many go along with each other."
+    return f"{introduction}\n\n{_weights('signal', clear)}"
+
+
+def _weights(what: str, rows: Sequence[tuple[str, Mapping[str, float]]]) -> str:
+    """A table, the strongest first."""
+    ordered = sorted(rows, key=lambda row: -abs(row[1]["mean"]))
+    lines = [f"| {name} | {each['mean']:+.2f} [{each['low']:+.2f}, {each['high']:+.2f}] |" for name, each in ordered]
+    return "\n".join([f"| {what} | weight |", "|---|---|", *lines])
 
 
 def _measured(evaluation: Mapping[str, Any] | None) -> str:
