@@ -75,14 +75,16 @@ def _scores(
     place: Workplace, session: Session, participant: Participant, pairs: list[tuple[Clip, Clip]], strategy: Strategy
 ) -> acquisition.Floats | None:
     """How much every candidate is worth asking; None when the choice is to be uniform."""
-    if strategy is Strategy.CONTESTED:
-        return acquisition.contested(_answers_of_others(place, session, participant, pairs))
-    model = records.newest_model(session, participant.id, ModelKind.REWARD)
-    if strategy is Strategy.UNIFORM or model is None:
+    if strategy is Strategy.UNIFORM:
         return None
-    segments = dataset.segment_pairs(place.store, pairs)
-    members = lessons.member_probabilities(place.store.read(model.artefact_sha256), segments)
-    return acquisition.score(strategy.value, members)
+    members = None
+    model = records.newest_model(session, participant.id, ModelKind.REWARD)
+    if model is not None:
+        segments = dataset.segment_pairs(place.store, pairs)
+        members = lessons.member_probabilities(place.store.read(model.artefact_sha256), segments)
+    if strategy is Strategy.CONTESTED:
+        return acquisition.contested(_answers_of_others(place, session, participant, pairs), members)
+    return None if members is None else acquisition.score(strategy.value, members)
 
 
 def _answers_of_others(

@@ -153,15 +153,15 @@ class Bench:
         return free[choice.indices]
 
     def _scores(self, chain: Chain, free: Indices, model: RewardModel | None) -> Floats | None:
+        if chain.rule == "uniform":
+            return None
+        members = model.member_probabilities(self.pool.segments(self.pairs[free])) if model else None
         if chain.rule == "contested":
             others = [user for user in User if user.value != chain.user]
             returns = np.array([self.rewards(user.value, self.pool).sum(-1) for user in others])
             differences = returns[:, self.pairs[:, 1]] - returns[:, self.pairs[:, 0]]
-            return acquisition.contested(acquisition.expected_answers(differences)[:, free])
-        if chain.rule == "uniform" or model is None:
-            return None
-        members = model.member_probabilities(self.pool.segments(self.pairs[free]))
-        return acquisition.score(chain.rule, members)
+            return acquisition.contested(acquisition.expected_answers(differences)[:, free], members)
+        return None if members is None else acquisition.score(chain.rule, members)
 
     def _fit(self, chain: Chain, rows: Indices, answers: Floats) -> reward_training.FitResult:
         prior = self.prior if chain.pooled else None

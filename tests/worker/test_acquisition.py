@@ -98,6 +98,13 @@ def test_contested_prefers_the_pair_that_others_disagree_about() -> None:
         contested(MEMBERS[:1])
 
 
+def test_a_contested_pair_is_not_asked_again_once_this_person_s_answer_is_clear() -> None:
+    others = np.array([[0.05, 0.1, 0.5], [0.95, 0.9, 0.5]])
+    own = np.array([[0.01, 0.4, 0.5], [0.02, 0.6, 0.5]])
+    assert contested(others).argmax() == 0
+    assert contested(others, own).argmax() == 1
+
+
 def test_stand_ins_answer_by_their_returns_whatever_their_unit() -> None:
     differences = np.array([[3.0, -1.0, 0.0], [3000.0, -1000.0, 0.0]])
     expected = expected_answers(differences)

@@ -158,8 +158,8 @@ def test_contested_pairs_are_those_other_participants_disagree_about(
         somebody_else(place, participant, number, sign * wish, querying.OTHERS_LABELS)
     seen: list[npt.NDArray[np.float64]] = []
 
-    def contested(said: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-        seen.append(disagreement(said))
+    def contested(said: npt.NDArray[np.float64], own: None) -> npt.NDArray[np.float64]:
+        seen.append(disagreement(said, own))
         return seen[-1]
 
     disagreement = acquisition.contested

@@ -1,9 +1,9 @@
 """Which pair to show next: pure functions on arrays, every choice with the probability it had.
 
-Random choice is the default: accuracy is then measured without bias. Greedy rules chased outliers and were worse than
-random below 200 labels; drawn with a random share, entropy needed a quarter of the labels for the structured model
-(docs/results/feedback_efficiency.md). Whatever the rule, a share of the choices stays random, so that every pair keeps
-a positive propensity and estimates made from the labels can be corrected for how the pairs were chosen.
+Random choice measures accuracy without bias. Greedy rules chase outliers; drawn with a random share, entropy, the
+default, needs a quarter to half of the labels (docs/results/feedback_efficiency.md). Whatever the rule, a share of the
+choices stays random, so that every pair keeps a positive propensity and estimates made from the labels can be corrected
+for how the pairs were chosen.
 
 Every rule but the uniform one is a score of each candidate, made here from predicted probabilities; choose() turns any
 score into chances.
@@ -80,14 +80,17 @@ def score(rule: str, member_probabilities: Floats) -> Floats:
     return own[rule](member_probabilities)
 
 
-def contested(others_probabilities: Floats) -> Floats:
+def contested(others_probabilities: Floats, member_probabilities: Floats | None = None) -> Floats:
     """(U, M) P(right) under U other people's models, U at least 2 -> (M,) their standard deviation.
 
-    Such pairs tell people apart; pairs on which everybody is unsure do not. Raises ValueError for fewer than two.
+    Such pairs tell people apart; pairs on which everybody is unsure do not. With the members of one's own model (E, M):
+    times how open one's own answer still is, 1 for a toss-up, since others go on disagreeing about what has been said.
+    Raises ValueError for fewer than two others.
     """
     if len(others_probabilities) < 2:
         raise ValueError("Two other people at least are needed to disagree.")
-    return disagreement(others_probabilities)
+    apart = disagreement(others_probabilities)
+    return apart if member_probabilities is None else apart * entropy(member_probabilities) / np.log(2.0)
 
 
 def expected_answers(return_differences: Floats) -> Floats:
