@@ -51,8 +51,9 @@ UNSEEN_SCENARIOS = 60
 COUNTS = (10, 25, 50, 100, 200, 1000, 5000)
 RETRAIN_EVERY = 10
 """labels, as in a study; network ensembles, which take seconds, choose anew at every one of COUNTS only"""
-NEW_PEOPLE, EARLIER_PEOPLE = range(6), range(100, 112)
-"""Numbers of people drawn from one population: those who are measured, and those who came before them."""
+PEOPLE = tuple(f"person-{number}" for number in range(6))
+EARLIER_PEOPLE = range(100, 112)
+"""Numbers of people from the same population who came before those who are measured."""
 RULES: tuple[acquisition.Rule, ...] = ("uniform", "disagreement", "entropy", "information_gain", "contested")
 AS_IN_A_STUDY: tuple[acquisition.Rule, ...] = ("uniform", "entropy")
 """rules that are also run with the pooled prior and with foreseen signals: random ones, and the studio's default"""
@@ -283,22 +284,19 @@ def _taste(user: str) -> Taste:
 
 def chains(seeds: int) -> list[Chain]:
     """What matters most first: when time is up, the rest is left out."""
-    people = [*NAMED, *(f"person-{number}" for number in NEW_PEOPLE)]
-    quick = [Chain(user, "structured", rule, seed=seed) for seed in range(seeds) for user in people for rule in RULES]
-    quick += [
-        Chain(user, "structured", rule, pooled=True, seed=seed)
-        for rule in AS_IN_A_STUDY
-        for seed in range(seeds)
-        for user in people
-    ]
-    quick += [
-        Chain(user, "predicted", rule, seed=seed) for seed in range(seeds) for user in NAMED for rule in AS_IN_A_STUDY
-    ]
     networks: tuple[reward_training.Kind, ...] = ("mlp", "preference_transformer")
+    first, *others = [_linear_chains(seed) for seed in range(seeds)]
     slow = [Chain(user, kind) for user in NAMED for kind in networks]
-    slow += [Chain(user, "mlp") for user in people if user not in NAMED]
-    slow += [Chain(user, kind, rule) for user in NAMED for rule in RULES[1:] for kind in networks]
-    return [*quick, *slow]
+    slow += [Chain(user, "mlp") for user in PEOPLE]
+    rest = [Chain(user, kind, rule) for user in NAMED for rule in RULES[1:] for kind in networks]
+    return [*first, *slow, *(chain for more in others for chain in more), *rest]
+
+
+def _linear_chains(seed: int) -> list[Chain]:
+    everybody = (*NAMED, *PEOPLE)
+    found = [Chain(user, "structured", rule, seed=seed) for user in everybody for rule in RULES]
+    found += [Chain(user, "structured", rule, pooled=True, seed=seed) for user in everybody for rule in AS_IN_A_STUDY]
+    return [*found, *(Chain(user, "predicted", rule, seed=seed) for user in NAMED for rule in AS_IN_A_STUDY)]
 
 
 def main() -> None:
