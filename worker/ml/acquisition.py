@@ -1,9 +1,9 @@
 """Which pair to show next: pure functions on arrays, every choice with the probability it had.
 
 Random choice measures accuracy without bias. Greedy rules chase outliers; drawn with a random share, entropy, the
-default, needs a quarter to half of the labels (docs/results/feedback_efficiency.md). Whatever the rule, a share of the
-choices stays random, so that every pair keeps a positive propensity and estimates made from the labels can be corrected
-for how the pairs were chosen.
+default, needs fewer labels from about a hundred on (docs/results/feedback_efficiency.md). Whatever the rule, a
+share of the choices stays random, so that every pair keeps a positive propensity and estimates made from the labels can
+be corrected for how the pairs were chosen.
 
 Every rule but the uniform one is a score of each candidate, made here from predicted probabilities; choose() turns any
 score into chances.
