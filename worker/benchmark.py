@@ -209,7 +209,7 @@ def _report(terms: Terms, work: Path, output: Path, command: str) -> None:
     _replace(output / "costs.csv", to_csv(cost_rows(cells)))
     _replace(output / "personalisation.csv", to_csv(personalisation_rows(cells, METHOD, groups)))
     _replace(output / "table1.md", to_markdown(cells, groups, _header(terms, cells, tastes, command, _states(found))))
-    for task, rows in _by_task(table_rows(cells)):
+    for task, rows in _by_task(_with_rivals(table_rows(cells))):
         _replace(output / f"pareto-{task}.svg", pareto_svg(task, rows))
         close = [row for row in rows if row["success_delta"] >= -CLOSE_POINTS]
         _replace(output / f"pareto-{task}-close.svg", pareto_svg(task, close))
@@ -269,6 +269,13 @@ def _groups(users: Sequence[str]) -> list[list[str]]:
     known = [list(PAPER_USERS), list(OPPOSED_USERS), list(INDIRECT_USERS)]
     others = [user for user in users if not any(user in group for group in known)]
     return [*known, others]
+
+
+def _with_rivals(rows: Sequence[Row]) -> Sequence[Row]:
+    """Of users for whom more than one method was run: a picture of a single method compares nothing."""
+    counts = Counter((row["task"], row["user"]) for row in rows)
+    compared = [row for row in rows if counts[row["task"], row["user"]] > 2]  # the reference policy is one of them
+    return compared or rows
 
 
 def _by_task(rows: Sequence[Row]) -> list[tuple[str, list[Row]]]:

@@ -2,7 +2,7 @@
 
 import csv
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from worker.analysis.comparison import (
@@ -161,31 +161,33 @@ def _costs(cells: Cells) -> str:
 
 
 def _matrices(cells: Cells, groups: Sequence[Sequence[str]]) -> str:
+    """One table per group of users who are compared with each other; the CSV file has everybody for everybody."""
     rows = personalisation_rows(cells, METHOD, groups)
     parts = []
     for task in dict.fromkeys(row["task"] for row in rows):
-        of_task = [row for row in rows if row["task"] == task]
-        users = list(dict.fromkeys(row["trained_for"] for row in of_task))
-        if len(users) < 2:
-            continue
-        gains = {(row["trained_for"], row["judged_by"]): row for row in of_task}
-        lines = [
-            f"## Whose filter serves whom: {task}",
-            f"Change of the column user's true return under the row user's `{METHOD}`, % of what the column user minds"
-            " and likes under the reference policy (taken positively: for the paper's users, of its true return)."
-            " Last line: the own filter beyond the best of somebody else's in the same group of users.",
-            "",
-            "| trained for | " + " | ".join(users) + " | success |",
-            "|---" * (len(users) + 2) + "|",
-        ]
-        for row_user in users:
-            values = [_bold(_change(gains[row_user, judge], "gain", 100), row_user == judge) for judge in users]
-            success = f"{100 * gains[row_user, row_user]['success_delta']:+.1f}"
-            lines.append(f"| {row_user} | " + " | ".join(values) + f" | {success} |")
-        own = [gains[user, user] for user in users]
-        lines.append("| own advantage | " + " | ".join(_advantage(row) for row in own) + " | |")
-        parts.append("\n".join(lines))
+        gains = {(row["trained_for"], row["judged_by"]): row for row in rows if row["task"] == task}
+        users = list(dict.fromkeys(user for user, _ in gains))
+        together = [found for group in groups if len(found := [user for user in users if user in group]) > 1]
+        tables = [_matrix(found, gains) for found in together or [users] if len(found) > 1]
+        if tables:
+            introduction = (
+                f"## Whose filter serves whom: {task}\n"
+                f"Change of the column user's true return under the row user's `{METHOD}`, % of what the column user"
+                " minds and likes under the reference policy (taken positively: for the paper's users, of its true return)."
+                " Last line: the own filter beyond the best of somebody else's in the same table."
+            )
+            parts += [introduction, *tables]
     return "\n\n".join(parts)
+
+
+def _matrix(users: Sequence[str], gains: Mapping[tuple[str, str], Row]) -> str:
+    lines = ["| trained for | " + " | ".join(users) + " | success |", "|---" * (len(users) + 2) + "|"]
+    for row_user in users:
+        values = [_bold(_change(gains[row_user, judge], "gain", 100), row_user == judge) for judge in users]
+        success = f"{100 * gains[row_user, row_user]['success_delta']:+.1f}"
+        lines.append(f"| {row_user} | " + " | ".join(values) + f" | {success} |")
+    own = [gains[user, user] for user in users]
+    return "\n".join([*lines, "| own advantage | " + " | ".join(_advantage(row) for row in own) + " | |"])
 
 
 def _seeds(cells: Cells, groups: Sequence[Sequence[str]]) -> str:
