@@ -173,8 +173,8 @@ def _matrices(cells: Cells, groups: Sequence[Sequence[str]]) -> str:
             introduction = (
                 f"## Whose filter serves whom: {task}\n"
                 f"Change of the column user's true return under the row user's `{METHOD}`, % of what the column user"
-                " minds and likes under the reference policy (taken positively: for the paper's users, of its true return)."
-                " Last line: the own filter beyond the best of somebody else's in the same table."
+                " minds and likes under the reference policy (taken positively: for the paper's users, of its true"
+                " return). Last line: the own filter beyond the best of somebody else's in the same table."
             )
             parts += [introduction, *tables]
     return "\n\n".join(parts)
