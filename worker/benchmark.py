@@ -209,7 +209,8 @@ def _report(terms: Terms, work: Path, output: Path, command: str) -> None:
     _replace(output / "costs.csv", to_csv(cost_rows(cells)))
     _replace(output / "personalisation.csv", to_csv(personalisation_rows(cells, METHOD, groups)))
     _replace(output / "table1.md", to_markdown(cells, groups, _header(terms, cells, tastes, command, _states(found))))
-    for task, rows in _by_task(_with_rivals(table_rows(cells))):
+    for task, all_rows in _by_task(table_rows(cells)):
+        rows = compared(all_rows)
         _replace(output / f"pareto-{task}.svg", pareto_svg(task, rows))
         close = [row for row in rows if row["success_delta"] >= -CLOSE_POINTS]
         _replace(output / f"pareto-{task}-close.svg", pareto_svg(task, close))
@@ -271,11 +272,13 @@ def _groups(users: Sequence[str]) -> list[list[str]]:
     return [*known, others]
 
 
-def _with_rivals(rows: Sequence[Row]) -> Sequence[Row]:
-    """Of users for whom more than one method was run: a picture of a single method compares nothing."""
-    counts = Counter((row["task"], row["user"]) for row in rows)
-    compared = [row for row in rows if counts[row["task"], row["user"]] > 2]  # the reference policy is one of them
-    return compared or rows
+def compared(rows: Sequence[Row]) -> Sequence[Row]:
+    """Of one task's rows those of users for whom several methods were run; all when there is no such user.
+
+    A picture of a single method beside the reference policy compares nothing.
+    """
+    counts = Counter(row["user"] for row in rows)
+    return [row for row in rows if counts[row["user"]] > 2] or rows
 
 
 def _by_task(rows: Sequence[Row]) -> list[tuple[str, list[Row]]]:
@@ -315,7 +318,7 @@ def _states(found: Sequence[tuple[dict[str, Any], dict[str, Any], Taste]]) -> st
     """Cells do not run again when the code changes, so the page says how many states of it they are from."""
     counts = Counter(record.get("code", "not recorded") for record, _, _ in found)
     told = ", ".join(f"{state} ({count} runs)" for state, count in counts.most_common())
-    return f"State of the code under worker/ml and worker/sim, as a hash: {told}."
+    return f"State of worker/ml, worker/sim and worker/contest.py, as a hash: {told}."
 
 
 def _spoken(manner: Manner) -> str:

@@ -95,7 +95,7 @@ class Question:
     seed: int
 
 
-class _UnkeptBench(Bench):
+class UnkeptBench(Bench):
     """A user's labels and a reward model of this very moment: none that is kept from another choice."""
 
     def _kept_reward(self, path: Path) -> RewardModel:
@@ -115,7 +115,7 @@ def answer(question: Question, work: Path) -> dict[str, Any]:
         terms = replace(terms, manner=HESITANT)
     gains, lost, regrets = [], [], []
     for row, user in enumerate(USERS):
-        bench = _UnkeptBench(Cell(task.name, TASTES[user], "pbarl", question.seed), terms, Shelf(task.name, work), work)
+        bench = UnkeptBench(Cell(task.name, TASTES[user], "pbarl", question.seed), terms, Shelf(task.name, work), work)
         learned = bench.reward.signal_weights([])
         mode = best_mode(surface, learned, question.seed, caution=question.choice.caution)
         change, success = surface.predict(mode)

@@ -61,6 +61,13 @@ def test_the_tables_are_written_from_whatever_is_finished(work: Path, tmp_path: 
     assert len(rows(tmp_path / "costs.csv")) == 4
 
 
+def test_pictures_show_users_for_whom_methods_can_be_compared() -> None:
+    alone = [{"user": "shy", "method": method} for method in ("reference", "pbarl")]
+    several = [{"user": "cautious", "method": method} for method in ("reference", "pbarl", "prefft")]
+    assert benchmark.compared([*alone, *several]) == several
+    assert benchmark.compared(alone) == alone
+
+
 def test_cells_of_other_terms_are_not_mixed_in(work: Path, tmp_path: Path) -> None:
     assert report(work, tmp_path, with_options(TINY, labels=13)) == 0
     assert not list(tmp_path.iterdir())

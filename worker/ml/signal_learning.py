@@ -61,7 +61,7 @@ def fit(
         rows = torch.randint(len(inputs), (chosen.batch,), generator=generator)
         loss = functional.mse_loss(_run(parameters, inputs[rows]), wanted[rows])
         optimiser.zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
+        loss.backward()  # type: ignore[no-untyped-call]  # torch gives it no types
         optimiser.step()
         schedule.step()
         progress(step + 1)
