@@ -25,7 +25,7 @@ from worker.analysis.pareto import pareto_svg
 from worker.analysis.table_files import METHOD, to_csv, to_markdown
 from worker.compute import Compute, Lane
 from worker.contest import INDIRECT_USERS, OPPOSED_USERS, PAPER_USERS, Cell, Terms
-from worker.ml.filter_problem import FilterConfig, scenarios_for
+from worker.ml.filter_problem import FilterConfig
 from worker.ml.methods import METHODS, MethodConfig
 from worker.ml.pbrl_hri import FromScratch
 from worker.ml.prefft import FineTuning
@@ -132,7 +132,7 @@ def _fill_shelves(compute: Compute, processes: int, missing: Sequence[Cell], ter
     """Rollouts that all cells of a task share, first and in parallel."""
     jobs = []
     for task in dict.fromkeys(cell.task for cell in missing):
-        gate = scenarios_for("gate", terms.filter.gate_scenarios)
+        gate = terms.filter.gate_block(laboratory.task(task))
         jobs += [(task, work, "behaviours", chunk) for chunk in _chunks(terms.pool)]
         unseen = [terms.unseen(seed) for seed in dict.fromkeys(cell.seed for cell in missing)]
         jobs += [(task, work, "reference", chunk) for part in (*unseen, gate) for chunk in _chunks(part)]

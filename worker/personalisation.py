@@ -25,7 +25,7 @@ from worker.ml.response_surface import ResponseSurface
 from worker.ml.reward_models import load_reward_model
 from worker.trajectory import Trajectory
 
-CHUNK = 5
+CHUNK = 3
 """Scenarios per call of a compute process: small enough to spread evenly, large enough not to matter."""
 
 
@@ -137,7 +137,7 @@ class Fitting:
         return self.compute.run(Lane.LEARNING, self.beat, residual_learning.learn_round, problem, draft, rounds)
 
     def _gate_reference(self) -> Sequence[Trajectory]:
-        return self._reference(filter_problem.scenarios_for("gate", self.problem.config.gate_scenarios))
+        return self._reference(self.problem.config.gate_block(self.problem.task))
 
     def _reference(self, scenarios: range) -> Sequence[Trajectory]:
         """The frozen policy's rollouts: the same for everybody, so they are made once per worker."""

@@ -230,3 +230,11 @@ def test_a_round_that_made_it_worse_is_taken_back_and_the_next_step_is_half_as_b
     assert came_from == [slow, slow, slow]
     assert boldness == [1.0, 0.5, 0.5]
     assert found.weights == slow
+
+
+def test_a_task_of_longer_episodes_gets_fewer_of_them_and_no_more_time() -> None:
+    config = FilterConfig(gate_scenarios=80, residual_rollouts=50)
+    usual, long = replace(invented.TASK, episode_steps=100), replace(invented.TASK, episode_steps=130)
+    assert [len(config.gate_block(task)) * task.episode_steps for task in (usual, long)] == [8000, 62 * 130]
+    assert [len(config.residual_block(task, 0)) * task.episode_steps for task in (usual, long)] == [5000, 38 * 130]
+    assert len(config.gate_block(replace(invented.TASK, episode_steps=50))) == 80

@@ -42,6 +42,10 @@ class Collect(Protocol):
         ...
 
 
+USUAL_STEPS = 100
+"""Control steps of an episode, in which the counts of episodes below are meant."""
+
+
 @dataclass(frozen=True)
 class FilterConfig:
     """Counts and tolerances; the defaults fit two cores and about a minute (docs/results/retraining.md)."""
@@ -53,6 +57,7 @@ class FilterConfig:
     gates: tuple[float, ...] = (0.6, 0.3)
     """strengths at which the last of them is tried when none at full strength was acceptable"""
     gate_scenarios: int = 80
+    """of USUAL_STEPS control steps; see gate_block()"""
     success_tolerance: float = 0.035
     """largest accepted loss of success on the gate's scenarios, as a share of episodes"""
     force_limit_n: float = 10.0
@@ -60,7 +65,7 @@ class FilterConfig:
     residual_rounds: int = 4
     """of residual learning; 0 leaves the residual out"""
     residual_rollouts: int = 50
-    """of the current filter before each round"""
+    """of the current filter before each round, of USUAL_STEPS control steps; see residual_block()"""
     residual_noise: float = 0.1
     """standard deviation of what is added to their actions"""
     value_steps: int = 3000
@@ -72,6 +77,14 @@ class FilterConfig:
     residual_shares: tuple[float, ...] = (1.0, 0.5)
     """tried in this order until one is acceptable and better than the mode alone"""
     evaluation_scenarios: int = 200
+
+    def gate_block(self, task: Task) -> range:
+        """Scenarios on which a setting is tried before it is accepted."""
+        return scenarios_for("gate", _affordable(self.gate_scenarios, task))
+
+    def residual_block(self, task: Task, number: int) -> range:
+        """Scenarios in which the filter is rolled out before round ``number`` of residual learning."""
+        return scenarios_for("residual", _affordable(self.residual_rollouts, task), 1000 * number)
 
     def bolder(self, factor: float) -> "FilterConfig":
         """The same with so many times the weight of the value."""
@@ -130,6 +143,11 @@ def scenarios_for(purpose: str, count: int, skip: int = 0) -> range:
     """Scenarios that no other purpose uses."""
     first = SCENARIO_BLOCKS[purpose] + skip
     return range(first, first + count)
+
+
+def _affordable(episodes: int, task: Task) -> int:
+    """So many episodes of the usual length, or fewer longer ones: a fit takes about the same time in every task."""
+    return max(1, round(episodes * min(1.0, USUAL_STEPS / task.episode_steps)))
 
 
 @dataclass(frozen=True)

@@ -102,7 +102,7 @@ def fit_reference(setting: Setting) -> tuple[Act, tuple[str, ...]]:
 def fit_pbarl(setting: Setting) -> tuple[Act, tuple[str, ...]]:
     """The studio's default: mode, gate, residual encoder, gate."""
     problem = setting.problem
-    gate = setting.reference(filter_problem.scenarios_for("gate", problem.config.gate_scenarios))
+    gate = setting.reference(problem.config.gate_block(problem.task))
     draft = studio_filter.fit_studio(problem, setting.surface(), setting.pool, gate, setting.collect)
     weights = draft.weights
     mode = ", ".join(f"{axis} {value:+.2f}" for axis, value in weights.mode.items()) or "off"
@@ -142,7 +142,7 @@ def fit_prefft(setting: Setting, tie_weight: float) -> tuple[Act, tuple[str, ...
 def fit_pbrl_hri(setting: Setting) -> tuple[Act, tuple[str, ...]]:
     """SAC from scratch on the distance and the learned reward."""
     problem, config = setting.problem, setting.config.from_scratch
-    reference = setting.reference(filter_problem.scenarios_for("gate", problem.config.gate_scenarios))
+    reference = setting.reference(problem.config.gate_block(problem.task))
     reward = pbrl_hri.sketchy(reference, learned(problem.reward))
     policy = pbrl_hri.train(setting.make_env, problem.policy, reward, problem.task.observation, config, problem.seed)
     return PolicyAct(policy), (f"SAC from scratch for {config.steps} steps.",)

@@ -22,7 +22,6 @@ from worker.ml.filter_problem import (
     Progress,
     Trial,
     act_of,
-    scenarios_for,
 )
 from worker.ml.policy_module import FrozenPolicy
 from worker.ml.trials import acceptable, try_on
@@ -71,12 +70,7 @@ def residual_rollouts(problem: FilterProblem, draft: FilterDraft, number: int) -
     """What ``collect`` is asked for before round ``number``."""
     config = problem.config
     act = act_of(problem.task.modes, problem.policy, draft.weights)
-    return (
-        act,
-        scenarios_for("residual", config.residual_rollouts, 1000 * number),
-        config.residual_noise,
-        problem.seed + number,
-    )
+    return act, config.residual_block(problem.task, number), config.residual_noise, problem.seed + number
 
 
 def _clearly_below(returns: Floats, earlier: Floats) -> bool:
