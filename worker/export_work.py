@@ -17,7 +17,7 @@ from app.db import now
 from app.domain.models import Export, RunKind
 from app.domain.studies import Deviation, Participant, Study
 from app.errors import AppError
-from app.services import archive, export_requests, export_tables, exporting, reports, unblinding
+from app.services import archive, export_requests, export_rows, export_tables, exporting, reports, unblinding
 from app.services.export_requests import ExportKind
 from app.services.exporting import Kind, Provenance, Table
 from worker import preference_arrays
@@ -144,7 +144,7 @@ def _write_report(target: zipfile.ZipFile, session: Session, place: Workplace, s
 
 def _write_pairs(target: zipfile.ZipFile, session: Session, place: Workplace, study: Study) -> list[str]:
     written = []
-    for person in export_tables.everybody(session, study):
+    for person in export_rows.everybody(session, study):
         arrays = preference_arrays.arrays_of(session, place.store, study, person)
         if arrays is not None:
             target.writestr(f"pairs/{person.code}.npz", arrays)

@@ -17,7 +17,7 @@ from app.domain.evaluation import Rating, Trial
 from app.domain.models import Model, Report, Run, RunKind, RunStatus
 from app.domain.preferences import LabelEvent, Query
 from app.domain.studies import Participant, Study
-from app.services import evaluating, export_tables, exporting, unblinding, withdrawal
+from app.services import evaluating, export_rows, export_tables, exporting, unblinding, withdrawal
 from worker.analysis.report import VERSION, Tables, make_report
 from worker.compute import Lane
 from worker.records import Job
@@ -106,7 +106,7 @@ def tables_of(session: Session, study: Study) -> Tables:
     provenance = exporting.provenance_of(session, study)
     rows = {name: list(exporting.records(table, session, study, provenance)) for name, table in wanted.items()}
     return Tables(
-        participants=[each.code for each in export_tables.everybody(session, study) if each.withdrawn_at is None],
+        participants=[each.code for each in export_rows.everybody(session, study) if each.withdrawn_at is None],
         groups=list(evaluating.LETTERS[: len(groups)]) if blinded else groups,
         blinded=blinded,
         planned=[test.value for test in study.settings.planned_tests],

@@ -1,278 +1,17 @@
-"""The tables of an export: which rows they have and what every column means."""
+"""The tables of an export and what every column means; export_rows reads what stands in them."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
-from sqlalchemy import select
-from sqlalchemy.orm import Session, aliased, joinedload
-
-from app.domain.clips import Clip, Rollout
-from app.domain.evaluation import Rating, Trial
-from app.domain.models import Bundle, Model, ModelKind
-from app.domain.participation import ConsentRecord, FormAnswer, ParticipantEvent, StageRecord
-from app.domain.preferences import LEARNED_FROM, LabelEvent, Purpose, Query, Response, SkipReason
+from app.domain.models import ModelKind
+from app.domain.preferences import Purpose, Response, SkipReason
 from app.domain.protocol import EvaluatedMethod, Stage
-from app.domain.studies import Deviation, Participant, Study
-from app.services import results, unblinding
+from app.services import export_rows
 from app.services.exporting import Column, Kind, Table
-
-Rows = Iterator[Sequence[Any]]
 
 PARTICIPANT = Column("participant", Kind.TEXT, "Code of the participant.", allowed="P01, P02, ...")
 ORDINAL = Column("ordinal", Kind.INTEGER, "Place of the pair in this participant's order.", allowed="from 1")
 SHA256 = "64 hexadecimal digits"
-
-
-def everybody(session: Session, study: Study) -> Sequence[Participant]:
-    """Everybody in the study by number, tombstones included; previews are nobody."""
-    people = select(Participant).where(Participant.study_id == study.id, Participant.is_preview.is_(False))
-    return session.scalars(people.order_by(Participant.number)).all()
-
-
-def _present(session: Session, study: Study) -> Sequence[Participant]:
-    return [each for each in everybody(session, study) if each.withdrawn_at is None]
-
-
-def _participants(session: Session, study: Study) -> Rows:
-    for each in everybody(session, study):
-        if each.withdrawn_at is not None:
-            yield (each.code, "withdrawn", *[None] * 9, each.withdrawn_at)
-            continue
-        status = "completed" if each.completed_at else "consented" if each.consented_at else "invited"
-        yield (
-            each.code,
-            status,
-            each.seed,
-            each.language or study.settings.language.value,
-            each.created_at,
-            each.consented_at,
-            each.consent_version,
-            each.instructed_at,
-            each.completed_at,
-            each.last_seen_at,
-            each.panel_id,
-            None,
-        )
-
-
-def _stages(session: Session, study: Study) -> Rows:
-    for person in _present(session, study):
-        theirs = select(StageRecord).where(StageRecord.participant_id == person.id).order_by(StageRecord.id)
-        for each in session.scalars(theirs):
-            yield person.code, each.stage, each.entered_at, each.finished_at
-
-
-def _queries(session: Session, study: Study) -> Rows:
-    for person in _present(session, study):
-        shown = select(Query).where(Query.participant_id == person.id).order_by(Query.ordinal)
-        clips = (joinedload(side).joinedload(Clip.rollout) for side in (Query.left_clip, Query.right_clip))
-        queries = {query.id: query for query in session.scalars(shown.options(*clips))}
-        answers = _last_events(session, person)
-        theirs = select(Model.id, Model.label_count).where(Model.participant_id == person.id)
-        seen = {model_id: labels for model_id, labels in session.execute(theirs)}  # noqa: C416  (typed rows)
-        for query in queries.values():
-            yield (
-                person.code,
-                *_query(query, queries, answers.get(query.id), seen.get(query.predicted_by_model_id or 0)),
-            )
-
-
-def _last_events(session: Session, person: Participant) -> dict[int, LabelEvent]:
-    events = select(LabelEvent).join(Query).where(Query.participant_id == person.id).order_by(LabelEvent.revision)
-    return {event.query_id: event for event in session.scalars(events)}
-
-
-def _query(query: Query, queries: dict[int, Query], last: LabelEvent | None, model_labels: int | None) -> Sequence[Any]:
-    earlier = queries.get(query.repeats_query_id or 0)
-    left, right = query.left_clip, query.right_clip
-    answer = last if last is not None and last.response is not None else None
-    return (
-        query.ordinal,
-        query.purpose,
-        earlier.ordinal if earlier else None,
-        earlier.left_clip_id != query.left_clip_id if earlier else None,
-        query.expected,
-        left.rollout.scenario,
-        left.rollout.behaviour,
-        right.rollout.scenario,
-        right.rollout.behaviour,
-        left.step_count,
-        right.step_count,
-        left.video_sha256,
-        right.video_sha256,
-        query.strategy,
-        query.propensity,
-        query.predicted_right,
-        model_labels,
-        query.served_at,
-        answer.response if answer else None,
-        answer.reason if answer else None,
-        answer.response_time_ms if answer else None,
-        answer.created_at if answer else None,
-        last.revision if last else 0,
-        answer is not None and query.purpose in LEARNED_FROM,
-    )
-
-
-def _labels(session: Session, study: Study) -> Rows:
-    for person in _present(session, study):
-        newest = {event.id for event in _last_events(session, person).values()}
-        rows = session.execute(
-            select(Query, LabelEvent)
-            .join(LabelEvent, LabelEvent.query_id == Query.id)
-            .where(Query.participant_id == person.id)
-            .order_by(LabelEvent.id)
-        )
-        for query, event in rows:
-            yield (
-                person.code,
-                query.ordinal,
-                query.purpose,
-                event.revision,
-                event.response,
-                event.id not in newest,
-                event.reason,
-                event.response_time_ms,
-                event.replay_count,
-                event.scrub_count,
-                event.playback_rate,
-                event.watched_whole,
-                event.play_error_count,
-                event.stall_count,
-                event.stalled_ms,
-                event.largest_drift_ms,
-                event.created_at,
-            )
-
-
-def _forms(session: Session, study: Study) -> Rows:
-    for person in _present(session, study):
-        answers = session.scalars(
-            select(FormAnswer).where(FormAnswer.participant_id == person.id).order_by(FormAnswer.id)
-        ).all()
-        newest = {(each.form, each.item): each.id for each in answers}
-        for each in answers:
-            superseded = newest[each.form, each.item] != each.id
-            yield person.code, each.form, each.item, each.value, superseded, each.created_at
-
-
-def _consent(session: Session, study: Study) -> Rows:
-    for person in _present(session, study):
-        theirs = select(ConsentRecord).where(ConsentRecord.participant_id == person.id).order_by(ConsentRecord.id)
-        for each in session.scalars(theirs):
-            yield person.code, each.version, each.language, each.agreed_at, each.text
-
-
-def _events(session: Session, study: Study) -> Rows:
-    for person in _present(session, study):
-        theirs = select(ParticipantEvent).where(ParticipantEvent.participant_id == person.id)
-        for each in session.scalars(theirs.order_by(ParticipantEvent.id)):
-            yield person.code, each.at, each.kind, each.detail
-
-
-def _ratings(session: Session, study: Study) -> Rows:
-    blinded = unblinding.is_blinded(study)
-    methods = {} if blinded else unblinding.methods_by_letter(session, study)
-    for person in _present(session, study):
-        rows = session.execute(
-            select(Trial, Rating)
-            .outerjoin(Rating, Rating.trial_id == Trial.id)
-            .where(Trial.participant_id == person.id)
-            .options(joinedload(Trial.film))
-            .order_by(Trial.ordinal, Rating.revision)
-        ).all()
-        newest = {trial.id: rating.revision for trial, rating in rows if rating is not None}
-        for trial, rating in rows:
-            yield (
-                person.code,
-                trial.letter,
-                methods.get((person.id, trial.letter)),
-                trial.repetition,
-                trial.ordinal,
-                trial.scenario,
-                rating.satisfaction if rating else None,
-                rating.personalisation if rating else None,
-                rating is not None and newest[trial.id] == rating.revision,
-                rating.revision if rating else None,
-                rating.response_time_ms if rating else None,
-                rating.created_at if rating else None,
-                trial.shown_at,
-                trial.started_at,
-                trial.finished_at,
-                trial.film.success if trial.film is not None and not blinded else None,
-            )
-
-
-def _models(session: Session, study: Study) -> Rows:
-    for person in _present(session, study):
-        for each in session.scalars(select(Model).where(Model.participant_id == person.id).order_by(Model.id)):
-            yield (
-                person.code,
-                each.kind,
-                each.label_count,
-                each.label_hash,
-                each.seed,
-                each.artefact_sha256,
-                each.created_at,
-                each.metrics,
-            )
-
-
-def _evaluations(session: Session, study: Study) -> Rows:
-    for person in _present(session, study):
-        rows = session.execute(
-            select(Model, Bundle)
-            .outerjoin(Bundle, Bundle.model_id == Model.id)
-            .where(Model.participant_id == person.id, Model.kind == ModelKind.FILTER)
-            .order_by(Model.label_count, Model.id)
-        ).all()
-        for place, (model, bundle) in enumerate(rows, 1):
-            measured = results.filter_version(model, bundle)
-            named = [("success", measured.success), ("preference", measured.preference)]
-            named += [(cost.symbol, cost) for cost in measured.costs]
-            for name, change in named:
-                if change is not None:
-                    yield (
-                        person.code,
-                        measured.label_count,
-                        place == len(rows),
-                        measured.bundle_version,
-                        measured.scenarios,
-                        name,
-                        change.reference,
-                        change.filtered,
-                        change.delta,
-                        change.low,
-                        change.high,
-                    )
-
-
-def _clips(session: Session, study: Study) -> Rows:
-    rollout = aliased(Rollout)
-    rows = session.execute(
-        select(Clip, rollout)
-        .join(rollout, Clip.rollout_id == rollout.id)
-        .where(rollout.study_id == study.id)
-        .order_by(rollout.scenario, rollout.behaviour, Clip.first_step, Clip.step_count)
-    )
-    for clip, run in rows:
-        yield (
-            clip.video_sha256,
-            run.scenario,
-            run.behaviour,
-            run.mode,
-            run.success,
-            clip.first_step,
-            clip.step_count,
-            clip.duration_ms,
-            clip.fps,
-            run.trajectory_sha256,
-        )
-
-
-def _deviations(session: Session, study: Study) -> Rows:
-    for each in session.scalars(select(Deviation).where(Deviation.study_id == study.id).order_by(Deviation.id)):
-        yield each.at, each.actor, each.reason, each.before, each.after
 
 
 def _words(values: type[Any]) -> str:
@@ -299,7 +38,7 @@ TABLES: Sequence[Table] = (
             Column("panel_id", T, "Who this is at the recruitment panel, if they came through one. Personal."),
             Column("withdrawn_at", W, "When they withdrew; nothing else is kept of them."),
         ),
-        _participants,
+        export_rows.participants,
     ),
     Table(
         "stages",
@@ -312,7 +51,7 @@ TABLES: Sequence[Table] = (
                 "finished_at", W, "When it was done; empty where that is counted instead (practice, pairs, evaluation)."
             ),
         ),
-        _stages,
+        export_rows.stages,
     ),
     Table(
         "queries",
@@ -355,7 +94,7 @@ TABLES: Sequence[Table] = (
             Column("revisions", I, "Answers and undos of this pair; table labels has them all."),
             Column("is_label", B, "Whether the answer is learned from."),
         ),
-        _queries,
+        export_rows.queries,
     ),
     Table(
         "labels",
@@ -384,7 +123,7 @@ TABLES: Sequence[Table] = (
             ),
             Column("created_at", W, "When it reached the server."),
         ),
-        _labels,
+        export_rows.labels,
     ),
     Table(
         "forms",
@@ -397,7 +136,7 @@ TABLES: Sequence[Table] = (
             Column("superseded", B, "Whether a later answer to the same question counts instead."),
             Column("created_at", W, "When it reached the server."),
         ),
-        _forms,
+        export_rows.forms,
     ),
     Table(
         "consent",
@@ -409,7 +148,7 @@ TABLES: Sequence[Table] = (
             Column("agreed_at", W, "When they agreed."),
             Column("text", T, "The text, word for word."),
         ),
-        _consent,
+        export_rows.consent,
     ),
     Table(
         "events",
@@ -420,7 +159,7 @@ TABLES: Sequence[Table] = (
             Column("kind", T, "What; app/services/participant_events.py says what each means."),
             Column("detail", J, "Numbers that belong to it."),
         ),
-        _events,
+        export_rows.events,
     ),
     Table(
         "ratings",
@@ -451,7 +190,7 @@ TABLES: Sequence[Table] = (
             Column("finished_at", W, "Physical: when the operator said that it was done."),
             Column("success", B, "Video: whether the robot succeeded; empty until the study is unblinded."),
         ),
-        _ratings,
+        export_rows.ratings,
     ),
     Table(
         "models",
@@ -466,7 +205,7 @@ TABLES: Sequence[Table] = (
             Column("created_at", W, "When it was ready."),
             Column("metrics", J, "What was measured while training."),
         ),
-        _models,
+        export_rows.models,
     ),
     Table(
         "evaluations",
@@ -490,7 +229,7 @@ TABLES: Sequence[Table] = (
             Column("low", N, "Lower end of the 95 % interval of the difference."),
             Column("high", N, "Upper end."),
         ),
-        _evaluations,
+        export_rows.evaluations,
     ),
     Table(
         "clips",
@@ -507,7 +246,7 @@ TABLES: Sequence[Table] = (
             Column("fps", I, "Frames per second.", "1/s"),
             Column("trajectory_sha256", T, "The stored trajectory.", allowed=SHA256),
         ),
-        _clips,
+        export_rows.clips,
     ),
     Table(
         "deviations",
@@ -519,7 +258,7 @@ TABLES: Sequence[Table] = (
             Column("before", J, "What was changed, as it was."),
             Column("after", J, "And as it is since."),
         ),
-        _deviations,
+        export_rows.deviations,
     ),
 )
 BY_NAME = {table.name: table for table in TABLES}

@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -172,6 +173,33 @@ def test_contested_pairs_are_those_other_participants_disagree_about(
     assert np.argsort(seen[0]).tolist() == np.argsort(differences).tolist()
 
 
+def test_contested_pairs_are_not_asked_where_this_person_s_own_model_is_sure(
+    place: Workplace, participant: Participant, add_clips: AddClips, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Others disagree about one signal, and this person's model is sure of just that."""
+    settle_on(place, Strategy.CONTESTED)
+    add_clips(1)
+    wish = np.eye(len(SIGNALS))[0]
+    for number, sign in ((2, 1.0), (3, -1.0)):
+        somebody_else(place, participant, number, sign * wish, querying.OTHERS_LABELS)
+    save_model_of(place, participant.study_id, participant.id, 1e4 * wish, labels=5)
+    scores: list[npt.NDArray[np.float64]] = []
+    choose = acquisition.choose
+
+    def chosen(*arguments: Any, **named: Any) -> acquisition.Choice:
+        scores.append(named["scores"])
+        return choose(*arguments, **named)
+
+    monkeypatch.setattr(acquisition, "choose", chosen)
+    querying.refill_queries(place, participant.id)
+    with place.database.reading() as session:
+        clips = dataset.pool_clips(session, participant.study_id)
+    sums = {clip.id: dataset.shown(place.store, clip).signals[:, 0].sum() for clip in clips}
+    differs = [sums[left.id] != sums[right.id] for left, right in dataset.matched_pairs(clips)]
+    assert any(differs)
+    assert scores[0][differs].max() < 1e-6
+
+
 def test_a_pooled_prior_is_of_those_who_joined_before_and_have_answered_everything(
     place: Workplace, participant: Participant
 ) -> None:
@@ -190,17 +218,27 @@ def somebody_else(
     place: Workplace, participant: Participant, number: int, weights: npt.NDArray[np.float64], labels: int
 ) -> int:
     """Another participant of the study with a reward model of these weights; returns their id."""
-    stored = StructuredReward(np.tile(weights, (8, 1))).to_bytes()
     with place.database.writing() as session:
         other = Participant(study_id=participant.study_id, number=number, token_sha256=f"{number:064}", seed=1)
         session.add(other)
         session.flush()
-        run = Run(workflow_id=f"{number}", kind="reward", study_id=other.study_id, participant_id=other.id, seed=0)
+        other_id = other.id
+    save_model_of(place, participant.study_id, other_id, weights, labels)
+    return other_id
+
+
+def save_model_of(
+    place: Workplace, study_id: int, participant_id: int, weights: npt.NDArray[np.float64], labels: int
+) -> None:
+    """Give a participant a reward model of these weights."""
+    stored = StructuredReward(np.tile(weights, (8, 1))).to_bytes()
+    with place.database.writing() as session:
+        name = f"reward-{participant_id}"
+        run = Run(workflow_id=name, kind="reward", study_id=study_id, participant_id=participant_id, seed=0)
         session.add(run)
         session.flush()
         records.set_labels(session, run.id, labels, "hash")
         records.save_model(session, run.id, ModelKind.REWARD, place.store.put(stored), {})
-        return other.id
 
 
 def settle_on(place: Workplace, strategy: Strategy) -> None:

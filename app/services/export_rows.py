@@ -1,0 +1,269 @@
+"""The rows of an export's tables: what is read from the database, in the order of the columns in export_tables."""
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session, aliased, joinedload
+
+from app.domain.clips import Clip, Rollout
+from app.domain.evaluation import Rating, Trial
+from app.domain.models import Bundle, Model, ModelKind
+from app.domain.participation import ConsentRecord, FormAnswer, ParticipantEvent, StageRecord
+from app.domain.preferences import LEARNED_FROM, LabelEvent, Query
+from app.domain.studies import Deviation, Participant, Study
+from app.services import results, unblinding
+
+Rows = Iterator[Sequence[Any]]
+
+
+def everybody(session: Session, study: Study) -> Sequence[Participant]:
+    """Everybody in the study by number, tombstones included; previews are nobody."""
+    people = select(Participant).where(Participant.study_id == study.id, Participant.is_preview.is_(False))
+    return session.scalars(people.order_by(Participant.number)).all()
+
+
+def _present(session: Session, study: Study) -> Sequence[Participant]:
+    return [each for each in everybody(session, study) if each.withdrawn_at is None]
+
+
+def participants(session: Session, study: Study) -> Rows:
+    for each in everybody(session, study):
+        if each.withdrawn_at is not None:
+            yield (each.code, "withdrawn", *[None] * 9, each.withdrawn_at)
+            continue
+        status = "completed" if each.completed_at else "consented" if each.consented_at else "invited"
+        yield (
+            each.code,
+            status,
+            each.seed,
+            each.language or study.settings.language.value,
+            each.created_at,
+            each.consented_at,
+            each.consent_version,
+            each.instructed_at,
+            each.completed_at,
+            each.last_seen_at,
+            each.panel_id,
+            None,
+        )
+
+
+def stages(session: Session, study: Study) -> Rows:
+    for person in _present(session, study):
+        theirs = select(StageRecord).where(StageRecord.participant_id == person.id).order_by(StageRecord.id)
+        for each in session.scalars(theirs):
+            yield person.code, each.stage, each.entered_at, each.finished_at
+
+
+def queries(session: Session, study: Study) -> Rows:
+    for person in _present(session, study):
+        shown = select(Query).where(Query.participant_id == person.id).order_by(Query.ordinal)
+        clips = (joinedload(side).joinedload(Clip.rollout) for side in (Query.left_clip, Query.right_clip))
+        queries = {query.id: query for query in session.scalars(shown.options(*clips))}
+        answers = _last_events(session, person)
+        theirs = select(Model.id, Model.label_count).where(Model.participant_id == person.id)
+        seen = {model_id: labels for model_id, labels in session.execute(theirs)}  # noqa: C416  (typed rows)
+        for query in queries.values():
+            yield (
+                person.code,
+                *_query(query, queries, answers.get(query.id), seen.get(query.predicted_by_model_id or 0)),
+            )
+
+
+def _last_events(session: Session, person: Participant) -> dict[int, LabelEvent]:
+    events = select(LabelEvent).join(Query).where(Query.participant_id == person.id).order_by(LabelEvent.revision)
+    return {event.query_id: event for event in session.scalars(events)}
+
+
+def _query(query: Query, queries: dict[int, Query], last: LabelEvent | None, model_labels: int | None) -> Sequence[Any]:
+    earlier = queries.get(query.repeats_query_id or 0)
+    left, right = query.left_clip, query.right_clip
+    answer = last if last is not None and last.response is not None else None
+    return (
+        query.ordinal,
+        query.purpose,
+        earlier.ordinal if earlier else None,
+        earlier.left_clip_id != query.left_clip_id if earlier else None,
+        query.expected,
+        left.rollout.scenario,
+        left.rollout.behaviour,
+        right.rollout.scenario,
+        right.rollout.behaviour,
+        left.step_count,
+        right.step_count,
+        left.video_sha256,
+        right.video_sha256,
+        query.strategy,
+        query.propensity,
+        query.predicted_right,
+        model_labels,
+        query.served_at,
+        answer.response if answer else None,
+        answer.reason if answer else None,
+        answer.response_time_ms if answer else None,
+        answer.created_at if answer else None,
+        last.revision if last else 0,
+        answer is not None and query.purpose in LEARNED_FROM,
+    )
+
+
+def labels(session: Session, study: Study) -> Rows:
+    for person in _present(session, study):
+        newest = {event.id for event in _last_events(session, person).values()}
+        rows = session.execute(
+            select(Query, LabelEvent)
+            .join(LabelEvent, LabelEvent.query_id == Query.id)
+            .where(Query.participant_id == person.id)
+            .order_by(LabelEvent.id)
+        )
+        for query, event in rows:
+            yield (
+                person.code,
+                query.ordinal,
+                query.purpose,
+                event.revision,
+                event.response,
+                event.id not in newest,
+                event.reason,
+                event.response_time_ms,
+                event.replay_count,
+                event.scrub_count,
+                event.playback_rate,
+                event.watched_whole,
+                event.play_error_count,
+                event.stall_count,
+                event.stalled_ms,
+                event.largest_drift_ms,
+                event.created_at,
+            )
+
+
+def forms(session: Session, study: Study) -> Rows:
+    for person in _present(session, study):
+        answers = session.scalars(
+            select(FormAnswer).where(FormAnswer.participant_id == person.id).order_by(FormAnswer.id)
+        ).all()
+        newest = {(each.form, each.item): each.id for each in answers}
+        for each in answers:
+            superseded = newest[each.form, each.item] != each.id
+            yield person.code, each.form, each.item, each.value, superseded, each.created_at
+
+
+def consent(session: Session, study: Study) -> Rows:
+    for person in _present(session, study):
+        theirs = select(ConsentRecord).where(ConsentRecord.participant_id == person.id).order_by(ConsentRecord.id)
+        for each in session.scalars(theirs):
+            yield person.code, each.version, each.language, each.agreed_at, each.text
+
+
+def events(session: Session, study: Study) -> Rows:
+    for person in _present(session, study):
+        theirs = select(ParticipantEvent).where(ParticipantEvent.participant_id == person.id)
+        for each in session.scalars(theirs.order_by(ParticipantEvent.id)):
+            yield person.code, each.at, each.kind, each.detail
+
+
+def ratings(session: Session, study: Study) -> Rows:
+    blinded = unblinding.is_blinded(study)
+    methods = {} if blinded else unblinding.methods_by_letter(session, study)
+    for person in _present(session, study):
+        rows = session.execute(
+            select(Trial, Rating)
+            .outerjoin(Rating, Rating.trial_id == Trial.id)
+            .where(Trial.participant_id == person.id)
+            .options(joinedload(Trial.film))
+            .order_by(Trial.ordinal, Rating.revision)
+        ).all()
+        newest = {trial.id: rating.revision for trial, rating in rows if rating is not None}
+        for trial, rating in rows:
+            yield (
+                person.code,
+                trial.letter,
+                methods.get((person.id, trial.letter)),
+                trial.repetition,
+                trial.ordinal,
+                trial.scenario,
+                rating.satisfaction if rating else None,
+                rating.personalisation if rating else None,
+                rating is not None and newest[trial.id] == rating.revision,
+                rating.revision if rating else None,
+                rating.response_time_ms if rating else None,
+                rating.created_at if rating else None,
+                trial.shown_at,
+                trial.started_at,
+                trial.finished_at,
+                trial.film.success if trial.film is not None and not blinded else None,
+            )
+
+
+def models(session: Session, study: Study) -> Rows:
+    for person in _present(session, study):
+        for each in session.scalars(select(Model).where(Model.participant_id == person.id).order_by(Model.id)):
+            yield (
+                person.code,
+                each.kind,
+                each.label_count,
+                each.label_hash,
+                each.seed,
+                each.artefact_sha256,
+                each.created_at,
+                each.metrics,
+            )
+
+
+def evaluations(session: Session, study: Study) -> Rows:
+    for person in _present(session, study):
+        rows = session.execute(
+            select(Model, Bundle)
+            .outerjoin(Bundle, Bundle.model_id == Model.id)
+            .where(Model.participant_id == person.id, Model.kind == ModelKind.FILTER)
+            .order_by(Model.label_count, Model.id)
+        ).all()
+        for place, (model, bundle) in enumerate(rows, 1):
+            measured = results.filter_version(model, bundle)
+            named = [("success", measured.success), ("preference", measured.preference)]
+            named += [(cost.symbol, cost) for cost in measured.costs]
+            for name, change in named:
+                if change is not None:
+                    yield (
+                        person.code,
+                        measured.label_count,
+                        place == len(rows),
+                        measured.bundle_version,
+                        measured.scenarios,
+                        name,
+                        change.reference,
+                        change.filtered,
+                        change.delta,
+                        change.low,
+                        change.high,
+                    )
+
+
+def clips(session: Session, study: Study) -> Rows:
+    rollout = aliased(Rollout)
+    rows = session.execute(
+        select(Clip, rollout)
+        .join(rollout, Clip.rollout_id == rollout.id)
+        .where(rollout.study_id == study.id)
+        .order_by(rollout.scenario, rollout.behaviour, Clip.first_step, Clip.step_count)
+    )
+    for clip, run in rows:
+        yield (
+            clip.video_sha256,
+            run.scenario,
+            run.behaviour,
+            run.mode,
+            run.success,
+            clip.first_step,
+            clip.step_count,
+            clip.duration_ms,
+            clip.fps,
+            run.trajectory_sha256,
+        )
+
+
+def deviations(session: Session, study: Study) -> Rows:
+    for each in session.scalars(select(Deviation).where(Deviation.study_id == study.id).order_by(Deviation.id)):
+        yield each.at, each.actor, each.reason, each.before, each.after
