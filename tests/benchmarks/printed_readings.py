@@ -1,0 +1,162 @@
+"""What becomes of the task under each reading of what the paper's PbARL leaves open, one choice changed at a time.
+
+    python -m tests.benchmarks.printed_readings --output docs/results/printed_readings.md
+
+A scripted user with 200 labels, the list ranked by a network on states and actions, nothing gated. Every filter is
+driven through unseen scenarios; changes are against the frozen policy in the same ones. Finished rows are kept in the
+work directory: the same command goes on.
+"""
+
+import argparse
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from worker import lessons
+from worker.analysis.evaluation import success_change
+from worker.contest import PAPER_USERS, Bench, Cell, Terms
+from worker.ml.filter_problem import act_of, scenarios_for
+from worker.ml.methods import Setting
+from worker.ml.pbarl_printed import BETAS, OTHER_TASKS_BETAS, PrintedConfig
+from worker.ml.printed_filter import fit_printed
+from worker.ml.trials import successes
+from worker.shelf import Shelf
+from worker.sim.catalogue import ENVIRONMENTS
+from worker.sim.costs import stakes
+from worker.trajectory import Trajectory
+
+ROLLOUTS = 100
+LOSSES = ("rec", "pref", "kl", "dyn")
+
+
+@dataclass(frozen=True)
+class Reading:
+    """One way to understand the paper."""
+
+    changes: Mapping[str, Any]
+    """fields of PrintedConfig"""
+    weights: Mapping[str, float]
+    """factors on the paper's beta of a loss"""
+
+    def config(self, task: str, steps: int) -> PrintedConfig:
+        """For a task."""
+        betas = BETAS.get(task, OTHER_TASKS_BETAS)
+        weighted = tuple(beta * self.weights.get(name, 1.0) for name, beta in zip(LOSSES, betas, strict=True))
+        return replace(PrintedConfig(betas=weighted, steps=steps), **self.changes)  # type: ignore[arg-type]
+
+
+NEAR = {"epsilon": 0.01}
+APART = {"dynamics_to_encoder": False}
+READINGS = {
+    "as the text reads": Reading({}, {}),
+    "the re-ranked list is a constant": Reading({"stop_gradient": True}, {}),
+    "L_dyn in standardised size (x 0.1)": Reading({"dynamics_scale": 0.1}, {}),
+    "L_dyn does not reach the encoder": Reading(APART, {}),
+    "eps = 0.01": Reading(NEAR, {}),
+    "eps = 0.01, L_dyn apart": Reading(NEAR | APART, {}),
+    "eps = 0.01, L_dyn apart, KL x 0.01": Reading(NEAR | APART, {"kl": 0.01}),
+    "eps = 0.01, L_dyn apart, KL x 0.01, without L_pref": Reading(NEAR | APART, {"kl": 0.01, "pref": 0.0}),
+}
+
+
+def main() -> None:
+    """Measure what was asked for, as far as it is not there yet."""
+    options = _options()
+    torch.set_num_threads(1)
+    options.work_directory.mkdir(parents=True, exist_ok=True)
+    journal = options.work_directory / "printed_readings.jsonl"
+    rows = [json.loads(line) for line in journal.read_text().splitlines()] if journal.exists() else []
+    wanted = [(task, name) for task in options.tasks for name in READINGS]
+    known = {(row["task"], row["reading"], row["user"], row["steps"], row["scenarios"]): row for row in rows}
+    found = []
+    for task, name in tqdm(wanted, unit="reading"):
+        key = (task, name, options.user, options.steps, options.scenarios)
+        if key not in known:
+            known[key] = _measured(task, name, options)
+            with journal.open("a") as stream:
+                stream.write(json.dumps(known[key]) + "\n")
+        found.append(known[key])
+    page = _page(found, options)
+    sys.stdout.write(page)
+    if options.output:
+        options.output.write_text(page)
+
+
+def _measured(task: str, name: str, options: argparse.Namespace) -> dict[str, Any]:
+    shelf = Shelf(task, options.work_directory / "rollouts")
+    cell = Cell(task, PAPER_USERS[options.user], "pbarl_printed", 0)
+    bench = Bench(cell, Terms(), shelf, options.work_directory)
+    setting: Setting = bench.setting()
+    problem = replace(setting.problem, reward=setting.action_reward())
+    config = READINGS[name].config(task, options.steps)
+    draft = fit_printed(problem, shelf.reference(scenarios_for("residual", ROLLOUTS)), config)
+    act = act_of(problem.task.modes, problem.policy, draft.weights)
+    scenarios = scenarios_for("evaluation", options.scenarios)
+    before, after = shelf.reference(scenarios), lessons.run_scenarios(task, act, scenarios, 0.0, 0)
+    success = success_change(successes(before), successes(after))
+    return {
+        "task": task,
+        "reading": name,
+        "user": options.user,
+        "steps": options.steps,
+        "scenarios": options.scenarios,
+        "config": asdict(config),
+        "success": float(successes(after).mean()),
+        "success_delta": [success[name] for name in ("delta", "low", "high")],
+        "true_change": _true_change(bench, before, after),
+        "moved": float(np.mean([np.abs(each.actions - each.reference_actions).mean() for each in after])),
+        "losses": draft.notes[-1],
+    }
+
+
+def _true_change(bench: Bench, before: Sequence[Trajectory], after: Sequence[Trajectory]) -> float:
+    """Of r^H, as a share of what the user minds and likes under the frozen policy."""
+    taste = bench.cell.taste
+    unit = np.mean([stakes(bench.task, each.costs, each.signals, taste.omega).sum() for each in before])
+    true = [np.mean([bench._true_rewards(each).sum() for each in driven]) for driven in (before, after)]
+    return float((true[1] - true[0]) / unit)
+
+
+def _page(rows: list[dict[str, Any]], options: argparse.Namespace) -> str:
+    lines = [
+        "# PbARL as printed, reading by reading",
+        "",
+        "    python -m tests.benchmarks.printed_readings --output docs/results/printed_readings.md",
+        "",
+        f"User {options.user}, 200 labels (seed 0), {options.steps} gradient steps, {options.scenarios} unseen",
+        "scenarios, changes against the frozen policy in the same ones. Moved: mean absolute change of an action's",
+        "seven numbers; a trained policy's samples differ by about 0.1. What is not named is as in `PrintedConfig`.",
+        "",
+        "| task | reading | success, % | change, points | true r^H, % | moved | last losses |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for row in rows:
+        delta, low, high = (100 * value for value in row["success_delta"])
+        losses = row["losses"].removeprefix("Last losses: ").rstrip(".")
+        lines.append(
+            f"| {row['task']} | {row['reading']} | {100 * row['success']:.1f} | {delta:+.1f} [{low:+.1f}, {high:+.1f}] "
+            f"| {100 * row['true_change']:+.0f} | {row['moved']:.3f} | {losses} |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def _options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--tasks", nargs="+", choices=ENVIRONMENTS, default=list(ENVIRONMENTS))
+    parser.add_argument("--user", choices=PAPER_USERS, default="neutral")
+    parser.add_argument("--steps", type=int, default=3000)
+    parser.add_argument("--scenarios", type=int, default=200)
+    parser.add_argument("--work-directory", type=Path, default=Path("data/benchmark"))
+    parser.add_argument("--output", type=Path)
+    return parser.parse_args()
+
+
+if __name__ == "__main__":
+    main()
