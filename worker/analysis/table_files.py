@@ -18,7 +18,7 @@ from worker.analysis.comparison import (
 from worker.analysis.published import published
 from worker.trajectory import COSTS
 
-METHOD, RIVAL = "pbarl", "prefft"
+METHOD, RIVALS = "pbarl", ("prefft", "prefft_anchored", "pbrl_hri")
 TOLERANCE = 0.05
 """Largest loss of success with which a method counts as keeping the task."""
 
@@ -99,33 +99,40 @@ def _line(row: Row) -> str:
 
 def _claim(cells: Cells) -> str:
     """The paper's sentence, cell by cell."""
-    rows = {(row["task"], row["user"]): row for row in table_rows(cells) if row["method"] == METHOD}
+    rows = [row for row in table_rows(cells) if row["method"] == METHOD]
     if not rows:
         return ""
-    rivals = {(row["task"], row["user"]): row for row in against(cells, METHOD, RIVAL)}
     lines = [
         f'## "PbARL keeps the task and raises the preference": `{METHOD}`, cell by cell',
-        f"Keeps the task: loses at most {100 * TOLERANCE:.0f} points of success. Raises: the whole interval is above 0."
-        f" Beside `{RIVAL}`: difference of the two methods, paired by scenario.",
+        f"Keeps the task: loses at most {100 * TOLERANCE:.0f} points of success. Raises: the interval is above 0.",
         "",
-        f"| task, user | keeps the task | raises R-hat | raises r^H | R-hat beyond `{RIVAL}` | r^H beyond | success |",
-        "|---|---|---|---|---|---|---|",
+        "| task, user | keeps the task | raises R-hat | raises r^H |",
+        "|---|---|---|---|",
     ]
-    for (task, user), row in rows.items():
+    for row in rows:
         marks = [
             _yes(row["success_delta"] >= -TOLERANCE - 1e-9),  # two of forty episodes are 5 points
             _yes(row["preference_delta_low"] > 0),
             _yes(row["true_preference_delta_low"] > 0),
         ]
-        rival = rivals.get((task, user))
-        beyond = ["not run"] * 3
-        if rival:
-            beyond = [
-                _change(rival, "preference"),
-                _change(rival, "true_preference", digits=2),
-                _change(rival, "success", 100),
-            ]
-        lines.append(f"| {task}, {user} | " + " | ".join([*marks, *beyond]) + " |")
+        lines.append(f"| {row['task']}, {row['user']} | " + " | ".join(marks) + " |")
+    parts = ["\n".join(lines), *(_beside(cells, rival) for rival in RIVALS)]
+    return "\n\n".join(part for part in parts if part)
+
+
+def _beside(cells: Cells, rival: str) -> str:
+    """By how much the method is ahead of another one, where both were run."""
+    rows = against(cells, METHOD, rival)
+    if not rows:
+        return ""
+    lines = [
+        f"### `{METHOD}` minus `{rival}`, paired by scenario",
+        "| task, user | R-hat | r^H | success, points |",
+        "|---|---|---|---|",
+    ]
+    for row in rows:
+        changes = [_change(row, "preference"), _change(row, "true_preference", digits=2), _change(row, "success", 100)]
+        lines.append(f"| {row['task']}, {row['user']} | " + " | ".join(changes) + " |")
     return "\n".join(lines)
 
 
