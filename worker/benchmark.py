@@ -211,9 +211,9 @@ def _report(terms: Terms, work: Path, output: Path, command: str) -> None:
     _replace(output / "table1.md", to_markdown(cells, groups, _header(terms, cells, tastes, command, _states(found))))
     for task, all_rows in _by_task(table_rows(cells)):
         rows = compared(all_rows)
-        _replace(output / f"pareto-{task}.svg", pareto_svg(task, rows))
+        _replace(output / f"pareto-{task}.svg", pareto_svg(task, rows, list(METHODS)))
         close = [row for row in rows if row["success_delta"] >= -CLOSE_POINTS]
-        _replace(output / f"pareto-{task}-close.svg", pareto_svg(task, close))
+        _replace(output / f"pareto-{task}-close.svg", pareto_svg(task, close, list(METHODS)))
 
 
 def _finished(terms: Terms, work: Path) -> Iterator[tuple[dict[str, Any], dict[str, Any], Taste]]:

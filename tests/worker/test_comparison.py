@@ -15,6 +15,7 @@ from worker.analysis.evaluation import success_change
 from worker.analysis.pareto import pareto_svg
 from worker.analysis.published import TABLE_1, published
 from worker.analysis.table_files import to_csv, to_markdown
+from worker.ml.methods import METHODS
 
 USERS = ("neutral", "cautious", "impatient")
 N = 40
@@ -210,7 +211,18 @@ def test_success_averaged_over_repetitions_has_an_interval_too() -> None:
 
 def test_the_picture_is_valid_and_has_a_mark_per_method_and_user() -> None:
     rows = table_rows(pooled(RUNS))
-    drawn = ElementTree.fromstring(pareto_svg("feeding", rows))  # noqa: S314
+    drawn = ElementTree.fromstring(pareto_svg("feeding", rows, list(METHODS)))  # noqa: S314
     titled = drawn.findall(".//{*}circle/{*}title")
     assert sorted(each.text or "" for each in titled) == sorted(row["method"] for row in rows)
     assert list(csv.reader(io.StringIO(to_csv([])))) == []
+
+
+def test_a_method_keeps_its_colour_in_a_picture_without_the_others() -> None:
+    rows = table_rows(pooled(RUNS))
+
+    def colour(shown: list[comparison.Row]) -> str | None:
+        drawn = ElementTree.fromstring(pareto_svg("feeding", shown, list(METHODS)))  # noqa: S314
+        marks = drawn.findall(".//{*}circle[{*}title]")
+        return next(each.get("fill") for each in marks if each[0].text == "prefft")
+
+    assert colour(rows) == colour([row for row in rows if row["method"] == "prefft"])

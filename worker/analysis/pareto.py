@@ -35,11 +35,14 @@ class _Axis:
         return [round(number * step, 6) for number in range(first, last + 1)]
 
 
-def pareto_svg(task: str, rows: Sequence[Row]) -> str:
-    """``rows``: of comparison.table_rows() for one task. Up and to the right is better; bars are 95 % intervals."""
+def pareto_svg(task: str, rows: Sequence[Row], known: Sequence[str]) -> str:
+    """``rows``: of comparison.table_rows() for one task. Up and to the right is better; bars are 95 % intervals.
+
+    ``known``: every method there is, so that each has its colour in all pictures.
+    """
     users = list(dict.fromkeys(row["user"] for row in rows))
     methods = list(dict.fromkeys(row["method"] for row in rows))
-    colours = {method: COLOURS[index % len(COLOURS)] for index, method in enumerate(methods)}
+    colours = {method: COLOURS[index % len(COLOURS)] for index, method in enumerate(known)}
     width = LEFT + len(users) * (PANEL + GAP)
     columns = max(1, int((width - LEFT) // LEGEND_WIDTH))
     height = TOP + PANEL + BOTTOM + LEGEND_LINE * math.ceil(len(methods) / columns)
