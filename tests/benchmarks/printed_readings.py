@@ -23,16 +23,14 @@ from worker import lessons
 from worker.analysis.evaluation import success_change
 from worker.contest import PAPER_USERS, Bench, Cell, Terms
 from worker.ml.filter_problem import act_of, scenarios_for
-from worker.ml.methods import Setting
 from worker.ml.pbarl_printed import BETAS, OTHER_TASKS_BETAS, PrintedConfig
 from worker.ml.printed_filter import fit_printed
 from worker.ml.trials import successes
 from worker.shelf import Shelf
 from worker.sim.catalogue import ENVIRONMENTS
-from worker.sim.costs import stakes
+from worker.sim.costs import preference_rewards, stakes
 from worker.trajectory import Trajectory
 
-ROLLOUTS = 100
 LOSSES = ("rec", "pref", "kl", "dyn")
 
 
@@ -48,8 +46,8 @@ class Reading:
     def config(self, task: str, steps: int) -> PrintedConfig:
         """For a task."""
         betas = BETAS.get(task, OTHER_TASKS_BETAS)
-        weighted = tuple(beta * self.weights.get(name, 1.0) for name, beta in zip(LOSSES, betas, strict=True))
-        return replace(PrintedConfig(betas=weighted, steps=steps), **self.changes)  # type: ignore[arg-type]
+        rec, pref, kl, dyn = (beta * self.weights.get(loss, 1.0) for loss, beta in zip(LOSSES, betas, strict=True))
+        return replace(PrintedConfig(betas=(rec, pref, kl, dyn), steps=steps), **self.changes)
 
 
 NEAR = {"epsilon": 0.01}
@@ -57,7 +55,7 @@ APART = {"dynamics_to_encoder": False}
 READINGS = {
     "as the text reads": Reading({}, {}),
     "the re-ranked list is a constant": Reading({"stop_gradient": True}, {}),
-    "L_dyn in standardised size (x 0.1)": Reading({"dynamics_scale": 0.1}, {}),
+    "L_dyn on states x 0.1": Reading({"dynamics_scale": 0.1}, {}),
     "L_dyn does not reach the encoder": Reading(APART, {}),
     "eps = 0.01": Reading(NEAR, {}),
     "eps = 0.01, L_dyn apart": Reading(NEAR | APART, {}),
@@ -93,10 +91,10 @@ def _measured(task: str, name: str, options: argparse.Namespace) -> dict[str, An
     shelf = Shelf(task, options.work_directory / "rollouts")
     cell = Cell(task, PAPER_USERS[options.user], "pbarl_printed", 0)
     bench = Bench(cell, Terms(), shelf, options.work_directory)
-    setting: Setting = bench.setting()
+    setting = bench.setting()
     problem = replace(setting.problem, reward=setting.action_reward())
     config = READINGS[name].config(task, options.steps)
-    draft = fit_printed(problem, shelf.reference(scenarios_for("residual", ROLLOUTS)), config)
+    draft = fit_printed(problem, shelf.reference(scenarios_for("residual", setting.config.printed_rollouts)), config)
     act = act_of(problem.task.modes, problem.policy, draft.weights)
     scenarios = scenarios_for("evaluation", options.scenarios)
     before, after = shelf.reference(scenarios), lessons.run_scenarios(task, act, scenarios, 0.0, 0)
@@ -118,10 +116,13 @@ def _measured(task: str, name: str, options: argparse.Namespace) -> dict[str, An
 
 def _true_change(bench: Bench, before: Sequence[Trajectory], after: Sequence[Trajectory]) -> float:
     """Of r^H, as a share of what the user minds and likes under the frozen policy."""
-    taste = bench.cell.taste
-    unit = np.mean([stakes(bench.task, each.costs, each.signals, taste.omega).sum() for each in before])
-    true = [np.mean([bench._true_rewards(each).sum() for each in driven]) for driven in (before, after)]
-    return float((true[1] - true[0]) / unit)
+    task, omega = bench.task, bench.cell.taste.omega
+    unit = np.mean([stakes(task, each.costs, each.signals, omega).sum() for each in before])
+    was, is_now = (
+        np.mean([preference_rewards(task, each.costs, each.signals, omega).sum() for each in driven])
+        for driven in (before, after)
+    )
+    return float((is_now - was) / unit)
 
 
 def _page(rows: list[dict[str, Any]], options: argparse.Namespace) -> str:

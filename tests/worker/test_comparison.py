@@ -209,11 +209,16 @@ def test_success_averaged_over_repetitions_has_an_interval_too() -> None:
     assert change["low"] < change["delta"] == -0.5 < change["high"]
 
 
+def marks_of(rows: list[comparison.Row]) -> list[ElementTree.Element]:
+    """The circles of the picture, each with the method as its title."""
+    drawn = ElementTree.fromstring(pareto_svg("feeding", rows, list(METHODS)))  # noqa: S314  (drawn by ourselves)
+    return drawn.findall(".//{*}circle[{*}title]")
+
+
 def test_the_picture_is_valid_and_has_a_mark_per_method_and_user() -> None:
     rows = table_rows(pooled(RUNS))
-    drawn = ElementTree.fromstring(pareto_svg("feeding", rows, list(METHODS)))  # noqa: S314
-    titled = drawn.findall(".//{*}circle/{*}title")
-    assert sorted(each.text or "" for each in titled) == sorted(row["method"] for row in rows)
+    titled = [mark[0].text or "" for mark in marks_of(rows)]
+    assert sorted(titled) == sorted(row["method"] for row in rows)
     assert list(csv.reader(io.StringIO(to_csv([])))) == []
 
 
@@ -221,8 +226,6 @@ def test_a_method_keeps_its_colour_in_a_picture_without_the_others() -> None:
     rows = table_rows(pooled(RUNS))
 
     def colour(shown: list[comparison.Row]) -> str | None:
-        drawn = ElementTree.fromstring(pareto_svg("feeding", shown, list(METHODS)))  # noqa: S314
-        marks = drawn.findall(".//{*}circle[{*}title]")
-        return next(each.get("fill") for each in marks if each[0].text == "prefft")
+        return next(mark.get("fill") for mark in marks_of(shown) if mark[0].text == "prefft")
 
     assert colour(rows) == colour([row for row in rows if row["method"] == "prefft"])
