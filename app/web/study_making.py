@@ -205,6 +205,7 @@ def _form_page(
         "experimenter": experimenter,
         "form": form,
         "errors": errors or {},
+        "first_wrong": next((each for each in StudyForm.model_fields if each in (errors or {})), None),
         "tasks": [(name, task_words.words_of(name)) for name in TaskName],
         "preset": preset,
         "presets": list(Preset),

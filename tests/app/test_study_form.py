@@ -14,6 +14,7 @@ from app.domain.studies import PAPER_PROTOCOL, PREVIEW_NUMBERS, Deviation, Parti
 from app.services import locking
 from app.storage import ArtefactStore
 from app.web.form_lines import items_of, lines_of, lines_of_texts, texts_of
+from app.web.study_form import StudyForm
 from tests import factories
 from tests.app.study_pages import typed
 
@@ -115,8 +116,23 @@ def test_a_complaint_stands_beside_its_field_and_opens_its_group(
     assert answer.status_code == 422
     opened = "".join(re.findall(r"<details[^>]*open.*?</details>", answer.text, re.DOTALL))
     assert complaint in opened
+    assert f'Please check <a href="#{field}">the marked field</a>' in answer.text
+    assert answer.text.count(f'id="{field}"') == 1
     with database.reading() as session:
         assert session.scalars(select(Study)).all() == []
+
+
+def test_the_first_of_several_wrong_fields_is_one_link_away(experimenter: TestClient) -> None:
+    form = typed(experimenter, seed="x", task="cooking", practice_pairs="x")
+    answer = experimenter.post("/studies/new", data=form).text
+    assert 'Please check <a href="#task">the 3 marked fields</a>' in answer
+
+
+def test_the_fields_of_the_form_are_declared_in_the_order_of_the_page(experimenter: TestClient) -> None:
+    shown = list(dict.fromkeys(re.findall(r' name="(\w+)"', experimenter.get("/studies/new").text)))
+    assert [each for each in StudyForm.model_fields if each != "reason"] == [
+        each for each in shown if each in StudyForm.model_fields
+    ]
 
 
 def test_questions_and_texts_are_read_back_as_they_were_written() -> None:

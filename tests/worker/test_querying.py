@@ -24,6 +24,8 @@ from worker.workplace import Workplace
 
 AddClips = Callable[..., list[Clip]]
 Answer = Callable[[Clip, Clip, Response], Query]
+FIRST_SIGNAL = np.eye(len(SIGNALS))[0]
+"""Weights of somebody who cares for one signal alone."""
 
 
 @pytest.fixture
@@ -154,9 +156,7 @@ def test_contested_pairs_are_those_other_participants_disagree_about(
     """Two others who want opposite things about a single signal: where it differs most they disagree most."""
     settle_on(place, Strategy.CONTESTED)
     add_clips(1)
-    wish = np.eye(len(SIGNALS))[0]
-    for number, sign in ((2, 1.0), (3, -1.0)):
-        somebody_else(place, participant, number, sign * wish, querying.OTHERS_LABELS)
+    two_who_disagree_about_the_first_signal(place, participant)
     seen: list[npt.NDArray[np.float64]] = []
 
     def contested(said: npt.NDArray[np.float64], own: None) -> npt.NDArray[np.float64]:
@@ -166,10 +166,7 @@ def test_contested_pairs_are_those_other_participants_disagree_about(
     disagreement = acquisition.contested
     monkeypatch.setattr(acquisition, "contested", contested)
     querying.refill_queries(place, participant.id)
-    with place.database.reading() as session:
-        clips = dataset.pool_clips(session, participant.study_id)
-    sums = {clip.id: dataset.shown(place.store, clip).signals[:, 0].sum() for clip in clips}
-    differences = [abs(sums[left.id] - sums[right.id]) for left, right in dataset.matched_pairs(clips)]
+    differences = differences_of_pairs(place, participant)
     assert np.argsort(seen[0]).tolist() == np.argsort(differences).tolist()
 
 
@@ -179,10 +176,8 @@ def test_contested_pairs_are_not_asked_where_this_person_s_own_model_is_sure(
     """Others disagree about one signal, and this person's model is sure of just that."""
     settle_on(place, Strategy.CONTESTED)
     add_clips(1)
-    wish = np.eye(len(SIGNALS))[0]
-    for number, sign in ((2, 1.0), (3, -1.0)):
-        somebody_else(place, participant, number, sign * wish, querying.OTHERS_LABELS)
-    save_model_of(place, participant.study_id, participant.id, 1e4 * wish, labels=5)
+    two_who_disagree_about_the_first_signal(place, participant)
+    save_model_of(place, participant.study_id, participant.id, 1e4 * FIRST_SIGNAL, labels=5)
     scores: list[npt.NDArray[np.float64]] = []
     choose = acquisition.choose
 
@@ -192,11 +187,8 @@ def test_contested_pairs_are_not_asked_where_this_person_s_own_model_is_sure(
 
     monkeypatch.setattr(acquisition, "choose", chosen)
     querying.refill_queries(place, participant.id)
-    with place.database.reading() as session:
-        clips = dataset.pool_clips(session, participant.study_id)
-    sums = {clip.id: dataset.shown(place.store, clip).signals[:, 0].sum() for clip in clips}
-    differs = [sums[left.id] != sums[right.id] for left, right in dataset.matched_pairs(clips)]
-    assert any(differs)
+    differs = differences_of_pairs(place, participant) > 0.0
+    assert differs.any()
     assert scores[0][differs].max() < 1e-6
 
 
@@ -212,6 +204,20 @@ def test_a_pooled_prior_is_of_those_who_joined_before_and_have_answered_everythi
         newcomers = [session.get_one(Participant, each) for each in (participant.id, finished, last)]
         earlier = [reward_work.earlier_models(session, each, study) for each in newcomers]
     assert [[model.participant_id for model in each] for each in earlier] == [[], [], [finished]]
+
+
+def two_who_disagree_about_the_first_signal(place: Workplace, participant: Participant) -> None:
+    """Add two other participants who want the opposite of each other."""
+    for number, sign in ((2, 1.0), (3, -1.0)):
+        somebody_else(place, participant, number, sign * FIRST_SIGNAL, querying.OTHERS_LABELS)
+
+
+def differences_of_pairs(place: Workplace, participant: Participant) -> npt.NDArray[np.float64]:
+    """By how much the clips of each pair that may be asked differ in the first signal, (P,)."""
+    with place.database.reading() as session:
+        clips = dataset.pool_clips(session, participant.study_id)
+    sums = {clip.id: dataset.shown(place.store, clip).signals[:, 0].sum() for clip in clips}
+    return np.array([abs(sums[left.id] - sums[right.id]) for left, right in dataset.matched_pairs(clips)])
 
 
 def somebody_else(
