@@ -7,15 +7,16 @@ pairs of other scenarios: how often the model prefers what the user truly prefer
 (where at least one of the paper's three users prefers the other clip), and the expected calibration error against
 answers like those it learned from. And what the person gets: the execution mode that a study's search would pick for
 this reward model, with its change of the true preference and of success as the response surface has them; for some
-numbers of labels the mode is also driven through unseen scenarios. Rollouts and finished chains are kept under data/;
-repeat the command to go on, and with more --minutes to do more. A pool of 170 scenarios has 1020 pairs.
+numbers of labels the mode is also driven through unseen scenarios. Rollouts are kept under data/, finished chains in
+--output: repeat the command to go on from what is there, and with more --minutes to do more. A pool of 170 scenarios
+has 1020 pairs.
 """
 
 import argparse
 import csv
-import json
 import time
-from collections.abc import Iterator
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -27,7 +28,7 @@ from tqdm import tqdm
 
 from tests.benchmarks import feedback_report
 from tests.benchmarks.chosen_modes import stake
-from tests.benchmarks.feedback_report import LINEAR, NAMED
+from tests.benchmarks.feedback_report import LINEAR, NAMED, Row
 from tests.benchmarks.pool_rollouts import Pool, pool_rollouts
 from worker import laboratory, lessons
 from worker.exploration import surface_file
@@ -131,9 +132,7 @@ class Bench:
         teacher = ScriptedTeacher.calibrated(Manner(), rewards)
         rows, answers = np.zeros(0, np.int64), np.zeros(0)
         model: RewardModel | None = None
-        stops = [count for count in COUNTS if count <= min(self.most_labels, len(self.pairs))]
-        if chain.rule != "uniform" or chain.pooled:
-            stops = [count for count in stops if count <= 200]
+        stops = self.stops(chain)
         every = [*range(RETRAIN_EVERY, stops[-1], RETRAIN_EVERY)] if chain.model in LINEAR else []
         for count in sorted({*stops, *every} if chain.rule != "uniform" else stops):
             added = self._choose(chain, count - len(rows), rows, model, rng)
@@ -143,6 +142,11 @@ class Bench:
             model = fitted.model
             if count in stops:
                 yield self._row(chain, count, fitted)
+
+    def stops(self, chain: Chain) -> list[int]:
+        """The numbers of labels at which a chain is measured."""
+        most = self.most_labels if chain.rule == "uniform" and not chain.pooled else min(200, self.most_labels)
+        return [count for count in COUNTS if count <= min(most, len(self.pairs))]
 
     def _choose(
         self, chain: Chain, count: int, used: Indices, model: RewardModel | None, rng: np.random.Generator
@@ -304,23 +308,32 @@ def main() -> None:
     options = _options()
     torch.set_num_threads(1)
     bench = Bench(options.task, options.pool_scenarios, options.most_labels)
-    journal = Path("data") / f"feedback_efficiency-{options.task}-{options.pool_scenarios}.jsonl"
-    journal.touch()
-    done = {line["chain"]: line["rows"] for line in map(json.loads, journal.read_text().splitlines())}
-    planned, until = chains(options.seeds), time.monotonic() + 60 * options.minutes
-    for chain in tqdm(planned, unit="chain", mininterval=5):
-        name = json.dumps([asdict(chain), options.most_labels])
-        if name not in done and time.monotonic() < until:
-            done[name] = [asdict(row) for row in bench.measure(chain)]
-            with journal.open("a") as stream:
-                stream.write(json.dumps({"chain": name, "rows": done[name]}) + "\n")
-    rows = [row for chain in planned for row in done.get(json.dumps([asdict(chain), options.most_labels]), [])]
     options.output.mkdir(parents=True, exist_ok=True)
-    with (options.output / f"feedback_efficiency-{options.task}.csv").open("w", newline="") as stream:
+    file = options.output / f"feedback_efficiency-{options.task}.csv"
+    done, planned, until = _finished(bench, file), chains(options.seeds), time.monotonic() + 60 * options.minutes
+    for chain in tqdm(planned, unit="chain", mininterval=5):
+        if chain not in done and time.monotonic() < until:
+            done[chain] = [asdict(row) for row in bench.measure(chain)]
+            _write(file, [row for each in planned for row in done.get(each, [])])
+    feedback_report.write(options.output)
+
+
+def _finished(bench: Bench, file: Path) -> dict[Chain, list[Row]]:
+    """Rows of the chains that an earlier call has measured as often as this one would."""
+    found: defaultdict[Chain, list[Row]] = defaultdict(list)
+    for row in feedback_report.read(file) if file.exists() else []:
+        found[Chain(row["user"], row["model"], row["strategy"], row["pooled_prior"], row["seed"])].append(row)
+    return {chain: rows for chain, rows in found.items() if [row["labels"] for row in rows] == bench.stops(chain)}
+
+
+def _write(file: Path, rows: Sequence[Row]) -> None:
+    """Replace the file at once, so that an interruption leaves it whole."""
+    unfinished = file.with_suffix(".unfinished")
+    with unfinished.open("w", newline="") as stream:
         writer = csv.DictWriter(stream, list(rows[0]), lineterminator="\n")
         writer.writeheader()
         writer.writerows({name: round(v, 4) if isinstance(v, float) else v for name, v in row.items()} for row in rows)
-    feedback_report.write(options.output)
+    unfinished.replace(file)
 
 
 def _options() -> argparse.Namespace:
