@@ -117,7 +117,9 @@ class Compute:
         """Stop every process; whoever waits for work in hand is Interrupted, and the next worker will do it again."""
         self._closing.set()
         for pool in list(self._pools.values()):
-            for process in list((pool._processes or {}).values()):
+            # Idle processes leave by themselves: terminated ones could not give back what they share with their parent.
+            busy = (pool._processes or {}) if pool._pending_work_items else {}
+            for process in list(busy.values()):
                 process.terminate()
             pool.shutdown(wait=False, cancel_futures=True)
         self._pools.clear()

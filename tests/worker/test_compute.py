@@ -1,6 +1,7 @@
 """Heavy work runs in processes that may die, and must die with their worker."""
 
 import contextlib
+import io
 import os
 import signal
 import subprocess
@@ -10,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from tqdm import tqdm
 
 from worker.compute import Compute, ComputeLost, Interrupted, Lane
 
@@ -28,6 +30,10 @@ def own_pid() -> int:
 
 def die() -> None:
     os.kill(os.getpid(), signal.SIGKILL)
+
+
+def show_progress() -> None:
+    list(tqdm(range(3), file=io.StringIO()))
 
 
 def wait_forever(started: Path) -> None:
@@ -116,6 +122,19 @@ def test_compute_processes_die_with_a_worker_that_is_killed() -> None:
         parent.kill()
         parent.wait()
         assert gone_within(child, seconds=10)
+
+
+def test_processes_with_nothing_left_to_do_leave_without_a_word() -> None:
+    program = (
+        "from tests.worker.test_compute import nothing, show_progress\n"
+        "from worker.compute import Compute, Lane\n"
+        "if __name__ == '__main__':\n"
+        "    compute = Compute(1)\n"
+        "    compute.run(Lane.LEARNING, nothing, show_progress)\n"
+        "    compute.close()\n"
+    )
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True)
+    assert ended.stderr == ""
 
 
 def gone_within(pid: int, seconds: float) -> bool:
