@@ -54,6 +54,7 @@ class Compute:
     def __init__(self, processes: int) -> None:
         self._sizes = {Lane.CLIPS: processes, Lane.REWARDS: 1, Lane.LEARNING: processes, Lane.PATIENT: 1}
         self._pools: dict[Lane, ProcessPoolExecutor] = {}
+        self._starting = threading.Lock()
         self._closing = threading.Event()
 
     def warm_up(self, lane: Lane, function: Callable[[], object]) -> None:
@@ -99,14 +100,15 @@ class Compute:
             raise ComputeLost(" ".join((ComputeLost.__doc__ or "").split())) from broken
 
     def _pool(self, lane: Lane) -> ProcessPoolExecutor:
-        if lane not in self._pools:
-            self._pools[lane] = ProcessPoolExecutor(
-                self._sizes[lane],
-                mp_context=multiprocessing.get_context("spawn"),
-                initializer=_settle_in,
-                initargs=(os.getpid(), _NICENESS[lane]),
-            )
-        return self._pools[lane]
+        with self._starting:  # several jobs may be the first of their lane at once
+            if lane not in self._pools:
+                self._pools[lane] = ProcessPoolExecutor(
+                    self._sizes[lane],
+                    mp_context=multiprocessing.get_context("spawn"),
+                    initializer=_settle_in,
+                    initargs=(os.getpid(), _NICENESS[lane]),
+                )
+            return self._pools[lane]
 
     def _discard(self, lane: Lane) -> None:
         pool = self._pools.pop(lane, None)

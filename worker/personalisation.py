@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from app.domain.studies import StudySettings
+from app.domain.studies import Method, StudySettings
 from worker import laboratory, lessons
 from worker.analysis.evaluation import evaluate
 from worker.compute import Compute, Lane
@@ -62,12 +62,8 @@ class Fitting:
     @property
     def problem(self) -> FilterProblem:
         """What is to be fitted, in the words of the learning code."""
-        config = FilterConfig(
-            success_tolerance=self.settings.success_tolerance,
-            evaluation_scenarios=self.settings.evaluation_scenarios,
-        )
-        policy = laboratory.reference_policy(self.task)
-        return FilterProblem(laboratory.task(self.task), policy, load_reward_model(self.reward), self.seed, config)
+        task, policy = laboratory.task(self.task), laboratory.reference_policy(self.task)
+        return FilterProblem(task, policy, load_reward_model(self.reward), self.seed, _config(self.settings))
 
     def find_mode(self, pool: Sequence[Trajectory]) -> FilterDraft:
         """The person's execution mode, as far as held-out scenarios allow it."""
@@ -86,7 +82,7 @@ class Fitting:
 
     def fit_printed(self) -> FilterDraft:
         """The paper's PbARL as printed, on transitions of the frozen policy. Not gated: it is what it is."""
-        transitions = self._reference(filter_problem.scenarios_for("residual", PRINTED_ROLLOUTS))
+        transitions = self.reference(filter_problem.scenarios_for("residual", PRINTED_ROLLOUTS))
         self.progress("training the printed action encoder", 0.1)
         return self.compute.run(Lane.LEARNING, self.beat, printed_filter.fit_printed, self.problem, transitions)
 
@@ -123,7 +119,7 @@ class Fitting:
     def _evaluate(self, act: FilterAct) -> tuple[dict[str, Any], list[Trajectory]]:
         scenarios = filter_problem.scenarios_for("evaluation", self.settings.evaluation_scenarios)
         filtered = self.collect(act, scenarios, 0.0, self.seed)
-        reference, reward = self._reference(scenarios), self.problem.reward
+        reference, reward = self.reference(scenarios), self.problem.reward
         return evaluate(reference, filtered, reward.returns(reference), reward.returns(filtered)), filtered
 
     def collect(self, act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
@@ -137,14 +133,27 @@ class Fitting:
         return self.compute.run(Lane.LEARNING, self.beat, residual_learning.learn_round, problem, draft, rounds)
 
     def _gate_reference(self) -> Sequence[Trajectory]:
-        return self._reference(self.problem.config.gate_block(self.problem.task))
+        return self.reference(self.problem.config.gate_block(self.problem.task))
 
-    def _reference(self, scenarios: range) -> Sequence[Trajectory]:
+    def reference(self, scenarios: range) -> Sequence[Trajectory]:
         """The frozen policy's rollouts: the same for everybody, so they are made once per worker."""
         key = (self.task, scenarios)
         if key not in self.references:
             self.references[key] = self.collect(laboratory.reference_policy(self.task).mean, scenarios, 0.0, 0)
         return self.references[key]
+
+
+def reference_blocks(task: str, settings: StudySettings) -> list[range]:
+    """The scenarios in which filters of such a study are compared with the reference policy."""
+    config = _config(settings)
+    gate = [config.gate_block(laboratory.task(task))] if settings.method is Method.STUDIO else []
+    return [*gate, filter_problem.scenarios_for("evaluation", config.evaluation_scenarios)]
+
+
+def _config(settings: StudySettings) -> FilterConfig:
+    return FilterConfig(
+        success_tolerance=settings.success_tolerance, evaluation_scenarios=settings.evaluation_scenarios
+    )
 
 
 def _warnings(evaluation: dict[str, Any], tolerance: float) -> list[str]:

@@ -53,10 +53,11 @@ def workflow_name(finding: str, attempt: int) -> str:
     return f"{finding}#{attempt}"
 
 
-def tasks_with_answers(session: Session) -> set[str]:
-    """The tasks of studies in which somebody has answered: their first retraining is not far."""
-    answered = select(Study.task).join(Participant).join(Query).join(LabelEvent).distinct()
-    return set(session.scalars(answered))
+def studies_with_answers(session: Session) -> list[Study]:
+    """The simulated studies in which somebody has answered: their first retraining is not far."""
+    answered = select(Participant.study_id).join(Query).join(LabelEvent)
+    found = session.scalars(select(Study).where(Study.id.in_(answered)).order_by(Study.id))
+    return [study for study in found if study.material is None]
 
 
 def short_of_queries(session: Session) -> list[int]:

@@ -18,13 +18,13 @@ from sqlalchemy.exc import OperationalError
 
 from app.db import Database
 from app.domain.models import RunKind
+from app.domain.studies import StudySettings
 from app.errors import AppError
 from app.settings import Settings
 from app.storage import ArtefactStore
-from worker import erasure, laboratory, lessons, orphans, querying, reconcile, records
-from worker.compute import Compute, Lane
+from worker import erasure, laboratory, lessons, orphans, querying, reconcile, records, references
+from worker.compute import Compute, ComputeLost, Interrupted, Lane
 from worker.records import Job
-from worker.sim.catalogue import ENVIRONMENTS
 from worker.workflows import Workshop, as_arguments
 from worker.workplace import Workplace
 
@@ -130,7 +130,7 @@ class _Rounds:
         self._started: set[str] = set()  # what the engine has been told already
         self._signed_at = -math.inf
         self._cleared_at = -math.inf
-        self._warm_tasks: set[str] = set()
+        self._prepared: set[int] = set()
         self._refused: set[int] = set()
 
     def until(self, stop: threading.Event) -> None:
@@ -160,7 +160,7 @@ class _Rounds:
             due = list(reconcile.findings(session))
             hungry = set(reconcile.short_of_queries(session))
             lost = reconcile.abandoned(session, self._workshop.in_hand)
-            learning_ahead = reconcile.tasks_with_answers(session) - self._warm_tasks
+            answered = reconcile.studies_with_answers(session)
             withdrawn = erasure.unfinished(session)
         for job, attempt in due:
             self._start(job, reconcile.workflow_name(job.finding, attempt))
@@ -171,10 +171,21 @@ class _Rounds:
         for name in lost:
             log.warning("%s was left behind by another worker; taking it over", name)
             DBOS.resume_workflow(name)
-        for name in learning_ahead & set(ENVIRONMENTS):
-            for lane in (Lane.REWARDS, Lane.LEARNING):
-                self._place.compute.warm_up(lane, partial(lessons.warm_up, name))
-        self._warm_tasks |= learning_ahead
+        for study in answered:
+            if study.id not in self._prepared:
+                self._prepared.add(study.id)
+                for lane in (Lane.REWARDS, Lane.LEARNING):
+                    self._place.compute.warm_up(lane, partial(lessons.warm_up, study.task))
+                threading.Thread(target=self._make_references, args=(study.task, study.settings), daemon=True).start()
+
+    def _make_references(self, task: str, settings: StudySettings) -> None:
+        """What the first filter would otherwise wait for."""
+        try:
+            references.make_ready(self._place.compute, self._place.references, task, settings)
+        except Interrupted:
+            return
+        except ComputeLost:
+            log.warning("rollouts of the reference policy were lost; the first filter of %s will make them", task)
 
     def _erase(self, participant_id: int) -> None:
         shop = self._workshop

@@ -66,10 +66,10 @@ def test_the_reward_model_is_due_at_every_tenth_label(
 
 def test_the_first_answer_is_noticed(database: Database, labels: Callable[[int], list[Query]]) -> None:
     with database.reading() as session:
-        assert reconcile.tasks_with_answers(session) == set()
+        assert reconcile.studies_with_answers(session) == []
     labels(1)
     with database.reading() as session:
-        assert reconcile.tasks_with_answers(session) == {"feeding"}
+        assert [study.task for study in reconcile.studies_with_answers(session)] == ["feeding"]
 
 
 def test_the_tenth_label_asks_for_a_reward_model_and_then_for_the_milestones_filter(

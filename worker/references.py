@@ -1,0 +1,28 @@
+"""What filters are compared with, the reference policy's rollouts, made before the first filter needs them."""
+
+from app.domain.studies import StudySettings
+from worker import laboratory, lessons
+from worker.compute import Compute, Lane
+from worker.personalisation import CHUNK, reference_blocks
+from worker.trajectory import Trajectory
+
+
+def make_ready(
+    compute: Compute, references: dict[tuple[str, range], list[Trajectory]], task: str, settings: StudySettings
+) -> None:
+    """Make what is missing behind everything else that is learning, a few episodes at a time.
+
+    A filter that cannot wait makes its own meanwhile; the rest of them is then left out.
+    Raises Interrupted when the worker stops, and ComputeLost when a process was killed.
+    """
+    act = laboratory.reference_policy(task).mean
+    for scenarios in reference_blocks(task, settings):
+        key, made = (task, scenarios), list[Trajectory]()
+        while key not in references and len(made) < len(scenarios):
+            some = scenarios[len(made) : len(made) + CHUNK]
+            made += compute.run(Lane.PATIENT, _no_beat, lessons.run_scenarios, task, act, some, 0.0, 0)
+        references.setdefault(key, made)
+
+
+def _no_beat() -> None:
+    """No run is waiting for this."""
