@@ -37,15 +37,15 @@ class Robot:
     controller: bytes
 
 
-def due(study: Study, participant: Participant, ending: str, succeeded: Collection[str]) -> list[Job]:
+def due(study: Study, participant_id: int, ending: str, succeeded: Collection[str]) -> list[Job]:
     """What is to be filmed or packed for somebody whose last filter is there. ``ending``: labels and last answer."""
     wanted = [BEFORE_AFTER] if study.material is None else []
     settings = evaluating.settings_of(study)
-    if settings and method_work.all_trained(study, participant, ending, succeeded):
+    if settings and method_work.all_trained(study, participant_id, ending, succeeded):
         wanted.append(TRIALS if settings.mode is EvaluationMode.VIDEO else CONTROLLERS)
     labels = study.settings.labels_per_participant
     return [
-        Job(f"films/participant-{participant.id}/{what}/{ending}", RunKind.FILMS, study.id, participant.id, labels)
+        Job(f"films/participant-{participant_id}/{what}/{ending}", RunKind.FILMS, study.id, participant_id, labels)
         for what in reversed(wanted)  # somebody may be waiting for the trials
     ]
 

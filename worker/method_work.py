@@ -33,12 +33,12 @@ TRAINING_SHARE = 0.9
 """Of the progress; the rest is the drive through unseen scenarios."""
 
 
-def due(study: Study, participant: Participant, ending: str) -> list[Job]:
+def due(study: Study, participant_id: int, ending: str) -> list[Job]:
     """What is to be trained for somebody whose last reward model is there. ``ending``: labels and last answer."""
     settings = evaluating.settings_of(study)
     labels = study.settings.labels_per_participant
     return [
-        Job(finding(participant.id, method, ending), RunKind.METHOD, study.id, participant.id, labels)
+        Job(finding(participant_id, method, ending), RunKind.METHOD, study.id, participant_id, labels)
         for method in (settings.methods if settings else ())
         if method in evaluating.TRAINED
     ]
@@ -49,9 +49,9 @@ def finding(participant_id: int, method: str, ending: str) -> str:
     return f"method/participant-{participant_id}/{method}/{ending}"
 
 
-def all_trained(study: Study, participant: Participant, ending: str, succeeded: Collection[str]) -> bool:
+def all_trained(study: Study, participant_id: int, ending: str, succeeded: Collection[str]) -> bool:
     """Whether everything that is due has been done."""
-    return all(job.finding in succeeded for job in due(study, participant, ending))
+    return all(job.finding in succeeded for job in due(study, participant_id, ending))
 
 
 def train_method(place: Workplace, job: Job, run_id: int, step: Step) -> None:

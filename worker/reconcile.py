@@ -6,6 +6,7 @@ anything undone or do it twice: each finding has one name, and work is started u
 
 from collections.abc import Collection, Iterator
 from datetime import datetime, timedelta
+from typing import NamedTuple
 
 from sqlalchemy import Select, func, select
 from sqlalchemy.orm import Session
@@ -25,9 +26,18 @@ CLIPS_AHEAD = 2
 RETRY_AFTER = timedelta(seconds=10)
 
 
+class _Attempted(NamedTuple):
+    """What is to be known of a run here. Whole ones take their time to load, and there are thousands of them."""
+
+    status: str
+    attempt: int
+    finished_at: datetime | None
+
+
 def findings(session: Session) -> Iterator[tuple[Job, int]]:
     """Every run that should exist and does not, or must be tried again, with the number of its attempt."""
-    runs = {run.workflow_id: run for run in session.scalars(select(Run))}
+    known = session.execute(select(Run.workflow_id, Run.status, Run.attempt, Run.finished_at))
+    runs = {name: _Attempted(status, attempt, finished) for name, status, attempt, finished in known}
     succeeded = {name for name, run in runs.items() if run.status == RunStatus.SUCCEEDED}
     for study in session.scalars(select(Study).order_by(Study.id)).all():
         jobs = (*_missing_clips(session, study), *_stale_models(session, study, succeeded))
@@ -63,19 +73,27 @@ def studies_with_answers(session: Session) -> list[Study]:
 def short_of_queries(session: Session) -> list[int]:
     """Participants who could soon run out of queries."""
     return [
-        participant.id
+        participant_id
         for study in session.scalars(select(Study)).all()
-        for participant in session.scalars(_present(study)).all()
-        if next_queries(session, participant.id, study.settings)[1] > 0
+        for participant_id in _without_all_queries(session, study)
+        if next_queries(session, participant_id, study.settings)[1] > 0
     ]
 
 
-def _present(study: Study) -> Select[Participant]:
+def _without_all_queries(session: Session, study: Study) -> list[int]:
+    """Everybody who has not yet been given all their queries: in a study that is over, nobody."""
+    settings = study.settings
+    counted = _present_ids(study).outerjoin(Query).group_by(Participant.id)
+    short = counted.having(func.count(Query.id) < settings.practice_pairs + settings.question_count)
+    return list(session.scalars(short.order_by(Participant.id)))
+
+
+def _present_ids(study: Study) -> Select[int]:
     """Everybody in the study who has not withdrawn."""
-    return select(Participant).where(Participant.study_id == study.id, Participant.withdrawn_at.is_(None))
+    return select(Participant.id).where(Participant.study_id == study.id, Participant.withdrawn_at.is_(None))
 
 
-def _attempt_due(run: Run | None, moment: datetime) -> int | None:
+def _attempt_due(run: _Attempted | None, moment: datetime) -> int | None:
     if run is None:
         return 1
     if run.status == RunStatus.RETRY:
@@ -119,35 +137,32 @@ def scenario_seed(study_seed: int, index: int) -> int:
 
 
 def _stale_models(session: Session, study: Study, succeeded: Collection[str]) -> list[Job]:
-    jobs = []
-    for participant in session.scalars(_present(study)).all():
-        count = count_labels(session, participant.id)
-        if count == 0:
-            continue
-        suffix = _last_answer(session, participant.id) if count >= study.settings.labels_per_participant else ""
-        reward = reward_due(study.settings, count)
+    jobs, settings = [], study.settings
+    last_answers = _last_answers(session, study)
+    for participant_id, count in sorted(count_labels(session, _present_ids(study)).items()):
+        # A last answer that is changed afterwards makes the last model's name new.
+        suffix = f"/answer-{last_answers[participant_id]}" if count >= settings.labels_per_participant else ""
+        reward = reward_due(settings, count)
         if reward:
-            name = f"reward/participant-{participant.id}/labels-{reward}{suffix}"
-            jobs.append(Job(name, RunKind.REWARD, study.id, participant.id, reward))
-            milestone = filter_due(study.settings, count)
+            name = f"reward/participant-{participant_id}/labels-{reward}{suffix}"
+            jobs.append(Job(name, RunKind.REWARD, study.id, participant_id, reward))
+            milestone = filter_due(settings, count)
             if milestone and name in succeeded and study.material is None:  # no simulator, no filter
-                ending = suffix if milestone == study.settings.labels_per_participant else ""
-                name = f"filter/participant-{participant.id}/labels-{milestone}{ending}"
-                jobs.append(Job(name, RunKind.FILTER, study.id, participant.id, milestone))
+                ending = suffix if milestone == settings.labels_per_participant else ""
+                name = f"filter/participant-{participant_id}/labels-{milestone}{ending}"
+                jobs.append(Job(name, RunKind.FILTER, study.id, participant_id, milestone))
         if suffix and study.material is None:
-            jobs += _missing_from_evaluation(study, participant, f"labels-{reward}{suffix}", succeeded)
+            jobs += _missing_from_evaluation(study, participant_id, f"labels-{reward}{suffix}", succeeded)
     return jobs
 
 
-def _missing_from_evaluation(
-    study: Study, participant: Participant, ending: str, succeeded: Collection[str]
-) -> list[Job]:
+def _missing_from_evaluation(study: Study, participant_id: int, ending: str, succeeded: Collection[str]) -> list[Job]:
     """What is to be trained, filmed or packed for somebody who has given all labels."""
-    if f"reward/participant-{participant.id}/{ending}" not in succeeded:
+    if f"reward/participant-{participant_id}/{ending}" not in succeeded:
         return []
-    jobs = method_work.due(study, participant, ending)
-    if f"filter/participant-{participant.id}/{ending}" in succeeded:
-        jobs += film_work.due(study, participant, ending, succeeded)
+    jobs = method_work.due(study, participant_id, ending)
+    if f"filter/participant-{participant_id}/{ending}" in succeeded:
+        jobs += film_work.due(study, participant_id, ending, succeeded)
     return jobs
 
 
@@ -163,8 +178,8 @@ def filter_due(settings: StudySettings, answered: int) -> int:
     return max((milestone for milestone in settings.milestones if milestone <= answered), default=0)
 
 
-def _last_answer(session: Session, participant_id: int) -> str:
-    """Makes the last model's name new when the participant changes an answer after the last one."""
-    events = select(func.max(LabelEvent.id)).join(Query)
-    events = events.where(Query.participant_id == participant_id, Query.purpose.in_(LEARNED_FROM))
-    return f"/answer-{session.scalar(events)}"
+def _last_answers(session: Session, study: Study) -> dict[int, int]:
+    """The number of everybody's last answer that is learned from."""
+    events = select(Query.participant_id, func.max(LabelEvent.id)).join(LabelEvent)
+    events = events.where(Query.participant_id.in_(_present_ids(study)), Query.purpose.in_(LEARNED_FROM))
+    return dict(session.execute(events.group_by(Query.participant_id)).all())

@@ -5,7 +5,17 @@ from dataclasses import dataclass
 from datetime import datetime
 from enum import StrEnum
 
-from sqlalchemy import CheckConstraint, ForeignKey, String, Subquery, UniqueConstraint, func, select
+from sqlalchemy import (
+    CheckConstraint,
+    ColumnElement,
+    ForeignKey,
+    Select,
+    String,
+    Subquery,
+    UniqueConstraint,
+    func,
+    select,
+)
 from sqlalchemy.orm import Mapped, Session, mapped_column, relationship
 from sqlalchemy.sql.base import ExecutableOption
 
@@ -137,30 +147,37 @@ def current_answers(session: Session, participant_id: int, *options: ExecutableO
     return _answered(session, participant_id, tuple(Purpose), options)
 
 
-def count_labels(session: Session, participant_id: int) -> int:
-    """How many current_labels there are, counted by the database: the worker asks for it all the time."""
-    newest = _newest(participant_id)
+def count_labels(session: Session, people: Select[int]) -> dict[int, int]:
+    """How many current_labels each of these participants has; whoever has none is left out.
+
+    ``people`` selects their ids. Counted by the database, for all at once: the worker asks for it all the time.
+    """
+    newest = _newest(Query.participant_id.in_(people))
     counting = (
-        select(func.count())
-        .select_from(LabelEvent)
+        select(Query.participant_id, func.count())
+        .join(LabelEvent)
         .join(newest, (newest.c.query_id == LabelEvent.query_id) & (newest.c.revision == LabelEvent.revision))
-        .join(Query, Query.id == LabelEvent.query_id)
         .where(LabelEvent.response.is_not(None), Query.purpose.in_(LEARNED_FROM))
+        .group_by(Query.participant_id)
     )
-    return session.scalar(counting) or 0
+    return dict(session.execute(counting).all())
 
 
-def _newest(participant_id: int) -> Subquery:
-    """The newest revision of every answered query of a participant."""
+def _newest(of_interest: ColumnElement[bool]) -> Subquery:
+    """The newest revision of every answered query of interest."""
     revisions = select(LabelEvent.query_id, func.max(LabelEvent.revision).label("revision"))
-    theirs = revisions.join(Query, Query.id == LabelEvent.query_id).where(Query.participant_id == participant_id)
-    return theirs.group_by(LabelEvent.query_id).subquery()
+    return (
+        revisions.join(Query, Query.id == LabelEvent.query_id)
+        .where(of_interest)
+        .group_by(LabelEvent.query_id)
+        .subquery()
+    )
 
 
 def _answered(
     session: Session, participant_id: int, purposes: Sequence[Purpose], options: Sequence[ExecutableOption]
 ) -> Sequence[Label]:
-    newest = _newest(participant_id)
+    newest = _newest(Query.participant_id == participant_id)
     rows = session.execute(
         select(Query, LabelEvent)
         .join(LabelEvent, LabelEvent.query_id == Query.id)

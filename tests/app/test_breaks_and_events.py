@@ -12,7 +12,7 @@ from sqlalchemy import select
 from app.db import Database
 from app.domain.participation import ParticipantEvent
 from app.domain.preferences import Purpose, Query, count_labels, current_answers, current_labels
-from app.domain.studies import Study
+from app.domain.studies import Participant, Study
 from app.services import participant_events
 from app.storage import ArtefactStore
 from tests import factories
@@ -84,7 +84,7 @@ def test_practice_is_stored_but_is_no_label_and_no_progress(
     assert (turn["practising"], turn["answered"], turn["wanted"], turn["undo_path"]) == (False, 0, 10, None)
     with database.reading() as session:
         assert current_labels(session, taking_part.participant.id) == []
-        assert count_labels(session, taking_part.participant.id) == 0
+        assert count_labels(session, select(Participant.id)) == {}
         assert len(current_answers(session, taking_part.participant.id)) == 1
 
 

@@ -2,7 +2,10 @@
 
 from uuid import uuid4
 
+from sqlalchemy import select
+
 from app.domain.preferences import count_labels
+from app.domain.studies import Participant
 from tests.app.conftest import TakingPart
 
 
@@ -64,7 +67,7 @@ def test_the_last_answer_of_the_study_can_be_taken_back_too(taking_part: TakingP
 def test_what_was_taken_back_is_not_counted_and_what_was_answered_again_counts_once(taking_part: TakingPart) -> None:
     def counted() -> int:
         with taking_part.database.reading() as session:
-            return count_labels(session, taking_part.participant.id)
+            return count_labels(session, select(Participant.id)).get(taking_part.participant.id, 0)
 
     taking_part.turn()
     taking_part.answer(taking_part.queries[0], "left")
