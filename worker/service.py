@@ -1,4 +1,4 @@
-"""The worker as a service: asks the database every half second what is to be done, and has the engine do it."""
+"""The worker as a service: looks every half second whether anything has changed, and has the engine do what is due."""
 
 import fcntl
 import logging
@@ -8,7 +8,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from functools import partial
 from pathlib import Path
 from types import FrameType
@@ -16,7 +16,7 @@ from types import FrameType
 from dbos import DBOS, SetWorkflowID
 from sqlalchemy.exc import OperationalError
 
-from app.db import Database
+from app.db import Database, Watch
 from app.domain.models import RunKind
 from app.domain.studies import StudySettings
 from app.errors import AppError
@@ -135,13 +135,18 @@ class _Rounds:
 
     def until(self, stop: threading.Event) -> None:
         """One round after the other; a database that is away for a while is waited for."""
-        while not stop.wait(ROUND_S):
-            try:
-                self._sign()
+        with closing(self._place.database.watch()) as watch:
+            while not stop.wait(ROUND_S):
+                self._look(watch)
+
+    def _look(self, watch: Watch) -> None:
+        try:
+            self._sign()  # a change as well, so that what is due for its time alone is found, too
+            if watch.changed():
                 self._round()
-                self._clear_away()
-            except OperationalError as error:
-                log.warning("the database could not be reached, trying again: %s", error.orig)
+            self._clear_away()
+        except OperationalError as error:
+            log.warning("the database could not be reached, trying again: %s", error.orig)
 
     def _sign(self) -> None:
         if time.monotonic() - self._signed_at >= PRESENCE_S:

@@ -1,0 +1,48 @@
+"""Who waits for changes sees everybody's, and nothing else."""
+
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+
+from sqlalchemy import select
+
+from app.db import Database
+from app.domain.studies import Study
+from app.settings import Settings
+from tests import factories
+
+
+def test_what_was_there_before_is_a_change_once(database: Database) -> None:
+    with closing(database.watch()) as watch:
+        assert [watch.changed(), watch.changed()] == [True, False]
+
+
+def test_reading_is_no_change_and_writing_is_one(database: Database) -> None:
+    with closing(database.watch()) as watch:
+        watch.changed()
+        with database.reading() as session:
+            assert session.scalars(select(Study)).all() == []
+        assert not watch.changed()
+        with database.writing() as session:
+            factories.make_study(session)
+        assert [watch.changed(), watch.changed()] == [True, False]
+
+
+def test_what_is_written_while_one_looks_is_seen_the_next_time(database: Database) -> None:
+    with closing(database.watch()) as watch:
+        watch.changed()
+        with database.writing() as session:
+            factories.make_study(session)
+            session.flush()
+            assert not watch.changed(), "not yet committed"
+        assert watch.changed()
+
+
+def test_another_process_s_changes_count(database: Database, settings: Settings) -> None:
+    with database.writing() as session:
+        factories.make_study(session)
+    with closing(database.watch()) as watch:
+        watch.changed()
+        with closing(sqlite3.connect(Path(settings.data_dir) / "studio.sqlite3")) as other, other:
+            other.execute("UPDATE study SET name = 'Renamed'")
+        assert watch.changed()
