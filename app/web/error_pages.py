@@ -12,7 +12,14 @@ from sqlalchemy.exc import OperationalError
 from starlette.exceptions import HTTPException
 
 from app.errors import AppError
-from app.web.deps import LANGUAGE_COOKIE, PARTICIPANT_COOKIE, LoginNeeded, NotYet, PasswordChangeDue
+from app.web.deps import (
+    EXPERIMENTER_COOKIE,
+    LANGUAGE_COOKIE,
+    PARTICIPANT_COOKIE,
+    LoginNeeded,
+    NotYet,
+    PasswordChangeDue,
+)
 from app.web.guard import HEADERS
 from app.web.templating import page
 from app.web.wording import Wording, preferred
@@ -115,10 +122,10 @@ def _answer(
         problem = {"title": title, "status": status, "detail": message}
         answer = JSONResponse(problem, status, media_type="application/problem+json")
     else:
-        known = wording is not None and PARTICIPANT_COOKIE in request.cookies and status != HTTPStatus.UNAUTHORIZED
-        onward_path = request.app.url_path_for("show_next") if known else None
+        known = (EXPERIMENTER_COOKIE if wording is None else PARTICIPANT_COOKIE) in request.cookies
+        onward = request.app.url_path_for("show_studies" if wording is None else "show_next")
         context = {"title": title, "message": message, "status": int(status), "wording": wording}
-        context |= {"onward_path": onward_path}
+        context |= {"onward_path": onward if known and status != HTTPStatus.UNAUTHORIZED else None}
         answer = page(request, "error.html", context, status)
     answer.headers.update(headers or {})
     return answer

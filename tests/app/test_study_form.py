@@ -122,6 +122,12 @@ def test_a_complaint_stands_beside_its_field_and_opens_its_group(
         assert session.scalars(select(Study)).all() == []
 
 
+def test_a_page_that_is_not_there_leads_back_to_the_studies(experimenter: TestClient) -> None:
+    answer = experimenter.get("/studies/nowhere")
+    assert answer.status_code == 404
+    assert 'href="/studies">All studies</a>' in answer.text
+
+
 def test_the_first_of_several_wrong_fields_is_one_link_away(experimenter: TestClient) -> None:
     form = typed(experimenter, seed="x", task="cooking", practice_pairs="x")
     answer = experimenter.post("/studies/new", data=form).text
