@@ -63,7 +63,7 @@ def queries(session: Session, study: Study) -> Rows:
         queries = {query.id: query for query in session.scalars(shown.options(*clips))}
         answers = _last_events(session, person)
         theirs = select(Model.id, Model.label_count).where(Model.participant_id == person.id)
-        seen = {model_id: labels for model_id, labels in session.execute(theirs)}  # noqa: C416  (dict() does not take typed rows)
+        seen = dict(session.execute(theirs).all())
         for query in queries.values():
             yield (
                 person.code,
