@@ -46,3 +46,13 @@ def test_another_process_s_changes_count(database: Database, settings: Settings)
         with closing(sqlite3.connect(Path(settings.data_dir) / "studio.sqlite3")) as other, other:
             other.execute("UPDATE study SET name = 'Renamed'")
         assert watch.changed()
+
+
+def test_who_watches_does_not_keep_erased_rows_in_the_files(database: Database) -> None:
+    with closing(database.watch()) as watch:
+        watch.changed()
+        assert database.forget_erased(), "the files could not be rewritten"
+        watch.changed()
+        with database.writing() as session:
+            factories.make_study(session)
+        assert watch.changed(), "still watching the rewritten file"
