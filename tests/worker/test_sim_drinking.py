@@ -106,7 +106,9 @@ def test_a_pellet_that_falls_into_the_mouth_is_drunk_once_with_its_speed(env: Dr
 
 def test_water_inside_the_cup_is_not_drunk_however_close_the_mouth(env: DrinkingEnv) -> None:
     env.reset(seed=2)
-    env._water.drink(env.particles[0], env._tool, env._tool_rotation)
+    reached = env._water.at_mouth(env.particles[0])
+    assert reached
+    env._water.drink(reached, env.particles[0], env._tool, env._tool_rotation)
     assert not env.step(STILL)[4]["delivered"]
 
 

@@ -44,7 +44,7 @@ def test_recorded_actions_replay_the_recorded_observations_bit_identically(env: 
 
 
 def test_the_reference_is_asked_in_the_same_states(env: FeedingEnv) -> None:
-    trajectory = rollout(env, wiggle, scenario=3, reference=lambda observation: observation[10:17])
+    trajectory = rollout(env, wiggle, scenario=3, reference=lambda observations: observations[:, 10:17])
     np.testing.assert_array_equal(trajectory.reference_actions, trajectory.observations[:-1, 10:17])
 
 

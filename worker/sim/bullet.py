@@ -314,7 +314,7 @@ class Bullet:
             self._bodies[name],
             range(count),
             pybullet.POSITION_CONTROL,
-            targetPositions=list(angles_rad),
+            targetPositions=np.asarray(angles_rad).tolist(),
             positionGains=[gain] * count,
             velocityGains=[1.0] * count,
             forces=[force_nm] * count,

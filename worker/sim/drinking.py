@@ -195,10 +195,11 @@ class DrinkingEnv(AssistiveEnv):
         target = self._driven_from + share * (self._driven_to - self._driven_from)
         self._world.drive_joints(ARM, target, POSITION_GAIN, MOTOR_FORCE_NM)
         cup_m, quaternion = self._world.carry(_INSIDE, ARM, CUP.name)
-        self._water.drink(self._target, cup_m, rotation_of(quaternion))
+        if reached := self._water.at_mouth(self._target):
+            self._water.drink(reached, self._target, cup_m, rotation_of(quaternion))
 
     def _outcome(self, motion: Motion) -> Outcome:
-        self._water.drink(self._target, self._tool, self._tool_rotation)
+        self._water.drink(self._water.at_mouth(self._target), self._target, self._tool, self._tool_rotation)
         return self._water.update(self._tool, self._tool_rotation, motion.touching)
 
     def _own_observation(self) -> dict[str, Any]:

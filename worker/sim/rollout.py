@@ -16,16 +16,16 @@ Act = Callable[[Array], Array]
 def rollout(env: AssistiveEnv, act: Act, scenario: int, reference: Act | None = None) -> Trajectory:
     """One whole episode. Whoever draws actions at random brings its own generator inside ``act``.
 
-    ``reference`` gives the frozen policy's mean in the same states; without it the executed actions stand in.
+    ``reference`` gives the frozen policy's means in the same states, (T, D) -> (T, 7); without it the executed actions
+    stand in.
     """
     observation, _ = env.reset(seed=scenario)
     observations, joints, particles = [observation], [env.joint_positions], [env.particles]
     heads, arms, targets = [env.head_quaternion], [env.arm_positions_rad], [env.target_m]
-    actions, references, signals, costs, rewards, forces = [], [], [], [], [], []
+    actions, signals, costs, rewards, forces = [], [], [], [], []
     over = False
     while not over:
         action = np.clip(np.asarray(act(observation), np.float32), -1.0, 1.0)
-        references.append(action if reference is None else reference(observation))
         observation, reward, terminated, truncated, info = env.step(action)
         over = terminated or truncated
         actions.append(action)
@@ -39,10 +39,11 @@ def rollout(env: AssistiveEnv, act: Act, scenario: int, reference: Act | None = 
         costs.append([info["costs"][name] for name in COSTS])
         rewards.append(reward)
         forces.append(info["contact_force_n"])
+    seen, executed = np.array(observations, np.float32), np.array(actions, np.float32)
     return Trajectory(
-        observations=np.array(observations, np.float32),
-        actions=np.array(actions, np.float32),
-        reference_actions=np.array(references, np.float32),
+        observations=seen,
+        actions=executed,
+        reference_actions=executed if reference is None else reference(seen[:-1]),
         signals=np.array(signals, np.float32),
         costs=np.array(costs, np.float32),
         task_rewards=np.array(rewards, np.float32),

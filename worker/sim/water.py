@@ -108,12 +108,16 @@ class Water:
         """(P, 3) m in the world after the last control step; NaN for pellets that were drunk or fell to the floor."""
         return self._positions.copy()
 
-    def drink(self, mouth_m: FloatArray, cup_m: FloatArray, rotation: FloatArray) -> None:
-        """Take what is at the mouth and outside the cup. To be called after every physics step: pellets are quick."""
+    def at_mouth(self, mouth_m: FloatArray) -> list[str]:
+        """What may be close enough to be drunk. To be asked after every physics step: pellets are quick."""
         if not self._to_drink:
-            return
+            return []
         reached = self._world.near(mouth_m.tolist(), DRUNK_WITHIN_M)
-        for name in [name for name in self._to_drink if name in reached]:
+        return [name for name in self._to_drink if name in reached]
+
+    def drink(self, names: Sequence[str], mouth_m: FloatArray, cup_m: FloatArray, rotation: FloatArray) -> None:
+        """Take those of these pellets that are at the mouth and outside the cup."""
+        for name in names:
             place = np.array(self._world.position(name))
             if math.dist(place, mouth_m) < DRUNK_WITHIN_M and not self._cup.contains((place - cup_m) @ rotation):
                 self._newly_drunk += 1
