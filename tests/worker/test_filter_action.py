@@ -1,6 +1,7 @@
 """The action filter: identity where it must be, the same in NumPy, torch and ONNX, and learned within bounds."""
 
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from worker.ml.action_filter import FilterWeights, build, state_of
 from worker.ml.adapter import REACH, ResidualAdapter
 from worker.ml.onnx_export import ExportDiffers, OnnxFilter, largest_difference, to_onnx
 from worker.ml.policy_module import FrozenPolicy
+from worker.modes import ApproachModes
 
 POLICY = invented.small_policy()
 SEEN = invented.observations(40, np.random.default_rng(0))
@@ -101,6 +103,16 @@ def test_the_exported_filter_takes_any_batch(exported: bytes, batch: int) -> Non
 def test_the_export_is_the_same_every_time(exported: bytes) -> None:
     module = build(FAMILY, POLICY, FilterWeights(mode=MODE, gate=0.7, encoder=adapter_state()))
     assert to_onnx(module, SEEN, MEANS) == exported
+
+
+def test_two_tasks_of_the_same_sizes_are_exported_each_by_its_own_rules(exported: bytes) -> None:
+    """A task that a lab adds may have as many axes and observations as another and still mean other things by them."""
+    assert isinstance(FAMILY, ApproachModes)
+    family = replace(FAMILY, detour_m=0.3)
+    module = build(family, POLICY, FilterWeights(mode=MODE, gate=0.7, encoder=adapter_state()))
+    stored = to_onnx(module, SEEN, MEANS)
+    assert largest_difference(stored, module, SEEN, MEANS) <= 1e-5
+    assert largest_difference(exported, module, SEEN, MEANS) > 0.01
 
 
 def test_an_export_that_differs_is_not_published(monkeypatch: pytest.MonkeyPatch) -> None:

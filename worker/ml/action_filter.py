@@ -120,6 +120,11 @@ class ActionFilter(nn.Module):
         self.transform = transform
         self.register_buffer("gate", torch.tensor(gate, dtype=torch.float32))
 
+    @property
+    def structure(self) -> object:
+        """What decides about the computation besides the weights and their shapes; can be hashed."""
+        return getattr(self.transform, "family", type(self.transform))
+
     def forward(self, observation: Tensor, policy_mean: Tensor) -> Tensor:
         """See the class."""
         change = self.transform(observation, policy_mean) - policy_mean
