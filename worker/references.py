@@ -1,8 +1,9 @@
-"""What filters are compared with, the reference policy's rollouts, made before the first filter needs them."""
+"""What the first filter would wait for, made beforehand: the reference policy's rollouts, and the graphs of exports."""
 
-from app.domain.studies import StudySettings
+from app.domain.studies import Method, StudySettings
 from worker import laboratory, lessons
 from worker.compute import Compute, Lane
+from worker.ml import filter_problem
 from worker.personalisation import CHUNK, reference_blocks
 from worker.trajectory import Trajectory
 
@@ -15,7 +16,10 @@ def make_ready(
     A filter that cannot wait makes its own meanwhile; the rest of them is then left out.
     Raises Interrupted when the worker stops, and ComputeLost when a process was killed.
     """
-    act = laboratory.reference_policy(task).mean
+    policy = laboratory.reference_policy(task)
+    if settings.method is Method.STUDIO:
+        filter_problem.trace(laboratory.task(task).modes, policy)
+    act = policy.mean
     for scenarios in reference_blocks(task, settings):
         key, made = (task, scenarios), list[Trajectory]()
         while key not in references and len(made) < len(scenarios):

@@ -238,3 +238,8 @@ def test_a_task_of_longer_episodes_gets_fewer_of_them_and_no_more_time() -> None
     assert [len(config.gate_block(task)) * task.episode_steps for task in (usual, long)] == [8000, 62 * 130]
     assert [len(config.residual_block(task, 0)) * task.episode_steps for task in (usual, long)] == [5000, 38 * 130]
     assert len(config.gate_block(replace(invented.TASK, episode_steps=50))) == 80
+
+
+def test_only_the_first_round_learns_from_nothing_and_takes_all_steps() -> None:
+    config = FilterConfig(value_steps=100, adapter_steps=20, later_share=0.5)
+    assert [config.learning_steps(number) for number in range(3)] == [(100, 20), (50, 10), (50, 10)]

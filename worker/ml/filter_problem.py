@@ -16,8 +16,10 @@ from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
+import torch
 
-from worker.ml.action_filter import FilterWeights, build
+from worker.ml.action_filter import FilterWeights, build, state_of
+from worker.ml.adapter import ResidualAdapter
 from worker.ml.onnx_export import OnnxFilter, to_onnx
 from worker.ml.policies import GaussianPolicy
 from worker.ml.reward_models import RewardModel
@@ -62,14 +64,18 @@ class FilterConfig:
     """largest accepted loss of success on the gate's scenarios, as a share of episodes"""
     force_limit_n: float = 10.0
     """largest accepted force on the person: 95 of 100 episodes must stay below it (or below the reference's own)"""
-    residual_rounds: int = 4
+    residual_rounds: int = 3
     """of residual learning; 0 leaves the residual out"""
     residual_rollouts: int = 50
     """of the current filter before each round, of USUAL_STEPS control steps; see residual_block()"""
     residual_noise: float = 0.1
     """standard deviation of what is added to their actions"""
     value_steps: int = 3000
+    """of fitted Q evaluation in the first round"""
     adapter_steps: int = 500
+    """of the encoder's ascent in the first round"""
+    later_share: float = 0.5
+    """so much of both in every later round, which goes on from the networks of the one before"""
     batch: int = 96
     preference_weight: float = 0.3
     """lambda: weight of the normalised value against squared distance in policy standard deviations"""
@@ -85,6 +91,11 @@ class FilterConfig:
     def residual_block(self, task: Task, number: int) -> range:
         """Scenarios in which the filter is rolled out before round ``number`` of residual learning."""
         return scenarios_for("residual", _affordable(self.residual_rollouts, task), 1000 * number)
+
+    def learning_steps(self, number: int) -> tuple[int, int]:
+        """Gradient steps of the value and of the encoder in round ``number``, from 0 on."""
+        share = self.later_share if number else 1.0
+        return max(1, round(share * self.value_steps)), max(1, round(share * self.adapter_steps))
 
     def bolder(self, factor: float) -> "FilterConfig":
         """The same with so many times the weight of the value."""
@@ -176,6 +187,13 @@ def noisy(act: Act, noise: float, seed: int, scenario: int) -> Act:
         return action + noise * rng.standard_normal(action.shape, np.float32)
 
     return act_with_noise
+
+
+def trace(family: ModeFamily, policy: GaussianPolicy) -> None:
+    """Export a mode without and with a residual, so that act_of() takes a hundredth of a second in this process."""
+    untrained = ResidualAdapter(torch.from_numpy(policy.offset), torch.from_numpy(policy.scale))
+    for encoder in ({}, state_of(untrained)):
+        act_of(family, policy, FilterWeights(encoder=encoder))
 
 
 def act_of(family: ModeFamily, policy: GaussianPolicy, weights: FilterWeights) -> FilterAct:

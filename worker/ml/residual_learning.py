@@ -96,9 +96,9 @@ def learn_round(problem: FilterProblem, draft: FilterDraft, rounds: Sequence[Seq
         here = _bases(networks, observations)
         return here.blended(networks.adapter(observations, here.actions, here.deviations))
 
-    steps = problem.config.value_steps
-    evaluate_filter(networks.value, networks.target, data, newest, current, steps, generator)
-    _ascend(problem.config, networks, data.observations, bases, generator)
+    value_steps, adapter_steps = problem.config.learning_steps(len(rounds) - 1)
+    evaluate_filter(networks.value, networks.target, data, newest, current, value_steps, generator)
+    _ascend(problem.config, networks, data.observations, bases, adapter_steps, generator)
     weights = draft.weights.changed(encoder=state_of(networks.adapter), residual_share=1.0)
     return replace(draft, weights=weights, value=state_of(networks.value)).timed("residual_learning", started)
 
@@ -192,7 +192,12 @@ def _bases(networks: _Networks, observations: Tensor) -> _Bases:
 
 
 def _ascend(
-    config: FilterConfig, networks: _Networks, observations: Tensor, bases: _Bases, generator: torch.Generator
+    config: FilterConfig,
+    networks: _Networks,
+    observations: Tensor,
+    bases: _Bases,
+    steps: int,
+    generator: torch.Generator,
 ) -> None:
     """Move the adapter's actions up the value, held back in units of the policy's own uncertainty."""
     value = networks.value
@@ -201,8 +206,8 @@ def _ascend(
     near = bases.take(sample)
     unit = spread_within_states(value, observations[sample], near.actions, near.deviations, generator)
     optimiser = torch.optim.Adam(networks.adapter.parameters(), 1e-3, fused=True)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, config.adapter_steps, 5e-5)
-    for _ in range(config.adapter_steps):
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps, 5e-5)
+    for _ in range(steps):
         rows = torch.randint(len(observations), (config.batch,), generator=generator)
         loss = _adapter_loss(config, networks, unit, observations[rows], bases.take(rows), generator)
         optimiser.zero_grad()
