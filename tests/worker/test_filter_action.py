@@ -1,6 +1,7 @@
 """The action filter: identity where it must be, the same in NumPy, torch and ONNX, and learned within bounds."""
 
 import pickle
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -113,6 +114,16 @@ def test_two_tasks_of_the_same_sizes_are_exported_each_by_its_own_rules(exported
     stored = to_onnx(module, SEEN, MEANS)
     assert largest_difference(stored, module, SEEN, MEANS) <= 1e-5
     assert largest_difference(exported, module, SEEN, MEANS) > 0.01
+
+
+def test_filters_of_several_tasks_can_be_exported_at_once() -> None:
+    """The worker traces graphs while people answer, and somebody's filter may be due meanwhile."""
+    assert isinstance(FAMILY, ApproachModes)
+    modules = [build(replace(FAMILY, press_m=each), POLICY, FilterWeights(mode=MODE)) for each in (0.05, 0.06)]
+    with ThreadPoolExecutor(2) as threads:
+        stored = list(threads.map(lambda module: to_onnx(module, SEEN, MEANS), modules))
+    for module, each in zip(modules, stored, strict=True):
+        assert largest_difference(each, module, SEEN, MEANS) <= 1e-5
 
 
 def test_an_export_that_differs_is_not_published(monkeypatch: pytest.MonkeyPatch) -> None:

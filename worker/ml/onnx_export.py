@@ -1,6 +1,7 @@
 """The filter as an ONNX file, checked against torch, and as a fast callable for rollouts."""
 
 import logging
+import threading
 import warnings
 from collections.abc import Sequence
 from typing import Any
@@ -22,6 +23,8 @@ OUTPUT = "action"
 LARGEST_DIFFERENCE = 1e-5
 
 _templates: dict[tuple[object, ...], onnx.ModelProto] = {}
+_tracing = threading.Lock()
+"""torch traces one module at a time; a filter that is due waits for a trace that was begun beforehand."""
 
 
 class ExportDiffers(RuntimeError):
@@ -38,8 +41,9 @@ def to_onnx(module: ActionFilter, observations: Array, policy_means: Array) -> b
     state = {name: tensor.detach().numpy() for name, tensor in module.state_dict().items()}
     shapes = tuple((name, array.shape) for name, array in sorted(state.items()))
     structure = (module.structure, shapes)
-    if structure not in _templates:
-        _templates[structure] = _template(_trace(module, observations[:2], policy_means[:2]), list(state))
+    with _tracing:
+        if structure not in _templates:
+            _templates[structure] = _template(_trace(module, observations[:2], policy_means[:2]), list(state))
     model = onnx.ModelProto()
     model.CopyFrom(_templates[structure])
     model.graph.initializer.extend(onnx.numpy_helper.from_array(state[name], name) for name in sorted(state))
