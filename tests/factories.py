@@ -39,6 +39,7 @@ def make_study(session: Session, name: str = "Feeding at home", **settings: Any)
         "random_share": 0.5,
         "filter_milestones": (),
         "answer_after_first_play": False,
+        "clip_quality": "quick",
     }
     return studies.create_study(session, name, StudySettings(**{**usual, **settings}), seed=7)
 

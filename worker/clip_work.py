@@ -32,7 +32,8 @@ def _film(place: Workplace, run_id: int, study_id: int, scenario: int, which: li
         study = session.get_one(Study, study_id)
         task, settings = study.task, study.settings
     behaviours = laboratory.behaviours(task, scenario, settings.behaviours_per_scenario)
-    shots = [(task, scenario, behaviours[index], 0, settings.clip_steps) for index in which]
+    quality = settings.clip_quality.value
+    shots = [(task, quality, scenario, behaviours[index], 0, settings.clip_steps) for index in which]
     recorded = place.compute.run_all(Lane.CLIPS, place.beat(run_id), laboratory.record_clip, shots)
     for index, each in zip(which, recorded, strict=True):
         rollout = {
@@ -50,9 +51,10 @@ def _film(place: Workplace, run_id: int, study_id: int, scenario: int, which: li
 def _film_whole(place: Workplace, run_id: int, study_id: int, scenario: int, which: list[int]) -> None:
     """The same rollouts again, from beginning to end."""
     with place.database.reading() as session:
-        steps = session.get_one(Study, study_id).whole_clip_steps or 0
+        study = session.get_one(Study, study_id)
+        steps, quality = study.whole_clip_steps or 0, study.settings.clip_quality.value
         rollouts = records.rollouts_of(session, study_id, scenario, which)
-    shots = [(place.store.read(rollout.trajectory_sha256), 0, steps) for rollout in rollouts]
+    shots = [(quality, place.store.read(rollout.trajectory_sha256), 0, steps) for rollout in rollouts]
     filmed = place.compute.run_all(Lane.CLIPS, place.beat(run_id), laboratory.film_again, shots)
     for rollout, each in zip(rollouts, filmed, strict=True):
         clip = _stored(place, each, steps)

@@ -11,7 +11,7 @@ from typing import TypeAlias, get_args
 
 from app.db import Database
 from app.domain.protocol import EvaluationSettings
-from app.domain.studies import PAPER_PROTOCOL, Method, RewardKind, Strategy, StudySettings
+from app.domain.studies import PAPER_PROTOCOL, ClipQuality, Method, RewardKind, Strategy, StudySettings
 from app.settings import Settings
 from app.storage import ArtefactStore
 from worker import benchmark, exploration, foresight, import_work, laboratory, pretraining, rehearsal, service
@@ -300,6 +300,7 @@ def _settings(options: argparse.Namespace) -> StudySettings:
         "reward_kind": options.reward,
         "strategy": options.strategy,
         "pooled_prior": options.pooled_prior,
+        "clip_quality": ClipQuality.QUICK,  # nobody looks at them
     }
     if not options.paper:
         return StudySettings(**chosen)

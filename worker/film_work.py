@@ -83,12 +83,13 @@ def _film(place: Workplace, run_id: int, job: Job, shots: list[list[Any]]) -> No
     task = _task(place, job)
     robots = {method: _robot(place, run_id, job, task, method) for method in dict.fromkeys(each[0] for each in shots)}
     with place.database.reading() as session:
+        quality = session.get_one(Study, job.study_id).settings.clip_quality.value
         missing = [
             (robots[method], scenario)
             for method, scenario in shots
             if evaluating.film_of(session, job.participant, method, scenario, robots[method].model_id) is None
         ]
-    arguments = [(task, robot.controller, scenario) for robot, scenario in missing]
+    arguments = [(task, quality, robot.controller, scenario) for robot, scenario in missing]
     recorded = place.compute.run_all(Lane.CLIPS, place.beat(run_id), laboratory.film, arguments)
     files = [_stored(place, each) for each in recorded]
     with place.database.writing() as session:

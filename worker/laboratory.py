@@ -19,8 +19,9 @@ from worker.ml.policies import GaussianPolicy
 from worker.ml.signal_predictor import SignalPredictor
 from worker.sim.assistive import AssistiveEnv
 from worker.sim.catalogue import ENVIRONMENTS
-from worker.sim.render import ClipRenderer, RenderedClip
+from worker.sim.render import STYLES, ClipRenderer, RenderedClip
 from worker.sim.rollout import rollout
+from worker.sim.scene import Scene
 from worker.tasks import Task
 from worker.trajectory import Array, Trajectory
 
@@ -60,7 +61,7 @@ class RecordedClip:
 def warm_up() -> None:
     """Import and build what making clips needs, so that the first clip comes quickly."""
     environment("feeding")
-    renderer()
+    renderer("sharp")
 
 
 def environment_class(name: str) -> type[AssistiveEnv]:
@@ -82,9 +83,15 @@ def environment(name: str) -> AssistiveEnv:
 
 
 @cache
-def renderer() -> ClipRenderer:
-    """This process' renderer."""
-    return ClipRenderer()
+def renderer(quality: str) -> ClipRenderer:
+    """This process' renderer of clips in a quality."""
+    return ClipRenderer(STYLES[quality], scene=_scene())
+
+
+@cache
+def _scene() -> Scene:
+    """Meshes and drawing clients, which take most of a renderer's memory: one set for every quality."""
+    return Scene()
 
 
 def checkpoints(name: str) -> Path:
@@ -152,29 +159,32 @@ def _in_mode(of: Task, base: Act, mode: Array) -> Act:
     return act
 
 
-def record_clip(name: str, scenario: int, behaviour: Behaviour, first_step: int, step_count: int) -> RecordedClip:
+def record_clip(
+    name: str, quality: str, scenario: int, behaviour: Behaviour, first_step: int, step_count: int
+) -> RecordedClip:
     """Run the scenario in some behaviour and render the stretch of it that participants will see."""
     trajectory = rollout(environment(name), act_as(name, behaviour), scenario, reference_policy(name).mean)
     target = io.BytesIO()
     trajectory.save(target)
     return RecordedClip(
-        target.getvalue(), trajectory.success, renderer().render_clip(trajectory, first_step, step_count)
+        target.getvalue(), trajectory.success, renderer(quality).render_clip(trajectory, first_step, step_count)
     )
 
 
-def film(name: str, controller: bytes, scenario: int) -> RecordedClip:
+def film(name: str, quality: str, controller: bytes, scenario: int) -> RecordedClip:
     """Run a whole episode as a controller (see worker.ml.controller) acts, and render all of it."""
     from worker.ml.run_controller import Controller  # processes that never film controllers do without its runtime
 
     trajectory = rollout(environment(name), Controller(controller), scenario, reference_policy(name).mean)
     target = io.BytesIO()
     trajectory.save(target)
-    return RecordedClip(target.getvalue(), trajectory.success, renderer().render_clip(trajectory, 0, len(trajectory)))
+    clip = renderer(quality).render_clip(trajectory, 0, len(trajectory))
+    return RecordedClip(target.getvalue(), trajectory.success, clip)
 
 
-def film_again(trajectory: bytes, first_step: int, step_count: int) -> RenderedClip:
+def film_again(quality: str, trajectory: bytes, first_step: int, step_count: int) -> RenderedClip:
     """Another stretch of a rollout that was recorded before."""
-    return renderer().render_clip(Trajectory.load(io.BytesIO(trajectory)), first_step, step_count)
+    return renderer(quality).render_clip(Trajectory.load(io.BytesIO(trajectory)), first_step, step_count)
 
 
 @lru_cache(maxsize=4)

@@ -55,6 +55,13 @@ class RewardKind(StrEnum):
     PREFERENCE_TRANSFORMER = "preference_transformer"
 
 
+class ClipQuality(StrEnum):
+    """How finely clips are drawn."""
+
+    SHARP = "sharp"
+    QUICK = "quick"
+
+
 class Strategy(StrEnum):
     """How the pairs to compare are chosen."""
 
@@ -79,6 +86,7 @@ class StudySettings(BaseModel):
         le=max(LONGEST_CLIP_STEPS.values()),
         description="Control steps shown, from the start (10 Hz).",
     )
+    clip_quality: ClipQuality = ClipQuality.SHARP
     pool_scenarios: int = Field(default=48, ge=1, le=500)
     behaviours_per_scenario: int = Field(default=6, ge=2, le=8)
     strategy: Strategy = Strategy.ENTROPY

@@ -26,7 +26,7 @@ from app.storage import ArtefactStore
 SEEDS_LISTED = 50
 """Of participants; those of later ones follow by the same rule."""
 
-OF_CLIPS = ("clip_steps", "behaviours_per_scenario")
+OF_CLIPS = ("clip_steps", "clip_quality", "behaviours_per_scenario")
 OF_PAIRS = ("labels_per_participant", "practice_pairs", "introduction_pairs", "repeated_pairs", "catch_pairs")
 OF_EVALUATION = ("evaluation",)
 

@@ -65,6 +65,7 @@ class StudyForm(BaseModel):
     pool_scenarios: _Text = ""
     behaviours_per_scenario: _Text = ""
     clip_steps: _Text = ""
+    clip_quality: _Text = ""
     seed: _Text = ""
     planned_tests: _Several = []
     reason: _Lines = ""
@@ -98,6 +99,7 @@ _WORDS = (
     "return_url",
     "panel_parameter",
     "advisor",
+    "clip_quality",
 )
 _SWITCHES = ("pooled_prior", "answer_after_first_play", "debrief")
 _ITEMS = ("demographics", "questionnaire")

@@ -21,7 +21,7 @@ def test_filming_loads_neither_torch_nor_the_engine_nor_the_database() -> None:
 
 def test_a_recorded_clip_shows_the_scenario_and_mode_it_was_asked_for() -> None:
     behaviour = Behaviour({"speed_far": 0.3, "to_side": 0.5})
-    recorded = laboratory.record_clip("feeding", 10_000_001, behaviour, 0, 20)
+    recorded = laboratory.record_clip("feeding", "quick", 10_000_001, behaviour, 0, 20)
     trajectory = Trajectory.load(io.BytesIO(recorded.trajectory))
     assert trajectory.scenario == 10_000_001
     assert recorded.success == trajectory.success

@@ -291,7 +291,7 @@ def test_whole_episodes_are_filmed_of_the_rollouts_that_are_there(
             session.delete(clip)
     filmed: list[tuple[bytes, int, int]] = []
 
-    def film(trajectory: bytes, first_step: int, step_count: int) -> RenderedClip:
+    def film(_quality: str, trajectory: bytes, first_step: int, step_count: int) -> RenderedClip:
         filmed.append((trajectory, first_step, step_count))
         return RenderedClip(b"video", b"poster", 640, 480, 15, step_count, 100 * step_count)
 

@@ -12,26 +12,29 @@ from worker.sim import layers
 from worker.sim.arm import Tool
 from worker.sim.camera import scene_camera
 from worker.sim.catalogue import ENVIRONMENTS
+from worker.sim.close_up import close_up
 from worker.sim.feeding import SPOON, FeedingEnv
-from worker.sim.geometry import Shape
+from worker.sim.geometry import Shape, rotation_of
 from worker.sim.highlight import Highlight
-from worker.sim.human import RIGHT
+from worker.sim.human import BROAD, RIGHT
 from worker.sim.jaco import JACO
 from worker.sim.motion import clip_motion
-from worker.sim.render import INSET_MARGIN_PX, ClipRenderer, RenderStyle
-from worker.sim.scratching import ScratchingEnv
+from worker.sim.render import INSET_MARGIN_PX, STYLES, ClipRenderer
+from worker.sim.scratching import SCRATCHER, ScratchingEnv
 from worker.sim.shots import Shot
 from worker.sim.stage import Stage
 from worker.sim.task_look import LOOKS
 from worker.trajectory import Trajectory
 
 Picture = npt.NDArray[np.uint8]
+QUICK = STYLES["quick"]
+PLAIN = replace(QUICK, inset=False)
 FILMED = {**ENVIRONMENTS, ScratchingEnv.task.name: ScratchingEnv}
 
 
 @pytest.fixture(scope="module")
 def renderer() -> Iterator[ClipRenderer]:
-    renderer = ClipRenderer(environments=FILMED)
+    renderer = ClipRenderer(QUICK, FILMED)
     yield renderer
     renderer.close()
 
@@ -64,6 +67,48 @@ def test_a_clip_reports_what_it_holds(renderer: ClipRenderer) -> None:
     assert clip.poster.startswith(b"\xff\xd8")
 
 
+def test_a_sharp_clip_shows_the_same_in_more_pixels_and_pictures(renderer: ClipRenderer) -> None:
+    sharp = ClipRenderer(STYLES["sharp"], FILMED)
+    trajectory = waving_trajectory(2)
+    clip, first = sharp.render_clip(trajectory, 0, 2), next(sharp.pictures(trajectory, 0, 1)).resize((640, 480))
+    sharp.close()
+    assert (clip.width, clip.height, clip.fps, clip.n_frames) == (960, 720, 25, 5)
+    assert different(np.asarray(first), film(renderer, trajectory)[0], by=40).mean() < 0.01
+
+
+def test_the_close_up_looks_the_person_in_the_face_wherever_it_turns(renderer: ClipRenderer) -> None:
+    for turn_rad in (-0.5, 0.0, 0.5):
+        trajectory = waving_trajectory(1)
+        turn = np.array([0.0, 0.0, np.sin(turn_rad / 2), np.cos(turn_rad / 2)])
+        trajectory.head_quaternions[:] = turn
+        pivot = np.array(BROAD.neck_pivot_m)
+        trajectory.target_m[:] = pivot + rotation_of(turn) @ BROAD.mouth_from_neck_m
+        motion = clip_motion(trajectory, JACO, SPOON, 0, 1, 15)
+        camera = close_up(LOOKS["feeding"], motion, 312, 228)
+        towards = np.array(camera.eye_m) - camera.target_m
+        out_of_the_face = rotation_of(turn) @ [0.0, -1.0, 0.0]
+        assert towards @ out_of_the_face / np.linalg.norm(towards) > np.cos(np.radians(40))
+        assert (camera.pixels(motion.target_m[0]) - [156, 114]) / [156, 114] == pytest.approx([0, 0], abs=0.4)
+
+
+def test_two_clips_of_a_scenario_are_seen_from_the_same_place() -> None:
+    for task, tool in (("feeding", SPOON), ("scratching", SCRATCHER)):
+        first = itching_trajectory(3) if task == "scratching" else waving_trajectory(3)
+        other = replace(first, joint_positions=first.joint_positions + np.float32(0.1))
+        cameras = {close_up(LOOKS[task], clip_motion(each, JACO, tool, 0, 3, 15), 208, 152) for each in (first, other)}
+        assert len(cameras) == 1
+
+
+def test_what_lies_behind_a_camera_is_not_drawn_and_what_reaches_behind_it_is_drawn_whole() -> None:
+    camera = scene_camera(LOOKS["feeding"], 640, 480)
+    ahead, eye = np.array(camera.target_m), np.array(camera.eye_m)
+    behind = 2 * eye - ahead
+    boxes = camera.boxes(np.array([[ahead, ahead], [behind, behind], [ahead, behind], [[np.nan] * 3] * 2]))
+    assert boxes[0] == pytest.approx([318.5, 238.5, 321.5, 241.5])
+    assert boxes[1].tolist() == boxes[3].tolist() == [0, 0, 0, 0]
+    assert boxes[2].tolist() == [0, 0, 640, 480]
+
+
 def test_rendering_twice_gives_identical_bytes(renderer: ClipRenderer) -> None:
     trajectory = waving_trajectory(5)
     first = renderer.render_clip(trajectory, 0, 5)
@@ -81,7 +126,7 @@ def test_nothing_of_other_clips_remains(renderer: ClipRenderer) -> None:
     first = [film(renderer, trajectory) for trajectory in trajectories]
     for trajectory, before in reversed(list(zip(trajectories, first, strict=True))):
         assert all((now == then).all() for now, then in zip(film(renderer, trajectory), before, strict=True))
-    fresh = ClipRenderer(environments=FILMED)
+    fresh = ClipRenderer(QUICK, FILMED)
     assert (film(fresh, trajectories[2])[1] == first[2][1]).all()
     fresh.close()
 
@@ -122,7 +167,7 @@ def test_two_skin_tones_differ_in_the_face_only_and_share_the_still_picture(
 
     monkeypatch.setattr(layers.View, "still", noted)
     dark = film(renderer, waving_trajectory(1, skin_tone=5))[0]
-    assert drawn == [renderer.style.inset_width]
+    assert drawn == [renderer.style.inset_size[0]]
     trajectory = waving_trajectory(1)
     assert different(light, dark, by=60)[around(trajectory.target_m[0] + [0.03, 0.0, 0.0])].mean() > 0.5
     assert not different(light, dark)[200:300, :200].any()
@@ -173,10 +218,10 @@ def test_a_task_nobody_designed_a_look_for_is_filmed_all_the_same() -> None:
     class CombingEnv(FeedingEnv):
         tool = Tool("comb", (0.13, 0, 0), (-np.pi / 2, 0, 0), (Shape.box((0, 0, 0), (0.06, 0.03, 0.03)),), 0.03)
 
-    renderer = ClipRenderer(RenderStyle(inset=False), {"combing": CombingEnv})
+    renderer = ClipRenderer(PLAIN, {"combing": CombingEnv})
     with_comb = film(renderer, replace(waving_trajectory(1), task="combing"))[0]
     renderer.close()
-    renderer = ClipRenderer(RenderStyle(inset=False))
+    renderer = ClipRenderer(PLAIN)
     with_spoon = film(renderer, waving_trajectory(1))[0]
     renderer.close()
     comb = clip_motion(waving_trajectory(1), JACO, CombingEnv.tool, 0, 1, 15).frames[0, -1, :3, 3]
@@ -204,7 +249,7 @@ def test_turning_the_head_moves_the_face_and_leaves_the_arm(renderer: ClipRender
 
 
 def test_a_style_without_inset_shows_the_room_in_the_corner() -> None:
-    plain = ClipRenderer(RenderStyle(inset=False))
+    plain = ClipRenderer(PLAIN)
     picture = pictures(plain, steps=1)[0]
     plain.close()
     assert picture[:30, :30].std(axis=(0, 1)).max() < 6

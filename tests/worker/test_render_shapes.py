@@ -8,7 +8,7 @@ import pytest
 from worker.sim import arm_look, body_look, chair_look, head_look, human, limb_look, tool_look
 from worker.sim.arm import Tool
 from worker.sim.colours import COMPLEXIONS, Palette, ramps
-from worker.sim.drinking import CUP
+from worker.sim.drinking import CUP, PELLETS, pellet_radius_m, resting_places_m
 from worker.sim.feeding import SPOON
 from worker.sim.geometry import Shape
 from worker.sim.human import BODY_SHAPES, BROAD, BodyShape
@@ -16,6 +16,7 @@ from worker.sim.jaco import JACO
 from worker.sim.meshes import Mesh, ball, curve, gradient, joined, openness, panel, surface, tube, without_hidden
 from worker.sim.scratching import SCRATCHER
 from worker.sim.solids import Field, box, carve, cone, cylinder, ellipsoid, sphere, torus, union
+from worker.sim.task_look import LOOKS
 from worker.trajectory import SKIN_TONES
 
 BALL = sphere((0.0, 0.0, 0.0), 0.1)
@@ -128,10 +129,25 @@ def test_full_light_is_not_wrapped_around_to_darkness() -> None:
     assert coordinates[0, 1] > coordinates[1, 1]
 
 
-def test_the_mouth_is_open_wide_enough_for_the_spoon() -> None:
-    mouth = head_look.MOUTH
-    bowl_edges = mouth + np.array([[0.019, -0.005, 0.0], [-0.019, -0.005, 0.0], [0, 0.02, 0.008], [0, 0.02, -0.004]])
-    assert (head_look.face()(bowl_edges) > 0).all()
+def test_the_mouth_is_open_wide_enough_for_the_spoon_and_no_wider_for_a_cup_or_nothing() -> None:
+    middle, features = head_look.MOUTH, head_look.FEATURES["broad"]
+    bowl_edges = middle + np.array([[0.019, -0.005, 0.0], [-0.019, -0.005, 0.0], [0, 0.02, 0.008], [0, 0.02, -0.004]])
+    assert (head_look.face(features, LOOKS["feeding"].mouth)(bowl_edges) > 0).all()
+    below_the_rim = middle + np.array([[0.0, 0.0, -0.009]])
+    assert (head_look.face(features, LOOKS["drinking"].mouth)(below_the_rim) < 0).all()
+    assert (head_look.face(features, LOOKS["scratching"].mouth)(middle + np.array([[0.0, 0.004, 0.004]])) < 0).all()
+
+
+def test_the_cup_is_cut_out_for_the_nose_and_whole_where_it_is_drunk_from() -> None:
+    for mesh in (tool_look.cup(arm_look.Detail(Palette())), tool_look.cup_glass(arm_look.Detail(Palette()))):
+        x, y, z = (mesh.vertices - tool_look.CUP_CENTRE_M).T
+        angle = np.arctan2(np.abs(y), x)
+        assert z[angle < 0.5].max() == pytest.approx(0.0, abs=0.004)
+        assert z[angle > 2.9].max() == pytest.approx(-tool_look.NOSE_CUT_M, abs=0.004)
+
+
+def test_water_in_a_level_cup_stays_below_the_cut() -> None:
+    assert resting_places_m(PELLETS)[:, 2].max() + pellet_radius_m(PELLETS) < -tool_look.NOSE_CUT_M + 0.002
 
 
 def test_the_mirror_image_of_a_mesh_still_faces_outwards() -> None:
@@ -225,7 +241,7 @@ def _finger_gap(detail: arm_look.Detail) -> tuple[float, float]:
 
 @pytest.mark.parametrize("body", BODY_SHAPES.values(), ids=lambda body: body.name)
 def test_the_same_code_always_makes_the_same_head(body: BodyShape) -> None:
-    first, second = head_look.head_mesh(body, Palette()), head_look.head_mesh(body, Palette())
+    first, second = (head_look.head_mesh(body, head_look.EATING, Palette()) for _ in range(2))
     assert (first.vertices == second.vertices).all()
     assert (first.faces == second.faces).all()
     assert np.isfinite(first.vertices).all()

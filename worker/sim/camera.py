@@ -92,6 +92,19 @@ class Camera:
         device = device[..., :2] / device[..., 3:]
         return np.asarray((device * [1, -1] + 1) / 2 * [self.width, self.height])
 
+    def boxes(self, corners_m: Array) -> Array:
+        """Boxes (K, 4) in pixels around corners (K, C, 3): the whole picture around what reaches behind the camera,
+
+        and nothing around what lies there wholly, or is NaN.
+        """
+        depth_m = -(corners_m @ self.view[2, :3] + self.view[2, 3])
+        inside = depth_m > self.near_m
+        pixels = self.pixels(np.where(inside[..., None], corners_m, np.asarray(self.target_m)))
+        boxes = np.concatenate([pixels.min(axis=-2) - 1.5, pixels.max(axis=-2) + 1.5], axis=-1)
+        boxes[inside.any(axis=-1) & ~inside.all(axis=-1)] = 0, 0, self.width, self.height
+        boxes[~inside.any(axis=-1)] = 0.0
+        return np.asarray(boxes)
+
     def pixels_per_m(self, point_m: Array) -> float:
         """How large things appear at a point."""
         distance = -float((self.view @ np.append(point_m, 1.0))[2])
@@ -104,9 +117,24 @@ def flat(matrix: Array) -> Sequence[float]:
     return numbers
 
 
+NEAR_M, FAR_M = 0.05, 6.0
+
+
 def scene_camera(look: TaskLook, width: int, height: int) -> Camera:
     """The camera of a task's film."""
-    return Camera(look.eye_m, look.target_m, look.field_of_view_deg, width, height, 0.05, 6.0)
+    return Camera(look.eye_m, look.target_m, look.field_of_view_deg, width, height, NEAR_M, FAR_M)
+
+
+CLOSE_UP_DISTANCE_M = 0.9
+"""Far enough that nothing between camera and person is cut off, and that a face keeps its proportions."""
+
+
+def close_up_camera(centre_m: Array, towards: Array, span_m: float, width: int, height: int) -> Camera:
+    """A camera that looks at a point against a direction (unit vector); ``span_m`` is the height of what it shows."""
+    x, y, z = (centre_m + CLOSE_UP_DISTANCE_M * towards).tolist()
+    field_of_view_deg = 2 * math.degrees(math.atan(span_m / 2 / CLOSE_UP_DISTANCE_M))
+    target_m = (float(centre_m[0]), float(centre_m[1]), float(centre_m[2]))
+    return Camera((x, y, z), target_m, field_of_view_deg, width, height, NEAR_M, FAR_M)
 
 
 LIGHT_CENTRE_M = np.array([-0.25, -0.15, 0.55])

@@ -23,7 +23,7 @@ Ramp = tuple[Colour, ...]
 RAMPS: dict[str, Ramp] = {
     "tongue": ((0.78, 0.40, 0.40), (0.66, 0.28, 0.30)),
     "teeth": ((0.97, 0.96, 0.93),),
-    "eye": ((0.98, 0.98, 0.97),),
+    "eye": ((0.93, 0.925, 0.91),),
     "pupil": ((0.06, 0.05, 0.05),),
     "shirt": ((0.50, 0.63, 0.76), (0.43, 0.56, 0.70)),
     "shirt_trim": ((0.40, 0.53, 0.67),),
@@ -80,8 +80,8 @@ COMPLEXIONS = (
     Complexion((0.92, 0.74, 0.62), (0.74, 0.42, 0.40), _CHESTNUT, _BROWN_EYES),
     Complexion((0.84, 0.64, 0.49), (0.66, 0.37, 0.33), _BROWN, _BROWN_EYES),
     Complexion((0.71, 0.51, 0.37), (0.56, 0.31, 0.27), _DARK_BROWN, _DARK_EYES),
-    Complexion((0.54, 0.37, 0.26), (0.43, 0.23, 0.20), _BLACK, _DARK_EYES),
-    Complexion((0.39, 0.26, 0.19), (0.41, 0.205, 0.19), _BLACK, _DARK_EYES),
+    Complexion((0.565, 0.39, 0.28), (0.47, 0.255, 0.225), _BLACK, _DARK_EYES),
+    Complexion((0.46, 0.312, 0.232), (0.46, 0.235, 0.215), _BLACK, _DARK_EYES),
 )
 """One per skin tone, from the lightest to the darkest."""
 

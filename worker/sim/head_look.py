@@ -1,4 +1,4 @@
-"""How the person's head looks: a friendly face and an open mouth. Landmarks come from human.py.
+"""How the person's head looks: a calm face, its mouth as open as a task wants it. Landmarks come from human.py.
 
 Head frame: origin at the neck pivot, z up, the face looks along -y. Heads are made at the broad body's size and scaled.
 """
@@ -29,7 +29,20 @@ from worker.sim.solids import (
 
 MOUTH = np.asarray(BROAD.mouth_from_neck_m)
 LIPS = MOUTH + np.array([0.0, -0.0005, 0.0])
-LIP_RADII = (0.0260, 0.0155)
+
+
+@dataclass(frozen=True)
+class Mouth:
+    """How far the lips are apart: half the width and half the height of the line along their middle, in metres."""
+
+    name: str
+    half_width_m: float
+    half_height_m: float
+
+
+EATING = Mouth("eating", 0.0265, 0.0125)
+SIPPING = Mouth("sipping", 0.0250, 0.0070)
+CLOSED = Mouth("closed", 0.0265, 0.0034)
 
 EYE = np.array([0.0325, -0.0735, 0.1155])
 EYE_RADIUS = 0.0165
@@ -72,8 +85,8 @@ def skull(features: Features) -> Field:
     )
 
 
-def face(features: Features = FEATURES["broad"]) -> Field:
-    """The skin of the head with nose, ears, lips and an open mouth."""
+def face(features: Features, mouth: Mouth) -> Field:
+    """The skin of the head with nose, ears, lips and what is behind them."""
     solid = union(
         skull(features),
         sphere((0, -0.0715, 0.0020), features.chin),
@@ -84,24 +97,26 @@ def face(features: Features = FEATURES["broad"]) -> Field:
     solid = union(solid, _nose(features.nose), blend=0.012)
     solid = union(solid, cone((0, 0.006, -0.004), (0, 0.006, 0.070), *features.neck), blend=0.022)
     solid = union(solid, mirrored(_ear()), blend=0.007)
-    solid = union(solid, _lips(), blend=0.009)
-    return carve(solid, mouth_cavity(), blend=0.004)
+    solid = union(solid, _lips(mouth), blend=0.009)
+    return carve(solid, mouth_cavity(mouth), blend=0.004)
 
 
-def mouth_cavity() -> Field:
+def mouth_cavity(mouth: Mouth) -> Field:
+    """What is carved out between the lips."""
     x, y, z = LIPS
-    return _smiling(ellipsoid((x, y + 0.022, z), (LIP_RADII[0] - 0.0022, 0.050, LIP_RADII[1] - 0.0020)))
+    radii = (mouth.half_width_m - 0.0022, 0.050, mouth.half_height_m - 0.0020)
+    return _smiling(ellipsoid((x, y + 0.022, z), radii))
 
 
-def _lips() -> Field:
+def _lips(mouth: Mouth) -> Field:
     """The upper lip dips in the middle and is thinner than the lower one."""
-    ring = torus((LIPS[0], LIPS[1], LIPS[2]), LIP_RADII, 0.0)
+    ring = torus((LIPS[0], LIPS[1], LIPS[2]), (mouth.half_width_m, mouth.half_height_m), 0.0)
 
     def distance(points: Array) -> Array:
         height = points[:, 2] - LIPS[2]
         dip = np.exp(-((points[:, 0] / 0.0045) ** 2)) * smooth_step(height, 0.0, 0.012)
         thickness = 0.0074 - 0.0012 * smooth_step(height, -0.008, 0.008) - 0.0012 * dip
-        corner = smooth_step(np.abs(points[:, 0]), 0.014, LIP_RADII[0])
+        corner = smooth_step(np.abs(points[:, 0]), 0.014, mouth.half_width_m)
         return np.asarray(ring(points) - thickness * (1 - 0.35 * corner))
 
     return _smiling(distance)
@@ -112,7 +127,7 @@ def _smiling(field: Field) -> Field:
 
     def distance(points: Array) -> Array:
         bend = points[:, 0] ** 2
-        return field(points - np.column_stack([0 * bend, 4.5 * bend, 5.0 * bend]))
+        return field(points - np.column_stack([0 * bend, 4.5 * bend, 9.0 * bend]))
 
     return distance
 
@@ -132,14 +147,14 @@ def _ear() -> Field:
     return carve(lobe, ellipsoid((0.0870, 0.0110, 0.1010), (0.0065, 0.0110, 0.0190), turn), blend=0.006)
 
 
-def head_mesh(body: BodyShape, palette: Palette) -> Mesh:
+def head_mesh(body: BodyShape, mouth: Mouth, palette: Palette) -> Mesh:
     """The whole head as one mesh."""
     features = FEATURES[body.name]
-    skin_field, hair_field = face(features), HAIR[body.name]()
+    skin_field, hair_field = face(features, mouth), HAIR[body.name]()
     whole = union(skin_field, hair_field)
-    skin = surface(skin_field, LOWER, UPPER, CELL_M, lambda points: palette.along("skin", _complexion(points)))
+    skin = surface(skin_field, LOWER, UPPER, CELL_M, lambda points: palette.along("skin", _complexion(points, mouth)))
     skin = softly_lit(whole, without_hidden(skin, hair_field, 0.002), 0.020)
-    skin = skin.shaded(_cavity_light(skin.vertices) * skin.paint[:, 1])
+    skin = skin.shaded(_cavity_light(skin.vertices, mouth) * skin.paint[:, 1])
     locks = surface(
         hair_field,
         LOWER,
@@ -149,15 +164,15 @@ def head_mesh(body: BodyShape, palette: Palette) -> Mesh:
     )
     locks = softly_lit(whole, without_hidden(locks, skin_field, 0.002), 0.02)
     eyes = _eyes(palette, features.lashes)
-    parts = [skin, locks, *eyes, *_brows(palette, features.brows), *_inside_mouth(palette)]
+    parts = [skin, locks, *eyes, *_brows(palette, features, mouth), *_inside_mouth(palette, mouth)]
     return joined(*parts).scaled(body.head_scale)
 
 
-def _complexion(points: Array) -> Array:
+def _complexion(points: Array, mouth: Mouth) -> Array:
     """Where each point of the skin lies on the ramp from skin over blush and lips to the inside of the mouth (N,)."""
-    lips = 0.66 * (1.0 - smooth_step(_lips()(points), 0.0012, 0.0032))
+    lips = 0.66 * (1.0 - smooth_step(_lips(mouth)(points), 0.0012, 0.0032))
     depth = points[:, 1] - LIPS[1] - 4.5 * points[:, 0] ** 2
-    inside = smooth_step(-mouth_cavity()(points), -0.0018, 0.0) * smooth_step(depth, -0.003, 0.003)
+    inside = smooth_step(-mouth_cavity(mouth)(points), -0.0018, 0.0) * smooth_step(depth, -0.003, 0.003)
     cheek = _spot(np.abs(points) * [1, -1, 1], (0.041, -0.068, 0.074), 0.024)
     nose = _spot(points, (0, -0.114, 0.086), 0.014)
     ear = smooth_step(np.abs(points[:, 0]), 0.076, 0.088)
@@ -170,22 +185,25 @@ def _spot(points: Array, centre: tuple[float, float, float], radius: float) -> A
     return np.asarray(np.exp(-(((points - np.array(centre)) ** 2).sum(axis=1)) / radius**2))
 
 
-def _cavity_light(points: Array) -> Array:
+def _cavity_light(points: Array, mouth: Mouth) -> Array:
     """The mouth gets dark with depth (N,)."""
     depth = smooth_step(points[:, 1], LIPS[1] - 0.001, LIPS[1] + 0.022)
-    return np.where(mouth_cavity()(points) < 0.004, 1.0 - 0.8 * depth, 1.0)
+    return np.where(mouth_cavity(mouth)(points) < 0.004, 1.0 - 0.8 * depth, 1.0)
 
 
-def _inside_mouth(palette: Palette) -> list[Mesh]:
-    """Upper teeth and tongue."""
+def _inside_mouth(palette: Palette, mouth: Mouth) -> list[Mesh]:
+    """Upper teeth and tongue, where they can be seen."""
+    if mouth.half_height_m < EATING.half_height_m:
+        return []
     x, y, z = LIPS
-    arch = [(x + 0.0195 * np.sin(a), y + 0.022 - 0.0175 * np.cos(a), z + 0.0124) for a in np.linspace(-1.25, 1.25, 13)]
+    upper, lower = z + mouth.half_height_m - 0.0031, z - mouth.half_height_m - 0.0010
+    arch = [(x + 0.0195 * np.sin(a), y + 0.022 - 0.0175 * np.cos(a), upper) for a in np.linspace(-1.25, 1.25, 13)]
     path = np.array(arch)
     teeth = tube(path, np.full(len(path), 0.0034), 8, np.full(len(path), palette.at("teeth")))
     tongue = surface(
-        ellipsoid((x, y + 0.029, z - 0.0165), (0.0160, 0.023, 0.0068)),
-        (-0.03, y - 0.01, z - 0.03),
-        (0.03, y + 0.06, z + 0.01),
+        ellipsoid((x, y + 0.029, lower), (0.0160, 0.023, 0.0068)),
+        (-0.03, y - 0.01, lower - 0.0135),
+        (0.03, y + 0.06, lower + 0.0265),
         0.003,
         palette.at("tongue", 0.3),
     )
@@ -215,7 +233,7 @@ def _eyeball(palette: Palette, centre: Array, gaze: Array) -> Mesh:
     return joined(ball.shaded(0.55 + 0.45 * upper), dot)
 
 
-UPPER_LID = (np.array([0.0, 0.34, -1.0]), 0.0062)
+UPPER_LID = (np.array([0.0, 0.34, -1.0]), 0.0046)
 """Outward normal of the plane that ends the lid, and how far above the middle of the eye's front it lies."""
 
 
@@ -242,19 +260,20 @@ def _lashes(palette: Palette, centre: Array, normal: Array, offset: float, radiu
     return tube(line, thick * (0.0013 * np.cos(sweep) + 0.0005), 6, np.full(len(line), palette.at("hair", 0.0)))
 
 
-def _brows(palette: Palette, thick: float) -> list[Mesh]:
-    field = face()
+def _brows(palette: Palette, features: Features, mouth: Mouth) -> list[Mesh]:
+    field = face(features, mouth)
     meshes = []
     for side in (-1.0, 1.0):
         points = curve(
             [
                 (side * x, -0.095, z)
-                for x, z in ((0.0165, 0.1425), (0.0290, 0.1475), (0.0420, 0.1475), (0.0545, 0.1410))
+                for x, z in ((0.0170, 0.1384), (0.0290, 0.1420), (0.0420, 0.1418), (0.0545, 0.1365))
             ],
             14,
         )
         points = _onto(field, points)
-        width = np.interp(np.linspace(0, 1, 14), [0, 0.2, 0.6, 1], [0.0026, 0.0036, 0.0032, 0.0010]) * thick
+        width = np.interp(np.linspace(0, 1, 14), [0, 0.2, 0.6, 1], [0.0024, 0.0033, 0.0030, 0.0010])
+        width *= features.brows
         # Thick along the skin, thin out of it.
         meshes.append(tube(points, np.column_stack([width * 0.62, width]), 8, np.full(14, palette.at("hair", 0.25))))
     return meshes

@@ -36,11 +36,18 @@ from worker.sim.stage import Stage
 
 STILL_LAMP_SIZE, MOVING_LAMP_SIZE = 640, 176
 
+STILL_SHADOW_BLUR_M, MOVING_SHADOW_BLUR_M, SKIN_SHADOW_BLUR_M = 0.002, 0.0036, 0.003
+"""Radius of a shadow's soft edge; of moving ones on a grid of half the picture's."""
 EDGE_BLUR_PX = 0.3
 """Smooths the edges of moving parts for less than half of what more pixels would cost."""
 CLEAR_SHARPNESS = 0.64
 """Water and glass are drawn on a coarser grid: the one is blurred anyway, the other is faint."""
 GLASS_OPACITY = 0.34
+
+BACKDROP = (190, 203, 200)
+"""Where a close-up sees past the room's two walls."""
+BEYOND_DEPTH = 0.99999
+"""Nothing is drawn deeper: the software renderer leaves slightly less than 1 where it draws nothing."""
 
 HEAD_RADIUS_M = 0.20
 """Everything of head and arms this close to the middle of the head is head or neck."""
@@ -58,18 +65,22 @@ class Portrait(NamedTuple):
 
 
 class View:
-    """A part of the camera's picture, drawn at its own size."""
+    """What one camera sees."""
 
-    def __init__(self, camera: Camera, rectangle: Rectangle, width: int, height: int, fine: Supersampling) -> None:
-        self._camera, self._rectangle, self._supersampling = camera, rectangle, fine
-        self.width, self.height = width, height
-        self._zoom = float(width / (rectangle[2] - rectangle[0]))
+    def __init__(self, camera: Camera, fine: Supersampling) -> None:
+        self._camera, self._supersampling = camera, fine
+        self.width, self.height = camera.width, camera.height
+        self._whole = (0.0, 0.0, float(camera.width), float(camera.height))
+        self._pixels_per_m = camera.pixels_per_m(np.asarray(camera.target_m))
         self._portraits: dict[Rectangle, Portrait] = {}
 
     def still(self, stage: Stage) -> Shot:
         """What never moves, drawn to be kept for many clips."""
         share = self._supersampling.still
-        return photograph(stage, self._camera, self._rectangle, round(self.width * share), round(self.height * share))
+        shot = photograph(stage, self._camera, self._whole, round(self.width * share), round(self.height * share))
+        beyond = shot.depth > BEYOND_DEPTH
+        shot.lit[beyond] = shot.shadowed[beyond] = BACKDROP
+        return shot
 
     def start(self, still: Shot, resting: Sequence[Part], itch_m: Array | None, lamp_depth: Depth) -> None:
         """Prepare a clip: add what rests during it, cast the still shadows, make the tables for the moving ones."""
@@ -80,15 +91,15 @@ class View:
         share = self._supersampling.moving
         self._depth = resampled(shot.depth, round(self.height * share), round(self.width * share))
         depth = resampled(shot.depth, self.height, self.width)
-        texel, limit = seen_from_lamp(self._camera, self._rectangle, depth, STILL_LAMP_SIZE)
+        texel, limit = seen_from_lamp(self._camera, self._whole, depth, STILL_LAMP_SIZE)
         dark = (lamp_depth.ravel()[texel] < limit).reshape(depth.shape)
         dark &= ~resampled(bright, self.height, self.width)
-        mask = as_mask(dark).filter(ImageFilter.BoxBlur(max(1.0, 0.7 * self._zoom)))
+        mask = as_mask(dark).filter(ImageFilter.BoxBlur(STILL_SHADOW_BLUR_M * self._pixels_per_m))
         self._background, dim = self._reduced(shot.lit), self._reduced(shot.shadowed)
         self._background.paste(dim, (0, 0), mask)
         self._background_shadowed = ImageChops.darker(dim, self._background)
         coarse = resampled(shot.depth, self.height // 2, self.width // 2)
-        self._texel, self._limit = seen_from_lamp(self._camera, self._rectangle, coarse, MOVING_LAMP_SIZE)
+        self._texel, self._limit = seen_from_lamp(self._camera, self._whole, coarse, MOVING_LAMP_SIZE)
 
     def frame(self, frame: Frame) -> Image.Image:
         """One picture."""
@@ -96,7 +107,7 @@ class View:
         self._cast_shadows(picture, frame.lamp_depth)
         covered = []
         for part in frame.parts:
-            for pixels in cover(self._own_pixels(part.boxes), self.width, self.height):
+            for pixels in cover(self._camera.boxes(part.corners_m), self.width, self.height):
                 if part.prepare:
                     part.prepare()
                 place = _on_grid_of(self._supersampling.moving, pixels)
@@ -112,25 +123,14 @@ class View:
         """Supersampled colours as a picture of this view's size."""
         return Image.fromarray(colours).resize((self.width, self.height), Image.Resampling.HAMMING)
 
-    def _own_pixels(self, boxes: Array) -> Array:
-        """Boxes (K, 4) of the whole picture in this view's pixels."""
-        left, top = self._rectangle[:2]
-        return np.asarray((boxes - [left, top, left, top]) * self._zoom)
-
-    def _part(self, pixels: Pixels) -> Rectangle:
-        """A rectangle of this view in pixels of the whole picture."""
-        left, top = self._rectangle[:2]
-        x0, y0, x1, y1 = (value / self._zoom for value in pixels)
-        return left + x0, top + y0, left + x1, top + y1
-
     def _add(self, shot: Shot, part: Part, itch_m: Array | None, bright: npt.NDArray[np.bool_]) -> None:
         """Draw a part into the still picture, and note in ``bright`` (h, w) where no still shadow falls."""
-        boxes = self._own_pixels(part.boxes)
+        boxes = self._camera.boxes(part.corners_m)
         whole = np.concatenate([boxes[:, :2].min(axis=0), boxes[:, 2:].max(axis=0)])
         left, top, right, bottom = pixels = on_grid(whole, self.width, self.height)
         if right <= left or bottom <= top:
             return
-        rectangle, place = self._part(pixels), _on_grid_of(self._supersampling.still, pixels)
+        rectangle, place = _as_rectangle(pixels), _on_grid_of(self._supersampling.still, pixels)
         height, width = shot.depth[place].shape
         own = photograph(part.stage, self._camera, rectangle, width, height)
         if part.alive and itch_m is not None:
@@ -150,7 +150,7 @@ class View:
         margin = 8
         x0, y0 = max(0, found[0] - margin), max(0, found[1] - margin)
         x1, y1 = min(self.width // 2, found[2] + margin), min(self.height // 2, found[3] + margin)
-        soft = mask.crop((x0, y0, x1, y1)).filter(ImageFilter.BoxBlur(max(2.0, 1.4 * self._zoom)))
+        soft = mask.crop((x0, y0, x1, y1)).filter(ImageFilter.BoxBlur(MOVING_SHADOW_BLUR_M * self._pixels_per_m))
         full = (2 * x0, 2 * y0, 2 * x1, 2 * y1)
         soft = soft.resize((full[2] - full[0], full[3] - full[1]), Image.Resampling.BILINEAR)
         picture.paste(self._background_shadowed.crop(full), full[:2], soft)
@@ -158,8 +158,8 @@ class View:
     def _layer(self, part: Part, pixels: Pixels, place: tuple[slice, slice], frame: Frame) -> Image.Image:
         """What is visible of a part in a rectangle; what is not clear hides whatever is drawn after it behind it."""
         size = (pixels[2] - pixels[0], pixels[3] - pixels[1])
-        rectangle, before = self._part(pixels), self._depth[place]
-        if part.drops_px or part.glass:
+        rectangle, before = _as_rectangle(pixels), self._depth[place]
+        if part.drops_m or part.glass:
             return self._clear(part, rectangle, size, before)
         height, width = before.shape
         if part.alive:
@@ -179,7 +179,7 @@ class View:
         layer = as_layer(rgba, depth < resampled(before, height, width))
         if not part.glass:
             for _ in range(2):
-                layer = layer.filter(ImageFilter.BoxBlur(0.42 * part.drops_px * self._zoom * share))
+                layer = layer.filter(ImageFilter.BoxBlur(0.42 * part.drops_m * self._pixels_per_m * share))
         layer = layer.resize(size, Image.Resampling.BICUBIC).convert("RGBA")
         layer.putalpha(layer.getchannel("A").point(_GLASS_ALPHA if part.glass else _WATER_ALPHA))
         return layer
@@ -197,13 +197,20 @@ class View:
                 skin.mark_itch(portrait.rgba[..., :3], portrait.depth, self._camera, rectangle, frame.itch_m)
         colours = portrait.rgba.copy()
         dark = (frame.lamp_depth.ravel()[portrait.texel] < portrait.limit).reshape(portrait.coarse)
-        skin.shade(colours[..., :3], as_mask(dark), 1.5 * self._zoom * self._supersampling.moving)
+        skin.shade(
+            colours[..., :3], as_mask(dark), SKIN_SHADOW_BLUR_M * self._pixels_per_m * self._supersampling.moving
+        )
         return colours, portrait.depth
 
 
 _WATER_ALPHA = [round(min(1.0, max(0.0, (alpha / 255 - 0.34) / 0.30)) * 245) for alpha in range(256)]
 """Opacity of water for each opacity of its blurred balls."""
 _GLASS_ALPHA = [round(GLASS_OPACITY * alpha) for alpha in range(256)]
+
+
+def _as_rectangle(pixels: Pixels) -> Rectangle:
+    left, top, right, bottom = pixels
+    return float(left), float(top), float(right), float(bottom)
 
 
 def _on_grid_of(supersampling: float, pixels: Pixels) -> tuple[slice, slice]:

@@ -11,16 +11,16 @@ from PIL import Image
 
 from worker.sim import video
 from worker.sim.assistive import AssistiveEnv
-from worker.sim.camera import Camera, Rectangle, scene_camera
+from worker.sim.camera import Camera, scene_camera
 from worker.sim.catalogue import ENVIRONMENTS
+from worker.sim.close_up import close_up
 from worker.sim.highlight import Highlight
 from worker.sim.layers import View
 from worker.sim.motion import clip_motion, frame_count
 from worker.sim.scene import Scene
 from worker.sim.shoot import Person, Shoot, moving_lamp_depth, moving_parts, still_lamp_depth
 from worker.sim.shots import Depth, Frame, Shot, Supersampling
-from worker.sim.solids import Array
-from worker.sim.task_look import task_look
+from worker.sim.task_look import TaskLook, task_look
 from worker.trajectory import Trajectory
 
 STILL_PICTURES = 4
@@ -32,16 +32,28 @@ ANTI_ALIASED = Supersampling(still=1.5, moving=1.0)
 
 @dataclass(frozen=True)
 class RenderStyle:
-    """How clips look."""
+    """How clips look. Sides of the picture are multiples of 80, so that everything falls on whole pixels."""
 
-    fps: int = 15
-    width: int = 640
-    height: int = 480
+    fps: int = 25
+    width: int = 960
+    height: int = 720
     supersampling: Supersampling = ANTI_ALIASED
     inset: bool = True
-    inset_width: int = 208
-    inset_height: int = 156
     highlight_pressing: bool = True
+
+    @property
+    def inset_size(self) -> tuple[int, int]:
+        """Width and height of the close-up in the corner, a third of the picture's."""
+        return self.width // 80 * 26, self.height // 60 * 19 // 2 * 2
+
+    @property
+    def scale(self) -> float:
+        """How large fixed marks are drawn, relative to a picture 640 pixels wide."""
+        return self.width / 640
+
+
+STYLES = {"sharp": RenderStyle(), "quick": RenderStyle(fps=15, width=640, height=480)}
+"""By the name of a study's clip quality. A quick clip takes about a third of a sharp one's time."""
 
 
 @dataclass(frozen=True)
@@ -70,11 +82,15 @@ class ClipRenderer:
     """Draws clips of any task one after the other. What it draws it makes when it is first needed, and keeps."""
 
     def __init__(
-        self, style: RenderStyle = RenderStyle(), environments: Mapping[str, type[AssistiveEnv]] = ENVIRONMENTS
+        self,
+        style: RenderStyle = RenderStyle(),
+        environments: Mapping[str, type[AssistiveEnv]] = ENVIRONMENTS,
+        scene: Scene | None = None,
     ) -> None:
+        """``scene``: one that several renderers of a process draw from, by turns."""
         self.style = style
         self._environments = environments
-        self._scene = Scene()
+        self._scene = scene or Scene()
         self._stills: OrderedDict[tuple[str, str], Still] = OrderedDict()
 
     def close(self) -> None:
@@ -105,14 +121,14 @@ class ClipRenderer:
         kit = self._scene.kit(trajectory.task, env.robot, env.tool, look)
         kit.take(motion.particles_m.shape[1])
         sitter = self._scene.sitter(motion.body)
-        sitter.sit(motion.skin_tone, kit.base)
-        camera = scene_camera(look, self.style.width, self.style.height)
-        yield from self._film(Shoot(camera, look, kit, sitter, motion), trajectory.task)
+        sitter.sit(motion.skin_tone, look.mouth, kit.base)
+        yield from self._film(Shoot(look, kit, sitter, motion), trajectory.task)
 
     def _film(self, shoot: Shoot, task: str) -> Iterator[Image.Image]:
         style, motion = self.style, shoot.motion
-        main, still = self._main_view(shoot, task)
-        inset = self._inset(shoot) if style.inset else None
+        camera = scene_camera(shoot.look, style.width, style.height)
+        main, still = self._main_view(camera, task, shoot.sitter.body.name)
+        inset = View(close_up(shoot.look, motion, *style.inset_size), style.supersampling) if style.inset else None
         inset_still = inset.still(self._scene.stages.still) if inset else None
         person = Person(shoot, self._scene.stages.still)
         lamp_depth = np.minimum(still.lamp_depth, person.lamp_depth())
@@ -121,22 +137,19 @@ class ClipRenderer:
         if inset and inset_still:
             inset.start(inset_still, resting, itch_m, lamp_depth)
         force_n = motion.force_n if style.highlight_pressing else np.zeros(len(motion))
-        highlight = Highlight(shoot.camera, force_n, motion.frames[:, -1, :3, 3], motion.target_m)
+        highlight = Highlight(camera, force_n, motion.frames[:, -1, :3, 3], motion.target_m, style.scale)
         for index, parts in enumerate(moving_parts(shoot)):
             itch_m = motion.target_m[index] if shoot.look.itch else None
             frame = Frame([*person.moving(index), *parts], moving_lamp_depth(shoot.kit), itch_m)
             picture = main.frame(frame)
             highlight.draw(picture, index)
             if inset:
-                near = frame._replace(parts=[part for part in frame.parts if part.stage is not shoot.kit.upper])
-                _paste_inset(picture, inset.frame(near), shoot.look.inset_on_right, highlight.border(index))
+                _paste_inset(picture, inset.frame(frame), shoot.look, highlight.border(index), style.scale)
             yield picture
 
-    def _main_view(self, shoot: Shoot, task: str) -> tuple[View, Still]:
+    def _main_view(self, camera: Camera, task: str, body: str) -> tuple[View, Still]:
         """The whole picture, and what never moves in it, from memory if it was drawn lately."""
-        style, key = self.style, (task, shoot.sitter.body.name)
-        whole = (0.0, 0.0, float(style.width), float(style.height))
-        view = View(shoot.camera, whole, style.width, style.height, style.supersampling)
+        view, key = View(camera, self.style.supersampling), (task, body)
         if key not in self._stills:
             still = self._scene.stages.still
             self._stills[key] = Still(view.still(still), still_lamp_depth(still))
@@ -145,27 +158,15 @@ class ClipRenderer:
             self._stills.popitem(last=False)
         return view, self._stills[key]
 
-    def _inset(self, shoot: Shoot) -> View:
-        style, look = self.style, shoot.look
-        width, height = style.inset_width / look.inset_zoom, style.inset_height / look.inset_zoom
-        rectangle = _around(shoot.camera, shoot.motion.target_m[0], (width, height), look.inset_focus)
-        return View(shoot.camera, rectangle, style.inset_width, style.inset_height, style.supersampling)
-
 
 INSET_MARGIN_PX, INSET_BORDER_PX = 11, 3
+"""In a picture 640 pixels wide."""
 
 
-def _paste_inset(picture: Image.Image, inset: Image.Image, on_right: bool, border: tuple[int, int, int]) -> None:
-    edge, y = INSET_BORDER_PX, INSET_MARGIN_PX
-    x = picture.width - inset.width - y if on_right else y
+def _paste_inset(
+    picture: Image.Image, inset: Image.Image, look: TaskLook, border: tuple[int, int, int], scale: float
+) -> None:
+    edge, y = round(INSET_BORDER_PX * scale), round(INSET_MARGIN_PX * scale)
+    x = picture.width - inset.width - y if look.inset_on_right else y
     picture.paste(border, (x - edge, y - edge, x + inset.width + edge, y + inset.height + edge))
     picture.paste(inset, (x, y))
-
-
-def _around(camera: Camera, target_m: Array, size: tuple[float, float], focus: tuple[float, float]) -> Rectangle:
-    """A part of the picture of this size with the target at these shares of its width and height."""
-    x, y = camera.pixels(target_m).tolist()
-    width, height = size
-    left = min(max(0.0, x - focus[0] * width), camera.width - width)
-    top = min(max(0.0, y - focus[1] * height), camera.height - height)
-    return left, top, left + width, top + height

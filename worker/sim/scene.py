@@ -10,6 +10,7 @@ from worker.sim import arm_look, body_look, chair_look, head_look, human, limb_l
 from worker.sim.arm import Robot, Tool
 from worker.sim.arm_look import Grip
 from worker.sim.geometry import rotation_of
+from worker.sim.head_look import Mouth
 from worker.sim.human import BodyShape
 from worker.sim.meshes import Mesh, ball
 from worker.sim.motion import quaternions
@@ -27,6 +28,8 @@ class Sitter:
 
     def __init__(self, body: BodyShape, stages: "Stages") -> None:
         self.body, self._stages = body, stages
+        self.head_names = ("", "")
+        """head and neck; the head's, once somebody sits, by how open the mouth is"""
         palette, chair = stages.paints.palette, chair_look.chair(body)
         trunk, cloth = body_look.trunk(body), body_look.BUILDS[body.name].cloth
         self._trunk = self._named(
@@ -36,15 +39,19 @@ class Sitter:
             }
         )
         self._arms = self._named(limb_look.arm_meshes(body, palette, cloth, union(trunk, chair)))
-        head = {"head": head_look.head_mesh(body, palette), "neck": body_look.neck_mesh(body, palette)}
-        self._head = self._named(head)
-        stages.still.add({**self._trunk, **self._arms, **self._head})
+        self._heads = self._named({"neck": body_look.neck_mesh(body, palette)})
+        stages.still.add({**self._trunk, **self._arms, **self._heads})
 
     def _named(self, meshes: Mapping[str, Mesh]) -> dict[str, Mesh]:
         return {f"{self.body.name}_{name}": mesh for name, mesh in meshes.items()}
 
-    def sit(self, skin_tone: int, base: str) -> None:
+    def sit(self, skin_tone: int, mouth: Mouth, base: str) -> None:
         """Take the place of any other sitter, beside this base of a robot; head and arms are still out of sight."""
+        self.head_names = f"{self.body.name}_head_{mouth.name}", f"{self.body.name}_neck"
+        if self.head_names[0] not in self._heads:
+            head = {self.head_names[0]: head_look.head_mesh(self.body, mouth, self._stages.paints.palette)}
+            self._heads.update(head)
+            self._stages.still.add(head)
         shown = [*self._stages.room, base, *self._trunk]
         for stage in (self._stages.still, *self._stages.if_made("alive")):
             stage.hide_all_but(shown)
@@ -60,11 +67,6 @@ class Sitter:
         stage.place(neck)
         turned = stage.corners_m(head) @ rotation_of(quaternion).T + np.array(self.body.neck_pivot_m)
         return corners_around(np.concatenate([turned, stage.corners_m(neck)]))[None]
-
-    @property
-    def head_names(self) -> tuple[str, str]:
-        """Head and neck."""
-        return f"{self.body.name}_head", f"{self.body.name}_neck"
 
     def pose_arm(self, stage: Stage, side: int, arm_rad: Array) -> Array:
         """Pose the right or left arm, and give the corners (2, 8, 3) in the world of boxes around its two segments."""
@@ -83,7 +85,7 @@ class Sitter:
 
     def alive(self, names: Sequence[str]) -> Stage:
         """The stage for what moves of persons during a clip, with these parts on it."""
-        stage, parts = self._stages.alive, {**self._arms, **self._head}
+        stage, parts = self._stages.alive, {**self._arms, **self._heads}
         stage.add({name: parts[name] for name in names})
         stage.repaint(self._skin_tone)
         return stage

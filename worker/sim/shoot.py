@@ -6,14 +6,14 @@ from functools import partial
 
 import numpy as np
 
-from worker.sim.camera import Camera, lamp
+from worker.sim.camera import lamp
 from worker.sim.human import LEFT, RIGHT
 from worker.sim.layers import MOVING_LAMP_SIZE, STILL_LAMP_SIZE
 from worker.sim.motion import Motion, quaternions
 from worker.sim.scene import UPPER_LINKS, Kit, Sitter
 from worker.sim.shots import BODY_LIGHT, DEPTH_ONLY, Depth, Part
 from worker.sim.solids import Array
-from worker.sim.stage import GONE_M, Stage
+from worker.sim.stage import CUBE, Stage
 from worker.sim.task_look import TaskLook
 
 HOLD_RAD = 0.0025
@@ -22,18 +22,12 @@ HOLD_RAD = 0.0025
 
 @dataclass(frozen=True)
 class Shoot:
-    """Who and what is filmed in one clip, and from where."""
+    """Who and what is filmed in one clip."""
 
-    camera: Camera
     look: TaskLook
     kit: Kit
     sitter: Sitter
     motion: Motion
-
-    def boxes(self, corners_m: Array) -> Array:
-        """Boxes (..., 4) in pixels around corners (..., 8, 3)."""
-        pixels = self.camera.pixels(corners_m)
-        return np.concatenate([pixels.min(axis=-2) - 1.5, pixels.max(axis=-2) + 1.5], axis=-1)
 
 
 class Person:
@@ -57,19 +51,19 @@ class Person:
         """What rests during the clip. Everything else is out of sight from now on."""
         shoot, sitter = self._shoot, self._shoot.sitter
         shown: list[str] = []
-        boxes: list[Array] = []
+        corners_m: list[Array] = []
         for side in (RIGHT, LEFT):
             if side not in self._moving:
                 shown += sitter.arm_names(side)
-                boxes.append(self._arms[side])
+                corners_m.append(self._arms[side])
         if not shoot.motion.head_moves:
             shown += sitter.head_names
-            boxes.append(self._head)
+            corners_m.append(self._head)
         self._stage.hide_all_but(shown)
-        if not boxes:
+        if not corners_m:
             return []
-        corners, head_m = np.concatenate(boxes), self._head[0].mean(axis=0)
-        return [Part(self._stage, shoot.boxes(corners), BODY_LIGHT, alive=True, head_m=head_m)]
+        head_m = self._head[0].mean(axis=0)
+        return [Part(self._stage, np.concatenate(corners_m), BODY_LIGHT, alive=True, head_m=head_m)]
 
     def moving(self, index: int) -> list[Part]:
         """What of the person moves, posed for a frame."""
@@ -86,43 +80,38 @@ class Person:
         if self._held is None or np.abs(state - self._held).max() > HOLD_RAD:
             self._held, self._pose = state, self._pose + 1
             stage.hide_all_but(names)
-            corners = [sitter.pose_arm(stage, side, motion.arms_rad[index, side]) for side in self._moving]
+            corners_m = [sitter.pose_arm(stage, side, motion.arms_rad[index, side]) for side in self._moving]
             if motion.head_moves:
-                corners.append(sitter.turn_head(stage, motion.head_quaternions[index]))
-            self._boxes = self._shoot.boxes(np.concatenate(corners))
-        return [Part(stage, self._boxes, BODY_LIGHT, alive=True, pose=self._pose)]
+                corners_m.append(sitter.turn_head(stage, motion.head_quaternions[index]))
+            self._corners_m = np.concatenate(corners_m)
+        return [Part(stage, self._corners_m, BODY_LIGHT, alive=True, pose=self._pose)]
 
 
 def moving_parts(shoot: Shoot) -> Iterator[list[Part]]:
     """The robot, its tool and the particles, posed frame by frame."""
     kit, motion = shoot.kit, shoot.motion
     turned = np.einsum("nlij,lcj->nlci", motion.frames[..., :3, :3], kit.corners_m)
-    links = shoot.boxes(turned + motion.frames[:, :, None, :3, 3])
-    drops_px = kit.radius_m * shoot.camera.pixels_per_m(motion.target_m[0])
-    particles = _particle_boxes(shoot, 1.5 * drops_px + 2.0)
+    links_m = turned + motion.frames[:, :, None, :3, 3]
     turns = quaternions(motion.frames[..., :3, :3]).tolist()
     places = motion.frames[..., :3, 3].tolist()
     for index in range(len(motion)):
         for part in range(len(kit.names)):
             kit.place(part, places[index][part], turns[index][part])
         kit.place_particles(motion.particles_m[index])
-        upper, near = Part(kit.upper, links[index, :UPPER_LINKS]), links[index, UPPER_LINKS:]
+        upper, near_m = Part(kit.upper, links_m[index, :UPPER_LINKS]), links_m[index, UPPER_LINKS:]
+        particles_m = _around(motion.particles_m[index], kit.radius_m)
         if shoot.look.water:
             show_glass = partial(kit.place_glass, places[index][-1], turns[index][-1])
-            water = Part(kit.particles, particles[index], prepare=kit.show_water, drops_px=drops_px)
-            glass = Part(kit.particles, links[index, -1:], prepare=show_glass, glass=True)
-            yield [upper, Part(kit.forearm, near), water, *([glass] if kit.glass else [])]
+            water = Part(kit.particles, particles_m, prepare=kit.show_water, drops_m=kit.radius_m)
+            glass = Part(kit.particles, links_m[index, -1:], prepare=show_glass, glass=True)
+            yield [upper, Part(kit.forearm, near_m), water, *([glass] if kit.glass else [])]
         else:
-            yield [upper, Part(kit.forearm, np.concatenate([near, particles[index]]))]
+            yield [upper, Part(kit.forearm, np.concatenate([near_m, particles_m]))]
 
 
-def _particle_boxes(shoot: Shoot, reach_px: float) -> Array:
-    """Boxes around every particle in every frame (N, P, 4), in pixels; an empty box when it is gone."""
-    particles = shoot.motion.particles_m
-    gone = np.asarray(np.isnan(particles).any(axis=-1))
-    centre = shoot.camera.pixels(np.where(gone[..., None], GONE_M, particles))
-    boxes = np.concatenate([centre - reach_px, centre + reach_px], axis=-1)
-    return np.where(gone[..., None], 0.0, boxes)
+def _around(centres_m: Array, radius_m: float) -> Array:
+    """Corners (P, 8, 3) of boxes around balls (P, 3), with room for water's blur."""
+    return np.asarray(centres_m[:, None] + 1.5 * radius_m * CUBE)
 
 
 def moving_lamp_depth(kit: Kit) -> Depth:

@@ -48,10 +48,11 @@ class Shot(NamedTuple):
 
 
 class Part(NamedTuple):
-    """A stage with boxes (K, 4) that hold it, in pixels of the whole picture, and how it is drawn."""
+    """A stage with the corners (K, 8, 3) of boxes in the world around what it shows, and how it is drawn."""
 
     stage: Stage
-    boxes: Array
+    corners_m: Array
+    """NaN around what is gone"""
     light: Lighting = MACHINE_LIGHT
     prepare: Callable[[], None] | None = None
     """called before drawing, by parts that share a stage"""
@@ -59,8 +60,8 @@ class Part(NamedTuple):
     """part of the person: the robot's shadow falls on it, and an itch on it shows"""
     pose: int = 0
     """a number for each pose of a part of the person; while it stays the same, the part is not drawn anew"""
-    drops_px: float = 0.0
-    """water: the radius in pixels of the whole picture of the balls that are drawn as one body"""
+    drops_m: float = 0.0
+    """water: the radius of the balls that are drawn as one body"""
     glass: bool = False
     head_m: Array | None = None
     """where the person's head is: it receives no still shadow, for that of brows and hair would only look dirty"""

@@ -17,7 +17,7 @@ from worker.sim.meshes import Mesh
 from worker.sim.solids import Array
 from worker.trajectory import SKIN_TONES
 
-GONE_M = (0.0, 0.0, -5.0)
+GONE_M = (0.0, 0.0, -1000.0)
 """Where food that was eaten or lost is kept, out of sight."""
 
 
@@ -118,9 +118,10 @@ class Stage:
         return Layer(rgba[..., :3].copy(), depth.copy())
 
 
-_CHOICES = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
+CUBE = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
+"""(8, 3) corners of a box from -1 to 1"""
 
 
 def corners_around(points_m: Array) -> Array:
     """(8, 3) corners of the box around points (N, 3)."""
-    return np.asarray(np.where(_CHOICES == 1, points_m.max(axis=0), points_m.min(axis=0)))
+    return np.asarray(np.where(CUBE == 1, points_m.max(axis=0), points_m.min(axis=0)))

@@ -1,6 +1,7 @@
 """How tools look, in the tool's frame: a spoon, a cup of glass, a back scratcher, or just the collision shapes."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -11,7 +12,7 @@ from worker.sim.drinking import CUP_BASE_RADIUS_M, CUP_HEIGHT_M, CUP_RIM_RADIUS_
 from worker.sim.geometry import Shape, rotation_of
 from worker.sim.meshes import Mesh, curve, joined, surface, tube
 from worker.sim.scratching import SCRATCHER_LENGTH_M, TIP_RADIUS_M
-from worker.sim.solids import Array, box
+from worker.sim.solids import Array, box, smooth_step
 
 CUP_OUTSIDE_M = 0.0040
 """Thickness of the drawn glass."""
@@ -112,6 +113,28 @@ def _wall(detail: Detail, heights: Array, radii: Array, colours: Array, inwards:
     return Mesh(mesh.vertices, -mesh.normals, mesh.paint, mesh.faces[:, ::-1]) if inwards else mesh
 
 
+NOSE_CUT_M = 0.034
+"""How deep the rim is cut out opposite to where it is drunk from, as in cups for people who cannot tip their head back:
+
+the nose has room, and the face stays in sight. The simulated wall is whole; water never reaches it there.
+"""
+
+
+def _cut_out(mesh: Mesh) -> Mesh:
+    """A cup's part, around the z axis and drunk from at +x, with room for the nose at -x."""
+    x, y, z = mesh.vertices.T
+    side = -x / np.maximum(np.hypot(x, y), 1e-9)
+    above = np.clip(1 + z / CUP_HEIGHT_M, 0.0, 1.0)
+    lowered = z - above * NOSE_CUT_M * smooth_step(side, 0.0, 0.85)
+    narrowed = _cup_radius_m(lowered) / _cup_radius_m(z)
+    return replace(mesh, vertices=np.column_stack([x * narrowed, y * narrowed, lowered]))
+
+
+def _cup_radius_m(height_m: Array) -> Array:
+    """Of the wall at heights (N,) from -CUP_HEIGHT_M at the bottom to 0 at the rim."""
+    return np.asarray(CUP_RIM_RADIUS_M + (CUP_RIM_RADIUS_M - CUP_BASE_RADIUS_M) * height_m / CUP_HEIGHT_M)
+
+
 def cup(detail: Detail) -> Mesh:
     """The opaque part of a glass: its edges, and the far inner wall (the near one faces away and is not drawn)."""
     base, rim, height, wall = CUP_BASE_RADIUS_M, CUP_RIM_RADIUS_M, CUP_HEIGHT_M, CUP_OUTSIDE_M
@@ -119,7 +142,7 @@ def cup(detail: Detail) -> Mesh:
     heights, radii = np.array([-height, -height / 2, 0.0]), np.array([base, (base + rim) / 2, rim])
     inside = _wall(detail, heights, radii, np.full(2, detail.at("glass", 0.6)), inwards=True)
     rings = [_ring(detail, rim + wall / 2, 0.0, 0.0019, edge), _ring(detail, base + wall, -height - wall, 0.0019, edge)]
-    return joined(inside, *rings).moved(np.eye(3), CUP_CENTRE_M)
+    return _cut_out(joined(inside, *rings)).moved(np.eye(3), CUP_CENTRE_M)
 
 
 def cup_glass(detail: Detail) -> Mesh:
@@ -128,7 +151,7 @@ def cup_glass(detail: Detail) -> Mesh:
     heights = np.array([below, below, -0.0005])
     radii = np.array([0.0005, CUP_BASE_RADIUS_M + CUP_OUTSIDE_M, CUP_RIM_RADIUS_M + CUP_OUTSIDE_M])
     colours = np.array([detail.at("glass", 0.0), detail.at("glass", 0.2)])
-    return _wall(detail, heights, radii, colours).moved(np.eye(3), CUP_CENTRE_M)
+    return _cut_out(_wall(detail, heights, radii, colours)).moved(np.eye(3), CUP_CENTRE_M)
 
 
 def _ring(detail: Detail, radius: float, height: float, thick: float, colour: float) -> Mesh:
