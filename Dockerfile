@@ -3,6 +3,7 @@ FROM python:3.11-slim
 RUN apt-get update && apt-get install -y --no-install-recommends make && rm -rf /var/lib/apt/lists/*
 WORKDIR /studio
 COPY Makefile pyproject.toml requirements.lock README.md alembic.ini ./
+COPY install install
 COPY app app
 COPY worker worker
 COPY migrations migrations

@@ -63,18 +63,9 @@ clean: ## Remove the virtual environment and caches; the data directory stays
 
 # --- the virtual environment -------------------------------------------------------------------------------------
 
+# PYTHON=/path/to/python chooses one; without any that fits, uv fetches one.
 $(VENV)/bin/python:
-	@python=$$(command -v python3.11 || true); \
-	if [ -z "$$python" ] && python3 -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' 2>/dev/null; then \
-	  python=$$(command -v python3); fi; \
-	if [ -z "$$python" ] || ! "$$python" -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' 2>/dev/null; then \
-	  echo "PbARL Studio needs Python 3.11 (the physics engine has no build for other versions)."; \
-	  echo "  Debian 12:      sudo apt-get install python3.11 python3.11-venv"; \
-	  echo "  Ubuntu:         sudo add-apt-repository ppa:deadsnakes/ppa && sudo apt-get install python3.11 python3.11-venv"; \
-	  echo "  With pyenv:     pyenv install 3.11 && pyenv local 3.11"; \
-	  echo "  With Docker:    docker compose up --build       (needs nothing but Docker)"; \
-	  exit 1; fi; \
-	echo "Creating $(VENV) with $$($$python --version) ..."; "$$python" -m venv $(VENV)
+	@PYTHON="$(PYTHON)" install/environment.sh $(VENV)
 
 # torch comes first and by itself: the default build on Linux would bring gigabytes of CUDA.
 $(VENV)/torch.stamp: $(VENV)/bin/python
@@ -86,6 +77,7 @@ $(VENV)/torch.stamp: $(VENV)/bin/python
 	@touch $@
 
 $(VENV)/run.stamp: requirements.lock $(VENV)/torch.stamp
+	@install/engine.sh $(VENV)
 	@echo "Installing pinned dependencies ..."
 	@$(PIP) install --no-deps --require-hashes -r requirements.lock
 	@$(PIP) install --no-deps --no-build-isolation -e .
