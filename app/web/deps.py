@@ -17,6 +17,7 @@ from app.errors import AppError
 from app.services import browser_sessions, roles
 from app.settings import Settings
 from app.storage import ArtefactStore
+from app.web.import_desk import ImportDesk
 from app.web.link_desk import LinkDesk
 from app.web.login_attempts import LoginAttempts
 from app.web.turns import Turns
@@ -61,6 +62,7 @@ class Studio:
     turns: Turns
     login_attempts: LoginAttempts
     link_desk: LinkDesk = field(default_factory=LinkDesk)
+    imports: ImportDesk = field(default_factory=ImportDesk)
     closing: Event = field(default_factory=Event)
     """Set when the server is asked to stop, so that open event streams end by themselves."""
 
