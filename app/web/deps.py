@@ -15,6 +15,7 @@ from app.domain.people import Experimenter, Role
 from app.domain.studies import Participant
 from app.errors import AppError
 from app.services import browser_sessions, roles
+from app.services.tallies import Tallies
 from app.settings import Settings
 from app.storage import ArtefactStore
 from app.web.import_desk import ImportDesk
@@ -63,6 +64,7 @@ class Studio:
     login_attempts: LoginAttempts
     link_desk: LinkDesk = field(default_factory=LinkDesk)
     imports: ImportDesk = field(default_factory=ImportDesk)
+    tallies: Tallies = field(default_factory=Tallies)
     closing: Event = field(default_factory=Event)
     """Set when the server is asked to stop, so that open event streams end by themselves."""
 

@@ -151,7 +151,7 @@ def _study_context(session: Session, studio: Studio, slug: str) -> dict[str, Any
     return {
         "study": study,
         "settings": study.settings,
-        "overview": dashboard.study_overview(session, study),
+        "overview": dashboard.study_overview(session, study, studio.tallies),
         "machine": dashboard.machine(session, studio.settings.data_dir),
         "sparkline": charts.sparkline,
     }
@@ -160,7 +160,7 @@ def _study_context(session: Session, studio: Studio, slug: str) -> dict[str, Any
 def _participant_context(session: Session, studio: Studio, slug: str, code: str) -> dict[str, Any]:
     study = studies.find_study(session, slug)
     participant = enrolment.find_by_code(session, study, code)
-    detail = dashboard.participant_detail(session, study, participant)
+    detail = dashboard.participant_detail(session, study, participant, studio.tallies)
     return {
         "study": study,
         "settings": study.settings,

@@ -20,7 +20,7 @@ CHUNK_BYTES = 64 * 1024
 
 async def spooled(turns: Turns, texts: Callable[[Session], Iterator[str]]) -> AsyncIterator[bytes]:
     """What ``texts`` yields, sent while it is still being written. Writing stops when nobody reads any more."""
-    file = tempfile.TemporaryFile()
+    file = tempfile.TemporaryFile()  # noqa: SIM115  (closed when its writer has ended, which may be later)
     written, gone = asyncio.Event(), threading.Event()
     writer = asyncio.create_task(_write(turns, texts, file, written, gone))
     writer.add_done_callback(lambda _: written.set())
