@@ -21,6 +21,7 @@ from app.storage import ArtefactStore
 from app.web.import_desk import ImportDesk
 from app.web.link_desk import LinkDesk
 from app.web.login_attempts import LoginAttempts
+from app.web.screens import Screens
 from app.web.turns import Turns
 
 PARTICIPANT_COOKIE = "studio_participant"
@@ -62,6 +63,7 @@ class Studio:
     store: ArtefactStore
     turns: Turns
     login_attempts: LoginAttempts
+    screens: Screens
     link_desk: LinkDesk = field(default_factory=LinkDesk)
     imports: ImportDesk = field(default_factory=ImportDesk)
     tallies: Tallies = field(default_factory=Tallies)
