@@ -19,8 +19,9 @@ from app.domain.participation import StageRecord
 from app.domain.preferences import LEARNED_FROM, LabelEvent, Response, count_labels
 from app.domain.protocol import Stage
 from app.domain.studies import Participant, Study
-from app.services import accuracy, results, stages, watching
+from app.services import accuracy, damage, results, stages, watching
 from app.services.tallies import Tallies
+from app.storage import ArtefactStore
 
 WORKER_SILENCE = timedelta(seconds=15)
 DISK_LOW_BYTES = 2 * 1024**3
@@ -30,12 +31,13 @@ ACTIVE_WITHIN = timedelta(seconds=60)
 
 @dataclass(frozen=True)
 class Machine:
-    """Whether anybody computes, and whether there is room for the results."""
+    """Whether anybody computes, and whether there is room for the results, and none of them is lost."""
 
     worker_seen_at: datetime | None
     worker_alive: bool
     disk_free_bytes: int
     disk_low: bool
+    damage: damage.Damage
 
 
 @dataclass(frozen=True)
@@ -128,7 +130,8 @@ def machine(session: Session, data_dir: Path) -> Machine:
     seen_at = session.scalar(select(WorkerPresence.last_seen_at).order_by(WorkerPresence.last_seen_at.desc()).limit(1))
     free = shutil.disk_usage(data_dir).free
     alive = seen_at is not None and now() - seen_at <= WORKER_SILENCE
-    return Machine(seen_at, alive, free, free < DISK_LOW_BYTES)
+    broken = damage.standing(session, ArtefactStore(data_dir / "artefacts"))
+    return Machine(seen_at, alive, free, free < DISK_LOW_BYTES, broken)
 
 
 def fingerprint(session: Session) -> str:

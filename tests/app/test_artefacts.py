@@ -46,7 +46,12 @@ def test_a_file_is_read_through_once_and_not_at_every_request(
 ) -> None:
     name = store.put(b"a clip")
     read: list[Path] = []
-    monkeypatch.setattr(storage, "hash_of_file", lambda path: (read.append(path), name)[1])
+
+    def counted(path: Path) -> str:
+        read.append(path)
+        return name
+
+    monkeypatch.setattr(storage, "hash_of_file", counted)
     for _ in range(5):
         store.verified(name)
     assert len(read) == 1
