@@ -23,7 +23,7 @@ from sqlalchemy.orm import Session
 from app.db import Database
 from app.domain.studies import USUAL_CLIP_STEPS, Study, StudySettings, TaskName
 from app.errors import AppError
-from app.services import accounts, archive, audit, enrolment, export_tables, exporting, studies
+from app.services import accounts, archive, audit, damage, enrolment, export_tables, exporting, studies
 from app.settings import Settings
 from app.storage import ArtefactStore
 
@@ -110,6 +110,19 @@ def import_study(settings: Settings, file: Path) -> int:
     for code, token in imported.tokens:
         _say(f"{code},{settings.base_url}/p/{token}")
     return 0
+
+
+def scrub(settings: Settings) -> int:
+    """Read every stored file; list what is damaged or missing, by study, and set it aside to be made again."""
+    migrate(settings)
+    with _database(settings).reading() as session:
+        broken = damage.scrub(session, ArtefactStore(settings.data_dir / "artefacts"))
+    for study, uses in sorted(broken.items()):
+        _say(f"{study}:")
+        for use in uses:
+            _say(f"  {use.what} ({use.sha256[:12]}): {use.remedy}")
+    _say(f"{sum(map(len, broken.values()))} stored files are damaged or missing." if broken else "All files are whole.")
+    return 1 if broken else 0
 
 
 def demo_study(settings: Settings, task: str) -> int:
@@ -274,6 +287,7 @@ _COMMANDS: dict[str, Callable[[Settings], int]] = {
     "reset-password": reset_password,
     "link": participant_link,
     "dictionary": dictionary,
+    "scrub": scrub,
 }
 
 if __name__ == "__main__":

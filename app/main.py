@@ -37,6 +37,7 @@ from app.web.deps import Studio
 from app.web.error_pages import add_error_pages, error_page
 from app.web.guard import Guard
 from app.web.login_attempts import LoginAttempts
+from app.web.screens import Screens
 from app.web.templating import ROOT, make_environment
 from app.web.turns import Turns
 
@@ -76,6 +77,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         store=ArtefactStore(settings.data_dir / "artefacts"),
         turns=Turns(database),
         login_attempts=LoginAttempts(settings.login_attempts_per_minute),
+        screens=Screens(database),
     )
 
     @asynccontextmanager

@@ -6,11 +6,14 @@ const path = document.querySelector("[data-live]").dataset.live;
 const state = document.querySelector("[data-live-state]");
 const events = new EventSource(path);
 
+const parts = new Map(); // by name: the pieces of their HTML, of which the server sends those that changed
+
 events.addEventListener("open", () => show("live", "live"));
 events.addEventListener("fragment", (event) => {
-  const { name, html } = JSON.parse(event.data);
+  const { name, pieces, changed } = JSON.parse(event.data);
+  parts.set(name, pieces ?? Object.assign(parts.get(name), changed));
   const part = document.querySelector(`[data-fragment="${CSS.escape(name)}"]`);
-  if (part) morph(part, html);
+  if (part) morph(part, parts.get(name).join(""));
 });
 events.addEventListener("gone", () => location.reload());
 events.addEventListener("error", () => {

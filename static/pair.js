@@ -278,10 +278,20 @@ function unplayable() {
   notice(seen ? words.brokenOff : words.unplayable, words.loadAgain, async () => {
     keepOnly([]);
     prepared = null; // it may have failed as well
+    const next = await nextTurn();
+    if (next && (next.state !== "pair" || next.pair.query_id !== turn.pair.query_id)) {
+      await go(next); // the server passes over pairs whose files are damaged
+      return;
+    }
     const videos = await videosOf(turn.pair);
     page.querySelectorAll("figure video").forEach((old, index) => old.replaceWith(videos[index]));
     await show(videos);
   });
+}
+
+async function nextTurn() {
+  const response = await fetch(page.dataset.nextPath, { headers: { Accept: "application/json" } }).catch(() => null);
+  return response?.ok && response.headers.get("content-type")?.includes("json") ? response.json() : null;
 }
 
 function playOnDemand(text = words.playBoth) {

@@ -3,7 +3,7 @@
 from typing import Any
 
 from app.domain.studies import Study
-from worker import laboratory, records
+from worker import laboratory, mending, records
 from worker.compute import Lane
 from worker.records import Job
 from worker.sim.render import RenderedClip
@@ -17,6 +17,9 @@ AT_A_TIME = 2
 
 def build_clips(place: Workplace, job: Job, run_id: int, step: Step) -> None:
     """Film what is still missing of the scenario that the job names: clips, or whole episodes."""
+    if mending.is_about(job):
+        mending.make_again(place, job, run_id, step)
+        return
     what, number = job.finding.rsplit("/", 1)[1].rsplit("-", 1)
     film = _film_whole if what == WHOLE else _film
     with place.database.reading() as session:
@@ -43,7 +46,7 @@ def _film(place: Workplace, run_id: int, study_id: int, scenario: int, which: li
             "trajectory_sha256": place.store.put(each.trajectory),
             "success": each.success,
         }
-        clip = _stored(place, each.clip, settings.clip_steps)
+        clip = _columns(place, each.clip, settings.clip_steps)
         with place.database.writing() as session:
             records.save_clip(session, study_id, rollout, clip)
 
@@ -57,21 +60,10 @@ def _film_whole(place: Workplace, run_id: int, study_id: int, scenario: int, whi
     shots = [(quality, place.store.read(rollout.trajectory_sha256), 0, steps) for rollout in rollouts]
     filmed = place.compute.run_all(Lane.CLIPS, place.beat(run_id), laboratory.film_again, shots)
     for rollout, each in zip(rollouts, filmed, strict=True):
-        clip = _stored(place, each, steps)
+        clip = _columns(place, each, steps)
         with place.database.writing() as session:
             records.save_clip(session, study_id, {"scenario": scenario, "behaviour": rollout.behaviour}, clip)
 
 
-def _stored(place: Workplace, clip: RenderedClip, steps: int) -> dict[str, Any]:
-    """The clip's columns, once its files are stored."""
-    return {
-        "first_step": 0,
-        "step_count": steps,
-        "video_sha256": place.store.put(clip.video),
-        "poster_sha256": place.store.put(clip.poster),
-        "width": clip.width,
-        "height": clip.height,
-        "fps": clip.fps,
-        "duration_ms": clip.duration_ms,
-        "byte_count": len(clip.video),
-    }
+def _columns(place: Workplace, clip: RenderedClip, steps: int) -> dict[str, Any]:
+    return {"first_step": 0, "step_count": steps, **mending.stored(place, clip)}

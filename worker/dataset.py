@@ -152,12 +152,17 @@ def _recorded(path: Path, imported: bool) -> Recorded:
 
 @lru_cache(maxsize=1024)
 def _recording(path: Path) -> Recording:
-    return Recording.load(io.BytesIO(path.read_bytes()))
+    return Recording.load(io.BytesIO(_verified(path)))
 
 
 @lru_cache(maxsize=1024)
 def _trajectory(path: Path) -> Trajectory:
     try:
-        return Trajectory.load(io.BytesIO(path.read_bytes()))
+        return Trajectory.load(io.BytesIO(_verified(path)))
     except OutdatedTrajectory as error:
         raise RecordedByAnOlderVersion from error
+
+
+def _verified(path: Path) -> bytes:
+    """The stored bytes. Raises ArtefactMissing and ArtefactDamaged."""
+    return ArtefactStore(path.parents[1]).read(path.name)

@@ -16,7 +16,7 @@ from app.domain.models import ModelKind, RunKind
 from app.domain.protocol import EvaluatedMethod, EvaluationMode
 from app.domain.studies import Participant, Study
 from app.services import evaluating
-from worker import laboratory, method_work, records, rivals
+from worker import laboratory, mending, method_work, records, rivals
 from worker.compute import Lane
 from worker.filter_work import NothingToLearnFrom
 from worker.laboratory import RecordedClip
@@ -52,6 +52,9 @@ def due(study: Study, participant_id: int, ending: str, succeeded: Collection[st
 
 def make_films(place: Workplace, job: Job, run_id: int, step: Step) -> None:
     """Make what the job names; a killed worker loses two films at most."""
+    if mending.is_about(job):
+        mending.make_again(place, job, run_id, step)
+        return
     what = job.finding.split("/")[2]
     shots = step("plan", _plan, place, job, what)
     for first in range(0, len(shots), AT_A_TIME):
@@ -100,17 +103,10 @@ def _film(place: Workplace, run_id: int, job: Job, shots: list[list[Any]]) -> No
 
 
 def _stored(place: Workplace, recorded: RecordedClip) -> dict[str, Any]:
-    clip = recorded.clip
     return {
         "success": recorded.success,
         "trajectory_sha256": place.store.put(recorded.trajectory),
-        "video_sha256": place.store.put(clip.video),
-        "poster_sha256": place.store.put(clip.poster),
-        "width": clip.width,
-        "height": clip.height,
-        "fps": clip.fps,
-        "duration_ms": clip.duration_ms,
-        "byte_count": len(clip.video),
+        **mending.stored(place, recorded.clip),
     }
 
 

@@ -4,7 +4,7 @@ Nothing here is remembered between two rounds, so a lost message, a killed worke
 anything undone or do it twice: each finding has one name, and work is started under that name at most once.
 """
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from datetime import datetime, timedelta
 from typing import NamedTuple
 
@@ -16,7 +16,7 @@ from app.domain.clips import Clip, Rollout
 from app.domain.models import Run, RunKind, RunStatus
 from app.domain.preferences import LEARNED_FROM, LabelEvent, Query, count_labels
 from app.domain.studies import Participant, Study, StudySettings
-from worker import export_work, film_work, method_work, report_work
+from worker import export_work, film_work, mending, method_work, report_work
 from worker.clip_work import WHOLE
 from worker.records import ATTEMPTS, LEASE, Job, next_queries
 
@@ -34,13 +34,20 @@ class _Attempted(NamedTuple):
     finished_at: datetime | None
 
 
-def findings(session: Session) -> Iterator[tuple[Job, int]]:
-    """Every run that should exist and does not, or must be tried again, with the number of its attempt."""
+def findings(session: Session, lost: Mapping[str, int] | None = None) -> Iterator[tuple[Job, int]]:
+    """Every run that should exist and does not, or must be tried again, with the number of its attempt.
+
+    ``lost``: stored files that are to be made again, as ArtefactStore.lost() gives them.
+    """
     known = session.execute(select(Run.workflow_id, Run.status, Run.attempt, Run.finished_at))
     runs = {name: _Attempted(status, attempt, finished) for name, status, attempt, finished in known}
     succeeded = {name for name, run in runs.items() if run.status == RunStatus.SUCCEEDED}
     for study in session.scalars(select(Study).order_by(Study.id)).all():
-        jobs = (*_missing_clips(session, study), *_stale_models(session, study, succeeded))
+        jobs = (
+            *mending.due(session, study, lost or {}),
+            *_missing_clips(session, study),
+            *_stale_models(session, study, succeeded),
+        )
         for job in (*jobs, *report_work.due(session, study), *export_work.due(session, study)):
             attempt = _attempt_due(runs.get(job.finding), now())
             if attempt is not None:

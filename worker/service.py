@@ -173,7 +173,7 @@ class _Rounds:
 
     def _round(self) -> None:
         with self._place.database.reading() as session:
-            due = list(reconcile.findings(session))
+            due = list(reconcile.findings(session, self._place.store.lost()))
             hungry = set(reconcile.short_of_queries(session))
             lost = reconcile.abandoned(session, self._workshop.in_hand)
             answered = reconcile.studies_with_answers(session)

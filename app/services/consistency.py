@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from itertools import groupby
 from math import exp, log, sqrt
 
-from app.domain.preferences import Label, Purpose, Response
+from app.domain.preferences import Purpose, Response
 from app.services.accuracy import Share, wilson
 
 _Z = 1.959964
@@ -119,26 +119,6 @@ class Consistency:
             "cannot_tell": self.answered >= FEWEST_FOR_A_TREND and self.balance[Response.SKIP] > self.answered / 3,
         }
         return [name for name, is_raised in raised.items() if is_raised]
-
-
-def answers_of(labels: Sequence[Label]) -> list[Answer]:
-    """From rows as preferences.current_answers gives them, clips loaded; in the order of the queries."""
-    return [
-        Answer(
-            ordinal=each.query.ordinal,
-            query_id=each.query.id,
-            purpose=Purpose(each.query.purpose),
-            response=each.response,
-            left_clip_id=each.query.left_clip_id,
-            right_clip_id=each.query.right_clip_id,
-            repeats_query_id=each.query.repeats_query_id,
-            expected=None if each.query.expected is None else Response(each.query.expected),
-            response_time_ms=each.event.response_time_ms,
-            clip_ms=max(each.query.left_clip.duration_ms, each.query.right_clip.duration_ms),
-            playback_rate=each.event.playback_rate,
-        )
-        for each in labels
-    ]
 
 
 def consistency(answers: Sequence[Answer]) -> Consistency:

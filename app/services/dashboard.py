@@ -2,12 +2,13 @@
 
 import shutil
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
+from typing import NamedTuple, TypeVar
 
-from sqlalchemy import func, select
+from sqlalchemy import ColumnElement, func, or_, select
 from sqlalchemy.orm import Session
 
 from app.db import now
@@ -15,10 +16,12 @@ from app.domain.clips import Clip, Rollout
 from app.domain.evaluation import Film, Rating, Trial
 from app.domain.models import Bundle, Model, ModelKind, Run, RunKind, RunStatus, WorkerPresence
 from app.domain.participation import StageRecord
-from app.domain.preferences import LEARNED_FROM, LabelEvent, Query, Response
+from app.domain.preferences import LEARNED_FROM, LabelEvent, Response, count_labels
 from app.domain.protocol import Stage
-from app.domain.studies import Participant, Strategy, Study
-from app.services import accuracy, results, stages, watching
+from app.domain.studies import Participant, Study
+from app.services import accuracy, damage, results, stages, watching
+from app.services.tallies import Tallies
+from app.storage import ArtefactStore
 
 WORKER_SILENCE = timedelta(seconds=15)
 DISK_LOW_BYTES = 2 * 1024**3
@@ -28,12 +31,13 @@ ACTIVE_WITHIN = timedelta(seconds=60)
 
 @dataclass(frozen=True)
 class Machine:
-    """Whether anybody computes, and whether there is room for the results."""
+    """Whether anybody computes, and whether there is room for the results, and none of them is lost."""
 
     worker_seen_at: datetime | None
     worker_alive: bool
     disk_free_bytes: int
     disk_low: bool
+    damage: damage.Damage
 
 
 @dataclass(frozen=True)
@@ -121,20 +125,13 @@ class ParticipantDetail:
     stage_times: Sequence[watching.StageTime]
 
 
-@dataclass(frozen=True)
-class _Answer:
-    response: Response
-    predicted_right: float | None
-    response_time_ms: int | None
-    drawn_at_random: bool
-
-
 def machine(session: Session, data_dir: Path) -> Machine:
     """The state of the worker and of the disk."""
     seen_at = session.scalar(select(WorkerPresence.last_seen_at).order_by(WorkerPresence.last_seen_at.desc()).limit(1))
     free = shutil.disk_usage(data_dir).free
     alive = seen_at is not None and now() - seen_at <= WORKER_SILENCE
-    return Machine(seen_at, alive, free, free < DISK_LOW_BYTES)
+    broken = damage.standing(session, ArtefactStore(data_dir / "artefacts"))
+    return Machine(seen_at, alive, free, free < DISK_LOW_BYTES, broken)
 
 
 def fingerprint(session: Session) -> str:
@@ -168,13 +165,15 @@ def study_lines(session: Session) -> Sequence[StudyLine]:
     """Every study, the newest first."""
     counted = session.execute(select(Rollout.study_id, func.count(Clip.id)).join(Clip).group_by(Rollout.study_id))
     clips = {study_id: count for study_id, count in counted}  # noqa: C416  (a typed row is not a typed pair)
+    everybody = select(Participant).where(Participant.is_preview.is_(False))
     people: dict[int, list[Participant]] = defaultdict(list)
-    for participant in session.scalars(select(Participant).where(Participant.is_preview.is_(False))):
+    for participant in session.scalars(everybody):
         people[participant.study_id].append(participant)
+    labels = count_labels(session, everybody.with_only_columns(Participant.id))
+    failed = Counter(run.study_id for run in _unmended(session))
     lines = []
     for study in session.scalars(select(Study).order_by(Study.id.desc())):
-        answers = _answers(session, [person.id for person in people[study.id]])
-        given = [len(answers[person.id]) for person in people[study.id]]
+        given = [labels.get(person.id, 0) for person in people[study.id]]
         wanted = study.settings.labels_per_participant
         lines.append(
             StudyLine(
@@ -185,7 +184,7 @@ def study_lines(session: Session) -> Sequence[StudyLine]:
                 labels_wanted=wanted * len(given),
                 clips=clips.get(study.id, 0),
                 clips_wanted=_clips_wanted(study),
-                failed=sum(job.run.status == RunStatus.FAILED for job in _jobs(session, study)),
+                failed=failed[study.id],
             )
         )
     return lines
@@ -201,11 +200,11 @@ def _finished(study: Study, people: Sequence[Participant], given: Sequence[int])
     )
 
 
-def study_overview(session: Session, study: Study) -> StudyOverview:
-    """One study: its pool and a row per participant."""
+def study_overview(session: Session, study: Study, tallies: Tallies | None = None) -> StudyOverview:
+    """One study: its pool and a row per participant. ``tallies``: what was counted before."""
     everybody = select(Participant).where(Participant.study_id == study.id, Participant.is_preview.is_(False))
     people = session.scalars(everybody.order_by(Participant.number)).all()
-    rows = _rows(session, study, people)
+    rows = _rows(session, study, people, tallies or Tallies())
     return StudyOverview(
         study,
         _pool(session, study),
@@ -217,16 +216,19 @@ def study_overview(session: Session, study: Study) -> StudyOverview:
     )
 
 
-def participant_detail(session: Session, study: Study, participant: Participant) -> ParticipantDetail:
+def participant_detail(
+    session: Session, study: Study, participant: Participant, tallies: Tallies | None = None
+) -> ParticipantDetail:
     """One participant: answers, models, filters, runs."""
-    answers = _answers(session, [participant.id])[participant.id]
-    times = sorted(answer.response_time_ms for answer in answers if answer.response_time_ms is not None)
+    given = watching.answers_given(session, [participant.id])[participant.id]
+    labels = [each.answer for each in given if each.answer.purpose in LEARNED_FROM]
+    times = sorted(label.response_time_ms for label in labels if label.response_time_ms is not None)
     model = _newest_reward_model(session, participant)
     return ParticipantDetail(
         study=study,
-        row=_rows(session, study, [participant])[0],
+        row=_rows(session, study, [participant], tallies or Tallies())[0],
         median_response_ms=times[len(times) // 2] if times else None,
-        versions=_versions(session, [participant.id])[participant.id],
+        versions=_versions(session, participant),
         weights=results.learned_weights(model),
         taste=results.taste(model),
         runs=session.scalars(select(Run).where(Run.participant_id == participant.id).order_by(Run.id.desc())).all(),
@@ -235,105 +237,79 @@ def participant_detail(session: Session, study: Study, participant: Participant)
     )
 
 
-def _rows(session: Session, study: Study, people: Sequence[Participant]) -> Sequence[ParticipantRow]:
+def _rows(session: Session, study: Study, people: Sequence[Participant], tallies: Tallies) -> Sequence[ParticipantRow]:
     ids = [person.id for person in people]
-    answers, versions, runs = _answers(session, ids), _versions(session, ids), _noteworthy_runs(session, ids)
-    settings = study.settings
-    given = {person: len(theirs) for person, theirs in answers.items()}
-    where, wanted = watching.where_they_are(session, settings, people, given), settings.labels_per_participant
+    told, runs, wanted = tallies.of(session, ids), _noteworthy_runs(session, ids), study.settings.labels_per_participant
+    where = watching.where_they_are(session, study.settings, people, {each: told[each].answered for each in ids})
     return [
         ParticipantRow(
             participant=person,
             stage=where[person.id],
             active=person.last_seen_at is not None and now() - person.last_seen_at < ACTIVE_WITHIN,
-            answered=len(answers[person.id]),
+            answered=told[person.id].answered,
             wanted=wanted,
-            counts=_counts(answers[person.id]),
-            curve=accuracy.curve(_hits(answers[person.id])),
+            counts=told[person.id].counts,
+            curve=told[person.id].curve,
             run=runs.get(person.id),
-            newest_filter=versions[person.id][0] if versions[person.id] else None,
-            watched=watching.watched(session, person.id),
+            newest_filter=told[person.id].newest_filter,
+            watched=told[person.id].watched,
         )
         for person in people
     ]
 
 
-def _counts(answers: Iterable[_Answer]) -> Mapping[Response, int]:
-    counted = Counter(answer.response for answer in answers)
-    return {response: counted[response] for response in Response}
-
-
-def _hits(answers: Iterable[_Answer]) -> Sequence[bool]:
-    """Whether each predicted answer that prefers a side was foreseen; only on pairs that were drawn at random.
-
-    What a model chose to ask is where it is worst: on that, every way of choosing well would look bad.
-    """
-    decided = [
-        answer for answer in answers if answer.drawn_at_random and answer.response in (Response.LEFT, Response.RIGHT)
-    ]
-    return [
-        (answer.predicted_right > 0.5) == (answer.response is Response.RIGHT)
-        for answer in decided
-        if answer.predicted_right is not None
-    ]
-
-
-def _answers(session: Session, participant_ids: Sequence[int]) -> dict[int, list[_Answer]]:
-    """The labels that count, by participant, in the order of the queries."""
-    newest = (
-        select(LabelEvent.query_id, func.max(LabelEvent.revision).label("revision"))
-        .join(Query, Query.id == LabelEvent.query_id)
-        .where(Query.participant_id.in_(participant_ids))
-        .group_by(LabelEvent.query_id)
-        .subquery()
-    )
-    rows = session.execute(
-        select(
-            Query.participant_id,
-            LabelEvent.response,
-            Query.predicted_right,
-            LabelEvent.response_time_ms,
-            Query.strategy == Strategy.UNIFORM,
-        )
-        .join(LabelEvent, LabelEvent.query_id == Query.id)
-        .join(newest, (newest.c.query_id == LabelEvent.query_id) & (newest.c.revision == LabelEvent.revision))
-        .where(Query.purpose.in_(LEARNED_FROM))
-        .order_by(Query.participant_id, Query.ordinal)
-    )
-    answers: dict[int, list[_Answer]] = defaultdict(list)
-    for participant_id, response, predicted_right, response_time_ms, at_random in rows:
-        if response is None:  # taken back
-            continue
-        answers[participant_id].append(_Answer(Response(response), predicted_right, response_time_ms, at_random))
-    return answers
-
-
-def _versions(session: Session, participant_ids: Sequence[int]) -> dict[int, list[results.FilterVersion]]:
-    """Every filter of these participants, the newest first."""
+def _versions(session: Session, participant: Participant) -> Sequence[results.FilterVersion]:
+    """Every filter of this participant, the newest first."""
     rows = session.execute(
         select(Model, Bundle)
         .outerjoin(Bundle, Bundle.model_id == Model.id)
-        .where(Model.participant_id.in_(participant_ids), Model.kind == ModelKind.FILTER)
+        .where(Model.participant_id == participant.id, Model.kind == ModelKind.FILTER)
         .order_by(Model.label_count.desc(), Model.id.desc())
     )
-    versions: dict[int, list[results.FilterVersion]] = defaultdict(list)
-    for model, bundle in rows:
-        versions[model.participant_id].append(results.filter_version(model, bundle))
-    return versions
+    return [results.filter_version(model, bundle) for model, bundle in rows]
+
+
+class _Glance(NamedTuple):
+    """What it takes to know whether a run deserves a line. Of thousands, whole ones take their time to load."""
+
+    id: int
+    kind: str
+    workflow_id: str
+    status: str
+    study_id: int
+    participant_id: int | None
+
+
+def _glances(session: Session, *which: ColumnElement[bool]) -> Sequence[_Glance]:
+    """Runs in their order, from the oldest that has not succeeded: what came before has been settled."""
+    oldest = select(func.min(Run.id)).where(Run.status != RunStatus.SUCCEEDED, *which).scalar_subquery()
+    rows = session.execute(
+        select(Run.id, Run.kind, Run.workflow_id, Run.status, Run.study_id, Run.participant_id)
+        .where(Run.id >= oldest, *which)
+        .order_by(Run.id)
+    )
+    return [_Glance(*row) for row in rows]
 
 
 def _noteworthy_runs(session: Session, participant_ids: Sequence[int]) -> dict[int, Run]:
     """Per participant the newest run at work; where none is, the newest failure that no later success has made good."""
-    runs = session.scalars(select(Run).where(Run.participant_id.in_(participant_ids)).order_by(Run.id))
-    by_person: dict[int, list[Run]] = defaultdict(list)
-    for run in runs:
+    by_person: dict[int, list[_Glance]] = defaultdict(list)
+    for run in _glances(session, Run.participant_id.in_(participant_ids)):
         if run.participant_id is not None:
             by_person[run.participant_id].append(run)
     chosen = {person: _noteworthy(theirs) for person, theirs in by_person.items()}
-    return {person: run for person, run in chosen.items() if run is not None}
+    whole = _whole(session, [run.id for run in chosen.values() if run is not None])
+    return {person: whole[run.id] for person, run in chosen.items() if run is not None}
 
 
-def _noteworthy(runs: Sequence[Run]) -> Run | None:
+def _whole(session: Session, run_ids: Sequence[int]) -> dict[int, Run]:
+    return {run.id: run for run in session.scalars(select(Run).where(Run.id.in_(run_ids)))}
+
+
+_R = TypeVar("_R", Run, _Glance)
+
+
+def _noteworthy(runs: Sequence[_R]) -> _R | None:
     """Of runs in their order: one at work, else a failure that still stands."""
     working = [run for run in runs if run.status in (RunStatus.RUNNING, RunStatus.RETRY)]
     if working:
@@ -342,26 +318,35 @@ def _noteworthy(runs: Sequence[Run]) -> Run | None:
     return next((run for run in newest.values() if run.status == RunStatus.FAILED), None)
 
 
+def _present_runs(session: Session, *which: ColumnElement[bool]) -> Sequence[_Glance]:
+    """Runs for everybody still in a study, and for whole studies."""
+    of_others = select(Participant.id).where(
+        or_(Participant.is_preview.is_(True), Participant.withdrawn_at.is_not(None))
+    )
+    return _glances(session, or_(Run.participant_id.is_(None), Run.participant_id.not_in(of_others)), *which)
+
+
+def _unmended(session: Session, *which: ColumnElement[bool]) -> Sequence[_Glance]:
+    """Failures that no later success has made good."""
+    newest = {(_work_of(run), run.study_id, run.participant_id): run for run in _present_runs(session, *which)}
+    return [run for run in newest.values() if run.status == RunStatus.FAILED]
+
+
 def _jobs(session: Session, study: Study) -> Sequence[Job]:
     """Of everybody still in the study, and of the study itself."""
-    runs = session.execute(
-        select(Run, Participant)
-        .outerjoin(Participant, Participant.id == Run.participant_id)
-        .where(Run.study_id == study.id, Participant.is_preview.is_not(True), Participant.withdrawn_at.is_(None))
-        .order_by(Run.id)
-    )
-    newest: dict[tuple[str, str | None], Job] = {}
-    working: list[Job] = []
-    for run, participant in runs:
-        job = Job(run, participant.code if participant is not None else None)
-        newest[_work_of(run), job.code] = job
-        if run.status in (RunStatus.RUNNING, RunStatus.RETRY):
-            working.append(job)
-    failed = [job for job in newest.values() if job.run.status == RunStatus.FAILED]
-    return [*sorted(failed, key=lambda job: -job.run.id), *reversed(working)]
+    mine = Run.study_id == study.id
+    at_work = _present_runs(session, mine, Run.status.in_((RunStatus.RUNNING, RunStatus.RETRY)))
+    ids = [
+        *(run.id for run in sorted(_unmended(session, mine), key=lambda run: -run.id)),
+        *(run.id for run in reversed(at_work)),
+    ]
+    runs = _whole(session, ids)
+    people = select(Participant).where(Participant.id.in_([run.participant_id for run in runs.values()]))
+    codes = {person.id: person.code for person in session.scalars(people)}
+    return [Job(runs[each], codes.get(runs[each].participant_id or 0)) for each in ids]
 
 
-def _work_of(run: Run) -> str:
+def _work_of(run: Run | _Glance) -> str:
     """What a later run of the same work makes good: of films and methods each has its own, and so has every export."""
     if run.kind in (RunKind.METHOD, RunKind.FILMS):
         return run.workflow_id.rpartition("/")[0]

@@ -7,6 +7,8 @@ from app.services.accuracy import Curve
 
 LEFT, RIGHT, TOP, BOTTOM = 44.0, 14.0, 12.0, 44.0
 """Margins around the plot, in SVG units."""
+SPARKLINE_POINTS = 48
+"""More cannot be told apart on 96 pixels, and a page has a hundred of these lines."""
 
 
 @dataclass(frozen=True)
@@ -75,13 +77,16 @@ def accuracy_chart(curve: Curve, wanted: int, width: float = 760.0, height: floa
 
 def sparkline(curve: Curve, width: float = 96.0, height: float = 28.0) -> str:
     """The running accuracy between 0 and 100 % as polyline points; empty while there are too few answers."""
-    if len(curve.points) < 2:
+    last = len(curve.points) - 1
+    if last < 1:
         return ""
-    step = (width - 4) / (len(curve.points) - 1)
+    stride = -(-last // SPARKLINE_POINTS)  # the last one is always there
     line = [
-        (round(2 + index * step, 1), round(height - 2 - (height - 4) * point.recent.value, 1))
-        for index, point in enumerate(curve.points)
+        (round(2 + (width - 4) * index / last, 1), round(height - 2 - (height - 4) * point.recent.value, 1))
+        for index in range(last, -1, -stride)
+        for point in [curve.points[index]]
     ]
+    line.reverse()
     return _points(line)
 
 

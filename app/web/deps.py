@@ -15,10 +15,13 @@ from app.domain.people import Experimenter, Role
 from app.domain.studies import Participant
 from app.errors import AppError
 from app.services import browser_sessions, roles
+from app.services.tallies import Tallies
 from app.settings import Settings
 from app.storage import ArtefactStore
+from app.web.import_desk import ImportDesk
 from app.web.link_desk import LinkDesk
 from app.web.login_attempts import LoginAttempts
+from app.web.screens import Screens
 from app.web.turns import Turns
 
 PARTICIPANT_COOKIE = "studio_participant"
@@ -60,7 +63,10 @@ class Studio:
     store: ArtefactStore
     turns: Turns
     login_attempts: LoginAttempts
+    screens: Screens
     link_desk: LinkDesk = field(default_factory=LinkDesk)
+    imports: ImportDesk = field(default_factory=ImportDesk)
+    tallies: Tallies = field(default_factory=Tallies)
     closing: Event = field(default_factory=Event)
     """Set when the server is asked to stop, so that open event streams end by themselves."""
 

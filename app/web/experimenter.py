@@ -7,6 +7,7 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Depends, Request
 from fastapi.responses import FileResponse, RedirectResponse, Response
 from fastapi.sse import EventSourceResponse, ServerSentEvent
+from jinja2 import Environment
 from sqlalchemy.orm import Session
 
 from app.services import audit, dashboard, debrief, enrolment, publishing, studies
@@ -23,7 +24,7 @@ from app.web.deps import (
     WritingSession,
     experimenter_asking,
 )
-from app.web.templating import fragment, page
+from app.web.templating import page
 
 router = APIRouter(prefix="/studies")
 
@@ -53,9 +54,10 @@ def show_studies(
 @router.get("/live", name="stream_studies", response_class=EventSourceResponse)
 async def stream_studies(request: Request, studio: StudioDep, _allowed: MayStream) -> AsyncIterator[ServerSentEvent]:
     """The list of studies as it changes."""
+    templates = request.app.state.templates  # and nothing else of the request: what is drawn is for all who look
 
     def draw(session: Session) -> Mapping[str, str]:
-        return _draw(request, LIST_PARTS, _list_context(session, studio))
+        return _draw(templates, LIST_PARTS, _list_context(session, studio))
 
     async for event in live.redrawn_parts(request, studio, draw):
         yield event
@@ -75,9 +77,10 @@ async def stream_study(
     request: Request, slug: Slug, studio: StudioDep, _allowed: MayStream
 ) -> AsyncIterator[ServerSentEvent]:
     """One study as it changes."""
+    templates = request.app.state.templates  # and nothing else of the request: what is drawn is for all who look
 
     def draw(session: Session) -> Mapping[str, str]:
-        return _draw(request, STUDY_PARTS, _study_context(session, studio, slug))
+        return _draw(templates, STUDY_PARTS, _study_context(session, studio, slug))
 
     async for event in live.redrawn_parts(request, studio, draw):
         yield event
@@ -113,9 +116,10 @@ async def stream_participant(
     request: Request, slug: Slug, code: Code, studio: StudioDep, _allowed: MayStream
 ) -> AsyncIterator[ServerSentEvent]:
     """One participant as it changes."""
+    templates = request.app.state.templates  # and nothing else of the request: what is drawn is for all who look
 
     def draw(session: Session) -> Mapping[str, str]:
-        return _draw(request, PARTICIPANT_PARTS, _participant_context(session, studio, slug, code))
+        return _draw(templates, PARTICIPANT_PARTS, _participant_context(session, studio, slug, code))
 
     async for event in live.redrawn_parts(request, studio, draw):
         yield event
@@ -151,7 +155,7 @@ def _study_context(session: Session, studio: Studio, slug: str) -> dict[str, Any
     return {
         "study": study,
         "settings": study.settings,
-        "overview": dashboard.study_overview(session, study),
+        "overview": dashboard.study_overview(session, study, studio.tallies),
         "machine": dashboard.machine(session, studio.settings.data_dir),
         "sparkline": charts.sparkline,
     }
@@ -160,7 +164,7 @@ def _study_context(session: Session, studio: Studio, slug: str) -> dict[str, Any
 def _participant_context(session: Session, studio: Studio, slug: str, code: str) -> dict[str, Any]:
     study = studies.find_study(session, slug)
     participant = enrolment.find_by_code(session, study, code)
-    detail = dashboard.participant_detail(session, study, participant)
+    detail = dashboard.participant_detail(session, study, participant, studio.tallies)
     return {
         "study": study,
         "settings": study.settings,
@@ -173,8 +177,8 @@ def _participant_context(session: Session, studio: Studio, slug: str, code: str)
     }
 
 
-def _draw(request: Request, parts: tuple[str, ...], context: Mapping[str, Any]) -> Mapping[str, str]:
-    return {name: fragment(request, f"experimenter/_{name}.html", context) for name in parts}
+def _draw(templates: Environment, parts: tuple[str, ...], context: Mapping[str, Any]) -> Mapping[str, str]:
+    return {name: templates.get_template(f"experimenter/_{name}.html").render(context) for name in parts}
 
 
 def _see(request: Request, name: str, **parameters: str) -> RedirectResponse:

@@ -1,21 +1,52 @@
 """Bringing a study in from another installation."""
 
+import asyncio
+import shutil
+import tempfile
 from http import HTTPStatus
-from typing import Annotated
+from typing import IO, Annotated
 
-from fastapi import APIRouter, File, Request, UploadFile
+from fastapi import APIRouter, Depends, Request
+from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import RedirectResponse, Response
+from sqlalchemy.orm import Session
+from starlette.datastructures import UploadFile
+from starlette.requests import ClientDisconnect
+from starlette.types import Message, Receive
 
-from app.domain.people import Role
+from app.domain.people import Experimenter, Role
+from app.errors import AppError
 from app.services import archive, roles
-from app.services.archive import ArchiveInvalid
-from app.web.deps import CurrentExperimenter, StudioDep
+from app.services.archive import ArchiveInvalid, Imported
+from app.web.deps import CurrentExperimenter, Studio, StudioDep, experimenter_asking
 from app.web.link_desk import Link
 from app.web.templating import page
 
 router = APIRouter()
 
 LARGEST_ARCHIVE_BYTES = 16 * 1024**3
+ROOM_LEFT_BYTES = 2 * 1024**3
+"""What an upload must leave free on the disk of temporary files."""
+PATIENCE_S = 60.0
+"""An upload of which nothing arrives for so long was given up."""
+
+
+class SizeUnknown(AppError):
+    """The upload did not say how large it is, so it was refused. Please use the form on the page of imports."""
+
+    status = HTTPStatus.LENGTH_REQUIRED
+
+
+class NoRoomForUpload(AppError):
+    """This archive is larger than what the studio's disk has room for. Free some space, then import it again."""
+
+    status = HTTPStatus.REQUEST_ENTITY_TOO_LARGE
+
+
+class UploadStalled(AppError):
+    """The upload stopped in the middle, so nothing was imported. Please try again."""
+
+    status = HTTPStatus.REQUEST_TIMEOUT
 
 
 @router.get("/import", name="show_import")
@@ -25,16 +56,32 @@ def show_import(request: Request, experimenter: CurrentExperimenter) -> Response
     return page(request, "experimenter/import.html", context)
 
 
-@router.post("/import", name="import_study", max_body_size=LARGEST_ARCHIVE_BYTES)
-def import_study(
-    request: Request, experimenter: CurrentExperimenter, studio: StudioDep, file: Annotated[UploadFile, File()]
-) -> Response:
-    """Check the archive without holding up anybody, then bring it in and lead to the new links."""
+async def _may_import(request: Request, studio: StudioDep) -> Experimenter:
+    """Checked before a byte of the upload is read, and without a session that lasts as long as the upload."""
+    async with studio.turns.reading() as session:
+        experimenter = await run_in_threadpool(experimenter_asking, request, session)
     roles.require(experimenter, Role.EXPERIMENTER)
+    return experimenter
+
+
+@router.post("/import", name="import_study", max_body_size=LARGEST_ARCHIVE_BYTES)
+async def import_study(
+    request: Request, experimenter: Annotated[Experimenter, Depends(_may_import)], studio: StudioDep
+) -> Response:
+    """Check the archive without holding up anybody, then bring it in and lead to the new links.
+
+    The form is no parameter: the framework reads those before it asks who is sending them.
+    """
+    _require_room(request)
     try:
-        unpacked = archive.unpack(studio.store, file.file)
-        with studio.database.writing() as session:
-            imported = archive.bring_in(session, studio.store, unpacked, experimenter.name)
+        with studio.imports.place():
+            async with Request(request.scope, _patiently(request)).form(max_files=1) as form:
+                file = form.get("file")
+                if not isinstance(file, UploadFile):
+                    raise ArchiveInvalid
+                imported = await _bring_in(studio, file.file, experimenter.name)
+    except ClientDisconnect as error:
+        raise UploadStalled from error
     except ArchiveInvalid as invalid:
         context = {"experimenter": experimenter, "error": invalid.message, "may_import": True}
         return page(request, "experimenter/import.html", context, HTTPStatus.UNPROCESSABLE_ENTITY)
@@ -47,3 +94,33 @@ def import_study(
         return RedirectResponse(request.app.url_path_for("show_study", slug=slug), HTTPStatus.SEE_OTHER)
     key = studio.link_desk.leave(experimenter.id, links)
     return RedirectResponse(request.app.url_path_for("show_links", slug=slug, key=key), HTTPStatus.SEE_OTHER)
+
+
+async def _bring_in(studio: Studio, file: IO[bytes], actor: str) -> Imported:
+    unpacked = await run_in_threadpool(archive.unpack, studio.store, file)
+
+    def bring_in(session: Session) -> Imported:
+        return archive.bring_in(session, studio.store, unpacked, actor)
+
+    async with studio.turns.writing() as session:
+        return await run_in_threadpool(bring_in, session)
+
+
+def _require_room(request: Request) -> None:
+    """The announced size, to which the server holds the sender. Raises SizeUnknown and NoRoomForUpload."""
+    announced = request.headers.get("content-length", "")
+    if not announced.isdecimal():
+        raise SizeUnknown
+    if int(announced) > shutil.disk_usage(tempfile.gettempdir()).free - ROOM_LEFT_BYTES:
+        raise NoRoomForUpload
+
+
+def _patiently(request: Request) -> Receive:
+    async def receive() -> Message:
+        try:
+            async with asyncio.timeout(PATIENCE_S):
+                return await request.receive()
+        except TimeoutError as error:
+            raise UploadStalled from error
+
+    return receive

@@ -1,70 +1,69 @@
-"""Pages that update themselves: server-sent events carry redrawn parts of a page, and only those that changed.
+"""Pages that update themselves: server-sent events carry the rows of a page that changed, and only those.
 
-A stream holds neither a database session nor a thread while it waits; each look takes one for some milliseconds.
+A stream holds neither a database session nor a thread while it waits.
 """
 
+import asyncio
 import signal
 import threading
-from asyncio import sleep
-from collections.abc import AsyncIterator, Callable, Iterator, Mapping
-from contextlib import contextmanager
-from datetime import timedelta
+from collections.abc import AsyncIterator, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import Any
 
-from anyio import CapacityLimiter, to_thread
+from anyio import to_thread
 from fastapi import Request
 from fastapi.sse import ServerSentEvent
-from sqlalchemy.orm import Session
 
-from app.db import now
 from app.errors import AppError
-from app.services import dashboard
 from app.web.deps import Studio, experimenter_asking
+from app.web.screens import Draw, Pieces
 
-LOOK_EVERY_S = 1.0
-REDRAW_AFTER = timedelta(seconds=20)
-"""Even when no row changed, "3 min ago" and a silent worker do."""
-
-Draw = Callable[[Session], Mapping[str, str]]
-"""Draws the parts of a page, by the names in its data-fragment attributes."""
+NOTICE_EVERY_S = 1.0
+"""How soon a stream notices that the server is to stop."""
+ASK_AGAIN_S = 5.0
+"""How often a login is looked at while nothing is sent; before anything is sent it always is."""
 
 
 async def redrawn_parts(request: Request, studio: Studio, draw: Draw) -> AsyncIterator[ServerSentEvent]:
-    """An endless stream of the parts that changed. Ends when the login does, or the server stops."""
-    watch, threads = _Watch(request, studio, draw), CapacityLimiter(1)
-    while not studio.closing.is_set():
-        try:
-            changed = await to_thread.run_sync(watch.look, limiter=threads)
-        except AppError:
+    """An endless stream of what changed. Ends when the login or the page does, or the server stops."""
+    sent: Mapping[str, Pieces] = {}
+    loop, asked_at_s = asyncio.get_running_loop(), 0.0
+    with studio.screens.watching(request.url.path, draw) as screen:
+        while not studio.closing.is_set() and not screen.ended:
+            drawn, parts = screen.drawn, screen.parts
+            changes = list(_changes(sent, parts))
+            if changes or loop.time() - asked_at_s >= ASK_AGAIN_S:
+                if not await to_thread.run_sync(_may_look, request, studio, limiter=screen.threads):
+                    yield ServerSentEvent(event="gone", raw_data="")
+                    return
+                asked_at_s = loop.time()
+            for change in changes:
+                yield ServerSentEvent(event="fragment", data=change)
+            sent = parts
+            with suppress(TimeoutError):
+                await asyncio.wait_for(drawn.wait(), NOTICE_EVERY_S)
+        if screen.is_gone:
             yield ServerSentEvent(event="gone", raw_data="")
-            return
-        for name, text in changed.items():
-            yield ServerSentEvent(event="fragment", data={"name": name, "html": text})
-        await sleep(LOOK_EVERY_S)
 
 
-class _Watch:
-    """What one open page has been sent."""
+def _changes(sent: Mapping[str, Pieces], parts: Mapping[str, Pieces]) -> Iterator[Mapping[str, Any]]:
+    """Parts as a whole, or those of their pieces that differ, by their places."""
+    for name, pieces in parts.items():
+        before = sent.get(name, ())
+        if len(before) != len(pieces):
+            yield {"name": name, "pieces": pieces}
+        elif changed := {place: piece for place, piece in enumerate(pieces) if piece != before[place]}:
+            yield {"name": name, "changed": changed}
 
-    def __init__(self, request: Request, studio: Studio, draw: Draw) -> None:
-        self._request, self._studio, self._draw = request, studio, draw
-        self._fingerprint: str | None = None
-        self._drawn_at = now()
-        self._sent: dict[str, str] = {}
 
-    def look(self) -> Mapping[str, str]:
-        """The parts that differ from what was sent. Raises AppError when the person may not look any more."""
-        with self._studio.database.reading() as session:
-            experimenter_asking(self._request, session)
-            fingerprint = dashboard.fingerprint(session)
-            if fingerprint == self._fingerprint and now() - self._drawn_at < REDRAW_AFTER:
-                return {}
-            parts = self._draw(session)
-        changed = {name: text for name, text in parts.items() if self._sent.get(name) != text}
-        self._sent |= changed
-        self._fingerprint, self._drawn_at = fingerprint, now()
-        return changed
+def _may_look(request: Request, studio: Studio) -> bool:
+    with studio.database.reading() as session:
+        try:
+            experimenter_asking(request, session)
+        except AppError:
+            return False
+    return True
 
 
 @contextmanager

@@ -1,7 +1,6 @@
 """Clips and posters, under the hash of their content: once loaded, a browser never has to ask again."""
 
 from http import HTTPStatus
-from pathlib import Path
 from typing import Annotated
 
 from fastapi import APIRouter, Depends, Request
@@ -13,6 +12,7 @@ from app.domain.clips import Clip, Rollout
 from app.domain.evaluation import Film
 from app.errors import AppError
 from app.services import browser_sessions
+from app.storage import ArtefactStore
 from app.web.deps import EXPERIMENTER_COOKIE, PARTICIPANT_COOKIE, ReadingSession, Sha256, StudioDep
 
 router = APIRouter()
@@ -50,13 +50,13 @@ MayWatch = Annotated[None, Depends(_may_watch, scope="function")]
 @router.api_route("/media/{sha256}.mp4", methods=["GET", "HEAD"], name="show_video")
 def show_video(request: Request, sha256: Sha256, studio: StudioDep, _allowed: MayWatch) -> Response:
     """The video of a clip; answers ranges."""
-    return _artefact(request, studio.store.path(sha256), sha256, "video/mp4")
+    return _artefact(request, studio.store, sha256, "video/mp4")
 
 
 @router.api_route("/media/{sha256}.jpg", methods=["GET", "HEAD"], name="show_poster")
 def show_poster(request: Request, sha256: Sha256, studio: StudioDep, _allowed: MayWatch) -> Response:
     """The first picture of a clip."""
-    return _artefact(request, studio.store.path(sha256), sha256, "image/jpeg")
+    return _artefact(request, studio.store, sha256, "image/jpeg")
 
 
 def _experimenter_asks(request: Request, session: Session) -> bool:
@@ -65,11 +65,10 @@ def _experimenter_asks(request: Request, session: Session) -> bool:
     return experimenter is not None and not experimenter.must_change_password
 
 
-def _artefact(request: Request, path: Path, sha256: str, media_type: str) -> Response:
-    if not path.is_file():
-        raise ClipNotFound
+def _artefact(request: Request, store: ArtefactStore, sha256: str, media_type: str) -> Response:
     headers = {"etag": f'"{sha256}"', "cache-control": _FOREVER}
     known = request.headers.get("if-none-match", "")
     if known == "*" or sha256 in known:
         return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=headers)
+    path = store.verified(sha256)  # what is kept for ever must be what it is called
     return FileResponse(path, headers=headers, media_type=media_type, stat_result=path.stat())

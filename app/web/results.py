@@ -1,11 +1,10 @@
 """Results: what the newest report says, its figures, and the data as files."""
 
-from collections.abc import AsyncIterator, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from http import HTTPStatus
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Path, Request
-from fastapi.concurrency import iterate_in_threadpool
 from fastapi.responses import FileResponse, RedirectResponse, Response, StreamingResponse
 from sqlalchemy.orm import Session
 
@@ -32,10 +31,10 @@ from app.web.deps import (
     ReadingSession,
     RowId,
     Slug,
-    Studio,
     StudioDep,
     WritingSession,
 )
+from app.web.spooling import spooled
 from app.web.templating import page
 
 router = APIRouter(prefix="/studies/{slug}")
@@ -187,7 +186,7 @@ def download_table(
     session: WritingSession,
     studio: StudioDep,
 ) -> Response:
-    """One table, as the database is now, sent while it is read."""
+    """One table, as the database is now."""
     roles.require(experimenter, Role.EXPERIMENTER)
     study = studies.find_study(session, slug)
     if table not in export_tables.BY_NAME:
@@ -197,19 +196,14 @@ def download_table(
     lock = "not-locked" if study.lock_hash is None else study.lock_hash[:8]
     name = f"{slug}-{table}-{lock}-{provenance.exported_at:%Y%m%dT%H%M%S}.{kind}"
     headers = {"content-disposition": f'attachment; filename="{name}"'}
-    lines = _lines(studio, slug, export_tables.BY_NAME[table], kind, provenance)
-    return StreamingResponse(lines, media_type=MEDIA_TYPES[kind], headers=headers)
-
-
-async def _lines(
-    studio: Studio, slug: str, table: exporting.Table, kind: FileKind, provenance: exporting.Provenance
-) -> AsyncIterator[str]:
-    """The file in handfuls of lines; the request's own session is over by now."""
     write = exporting.csv_lines if kind == "csv" else exporting.json_lines
-    async with studio.turns.reading() as session:
-        study = studies.find_study(session, slug)
-        async for lines in iterate_in_threadpool(_handfuls(write(table, session, study, provenance))):
-            yield lines
+
+    def lines(later: Session) -> Iterator[str]:
+        """The request's own session is over by the time anything is sent."""
+        found = studies.find_study(later, slug)
+        return _handfuls(write(export_tables.BY_NAME[table], later, found, provenance))
+
+    return StreamingResponse(spooled(studio.turns, lines), media_type=MEDIA_TYPES[kind], headers=headers)
 
 
 def _handfuls(lines: Iterator[str]) -> Iterator[str]:

@@ -3,15 +3,22 @@
 import json
 import threading
 from collections.abc import Iterator
+from contextlib import ExitStack
+from datetime import timedelta
+from typing import Any
 
 import httpx2
 import pytest
 from fastapi import FastAPI
-from sqlalchemy import delete
+from sqlalchemy import delete, select
+from sqlalchemy.orm import Session
 
 from app.db import Database
-from app.domain.people import BrowserSession
-from app.domain.studies import Study
+from app.domain.people import BrowserSession, Experimenter, Role
+from app.domain.studies import Participant, Study
+from app.services import browser_sessions, dashboard
+from app.services.tallies import Tallies
+from app.storage import ArtefactStore
 from tests import factories
 from tests.conftest import serving
 
@@ -42,20 +49,85 @@ def events_of(lines: Iterator[str]) -> Iterator[tuple[str, str]]:
             yield name, ""
 
 
-def next_fragment(events: Iterator[tuple[str, str]], name: str) -> str:
-    """The HTML of the next part of that name."""
-    fragments = (json.loads(data) for event, data in events if event == "fragment")
-    return str(next(part["html"] for part in fragments if part["name"] == name))
+def sent_of(events: Iterator[tuple[str, str]], name: str) -> Iterator[dict[str, Any]]:
+    """What is sent about a part of the page."""
+    return (part for event, data in events if event == "fragment" if (part := json.loads(data))["name"] == name)
 
 
 def test_a_change_arrives_by_itself(browser: httpx2.Client, study: Study, database: Database) -> None:
     with browser.stream("GET", "/studies/pilot/live") as stream:
         assert stream.headers["content-type"].startswith("text/event-stream")
-        events = events_of(stream.iter_lines())
-        assert "P02" not in next_fragment(events, "participants")
+        sent = sent_of(events_of(stream.iter_lines()), "participants")
+        assert "P02" not in "".join(next(sent)["pieces"])
         with database.writing() as session:
             factories.make_participant(session, study)
-        assert "P02" in next_fragment(events, "participants")
+        assert "P02" in "".join(next(sent)["pieces"])
+
+
+def test_of_a_change_only_the_rows_are_sent_that_it_is_in(
+    browser: httpx2.Client, study: Study, database: Database, store: ArtefactStore
+) -> None:
+    with database.writing() as session:
+        first = session.scalars(select(Participant)).one()
+        (query,) = factories.make_queries(session, store, first, 1)
+        for _ in range(3):
+            factories.make_participant(session, study)
+    with browser.stream("GET", "/studies/pilot/live") as stream:
+        sent = sent_of(events_of(stream.iter_lines()), "participants")
+        pieces = next(sent)["pieces"]
+        with database.writing() as session:
+            factories.make_label(session, query)
+        changed = next(sent)["changed"]
+        pieces = [changed.get(str(place), piece) for place, piece in enumerate(pieces)]
+        others = [
+            code for code in ("P02", "P03", "P04") if any(f'data-row="{code}"' in row for row in changed.values())
+        ]
+        assert others == []
+        page = browser.get("/studies/pilot").text
+    assert "".join("".join(pieces).split()) in "".join(page.split())
+
+
+def test_however_many_look_a_page_is_drawn_once(
+    browser: httpx2.Client, study: Study, database: Database, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawings: list[str] = []
+    overview = dashboard.study_overview
+
+    def counted(session: Session, study: Study, tallies: Tallies) -> dashboard.StudyOverview:
+        drawings.append(study.slug)
+        return overview(session, study, tallies)
+
+    monkeypatch.setattr(dashboard, "study_overview", counted)
+    with ExitStack() as stack:
+        streams = [stack.enter_context(browser.stream("GET", "/studies/pilot/live")) for _ in range(8)]
+        parts = [sent_of(events_of(stream.iter_lines()), "participants") for stream in streams]
+        for each in parts:
+            next(each)
+        before = len(drawings)
+        with database.writing() as session:
+            factories.make_participant(session, study)
+        for each in parts:
+            assert "P02" in "".join(next(each)["pieces"])
+    assert len(drawings) - before < len(streams)
+
+
+def test_all_who_look_are_sent_the_same_whatever_their_role(
+    browser: httpx2.Client, database: Database, address: str
+) -> None:
+    with database.writing() as session:
+        reader = Experimenter(name="reader", password_hash="-", must_change_password=False, role=Role.READER)
+        session.add(reader)
+        session.flush()
+        cookie = browser_sessions.open_for_experimenter(session, reader, timedelta(hours=1))
+    with httpx2.Client(base_url=address, cookies={"studio_experimenter": cookie}, timeout=30) as other:
+        for page in ("/studies", "/studies/pilot", "/studies/pilot/participants/P01"):
+            pages = [fragments_of(each.get(page).text) for each in (browser, other)]
+            assert pages[0] == pages[1] != []
+
+
+def fragments_of(page: str) -> list[str]:
+    """The names and the beginnings of the parts that a page has."""
+    return [part.split("<h2")[0] for part in page.split("data-fragment=")[1:]]
 
 
 def test_the_parts_are_those_of_the_page(browser: httpx2.Client) -> None:
@@ -66,7 +138,8 @@ def test_the_parts_are_those_of_the_page(browser: httpx2.Client) -> None:
             name, data = next(events)
             part = json.loads(data)
         assert name == "fragment"
-        assert f'data-fragment="{part["name"]}">{"".join(part["html"].split())}</div>' in whole
+        html = "".join("".join(part["pieces"]).split())
+        assert f'data-fragment="{part["name"]}">{html}</div>' in whole
 
 
 def test_a_stream_ends_with_the_login(browser: httpx2.Client, database: Database) -> None:

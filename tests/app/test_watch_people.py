@@ -75,7 +75,7 @@ def test_the_pace_leaves_breaks_out(participant: Participant, database: Database
         for query, ago_s in zip(factories.make_queries(session, store, participant, 6), moments, strict=True):
             factories.make_label(session, query, ago=timedelta(seconds=ago_s))
     with database.reading() as session:
-        pace_s = watching.watched(session, participant.id).pace_s
+        pace_s = watching.judged(watching.answers_given(session, [participant.id])[participant.id], []).pace_s
     assert pace_s == pytest.approx(10.0, abs=0.5)
 
 
