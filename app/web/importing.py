@@ -3,11 +3,11 @@
 from http import HTTPStatus
 from typing import Annotated
 
-from fastapi import APIRouter, File, Request, UploadFile
+from fastapi import APIRouter, File, Form, Request, UploadFile
 from fastapi.responses import RedirectResponse, Response
 
 from app.domain.people import Role
-from app.services import archive, roles
+from app.services import roles, study_import
 from app.services.archive import ArchiveInvalid
 from app.web.deps import CurrentExperimenter, StudioDep
 from app.web.link_desk import Link
@@ -27,14 +27,18 @@ def show_import(request: Request, experimenter: CurrentExperimenter) -> Response
 
 @router.post("/import", name="import_study", max_body_size=LARGEST_ARCHIVE_BYTES)
 def import_study(
-    request: Request, experimenter: CurrentExperimenter, studio: StudioDep, file: Annotated[UploadFile, File()]
+    request: Request,
+    experimenter: CurrentExperimenter,
+    studio: StudioDep,
+    file: Annotated[UploadFile, File()],
+    seal_key: Annotated[str, Form(max_length=100)] = "",
 ) -> Response:
     """Check the archive without holding up anybody, then bring it in and lead to the new links."""
     roles.require(experimenter, Role.EXPERIMENTER)
     try:
-        unpacked = archive.unpack(studio.store, file.file)
-        with studio.database.writing() as session:
-            imported = archive.bring_in(session, studio.store, unpacked, experimenter.name)
+        reading = study_import.unpack(studio.store, file.file, seal_key)
+        with reading as unpacked, studio.database.writing() as session:
+            imported = study_import.bring_in(session, studio.store, unpacked, experimenter.name)
     except ArchiveInvalid as invalid:
         context = {"experimenter": experimenter, "error": invalid.message, "may_import": True}
         return page(request, "experimenter/import.html", context, HTTPStatus.UNPROCESSABLE_ENTITY)
