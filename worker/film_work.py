@@ -66,7 +66,7 @@ _DOING = {BEFORE_AFTER: "filming before and after,", TRIALS: "filming robot", CO
 def _plan(place: Workplace, job: Job, what: str) -> list[list[Any]]:
     """[method, scenario] of every film, or [method, letter] of every controller. Draws the evaluation if need be.
 
-    In the order of the methods, never of the letters: rows, times and words about progress then tell nothing of the key.
+    In the order of the methods, never of the letters: rows, times and progress then tell nothing of the key.
     """
     with place.database.writing() as session:
         study, participant = session.get_one(Study, job.study_id), session.get_one(Participant, job.participant)

@@ -4,9 +4,10 @@ How it is drawn. As in the paper every method is met in one block of trials (thr
 blocks varies. The orders are the rows of a Williams design: over one cycle of participants (2, 4, 6 or 10 of them for
 2, 4, 3 or 5 methods) every method comes equally often at every place and equally often right after every other one.
 Which row a participant gets follows from their number: each cycle goes through all rows once, in an order drawn from
-the study's secret, which nobody sees before unblinding (the seed, which everybody sees, tells nothing about it). Letters are given in the order of appearance (the first block is Robot A), so a letter says when a
-method was met and nothing else. The scenarios are the same for all methods of a participant, one per repetition, and
-different for other participants.
+the study's secret, which nobody sees before unblinding; the seed, which everybody sees, tells nothing about it. Letters
+are given in the order of appearance (the first block is Robot A), so a letter says when a method was met and nothing
+else. The scenarios are the same for all methods of a participant, one per repetition, and different for other
+participants.
 
 Everything follows from the secret and the seeds, so that drawing twice is drawing once. The hash of the secret is part
 of what is locked, and the secret is shown after unblinding: whoever has both can draw the letters again.

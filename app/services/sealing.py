@@ -76,7 +76,7 @@ def _nonce(number: int, last: bool) -> bytes:
 
 
 def _cipher(key: str, salt: bytes) -> ChaCha20Poly1305:
-    """Of this file alone. The key may be typed with spaces and in small letters. Raises SealBroken for no key at all."""
+    """Of this file alone. The key may be typed in small letters and with spaces. Raises SealBroken when it is none."""
     typed = "".join(each for each in key.upper() if each.isascii() and each.isalnum())
     if len(typed) != _KEY_CHARACTERS:
         raise SealBroken

@@ -1,4 +1,4 @@
-"""Bringing in an archive of a study: completely or not at all, with new ids, new links, and nothing of other studies."""
+"""Bringing in an archive of a study: completely or not at all, with new ids and links, and nothing of other studies."""
 
 import hashlib
 import re
@@ -48,9 +48,7 @@ class Unpacked:
     """hashes of files that were not in the store before"""
 
 
-def read(
-    session: Session, store: ArtefactStore, source: Path | IO[bytes], actor: str, seal_key: str = ""
-) -> Imported:
+def read(session: Session, store: ArtefactStore, source: Path | IO[bytes], actor: str, seal_key: str = "") -> Imported:
     """Import what archive.write() has written, completely or not at all. Raises ArchiveInvalid."""
     with unpack(store, source, seal_key) as unpacked:
         return bring_in(session, store, unpacked, actor)

@@ -51,7 +51,7 @@ def opened(source: Path | IO[bytes], most_bytes: int) -> Iterator[zipfile.ZipFil
         with source.open("rb") as file, opened(file, most_bytes) as archive:
             yield archive
         return
-    with zipfile.ZipFile(_InPieces(source)) as archive:  # type: ignore[arg-type]  # all that is used of a file
+    with zipfile.ZipFile(_InPieces(source)) as archive:  # all that is used of a file
         source.seek(0, 2)
         _check(archive.infolist(), source.tell(), most_bytes)
         yield archive

@@ -120,7 +120,7 @@ def test_the_archive_of_a_blinded_study_says_nothing_but_what_it_is(sealed: Path
         assert said.keys() == {"format", "version", "software_version", "written_at", "sealed"}
         assert (file.getinfo("sealed").file_size - 16) % (2**20 + 16) == 0, "whole pieces"
     content = sealed.read_bytes()
-    for told in (b"pbarl\"", b"reference", b"letter", b"feeding-finished", b"rows/", b"files/"):
+    for told in (b'pbarl"', b"reference", b"letter", b"feeding-finished", b"rows/", b"files/"):
         assert told not in content, told
 
 
