@@ -23,7 +23,7 @@ from sqlalchemy.orm import Session
 from app.db import Database
 from app.domain.studies import USUAL_CLIP_STEPS, Study, StudySettings, TaskName
 from app.errors import AppError
-from app.services import accounts, archive, audit, damage, enrolment, export_tables, exporting, studies
+from app.services import accounts, audit, damage, enrolment, export_tables, exporting, studies, study_import
 from app.settings import Settings
 from app.storage import ArtefactStore
 
@@ -47,6 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     demo.set_defaults(act=demo_study)
     importing = commands.add_parser("import-study", help=import_study.__doc__)
     importing.add_argument("file", type=Path, help="the archive")
+    importing.add_argument("--seal-key", default="", help="of the archive of a study that is still blinded")
     importing.set_defaults(act=import_study)
     chosen = vars(parser.parse_args(arguments))
     act, _ = chosen.pop("act"), chosen.pop("command")
@@ -97,15 +98,14 @@ def dictionary(_settings: Settings) -> int:
     return 0
 
 
-def import_study(settings: Settings, file: Path) -> int:
+def import_study(settings: Settings, file: Path, seal_key: str = "") -> int:
     """Import an archive of a study and print new personal links of its participants."""
     migrate(settings)
     store = ArtefactStore(settings.data_dir / "artefacts")
     if not file.is_file():
         raise AppError(f"There is no file {file}.")
-    unpacked = archive.unpack(store, file)
-    with _database(settings).writing() as session:
-        imported = archive.bring_in(session, store, unpacked, audit.SYSTEM)
+    with study_import.unpack(store, file, seal_key) as unpacked, _database(settings).writing() as session:
+        imported = study_import.bring_in(session, store, unpacked, audit.SYSTEM)
         _say(f"Imported: {settings.base_url}/studies/{imported.study.slug}")
     for code, token in imported.tokens:
         _say(f"{code},{settings.base_url}/p/{token}")

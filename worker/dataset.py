@@ -94,7 +94,7 @@ def segment_pairs(store: ArtefactStore, pairs: Sequence[tuple[Clip, Clip]]) -> S
 
 def stretch(store: ArtefactStore, clip: Clip) -> Stretch:
     """What a clip shows, simulated here or recorded elsewhere."""
-    trajectory = _recorded(store.path(clip.rollout.trajectory_sha256), IMPORTED in clip.rollout.mode)
+    trajectory = _recorded(store, clip.rollout.trajectory_sha256, IMPORTED in clip.rollout.mode)
     return Stretch(trajectory, clip.first_step, clip.step_count)
 
 
@@ -133,7 +133,7 @@ def signal_scale(session: Session, store: ArtefactStore, study_id: int) -> Signa
 
 def shown(store: ArtefactStore, clip: Clip) -> Trajectory:
     """The whole simulated trajectory that a clip shows a stretch of."""
-    return _trajectory(store.path(clip.rollout.trajectory_sha256))
+    return _trajectory(store.root, clip.rollout.trajectory_sha256)
 
 
 def signal_names(study: Study) -> Sequence[str]:
@@ -143,26 +143,21 @@ def signal_names(study: Study) -> Sequence[str]:
 
 def stored_trajectory(store: ArtefactStore, sha256: str) -> Trajectory:
     """A trajectory by the hash of its file."""
-    return _trajectory(store.path(sha256))
+    return _trajectory(store.root, sha256)
 
 
-def _recorded(path: Path, imported: bool) -> Recorded:
-    return _recording(path) if imported else _trajectory(path)
-
-
-@lru_cache(maxsize=1024)
-def _recording(path: Path) -> Recording:
-    return Recording.load(io.BytesIO(_verified(path)))
+def _recorded(store: ArtefactStore, sha256: str, imported: bool) -> Recorded:
+    return (_recording if imported else _trajectory)(store.root, sha256)
 
 
 @lru_cache(maxsize=1024)
-def _trajectory(path: Path) -> Trajectory:
+def _recording(root: Path, sha256: str) -> Recording:
+    return Recording.load(io.BytesIO(ArtefactStore(root).read(sha256)))
+
+
+@lru_cache(maxsize=1024)
+def _trajectory(root: Path, sha256: str) -> Trajectory:
     try:
-        return Trajectory.load(io.BytesIO(_verified(path)))
+        return Trajectory.load(io.BytesIO(ArtefactStore(root).read(sha256)))
     except OutdatedTrajectory as error:
         raise RecordedByAnOlderVersion from error
-
-
-def _verified(path: Path) -> bytes:
-    """The stored bytes. Raises ArtefactMissing and ArtefactDamaged."""
-    return ArtefactStore(path.parents[1]).read(path.name)

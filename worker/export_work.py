@@ -3,7 +3,7 @@
 import json
 import tempfile
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -16,13 +16,27 @@ from sqlalchemy.orm import Session
 from app.db import now
 from app.domain.models import Export, RunKind
 from app.domain.studies import Deviation, Participant, Study
-from app.errors import AppError
-from app.services import archive, export_requests, export_rows, export_tables, exporting, reports, unblinding
+from app.services import (
+    archive,
+    archive_reading,
+    export_requests,
+    export_rows,
+    export_tables,
+    exporting,
+    reports,
+    sealing,
+    unblinding,
+)
+from app.services.csv_cells import json_text
 from app.services.export_requests import ExportKind
 from app.services.exporting import Kind, Provenance, Table
+from app.storage import ArtefactMissing
 from worker import preference_arrays
 from worker.records import Job
 from worker.workplace import Step, Workplace
+
+Missing = Mapping[str, Sequence[str]]
+"""Hashes of stored files that could not be had, by what they are."""
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 _ARROW = {
@@ -33,10 +47,6 @@ _ARROW = {
     Kind.TIME: pa.timestamp("ms", "UTC"),
     Kind.JSON: pa.string(),
 }
-
-
-class SomebodyWithdrew(AppError):
-    """Somebody withdrew while the file was made, so it was thrown away. Please ask for it again."""
 
 
 def due(session: Session, study: Study) -> list[Job]:
@@ -51,7 +61,14 @@ def make(place: Workplace, job: Job, run_id: int, step: Step) -> None:
 
 
 def _make(place: Workplace, export_id: int, run_id: int) -> str:
-    """The artefact's hash."""
+    """The artefact's hash. When somebody withdraws meanwhile, the file is thrown away and made again without them."""
+    while (sha256 := _made(place, export_id, run_id)) is None:
+        place.report(run_id, "writing the file again, because somebody has withdrawn", 0.1)
+    return sha256
+
+
+def _made(place: Workplace, export_id: int, run_id: int) -> str | None:
+    """The artefact's hash; None when somebody withdrew while it was made."""
     with place.database.reading() as session:
         export = session.get_one(Export, export_id)
         study_id, kind = export.study_id, ExportKind(export.kind)
@@ -60,19 +77,24 @@ def _make(place: Workplace, export_id: int, run_id: int) -> str:
         path = folder / "export.zip"
         place.report(run_id, "writing the file", 0.1)
         with place.database.reading() as session:
-            study = session.get_one(Study, study_id)
-            if kind is ExportKind.DATA:
-                write_data(session, place, study, path)
-            else:
-                archive.write(session, place.store, study, path)
+            write = write_data if kind is ExportKind.DATA else _write_archive
+            missing = write(session, place, session.get_one(Study, study_id), path)
         byte_count, sha256 = path.stat().st_size, place.store.take(path)
     with place.database.writing() as session:
         if _gone(session, study_id) != gone:
             place.store.delete(sha256)
-            raise SomebodyWithdrew
+            return None
         export = session.get_one(Export, export_id)
         export.artefact_sha256, export.byte_count, export.finished_at = sha256, byte_count, now()
+        export.missing = dict(missing) or None
     return sha256
+
+
+def _write_archive(session: Session, place: Workplace, study: Study, path: Path) -> Missing:
+    """Written, and read back as another installation would: nobody is to find out when it is needed."""
+    missing = archive.write(session, place.store, study, path)
+    archive_reading.verify(path, path.parent, sealing.key_of(study))
+    return missing
 
 
 @contextmanager
@@ -89,18 +111,23 @@ def _gone(session: Session, study_id: int) -> Sequence[int]:
     return session.scalars(people.order_by(Participant.id)).all()
 
 
-def write_data(session: Session, place: Workplace, study: Study, path: Path) -> None:
-    """Tables in three formats, their dictionary, the report with its figures, and preference pairs as arrays."""
-    provenance = exporting.provenance_of(session, study)
+def write_data(session: Session, place: Workplace, study: Study, path: Path) -> Missing:
+    """Tables in three formats, their dictionary, the report with its figures, and preference pairs as arrays.
+
+    A stored file that is missing or damaged is left out, and said to be.
+    """
+    provenance, missing = exporting.provenance_of(session, study), dict[str, list[str]]()
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as target:
         for table in export_tables.TABLES:
             _write_table(target, session, study, table, provenance)
         target.writestr("dictionary.csv", exporting.dictionary_csv(export_tables.TABLES))
         target.writestr("dictionary.md", exporting.dictionary_markdown(export_tables.TABLES))
-        target.writestr("provenance.json", _json(_provenance(session, study, provenance)))
-        pictures = _write_report(target, session, place, study)
-        people = _write_pairs(target, session, place, study)
-        target.writestr("README.md", _readme(session, study, provenance, pictures, people))
+        pictures = _write_report(target, session, place, study, missing)
+        people = _write_pairs(target, session, place, study, missing)
+        about = _provenance(session, study, provenance) | {"missing": missing}
+        target.writestr("provenance.json", _json(about))
+        target.writestr("README.md", _readme(study, provenance, about, pictures, people))
+    return missing
 
 
 def _write_table(target: zipfile.ZipFile, session: Session, study: Study, table: Table, provenance: Provenance) -> None:
@@ -128,24 +155,34 @@ def arrow_table(table: Table, session: Session, study: Study, provenance: Proven
 
 
 def _arrow_value(kind: Kind, value: Any) -> Any:
-    return json.dumps(value, ensure_ascii=False) if kind is Kind.JSON and value is not None else value
+    return json_text(value) if kind is Kind.JSON and value is not None else value
 
 
-def _write_report(target: zipfile.ZipFile, session: Session, place: Workplace, study: Study) -> list[str]:
+def _write_report(
+    target: zipfile.ZipFile, session: Session, place: Workplace, study: Study, missing: dict[str, list[str]]
+) -> list[str]:
     report = reports.newest(session, study)
     if report is None:
         return []
     target.writestr("report/report.json", _json({"made_at": report.created_at.isoformat(), **report.contents}))
     for name, formats in sorted(report.figures.items()):
         for kind, sha256 in formats.items():
-            target.writestr(f"report/{name}.{kind}", place.store.read(sha256))
+            try:
+                target.writestr(f"report/{name}.{kind}", place.store.read(sha256))
+            except ArtefactMissing:
+                missing.setdefault("figures of the report", []).append(sha256)
     return sorted(report.figures)
 
 
-def _write_pairs(target: zipfile.ZipFile, session: Session, place: Workplace, study: Study) -> list[str]:
+def _write_pairs(
+    target: zipfile.ZipFile, session: Session, place: Workplace, study: Study, missing: dict[str, list[str]]
+) -> list[str]:
     written = []
     for person in export_rows.everybody(session, study):
-        arrays = preference_arrays.arrays_of(session, place.store, study, person)
+        lost = set[str]()
+        arrays = preference_arrays.arrays_of(session, place.store, study, person, lost)
+        if lost:
+            missing[f"recordings: pairs of {person.code} that show them are not in its arrays"] = sorted(lost)
         if arrays is not None:
             target.writestr(f"pairs/{person.code}.npz", arrays)
             written.append(person.code)
@@ -173,16 +210,17 @@ def _provenance(session: Session, study: Study, provenance: Provenance) -> dict[
         ],
         "blinded": unblinding.is_blinded(study),
         "unblinded_at": study.unblinded_at.isoformat() if study.unblinded_at else None,
+        "evaluation_key": study.key_secret if study.unblinded_at else None,
         "software_version": provenance.software_version,
         "exported_at": provenance.exported_at.isoformat(),
     }
 
 
 def _readme(
-    session: Session, study: Study, provenance: Provenance, pictures: Sequence[str], people: Sequence[str]
+    study: Study, provenance: Provenance, about: dict[str, Any], pictures: Sequence[str], people: Sequence[str]
 ) -> str:
-    deviations = _provenance(session, study, provenance)["deviations"]
-    listed = "\n".join(f"* {each['at']}, {each['actor']}: {each['reason']}" for each in deviations) or "None."
+    listed = [f"* {each['at']}, {each['actor']}: {' '.join(each['reason'].split())}" for each in about["deviations"]]
+    lost = [f"* {what}: {', '.join(hashes)}" for what, hashes in about["missing"].items()]
     blinded = (
         "The study is blinded: letters stand for methods, and no file here says which is which."
         if unblinding.is_blinded(study)
@@ -195,7 +233,8 @@ def _readme(
         version=provenance.software_version,
         moment=provenance.exported_at.isoformat(timespec="seconds"),
         blinded=blinded,
-        deviations=listed,
+        deviations="\n".join(listed) or "None.",
+        missing="\n".join(lost) or "Nothing.",
         figures=", ".join(pictures) or "none yet",
         people=", ".join(people) or "nobody yet",
     )
@@ -219,6 +258,11 @@ Participants who withdrew are tombstones in `participants`, and nothing of them 
 
 ## Deviations from the locked plan
 {deviations}
+
+## Missing
+Stored files that were missing or damaged when this was made, by their hashes; a backup of the data directory has them.
+
+{missing}
 """
 
 

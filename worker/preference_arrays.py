@@ -12,7 +12,7 @@ from sqlalchemy.orm import Session
 from app.domain.preferences import Label
 from app.domain.studies import Participant, Study
 from app.services import exporting
-from app.storage import ArtefactStore
+from app.storage import ArtefactMissing, ArtefactStore
 from worker import dataset
 from worker.ml.segments import SegmentPairs, Stretch
 from worker.trajectory import Array
@@ -21,13 +21,19 @@ LAYOUT = 1
 """Version of the layout in docs/arrays.md."""
 
 
-def arrays_of(session: Session, store: ArtefactStore, study: Study, participant: Participant) -> bytes | None:
-    """The participant's labels as one .npz file; None when nothing with a target was said."""
+def arrays_of(
+    session: Session, store: ArtefactStore, study: Study, participant: Participant, lost: set[str]
+) -> bytes | None:
+    """The participant's labels as one .npz file; None when nothing with a target was said.
+
+    Pairs whose recordings cannot be read are left out, and the recordings' hashes added to ``lost``.
+    """
     labels = dataset.labels_with_clips(session, participant.id)
-    said = [(each, target) for each in labels if (target := dataset.target_of(each.response)) is not None]
+    answered = [(each, target) for each in labels if (target := dataset.target_of(each.response)) is not None]
+    said = [(each, target, both) for each, target in answered if (both := _stretches(store, each, lost))]
     if not said:
         return None
-    stretches = [_stretches(store, label) for label, _ in said]
+    stretches = [both for _, _, both in said]
     pairs = SegmentPairs.of(stretches)
     about = {
         "layout": LAYOUT,
@@ -46,19 +52,26 @@ def arrays_of(session: Session, store: ArtefactStore, study: Study, participant:
         actions=pairs.actions,
         signals=pairs.signals,
         masks=pairs.shown,
-        targets=np.array([value for _, value in said], np.float32),
-        ordinals=np.array([label.query.ordinal for label, _ in said], np.int64),
-        purposes=_texts([label.query.purpose for label, _ in said]),
-        responses=_texts([label.response.value for label, _ in said]),
-        clip_ids=np.array([_clip_ids(label) for label, _ in said]),
+        targets=np.array([value for _, value, _ in said], np.float32),
+        ordinals=np.array([label.query.ordinal for label, _, _ in said], np.int64),
+        purposes=_texts([label.query.purpose for label, _, _ in said]),
+        responses=_texts([label.response.value for label, _, _ in said]),
+        clip_ids=np.array([_clip_ids(label) for label, _, _ in said]),
         signal_names=_texts(dataset.signal_names(study)),
         about=np.array(json.dumps(about)),
     )
     return file.getvalue()
 
 
-def _stretches(store: ArtefactStore, label: Label) -> tuple[Stretch, Stretch]:
-    return dataset.stretch(store, label.query.left_clip), dataset.stretch(store, label.query.right_clip)
+def _stretches(store: ArtefactStore, label: Label, lost: set[str]) -> tuple[Stretch, Stretch] | None:
+    """Left and right; None when one of them cannot be read."""
+    found = []
+    for clip in (label.query.left_clip, label.query.right_clip):
+        try:
+            found.append(dataset.stretch(store, clip))
+        except (ArtefactMissing, dataset.RecordedByAnOlderVersion):
+            lost.add(clip.rollout.trajectory_sha256)
+    return (found[0], found[1]) if len(found) == 2 else None
 
 
 def _last_observations(pairs: Sequence[tuple[Stretch, Stretch]]) -> Array:

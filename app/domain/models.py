@@ -125,7 +125,10 @@ class Export(Base):
     requested_at: Mapped[datetime] = mapped_column(default=now)
     finished_at: Mapped[datetime | None]
     artefact_sha256: Mapped[str | None] = mapped_column(String(64))
+    """None of a finished one: taken back, because somebody withdrew who was in it."""
     byte_count: Mapped[int | None]
+    missing: Mapped[dict[str, Any] | None]
+    """What could not be put in, by what it is: {"video of a clip": [sha256, ...]}; None: nothing."""
 
 
 class WorkerPresence(Base):

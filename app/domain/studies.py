@@ -1,5 +1,6 @@
 """Studies, their settings, and the participants in them."""
 
+import secrets
 from datetime import datetime
 from enum import StrEnum
 from typing import Any
@@ -174,6 +175,11 @@ PAPER_PROTOCOL = StudySettings(
 """The user study of the paper: 10 + 190 labels, three methods, three trials each. The default of everything else."""
 
 
+def new_key_secret() -> str:
+    """What the letters of a study's blinded evaluation are drawn from; nobody can guess it."""
+    return secrets.token_hex(32)
+
+
 class Study(Base):
     """One experiment: a task, its settings, its pool of clips and its participants."""
 
@@ -195,6 +201,8 @@ class Study(Base):
     lock_document: Mapped[dict[str, Any] | None]
     """Settings, plan of pairs, stop rule and planned tests as they were locked; lock_hash is the hash of this."""
     unblinded_at: Mapped[datetime | None]
+    key_secret: Mapped[str] = mapped_column(String(64), default=new_key_secret)
+    """Decides which letter hides which method. Shown to nobody before the study is unblinded."""
 
     @property
     def settings(self) -> StudySettings:

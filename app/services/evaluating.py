@@ -4,11 +4,13 @@ How it is drawn. As in the paper every method is met in one block of trials (thr
 blocks varies. The orders are the rows of a Williams design: over one cycle of participants (2, 4, 6 or 10 of them for
 2, 4, 3 or 5 methods) every method comes equally often at every place and equally often right after every other one.
 Which row a participant gets follows from their number: each cycle goes through all rows once, in an order drawn from
-the study's seed. Letters are given in the order of appearance (the first block is Robot A), so a letter says when a
-method was met and nothing else. The scenarios are the same for all methods of a participant, one per repetition, and
-different for other participants.
+the study's secret, which nobody sees before unblinding; the seed, which everybody sees, tells nothing about it. Letters
+are given in the order of appearance (the first block is Robot A), so a letter says when a method was met and nothing
+else. The scenarios are the same for all methods of a participant, one per repetition, and different for other
+participants.
 
-Everything follows from seeds, so that drawing twice is drawing once, and a study can be repeated exactly.
+Everything follows from the secret and the seeds, so that drawing twice is drawing once. The hash of the secret is part
+of what is locked, and the secret is shown after unblinding: whoever has both can draw the letters again.
 """
 
 import hashlib
@@ -98,12 +100,12 @@ def williams_rows(count: int) -> Sequence[tuple[int, ...]]:
     return square if count % 2 == 0 else [*square, *(row[::-1] for row in square)]
 
 
-def order_of_methods(study_seed: int, methods: Sequence[EvaluatedMethod], number: int) -> Sequence[EvaluatedMethod]:
+def order_of_methods(secret: str, methods: Sequence[EvaluatedMethod], number: int) -> Sequence[EvaluatedMethod]:
     """The order in which the participant of this number meets the methods."""
-    drawn = sorted(methods, key=lambda method: _mark(study_seed, "method", method))
+    drawn = sorted(methods, key=lambda method: _mark(secret, "method", method))
     rows = williams_rows(len(methods))
     cycle, place = divmod(number - 1, len(rows))
-    row = sorted(rows, key=lambda each: _mark(study_seed, "row", cycle, *each))[place]
+    row = sorted(rows, key=lambda each: _mark(secret, "row", cycle, *each))[place]
     return [drawn[index] for index in row]
 
 
@@ -115,7 +117,7 @@ def draw(session: Session, study: Study, participant: Participant) -> None:
     session.scalar(select(Participant.id).where(Participant.id == participant.id).with_for_update())  # one at a time
     if session.scalar(select(Assignment.id).where(Assignment.participant_id == participant.id).limit(1)) is not None:
         return
-    methods = order_of_methods(study.seed, settings.methods, participant.number)
+    methods = order_of_methods(study.key_secret, settings.methods, participant.number)
     for block, (letter, method) in enumerate(zip(LETTERS, methods, strict=False)):
         session.add(Assignment(participant_id=participant.id, letter=letter, method=method))
         for repetition in range(1, settings.trials + 1):
@@ -287,6 +289,6 @@ def film_of(session: Session, participant_id: int, method: str, scenario: int, m
     return session.scalar(theirs.where(Film.model_id == model_id if model_id is not None else Film.model_id.is_(None)))
 
 
-def _mark(study_seed: int, *parts: object) -> str:
+def _mark(secret: str, *parts: object) -> str:
     """Sorts in an order that looks random and is the same on every machine."""
-    return hashlib.sha256(f"{study_seed}/evaluation/{'/'.join(map(str, parts))}".encode()).hexdigest()
+    return hashlib.sha256(f"{secret}/evaluation/{'/'.join(map(str, parts))}".encode()).hexdigest()

@@ -24,7 +24,7 @@ class ExportKind(StrEnum):
 
 
 class ExportNotFound(AppError):
-    """There is no such file, or it is not finished yet. The page of exports shows what there is."""
+    """There is no such file, it is not finished yet, or somebody in it has withdrawn. Look at the page of exports."""
 
     status = HTTPStatus.NOT_FOUND
 

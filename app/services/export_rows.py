@@ -198,6 +198,8 @@ def ratings(session: Session, study: Study) -> Rows:
 
 
 def models(session: Session, study: Study) -> Rows:
+    """While the study is blinded, without the hashes of methods: those are files of letters as well."""
+    blinded = unblinding.is_blinded(study)
     for person in _present(session, study):
         for each in session.scalars(select(Model).where(Model.participant_id == person.id).order_by(Model.id)):
             yield (
@@ -206,7 +208,7 @@ def models(session: Session, study: Study) -> Rows:
                 each.label_count,
                 each.label_hash,
                 each.seed,
-                each.artefact_sha256,
+                None if blinded and each.kind == ModelKind.METHOD else each.artefact_sha256,
                 each.created_at,
                 each.metrics,
             )

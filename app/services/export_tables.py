@@ -201,7 +201,9 @@ TABLES: Sequence[Table] = (
             Column("label_count", I, "Answers it has learned from, those without a preference included."),
             Column("label_hash", T, "Fingerprint of these answers.", allowed=SHA256),
             Column("seed", I, "Of the training."),
-            Column("artefact_sha256", T, "The stored file.", allowed=SHA256),
+            Column(
+                "artefact_sha256", T, "The stored file; of methods unknown while the study is blinded.", allowed=SHA256
+            ),
             Column("created_at", W, "When it was ready."),
             Column("metrics", J, "What was measured while training."),
         ),

@@ -1,12 +1,9 @@
 """Tables as files: every column is defined once, and files, dictionary and documentation follow from that.
 
 What all files have in common: UTF-8, times in UTC (ISO 8601), unknown is empty (null), and five columns at the end that
-say where the row comes from. Cells of a CSV file that a spreadsheet would run as a formula get an apostrophe in front.
+say where the row comes from. Nothing in a CSV file is a formula to a spreadsheet (csv_cells).
 """
 
-import csv
-import io
-import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime
@@ -19,10 +16,9 @@ from sqlalchemy.orm import Session
 
 from app.db import now
 from app.domain.studies import Deviation, Study
+from app.services.csv_cells import csv_line, json_text, moment
 
 NOT_LOCKED = "not locked"
-FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\r")
-"""What makes Excel, LibreOffice and Google Sheets take a text for a formula."""
 
 
 class Kind(StrEnum):
@@ -97,15 +93,15 @@ PROVENANCE = (
 )
 
 
-def provenance_of(session: Session, study: Study, moment: datetime | None = None) -> Provenance:
+def provenance_of(session: Session, study: Study, exported_at: datetime | None = None) -> Provenance:
     """Of an export that is made now, or at another moment."""
     deviations = session.scalars(select(Deviation).where(Deviation.study_id == study.id).order_by(Deviation.id)).all()
     return Provenance(
         study=study.slug,
         lock_hash=study.lock_hash or NOT_LOCKED,
-        deviations=" | ".join(f"{_time(each.at)}: {each.reason}" for each in deviations) or "none",
+        deviations=" | ".join(f"{moment(each.at)}: {each.reason}" for each in deviations) or "none",
         software_version=software_version(),
-        exported_at=moment or now(),
+        exported_at=exported_at or now(),
     )
 
 
@@ -119,15 +115,15 @@ def software_version() -> str:
 
 def csv_lines(table: Table, session: Session, study: Study, provenance: Provenance) -> Iterator[str]:
     """The file, line by line. Cells that would run as formulas are defused."""
-    yield _csv_line([column.name for column in table.all_columns])
+    yield csv_line(column.name for column in table.all_columns)
     for values in _complete(table, session, study, provenance):
-        yield _csv_line([_cell(value) for value in values])
+        yield csv_line(values)
 
 
 def json_lines(table: Table, session: Session, study: Study, provenance: Provenance) -> Iterator[str]:
     """The file, line by line: one object per row, every value as it is stored."""
     for record in records(table, session, study, provenance):
-        yield json.dumps(record, ensure_ascii=False) + "\n"
+        yield json_text(record) + "\n"
 
 
 def records(table: Table, session: Session, study: Study, provenance: Provenance) -> Iterator[dict[str, Any]]:
@@ -156,7 +152,7 @@ def dictionary(tables: Iterable[Table]) -> list[dict[str, str]]:
 def dictionary_csv(tables: Iterable[Table]) -> str:
     """The data dictionary as a table of its own."""
     rows = dictionary(tables)
-    return "".join([_csv_line(list(rows[0])), *(_csv_line(list(row.values())) for row in rows)])
+    return "".join([csv_line(rows[0]), *(csv_line(row.values()) for row in rows)])
 
 
 def dictionary_markdown(tables: Sequence[Table]) -> str:
@@ -178,8 +174,9 @@ Every table can be downloaded by itself as CSV or JSONL while a study runs, and 
 * Files are UTF-8 without a byte order mark; CSV has a header line, commas, and double quotes where needed.
 * Times are UTC in ISO 8601. Unknown is empty in CSV and `null` elsewhere, never 0.
 * `json` columns hold JSON text in CSV and Parquet, and the value itself in JSONL.
-* In CSV, a text that a spreadsheet would run as a formula (it begins with `=`, `+`, `-`, `@`, tab or carriage return)
-  gets an apostrophe in front, because participants write some of these texts. JSONL and Parquet have texts as they are.
+* In CSV, an apostrophe stands wherever a spreadsheet would begin a formula in a text (before `=`, `+`, `-`, `@` at its
+  start, and after a line break, a semicolon or a tab), because participants write some of these texts; line breaks are
+  `\\n`, and control characters are replaced (U+FFFD). JSONL and Parquet have texts as they are.
 * Participants are known by codes. Of somebody who has withdrawn only a tombstone is left: code, and when it was.
 * Until a study is unblinded, methods of the evaluation are left out everywhere: letters stand for them, and a letter is
   another method for every participant.
@@ -197,31 +194,5 @@ def _complete(table: Table, session: Session, study: Study, provenance: Provenan
         yield (*values, *provenance.values)
 
 
-def _csv_line(cells: Sequence[str]) -> str:
-    target = io.StringIO()
-    csv.writer(target, lineterminator="\n").writerow(cells)
-    return target.getvalue()
-
-
-def _cell(value: Any) -> str:
-    if isinstance(value, str):
-        return defused(value)
-    plain = _plain(value)
-    if plain is None:
-        return ""
-    if isinstance(plain, bool):
-        return "true" if plain else "false"
-    return json.dumps(plain, ensure_ascii=False) if isinstance(plain, dict | list) else str(plain)
-
-
-def defused(text: str) -> str:
-    """The text, with an apostrophe in front if a spreadsheet would run it."""
-    return f"'{text}" if text.startswith(FORMULA_STARTS) else text
-
-
 def _plain(value: Any) -> Any:
-    return _time(value) if isinstance(value, datetime) else value
-
-
-def _time(moment: datetime) -> str:
-    return moment.isoformat(timespec="milliseconds")
+    return moment(value) if isinstance(value, datetime) else value

@@ -124,6 +124,7 @@ def document(study: Study) -> dict[str, Any]:
             "participant_seeds": [participant_seed(study.seed, number + 1) for number in range(SEEDS_LISTED)],
         },
         "stop_rule": _stop_rule(settings),
+        "evaluation_key_sha256": hashlib.sha256(study.key_secret.encode()).hexdigest(),
         "planned_tests": [test.value for test in settings.planned_tests],
         "software_version": exporting.software_version(),
     }

@@ -8,7 +8,7 @@ import shutil
 from collections.abc import Collection, Iterator
 from typing import Any
 
-from sqlalchemy import ColumnElement, Table, delete, select
+from sqlalchemy import ColumnElement, Table, delete, select, update
 from sqlalchemy.orm import InstrumentedAttribute, Session
 
 from app.db import Base, now
@@ -96,11 +96,17 @@ def in_use(session: Session, artefacts: Collection[str]) -> set[str]:
 
 
 def _erase_made_of_everybody(session: Session, study_id: int) -> None:
-    """Reports and exports hold something of each participant; new ones are made without this one."""
+    """Reports and exports hold something of each participant; new ones are made without this one.
+
+    That an export was asked for is kept: a finished one is taken back, one that is waiting is made without this person.
+    """
     session.execute(delete(Report).where(Report.study_id == study_id))
-    session.execute(delete(Export).where(Export.study_id == study_id))
-    kinds = (RunKind.REPORT, RunKind.EXPORT)
-    session.execute(delete(Run).where(Run.study_id == study_id, Run.kind.in_(kinds)))
+    session.execute(delete(Run).where(Run.study_id == study_id, Run.kind == RunKind.REPORT))
+    finished = update(Export).where(Export.study_id == study_id, Export.finished_at.is_not(None))
+    session.execute(finished.values(artefact_sha256=None, byte_count=None, missing=None))
+    runs = update(Run).where(Run.study_id == study_id, Run.kind == RunKind.EXPORT)
+    session.execute(runs.values(stage=""))
+    session.execute(runs.where(Run.error.is_not(None)).values(error="It failed before somebody withdrew."))
 
 
 def _artefacts(session: Session, participant: Participant) -> Iterator[str]:

@@ -341,7 +341,7 @@ def _export(session: Session, study: Study, export: Export) -> answers.ExportAns
         finished_at=export.finished_at,
         byte_count=export.byte_count,
         error=run.error if run else None,
-        download=address if export.finished_at else None,
+        download=address if export.artefact_sha256 else None,
     )
 
 

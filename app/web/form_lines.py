@@ -21,7 +21,7 @@ class LineBroken(ValueError):
 def items_of(typed: str) -> tuple[FormItem, ...]:
     """The questions. Raises LineBroken."""
     items: list[FormItem] = []
-    for number, line in enumerate(typed.splitlines(), 1):
+    for number, line in enumerate(_lines(typed), 1):
         if not line.strip():
             continue
         item = _item(number, line)
@@ -40,7 +40,7 @@ def texts_of(typed: str) -> dict[str, str]:
     """The texts by name. Raises LineBroken."""
     texts: dict[str, list[str]] = {}
     name = None
-    for number, line in enumerate(typed.replace("\r\n", "\n").split("\n"), 1):
+    for number, line in enumerate(_lines(typed), 1):
         found = _TEXT.match(line)
         if found and found[1] in texts:
             raise LineBroken(f"Line {number}: {found[1]} has a text already.")
@@ -57,6 +57,11 @@ def texts_of(typed: str) -> dict[str, str]:
 def lines_of_texts(texts: Mapping[str, str]) -> str:
     """Texts as they are typed."""
     return "\n".join(f"{name} = {text.strip()}".replace("\n", "\n    ") for name, text in texts.items())
+
+
+def _lines(typed: str) -> Sequence[str]:
+    """As they were typed: other characters that some take for the end of a line are part of a text."""
+    return re.split(r"\r\n|\r|\n", typed)
 
 
 def _item(number: int, line: str) -> FormItem:

@@ -7,23 +7,24 @@ from http import HTTPStatus
 from typing import IO, Annotated
 
 from fastapi import APIRouter, Depends, Request
-from fastapi.concurrency import run_in_threadpool
+from fastapi.concurrency import contextmanager_in_threadpool, run_in_threadpool
 from fastapi.responses import RedirectResponse, Response
-from sqlalchemy.orm import Session
 from starlette.datastructures import UploadFile
 from starlette.requests import ClientDisconnect
 from starlette.types import Message, Receive
 
 from app.domain.people import Experimenter, Role
 from app.errors import AppError
-from app.services import archive, roles
-from app.services.archive import ArchiveInvalid, Imported
+from app.services import roles, study_import
+from app.services.archive import ArchiveInvalid
+from app.services.study_import import Imported
 from app.web.deps import CurrentExperimenter, Studio, StudioDep, experimenter_asking
 from app.web.link_desk import Link
 from app.web.templating import page
 
 router = APIRouter()
 
+LONGEST_SEAL_KEY = 100
 LARGEST_ARCHIVE_BYTES = 16 * 1024**3
 ROOM_LEFT_BYTES = 2 * 1024**3
 """What an upload must leave free on the disk of temporary files."""
@@ -76,10 +77,10 @@ async def import_study(
     try:
         with studio.imports.place():
             async with Request(request.scope, _patiently(request)).form(max_files=1) as form:
-                file = form.get("file")
-                if not isinstance(file, UploadFile):
+                file, seal_key = form.get("file"), form.get("seal_key", "")
+                if not isinstance(file, UploadFile) or not isinstance(seal_key, str):
                     raise ArchiveInvalid
-                imported = await _bring_in(studio, file.file, experimenter.name)
+                imported = await _bring_in(studio, file.file, seal_key[:LONGEST_SEAL_KEY], experimenter.name)
     except ClientDisconnect as error:
         raise UploadStalled from error
     except ArchiveInvalid as invalid:
@@ -96,14 +97,10 @@ async def import_study(
     return RedirectResponse(request.app.url_path_for("show_links", slug=slug, key=key), HTTPStatus.SEE_OTHER)
 
 
-async def _bring_in(studio: Studio, file: IO[bytes], actor: str) -> Imported:
-    unpacked = await run_in_threadpool(archive.unpack, studio.store, file)
-
-    def bring_in(session: Session) -> Imported:
-        return archive.bring_in(session, studio.store, unpacked, actor)
-
-    async with studio.turns.writing() as session:
-        return await run_in_threadpool(bring_in, session)
+async def _bring_in(studio: Studio, file: IO[bytes], seal_key: str, actor: str) -> Imported:
+    unpacking = study_import.unpack(studio.store, file, seal_key)
+    async with contextmanager_in_threadpool(unpacking) as unpacked, studio.turns.writing() as session:
+        return await run_in_threadpool(study_import.bring_in, session, studio.store, unpacked, actor)
 
 
 def _require_room(request: Request) -> None:

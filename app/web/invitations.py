@@ -1,7 +1,5 @@
 """Inviting people: personal links as a list, a file and a sheet to print, and the open address for panels."""
 
-import csv
-import io
 from collections.abc import Sequence
 from http import HTTPStatus
 from typing import Annotated
@@ -13,6 +11,7 @@ from markupsafe import Markup
 from starlette.background import BackgroundTask
 
 from app.services import enrolment, panel, studies, withdrawal
+from app.services.csv_cells import csv_line
 from app.web.deps import (
     ActingExperimenter,
     Code,
@@ -183,11 +182,7 @@ def _qr_code(url: str) -> Markup:
 
 
 def _as_csv(links: Sequence[Link]) -> str:
-    written = io.StringIO()
-    rows = csv.writer(written)
-    rows.writerow(["participant", "link"])
-    rows.writerows((link.code, link.url) for link in links)
-    return written.getvalue()
+    return "".join([csv_line(("participant", "link")), *(csv_line((link.code, link.url)) for link in links)])
 
 
 def _base(request: Request, studio: Studio) -> str:

@@ -8,7 +8,7 @@ from fastapi import APIRouter, Path, Request
 from fastapi.responses import FileResponse, RedirectResponse, Response, StreamingResponse
 from sqlalchemy.orm import Session
 
-from app.domain.people import Role
+from app.domain.people import Experimenter, Role
 from app.domain.studies import Study
 from app.errors import AppError
 from app.services import (
@@ -20,6 +20,7 @@ from app.services import (
     locking,
     reports,
     roles,
+    sealing,
     studies,
     unblinding,
 )
@@ -137,7 +138,21 @@ def show_exports(
     request: Request, slug: Slug, experimenter: CurrentExperimenter, session: ReadingSession, studio: StudioDep
 ) -> Response:
     """Every table, the whole as one file, and the archive."""
+    return _exports_page(request, studies.find_study(session, slug), experimenter, session)
+
+
+@router.post("/export/seal-key", name="show_seal_key")
+def show_seal_key(request: Request, slug: Slug, experimenter: ActingExperimenter, session: WritingSession) -> Response:
+    """The key of this study's sealed archives; who has asked for it is kept."""
+    roles.require(experimenter, Role.EXPERIMENTER)
     study = studies.find_study(session, slug)
+    audit.record(session, experimenter.name, "seal key shown", slug)
+    return _exports_page(request, study, experimenter, session, sealing.key_of(study))
+
+
+def _exports_page(
+    request: Request, study: Study, experimenter: Experimenter, session: Session, seal_key: str | None = None
+) -> Response:
     exports = [(export, export_requests.run_of(session, export)) for export in export_requests.of_study(session, study)]
     context = {
         "study": study,
@@ -149,6 +164,7 @@ def show_exports(
         "tables": export_tables.TABLES,
         "provenance": exporting.provenance_of(session, study),
         "may_export": roles.may(experimenter, Role.EXPERIMENTER),
+        "seal_key": seal_key,
     }
     return page(request, "experimenter/export.html", context)
 

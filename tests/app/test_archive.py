@@ -1,6 +1,7 @@
 """A study moves to another installation: everything arrives, or nothing does."""
 
 import hashlib
+import io
 import json
 import zipfile
 from collections.abc import Callable, Iterator
@@ -18,7 +19,7 @@ from app.domain.models import Run, RunStatus
 from app.domain.preferences import Query
 from app.domain.studies import Participant, Study
 from app.main import create_app
-from app.services import archive, enrolment, export_tables, exporting, unblinding, withdrawal
+from app.services import archive, enrolment, export_tables, exporting, sealing, study_import, unblinding, withdrawal
 from app.services.archive import ArchiveInvalid
 from app.settings import Settings
 from app.storage import ArtefactStore
@@ -76,10 +77,10 @@ def exports(database: Database, slug: str) -> dict[str, str]:
         }
 
 
-def bring(application: FastAPI, path: Path) -> archive.Imported:
+def bring(application: FastAPI, path: Path, seal_key: str = "") -> study_import.Imported:
     studio = application.state.studio
     with studio.database.writing() as session:
-        return archive.read(session, studio.store, path, "experimenter")
+        return study_import.read(session, studio.store, path, "experimenter", seal_key)
 
 
 def count(database: Database) -> dict[str, int]:
@@ -101,25 +102,87 @@ def test_a_study_that_was_imported_exports_the_same(
             assert hashlib.sha256(there.store.read(sha256)).hexdigest() == sha256
 
 
-def test_the_archive_of_a_blinded_study_shows_no_key_and_arrives_with_it(
-    database: Database, store: ArtefactStore, elsewhere: FastAPI, study: Study, tmp_path: Path
-) -> None:
+@pytest.fixture
+def sealed(database: Database, store: ArtefactStore, study: Study, tmp_path: Path) -> Path:
+    """The archive of the same study while it is blinded."""
     path = tmp_path / "blinded.zip"
     with database.writing() as session:
         session.get_one(Study, study.id).unblinded_at = None
         session.flush()
         archive.write(session, store, session.get_one(Study, study.id), path)
-    with zipfile.ZipFile(path) as file:
-        readable = {name: file.read(name) for name in file.namelist() if name.endswith((".jsonl", ".sealed"))}
-    assert "rows/assignment.sealed" in readable
-    assert [name for name, content in readable.items() if b'"letter"' in content] == []
-    imported = bring(elsewhere, path)
+    return path
+
+
+def test_the_archive_of_a_blinded_study_says_nothing_but_what_it_is(sealed: Path) -> None:
+    with zipfile.ZipFile(sealed) as file:
+        assert file.namelist() == ["manifest.json", "sealed"]
+        said = json.loads(file.read("manifest.json"))
+        assert said.keys() == {"format", "version", "software_version", "written_at", "sealed"}
+        assert (file.getinfo("sealed").file_size - 16) % (2**20 + 16) == 0, "whole pieces"
+    content = sealed.read_bytes()
+    for told in (b'pbarl"', b"reference", b"letter", b"feeding-finished", b"rows/", b"files/"):
+        assert told not in content, told
+
+
+def test_a_sealed_archive_arrives_with_its_key_of_letters(
+    database: Database, elsewhere: FastAPI, study: Study, sealed: Path
+) -> None:
+    imported = bring(elsewhere, sealed, sealing.key_of(study).lower().replace("-", " "))
     with elsewhere.state.studio.database.writing() as session:
-        session.get_one(Study, imported.study.id).unblinded_at = MOMENT
-        there = unblinding.key_of(session, session.get_one(Study, imported.study.id))
+        there = session.get_one(Study, imported.study.id)
+        assert unblinding.is_blinded(there)
+        assert there.key_secret == study.key_secret, "who comes later is drawn as they would have been"
+        there.unblinded_at = MOMENT
+        key = unblinding.key_of(session, there)
     with database.writing() as session:
         session.get_one(Study, study.id).unblinded_at = MOMENT
-        assert there == unblinding.key_of(session, session.get_one(Study, study.id))
+        assert key == unblinding.key_of(session, session.get_one(Study, study.id))
+
+
+@pytest.mark.parametrize("wrong", ["", "ABCD", "AAAA-AAAA-AAAA-AAAA-AAAA-AAAA-AAAA-AAAA"])
+def test_without_its_seal_key_a_sealed_archive_stays_shut(elsewhere: FastAPI, sealed: Path, wrong: str) -> None:
+    with pytest.raises(ArchiveInvalid, match="seal key"):
+        bring(elsewhere, sealed, wrong)
+
+
+def _with_a_piece_left_out(content: bytes) -> bytes:
+    return content[: 16 + 2**20 + 16]
+
+
+def _with_pieces_exchanged(content: bytes) -> bytes:
+    first, second = content[16 : 16 + 2**20 + 16], content[16 + 2**20 + 16 :]
+    return content[:16] + second + first
+
+
+def _with_another_bit(content: bytes) -> bytes:
+    return content[:100] + bytes([content[100] ^ 1]) + content[101:]
+
+
+@pytest.mark.parametrize("change", [_with_a_piece_left_out, _with_pieces_exchanged, _with_another_bit])
+def test_a_seal_that_was_tampered_with_is_noticed(study: Study, change: Callable[[bytes], bytes]) -> None:
+    content = bytes(range(256)) * 6000
+    key, target = sealing.key_of(study), io.BytesIO()
+    sealing.seal(io.BytesIO(content), len(content), target, key)
+    opened = io.BytesIO()
+    sealing.unseal(io.BytesIO(target.getvalue()), opened, key)
+    assert opened.getvalue() == content
+    with pytest.raises(sealing.SealBroken):
+        sealing.unseal(io.BytesIO(change(target.getvalue())), io.BytesIO(), key)
+
+
+def test_a_study_without_an_evaluation_keeps_its_secret_to_itself(
+    database: Database, store: ArtefactStore, tmp_path: Path
+) -> None:
+    """Its archive is not sealed, and an evaluation may be added later."""
+    with database.writing() as session:
+        study = factories.make_study(session)
+        archive.write(session, store, study, tmp_path / "plain.zip")
+    assert study.key_secret.encode() not in b"".join(_contents(tmp_path / "plain.zip").values())
+
+
+def _contents(path: Path) -> dict[str, bytes]:
+    with zipfile.ZipFile(path) as file:
+        return {name: file.read(name) for name in file.namelist()}
 
 
 def test_rows_refer_to_each_other_as_before(elsewhere: FastAPI, study: Study, packed: Path) -> None:
@@ -192,7 +255,7 @@ def _edited(packed: Path, edit: Callable[[str, bytes], bytes | None]) -> Path:
 
 
 def _with_version_9(name: str, content: bytes) -> bytes:
-    return content.replace(b'"version": 1,', b'"version": 9,') if name == "manifest.json" else content
+    return content.replace(b'"version": 2,', b'"version": 9,') if name == "manifest.json" else content
 
 
 def _with_one_wrong_letter(name: str, content: bytes) -> bytes:

@@ -26,7 +26,7 @@ def test_over_one_cycle_every_method_comes_equally_often_at_every_place(count: i
     places = Counter(
         (place, method)
         for number in range(1, cycle + 1)
-        for place, method in enumerate(order_of_methods(7, methods, number))
+        for place, method in enumerate(order_of_methods("7", methods, number))
     )
     assert set(places.values()) == {cycle // count}
     assert len(places) == count * count
@@ -37,7 +37,7 @@ def test_over_one_cycle_every_method_follows_every_other_equally_often(count: in
     methods = tuple(EvaluatedMethod)[:count]
     cycle = len(williams_rows(count))
     followed = Counter(
-        pair for number in range(1, cycle + 1) for pair in pairwise(order_of_methods(7, methods, number))
+        pair for number in range(1, cycle + 1) for pair in pairwise(order_of_methods("7", methods, number))
     )
     assert len(followed) == count * (count - 1)
     assert len(set(followed.values())) == 1
@@ -45,14 +45,14 @@ def test_over_one_cycle_every_method_follows_every_other_equally_often(count: in
 
 def test_with_three_methods_six_participants_have_all_six_orders() -> None:
     methods = EvaluationSettings().methods
-    assert len({tuple(order_of_methods(3, methods, number)) for number in range(13, 19)}) == 6
+    assert len({tuple(order_of_methods("3", methods, number)) for number in range(13, 19)}) == 6
 
 
 def test_another_study_has_another_sequence_of_orders_and_the_same_study_the_same() -> None:
     methods = EvaluationSettings().methods
 
-    def sequence(seed: int) -> list[tuple[EvaluatedMethod, ...]]:
-        return [tuple(order_of_methods(seed, methods, number)) for number in range(1, 13)]
+    def sequence(secret: int) -> list[tuple[EvaluatedMethod, ...]]:
+        return [tuple(order_of_methods(str(secret), methods, number)) for number in range(1, 13)]
 
     assert sequence(1) == sequence(1)
     assert len({tuple(sequence(seed)) for seed in range(10)}) > 5
@@ -80,7 +80,7 @@ def test_every_letter_is_met_in_one_block_of_trials_and_letters_follow_the_order
         methods = {each.letter: each.method for each in evaluating.assignments_of(session, participant.id)}
     assert [trial.letter for trial in trials] == list("AAABBBCCC")
     assert [trial.repetition for trial in trials] == [1, 2, 3] * 3
-    assert list(methods.values()) == list(order_of_methods(study.seed, EvaluationSettings().methods, 1))
+    assert list(methods.values()) == list(order_of_methods(study.key_secret, EvaluationSettings().methods, 1))
 
 
 def test_all_methods_of_a_participant_meet_the_same_scenarios_and_other_participants_meet_others(

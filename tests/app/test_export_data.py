@@ -6,14 +6,16 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+import pandas as pd
 import pytest
 from fastapi.testclient import TestClient
 from sqlalchemy import select
 
 from app.db import Database, now
+from app.domain.models import Export
 from app.domain.people import AuditEvent, Experimenter, Role
 from app.domain.studies import Deviation, Participant, Study
-from app.services import export_tables, exporting, withdrawal
+from app.services import csv_cells, export_tables, exporting, sealing, withdrawal
 from app.storage import ArtefactStore
 from tests.finished_study import make_finished_study
 
@@ -89,9 +91,48 @@ def test_formulas_that_participants_write_do_not_run_in_a_spreadsheet(
     assert '"=HYPERLINK(\\"http://example.com\\")"' in lines, "other formats have the words as they were written"
 
 
-@pytest.mark.parametrize("text", ["=1+1", "+1", "-1", "@SUM(A1)", "\tx", "\rx"])
-def test_whatever_a_spreadsheet_would_run_is_defused(text: str) -> None:
-    assert exporting.defused(text) == "'" + text
+RUN_BY_SPREADSHEETS = {
+    "=1+1": "'=1+1",
+    "+1": "'+1",
+    "-1": "'-1",
+    "@SUM(A1)": "'@SUM(A1)",
+    "all fine\r=HYPERLINK(A1)": "all fine\n'=HYPERLINK(A1)",
+    "all fine\r\n=1": "all fine\n'=1",
+    "all fine\n \t@SUM(A1)": "all fine\n \t'@SUM(A1)",
+    "good; =1": "good; '=1",
+    "good\t-1": "good\t'-1",
+    " =1": " '=1",
+    "\N{ZERO WIDTH NO-BREAK SPACE}=1": "\N{ZERO WIDTH NO-BREAK SPACE}'=1",
+    "\N{ZERO WIDTH SPACE}+1": "\N{ZERO WIDTH SPACE}'+1",
+    "\N{NO-BREAK SPACE}=1": "\N{NO-BREAK SPACE}'=1",
+    "\N{FULLWIDTH EQUALS SIGN}1": "'\N{FULLWIDTH EQUALS SIGN}1",
+    "\N{FULLWIDTH COMMERCIAL AT}A1": "'\N{FULLWIDTH COMMERCIAL AT}A1",
+    "\N{LINE SEPARATOR}=1": "\N{LINE SEPARATOR}'=1",
+    "a\0b": "a\N{REPLACEMENT CHARACTER}b",
+    "1 - 2, at most": "1 - 2, at most",
+    "\tx": "\tx",
+}
+
+
+@pytest.mark.parametrize("text", RUN_BY_SPREADSHEETS)
+def test_nothing_that_somebody_writes_begins_a_formula_wherever_a_cell_begins(text: str) -> None:
+    written = RUN_BY_SPREADSHEETS[text]
+    line = csv_cells.csv_line(("P01", text, "next"))
+    assert list(csv.reader(io.StringIO(line, newline=""))) == [["P01", written, "next"]]
+    frame = pd.read_csv(io.StringIO(line), header=None, keep_default_na=False)
+    assert frame.to_numpy().tolist() == [["P01", written, "next"]], "pandas takes it for one row"
+    for end in ",;\t":
+        for cell in line.replace('"', "").replace("\n", end).split(end):
+            assert not cell.strip().startswith(("=", "@")), "read with another end of cells"
+
+
+def test_json_in_a_cell_means_the_same_and_begins_no_formula_either() -> None:
+    value = {"note": "good; =1", "x": "a\N{LINE SEPARATOR}b", "half": "\ud800", "n": [-1, None]}
+    text = csv_cells.cell(value)
+    assert json.loads(text) == value
+    assert "; =" not in text
+    assert len(text.splitlines()) == 1
+    assert text.encode()
 
 
 def test_negative_numbers_stay_numbers(download: Callable[[str], Table]) -> None:
@@ -183,8 +224,6 @@ def test_strangers_get_nothing(client: TestClient, study: Study) -> None:
 def test_a_file_is_asked_for_once_and_downloaded_when_it_is_there(
     database: Database, store: ArtefactStore, study: Study, experimenter: TestClient
 ) -> None:
-    from app.domain.models import Export
-
     for _ in range(2):
         assert experimenter.post(f"/studies/{study.slug}/export/files/data").status_code == 303
     assert "waiting for the worker" in experimenter.get(f"/studies/{study.slug}/export").text
@@ -194,3 +233,45 @@ def test_a_file_is_asked_for_once_and_downloaded_when_it_is_there(
         export.artefact_sha256, export.byte_count, export.finished_at = store.put(b"PK"), 2, now()
     assert experimenter.get(f"/studies/{study.slug}/export/files/{export.id}.zip").content == b"PK"
     assert experimenter.get(f"/studies/{study.slug}/export/files/99.zip").status_code == 404
+
+
+def test_an_export_that_somebody_withdrew_from_is_taken_back_in_words_and_its_number_is_not_used_again(
+    database: Database, store: ArtefactStore, study: Study, experimenter: TestClient
+) -> None:
+    address = f"/studies/{study.slug}/export"
+    for kind in ("data", "archive"):
+        experimenter.post(f"{address}/files/{kind}")
+    with database.writing() as session:
+        finished, waiting = session.scalars(select(Export).order_by(Export.id)).all()
+        old, next_one = finished.id, waiting.id
+        finished.artefact_sha256, finished.byte_count, finished.finished_at = store.put(b"PK of two"), 9, now()
+        finished.missing = {"recordings: pairs of P01": ["0" * 64]}
+        session.flush()
+        person = session.scalars(select(Participant).where(Participant.number == 1)).one()
+        withdrawal.withdraw(session, store, person, "P01")
+    page = experimenter.get(address).text
+    assert "somebody who was in it has withdrawn" in page
+    assert "waiting for the worker" in page
+    assert "pairs of P01" not in page
+    assert experimenter.get(f"{address}/files/{old}.zip").status_code == 404
+    experimenter.post(f"{address}/files/data")
+    with database.reading() as session:
+        numbers = [each.id for each in session.scalars(select(Export).order_by(Export.id))]
+    assert numbers == [old, next_one, next_one + 1]
+
+
+def test_the_seal_key_is_shown_to_who_asks_and_that_is_kept(
+    database: Database, study: Study, experimenter: TestClient
+) -> None:
+    address = f"/studies/{study.slug}/export"
+    with database.writing() as session:
+        session.get_one(Study, study.id).unblinded_at = None
+    assert "encrypted" in experimenter.get(address).text
+    assert sealing.key_of(study) not in experimenter.get(address).text
+    assert sealing.key_of(study) in experimenter.post(f"{address}/seal-key").text
+    with database.writing() as session:
+        assert session.scalars(select(AuditEvent.subject).where(AuditEvent.action == "seal key shown")).all() == [
+            study.slug
+        ]
+        session.scalars(select(Experimenter)).one().role = Role.READER
+    assert experimenter.post(f"{address}/seal-key").status_code == 403

@@ -15,11 +15,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from fastapi.testclient import TestClient
 from sqlalchemy import select
+from sqlalchemy.orm import Session
 
 from app.db import Database
-from app.domain.clips import Clip
-from app.domain.models import Export, RunKind
+from app.domain.clips import Clip, Rollout
+from app.domain.models import Export
 from app.domain.preferences import Query, Response
 from app.domain.studies import Participant, Study
 from app.services import export_requests, export_tables
@@ -27,7 +29,6 @@ from app.services.export_requests import ExportKind
 from app.storage import ArtefactStore
 from worker import dataset, export_work, reconcile, records
 from worker.compute import Compute
-from worker.records import Job
 from worker.trajectory import SIGNALS
 from worker.workplace import Workplace
 
@@ -94,27 +95,81 @@ def test_the_file_explains_itself(place: Workplace, study: Study, pairs: list[tu
     assert archive.testzip() is None
 
 
-def test_nobody_learns_from_an_export_that_somebody_withdrew_from(
-    place: Workplace, study: Study, participant: Participant, monkeypatch: pytest.MonkeyPatch
+def test_an_export_that_somebody_withdraws_from_while_it_is_made_is_made_again_without_them(
+    place: Workplace,
+    study: Study,
+    participant: Participant,
+    pairs: list[tuple[Clip, Clip]],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     from app.services import withdrawal
 
-    write = export_work.write_data
+    write, held = export_work.write_data, list[str]()
 
-    def withdrawing(*arguments: Any) -> None:
-        write(*arguments)
-        with place.database.writing() as session:
-            withdrawal.withdraw(session, place.store, session.get_one(Participant, participant.id), "P01")
+    def withdrawing(session: Session, place: Workplace, study: Study, path: Path) -> Any:
+        missing = write(session, place, study, path)
+        with zipfile.ZipFile(path) as made:
+            held.append(made.read("csv/labels.csv").decode())
+        with place.database.writing() as another:
+            withdrawal.withdraw(another, place.store, another.get_one(Participant, participant.id), "P01")
+        return missing
 
     monkeypatch.setattr(export_work, "write_data", withdrawing)
-    with place.database.writing() as session:
-        export = export_requests.request(session, session.get_one(Study, study.id), ExportKind.DATA, "experimenter")
-        job = Job(export_requests.finding(export), RunKind.EXPORT, study.id)
-        run_id = records.begin_run(session, job, seed=1)
-    with pytest.raises(export_work.SomebodyWithdrew):
-        export_work._make(place, export.id, run_id)
-    assert list(place.store.root.glob("??/*")) == []
+    made = make_export(place, study)
+    assert ["P01," in each for each in held] == [True, False], "made twice"
+    assert "withdrawn" in made.read("csv/participants.csv").decode()
+    assert "P01" not in made.read("csv/labels.csv").decode()
     assert list(place.store.unfinished(0).parent.iterdir()) == []
+    with place.database.reading() as session:
+        kept = {each.artefact_sha256 for each in session.scalars(select(Export))}
+    assert {path.name for path in place.store.root.glob("??/*")} - withdrawal_keeps(place) == kept
+
+
+def withdrawal_keeps(place: Workplace) -> set[str]:
+    """Files of the pool, which belongs to nobody."""
+    with place.database.reading() as session:
+        clips = session.scalars(select(Clip)).all()
+        rollouts = session.scalars(select(Rollout)).all()
+    return {
+        *(each.trajectory_sha256 for each in rollouts),
+        *(each.video_sha256 for each in clips),
+        *(each.poster_sha256 for each in clips),
+    }
+
+
+@pytest.mark.parametrize("damage", [lambda path: path.unlink(), lambda path: path.write_bytes(b"something else")])
+@pytest.mark.parametrize("kind", ExportKind)
+def test_a_lost_or_damaged_recording_is_left_out_and_said_to_be(
+    place: Workplace,
+    study: Study,
+    pairs: list[tuple[Clip, Clip]],
+    kind: ExportKind,
+    damage: Callable[[Path], None],
+    experimenter: TestClient,
+) -> None:
+    with place.database.writing() as session:
+        session.get_one(Study, study.id).unblinded_at = study.created_at
+        lost = session.get_one(Rollout, pairs[0][0].rollout_id).trajectory_sha256
+        others = len(session.scalars(select(Rollout.trajectory_sha256).distinct()).all()) - 1
+    damage(place.store.path(lost))
+    made = make_export(place, study, kind)
+    if kind is ExportKind.DATA:
+        arrays = np.load(io.BytesIO(made.read("pairs/P01.npz")), allow_pickle=False)
+        assert list(arrays["ordinals"]) == [2, 3]
+        assert lost in made.read("README.md").decode()
+        assert lost in json.dumps(json.loads(made.read("provenance.json"))["missing"])
+    else:
+        manifest = json.loads(made.read("manifest.json"))
+        assert manifest["missing"] == [lost]
+        assert len([each for each in manifest["files"] if each in _trajectories(place)]) == others
+    page = experimenter.get(f"/studies/{study.slug}/export").text
+    assert "Without 1 stored files that are missing or damaged" in page
+    assert lost[:12] in page
+
+
+def _trajectories(place: Workplace) -> set[str]:
+    with place.database.reading() as session:
+        return set(session.scalars(select(Rollout.trajectory_sha256)))
 
 
 # --- other libraries ---

@@ -152,7 +152,7 @@ def _train(place: Workplace, job: Job) -> None:
 def test_exports_hold_the_labs_own_signals_and_actions(place: Workplace, own: Study) -> None:
     person = _answer_everything(place, own)
     with place.database.reading() as session:
-        stored = preference_arrays.arrays_of(session, place.store, own, session.get_one(Participant, person))
+        stored = preference_arrays.arrays_of(session, place.store, own, session.get_one(Participant, person), set())
     assert stored is not None
     file = np.load(io.BytesIO(stored))
     assert list(file["signal_names"]) == ["speed_m_s", "distance_m"]

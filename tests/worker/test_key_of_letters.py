@@ -1,0 +1,137 @@
+"""Another key, exchanged before anything is filmed or packed, leaves no other trace than what it decides."""
+
+import hashlib
+import json
+import re
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sqlalchemy import delete, inspect, select
+
+from app.db import Database
+from app.domain.clips import Clip
+from app.domain.evaluation import Assignment, Controller, Film, Trial
+from app.domain.models import Run, RunKind
+from app.domain.preferences import Query, Response
+from app.domain.protocol import EvaluationMode, EvaluationSettings
+from app.domain.studies import Participant, Study
+from app.services import archive, evaluating, locking, unblinding
+from app.storage import ArtefactStore
+from tests.worker.test_evaluation_work import AtHand, done, due, learn, settle
+from worker import export_work
+from worker.film_work import make_films
+from worker.workplace import Workplace
+
+METHODS = ("reference", "pbarl")
+MOMENT = re.compile(rb"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(\.\d+)?(\+00:00)?")
+
+
+@dataclass(frozen=True)
+class Told(Workplace):
+    """A workplace that remembers what it said about its progress."""
+
+    said: list[str] = field(default_factory=list)
+
+    def report(self, run_id: int, stage: str, progress: float) -> None:
+        """See Workplace."""
+        self.said.append(f"{stage} {progress:.2f}")
+        super().report(run_id, stage, progress)
+
+
+@pytest.fixture
+def place(database: Database, store: ArtefactStore) -> Told:
+    return Told(database, store, AtHand(1))
+
+
+@pytest.fixture
+def all_said(add_clips: Callable[[int], list[Clip]], answer: Callable[[Clip, Clip, Response], Query]) -> None:
+    clips = [clip for scenario in range(3) for clip in add_clips(scenario)]
+    for index in range(10):
+        answer(clips[index], clips[index + 1], Response.LEFT)
+
+
+def _keys() -> tuple[str, str]:
+    """Two secrets that give the first participant other letters."""
+    methods = EvaluationSettings(methods=METHODS).methods
+    by_order = {tuple(evaluating.order_of_methods(f"{each:064x}", methods, 1)): f"{each:064x}" for each in range(20)}
+    one, other = by_order.values()
+    return one, other
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("all_said")
+@pytest.mark.parametrize("mode", EvaluationMode)
+def test_rows_times_progress_and_archives_say_the_same_whichever_method_a_letter_hides(
+    place: Told, database: Database, study: Study, participant: Participant, mode: EvaluationMode, tmp_path: Path
+) -> None:
+    settle(database, study, mode=mode, methods=METHODS, trials=1)
+    learn(place)
+    seen = [_prepared_under(place, study, participant, key, tmp_path) for key in _keys()]
+    (one, letters), (other, exchanged) = seen
+    assert letters == {letter: {"A": exchanged["B"], "B": exchanged["A"]}[letter] for letter in letters}
+    assert one == other
+
+
+def _prepared_under(
+    place: Told, study: Study, participant: Participant, key: str, folder: Path
+) -> tuple[dict[str, Any], dict[str, str]]:
+    """Everything but the key itself that its robots leave behind, and the key."""
+    with place.database.writing() as session:
+        for table in (Trial, Film, Controller, Assignment):
+            session.execute(delete(table))
+        session.execute(delete(Run).where(Run.kind == RunKind.FILMS))
+        session.get_one(Study, study.id).key_secret = key
+    place.said.clear()
+    job = due(place.database, RunKind.FILMS)[0]
+    done(place, job, make_films)
+    with place.database.reading() as session:
+        here = session.get_one(Study, study.id)
+        assert unblinding.is_blinded(here)
+        archive.write(session, place.store, here, folder / "study.zip")
+        export_work.write_data(session, place, here, folder / "data.zip")
+        left = {
+            "films": _rows(session.scalars(select(Film).order_by(Film.id)).all()),
+            "controllers": _rows(session.scalars(select(Controller).order_by(Controller.id)).all(), "artefact_sha256"),
+            "progress": list(place.said),
+            "archive": _from_outside(folder / "study.zip"),
+            "data": _inside(folder / "data.zip"),
+        }
+        letters = {each.letter: each.method for each in evaluating.assignments_of(session, participant.id)}
+    return left, letters
+
+
+def _rows(rows: Any, *without: str) -> list[dict[str, Any]]:
+    left_out = {"created_at", *without}
+    names = [column.key for row in rows for column in inspect(row).mapper.column_attrs if column.key not in left_out]
+    return [{name: getattr(row, name) for name in names} for row in rows]
+
+
+def _from_outside(path: Path) -> list[tuple[str, int]]:
+    """What can be known of an archive without its seal key."""
+    with zipfile.ZipFile(path) as file:
+        said = json.loads(file.read("manifest.json"))
+        return [*((each.filename, each.file_size) for each in file.infolist()), *((name, 0) for name in said)]
+
+
+def _inside(path: Path) -> dict[str, bytes]:
+    """The texts of an export, without moments."""
+    with zipfile.ZipFile(path) as file:
+        texts = [name for name in file.namelist() if name.endswith((".csv", ".jsonl", ".md", ".json"))]
+        return {name: MOMENT.sub(b"", file.read(name)) for name in texts}
+
+
+def test_the_seed_that_everybody_sees_does_not_tell_the_letters(database: Database, study: Study) -> None:
+    methods = EvaluationSettings().methods
+    with database.writing() as session:
+        stored = session.get_one(Study, study.id)
+        stored.key_secret = "f" * 64
+        drawn = [evaluating.order_of_methods(stored.key_secret, methods, number) for number in range(1, 13)]
+        from_seed = [evaluating.order_of_methods(str(stored.seed), methods, number) for number in range(1, 13)]
+        assert drawn != from_seed
+        locked = json.dumps(locking.document(stored))
+    assert "f" * 64 not in locked
+    assert hashlib.sha256(b"f" * 64).hexdigest() in locked, "who sees the secret later can tell that it is the same"
