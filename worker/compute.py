@@ -67,14 +67,15 @@ class _Outcome(NamedTuple):
 class Compute:
     """Some processes per lane, each started when first needed and again after it has died."""
 
-    def __init__(self, processes: int) -> None:
+    def __init__(self, processes: int, closing: threading.Event | None = None) -> None:
+        """``closing``: when this is set, nothing more is begun, and whoever waits is Interrupted."""
         self._sizes = {Lane.CLIPS: processes, Lane.REWARDS: 1, Lane.LEARNING: processes, Lane.PATIENT: 1}
         self._lanes: dict[Lane, ThreadPoolExecutor] = {}
         self._seats: list[_Seat] = []
         self._mine = threading.local()
         """``seat``: the process that this thread of a lane speaks for"""
         self._changing = threading.Lock()
-        self._closing = threading.Event()
+        self._closing = closing or threading.Event()
 
     def warm_up(self, lane: Lane, function: Callable[[], object]) -> None:
         """Have every process of a lane import what it will need, without waiting for it."""
@@ -143,6 +144,11 @@ class Compute:
         deadline = time.monotonic() + LEAVING_S
         for seat in seats:
             seat.end(max(0.0, deadline - time.monotonic()))
+
+    def kill(self) -> None:
+        """End every process at once, without waiting for anything."""
+        for seat in self._seats:
+            seat.end(0.0)
 
 
 class _Seat:

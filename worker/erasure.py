@@ -18,6 +18,7 @@ from app.db import now, rewrite
 from app.domain.models import RunKind
 from app.domain.studies import Participant
 from app.services import withdrawal
+from worker import engine
 from worker.records import Job
 from worker.workplace import Workplace
 
@@ -74,6 +75,8 @@ def erase_traces(
     DBOS.delete_workflows(list(jobs))
     if not place.database.forget_erased() or (engine_file is not None and not rewrite(engine_file)):
         return Progress(finished=False, forgotten=frozenset(jobs))  # somebody is reading; the next round tries again
+    if engine_file is not None:
+        engine.forget_set_aside(engine_file)
     with place.database.writing() as session:
         session.get_one(Participant, participant_id).erased_at = now()
     log.info("participant %d has withdrawn: the last traces are erased", participant_id)
