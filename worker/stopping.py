@@ -11,11 +11,28 @@ import socket
 import threading
 import time
 from collections.abc import Callable
+from types import FrameType
 
 log = logging.getLogger("worker")
 
+_ASKING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 GOOD_ORDER_S = 7.0
 """Longer than this nobody waits; the supervisor (``python -m app up``) kills soon afterwards."""
+
+
+def any_signal_is_ctrl_c() -> None:
+    """For commands that work and then end: whoever asks them to stop gets what Ctrl-C gets, tidying up included.
+
+    Asked again, they go on tidying up.
+    """
+
+    def interrupt(_number: int, _frame: FrameType | None) -> None:
+        for number in _ASKING:
+            signal.signal(number, signal.SIG_IGN)
+        raise KeyboardInterrupt
+
+    for number in _ASKING:
+        signal.signal(number, interrupt)
 
 
 class Stop:
@@ -29,7 +46,7 @@ class Stop:
         mouth.setblocking(False)
         self._mouth = mouth  # or it would be closed
         signal.set_wakeup_fd(mouth.fileno(), warn_on_full_buffer=False)
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        for number in _ASKING:
             signal.signal(number, lambda _number, _frame: None)
         threading.Thread(target=self._listen, args=(ear,), name="stop", daemon=True).start()
 

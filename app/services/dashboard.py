@@ -18,6 +18,7 @@ from app.domain.participation import StageRecord
 from app.domain.preferences import LEARNED_FROM, LabelEvent, Query, Response
 from app.domain.protocol import Stage
 from app.domain.studies import Participant, Strategy, Study
+from app.falls import Falls, noted
 from app.services import accuracy, results, stages, watching
 
 WORKER_SILENCE = timedelta(seconds=15)
@@ -34,6 +35,8 @@ class Machine:
     worker_alive: bool
     disk_free_bytes: int
     disk_low: bool
+    falls: Sequence[Falls]
+    """Programs that have stopped by themselves of late."""
 
 
 @dataclass(frozen=True)
@@ -134,7 +137,7 @@ def machine(session: Session, data_dir: Path) -> Machine:
     seen_at = session.scalar(select(WorkerPresence.last_seen_at).order_by(WorkerPresence.last_seen_at.desc()).limit(1))
     free = shutil.disk_usage(data_dir).free
     alive = seen_at is not None and now() - seen_at <= WORKER_SILENCE
-    return Machine(seen_at, alive, free, free < DISK_LOW_BYTES)
+    return Machine(seen_at, alive, free, free < DISK_LOW_BYTES, noted(data_dir))
 
 
 def fingerprint(session: Session) -> str:
