@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, ClassVar
 
-from sqlalchemy import JSON, DateTime, Dialect, Engine, MetaData, TypeDecorator, create_engine, event
+from sqlalchemy import JSON, DateTime, Dialect, Engine, MetaData, TypeDecorator, create_engine, event, make_url
 from sqlalchemy.orm import DeclarativeBase, Session, sessionmaker
 
 BUSY_TIMEOUT_S = 15
@@ -51,6 +51,12 @@ class Base(DeclarativeBase):
     type_annotation_map: ClassVar[dict[Any, Any]] = {datetime: UtcDateTime, dict[str, Any]: JSON}
 
 
+def file_of(url: str) -> Path | None:
+    """The file of an SQLite database; None for any other."""
+    parts = make_url(url)
+    return Path(parts.database) if parts.get_backend_name() == "sqlite" and parts.database else None
+
+
 def now() -> datetime:
     """The current time, aware, in UTC."""
     return datetime.now(UTC)
@@ -83,13 +89,12 @@ class Database:
 
         On PostgreSQL that is the server's own upkeep (autovacuum), and nothing is done here.
         """
-        path = self.writer.url.database
-        return rewrite(Path(path)) if self.url.startswith("sqlite") and path else True
+        path = file_of(self.url)
+        return path is None or rewrite(path)
 
     def watch(self) -> "Watch":
         """Tells from now on whether anybody has written."""
-        path = self.writer.url.database
-        return Watch(Path(path) if self.url.startswith("sqlite") and path else None)
+        return Watch(file_of(self.url))
 
     def dispose(self) -> None:
         """Close every pooled connection."""

@@ -3,19 +3,26 @@
 import sys
 from collections.abc import Sequence
 
+INTERRUPTED = 130
+"""Exit code, as shells have it."""
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code."""
     # Compute processes import this module again when they start. What they need they load themselves, and most of
     # what we need (torch, the engine) they do not.
     from app.errors import AppError
-    from worker import commands
+    from worker import commands, stopping
 
+    stopping.any_signal_is_ctrl_c()
     try:
         return commands.run(arguments)
     except AppError as error:
         sys.stderr.write(f"Error: {error.message}\n")
         return 1
+    except KeyboardInterrupt:
+        sys.stderr.write("Interrupted.\n")
+        return INTERRUPTED
 
 
 if __name__ == "__main__":

@@ -14,10 +14,12 @@ from dbos import DBOS, WorkflowStatus
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from app.db import now, rewrite
+from app import upgrading
+from app.db import file_of, now, rewrite
 from app.domain.models import RunKind
 from app.domain.studies import Participant
 from app.services import withdrawal
+from worker import engine
 from worker.records import Job
 from worker.workplace import Workplace
 
@@ -74,6 +76,11 @@ def erase_traces(
     DBOS.delete_workflows(list(jobs))
     if not place.database.forget_erased() or (engine_file is not None and not rewrite(engine_file)):
         return Progress(finished=False, forgotten=frozenset(jobs))  # somebody is reading; the next round tries again
+    if engine_file is not None:
+        engine.forget_set_aside(engine_file)
+    database_file = file_of(place.database.url)
+    if database_file is not None:
+        upgrading.forget_copies(database_file)
     with place.database.writing() as session:
         session.get_one(Participant, participant_id).erased_at = now()
     log.info("participant %d has withdrawn: the last traces are erased", participant_id)

@@ -6,12 +6,14 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Self, TypeVar
 
 import httpx2
 
 from app.errors import AppError
+from app.programs import GRACE_S, end_with_parent
 from app.settings import Settings
 
 Found = TypeVar("Found")
@@ -38,18 +40,30 @@ class OwnStudio:
             "PORT": str(self.settings.port),
         }
         self._programs: dict[str, subprocess.Popen[bytes]] = {}
+        self._starter = ThreadPoolExecutor(1, "starter")
+        """one thread that lives as long as we do: programs end with the thread that started them"""
 
     def __enter__(self) -> Self:
-        subprocess.run([sys.executable, "-m", "app", "migrate"], check=True, env=self._environment)
-        self.start_web()
-        self.start_worker()
+        try:
+            subprocess.run([sys.executable, "-m", "app", "migrate"], check=True, env=self._environment)
+            self.start_web()
+            self.start_worker()
+        except BaseException:
+            self.__exit__()
+            raise
         return self
 
     def __exit__(self, *exception: object) -> None:
         for program in self._programs.values():
             program.terminate()
+        deadline = time.monotonic() + GRACE_S
         for program in self._programs.values():
-            program.wait()
+            try:
+                program.wait(max(0.1, deadline - time.monotonic()))
+            except subprocess.TimeoutExpired:
+                program.kill()
+                program.wait()
+        self._starter.shutdown()
 
     def start_web(self) -> None:
         """Start the web server and wait until it answers."""
@@ -76,12 +90,14 @@ class OwnStudio:
 
     def _start(self, name: str, module: str, *arguments: str) -> None:
         with self.log.open("ab") as stream:
-            self._programs[name] = subprocess.Popen(
+            self._programs[name] = self._starter.submit(
+                subprocess.Popen[bytes],
                 [sys.executable, "-m", module, *arguments],
                 env=self._environment,
                 stdout=stream,
                 stderr=subprocess.STDOUT,
-            )
+                preexec_fn=end_with_parent,
+            ).result()
 
 
 def wait_until(patience_s: float, missing: str, look: Callable[[], Found | None]) -> Found:

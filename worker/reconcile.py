@@ -54,15 +54,18 @@ def findings(session: Session, lost: Mapping[str, int] | None = None) -> Iterato
                 yield job, attempt
 
 
-def abandoned(session: Session, in_hand: Collection[str]) -> list[str]:
-    """Names under which some worker began to work and has not been heard of since: ``finding#attempt``.
+def abandoned(session: Session, in_hand: Collection[str]) -> list[tuple[Job, int]]:
+    """Runs that some worker began and of which nothing has been heard since, with the number of the attempt.
 
     ``in_hand``: findings that this worker is busy with itself; a machine under load may be late with a sign of life.
     """
     lost = select(Run).where(Run.status == RunStatus.RUNNING, Run.heartbeat_at < now() - LEASE)
-    return [
-        workflow_name(run.workflow_id, run.attempt) for run in session.scalars(lost) if run.workflow_id not in in_hand
-    ]
+    return [(job_of(run), run.attempt) for run in session.scalars(lost) if run.workflow_id not in in_hand]
+
+
+def job_of(run: Run) -> Job:
+    """What the run was begun for."""
+    return Job(run.workflow_id, RunKind(run.kind), run.study_id, run.participant_id, run.label_count, run.label_hash)
 
 
 def workflow_name(finding: str, attempt: int) -> str:

@@ -61,6 +61,12 @@ def begin_run(session: Session, job: Job, seed: int) -> int:
     return run.id
 
 
+def has_succeeded(session: Session, finding: str) -> bool:
+    """Whether there is nothing left to be done about this finding."""
+    done = select(Run.id).where(Run.workflow_id == finding, Run.status == RunStatus.SUCCEEDED)
+    return session.scalar(done) is not None
+
+
 def report(session: Session, run_id: int, stage: str, progress: float) -> None:
     """Say where the run is: a few words and a share between 0 and 1."""
     run = session.get_one(Run, run_id)
@@ -78,12 +84,15 @@ def finish_run(session: Session, run_id: int) -> None:
     run.status, run.stage, run.progress, run.finished_at = RunStatus.SUCCEEDED, "done", 1.0, now()
 
 
-def fail_run(session: Session, finding: str, error: str) -> None:
-    """Keep what went wrong; the run is tried again until its attempts are used up."""
+def fail_run(session: Session, finding: str, error: str, counts: bool = True) -> None:
+    """Keep what went wrong; the run is tried again until its attempts are used up.
+
+    What is no fault of the work (a full disk) does not count as an attempt: it is tried until it succeeds.
+    """
     run = session.scalar(select(Run).where(Run.workflow_id == finding))
     if run is not None:
         run.status, run.error, run.finished_at = RunStatus.FAILED, error, now()
-        run.attempt += 1
+        run.attempt += counts
 
 
 def save_clip(session: Session, study_id: int, rollout: dict[str, Any], clip: dict[str, Any]) -> None:
@@ -278,10 +287,10 @@ def models_of_others(
     return enough[-most:]
 
 
-def sign_presence(session: Session, name: str) -> None:
+def sign_presence(session: Session, name: str, moment: datetime) -> None:
     """Say that this worker lives."""
     presence = session.get(WorkerPresence, name)
     if presence is None:
-        session.add(WorkerPresence(name=name))
+        session.add(WorkerPresence(name=name, last_seen_at=moment))
     else:
-        presence.last_seen_at = now()
+        presence.last_seen_at = moment

@@ -4,27 +4,25 @@ import fcntl
 import logging
 import math
 import os
-import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from functools import partial
 from pathlib import Path
-from types import FrameType
 
 from dbos import DBOS, SetWorkflowID
 from sqlalchemy.exc import OperationalError
 
-from app.db import Database, Watch
-from app.domain.models import RunKind
+from app.db import Database, Watch, now
 from app.domain.studies import StudySettings
 from app.errors import AppError
 from app.settings import Settings
 from app.storage import ArtefactStore
-from worker import erasure, laboratory, lessons, orphans, querying, reconcile, records, references
+from worker import engine, erasure, laboratory, lessons, orphans, querying, reconcile, records, references
 from worker.compute import Compute, ComputeLost, Interrupted, Lane
 from worker.records import Job
+from worker.stopping import Stop
 from worker.workflows import Workshop, as_arguments
 from worker.workplace import Workplace
 
@@ -35,58 +33,40 @@ REST = 9.0
 """Times as long as the last round took: a tenth of a core at most, however large the studies are."""
 PRESENCE_S = 5.0
 CLEARING_S = 24 * 3600.0
-ENGINE_VERSION = "2"
-"""Raised when the steps of a workflow change so that a half-finished one could not be resumed."""
-
-QUEUES = {
-    RunKind.CLIPS: 2,
-    RunKind.REWARD: 1,
-    RunKind.FILTER: 1,
-    RunKind.METHOD: 1,
-    RunKind.FILMS: 1,
-    RunKind.REPORT: 1,
-    RunKind.EXPORT: 1,
-}
-"""How many jobs of each kind one worker does at a time."""
-AWAITED = {RunKind.CLIPS, RunKind.REWARD}
-"""What somebody may be waiting for who is answering: begun within AWAITED_POLL_S, anything else within POLL_S.
-
-Asking the engine for all seven kinds five times a second took a tenth of a core, whether there was work or not."""
-AWAITED_POLL_S, POLL_S = 0.3, 1.0
+LOOK_AGAIN_S = 10.0
+"""What is still due after this long may have been forgotten by the engine, or given up."""
 
 
 class WorkerAlreadyRunning(AppError):
     """A worker of this name is already running on this data directory. Stop it first, or set WORKER_NAME."""
 
 
+class KeepsFelling(AppError):
+    """The worker has stopped again and again in the middle of this, as it does when the machine runs out of memory."""
+
+
 def run(settings: Settings) -> int:
     """Keep studies supplied with clips, queries, models and bundles until told to stop."""
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
     logging.getLogger("dbos").setLevel(logging.ERROR)
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, _setter(stop))
+    stop = Stop()
     with _only_one(settings):
         database = Database(settings.sqlalchemy_url)
-        compute = Compute(settings.compute_processes)
-        compute.warm_up(Lane.CLIPS, laboratory.warm_up)
+        compute = Compute(settings.compute_processes, stop.asked)
+        stop.at_once = compute.kill
         workshop = Workshop(Workplace(database, ArtefactStore(settings.data_dir / "artefacts"), compute))
-        _launch_engine(settings)
-        log.info("worker %s is ready", settings.worker_name)
         try:
-            _Rounds(settings, workshop).until(stop)
+            compute.warm_up(Lane.CLIPS, laboratory.warm_up)
+            with engine.running(settings, database) as bond:
+                log.info("worker %s is ready", settings.worker_name)
+                _Rounds(settings, workshop, bond).until(stop.asked)
+        except Interrupted:
+            log.info("stopped while starting")
         finally:
             compute.close()
             DBOS.destroy()
             database.dispose()
     return 0
-
-
-def _setter(stop: threading.Event) -> Callable[[int, FrameType | None], None]:
-    def on_signal(_number: int, _frame: FrameType | None) -> None:
-        stop.set()
-
-    return on_signal
 
 
 @contextmanager
@@ -104,38 +84,16 @@ def _only_one(settings: Settings) -> Iterator[None]:
         yield
 
 
-def engine_file(settings: Settings) -> Path | None:
-    """Where the durable engine keeps its own notes; None when they lie on the PostgreSQL server."""
-    return settings.data_dir.resolve() / "engine.sqlite3" if settings.sqlalchemy_url.startswith("sqlite") else None
-
-
-def _launch_engine(settings: Settings) -> None:
-    path = engine_file(settings)
-    url = settings.sqlalchemy_url if path is None else f"sqlite:///{path}"
-    DBOS(
-        config={
-            "name": "pbarl-studio",
-            "system_database_url": url,
-            "executor_id": settings.worker_name,
-            "application_version": ENGINE_VERSION,
-            "log_level": "ERROR",
-        }
-    )
-    DBOS.launch()
-    for kind, count in QUEUES.items():
-        interval = AWAITED_POLL_S if kind in AWAITED else POLL_S
-        DBOS.register_queue(kind.value, worker_concurrency=count, polling_interval_sec=interval)
-
-
 class _Rounds:
     """Asks the database again and again; remembers only what spares work, nothing that work depends on."""
 
-    def __init__(self, settings: Settings, workshop: Workshop) -> None:
+    def __init__(self, settings: Settings, workshop: Workshop, bond: engine.Bond) -> None:
         self._worker_name = settings.worker_name
-        self._engine_file = engine_file(settings)
+        self._engine_file = engine.file_of(settings)
+        self._bond = bond
         self._workshop = workshop
         self._place = workshop.place
-        self._started: set[str] = set()  # what the engine has been told already
+        self._started: dict[str, float] = {}  # what the engine has been told already, and when it was last asked
         self._signed_at = -math.inf
         self._cleared_at = -math.inf
         self._rested_at = -math.inf
@@ -161,8 +119,11 @@ class _Rounds:
 
     def _sign(self) -> None:
         if time.monotonic() - self._signed_at >= PRESENCE_S:
+            moment = now()
+            self._bond.promise(moment)
             with self._place.database.writing() as session:
-                records.sign_presence(session, self._worker_name)
+                records.sign_presence(session, self._worker_name, moment)
+            self._bond.signed(moment)
             self._signed_at = time.monotonic()
 
     def _clear_away(self) -> None:
@@ -184,9 +145,8 @@ class _Rounds:
             self._refill(participant_id)
         for participant_id in withdrawn:
             self._erase(participant_id)
-        for name in lost:
-            log.warning("%s was left behind by another worker; taking it over", name)
-            DBOS.resume_workflow(name)
+        for job, attempt in lost:
+            self._take_over(job, reconcile.workflow_name(job.finding, attempt))
         for study in answered:
             if study.id not in self._prepared:
                 self._prepared.add(study.id)
@@ -206,7 +166,8 @@ class _Rounds:
     def _erase(self, participant_id: int) -> None:
         shop = self._workshop
         progress = erasure.erase_traces(self._place, participant_id, shop.in_hand, shop.stored, self._engine_file)
-        self._started -= progress.forgotten
+        for name in progress.forgotten:
+            self._started.pop(name, None)
 
     def _refill(self, participant_id: int) -> None:
         try:
@@ -216,7 +177,24 @@ class _Rounds:
             self._refused.add(participant_id)
 
     def _start(self, job: Job, name: str) -> None:
-        if name not in self._started:
+        """Have the engine do it; once, unless it turns out to be due still and in nobody's hands."""
+        if time.monotonic() - self._started.get(name, -math.inf) < LOOK_AGAIN_S:
+            return
+        self._started[name] = time.monotonic()
+        if job.finding not in self._workshop.in_hand and not engine.is_at_it(name):
+            self._go_on(job, name)
+
+    def _take_over(self, job: Job, name: str) -> None:
+        """Go on with what was begun; anew where the engine does not know how far it had come."""
+        if engine.gave_up(name):
+            log.warning("%s: %s", name, KeepsFelling().message)
+            with self._place.database.writing() as session:
+                records.fail_run(session, job.finding, KeepsFelling().message)
+            return
+        log.warning("%s was left behind; taking it over", name)
+        self._go_on(job, name)
+
+    def _go_on(self, job: Job, name: str) -> None:
+        if not engine.resume(name):
             with SetWorkflowID(name):
                 DBOS.enqueue_workflow(job.kind, self._workshop.work, as_arguments(job))
-            self._started.add(name)

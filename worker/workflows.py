@@ -4,6 +4,7 @@ The engine remembers which steps of a workflow are finished. A worker that is ki
 one; every step may therefore run twice, and leaves the same rows and files when it does.
 """
 
+import errno
 import logging
 import time
 from collections.abc import Callable
@@ -11,6 +12,7 @@ from dataclasses import asdict
 from typing import Any
 
 from dbos import DBOS, DBOSConfiguredInstance
+from sqlalchemy.exc import OperationalError
 from sqlalchemy.orm import Session
 
 from app.domain.models import RunKind
@@ -26,6 +28,9 @@ from worker.reward_work import train_reward
 from worker.workplace import Step, Workplace
 
 log = logging.getLogger("worker")
+
+FALLS_ALLOWED = 5
+"""How often a worker may fall in the middle of an attempt before that has failed."""
 
 _BODIES: dict[RunKind, Callable[[Workplace, Job, int, Step], None]] = {
     RunKind.CLIPS: build_clips,
@@ -54,7 +59,7 @@ class Workshop(DBOSConfiguredInstance):
         self.stored: dict[str, set[str]] = {}
         """artefacts of work that has not succeeded yet, by finding: nothing else may know of them"""
 
-    @DBOS.workflow()
+    @DBOS.workflow(max_recovery_attempts=FALLS_ALLOWED)
     def work(self, arguments: dict[str, Any]) -> None:
         """Do one job; what goes wrong is kept with the run and in the log, never raised."""
         job = Job(**arguments)
@@ -62,6 +67,8 @@ class Workshop(DBOSConfiguredInstance):
         started = time.monotonic()
         try:
             run_id = _step("begin", self._begin, arguments)
+            if run_id is None:
+                return
             place = self.place.noting(self.stored.setdefault(job.finding, set()))
             _BODIES[RunKind(job.kind)](place, job, run_id, _step)
             _step("finish", self._finish, run_id)
@@ -75,7 +82,7 @@ class Workshop(DBOSConfiguredInstance):
                 log.info("%s is abandoned: the participant has withdrawn", job.finding)
                 return
             log.exception("%s failed", job.finding)
-            _step("fail", self._fail, job.finding, f"{type(error).__name__}: {error}")
+            _step("fail", self._fail, job.finding, f"{type(error).__name__}: {error}", not _is_the_machine_s(error))
         finally:
             self.in_hand.discard(job.finding)
 
@@ -83,24 +90,34 @@ class Workshop(DBOSConfiguredInstance):
         with self.place.database.reading() as session:
             return _has_withdrawn(session, job)
 
-    def _begin(self, arguments: dict[str, Any]) -> int:
+    def _begin(self, arguments: dict[str, Any]) -> int | None:
+        """The run's id; None when there is nothing to be done, because an earlier life of this job has finished it."""
         job = Job(**arguments)
         with self.place.database.writing() as session:
             if _has_withdrawn(session, job):
                 raise ParticipantWithdrew
+            if records.has_succeeded(session, job.finding):
+                return None
             return records.begin_run(session, job, _seed(session, job))
 
     def _finish(self, run_id: int) -> None:
         with self.place.database.writing() as session:
             records.finish_run(session, run_id)
 
-    def _fail(self, finding: str, error: str) -> None:
+    def _fail(self, finding: str, error: str, counts: bool = True) -> None:
         with self.place.database.writing() as session:
-            records.fail_run(session, finding, error)
+            records.fail_run(session, finding, error, counts)
 
 
 def _step(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
     return DBOS.run_step({"name": name}, function, *arguments)
+
+
+def _is_the_machine_s(error: Exception) -> bool:
+    """Whether the same work would succeed once there is space again, or the database can be reached."""
+    if isinstance(error, OSError):
+        return error.errno in {errno.ENOSPC, errno.EDQUOT, errno.EROFS}
+    return isinstance(error, OperationalError)
 
 
 def _has_withdrawn(session: Session, job: Job) -> bool:

@@ -19,6 +19,7 @@ from app.domain.participation import StageRecord
 from app.domain.preferences import LEARNED_FROM, LabelEvent, Response, count_labels
 from app.domain.protocol import Stage
 from app.domain.studies import Participant, Study
+from app.falls import Falls, noted
 from app.services import accuracy, damage, results, stages, watching
 from app.services.tallies import Tallies
 from app.storage import ArtefactStore
@@ -38,6 +39,8 @@ class Machine:
     disk_free_bytes: int
     disk_low: bool
     damage: damage.Damage
+    falls: Sequence[Falls]
+    """Programs that have stopped by themselves of late."""
 
 
 @dataclass(frozen=True)
@@ -131,7 +134,7 @@ def machine(session: Session, data_dir: Path) -> Machine:
     free = shutil.disk_usage(data_dir).free
     alive = seen_at is not None and now() - seen_at <= WORKER_SILENCE
     broken = damage.standing(session, ArtefactStore(data_dir / "artefacts"))
-    return Machine(seen_at, alive, free, free < DISK_LOW_BYTES, broken)
+    return Machine(seen_at, alive, free, free < DISK_LOW_BYTES, broken, noted(data_dir))
 
 
 def fingerprint(session: Session) -> str:

@@ -1,5 +1,6 @@
 """``make run``: one supervisor for web server and worker, from the greeting to Ctrl-C."""
 
+import fcntl
 import os
 import re
 import signal
@@ -14,7 +15,9 @@ from urllib.request import urlopen
 
 import pytest
 
-PATIENCE_S = 60.0
+from app.falls import noted
+
+PATIENCE_S = 300.0
 
 Start = Callable[[], "Studio"]
 
@@ -136,6 +139,39 @@ def test_a_worker_that_is_killed_is_started_again(start: Start) -> None:
     os.kill(studio.child("worker"), signal.SIGKILL)
     assert within_patience(lambda: studio.said.count("worker-1 is ready") == 2)
     assert "The worker stopped by itself (exit code -9); starting it again." in studio.said
+
+
+def test_a_worker_that_keeps_falling_leaves_the_web_server_alone_and_is_tried_until_it_can_run(
+    start: Start, tmp_path: Path
+) -> None:
+    with (tmp_path / "worker-1.lock").open("w") as held_by_another:
+        fcntl.flock(held_by_another, fcntl.LOCK_EX)
+        studio = start()
+        assert within_patience(lambda: "exit code 1, 3 times by now" in studio.said)
+        assert answers(studio.address)
+        (falls,) = noted(tmp_path)
+        assert falls.program == "worker"
+        assert falls.count >= 3
+        assert "A worker of this name is already running" in falls.last_words
+    assert within_patience(lambda: "worker-1 is ready" in studio.said)
+    assert studio.stop() == 0
+
+
+def test_a_web_server_that_falls_is_started_again_and_the_worker_keeps_its_work(start: Start) -> None:
+    studio = start()
+    assert within_patience(lambda: "worker-1 is ready" in studio.said and answers(studio.address))
+    worker, web = studio.child("worker"), studio.child("uvicorn")
+    os.kill(web, signal.SIGKILL)
+    assert within_patience(lambda: "The web stopped by itself" in studio.said)
+    assert within_patience(lambda: answers(studio.address))
+    assert studio.child("worker") == worker
+
+
+def test_a_damaged_file_of_the_engine_is_set_aside_and_the_studio_starts(start: Start, tmp_path: Path) -> None:
+    (tmp_path / "engine.sqlite3").write_bytes(os.urandom(30_000))
+    studio = start()
+    assert within_patience(lambda: "worker-1 is ready" in studio.said and answers(studio.address))
+    assert "the engine's file cannot be read (file is not a database); it is kept as" in studio.said
 
 
 def test_killing_the_supervisor_leaves_nothing_running(start: Start) -> None:

@@ -15,7 +15,8 @@ import csv
 import json
 import sys
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -27,6 +28,7 @@ import torch
 from tqdm import tqdm
 
 from worker import laboratory
+from worker.compute import Compute, Lane
 from worker.contest import Bench, Cell, Terms
 from worker.exploration import surface_file
 from worker.ml import acquisition, bradley_terry, pooled_prior
@@ -154,9 +156,13 @@ def main() -> None:
     done = {line["question"]: line["row"] for line in map(json.loads, options.journal.read_text().splitlines())}
     asked = questions(options.seeds)
     missing = [question for question in asked if _key(question) not in done]
-    with ProcessPoolExecutor(options.processes) as pool, options.journal.open("a") as stream:
-        work = [options.work_directory] * len(missing)
-        rows = tqdm(pool.map(answer, missing, work), total=len(missing), unit="row")
+    compute = Compute(options.processes)
+
+    def ask(question: Question) -> dict[str, Any]:
+        return compute.run(Lane.LEARNING, lambda: None, answer, question, options.work_directory)
+
+    with closing(compute), ThreadPoolExecutor(options.processes) as threads, options.journal.open("a") as stream:
+        rows = tqdm(threads.map(ask, missing), total=len(missing), unit="row")
         for question, row in zip(missing, rows, strict=True):
             done[_key(question)] = row
             stream.write(json.dumps({"question": _key(question), "row": row}) + "\n")

@@ -19,6 +19,7 @@ import httpx2
 
 from app.__main__ import migrate
 from app.db import Database
+from app.programs import end_with_parent
 from app.settings import Settings
 from app.storage import ArtefactStore
 from tests import factories
@@ -39,6 +40,7 @@ def main() -> None:
                 *("--log-level", "warning", "--port", str(settings.port)),
             ],
             env={**os.environ, "DATA_DIR": directory},
+            preexec_fn=end_with_parent,
         )
         try:
             _await_health(settings.base_url)

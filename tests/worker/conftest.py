@@ -3,7 +3,9 @@
 import io
 import itertools
 from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
@@ -17,8 +19,16 @@ from app.domain.studies import Participant, Study, StudySettings
 from app.settings import Settings
 from app.storage import ArtefactStore
 from worker.trajectory import COSTS, SIGNALS, Trajectory
+from worker.workflows import Workshop
+from worker.workplace import Workplace
 
 STEPS = 20
+
+
+@cache
+def the_workshop() -> Workshop:
+    """The engine knows one workshop per process; whoever borrows it gives it a place."""
+    return Workshop(cast("Workplace", None))
 
 
 def make_trajectory(scenario: int, behaviour: int, steps: int = STEPS) -> Trajectory:

@@ -1,6 +1,7 @@
 """Heavy work runs in processes that may die, and must die with their worker."""
 
 import contextlib
+import errno
 import io
 import os
 import signal
@@ -36,8 +37,24 @@ def show_progress() -> None:
     list(tqdm(range(3), file=io.StringIO()))
 
 
+def die_by_the_end_of(number: int, started: Path) -> int:
+    """The process that is given 0 dies; the others are at work by then, and finish."""
+    (started / str(number)).touch()
+    while len(list(started.iterdir())) < 2:
+        threading.Event().wait(0.01)
+    if number == 0:
+        die()
+    while not (started / "lost").exists():
+        threading.Event().wait(0.01)
+    return number
+
+
+def fail_with_a_lock() -> None:
+    raise RuntimeError("no use", threading.Lock())
+
+
 def wait_forever(started: Path) -> None:
-    started.touch()
+    started.write_text(str(os.getpid()))
     threading.Event().wait()
 
 
@@ -64,6 +81,73 @@ def test_a_killed_process_is_reported_and_replaced(compute: Compute) -> None:
     with pytest.raises(ComputeLost, match="memory"):
         compute.run(Lane.CLIPS, nothing, die)
     assert compute.run(Lane.CLIPS, nothing, square, 3) == 9
+
+
+def test_only_the_job_whose_process_died_is_lost(compute: Compute, tmp_path: Path) -> None:
+    outcomes: dict[int, object] = {}
+
+    def work(number: int) -> None:
+        try:
+            outcomes[number] = compute.run(Lane.LEARNING, nothing, die_by_the_end_of, number, tmp_path)
+        except ComputeLost as lost:
+            outcomes[number] = lost
+            (tmp_path / "lost").touch()
+
+    threads = [threading.Thread(target=work, args=(number,)) for number in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(timeout=60)
+    assert isinstance(outcomes[0], ComputeLost)
+    assert outcomes[1] == 1
+
+
+def test_a_process_that_cannot_be_started_is_reported_and_tried_again_by_the_next_job(
+    compute: Compute, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def no_memory(_self: object) -> None:
+        raise OSError(errno.ENOMEM, "Cannot allocate memory")
+
+    with monkeypatch.context() as machine:
+        machine.setattr("multiprocessing.context.SpawnProcess.start", no_memory)
+        with pytest.raises(ComputeLost):
+            compute.run(Lane.LEARNING, nothing, square, 2)
+    assert compute.run(Lane.LEARNING, nothing, square, 3) == 9
+
+
+def test_an_error_says_where_in_the_process_it_happened_even_one_that_cannot_travel(compute: Compute) -> None:
+    with pytest.raises(ZeroDivisionError) as divided:
+        compute.run(Lane.LEARNING, nothing, divmod, 1, 0)
+    assert "compute process" in "".join(divided.value.__notes__)
+    with pytest.raises(RuntimeError, match="no use") as failed:
+        compute.run(Lane.LEARNING, nothing, fail_with_a_lock)
+    assert "fail_with_a_lock" in "".join(failed.value.__notes__)
+
+
+def test_a_compute_process_that_was_stopped_does_not_hold_up_the_end(tmp_path: Path) -> None:
+    compute = Compute(1)
+    idle = compute.run(Lane.CLIPS, nothing, own_pid)
+    started = tmp_path / "started"
+    raised: list[BaseException] = []
+
+    def work() -> None:
+        try:
+            compute.run(Lane.LEARNING, nothing, wait_forever, started)
+        except BaseException as error:
+            raised.append(error)
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    while not (started.exists() and started.read_text()):
+        threading.Event().wait(0.01)
+    busy = int(started.read_text())
+    for pid in (idle, busy):
+        os.kill(pid, signal.SIGSTOP)
+    compute.close()
+    thread.join(timeout=60)
+    assert [type(error) for error in raised] == [Interrupted]
+    assert gone_within(idle, seconds=10)
+    assert gone_within(busy, seconds=10)
 
 
 def test_who_is_answering_does_not_wait_for_somebody_else_s_filter(tmp_path: Path) -> None:

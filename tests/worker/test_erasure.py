@@ -5,9 +5,7 @@ import hashlib
 import threading
 import time
 from collections.abc import Callable, Iterator
-from functools import cache
 from pathlib import Path
-from typing import cast
 
 import pytest
 from dbos import DBOS, SetWorkflowID
@@ -18,7 +16,8 @@ from app.domain.studies import Participant
 from app.services import withdrawal
 from app.settings import Settings
 from app.storage import ArtefactStore
-from worker import erasure, records, service, workflows
+from tests.worker.conftest import the_workshop
+from worker import engine, erasure, records, workflows
 from worker.compute import Compute
 from worker.reconcile import findings, short_of_queries
 from worker.records import Job
@@ -58,18 +57,12 @@ def work(monkeypatch: pytest.MonkeyPatch) -> Work:
     return work
 
 
-@cache
-def the_workshop() -> Workshop:
-    """The engine knows one workshop per process."""
-    return Workshop(cast("Workplace", None))
-
-
 @pytest.fixture
 def workshop(settings: Settings, database: Database, store: ArtefactStore) -> Iterator[Workshop]:
     """A worker's engine on the data directory."""
     workshop, compute = the_workshop(), Compute(1)
     workshop.place = Workplace(database, store, compute)
-    service._launch_engine(settings)
+    engine.launch(settings)
     yield workshop
     DBOS.destroy(destroy_registry=False)
     compute.close()
@@ -91,9 +84,8 @@ def withdraw(database: Database, store: ArtefactStore, participant_id: int) -> N
 
 
 def erase(workshop: Workshop, settings: Settings, participant_id: int) -> bool:
-    engine = service.engine_file(settings)
-    place = workshop.place
-    return erasure.erase_traces(place, participant_id, workshop.in_hand, workshop.stored, engine).finished
+    place, file = workshop.place, engine.file_of(settings)
+    return erasure.erase_traces(place, participant_id, workshop.in_hand, workshop.stored, file).finished
 
 
 def until(condition: Callable[[], bool]) -> bool:

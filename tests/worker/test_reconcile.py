@@ -114,7 +114,7 @@ def test_a_running_run_is_left_alone_until_nobody_has_heard_of_it_for_a_minute(
     with database.writing() as session:
         session.get_one(Run, run_id).heartbeat_at = now() - timedelta(seconds=61)
     with database.reading() as session:
-        assert reconcile.abandoned(session, ()) == ["reward/participant-1/labels-10#1"]
+        assert reconcile.abandoned(session, ()) == [(job, 1)]
         assert reconcile.abandoned(session, {"reward/participant-1/labels-10"}) == []
 
 

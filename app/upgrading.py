@@ -1,0 +1,151 @@
+"""Brings a database to the newest schema: wholly or not at all, one program at a time, and never without a copy."""
+
+import fcntl
+import logging
+import os
+import shutil
+import sqlite3
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+
+from alembic import command
+from alembic.config import Config
+from alembic.script import ScriptDirectory
+from sqlalchemy import create_engine, inspect, text
+from sqlalchemy.exc import DatabaseError, OperationalError
+
+from app.db import BUSY_TIMEOUT_S, file_of, now
+from app.errors import AppError
+from app.settings import Settings
+
+log = logging.getLogger(__name__)
+
+KEPT_COPIES = 3
+SPARE_BYTES = 64 * 1024**2
+"""What is left free beside the copy and the growth of the database itself."""
+_COPY = ".before-"
+_VERSIONS = "alembic_version"
+
+
+class NewerDatabase(AppError):
+    """The database was written by a newer version of this program. Install that version, or restore an older copy."""
+
+
+class UnfinishedDatabase(AppError):
+    """The database has tables and no version: an earlier version was killed while it made them."""
+
+
+class NoSpaceToUpgrade(AppError):
+    """There is too little space for the copy that is made before the database is upgraded."""
+
+
+class UpgradeFailed(AppError):
+    """The database could not be upgraded and is as it was. If an earlier version of this program was killed while it
+    upgraded, restore the database from before that."""
+
+
+class DamagedDatabase(AppError):
+    """The database is damaged and was left as it is. Restore it from a backup."""
+
+
+def upgrade(settings: Settings) -> None:
+    """Bring the database to the newest schema; whoever comes second finds it done."""
+    settings.data_dir.mkdir(parents=True, exist_ok=True)
+    config = _config(settings)
+    newest = ScriptDirectory.from_config(config).get_current_head() or ""
+    with _one_at_a_time(settings):
+        present = _revision(settings, config)
+        path = file_of(settings.sqlalchemy_url)
+        if present == newest:
+            return
+        if present is not None and path is not None:
+            _copy(path, newest)
+        try:
+            command.upgrade(config, "head")
+        except OperationalError as error:
+            raise UpgradeFailed(f"{_words(UpgradeFailed)} The database says: {error.orig}.") from error
+
+
+def forget_copies(path: Path) -> None:
+    """Erase the copies made before upgrades: somebody who has withdrawn is still in them."""
+    for copy in copies(path):
+        copy.unlink(missing_ok=True)
+        log.warning("%s is erased: somebody who is in it has withdrawn", copy.name)
+
+
+def copies(path: Path) -> list[Path]:
+    """The copies made before upgrades, the oldest first."""
+    return sorted(path.parent.glob(f"{path.name}{_COPY}*"), key=lambda copy: copy.stat().st_mtime_ns)
+
+
+def _config(settings: Settings) -> Config:
+    config = Config()
+    config.set_main_option("script_location", str(Path(__file__).resolve().parent.parent / "migrations"))
+    config.set_main_option("sqlalchemy.url", settings.sqlalchemy_url.replace("%", "%%"))
+    return config
+
+
+@contextmanager
+def _one_at_a_time(settings: Settings) -> Iterator[None]:
+    with (settings.data_dir / "upgrade.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+
+
+def _revision(settings: Settings, config: Config) -> str | None:
+    """The schema's revision, None while there is none. Raises what an upgrade could not mend."""
+    path = file_of(settings.sqlalchemy_url)
+    if path is not None and not path.exists():
+        return None
+    engine = create_engine(settings.sqlalchemy_url)
+    try:
+        tables = set(inspect(engine).get_table_names())
+        with engine.connect() as connection:
+            found = connection.scalar(text("SELECT version_num FROM alembic_version")) if _VERSIONS in tables else None
+    except DatabaseError as error:
+        if isinstance(error, OperationalError):  # away or locked, which is not damaged
+            raise
+        raise DamagedDatabase from error
+    finally:
+        engine.dispose()
+    known = {script.revision for script in ScriptDirectory.from_config(config).walk_revisions()}
+    if found is not None and found not in known:
+        raise NewerDatabase(f"{_words(NewerDatabase)} (It is of revision {found}.)")
+    if found is None and tables - {_VERSIONS}:
+        raise UnfinishedDatabase(
+            f"{_words(UnfinishedDatabase)} Nothing can have been recorded in it: move {path or 'its tables'} away and "
+            "start again."
+        )
+    return found
+
+
+def _copy(path: Path, newest: str) -> None:
+    """A consistent copy for its owner only, complete or absent; the oldest copies make room."""
+    needed = 2 * path.stat().st_size + SPARE_BYTES  # once for the copy, once for what the upgrade rewrites
+    free = shutil.disk_usage(path.parent).free
+    if free < needed:
+        raise NoSpaceToUpgrade(f"{_words(NoSpaceToUpgrade)} Free {(needed - free) / 1024**2:.0f} MiB on its disk.")
+    target = path.with_name(f"{path.name}{_COPY}{newest}-{now():%Y%m%dT%H%M%S}")
+    draft = path.with_name(f"{path.name}.copying")
+    draft.unlink(missing_ok=True)
+    os.close(os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600))  # SQLite fills an empty file as it is
+    try:
+        with closing(sqlite3.connect(path, timeout=BUSY_TIMEOUT_S, isolation_level=None)) as connection:
+            connection.execute("VACUUM INTO ?", (str(draft),))
+        with draft.open("rb") as stream:
+            os.fsync(stream.fileno())
+        draft.replace(target)
+    except sqlite3.DatabaseError as error:
+        if error.sqlite_errorcode & 0xFF in {sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB}:
+            raise DamagedDatabase from error
+        raise
+    finally:
+        draft.unlink(missing_ok=True)
+    log.warning("the database is upgraded to revision %s; a copy of what it was is %s", newest, target.name)
+    for old in copies(path)[:-KEPT_COPIES]:
+        old.unlink()
+
+
+def _words(error: type[AppError]) -> str:
+    return error().message

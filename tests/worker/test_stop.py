@@ -1,0 +1,126 @@
+"""A worker that is told to stop has stopped ten seconds later, whatever it is doing."""
+
+import os
+import signal
+import sqlite3
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing, suppress
+from pathlib import Path
+
+import pytest
+from sqlalchemy import select
+
+from app.db import Database
+from app.domain.models import Run, RunStatus, WorkerPresence
+from app.domain.studies import StudySettings
+from app.services import studies
+from app.settings import Settings
+
+PATIENCE_S = 600.0
+AT_MOST_S = 10.0
+
+Worker = subprocess.Popen[bytes]
+
+
+@pytest.fixture
+def worker(settings: Settings, database: Database) -> Iterator[Worker]:
+    """A worker that has only just been started, with work at hand."""
+    with database.writing() as session:
+        studies.create_study(session, "Study", StudySettings(labels_per_participant=20, pool_scenarios=2))
+    environment = {name: value for name, value in os.environ.items() if name != "DATABASE_URL"}
+    environment.update(DATA_DIR=str(settings.data_dir), COMPUTE_PROCESSES="1")
+    process = subprocess.Popen([sys.executable, "-m", "worker", "run"], env=environment)
+    yield process
+    for pid in (*descendants(process.pid), process.pid):
+        if not gone(pid):
+            os.kill(pid, signal.SIGKILL)
+    process.wait()
+
+
+def descendants(pid: int) -> list[int]:
+    """Its compute processes, whichever of its threads has started them."""
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        with suppress(OSError):
+            if int(stat.read_text().rsplit(")", 1)[1].split()[1]) == pid:
+                found.append(int(stat.parent.name))
+    return found
+
+
+def gone(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] == "Z"
+    except FileNotFoundError:
+        return True
+
+
+def until(condition: Callable[[], bool]) -> bool:
+    """Whether it became true in time."""
+    deadline = time.monotonic() + PATIENCE_S
+    while not condition():
+        if time.monotonic() > deadline:
+            return False
+        threading.Event().wait(0.02)
+    return True
+
+
+def is_filming(database: Database) -> bool:
+    with database.reading() as session:
+        return session.scalar(select(Run.id).where(Run.status == RunStatus.RUNNING)) is not None
+
+
+def is_present(database: Database) -> bool:
+    with database.reading() as session:
+        return session.scalar(select(WorkerPresence.name)) is not None
+
+
+def stops(process: Worker, number: int = signal.SIGTERM) -> bool:
+    """Whether it has ended in time, its compute processes as well."""
+    computing = descendants(process.pid)
+    process.send_signal(number)
+    try:
+        process.wait(AT_MOST_S)
+    except subprocess.TimeoutExpired:
+        return False
+    return until(lambda: all(gone(pid) for pid in computing))
+
+
+def test_while_it_starts(worker: Worker, settings: Settings) -> None:
+    assert until((settings.data_dir / "worker-1.lock").exists)
+    assert stops(worker)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
+def test_while_it_films(worker: Worker, database: Database, number: int) -> None:
+    assert until(lambda: is_filming(database))
+    assert stops(worker, number)
+    assert worker.returncode == 0, "in good order"
+
+
+def test_while_its_compute_processes_are_stopped(worker: Worker, database: Database) -> None:
+    assert until(lambda: is_filming(database) and len(descendants(worker.pid)) > 0)
+    for pid in descendants(worker.pid):
+        os.kill(pid, signal.SIGSTOP)
+    assert stops(worker)
+
+
+def test_while_its_compute_processes_are_killed(worker: Worker, database: Database) -> None:
+    assert until(lambda: is_filming(database) and len(descendants(worker.pid)) > 0)
+    for pid in descendants(worker.pid):
+        os.kill(pid, signal.SIGKILL)
+    assert stops(worker)
+
+
+@pytest.mark.parametrize("file", ["studio.sqlite3", "engine.sqlite3"])
+def test_while_somebody_else_has_locked_its_files(
+    worker: Worker, database: Database, settings: Settings, file: str
+) -> None:
+    assert until(lambda: is_present(database))
+    with closing(sqlite3.connect(settings.data_dir / file, timeout=PATIENCE_S, isolation_level=None)) as connection:
+        connection.execute("BEGIN IMMEDIATE" if file == "studio.sqlite3" else "BEGIN EXCLUSIVE")
+        threading.Event().wait(2.0)  # longer than between two signs of its life; a wait for nothing tests less
+        assert stops(worker)
