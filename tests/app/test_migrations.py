@@ -51,12 +51,10 @@ def test_every_migration_can_be_taken_back_and_made_again(config: Config, engine
 
 def test_every_study_of_the_second_version_gets_a_secret_of_its_own(config: Config, engine: Engine) -> None:
     command.upgrade(config, "0002")
-    columns = "(slug, name, task, stored_settings, seed, created_at)"
+    study = "INSERT INTO study (slug, name, task, stored_settings, seed, created_at)"
     with engine.begin() as connection:
         for slug in ("one", "other"):
-            connection.execute(
-                text(f"INSERT INTO study {columns} VALUES ('{slug}', 'x', 'feeding', '{{}}', 7, '2026')")
-            )
+            connection.execute(text(f"{study} VALUES (:slug, 'x', 'feeding', '{{}}', 7, '2026')"), {"slug": slug})
     command.upgrade(config, "head")
     with engine.connect() as connection:
         secrets = connection.execute(text("SELECT key_secret FROM study")).scalars().all()
