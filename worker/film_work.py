@@ -69,7 +69,8 @@ _DOING = {BEFORE_AFTER: "filming before and after,", TRIALS: "filming robot", CO
 def _plan(place: Workplace, job: Job, what: str) -> list[list[Any]]:
     """[method, scenario] of every film, or [method, letter] of every controller. Draws the evaluation if need be.
 
-    In the order of the methods, never of the letters: rows, times and progress then tell nothing of the key.
+    In an order of its own, neither of the letters nor of the methods: when what was made, and at which place something
+    went wrong, then tells nothing of the key.
     """
     with place.database.writing() as session:
         study, participant = session.get_one(Study, job.study_id), session.get_one(Participant, job.participant)
@@ -81,9 +82,11 @@ def _plan(place: Workplace, job: Job, what: str) -> list[list[Any]]:
         evaluating.draw(session, study, participant)
         letters = {each.letter: each.method for each in evaluating.assignments_of(session, participant.id)}
         if what == CONTROLLERS:
-            return sorted([method, letter] for letter, method in letters.items())
-        trials = evaluating.trials_of(session, participant.id)
-        return sorted([letters[each.letter], each.scenario] for each in trials)
+            shots: list[list[Any]] = [[method, letter] for letter, method in letters.items()]
+        else:
+            trials = evaluating.trials_of(session, participant.id)
+            shots = [[letters[each.letter], each.scenario] for each in trials]
+        return sorted(shots, key=lambda shot: evaluating.mark(study.key_secret, "made", participant.id, *shot))
 
 
 def _film(place: Workplace, run_id: int, job: Job, shots: list[list[Any]]) -> None:

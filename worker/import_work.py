@@ -24,14 +24,17 @@ from app.db import Database
 from app.domain.clips import Clip, Rollout
 from app.domain.studies import LONGEST_CLIP_STEPS, RewardKind, Strategy, Study, StudySettings
 from app.errors import AppError
-from app.services import audit, studies
+from app.services import audit, studies, unpacking, withdrawal
 from app.storage import ArtefactStore
 from worker.dataset import IMPORTED
 from worker.sim.video import PlayableVideo, playable
 from worker.trajectory import Array, Recording
+from worker.workplace import NotingStore
 
 FORMAT, VERSION = "pbarl-studio-clips", 1
 MANIFEST = "manifest.json"
+LARGEST_MANIFEST_BYTES, LARGEST_TRAJECTORY_BYTES, LARGEST_VIDEO_BYTES = 8 << 20, 64 << 20, 256 << 20
+LARGEST_UNPACKED_BYTES = 64 << 30
 LONGEST_DIFFERENCE_S = 0.5
 """Between a video and its trajectory."""
 FEWEST_STEPS = 2
@@ -84,8 +87,8 @@ class Source(ABC):
     """Where files come from; names are relative, with slashes."""
 
     @abstractmethod
-    def read(self, name: str) -> bytes:
-        """The file of that name. Raises ClipsInvalid when there is none."""
+    def read(self, name: str, most_bytes: int) -> bytes:
+        """The file of that name. Raises ClipsInvalid when there is none, or when it is larger than that."""
 
 
 class Folder(Source):
@@ -94,11 +97,13 @@ class Folder(Source):
     def __init__(self, root: Path) -> None:
         self._root = root.resolve()
 
-    def read(self, name: str) -> bytes:
+    def read(self, name: str, most_bytes: int) -> bytes:
         """See Source."""
         path = (self._root / name).resolve()
         if not path.is_relative_to(self._root) or not path.is_file():
             raise ClipsInvalid(f"There is no file {name} in this folder.")
+        if path.stat().st_size > most_bytes:
+            raise ClipsInvalid(f"{name} is larger than {most_bytes / 1e6:.0f} MB.")
         return path.read_bytes()
 
 
@@ -110,19 +115,24 @@ class Zip(Source):
         inside = [PurePosixPath(name) for name in archive.namelist()]
         self._prefix = next((path.parent for path in inside if path.name == MANIFEST), PurePosixPath())
 
-    def read(self, name: str) -> bytes:
+    def read(self, name: str, most_bytes: int) -> bytes:
         """See Source."""
         try:
-            return self._archive.read(str(self._prefix / name))
-        except (KeyError, zipfile.BadZipFile) as error:
+            return unpacking.content(self._archive, str(self._prefix / name), most_bytes)
+        except unpacking.UNREADABLE as error:
             raise ClipsInvalid(f"There is no file {name} in this zip file, or it is damaged.") from error
 
 
 @dataclass(frozen=True)
 class _Ready:
-    clip: OwnClip
-    recording: Recording
-    video: PlayableVideo
+    """A clip whose files were looked at and stored, with the columns of its rollout and of itself."""
+
+    scenario: int
+    rollout: Mapping[str, Any]
+    clip: Mapping[str, Any]
+    steps: int
+    columns: tuple[int, int]
+    """of observations and of actions"""
 
 
 def import_clips(database: Database, store: ArtefactStore, path: Path, actor: str = audit.SYSTEM) -> str:
@@ -130,28 +140,38 @@ def import_clips(database: Database, store: ArtefactStore, path: Path, actor: st
     if path.is_dir():
         return _import(database, store, Folder(path), actor)
     try:
-        with zipfile.ZipFile(path) as archive:
+        with unpacking.opened(path, LARGEST_UNPACKED_BYTES) as archive:
             return _import(database, store, Zip(archive), actor)
+    except unpacking.ZipRefused as error:
+        raise ClipsInvalid(f"{path} is not read: {error}.") from error
     except (OSError, zipfile.BadZipFile) as error:
         raise ClipsInvalid(f"{path} is neither a folder nor a zip file.") from error
 
 
 def _import(database: Database, store: ArtefactStore, source: Source, actor: str) -> str:
-    manifest = _manifest(source)
-    ready = [_read(source, manifest, clip) for clip in manifest.clips]
-    _check_observations(ready)
-    settings = _settings(manifest, ready)
-    rows = [_stored(store, each) for each in ready]
-    with database.writing() as session:
-        return _save(session, manifest, settings, rows, actor).slug
+    """Files are stored one clip after the other, and go again when one of them is wrong."""
+    noted = set[str]()
+    shelf = NotingStore(store, noted)
+    try:
+        manifest = _manifest(source)
+        ready = [_read(shelf, source, manifest, clip) for clip in manifest.clips]
+        _check_observations(ready)
+        settings = _settings(manifest, ready)
+        with database.writing() as session:
+            return _save(session, manifest, settings, ready, actor).slug
+    except BaseException:
+        with database.writing() as session:  # nobody can begin to refer to one of them meanwhile
+            for sha256 in noted - withdrawal.in_use(session, noted):
+                store.delete(sha256)
+        raise
 
 
 def _manifest(source: Source) -> Manifest:
     try:
-        return Manifest.model_validate(json.loads(source.read(MANIFEST)))
+        return Manifest.model_validate(json.loads(source.read(MANIFEST, LARGEST_MANIFEST_BYTES)))
     except ValidationError as error:
         raise ClipsInvalid(f"{MANIFEST}: {_in_words(error)}") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ClipsInvalid(f"{MANIFEST} is not JSON: {error}.") from error
 
 
@@ -161,10 +181,10 @@ def _in_words(error: ValidationError) -> str:
     return f"{place}: {first['msg']}."
 
 
-def _read(source: Source, manifest: Manifest, clip: OwnClip) -> _Ready:
-    recording = _recording(source.read(clip.trajectory), manifest, clip)
+def _read(store: ArtefactStore, source: Source, manifest: Manifest, clip: OwnClip) -> _Ready:
+    recording = _recording(source.read(clip.trajectory, LARGEST_TRAJECTORY_BYTES), manifest, clip)
     try:
-        video = playable(source.read(clip.video))
+        video = playable(source.read(clip.video, LARGEST_VIDEO_BYTES))
     except ValueError as error:
         raise ClipsInvalid(f"{clip.video} is {error}.") from error
     lasts_s = len(recording) / manifest.rate_hz
@@ -173,7 +193,7 @@ def _read(source: Source, manifest: Manifest, clip: OwnClip) -> _Ready:
             f"{clip.trajectory} lasts {lasts_s:.1f} s ({len(recording)} steps at {manifest.rate_hz:g} Hz), but "
             f"{clip.video} lasts {video.duration_ms / 1000:.1f} s. They must be of the same stretch of time."
         )
-    return _Ready(clip, recording, video)
+    return _stored(store, clip, recording, video)
 
 
 def _recording(content: bytes, manifest: Manifest, clip: OwnClip) -> Recording:
@@ -186,13 +206,13 @@ def _recording(content: bytes, manifest: Manifest, clip: OwnClip) -> Recording:
         if len(observations) == len(signals):  # nothing was observed after the last step: the last is the best guess
             observations = np.concatenate([observations, observations[-1:]])
         return Recording(signals, observations, actions, clip.success)
-    except (ValueError, KeyError, zipfile.BadZipFile, EOFError) as error:
+    except (ValueError, MemoryError, csv.Error, *unpacking.UNREADABLE) as error:
         raise ClipsInvalid(f"{clip.trajectory}: {str(error).strip(chr(39))}") from error
 
 
 def _from_csv(content: bytes, names: Sequence[str]) -> tuple[Array, Array, Array]:
     """A row per step. Columns by name: the signals, and observations obs_0.. and actions act_0.. if there are any."""
-    rows = list(csv.reader(io.StringIO(content.decode("utf-8-sig"))))
+    rows = list(csv.reader(io.StringIO(content.decode("utf-8-sig"), newline="")))
     if not rows:
         raise ValueError("the file is empty")
     header = [cell.strip() for cell in rows[0]]
@@ -219,6 +239,8 @@ def _numbered(header: Sequence[str], prefix: str) -> list[int]:
 
 def _from_npz(content: bytes, names: Sequence[str]) -> tuple[Array, Array, Array]:
     """signals (T, S) in the manifest's order, and observations (T or T + 1, D) and actions (T, A) if there are any."""
+    with unpacking.opened(io.BytesIO(content), LARGEST_TRAJECTORY_BYTES):
+        pass  # what it would unpack to is looked at before numpy does that
     with np.load(io.BytesIO(content), allow_pickle=False) as stored:
         signals = np.asarray(stored["signals"], np.float32)
         if signals.ndim != 2 or signals.shape[1] != len(names):
@@ -231,19 +253,19 @@ def _from_npz(content: bytes, names: Sequence[str]) -> tuple[Array, Array, Array
 
 def _check_observations(ready: Sequence[_Ready]) -> None:
     """All trajectories must have the same columns, or no model could read them all."""
-    shapes = {(each.recording.observations.shape[1], each.recording.actions.shape[1]) for each in ready}
+    shapes = {each.columns for each in ready}
     if len(shapes) > 1:
         raise ClipsInvalid(f"Trajectories differ in how many observations and actions they have: {sorted(shapes)}.")
 
 
 def _settings(manifest: Manifest, ready: Sequence[_Ready]) -> StudySettings:
     """What the manifest says; the rest follows from the clips. Raises ClipsInvalid for what needs a simulator."""
-    per_scenario = Counter(each.clip.scenario for each in ready)
+    per_scenario = Counter(each.scenario for each in ready)
     pairs = sum(count * (count - 1) // 2 for count in per_scenario.values())
     alone = [scenario for scenario, count in per_scenario.items() if count < 2]
     if alone:
         raise ClipsInvalid(f"Scenario {alone[0]} has one clip only; clips are compared within a scenario.")
-    longest = max(len(each.recording) for each in ready)
+    longest = max(each.steps for each in ready)
     usual: dict[str, Any] = {
         "strategy": Strategy.UNIFORM,
         "pool_scenarios": len(per_scenario),
@@ -272,31 +294,31 @@ def _settings(manifest: Manifest, ready: Sequence[_Ready]) -> StudySettings:
     return settings
 
 
-def _stored(store: ArtefactStore, each: _Ready) -> tuple[_Ready, dict[str, Any], dict[str, Any]]:
-    """The clip with the columns of its rollout and of itself."""
+def _stored(store: ArtefactStore, own: OwnClip, recording: Recording, video: PlayableVideo) -> _Ready:
     file = io.BytesIO()
-    each.recording.save(file)
-    mode = {IMPORTED: {"video": each.clip.video, "trajectory": each.clip.trajectory, "label": each.clip.label}}
-    rollout = {"mode": mode, "trajectory_sha256": store.put(file.getvalue()), "success": each.recording.success}
+    recording.save(file)
+    mode = {IMPORTED: {"video": own.video, "trajectory": own.trajectory, "label": own.label}}
+    rollout = {"mode": mode, "trajectory_sha256": store.put(file.getvalue()), "success": recording.success}
     clip = {
         "first_step": 0,
-        "step_count": len(each.recording),
-        "video_sha256": store.put(each.video.video),
-        "poster_sha256": store.put(each.video.poster),
-        "width": each.video.width,
-        "height": each.video.height,
-        "fps": each.video.fps,
-        "duration_ms": each.video.duration_ms,
-        "byte_count": len(each.video.video),
+        "step_count": len(recording),
+        "video_sha256": store.put(video.video),
+        "poster_sha256": store.put(video.poster),
+        "width": video.width,
+        "height": video.height,
+        "fps": video.fps,
+        "duration_ms": video.duration_ms,
+        "byte_count": len(video.video),
     }
-    return each, rollout, clip
+    columns = recording.observations.shape[1], recording.actions.shape[1]
+    return _Ready(own.scenario, rollout, clip, len(recording), columns)
 
 
 def _save(
     session: Session,
     manifest: Manifest,
     settings: StudySettings,
-    rows: Sequence[tuple[_Ready, Mapping[str, Any], Mapping[str, Any]]],
+    ready: Sequence[_Ready],
     actor: str,
 ) -> Study:
     study = Study(
@@ -310,12 +332,12 @@ def _save(
     session.add(study)
     session.flush()
     behaviours: Counter[int] = Counter()
-    for each, rollout, clip in rows:
-        scenario = each.clip.scenario
-        known = Rollout(study_id=study.id, scenario=scenario, behaviour=behaviours[scenario], **rollout)
-        behaviours[scenario] += 1
+    for each in ready:
+        behaviour = behaviours[each.scenario]
+        known = Rollout(study_id=study.id, scenario=each.scenario, behaviour=behaviour, **each.rollout)
+        behaviours[each.scenario] += 1
         session.add(known)
         session.flush()
-        session.add(Clip(rollout_id=known.id, **clip))
-    audit.record(session, actor, "clips imported", f"{study.slug} ({len(rows)} clips)")
+        session.add(Clip(rollout_id=known.id, **each.clip))
+    audit.record(session, actor, "clips imported", f"{study.slug} ({len(ready)} clips)")
     return study

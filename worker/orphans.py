@@ -1,8 +1,11 @@
 """Files that nobody refers to: a worker was killed after it had stored a result and before it could write that down."""
 
 import logging
+import shutil
+import time
 from collections.abc import Collection
 from datetime import timedelta
+from pathlib import Path
 
 from app.services import withdrawal
 from worker.workplace import Workplace
@@ -23,6 +26,14 @@ def clear_away(place: Workplace, promised: Collection[str]) -> int:
         orphans = old - withdrawal.in_use(session, old)
         for sha256 in orphans:
             place.store.delete(sha256)
+    for folder in (*_workspaces(place, "export-*"), *_workspaces(place, "import-*")):
+        shutil.rmtree(folder, ignore_errors=True)
     if orphans:
         log.info("%d stored files that nobody refers to any more are cleared away", len(orphans))
     return len(orphans)
+
+
+def _workspaces(place: Workplace, names: str) -> list[Path]:
+    """Folders in which a killed program was writing or reading an archive: they hold what everybody has said."""
+    oldest_s = time.time() - OLD_ENOUGH.total_seconds()
+    return [each for each in place.store.unfinished(0).parent.glob(names) if each.stat().st_mtime < oldest_s]

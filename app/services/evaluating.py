@@ -102,10 +102,10 @@ def williams_rows(count: int) -> Sequence[tuple[int, ...]]:
 
 def order_of_methods(secret: str, methods: Sequence[EvaluatedMethod], number: int) -> Sequence[EvaluatedMethod]:
     """The order in which the participant of this number meets the methods."""
-    drawn = sorted(methods, key=lambda method: _mark(secret, "method", method))
+    drawn = sorted(methods, key=lambda method: mark(secret, "method", method))
     rows = williams_rows(len(methods))
     cycle, place = divmod(number - 1, len(rows))
-    row = sorted(rows, key=lambda each: _mark(secret, "row", cycle, *each))[place]
+    row = sorted(rows, key=lambda each: mark(secret, "row", cycle, *each))[place]
     return [drawn[index] for index in row]
 
 
@@ -289,6 +289,6 @@ def film_of(session: Session, participant_id: int, method: str, scenario: int, m
     return session.scalar(theirs.where(Film.model_id == model_id if model_id is not None else Film.model_id.is_(None)))
 
 
-def _mark(secret: str, *parts: object) -> str:
+def mark(secret: str, *parts: object) -> str:
     """Sorts in an order that looks random and is the same on every machine."""
     return hashlib.sha256(f"{secret}/evaluation/{'/'.join(map(str, parts))}".encode()).hexdigest()

@@ -15,7 +15,7 @@ PIECE_BYTES = 1 << 20
 LARGEST_DIRECTORY_BYTES = 8 << 20
 """Of the list of contents, which is read at once: about seventy thousand files."""
 HIGHEST_RATIO = 300
-"""Unpacked to packed. Answers reach 30, a long consent text that everybody agreed to 140; noughts reach 1000."""
+"""Unpacked to packed. Answers reach 10, a long consent text that everybody agreed to 115; noughts reach 1000."""
 RATIO_FROM_BYTES = 4 << 20
 """What is unpacked to less than this does no harm, whatever its ratio."""
 

@@ -26,6 +26,7 @@ from app.web.deps import (
     StudioDep,
     WritingSession,
 )
+from app.web.media import AT_NO_TIME
 from app.web.templating import page
 
 router = APIRouter(prefix="/studies/{slug}")
@@ -110,7 +111,8 @@ def download_controller(
     controller = operating.find_controller(session, studio.store, participant, letter)
     audit.record(session, experimenter.name, "controller downloaded", f"{study.slug}/{code}/{letter}")
     path = studio.store.path(controller.artefact_sha256)
-    return FileResponse(path, media_type="application/zip", filename=f"{slug}-{code}-{letter}.zip")
+    headers = {"etag": f'"{controller.artefact_sha256}"', "last-modified": AT_NO_TIME}
+    return FileResponse(path, media_type="application/zip", filename=f"{slug}-{code}-{letter}.zip", headers=headers)
 
 
 @router.get("/unblind", name="show_unblinding")

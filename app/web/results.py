@@ -141,6 +141,12 @@ def show_exports(
     return _exports_page(request, studies.find_study(session, slug), experimenter, session)
 
 
+@router.get("/export/seal-key", include_in_schema=False)
+def forget_seal_key(request: Request, slug: Slug) -> Response:
+    """The page of exports, for whoever loads the page with the key again."""
+    return RedirectResponse(request.app.url_path_for("show_exports", slug=slug), HTTPStatus.SEE_OTHER)
+
+
 @router.post("/export/seal-key", name="show_seal_key")
 def show_seal_key(request: Request, slug: Slug, experimenter: ActingExperimenter, session: WritingSession) -> Response:
     """The key of this study's sealed archives; who has asked for it is kept."""

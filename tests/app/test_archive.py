@@ -1,9 +1,11 @@
 """A study moves to another installation: everything arrives, or nothing does."""
 
+import base64
 import hashlib
 import io
 import json
 import zipfile
+import zlib
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
@@ -16,10 +18,21 @@ from sqlalchemy import func, select
 from app.__main__ import import_study
 from app.db import Base, Database
 from app.domain.models import Run, RunStatus
+from app.domain.participation import ConsentRecord, FormAnswer, ParticipantEvent
 from app.domain.preferences import Query
-from app.domain.studies import Participant, Study
+from app.domain.studies import Deviation, Participant, Study
 from app.main import create_app
-from app.services import archive, enrolment, export_tables, exporting, sealing, study_import, unblinding, withdrawal
+from app.services import (
+    archive,
+    archive_reading,
+    enrolment,
+    export_tables,
+    exporting,
+    sealing,
+    study_import,
+    unblinding,
+    withdrawal,
+)
 from app.services.archive import ArchiveInvalid
 from app.settings import Settings
 from app.storage import ArtefactStore
@@ -320,3 +333,71 @@ def test_a_study_is_imported_by_a_command(packed: Path, tmp_path: Path, capsys: 
     said = capsys.readouterr().out
     assert "/studies/feeding-finished" in said
     assert "P01,http" in said
+
+
+ODD_TEXTS = (
+    *(f"one{end}two" for end in "\n\r\v\f\x1c\x1d\x1e\x85\u2028\u2029\0"),
+    "\r\n",
+    "\ufeffwith a mark \u202eand backwards",
+    "\U0001f37d\ufe0f \u0301 \U0010ffff",
+    '{"a": "\\u2028"}\n{}',
+    "'; DROP TABLE participant; --",
+    "\u2028" * 4000,
+)
+
+
+def test_whatever_somebody_writes_an_archive_brings_it_back(
+    database: Database, store: ArtefactStore, elsewhere: FastAPI, tmp_path: Path
+) -> None:
+    with database.writing() as session:
+        study = factories.make_study(session, "Odd\u2028texts")
+        for text in ODD_TEXTS:
+            person, _ = factories.make_participant(session, study)
+            person.panel_id, person.panel_parameters = text[:120], {text: text, "half a character": "\ud800"}
+            session.add(ConsentRecord(participant_id=person.id, version=text[:40], language="en", text=text))
+            session.add(FormAnswer(participant_id=person.id, form="questionnaire", item="comments", value=text))
+            session.add(ParticipantEvent(participant_id=person.id, kind="break_begun", detail={text: "\udfff"}))
+            factories.make_run(session, study, person, error=text)
+        session.add(Deviation(study_id=study.id, actor="x", reason=ODD_TEXTS[8], before={}, after={ODD_TEXTS[0]: "\r"}))
+        session.flush()
+        archive.write(session, store, study, tmp_path / "odd.zip")
+    archive_reading.verify(tmp_path / "odd.zip", tmp_path / "work", "")
+    imported = bring(elsewhere, tmp_path / "odd.zip")
+    assert exports(elsewhere.state.studio.database, imported.study.slug) == exports(database, study.slug)
+    with elsewhere.state.studio.database.reading() as session:
+        people = select(Participant).where(Participant.study_id == imported.study.id).order_by(Participant.number)
+        for person, text in zip(session.scalars(people).all(), ODD_TEXTS, strict=True):
+            assert person.panel_parameters == {text: text, "half a character": "\ud800"}
+            theirs = FormAnswer.participant_id == person.id
+            assert session.scalar(select(FormAnswer.value).where(theirs)) == text
+
+
+def _as_version_1(packed: Path, sealed: tuple[str, ...] = ()) -> Path:
+    """The archive as the first version wrote it: without the secret, some tables packed as text."""
+    target = packed.with_name("version-1.zip")
+    with zipfile.ZipFile(packed) as source, zipfile.ZipFile(target, "w") as copy:
+        manifest = json.loads(source.read("manifest.json"))
+        manifest |= {"version": 1, "study": "feeding-finished"}
+        del manifest["missing"], manifest["sealed"]
+        for name, said in manifest["tables"].items():
+            rows = [json.loads(line) for line in source.read(f"rows/{name}.jsonl").split(b"\n") if line]
+            for row in rows:
+                row.pop("key_secret", None)
+            content = "".join(json.dumps(row, ensure_ascii=False) + "\n" for row in rows).encode()
+            said |= {"sha256": hashlib.sha256(content).hexdigest(), "sealed": name in sealed}
+            packed_text = base64.b64encode(zlib.compress(content)) if name in sealed else content
+            copy.writestr(f"rows/{name}.{'sealed' if name in sealed else 'jsonl'}", packed_text)
+        for sha256 in manifest["files"]:
+            copy.writestr(f"files/{sha256}", source.read(f"files/{sha256}"))
+        copy.writestr("manifest.json", json.dumps(manifest))
+    return target
+
+
+@pytest.mark.parametrize("sealed", [(), ("assignment", "trial")])
+def test_an_archive_of_the_first_version_is_still_read(
+    database: Database, elsewhere: FastAPI, study: Study, packed: Path, sealed: tuple[str, ...]
+) -> None:
+    imported = bring(elsewhere, _as_version_1(packed, sealed))
+    assert exports(elsewhere.state.studio.database, imported.study.slug) == exports(database, study.slug)
+    with elsewhere.state.studio.database.reading() as session:
+        assert len(session.get_one(Study, imported.study.id).key_secret) == 64, "drawn for who comes later"

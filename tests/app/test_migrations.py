@@ -8,7 +8,7 @@ from alembic import command
 from alembic.autogenerate import compare_metadata
 from alembic.config import Config
 from alembic.migration import MigrationContext
-from sqlalchemy import Engine, create_engine, inspect
+from sqlalchemy import Engine, create_engine, inspect, text
 
 import app.domain.clips
 import app.domain.evaluation
@@ -47,3 +47,16 @@ def test_every_migration_can_be_taken_back_and_made_again(config: Config, engine
     assert inspect(engine).get_table_names() == ["alembic_version"]
     command.upgrade(config, "head")
     assert "label_event" in inspect(engine).get_table_names()
+
+
+def test_every_study_of_the_second_version_gets_a_secret_of_its_own(config: Config, engine: Engine) -> None:
+    command.upgrade(config, "0002")
+    study = "INSERT INTO study (slug, name, task, stored_settings, seed, created_at)"
+    with engine.begin() as connection:
+        for slug in ("one", "other"):
+            connection.execute(text(f"{study} VALUES (:slug, 'x', 'feeding', '{{}}', 7, '2026')"), {"slug": slug})
+    command.upgrade(config, "head")
+    with engine.connect() as connection:
+        secrets = connection.execute(text("SELECT key_secret FROM study")).scalars().all()
+    assert len(set(secrets)) == 2
+    assert all(len(secret) == 64 for secret in secrets)

@@ -142,6 +142,7 @@ def test_controllers_are_downloaded_by_letter_and_the_download_is_logged(
         artefact = session.scalars(select(Controller.artefact_sha256).where(Controller.method == method)).one()
     assert answer.content == store.read(artefact)
     assert laboratory.audit() == ["controller downloaded: feeding-at-home/P01/B"]
+    assert answer.headers["last-modified"] == "Thu, 01 Jan 1970 00:00:00 GMT", "when it was made would tell with what"
     assert laboratory.operator.get(f"{laboratory.base}/controllers/E.zip").status_code == 404
 
 

@@ -1,5 +1,6 @@
 """Watching a clip: ranges, caching, and who may."""
 
+import os
 from collections.abc import Callable
 
 import pytest
@@ -49,6 +50,16 @@ def test_a_range_is_answered_with_that_range(
 def test_a_range_beyond_the_end_is_refused(taking_part: TakingPart, clip: Clip) -> None:
     answer = taking_part.browser.get(f"/media/{clip.video_sha256}.mp4", headers={"Range": "bytes=99999999-"})
     assert answer.status_code == 416
+
+
+def test_when_a_clip_was_made_is_not_told(taking_part: TakingPart, store: ArtefactStore, clip: Clip) -> None:
+    """Films of a blinded evaluation are made in an order, and some are made again."""
+    path = f"/media/{clip.video_sha256}.mp4"
+    told = []
+    for made_at_s in (1_700_000_000, 1_800_000_000):
+        os.utime(store.path(clip.video_sha256), (made_at_s, made_at_s))
+        told.append({**taking_part.browser.get(path).headers} | {"date": ""})
+    assert told[0] == told[1]
 
 
 def test_a_known_clip_is_not_sent_again(taking_part: TakingPart, clip: Clip) -> None:

@@ -160,10 +160,10 @@ def test_a_lost_or_damaged_recording_is_left_out_and_said_to_be(
         assert lost in json.dumps(json.loads(made.read("provenance.json"))["missing"])
     else:
         manifest = json.loads(made.read("manifest.json"))
-        assert manifest["missing"] == [lost]
+        assert lost in manifest["missing"]
         assert len([each for each in manifest["files"] if each in _trajectories(place)]) == others
     page = experimenter.get(f"/studies/{study.slug}/export").text
-    assert "Without 1 stored files that are missing or damaged" in page
+    assert re.search(r"Without \d+ stored files? that (is|are) missing or damaged", page)
     assert lost[:12] in page
 
 

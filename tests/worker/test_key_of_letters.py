@@ -22,8 +22,9 @@ from app.domain.studies import Participant, Study
 from app.services import archive, evaluating, locking, unblinding
 from app.storage import ArtefactStore
 from tests.worker.test_evaluation_work import AtHand, done, due, learn, settle
-from worker import export_work
+from worker import export_work, film_work
 from worker.film_work import make_films
+from worker.records import Job
 from worker.workplace import Workplace
 
 METHODS = ("reference", "pbarl")
@@ -94,8 +95,8 @@ def _prepared_under(
         archive.write(session, place.store, here, folder / "study.zip")
         export_work.write_data(session, place, here, folder / "data.zip")
         left = {
-            "films": _rows(session.scalars(select(Film).order_by(Film.id)).all()),
-            "controllers": _rows(session.scalars(select(Controller).order_by(Controller.id)).all(), "artefact_sha256"),
+            "films": _rows(session.scalars(select(Film).order_by(Film.method)).all()),
+            "controllers": _rows(session.scalars(select(Controller).order_by(Controller.method)).all()),
             "progress": list(place.said),
             "archive": _from_outside(folder / "study.zip"),
             "data": _inside(folder / "data.zip"),
@@ -104,8 +105,9 @@ def _prepared_under(
     return left, letters
 
 
-def _rows(rows: Any, *without: str) -> list[dict[str, Any]]:
-    left_out = {"created_at", *without}
+def _rows(rows: Any) -> list[dict[str, Any]]:
+    """What was made, whenever it was made. A controller holds its letter."""
+    left_out = {"id", "created_at", "artefact_sha256"}
     names = [column.key for row in rows for column in inspect(row).mapper.column_attrs if column.key not in left_out]
     return [{name: getattr(row, name) for name in names} for row in rows]
 
@@ -122,6 +124,27 @@ def _inside(path: Path) -> dict[str, bytes]:
     with zipfile.ZipFile(path) as file:
         texts = [name for name in file.namelist() if name.endswith((".csv", ".jsonl", ".md", ".json"))]
         return {name: MOMENT.sub(b"", file.read(name)) for name in texts}
+
+
+@pytest.mark.usefixtures("all_said")
+def test_the_order_in_which_robots_are_made_is_neither_that_of_letters_nor_that_of_methods(
+    place: Told, database: Database, study: Study, participant: Participant
+) -> None:
+    """Or the times at which files were made would tell."""
+    settle(database, study, methods=("reference", "pbarl", "prefft"), trials=1)
+    job = Job("films/participant-1/trials/x", RunKind.FILMS, study.id, participant.id)
+    orders = []
+    for number in range(20):
+        with database.writing() as session:
+            for table in (Trial, Assignment):
+                session.execute(delete(table))
+            session.get_one(Study, study.id).key_secret = f"{number:064x}"
+        made = [method for method, _ in film_work._plan(place, job, film_work.TRIALS)]
+        with database.reading() as session:
+            letters = {each.method: each.letter for each in evaluating.assignments_of(session, participant.id)}
+        orders.append((tuple(made), "".join(letters[method] for method in made)))
+    assert len({methods for methods, _ in orders}) > 3
+    assert len({letters for _, letters in orders}) > 3
 
 
 def test_the_seed_that_everybody_sees_does_not_tell_the_letters(database: Database, study: Study) -> None:

@@ -3,6 +3,7 @@
 import io
 import json
 import re
+import tracemalloc
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -26,7 +27,7 @@ from worker.import_work import ClipsInvalid, import_clips
 from worker.ml.reward_models import StructuredReward, load_reward_model
 from worker.records import Job
 from worker.reward_work import train_reward
-from worker.sim.video import playable
+from worker.sim.video import encode_mp4, playable
 from worker.workplace import Workplace
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
@@ -220,3 +221,76 @@ def test_numbers_that_are_none_are_refused(place: Workplace, folder: Path, cell:
     path.write_text(path.read_text().replace("0.1,0.51", f"{cell},0.51", 1))
     with pytest.raises(ClipsInvalid, match=re.escape("trajectories/slow_far_1.csv")):
         import_clips(place.database, place.store, folder)
+
+
+def _zipped(folder: Path, name: str, content: bytes) -> Path:
+    """The example as a zip file, with something else in one of its files."""
+    target = folder.with_name("swollen.zip")
+    with zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as archive:
+        for path in folder.rglob("*.*"):
+            inside = str(path.relative_to(folder))
+            archive.writestr(inside, content if inside == name else path.read_bytes())
+    return target
+
+
+def _swollen_arrays() -> bytes:
+    file = io.BytesIO()
+    np.savez_compressed(file, signals=np.zeros((25_000_000, 2), np.float32))
+    return file.getvalue()
+
+
+def _boundless_arrays() -> bytes:
+    """An array that says of itself that it has a billion rows."""
+    member, file = io.BytesIO(), io.BytesIO()
+    np.lib.format.write_array_header_1_0(member, {"descr": "<f4", "fortran_order": False, "shape": (10**12, 2)})
+    with zipfile.ZipFile(file, "w") as archive:
+        archive.writestr("signals.npy", member.getvalue())
+    return file.getvalue()
+
+
+@pytest.mark.parametrize("name", ["manifest.json", "videos/slow_far_1.mp4", "trajectories/slow_far_1.csv"])
+def test_noughts_in_a_zip_file_fill_no_memory(place: Workplace, folder: Path, name: str) -> None:
+    path = _zipped(folder, name, bytes(200 << 20))
+    assert path.stat().st_size < 2 << 20
+    _refused_within_memory(place, path)
+
+
+def test_arrays_that_swell_fill_no_memory(place: Workplace, folder: Path) -> None:
+    (folder / "trajectories" / "one.npz").write_bytes(_swollen_arrays())
+    edit(folder, lambda manifest: manifest["clips"][0].update(trajectory="trajectories/one.npz"))
+    _refused_within_memory(place, folder)
+
+
+def test_an_array_that_says_it_is_boundless_is_refused(place: Workplace, folder: Path) -> None:
+    """numpy asks for all that memory, and never touches it."""
+    (folder / "trajectories" / "one.npz").write_bytes(_boundless_arrays())
+    edit(folder, lambda manifest: manifest["clips"][0].update(trajectory="trajectories/one.npz"))
+    with pytest.raises(ClipsInvalid, match=re.escape("trajectories/one.npz")):
+        import_clips(place.database, place.store, folder)
+
+
+def _refused_within_memory(place: Workplace, path: Path) -> None:
+    tracemalloc.start()
+    try:
+        with pytest.raises(ClipsInvalid):
+            import_clips(place.database, place.store, path)
+        assert tracemalloc.get_traced_memory()[1] < 48 << 20
+    finally:
+        tracemalloc.stop()
+    assert list(place.store.root.glob("??/*")) == []
+
+
+def test_a_table_with_the_line_ends_of_any_machine_is_read(place: Workplace, folder: Path) -> None:
+    for path, end in zip(sorted((folder / "trajectories").iterdir()), (b"\r", b"\r\n", b"\n") * 3, strict=False):
+        path.write_bytes(path.read_bytes().replace(b"\r\n", b"\n").replace(b"\n", end))
+    assert import_clips(place.database, place.store, folder)
+
+
+def test_a_long_video_is_looked_at_picture_by_picture() -> None:
+    long = encode_mp4((np.zeros((480, 640, 3), np.uint8) for _ in range(200)), 640, 480, 10)
+    tracemalloc.start()
+    try:
+        assert playable(long).duration_ms == 20_000
+        assert tracemalloc.get_traced_memory()[1] < 20 << 20, "two hundred pictures take 184 MB"
+    finally:
+        tracemalloc.stop()

@@ -33,6 +33,8 @@ Array = npt.NDArray[np.float32]
 
 SCHEMA_VERSION = 1
 MANIFEST = "manifest.json"
+LARGEST_BYTES = 256 << 20
+"""Of all files of a bundle together; those written so far have a hundredth of it."""
 _TIMESTAMP = (1980, 1, 1, 0, 0, 0)
 _LIBRARIES = ("numpy", "onnx", "onnxruntime", "onnxscript", "safetensors", "torch")
 
@@ -118,6 +120,8 @@ def verify(stored: bytes) -> dict[str, Any]:
     """The manifest of an undamaged bundle. Raises BundleDamaged when a file is missing, changed or was never listed."""
     try:
         with zipfile.ZipFile(io.BytesIO(stored)) as archive:
+            if sum(each.file_size for each in archive.infolist()) > LARGEST_BYTES:
+                raise BundleDamaged(f"{BundleDamaged.__doc__} It would unpack to far more than a bundle holds.")
             files = {name: archive.read(name) for name in archive.namelist()}
         manifest: dict[str, Any] = json.loads(files.pop(MANIFEST))
         listed: dict[str, dict[str, Any]] = manifest["files"]

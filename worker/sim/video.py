@@ -2,9 +2,11 @@
 
 import io
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
+from typing import Self
 
 import av
 import imageio.v3 as iio
@@ -17,6 +19,8 @@ CONSTANT_RATE_FACTOR = 26
 PRESET = "veryfast"
 CHROMA_OFFSET = -6
 """Tiny coloured food keeps its colour."""
+MOST_PIXELS, MOST_PICTURES = 4096 * 2304, 20_000
+"""Of a video that somebody else has made."""
 
 
 def encode_mp4(frames: Iterable[Frame], width: int, height: int, fps: int) -> bytes:
@@ -64,19 +68,57 @@ class PlayableVideo:
 
 
 def playable(content: bytes) -> PlayableVideo:
-    """Any video as H.264 in MP4; left as it is when it is that already. Raises ValueError when it cannot be read."""
+    """Any video as H.264 in MP4; left as it is when it is that already. One picture is in memory at a time.
+
+    Raises ValueError when it cannot be read, or is larger or longer than any clip.
+    """
     try:
         with av.open(io.BytesIO(content), "r") as container:
             stream = container.streams.video[0]
-            usual = (stream.codec_context.name, stream.codec_context.pix_fmt) == ("h264", "yuv420p")
-            is_mp4 = "mp4" in container.format.name
+            codec = (stream.codec_context.name, stream.codec_context.pix_fmt)
+            usual = codec == ("h264", "yuv420p") and "mp4" in container.format.name
             fps = round(float(stream.average_rate or 0))
-            frames = [np.asarray(each.to_ndarray(format="rgb24"), np.uint8) for each in container.decode(stream)]
+            decoded = _Decoded(container.decode(stream))
+            first = next(decoded, None)
+            if first is None or fps < 1:
+                raise ValueError("a video without frames")
+            height, width = (size // 2 * 2 for size in (first.height, first.width))  # yuv420p wants even
+            poster = _picture(first, width, height)
+            pictures = (_picture(each, width, height) for each in chain([first], decoded))
+            video = content if usual else encode_mp4(pictures, width, height, fps)
+            decoded.count_the_rest()
     except (av.FFmpegError, IndexError) as error:
         raise ValueError(f"not a video that can be read ({error})") from error
-    if not frames or fps < 1:
-        raise ValueError("a video without frames")
-    frames = [frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2] for frame in frames]  # yuv420p wants even
-    height, width = frames[0].shape[:2]
-    video = content if usual and is_mp4 else encode_mp4(frames, width, height, fps)
-    return PlayableVideo(video, encode_poster(frames[0]), width, height, fps, round(1000 * len(frames) / fps))
+    return PlayableVideo(video, encode_poster(poster), width, height, fps, round(1000 * decoded.count / fps))
+
+
+class _Decoded:
+    """Pictures of a video, counted. Raises ValueError when they are too large or too many."""
+
+    def __init__(self, pictures: Iterator[av.VideoFrame]) -> None:
+        self._pictures = pictures
+        self.count = 0
+
+    def __iter__(self) -> Self:
+        return self
+
+    def __next__(self) -> av.VideoFrame:
+        picture = next(self._pictures)
+        self.count += 1
+        if picture.width * picture.height > MOST_PIXELS or self.count > MOST_PICTURES:
+            raise ValueError(
+                f"larger than {MOST_PIXELS / 1e6:.0f} million pixels or longer than {MOST_PICTURES} pictures"
+            )
+        return picture
+
+    def count_the_rest(self) -> None:
+        """Look at what nobody has looked at yet."""
+        for _ in self:
+            pass
+
+
+def _picture(decoded: av.VideoFrame, width: int, height: int) -> Frame:
+    picture = np.asarray(decoded.to_ndarray(format="rgb24"), np.uint8)[:height, :width]
+    if picture.shape[:2] != (height, width):
+        raise ValueError("a video whose pictures change their size")
+    return picture
