@@ -53,7 +53,7 @@ def main() -> None:
         server = subprocess.Popen(
             [
                 *(sys.executable, "-m", "uvicorn", "app.main:create_app", "--factory", "--no-access-log"),
-                *("--log-level", "warning", "--port", str(settings.port)),
+                *("--log-level", "warning", "--port", str(settings.port), "--timeout-keep-alive", "60"),
             ],
             env={**os.environ, "DATA_DIR": directory},
         )
