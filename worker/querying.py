@@ -1,7 +1,7 @@
 """What each participant is asked next, and what the newest model expects them to say."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import numpy as np
@@ -36,16 +36,22 @@ MOST_OTHERS = 12
 def refill_queries(place: Workplace, participant_id: int) -> None:
     """Make the queries the participant will meet next. Safe to call at any time, by any number of workers.
 
-    Places are filled in their order: where one must wait, for clips to be filmed, the later ones wait as well.
+    Places are filled in their order: where one must wait, for clips to be filmed, the later ones wait as well. Pairs of
+    a study of own clips that cannot be shown any more make room for others; clips of ours are made again.
     """
+    lost = place.store.lost()
     with place.database.reading() as session:
         participant = session.get_one(Participant, participant_id)
         study = session.get_one(Study, participant.study_id)
+    if lost and study.material is not None:
+        with place.database.writing() as session:
+            records.drop_lost_queries(session, participant_id, lost)
+    with place.database.reading() as session:
         free = records.free_ordinals(session, participant_id, study.settings)
         if not free:
             return
         slots = pair_plan.plan(study.settings, participant.seed)
-        rows = _Choosing(place, session, participant, study).rows([slots[ordinal - 1] for ordinal in free])
+        rows = _Choosing(place, session, participant, study, lost).rows([slots[ordinal - 1] for ordinal in free])
     if not rows:
         return
     with place.database.writing() as session:
@@ -111,12 +117,15 @@ def _stand_ins(place: Workplace, task: Task, clip: Clip) -> acquisition.Floats:
 class _Choosing:
     """Gives places of a participant's plan their clips. No pair of clips is chosen twice, on whichever side."""
 
-    def __init__(self, place: Workplace, session: Session, participant: Participant, study: Study) -> None:
+    def __init__(
+        self, place: Workplace, session: Session, participant: Participant, study: Study, lost: Collection[str]
+    ) -> None:
+        self._lost = lost
         self._place, self._session, self._participant, self._study = place, session, participant, study
         asked = select(Query).where(Query.participant_id == participant.id)
         self._sides = {query.ordinal: (query.left_clip_id, query.right_clip_id) for query in session.scalars(asked)}
         self._used = {frozenset(sides) for sides in self._sides.values()}
-        self._clips = dataset.pool_clips(session, study.id)
+        self._clips = self._shown(dataset.pool_clips(session, study.id))
 
     def rows(self, slots: Sequence[Slot]) -> list[dict[str, Any]]:
         """As many of these places as can be filled now, as columns of queries."""
@@ -127,7 +136,7 @@ class _Choosing:
             if slot.purpose is Purpose.PREFERENCE:
                 row = next(preferences, None)
             elif slot.purpose is Purpose.REPEAT:
-                row = self._again(slot.repeats_ordinal, slot.swapped, REPEAT)
+                row = self._again(self._askable(slot), slot.swapped, REPEAT)
             else:
                 row = own[slot.ordinal]
             if row is None and slot.purpose is Purpose.CATCH:
@@ -174,7 +183,9 @@ class _Choosing:
 
     def _introduction(self, rng: np.random.Generator) -> dict[str, Any] | None:
         """A pair of whole trajectories."""
-        return self._one_of(self._unused(dataset.whole_clips(self._session, self._study.id)), Strategy.UNIFORM, rng)
+        return self._one_of(
+            self._unused(self._shown(dataset.whole_clips(self._session, self._study.id))), Strategy.UNIFORM, rng
+        )
 
     def _practice(self, rng: np.random.Generator) -> dict[str, Any] | None:
         """Two very different clips: the keys are to be learned, not to be pondered over."""
@@ -221,6 +232,14 @@ class _Choosing:
         fresh = [each for each in labels if each not in again and ordinal - each >= pair_plan.REPEAT_DISTANCE]
         return fresh or labels[:1]
 
+    def _askable(self, slot: Slot) -> int | None:
+        """The place of the pair that is to be asked again; of another one if that cannot be shown any more."""
+        if not self._lost:
+            return slot.repeats_ordinal
+        known = {clip.id for clip in self._clips}
+        places = (slot.repeats_ordinal, *self._labels_before(slot.ordinal))
+        return next((place for place in places if place in self._sides and known.issuperset(self._sides[place])), None)
+
     def _again(self, ordinal: int | None, swapped: bool, strategy: str) -> dict[str, Any] | None:
         if ordinal is None or ordinal not in self._sides:
             return None
@@ -241,6 +260,10 @@ class _Choosing:
             return None
         index, swapped = int(rng.integers(len(pairs))), bool(rng.integers(2))
         return _columns(pairs[index], swapped, strategy, 1.0 / len(pairs))
+
+    def _shown(self, clips: Sequence[Clip]) -> list[Clip]:
+        """Those of the clips that can be shown."""
+        return [clip for clip in clips if clip.video_sha256 not in self._lost and clip.poster_sha256 not in self._lost]
 
     def _unused(self, clips: Sequence[Clip]) -> list[tuple[Clip, Clip]]:
         """Pairs of clips of one scenario that this participant has not been given yet."""

@@ -8,7 +8,7 @@ from collections.abc import Collection, Iterator, Mapping
 from datetime import datetime, timedelta
 from typing import NamedTuple
 
-from sqlalchemy import Select, func, select
+from sqlalchemy import Select, func, or_, select
 from sqlalchemy.orm import Session
 
 from app.db import now
@@ -88,6 +88,18 @@ def short_of_queries(session: Session) -> list[int]:
         for participant_id in _without_all_queries(session, study)
         if next_queries(session, participant_id, study.settings)[1] > 0
     ]
+
+
+def with_lost_queries(session: Session, lost: Collection[str]) -> list[int]:
+    """Participants who wait for pairs that cannot be shown, nor their clips be made again: videos from outside."""
+    if not lost:
+        return []
+    studies = [study.id for study in session.scalars(select(Study)).all() if study.material is not None]
+    of_lost = select(Clip.id).where(or_(Clip.video_sha256.in_(lost), Clip.poster_sha256.in_(lost)))
+    answered = select(LabelEvent.id).where(LabelEvent.query_id == Query.id).exists()
+    waiting = select(Query.participant_id).join(Participant, Participant.id == Query.participant_id)
+    waiting = waiting.where(Participant.study_id.in_(studies), ~answered)
+    return list(session.scalars(waiting.where(or_(Query.left_clip_id.in_(of_lost), Query.right_clip_id.in_(of_lost)))))
 
 
 def _without_all_queries(session: Session, study: Study) -> list[int]:

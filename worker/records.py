@@ -3,13 +3,13 @@
 Every function is one short step inside a transaction of its caller; none computes.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from typing import Any
 
 from sqlalchemy import func, select
-from sqlalchemy.orm import Session
+from sqlalchemy.orm import Session, joinedload
 from sqlalchemy.sql.base import ExecutableOption
 
 from app.db import now
@@ -23,6 +23,9 @@ ATTEMPTS = 3
 
 QUERIES_AHEAD = 12
 """Unanswered queries each participant has waiting."""
+
+LIES_OPEN = timedelta(minutes=10)
+"""So long a pair that was shown may still be in front of somebody."""
 
 LEASE = timedelta(seconds=60)
 """A running run that has not been heard of for this long belongs to nobody."""
@@ -236,6 +239,26 @@ def drop_unseen_queries(session: Session, participant_id: int, keep: int) -> Non
     session.flush()  # what refers to others goes first
     for query in chosen:
         session.delete(query)
+
+
+def drop_lost_queries(session: Session, participant_id: int, lost: Collection[str]) -> None:
+    """Forget pairs that cannot be shown, so that others take their places; one that lies open may still be answered."""
+    waiting = unanswered(session, participant_id, joinedload(Query.left_clip), joinedload(Query.right_clip))
+    gone = {query.id for query in waiting if _is_lost(query, lost) and not _lies_open(query)}
+    asked_again = {query.repeats_query_id for query in waiting if query.id not in gone}
+    for query in reversed(waiting):  # what repeats others goes first
+        if query.id in gone - asked_again:
+            session.delete(query)
+            session.flush()
+
+
+def _is_lost(query: Query, lost: Collection[str]) -> bool:
+    clips = (query.left_clip, query.right_clip)
+    return any(sha256 in lost for clip in clips for sha256 in (clip.video_sha256, clip.poster_sha256))
+
+
+def _lies_open(query: Query) -> bool:
+    return query.served_at is not None and now() - query.served_at < LIES_OPEN
 
 
 def save_predictions(session: Session, model_id: int, probabilities: dict[int, float]) -> None:

@@ -134,8 +134,9 @@ class _Rounds:
 
     def _round(self) -> None:
         with self._place.database.reading() as session:
-            due = list(reconcile.findings(session, self._place.store.lost()))
-            hungry = set(reconcile.short_of_queries(session))
+            lost_files = self._place.store.lost()
+            due = list(reconcile.findings(session, lost_files))
+            hungry = {*reconcile.short_of_queries(session), *reconcile.with_lost_queries(session, lost_files)}
             lost = reconcile.abandoned(session, self._workshop.in_hand)
             answered = reconcile.studies_with_answers(session)
             withdrawn = erasure.unfinished(session)

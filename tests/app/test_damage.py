@@ -8,7 +8,7 @@ from fastapi.testclient import TestClient
 
 from app.__main__ import main
 from app.db import Database
-from app.domain.clips import Clip
+from app.domain.clips import Clip, Rollout
 from app.domain.models import ModelKind
 from app.domain.studies import Study
 from app.storage import ArtefactStore
@@ -110,7 +110,7 @@ def test_a_scrub_reads_everything_and_says_what_is_wrong(
         person, _ = factories.make_participant(session, study)
         clips = [factories.make_clip(session, store, study) for _ in range(3)]
         for clip in clips:
-            clip.rollout.trajectory_sha256 = store.put(f"trajectory of {clip.id}".encode())
+            session.get_one(Rollout, clip.rollout_id).trajectory_sha256 = store.put(f"trajectory of {clip.id}".encode())
         model = factories.make_model(session, study, person, ModelKind.FILTER, factories.filter_metrics())
         model.artefact_sha256 = store.put(b"a filter")
         bundle = factories.make_bundle(session, store, model)

@@ -53,14 +53,14 @@ def main() -> None:
         server = subprocess.Popen(
             [
                 *(sys.executable, "-m", "uvicorn", "app.main:create_app", "--factory", "--no-access-log"),
-                *("--log-level", "warning", "--port", str(settings.port)),
+                *("--log-level", "warning", "--port", str(settings.port), "--timeout-keep-alive", "60"),
             ],
             env={**os.environ, "DATA_DIR": directory},
         )
         try:
             _await_health(settings.base_url)
-            _pages(settings.base_url, cookie)
-            _labelling(settings.base_url, cookie, tokens)
+            _pages(settings.base_url, cookie, server.pid)
+            _labelling(settings.base_url, cookie, tokens, server.pid)
             _say(f"memory of the web server {_rss_mb(server.pid):.0f} MB")
         finally:
             server.terminate()
@@ -139,22 +139,26 @@ def _labeller(session: Session, study: Study, clips: list[int]) -> str:
     return token
 
 
-def _pages(base_url: str, cookie: str) -> None:
+def _pages(base_url: str, cookie: str, pid: int) -> None:
     for path in ("/studies", STUDY, f"{STUDY}/participants/P01", f"{STUDY}/results", f"{STUDY}/export"):
-        times, size = [], 0
+        times, used_s, size = [], list[float](), 0
         with httpx2.Client(base_url=base_url, cookies={"studio_experimenter": cookie}, timeout=120) as browser:
-            for _ in range(7):
-                started = time.perf_counter()
+            for _ in range(4):
+                started, before_s = time.perf_counter(), _cpu_s(pid)
                 with browser.stream("GET", path) as answer:
                     answer.raise_for_status()
                     pieces = answer.iter_raw()
                     next(pieces)
                     times.append(1000 * (time.perf_counter() - started))
+                    used_s.append(_cpu_s(pid) - before_s)
                     size = len(answer.headers.get("content-length", "")) and int(answer.headers["content-length"])
-        _say(f"{path}: first byte {times[0]:.0f} ms at first, then {median(times[1:]):.0f} ms; {size / 1000:.0f} kB")
+        _say(
+            f"{path}: first byte after {times[0]:.0f} ms at first ({1000 * used_s[0]:.0f} ms of a processor), "
+            f"then {median(times[1:]):.0f} ms ({1000 * median(used_s[1:]):.0f} ms); {size / 1000:.0f} kB"
+        )
 
 
-def _labelling(base_url: str, cookie: str, tokens: list[str]) -> None:
+def _labelling(base_url: str, cookie: str, tokens: list[str], pid: int) -> None:
     times: dict[int, list[float]] = {0: [], ONLOOKERS: [], OPENING: []}
     phase, done = [0], threading.Event()
     ready = threading.Barrier(len(tokens) + 1)
@@ -162,15 +166,19 @@ def _labelling(base_url: str, cookie: str, tokens: list[str]) -> None:
     for labeller in labellers:
         labeller.start()
     ready.wait()
-    received = [0]
+    received, used_s = [0], {0: 0.0, ONLOOKERS: 0.0}
     for _ in range(2):
+        used_s[0] -= _cpu_s(pid)
         phase[0] = 0
         time.sleep(PHASE_S)
         phase[0] = OPENING
+        used_s[0] += _cpu_s(pid)
         with _dashboards(base_url, cookie, received):
+            used_s[ONLOOKERS] -= _cpu_s(pid)
             phase[0] = ONLOOKERS
             time.sleep(PHASE_S)
             phase[0] = OPENING
+            used_s[ONLOOKERS] += _cpu_s(pid)
     done.set()
     for labeller in labellers:
         labeller.join()
@@ -180,7 +188,7 @@ def _labelling(base_url: str, cookie: str, tokens: list[str]) -> None:
         p95[count] = cuts[94]
         _say(
             f"{LABELLERS} labellers, {count} dashboards: save and next p50 {cuts[49]:.0f} ms, p95 {cuts[94]:.0f} ms, "
-            f"{len(times[count]) / (2 * PHASE_S):.0f} answers per second"
+            f"{len(times[count]) / (2 * PHASE_S):.1f} answers per second, {used_s[count] / (2 * PHASE_S):.0%} of a core"
         )
     _say(f"p95 with {ONLOOKERS} dashboards: {p95[ONLOOKERS] / p95[0]:.2f} times that without")
     _say(f"a dashboard received {received[0] / 1000 / ONLOOKERS / (2 * PHASE_S):.1f} kB per second")
@@ -231,6 +239,12 @@ def _dashboards(base_url: str, cookie: str, received: list[int]) -> Iterator[Non
     done.set()
     for watcher in watchers:
         watcher.join()
+
+
+def _cpu_s(pid: int) -> float:
+    """Processor time that the server has used so far; unlike waiting times, it does not depend on who else computes."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 if __name__ == "__main__":

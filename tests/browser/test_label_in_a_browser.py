@@ -2,7 +2,10 @@
 
 import pytest
 from playwright.sync_api import Route, expect
+from sqlalchemy import select
 
+from app.domain.clips import Clip
+from app.domain.preferences import Query
 from app.storage import ArtefactStore
 from tests import factories
 from tests.browser.conftest import Invited, NewPage, serious_findings, wait_ready
@@ -230,6 +233,25 @@ def test_clips_that_cannot_be_loaded_can_be_loaded_again_and_are_counted(invited
     page.keyboard.press("ArrowLeft")
     wait_ready(page, 1)
     assert invited.events()[0].play_error_count == 1
+
+
+def test_a_pair_whose_clip_is_damaged_gives_way_to_the_next(
+    invited: Invited, new_page: NewPage, store: ArtefactStore
+) -> None:
+    page = new_page()
+    page.route("**/media/*.mp4", lambda route: route.abort())
+    page.goto(invited.link)
+    expect(page.get_by_text("These clips could not be loaded.")).to_be_visible()
+    with invited.database.reading() as session:
+        first, second = session.scalars(select(Query).order_by(Query.ordinal).limit(2))
+        clip = session.get_one(Clip, first.left_clip_id)
+    store.path(clip.video_sha256).write_bytes(b"no video")
+    page.unroute("**/media/*.mp4")
+    page.get_by_role("button", name="Load them again").click()
+    wait_ready(page, 0)
+    page.keyboard.press("ArrowLeft")
+    wait_ready(page, 1)
+    assert [event.query_id for event in invited.events()] == [second.id]
 
 
 def test_clips_that_never_load_can_be_passed_over(invited: Invited, new_page: NewPage) -> None:

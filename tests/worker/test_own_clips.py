@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from sqlalchemy import func, select
 
-from app.db import Database
+from app.db import Database, now
 from app.domain.clips import Clip, Rollout
 from app.domain.models import Model, ModelKind, RunKind
 from app.domain.preferences import Query, Response
@@ -294,3 +294,36 @@ def test_a_long_video_is_looked_at_picture_by_picture() -> None:
         assert tracemalloc.get_traced_memory()[1] < 20 << 20, "two hundred pictures take 184 MB"
     finally:
         tracemalloc.stop()
+
+
+def test_pairs_whose_videos_are_lost_make_room_for_others(place: Workplace, own: Study) -> None:
+    with place.database.writing() as session:
+        participant, _ = enrolment.add_participant(session, own)
+    querying.refill_queries(place, participant.id)
+
+    def waiting() -> list[Query]:
+        with place.database.reading() as session:
+            return list(records.unanswered(session, participant.id, *dataset.CLIPS_AND_ROLLOUTS))
+
+    before = waiting()
+    lost = before[0].left_clip
+    with place.database.writing() as session:
+        session.get_one(Query, before[0].id).served_at = now()
+    place.store.path(lost.video_sha256).write_bytes(b"no video")
+    assert not place.store.has(lost.video_sha256)
+    with place.database.reading() as session:
+        assert reconcile.with_lost_queries(session, place.store.lost()) != []
+        assert list(reconcile.findings(session, place.store.lost())) == [], "nobody can film another lab's robot again"
+    querying.refill_queries(place, participant.id)
+    after = waiting()
+    showing = [query.id for query in after if lost.id in (query.left_clip_id, query.right_clip_id)]
+    assert showing == [before[0].id], "the one in front of the participant may still be answered"
+    with place.database.writing() as session:
+        session.get_one(Query, before[0].id).served_at = now() - records.LIES_OPEN
+    querying.refill_queries(place, participant.id)
+    with place.database.reading() as session:
+        shown = [clip for clip in dataset.pool_clips(session, own.id) if clip.id != lost.id]
+        left_over = {frozenset((left.id, right.id)) for left, right in dataset.matched_pairs(shown)}
+    assert {frozenset((query.left_clip_id, query.right_clip_id)) for query in waiting()} == left_over, "all there is"
+    with place.database.reading() as session:
+        assert reconcile.with_lost_queries(session, place.store.lost()) == []
