@@ -51,6 +51,8 @@ class Learned:
 
     scenarios: int
     lessons: Sequence[Lesson]
+    is_reference: bool
+    """Nothing was surely better for the person, so theirs is the robot that everybody meets."""
 
 
 def before_and_after(session: Session, participant: Participant) -> BeforeAndAfter | None:
@@ -85,7 +87,7 @@ def learned(session: Session, participant: Participant) -> Learned | None:
     version = results.filter_version(*row)
     if version.scenarios is None or not version.costs:
         return None
-    return Learned(version.scenarios, lessons_of(version.costs)[:MOST_LESSONS])
+    return Learned(version.scenarios, lessons_of(version.costs)[:MOST_LESSONS], version.uses_reference)
 
 
 def lessons_of(changes: Sequence[results.Change]) -> Sequence[Lesson]:

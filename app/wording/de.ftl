@@ -105,6 +105,7 @@ debrief-films-making = Die Filme entstehen gerade
 debrief-films-making-text = Ihr Roboter hat gelernt; nun wird er gefilmt. Sie brauchen nicht zu warten: Gehen Sie weiter, und öffnen Sie Ihren Link später noch einmal, um ihn zu sehen.
 debrief-learned = Was er von Ihnen gelernt hat
 debrief-learned-how = Verglichen mit dem Roboter vorher, über { $count } Situationen, die neu für ihn waren:
+debrief-learned-reference = Wir haben in { $count } Situationen, die für den Roboter neu waren, ausprobiert, was Ihre Antworten nahelegten. Nichts davon war sicher besser für Sie, ohne einen Nachteil zu haben. Ihr Roboter ist deshalb der, den alle kennenlernen: Beide Filme zeigen denselben Roboter.
 debrief-learned-nothing = Über { $count } Situationen, die neu für ihn waren, bewegt er sich ganz ähnlich wie der Roboter vorher. Entweder mochten Sie jenen, oder Ihre Antworten zogen in verschiedene Richtungen; beides ist in Ordnung.
 debrief-pace-quicker = Er bewegt sich schneller ({ $percent } % mehr) und ist eher bei Ihnen.
 debrief-pace-calmer = Er bewegt sich langsamer ({ $percent } % weniger) und lässt sich auf dem Weg zu Ihnen mehr Zeit.

@@ -107,6 +107,7 @@ debrief-films-making = The films are still being made
 debrief-films-making-text = Your robot has learned; now it is being filmed. You need not wait: go on, and open your link again later to see it.
 debrief-learned = What it learned from you
 debrief-learned-how = Compared with the robot before, over { $count } situations it had not met:
+debrief-learned-reference = We tried what your answers suggested in { $count } situations that were new to the robot. Nothing there was surely better for you without a drawback, so your robot is the one that everybody meets: both films show the same robot.
 debrief-learned-nothing = Over { $count } situations it had not met, it moves much like the robot before. Either you liked that one, or your answers pulled in several directions; both are fine.
 debrief-pace-quicker = It moves more quickly ({ $percent } % more) and is with you sooner.
 debrief-pace-calmer = It moves more slowly ({ $percent } % less) and takes more time on its way to you.

@@ -130,6 +130,13 @@ def test_a_robot_that_learned_nothing_certain_is_not_made_more_of(at_debrief: Ta
     assert "much like the robot before" in at_debrief.browser.get("/p/debrief").text
 
 
+def test_a_robot_that_is_the_reference_is_called_that(at_debrief: TakingPart) -> None:
+    add_filter(at_debrief, factories.filter_metrics() | {"uses_reference": True})
+    page = at_debrief.browser.get("/p/debrief").text
+    assert "your robot is the one that everybody meets" in page
+    assert "slowly" not in page
+
+
 def test_metrics_that_cannot_be_read_are_no_lesson(at_debrief: TakingPart) -> None:
     model = add_filter(at_debrief, {"evaluation": "nonsense"})
     with at_debrief.database.reading() as session:
