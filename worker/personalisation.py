@@ -16,7 +16,7 @@ from app.domain.studies import Method, StudySettings
 from worker import laboratory, lessons
 from worker.analysis.evaluation import evaluate
 from worker.analysis.proof import case_against
-from worker.compute import Compute, Lane
+from worker.compute import Lane
 from worker.exploration import surface_file
 from worker.ml import bundle, filter_problem, mode_search, printed_filter, residual_learning
 from worker.ml.action_filter import FilterWeights
@@ -25,6 +25,7 @@ from worker.ml.filter_problem import Act, FilterAct, FilterConfig, FilterDraft, 
 from worker.ml.response_surface import ResponseSurface
 from worker.ml.reward_models import load_reward_model
 from worker.trajectory import Trajectory
+from worker.turns import Computing
 
 CHUNK = 3
 """Scenarios per call of a compute process: small enough to spread evenly, large enough not to matter."""
@@ -51,7 +52,7 @@ class Fitting:
     """One filter in the making."""
 
     task: str
-    compute: Compute
+    compute: Computing
     beat: Callable[[], None]
     reward: bytes
     seed: int

@@ -7,7 +7,8 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from functools import partial
 from pathlib import Path
@@ -25,6 +26,8 @@ from app.storage import ArtefactStore
 from worker import erasure, laboratory, lessons, orphans, querying, reconcile, records, references
 from worker.compute import Compute, ComputeLost, Interrupted, Lane
 from worker.records import Job
+from worker.turns import Turns
+from worker.urgency import Level, WhoWaits
 from worker.workflows import Workshop, as_arguments
 from worker.workplace import Workplace
 
@@ -35,7 +38,7 @@ REST = 9.0
 """Times as long as the last round took: a tenth of a core at most, however large the studies are."""
 PRESENCE_S = 5.0
 CLEARING_S = 24 * 3600.0
-ENGINE_VERSION = "2"
+ENGINE_VERSION = "3"
 """Raised when the steps of a workflow change so that a half-finished one could not be resumed."""
 
 QUEUES = {
@@ -48,6 +51,8 @@ QUEUES = {
     RunKind.EXPORT: 1,
 }
 """How many jobs of each kind one worker does at a time."""
+RESERVE = 2
+"""So many more are begun of a kind when somebody waits; what began earlier gives way in the lanes (worker.turns)."""
 AWAITED = {RunKind.CLIPS, RunKind.REWARD}
 """What somebody may be waiting for who is answering: begun within AWAITED_POLL_S, anything else within POLL_S.
 
@@ -70,7 +75,8 @@ def run(settings: Settings) -> int:
         database = Database(settings.sqlalchemy_url)
         compute = Compute(settings.compute_processes)
         compute.warm_up(Lane.CLIPS, laboratory.warm_up)
-        workshop = Workshop(Workplace(database, ArtefactStore(settings.data_dir / "artefacts"), compute))
+        place = Workplace(database, ArtefactStore(settings.data_dir / "artefacts"), compute)
+        workshop = Workshop(place, Turns(compute))
         _launch_engine(settings)
         log.info("worker %s is ready", settings.worker_name)
         try:
@@ -124,7 +130,7 @@ def _launch_engine(settings: Settings) -> None:
     DBOS.launch()
     for kind, count in QUEUES.items():
         interval = AWAITED_POLL_S if kind in AWAITED else POLL_S
-        DBOS.register_queue(kind.value, worker_concurrency=count, polling_interval_sec=interval)
+        DBOS.register_queue(kind.value, worker_concurrency=count + RESERVE, polling_interval_sec=interval)
 
 
 class _Rounds:
@@ -172,14 +178,15 @@ class _Rounds:
             self._cleared_at = time.monotonic()
 
     def _round(self) -> None:
+        turns = self._workshop.turns
         with self._place.database.reading() as session:
             due = list(reconcile.findings(session))
             hungry = set(reconcile.short_of_queries(session))
             lost = reconcile.abandoned(session, self._workshop.in_hand)
             answered = reconcile.studies_with_answers(session)
             withdrawn = erasure.unfinished(session)
-        for job, attempt in due:
-            self._start(job, reconcile.workflow_name(job.finding, attempt))
+            turns.who_waits = WhoWaits.look(session)
+        self._start_most_urgent(due)
         for participant_id in hungry - self._refused:
             self._refill(participant_id)
         for participant_id in withdrawn:
@@ -191,7 +198,7 @@ class _Rounds:
             if study.id not in self._prepared:
                 self._prepared.add(study.id)
                 for lane in (Lane.REWARDS, Lane.LEARNING):
-                    self._place.compute.warm_up(lane, partial(lessons.warm_up, study.task))
+                    turns.compute.warm_up(lane, partial(lessons.warm_up, study.task))
                 threading.Thread(target=self._make_references, args=(study.task, study.settings), daemon=True).start()
 
     def _make_references(self, task: str, settings: StudySettings) -> None:
@@ -214,6 +221,19 @@ class _Rounds:
         except AppError as refusal:  # one study that cannot go on must not stop the others
             log.warning("participant %d gets no further pairs: %s", participant_id, refusal.message)
             self._refused.add(participant_id)
+
+    def _start_most_urgent(self, due: Sequence[tuple[Job, int]]) -> None:
+        """Tell the engine only of what can be begun now, so that whoever comes to wait later stands before the rest.
+
+        What the engine was told and has not begun is still due, and counts.
+        """
+        begun = Counter(finding.partition("/")[0] for finding in self._workshop.in_hand)
+        for job, attempt in sorted(due, key=lambda each: self._workshop.turns.who_waits.urgency(each[0])):
+            level = self._workshop.turns.who_waits.urgency(job).level
+            places = QUEUES[job.kind] + (RESERVE if level <= Level.ANSWERING else 0)
+            if job.finding not in self._workshop.in_hand and begun[job.kind] < places:
+                begun[job.kind] += 1
+                self._start(job, reconcile.workflow_name(job.finding, attempt))
 
     def _start(self, job: Job, name: str) -> None:
         if name not in self._started:

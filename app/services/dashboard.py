@@ -8,7 +8,7 @@ from datetime import datetime, timedelta
 from pathlib import Path
 
 from sqlalchemy import func, select
-from sqlalchemy.orm import Session
+from sqlalchemy.orm import Session, joinedload
 
 from app.db import now
 from app.domain.clips import Clip, Rollout
@@ -17,8 +17,8 @@ from app.domain.models import Bundle, Model, ModelKind, Run, RunKind, RunStatus,
 from app.domain.participation import StageRecord
 from app.domain.preferences import LEARNED_FROM, LabelEvent, Query, Response
 from app.domain.protocol import Stage
-from app.domain.studies import Participant, Strategy, Study
-from app.services import accuracy, results, stages, watching
+from app.domain.studies import Awaited, Participant, Strategy, Study
+from app.services import accuracy, preparing, results, stages, watching
 
 WORKER_SILENCE = timedelta(seconds=15)
 DISK_LOW_BYTES = 2 * 1024**3
@@ -72,6 +72,8 @@ class ParticipantRow:
     run: Run | None
     """What the worker is doing for them, or what failed; None when nothing is to be said."""
     newest_filter: results.FilterVersion | None
+    preparation: preparing.Preparation | None
+    """How far the robots are of somebody who waits for them, here or elsewhere."""
     watched: watching.Watched
 
 
@@ -240,6 +242,7 @@ def _rows(session: Session, study: Study, people: Sequence[Participant]) -> Sequ
     answers, versions, runs = _answers(session, ids), _versions(session, ids), _noteworthy_runs(session, ids)
     settings = study.settings
     given = {person: len(theirs) for person, theirs in answers.items()}
+    preparations = _preparations(session, ids)
     where, wanted = watching.where_they_are(session, settings, people, given), settings.labels_per_participant
     return [
         ParticipantRow(
@@ -252,10 +255,18 @@ def _rows(session: Session, study: Study, people: Sequence[Participant]) -> Sequ
             curve=accuracy.curve(_hits(answers[person.id])),
             run=runs.get(person.id),
             newest_filter=versions[person.id][0] if versions[person.id] else None,
+            preparation=preparations.get(person.id),
             watched=watching.watched(session, person.id),
         )
         for person in people
     ]
+
+
+def _preparations(session: Session, ids: Sequence[int]) -> Mapping[int, preparing.Preparation]:
+    """By participant id."""
+    waiting = select(Participant).where(Participant.id.in_(ids), Participant.waiting_for == Awaited.ROBOTS)
+    people = session.scalars(waiting.options(joinedload(Participant.study)))
+    return {person.id: preparing.preparation(session, person) for person in people}
 
 
 def _counts(answers: Iterable[_Answer]) -> Mapping[Response, int]:

@@ -12,7 +12,7 @@ from sqlalchemy.orm import Session, aliased, joinedload
 
 from app.db import now
 from app.domain.preferences import LabelEvent, Purpose, Query
-from app.domain.studies import Participant
+from app.domain.studies import Awaited, Participant
 from app.services import participant_events
 from app.services.participant_events import EventKind
 from app.storage import ArtefactStore
@@ -155,6 +155,16 @@ def seen(participant: Participant) -> None:
     """Remember that the participant's browser was here."""
     if participant.last_seen_at is None or now() - participant.last_seen_at > SEEN_EVERY:
         participant.last_seen_at = now()
+
+
+def waits(participant: Participant, awaited: Awaited | None) -> None:
+    """Remember that the page shown now makes the participant wait, or (None) that it does not: work is ordered by it.
+
+    Whoever leaves and comes back to the same waiting page has waited all the time.
+    """
+    if participant.waiting_for != awaited:
+        participant.waiting_for = awaited
+        participant.waiting_since = None if awaited is None else now()
 
 
 def _ready(session: Session, store: ArtefactStore, participant: Participant) -> Iterator[Query]:

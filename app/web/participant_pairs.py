@@ -13,8 +13,8 @@ from sqlalchemy.orm import Session
 from app.domain import preferences
 from app.domain.clips import Clip
 from app.domain.preferences import Purpose, SkipReason
-from app.domain.studies import Participant
-from app.services import labelling, participant_events, querying
+from app.domain.studies import Awaited, Participant
+from app.services import estimates, labelling, participant_events, querying
 from app.services.participant_events import EventKind
 from app.web.deps import CurrentParticipant, RowId, Studio, StudioDep, WritingSession
 from app.web.error_pages import wants_json
@@ -76,12 +76,15 @@ def show_turn(request: Request, session: Session, studio: Studio, participant: P
     """
     querying.seen(participant)
     turn = querying.next_turn(session, studio.store, participant)
+    querying.waits(participant, Awaited.PAIR if _state(turn) == "waiting" else None)
     state = _turn_for_script(request, turn, wording_of(participant))
     if wants_json(request):
         return JSONResponse(state)
     if turn.break_due:
         participant_events.note_once(session, participant, EventKind.BREAK_BEGUN, turn.progress.answered)
     context: dict[str, Any] = {"turn": turn, "state": state, "undo_uuid": uuid4()}
+    if state["state"] == "waiting":
+        context["seconds_left"] = estimates.until_pair_s(session, participant.study)
     if turn.query is not None:
         context |= {"pair": _pair(request, turn.query), "client_uuid": uuid4(), "reasons": list(SkipReason)}
     return participant_page(request, f"participant/{_template(turn)}.html", participant, context)
@@ -158,6 +161,7 @@ def _go_on(request: Request, session: Session, studio: Studio, participant: Part
     if not wants_json(request):
         return go(request, "show_next")
     turn = querying.next_turn(session, studio.store, participant)
+    querying.waits(participant, Awaited.PAIR if _state(turn) == "waiting" else None)
     return JSONResponse(_turn_for_script(request, turn, wording_of(participant)))
 
 

@@ -285,6 +285,17 @@ break-left-unknown = Noch { $count }.
 break-go-on = Weiter
 break-key = Die Eingabetaste geht weiter
 
+## Warten (prefix wait-)
+
+evaluation-minutes-left =
+    { $minutes ->
+        [one] Noch etwa eine Minute.
+       *[other] Noch etwa { $minutes } Minuten.
+    }
+wait-hours = Noch etwa { $hours } Stunden.
+wait-unknown = Wie lange es dauert, lässt sich noch nicht sagen: Mit diesen Einstellungen ist es das erste Mal.
+wait-others-first = Es kann länger dauern, weil andere schon vor Ihnen warten.
+
 ## Bewertung (Vorsilbe evaluation-)
 
 evaluation-progress = Bewertete Roboter
@@ -324,17 +335,14 @@ evaluation-moving = Roboter { $letter } bewegt sich, bitte schauen Sie zu
 evaluation-moving-text = Sobald er fertig ist, werden Sie nach Ihrer Meinung gefragt.
 evaluation-waiting-title = Ihre Roboter werden vorbereitet
 evaluation-waiting-text = Sie lernen aus Ihren Antworten. Wenn sie fertig sind, sehen Sie jeden bei der Arbeit und bewerten ihn. Sie kennen sie nur unter Buchstaben.
+evaluation-next-title = Der nächste Roboter wird vorbereitet
+evaluation-next-text = { $rated } von { $wanted } Bewertungen sind sicher gespeichert. Der nächste Film entsteht gerade; es geht von selbst weiter.
 evaluation-waiting-progress = Wie weit Ihre Roboter sind
 evaluation-step-learning = Aus Ihren Antworten wird gelernt
 evaluation-step-training = Die Roboter werden trainiert
 evaluation-step-filming = Die Roboter werden gefilmt
 evaluation-step-packing = Die Roboter werden bereitgestellt
 evaluation-robots-ready = { $ready } von { $count } Robotern sind trainiert; { $percent } % der ganzen Arbeit sind getan.
-evaluation-minutes-left =
-    { $minutes ->
-        [one] Noch etwa eine Minute, länger, wenn andere vor Ihnen sind.
-       *[other] Noch etwa { $minutes } Minuten, länger, wenn andere vor Ihnen sind.
-    }
 evaluation-may-close = Sie können diese Seite schließen: Ihre Antworten sind sicher gespeichert, und die Arbeit geht ohne Sie weiter. Ihr Link bringt Sie hierher zurück. Wenn Sie die Seite offen lassen, geht sie von selbst weiter.
 evaluation-trouble = Etwas ist schiefgegangen. Es wird noch einmal versucht, und die Person, von der Sie den Link haben, kann es sehen. Nichts von Ihnen ist verloren.
 evaluation-done-title = Alle Roboter sind bewertet

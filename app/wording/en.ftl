@@ -287,6 +287,17 @@ break-left-unknown = { $count } to go.
 break-go-on = Go on
 break-key = Enter goes on
 
+## Waiting (prefix wait-)
+
+evaluation-minutes-left =
+    { $minutes ->
+        [one] About a minute to go.
+       *[other] About { $minutes } minutes to go.
+    }
+wait-hours = About { $hours } hours to go.
+wait-unknown = How long this takes is not known yet: it has not been done before with these settings.
+wait-others-first = It can take longer, because others have been waiting before you.
+
 ## Evaluation (prefix evaluation-)
 
 evaluation-progress = Robots you have rated
@@ -326,17 +337,14 @@ evaluation-moving = Robot { $letter } is moving, please watch
 evaluation-moving-text = You will be asked about it as soon as it is done.
 evaluation-waiting-title = Your robots are being prepared
 evaluation-waiting-text = They are trained on your answers. When they are ready you will watch each of them at work and rate it. You will know them by letters only.
+evaluation-next-title = The next robot is being prepared
+evaluation-next-text = { $rated } of { $wanted } ratings are safely stored. The next film is in the making, and this page goes on by itself.
 evaluation-waiting-progress = How far your robots are
 evaluation-step-learning = Learning from your answers
 evaluation-step-training = Training the robots
 evaluation-step-filming = Filming the robots
 evaluation-step-packing = Getting the robots ready
 evaluation-robots-ready = { $ready } of { $count } robots are trained; { $percent } % of everything is done.
-evaluation-minutes-left =
-    { $minutes ->
-        [one] About a minute to go, longer if others are before you.
-       *[other] About { $minutes } minutes to go, longer if others are before you.
-    }
 evaluation-may-close = You may close this page: your answers are safely stored, and the work goes on without you. Your link brings you back here. If you leave the page open, it goes on by itself.
 evaluation-trouble = Something went wrong. It is being tried again, and the person who sent you the link can see it. Nothing of yours is lost.
 evaluation-done-title = All robots are rated

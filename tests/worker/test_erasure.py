@@ -22,6 +22,7 @@ from worker import erasure, records, service, workflows
 from worker.compute import Compute
 from worker.reconcile import findings, short_of_queries
 from worker.records import Job
+from worker.turns import Turns
 from worker.workflows import Workshop, as_arguments
 from worker.workplace import Step, Workplace
 
@@ -61,7 +62,7 @@ def work(monkeypatch: pytest.MonkeyPatch) -> Work:
 @cache
 def the_workshop() -> Workshop:
     """The engine knows one workshop per process."""
-    return Workshop(cast("Workplace", None))
+    return Workshop(cast("Workplace", None), Turns(Compute(1)))
 
 
 @pytest.fixture
