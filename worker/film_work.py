@@ -46,7 +46,7 @@ def due(study: Study, participant_id: int, ending: str, succeeded: Collection[st
     labels = study.settings.labels_per_participant
     return [
         Job(f"films/participant-{participant_id}/{what}/{ending}", RunKind.FILMS, study.id, participant_id, labels)
-        for what in wanted
+        for what in reversed(wanted)  # the debrief comes last
     ]
 
 

@@ -52,7 +52,7 @@ def is_outdated(session: Session, job: Job, *, begun: bool = False) -> bool:
     everything = settings.labels_per_participant
     if answered < everything and (begun or job.kind != RunKind.FILTER):
         return False
+    if job.kind == RunKind.FILTER and filter_due(settings, answered) > (job.label_count or 0):
+        return True
     last = last_answers(session, mine).get(job.participant, 0)
-    if job.kind == RunKind.FILTER:
-        return job.finding != filter_name(settings, job.participant, answered, last)
     return "/answer-" in job.finding and not job.finding.endswith(f"/answer-{last}")

@@ -49,8 +49,8 @@ class Progress:
 
     answered: int
     wanted: int
-    seconds_left: int | None
-    """At the person's own recent pace; None while too little is known."""
+    pace_s: float | None
+    """From one answer to the next, the median of the newest ones; None while too little is known."""
     practised: int = 0
     practice_wanted: int = 0
 
@@ -122,14 +122,12 @@ def answers_given(session: Session, participant: Participant) -> Given:
 
 
 def progress_of(participant: Participant, given: Given) -> Progress:
-    """Given and wanted answers, and the time the rest will take."""
+    """Given and wanted answers, and how fast they come."""
     settings = participant.study.settings
-    pace_s = _pace_s(given.times)
-    left = max(0, settings.question_count - given.count)
     return Progress(
         answered=given.count,
         wanted=settings.question_count,
-        seconds_left=None if pace_s is None else round(pace_s * left),
+        pace_s=_pace_s(given.times),
         practised=given.practised,
         practice_wanted=settings.practice_pairs,
     )

@@ -223,6 +223,7 @@ pair-right-clip = Rechtes Video
 pair-progress = Ihr Fortschritt
 pair-count = { $answered } von { $wanted }
 pair-time-left = noch { $time }
+pair-time-left-comparing = { $time } zum Vergleichen
 pair-time-left-minute = etwa eine Minute
 pair-time-left-minutes = etwa { $minutes } min
 pair-time-left-hours = etwa { $hours } h

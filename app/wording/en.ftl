@@ -225,6 +225,7 @@ pair-right-clip = Right clip
 pair-progress = Your progress
 pair-count = { $answered } of { $wanted }
 pair-time-left = { $time } left
+pair-time-left-comparing = { $time } of comparing
 pair-time-left-minute = about a minute
 pair-time-left-minutes = about { $minutes } min
 pair-time-left-hours = about { $hours } h

@@ -22,24 +22,27 @@ from app.domain.studies import PAPER_PROTOCOL, StudySettings
 from app.services import enrolment, evaluating, studies
 from app.storage import ArtefactStore
 from worker.ml.teachers import TASTES, Manner
-from worker.own_studio import PATIENCE_S, OwnStudio, wait_until
+from worker.own_studio import OwnStudio, wait_until
 from worker.scripted_person import ScriptedPerson
 from worker.visitor import Visitor
 
-LABELS, TRIALS = 20, 3
+LABELS, TRIALS = 12, 1
 PACE_S = 2.0
 """Between two answers: slow enough for a filter to be in the making when the last one comes."""
+PATIENCE_S = 3600.0
 TOLD = re.compile(r"bout (a|\d+) minutes? to go")
 
 
 def main() -> None:
-    steps = int(sys.argv[1]) if len(sys.argv) > 1 else 2_000
+    steps = int(sys.argv[1]) if len(sys.argv) > 1 else 1_000
     people = int(sys.argv[2]) if len(sys.argv) > 2 else 2
     small = {
         "labels_per_participant": LABELS,
-        "introduction_pairs": 4,
-        "filter_milestones": (10,),
-        "pool_scenarios": 4,
+        "introduction_pairs": 2,
+        "filter_milestones": (6,),
+        "pool_scenarios": 2,
+        "evaluation_scenarios": 10,
+        "retrain_every_labels": 6,
         "evaluation": EvaluationSettings(fine_tuning_steps=steps, trials=TRIALS),
     }
     with tempfile.TemporaryDirectory() as directory, OwnStudio(Path(directory)) as studio:
