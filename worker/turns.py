@@ -1,18 +1,20 @@
 """The way into the compute processes: each lane takes the tasks of whoever waits before those of others.
 
 A job's tasks go in one by one, so work that began earlier gives way within one task (a few rollouts, a film); trainings
-of many minutes ask is_needed_elsewhere() and pause at a checkpoint.
+of many minutes ask is_needed_elsewhere() and pause at a checkpoint. Lanes share the processors: while work that
+somebody waits for is in any lane but the patient one, no lane takes tasks that nobody is here for.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, ParamSpec, Protocol, TypeVar
 
 from worker.compute import HEARTBEAT_S, Compute, Lane
 from worker.records import Job
-from worker.urgency import Gate, Urgency, WhoWaits
+from worker.urgency import Gate, Level, Urgency, WhoWaits
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -49,11 +51,32 @@ class Turns:
     who_waits: WhoWaits = field(default_factory=WhoWaits)
 
     def __post_init__(self) -> None:
-        self._gates = {lane: Gate(self.compute.size(lane) + (AHEAD if lane != Lane.PATIENT else 0)) for lane in Lane}
+        self._in_hand: list[Job] = []
+        self._gates = {
+            lane: Gate(self.compute.size(lane) + (AHEAD if lane != Lane.PATIENT else 0), self._holds_back)
+            for lane in Lane
+        }
 
     def of(self, job: Job) -> "Turn":
         """The compute processes as this job may use them."""
         return Turn(self, job)
+
+    @contextmanager
+    def working(self, lane: Lane, job: Job) -> Iterator[None]:
+        """Meanwhile the job has tasks for the lane."""
+        if lane == Lane.PATIENT:
+            yield
+            return
+        self._in_hand.append(job)
+        try:
+            yield
+        finally:
+            self._in_hand.remove(job)
+
+    def _holds_back(self, level: Level) -> bool:
+        return level > Level.ASKED and any(
+            self.who_waits.urgency(job).level == Level.WAITING for job in tuple(self._in_hand)
+        )
 
     def gate(self, lane: Lane) -> Gate:
         """The way into a lane."""
@@ -88,7 +111,10 @@ class Turn:
 
     def _each(self, lane: Lane, beat: Callable[[], None], tasks: "list[partial[R]]") -> list[R]:
         at_once = min(self.turns.compute.size(lane) + AHEAD, len(tasks)) or 1
-        with ThreadPoolExecutor(max_workers=at_once, thread_name_prefix=f"turn-{lane}") as threads:
+        with (
+            self.turns.working(lane, self.job),
+            ThreadPoolExecutor(max_workers=at_once, thread_name_prefix=f"turn-{lane}") as threads,
+        ):
             futures = [threads.submit(self._in_turn, lane, task) for task in tasks]
             try:
                 pending = set(futures)

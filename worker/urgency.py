@@ -131,12 +131,15 @@ def _of_person(person: _Person, job: Job) -> Urgency:
 
 
 class Gate:
-    """Lets so many in at a time, the most urgent first; asked anew whenever one leaves, for urgency changes."""
+    """Lets so many in at a time, the most urgent first; asked anew whenever one leaves, for urgency changes.
+
+    ``holds_back``: whether nobody of this level is to be let in at present, although there is room.
+    """
 
     LOOK_S = 1.0
 
-    def __init__(self, places: int) -> None:
-        self._free = places
+    def __init__(self, places: int, holds_back: Callable[[Level], bool] = lambda _level: False) -> None:
+        self._free, self._holds_back = places, holds_back
         self._waiting: dict[int, Callable[[], Urgency]] = {}
         self._number = 0
         self._changed = threading.Condition()
@@ -166,5 +169,6 @@ class Gate:
             return any(urgency().level < level for urgency in self._waiting.values())
 
     def _is_next(self, mine: int) -> bool:
-        first = min(self._waiting, key=lambda number: (self._waiting[number](), number))
-        return self._free > 0 and first == mine
+        ranks = {number: urgency() for number, urgency in self._waiting.items()}
+        admissible = [(rank, number) for number, rank in ranks.items() if not self._holds_back(rank.level)]
+        return self._free > 0 and bool(admissible) and min(admissible)[1] == mine

@@ -188,6 +188,43 @@ def test_a_long_job_that_began_earlier_gives_way_within_one_task(database: Datab
     assert len(compute.order) == 8, "and the long job is finished afterwards"
 
 
+def test_while_somebody_waits_no_lane_takes_what_nobody_is_here_for(database: Database, study: Study) -> None:
+    with database.writing() as session:
+        waiting = add_person(session, study, Awaited.ROBOTS, seen=1, waiting=5)
+        unopened = add_study(session, "unopened", study)
+    turns = Turns(Compute(1))
+    with database.reading() as session:
+        turns.who_waits = WhoWaits.look(session)
+    done = threading.Event()
+
+    def make_clips() -> None:
+        with turns.gate(Lane.CLIPS).passed(lambda: turns.who_waits.urgency(clips(unopened))):
+            done.set()
+
+    with turns.working(Lane.LEARNING, films(waiting)):
+        thread = threading.Thread(target=make_clips)
+        thread.start()
+        while not turns.gate(Lane.CLIPS)._waiting:
+            threading.Event().wait(0.01)
+        with turns.gate(Lane.CLIPS).passed(lambda: turns.who_waits.urgency(films(waiting))):
+            assert not done.is_set(), "there is room, but the processors are needed"
+    thread.join()
+    assert done.is_set()
+
+
+def test_a_training_of_many_minutes_does_not_stop_the_other_lanes(database: Database, study: Study) -> None:
+    with database.writing() as session:
+        waiting = add_person(session, study, Awaited.ROBOTS, seen=1, waiting=5)
+    turns = Turns(Compute(1))
+    with database.reading() as session:
+        turns.who_waits = WhoWaits.look(session)
+    with (
+        turns.working(Lane.PATIENT, films(waiting)),
+        turns.gate(Lane.CLIPS).passed(lambda: turns.who_waits.urgency(clips(study))),
+    ):
+        pass
+
+
 def test_what_goes_wrong_in_one_task_reaches_the_job(database: Database, study: Study) -> None:
     compute = Slowly()
     for _ in range(3):

@@ -36,6 +36,8 @@ class Checkpoint:
     every_s: float = EVERY_S
     _written_at: float = field(default_factory=time.monotonic)
     _noted_at: float = float("-inf")
+    pause_is_asked: bool = field(default=False, init=False)
+    """as of the last note"""
 
     def note(self, share: float) -> None:
         """Say which share of the training is done, and see whether to pause; once a second. Raises Abandoned."""
