@@ -40,7 +40,7 @@ def findings(session: Session) -> Iterator[tuple[Job, int]]:
     known = session.execute(select(Run.workflow_id, Run.status, Run.attempt, Run.finished_at))
     runs = {name: _Attempted(status, attempt, finished) for name, status, attempt, finished in known}
     filters = select(Run.participant_id).where(Run.kind == RunKind.FILTER, Run.status == RunStatus.RUNNING)
-    being_filtered = set(session.scalars(filters))
+    being_filtered = set(session.scalars(filters.where(Run.heartbeat_at >= now() - LEASE)))
     succeeded = {name for name, run in runs.items() if run.status == RunStatus.SUCCEEDED}
     for study in session.scalars(select(Study).order_by(Study.id)).all():
         jobs = (*_missing_clips(session, study), *_stale_models(session, study, succeeded))

@@ -53,6 +53,8 @@ QUEUES = {
 """How many jobs of each kind one worker does at a time."""
 RESERVE = 2
 """So many more are begun of a kind when somebody waits; what began earlier gives way in the lanes (worker.turns)."""
+BEGINS_WITHIN_S = 30.0
+"""A job the engine was told of takes up a place for so long; one of an earlier version it may never begin."""
 AWAITED = {RunKind.CLIPS, RunKind.REWARD}
 """What somebody may be waiting for who is answering: begun within AWAITED_POLL_S, anything else within POLL_S.
 
@@ -142,6 +144,7 @@ class _Rounds:
         self._workshop = workshop
         self._place = workshop.place
         self._started: set[str] = set()  # what the engine has been told already
+        self._told_at: dict[str, float] = {}
         self._signed_at = -math.inf
         self._cleared_at = -math.inf
         self._rested_at = -math.inf
@@ -225,15 +228,17 @@ class _Rounds:
     def _start_most_urgent(self, due: Sequence[tuple[Job, int]]) -> None:
         """Tell the engine only of what can be begun now, so that whoever comes to wait later stands before the rest.
 
-        What the engine was told and has not begun is still due, and counts.
+        What the engine was told and has not begun is still due, and counts, unless it seems to have forgotten it.
         """
         begun = Counter(finding.partition("/")[0] for finding in self._workshop.in_hand)
         for job, attempt in sorted(due, key=lambda each: self._workshop.turns.who_waits.urgency(each[0])):
             level = self._workshop.turns.who_waits.urgency(job).level
             places = QUEUES[job.kind] + (RESERVE if level <= Level.ANSWERING else 0)
-            if job.finding not in self._workshop.in_hand and begun[job.kind] < places:
-                begun[job.kind] += 1
-                self._start(job, reconcile.workflow_name(job.finding, attempt))
+            if job.finding in self._workshop.in_hand or begun[job.kind] >= places:
+                continue
+            name = reconcile.workflow_name(job.finding, attempt)
+            self._start(job, name)
+            begun[job.kind] += time.monotonic() - self._told_at.setdefault(name, time.monotonic()) < BEGINS_WITHIN_S
 
     def _start(self, job: Job, name: str) -> None:
         if name not in self._started:

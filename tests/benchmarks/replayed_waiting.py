@@ -25,14 +25,14 @@ from sqlalchemy import select
 from app.__main__ import migrate
 from app.db import Database, now
 from app.domain.clips import Rollout
-from app.domain.models import Run, RunKind, RunStatus
+from app.domain.models import ModelKind, Run, RunKind, RunStatus
 from app.domain.protocol import EvaluationSettings
 from app.domain.studies import PAPER_PROTOCOL, Participant, Study, StudySettings
 from app.services import studies
 from app.settings import Settings
 from app.storage import ArtefactStore
 from tests import factories
-from worker import records, references, service, workflows
+from worker import laboratory, lessons, records, references, service, workflows
 from worker.compute import Lane
 from worker.records import Job
 from worker.workplace import Step, Workplace
@@ -92,8 +92,7 @@ def learning(lane: Lane, stages: tuple[tuple[int, int, float], ...]) -> Callable
                 done += tasks * each
         with place.database.writing() as session:
             records.set_labels(session, run_id, LABELS, "hash")
-            kind = workflows.RunKind(job.kind).value
-            records.save_model(session, run_id, kind, "0" * 64, {"method": "prefft"})  # type: ignore[arg-type]
+            records.save_model(session, run_id, ModelKind(str(job.kind)), "0" * 64, {"method": "prefft"})
 
     return work
 
@@ -121,9 +120,8 @@ def serve() -> None:
             RunKind.REPORT: quick,
         }
     )
-    service.laboratory.warm_up = nothing
-    service.lessons.warm_up = nothing  # type: ignore[assignment]
-    references.make_ready = nothing
+    for module, name in ((laboratory, "warm_up"), (lessons, "warm_up"), (references, "make_ready")):
+        setattr(module, name, nothing)
     service.run(Settings())
 
 
