@@ -77,6 +77,14 @@ class Compute:
         self._changing = threading.Lock()
         self._closing = closing or threading.Event()
 
+    def size(self, lane: Lane) -> int:
+        """How many processes the lane has."""
+        return self._sizes[lane]
+
+    def is_needed_elsewhere(self, lane: Lane) -> bool:
+        """Never: a lane takes its tasks as they come. Whoever is to give way goes by worker.turns."""
+        return False
+
     def warm_up(self, lane: Lane, function: Callable[[], object]) -> None:
         """Have every process of a lane import what it will need, without waiting for it."""
         for _ in range(self._sizes[lane]):

@@ -22,7 +22,7 @@ from app.settings import Settings
 
 log = logging.getLogger("worker")
 
-VERSION = "2"
+VERSION = "3"
 """Raised when the steps of a workflow change so that a half-finished one could not be resumed."""
 
 QUEUES = {
@@ -35,6 +35,8 @@ QUEUES = {
     RunKind.EXPORT: 1,
 }
 """How many jobs of each kind one worker does at a time."""
+RESERVE = 2
+"""So many more are begun of a kind when somebody waits; what began earlier gives way in the lanes (worker.turns)."""
 AWAITED = {RunKind.CLIPS, RunKind.REWARD}
 """What somebody may be waiting for who is answering: begun within AWAITED_POLL_S, anything else within POLL_S.
 
@@ -101,7 +103,7 @@ def launch(settings: Settings) -> None:
     DBOS.launch()
     for kind, count in QUEUES.items():
         interval = AWAITED_POLL_S if kind in AWAITED else POLL_S
-        DBOS.register_queue(kind.value, worker_concurrency=count, polling_interval_sec=interval)
+        DBOS.register_queue(kind.value, worker_concurrency=count + RESERVE, polling_interval_sec=interval)
 
 
 def is_at_it(name: str) -> bool:

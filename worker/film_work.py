@@ -12,11 +12,11 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from app.domain.evaluation import Controller, Film, Trial
-from app.domain.models import ModelKind, RunKind
+from app.domain.models import Model, ModelKind, RunKind
 from app.domain.protocol import EvaluatedMethod, EvaluationMode
 from app.domain.studies import Participant, Study
 from app.services import evaluating
-from worker import laboratory, mending, method_work, records, rivals
+from worker import laboratory, mending, method_work, outdated, records, rivals
 from worker.compute import Lane
 from worker.filter_work import NothingToLearnFrom
 from worker.laboratory import RecordedClip
@@ -46,7 +46,7 @@ def due(study: Study, participant_id: int, ending: str, succeeded: Collection[st
     labels = study.settings.labels_per_participant
     return [
         Job(f"films/participant-{participant_id}/{what}/{ending}", RunKind.FILMS, study.id, participant_id, labels)
-        for what in reversed(wanted)  # somebody may be waiting for the trials
+        for what in reversed(wanted)  # the debrief comes last
     ]
 
 
@@ -58,6 +58,8 @@ def make_films(place: Workplace, job: Job, run_id: int, step: Step) -> None:
     what = job.finding.split("/")[2]
     shots = step("plan", _plan, place, job, what)
     for first in range(0, len(shots), AT_A_TIME):
+        if step(f"is-outdated-{first}", _is_outdated, place, job):
+            return
         place.report(run_id, f"{_DOING[what]} {first + 1} of {len(shots)}", first / len(shots))
         some = shots[first : first + AT_A_TIME]
         step(f"shots-{first}", _pack if what == CONTROLLERS else _film, place, run_id, job, some)
@@ -66,38 +68,62 @@ def make_films(place: Workplace, job: Job, run_id: int, step: Step) -> None:
 _DOING = {BEFORE_AFTER: "filming before and after,", TRIALS: "filming robot", CONTROLLERS: "packing robot"}
 
 
-def _plan(place: Workplace, job: Job, what: str) -> list[list[Any]]:
-    """[method, scenario] of every film, or [method, letter] of every controller. Draws the evaluation if need be.
+def _is_outdated(place: Workplace, job: Job) -> bool:
+    with place.database.reading() as session:
+        return outdated.is_outdated(session, job)
 
-    In an order of its own, neither of the letters nor of the methods: when what was made, and at which place something
-    went wrong, then tells nothing of the key.
+
+def _plan(place: Workplace, job: Job, what: str) -> list[list[Any]]:
+    """[method, model, scenario] of every film in the order of showing, or [method, model, letter] of every controller.
+
+    Draws the evaluation if need be. Whoever has begun to watch sees the models they began with to the end. Controllers
+    come in an order of their own: which was made when then tells nothing of the key.
     """
     with place.database.writing() as session:
         study, participant = session.get_one(Study, job.study_id), session.get_one(Participant, job.participant)
         if what == BEFORE_AFTER:
             methods = (EvaluatedMethod.REFERENCE.value, EvaluatedMethod.PBARL.value)
             return [
-                [method, scenario] for scenario in evaluating.comparison_scenarios(participant) for method in methods
+                [method, _newest_model(session, participant.id, method), scenario]
+                for scenario in evaluating.comparison_scenarios(participant)
+                for method in methods
             ]
         evaluating.draw(session, study, participant)
         letters = {each.letter: each.method for each in evaluating.assignments_of(session, participant.id)}
+        trials = evaluating.trials_of(session, participant.id)
+        models = {method: _newest_model(session, participant.id, method) for method in letters.values()}
+        models |= {trial.film.method: trial.film.model_id for trial in trials if trial.shown_at and trial.film}
         if what == CONTROLLERS:
-            shots: list[list[Any]] = [[method, letter] for letter, method in letters.items()]
-        else:
-            trials = evaluating.trials_of(session, participant.id)
-            shots = [[letters[each.letter], each.scenario] for each in trials]
-        return sorted(shots, key=lambda shot: evaluating.mark(study.key_secret, "made", participant.id, *shot))
+            shots = [[method, models[method], letter] for letter, method in letters.items()]
+            return sorted(shots, key=lambda shot: evaluating.mark(study.key_secret, "made", participant.id, *shot))
+        return [[letters[each.letter], models[letters[each.letter]], each.scenario] for each in trials]
+
+
+def _newest_model(session: Session, participant_id: int, method: str) -> int | None:
+    """None: the reference. Raises NothingToLearnFrom when nothing was ever trained."""
+    if method == EvaluatedMethod.REFERENCE:
+        return None
+    if method == EvaluatedMethod.PBARL:
+        own = records.newest_model(session, participant_id, ModelKind.FILTER)
+        found = None if own is None else own.id
+    else:
+        rival = method_work.newest(session, participant_id, method)
+        found = None if rival is None else rival[0]
+    if found is None:
+        raise NothingToLearnFrom
+    return found
 
 
 def _film(place: Workplace, run_id: int, job: Job, shots: list[list[Any]]) -> None:
     task = _task(place, job)
-    robots = {method: _robot(place, run_id, job, task, method) for method in dict.fromkeys(each[0] for each in shots)}
+    wanted = dict.fromkeys((method, model_id) for method, model_id, _ in shots)
+    robots = {method: _robot(place, run_id, task, method, model_id) for method, model_id in wanted}
     with place.database.reading() as session:
         quality = session.get_one(Study, job.study_id).settings.clip_quality.value
         missing = [
             (robots[method], scenario)
-            for method, scenario in shots
-            if evaluating.film_of(session, job.participant, method, scenario, robots[method].model_id) is None
+            for method, model_id, scenario in shots
+            if evaluating.film_of(session, job.participant, method, scenario, model_id) is None
         ]
     arguments = [(task, quality, robot.controller, scenario) for robot, scenario in missing]
     recorded = place.compute.run_all(Lane.CLIPS, place.beat(run_id), laboratory.film, arguments)
@@ -105,8 +131,8 @@ def _film(place: Workplace, run_id: int, job: Job, shots: list[list[Any]]) -> No
     with place.database.writing() as session:
         for (robot, scenario), columns in zip(missing, files, strict=True):
             _save(session, job.participant, robot, scenario, columns)
-        for method, scenario in shots:
-            _show(session, job.participant, method, scenario, robots[method].model_id)
+        for method, model_id, scenario in shots:
+            _show(session, job.participant, method, scenario, model_id)
 
 
 def _stored(place: Workplace, recorded: RecordedClip) -> dict[str, Any]:
@@ -128,14 +154,15 @@ def _save(session: Session, participant_id: int, robot: Robot, scenario: int, co
 
 
 def _show(session: Session, participant_id: int, method: str, scenario: int, model_id: int | None) -> None:
-    """Give the film to the trial it was made for, unless the participant has begun to watch older ones."""
-    trials = session.scalars(select(Trial).where(Trial.participant_id == participant_id)).all()
+    """Give the film to the trial it was made for, unless that has been watched, or another model of the method has."""
+    trials = evaluating.trials_of(session, participant_id)
     film = evaluating.film_of(session, participant_id, method, scenario, model_id)
-    if film is None or any(trial.shown_at is not None for trial in trials):
+    watched = [trial.film for trial in trials if trial.shown_at is not None and trial.film is not None]
+    if film is None or any(each.method == method and each.model_id != model_id for each in watched):
         return
     letters = {each.method: each.letter for each in evaluating.assignments_of(session, participant_id)}
     for trial in trials:
-        if trial.letter == letters.get(method) and trial.scenario == scenario:
+        if trial.letter == letters.get(method) and trial.scenario == scenario and trial.shown_at is None:
             trial.film_id = film.id
 
 
@@ -143,8 +170,8 @@ def _pack(place: Workplace, run_id: int, job: Job, shots: list[list[Any]]) -> No
     task = _task(place, job)
     with place.database.reading() as session:
         slug, code = session.get_one(Study, job.study_id).slug, session.get_one(Participant, job.participant).code
-    for method, letter in shots:
-        robot = _robot(place, run_id, job, task, method)
+    for method, model_id, letter in shots:
+        robot = _robot(place, run_id, task, method, model_id)
         packed = rivals.packed(task, slug, code, letter, robot.controller)
         artefact = place.store.put(packed)
         with place.database.writing() as session:
@@ -164,24 +191,16 @@ def _keep_controller(session: Session, participant_id: int, robot: Robot, artefa
     known.model_id, known.artefact_sha256, known.byte_count = robot.model_id, artefact, byte_count
 
 
-def _robot(place: Workplace, run_id: int, job: Job, task: str, method: str) -> Robot:
-    """The method's newest controller for this participant. Raises NothingToLearnFrom when nothing was ever trained."""
+def _robot(place: Workplace, run_id: int, task: str, method: str, model_id: int | None) -> Robot:
+    """A model of the method as a controller."""
     beat = place.beat(run_id)
-    if method == EvaluatedMethod.REFERENCE:
+    if model_id is None:
         return Robot(method, None, place.compute.run(Lane.LEARNING, beat, rivals.controller_of_reference, task))
-    if method == EvaluatedMethod.PBARL:
-        with place.database.reading() as session:
-            model = records.newest_model(session, job.participant, ModelKind.FILTER)
-        if model is None:
-            raise NothingToLearnFrom
-        weights = place.store.read(model.artefact_sha256)
-        stored = place.compute.run(Lane.LEARNING, beat, rivals.controller_of_filter, task, weights)
-        return Robot(method, model.id, stored)
     with place.database.reading() as session:
-        found = method_work.newest(session, job.participant, method)
-    if found is None:
-        raise NothingToLearnFrom
-    return Robot(method, found[0], place.store.read(found[1]))
+        stored = place.store.read(session.get_one(Model, model_id).artefact_sha256)
+    if method == EvaluatedMethod.PBARL:
+        stored = place.compute.run(Lane.LEARNING, beat, rivals.controller_of_filter, task, stored)
+    return Robot(method, model_id, stored)
 
 
 def _task(place: Workplace, job: Job) -> str:

@@ -4,7 +4,7 @@ from app.domain.models import ModelKind
 from app.domain.studies import Method, Participant, RewardKind, Study
 from app.errors import AppError
 from app.services.exporting import provenance_of
-from worker import dataset, lessons, personalisation, records
+from worker import dataset, lessons, outdated, personalisation, records
 from worker.compute import Lane
 from worker.ml.bundle import Provenance
 from worker.ml.filter_problem import FilterDraft
@@ -20,7 +20,13 @@ class NothingToLearnFrom(AppError):
 
 
 def train_filter(place: Workplace, job: Job, run_id: int, step: Step) -> None:
-    """Train, evaluate and publish; every stage is a step, so that a killed worker loses one stage at most."""
+    """Train, evaluate and publish; every stage is a step, so that a killed worker loses one stage at most.
+
+    Nothing is made of a filter that is outdated before it is begun, and none is gone on with once its person has given
+    the last answer, for then they wait for the last one.
+    """
+    if step("is-outdated", _is_outdated, place, job, False):
+        return
     reward = step("reward", _choose_reward, place, run_id, job)
     if not reward:
         return
@@ -28,8 +34,15 @@ def train_filter(place: Workplace, job: Job, run_id: int, step: Step) -> None:
         settings = session.get_one(Study, job.study_id).settings
     draft = ""
     for stage in STAGES[settings.method]:
+        if step(f"is-outdated-before-{stage}", _is_outdated, place, job, True):
+            return
         draft = step(stage, _stage, place, run_id, job, reward, draft, stage)
     step("publish", _publish, place, run_id, job, reward, draft)
+
+
+def _is_outdated(place: Workplace, job: Job, begun: bool) -> bool:
+    with place.database.reading() as session:
+        return outdated.is_outdated(session, job, begun=begun)
 
 
 def _choose_reward(place: Workplace, run_id: int, job: Job) -> str:

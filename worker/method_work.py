@@ -15,12 +15,12 @@ from app.domain.models import ModelKind, RunKind
 from app.domain.protocol import EvaluatedMethod
 from app.domain.studies import Participant, RewardKind, Study
 from app.services import evaluating
-from worker import dataset, lessons, records, rivals
+from worker import dataset, lessons, outdated, records, rivals
 from worker.analysis.evaluation import evaluate
 from worker.compute import Lane
 from worker.filter_work import NothingToLearnFrom
 from worker.ml import filter_problem
-from worker.ml.checkpoint import share_done
+from worker.ml.checkpoint import ask_to_pause, share_done
 from worker.ml.reward_models import load_reward_model
 from worker.records import Job
 from worker.rivals import Rival
@@ -59,6 +59,8 @@ def train_method(place: Workplace, job: Job, run_id: int, step: Step) -> None:
     method = EvaluatedMethod(job.finding.split("/")[2])
     reward = step("reward", _choose_reward, place, run_id, job)
     trained = step("train", _train, place, run_id, job, method.value, reward)
+    if not trained:
+        return  # the last answer was given again, and the same method is due anew
     step("save", _save, place, run_id, job, method.value, reward, trained)
 
 
@@ -72,7 +74,10 @@ def _choose_reward(place: Workplace, run_id: int, job: Job) -> str:
 
 
 def _train(place: Workplace, run_id: int, job: Job, method: str, reward: str) -> dict[str, object]:
-    """The artefact of the finished controller, and what is to be said about it."""
+    """The artefact of the finished controller, and what is to be said about it; empty when nobody needs it any more.
+
+    A training makes room for that of somebody who waits, and goes on from its checkpoint afterwards.
+    """
     folder = _folder(place, job, run_id)
     folder.mkdir(parents=True, exist_ok=True)
     rival = _rival(place, run_id, job, method, reward, folder)
@@ -80,9 +85,22 @@ def _train(place: Workplace, run_id: int, job: Job, method: str, reward: str) ->
     def beat() -> None:
         share = share_done(folder)
         place.report(run_id, f"training a method to be evaluated, {share:.0%} done", TRAINING_SHARE * share)
+        if place.compute.is_needed_elsewhere(Lane.PATIENT) or _is_outdated(place, job):
+            ask_to_pause(folder)
 
-    fitted = place.compute.run(Lane.PATIENT, beat, rivals.fit, rival, folder)
-    return {"artefact": place.store.put(fitted.controller), "notes": list(fitted.notes), "seconds": fitted.seconds}
+    seconds = 0.0
+    while not _is_outdated(place, job):
+        fitted = place.compute.run(Lane.PATIENT, beat, rivals.fit, rival, folder)
+        seconds += fitted.seconds
+        if fitted.controller is not None:
+            return {"artefact": place.store.put(fitted.controller), "notes": list(fitted.notes), "seconds": seconds}
+    shutil.rmtree(folder, ignore_errors=True)
+    return {}
+
+
+def _is_outdated(place: Workplace, job: Job) -> bool:
+    with place.database.reading() as session:
+        return outdated.is_outdated(session, job)
 
 
 def _rival(place: Workplace, run_id: int, job: Job, method: str, reward: str, folder: Path) -> Rival:

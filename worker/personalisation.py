@@ -7,7 +7,7 @@ import io
 import json
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,8 @@ import numpy as np
 from app.domain.studies import Method, StudySettings
 from worker import laboratory, lessons
 from worker.analysis.evaluation import evaluate
-from worker.compute import Compute, Lane
+from worker.analysis.proof import case_against
+from worker.compute import Lane
 from worker.exploration import surface_file
 from worker.ml import bundle, filter_problem, mode_search, printed_filter, residual_learning
 from worker.ml.action_filter import FilterWeights
@@ -24,6 +25,7 @@ from worker.ml.filter_problem import Act, FilterAct, FilterConfig, FilterDraft, 
 from worker.ml.response_surface import ResponseSurface
 from worker.ml.reward_models import load_reward_model
 from worker.trajectory import Trajectory
+from worker.turns import Computing
 
 CHUNK = 3
 """Scenarios per call of a compute process: small enough to spread evenly, large enough not to matter."""
@@ -50,7 +52,7 @@ class Fitting:
     """One filter in the making."""
 
     task: str
-    compute: Compute
+    compute: Computing
     beat: Callable[[], None]
     reward: bytes
     seed: int
@@ -87,15 +89,26 @@ class Fitting:
         return self.compute.run(Lane.LEARNING, self.beat, printed_filter.fit_printed, self.problem, transitions)
 
     def finish(self, draft: FilterDraft, provenance: Provenance, learned: Mapping[str, Any]) -> Finished:
-        """Export, drive through unseen scenarios, pack. ``learned``: the reward model's metrics, for the model card."""
+        """Export, drive through unseen scenarios, pack. ``learned``: the reward model's metrics, for the model card.
+
+        A studio's filter that does not meet the burden of proof (worker.analysis.proof) is replaced by the reference.
+        """
         started = time.perf_counter()
         self.progress("driving the filter through unseen scenarios", 0.88)
         act = filter_problem.act_of(self.problem.task.modes, self.problem.policy, draft.weights)
         evaluation, filtered = self._evaluate(act)
+        against = case_against(evaluation) if draft.weights.method == "studio" else ()
+        rejected: dict[str, Any] = {}
+        if against:
+            rejected = {"evaluation": evaluation, "mode": dict(draft.weights.mode), **_strengths(draft.weights)}
+            draft = as_reference(draft, evaluation["preference"], against)
+            act = filter_problem.act_of(self.problem.task.modes, self.problem.policy, draft.weights)
+            evaluation, filtered = self._evaluate_reference()
         metrics: dict[str, Any] = {
             "evaluation": evaluation,
-            "gate": draft.weights.gate,
-            "residual_share": draft.weights.residual_share if draft.weights.encoder else 0.0,
+            "uses_reference": moves_nothing(draft.weights),
+            "rejected": rejected,
+            **_strengths(draft.weights),
             "mode": dict(draft.weights.mode),
             "method": draft.weights.method,
             "notes": [*draft.notes, *_warnings(evaluation, self.settings.success_tolerance)],
@@ -121,6 +134,12 @@ class Fitting:
         filtered = self.collect(act, scenarios, 0.0, self.seed)
         reference, reward = self.reference(scenarios), self.problem.reward
         return evaluate(reference, filtered, reward.returns(reference), reward.returns(filtered)), filtered
+
+    def _evaluate_reference(self) -> tuple[dict[str, Any], list[Trajectory]]:
+        """What would be measured of a filter that changes nothing: simulations repeat themselves exactly."""
+        reference = self.reference(filter_problem.scenarios_for("evaluation", self.settings.evaluation_scenarios))
+        returns = self.problem.reward.returns(reference)
+        return evaluate(reference, reference, returns, returns), list(reference)
 
     def collect(self, act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
         """One rollout per scenario, in order; the same whatever the number of processes."""
@@ -154,6 +173,27 @@ def _config(settings: StudySettings) -> FilterConfig:
     return FilterConfig(
         success_tolerance=settings.success_tolerance, evaluation_scenarios=settings.evaluation_scenarios
     )
+
+
+def moves_nothing(weights: FilterWeights) -> bool:
+    """Whether the filter leaves the reference policy as it is."""
+    without_residual = not weights.encoder or weights.residual_share == 0.0
+    off = without_residual and not any(weights.mode.values())
+    return weights.gate == 0.0 or (weights.method == "studio" and off)
+
+
+def as_reference(draft: FilterDraft, preference: Mapping[str, float], against: Sequence[str]) -> FilterDraft:
+    """A filter that changes nothing in place of one that did not meet the burden of proof, and why."""
+    note = (
+        "The reference policy is used as it is. The filter that was trained had no sure gain on unseen scenarios "
+        f"(learned preference {preference['delta']:+.2f} [{preference['low']:+.2f}, {preference['high']:+.2f}] sd), "
+        f"and a price: {'; '.join(against)}."
+    )
+    return replace(draft, weights=FilterWeights(gate=0.0), notes=(*draft.notes, note))
+
+
+def _strengths(weights: FilterWeights) -> dict[str, float]:
+    return {"gate": weights.gate, "residual_share": weights.residual_share if weights.encoder else 0.0}
 
 
 def _warnings(evaluation: dict[str, Any], tolerance: float) -> list[str]:

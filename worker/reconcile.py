@@ -8,16 +8,17 @@ from collections.abc import Collection, Iterator, Mapping
 from datetime import datetime, timedelta
 from typing import NamedTuple
 
-from sqlalchemy import Select, func, or_, select
+from sqlalchemy import func, or_, select
 from sqlalchemy.orm import Session
 
 from app.db import now
 from app.domain.clips import Clip, Rollout
 from app.domain.models import Run, RunKind, RunStatus
-from app.domain.preferences import LEARNED_FROM, LabelEvent, Query, count_labels
-from app.domain.studies import Participant, Study, StudySettings
+from app.domain.preferences import LabelEvent, Query, count_labels
+from app.domain.studies import Participant, Study
 from worker import export_work, film_work, mending, method_work, report_work
 from worker.clip_work import WHOLE
+from worker.outdated import filter_due, filter_name, last_answers, present_ids, reward_due
 from worker.records import ATTEMPTS, LEASE, Job, next_queries
 
 CLIPS_AHEAD = 2
@@ -41,6 +42,8 @@ def findings(session: Session, lost: Mapping[str, int] | None = None) -> Iterato
     """
     known = session.execute(select(Run.workflow_id, Run.status, Run.attempt, Run.finished_at))
     runs = {name: _Attempted(status, attempt, finished) for name, status, attempt, finished in known}
+    filters = select(Run.participant_id).where(Run.kind == RunKind.FILTER, Run.status == RunStatus.RUNNING)
+    being_filtered = set(session.scalars(filters.where(Run.heartbeat_at >= now() - LEASE)))
     succeeded = {name for name, run in runs.items() if run.status == RunStatus.SUCCEEDED}
     for study in session.scalars(select(Study).order_by(Study.id)).all():
         jobs = (
@@ -50,7 +53,8 @@ def findings(session: Session, lost: Mapping[str, int] | None = None) -> Iterato
         )
         for job in (*jobs, *report_work.due(session, study), *export_work.due(session, study)):
             attempt = _attempt_due(runs.get(job.finding), now())
-            if attempt is not None:
+            one_at_a_time = job.kind == RunKind.FILTER and job.participant_id in being_filtered
+            if attempt is not None and not one_at_a_time:
                 yield job, attempt
 
 
@@ -105,14 +109,9 @@ def with_lost_queries(session: Session, lost: Collection[str]) -> list[int]:
 def _without_all_queries(session: Session, study: Study) -> list[int]:
     """Everybody who has not yet been given all their queries: in a study that is over, nobody."""
     settings = study.settings
-    counted = _present_ids(study).outerjoin(Query).group_by(Participant.id)
+    counted = present_ids(study).outerjoin(Query).group_by(Participant.id)
     short = counted.having(func.count(Query.id) < settings.practice_pairs + settings.question_count)
     return list(session.scalars(short.order_by(Participant.id)))
-
-
-def _present_ids(study: Study) -> Select[int]:
-    """Everybody in the study who has not withdrawn."""
-    return select(Participant.id).where(Participant.study_id == study.id, Participant.withdrawn_at.is_(None))
 
 
 def _attempt_due(run: _Attempted | None, moment: datetime) -> int | None:
@@ -160,18 +159,17 @@ def scenario_seed(study_seed: int, index: int) -> int:
 
 def _stale_models(session: Session, study: Study, succeeded: Collection[str]) -> list[Job]:
     jobs, settings = [], study.settings
-    last_answers = _last_answers(session, study)
-    for participant_id, count in sorted(count_labels(session, _present_ids(study)).items()):
+    newest = last_answers(session, present_ids(study))
+    for participant_id, count in sorted(count_labels(session, present_ids(study)).items()):
         # A last answer that is changed afterwards makes the last model's name new.
-        suffix = f"/answer-{last_answers[participant_id]}" if count >= settings.labels_per_participant else ""
+        suffix = f"/answer-{newest[participant_id]}" if count >= settings.labels_per_participant else ""
         reward = reward_due(settings, count)
         if reward:
             name = f"reward/participant-{participant_id}/labels-{reward}{suffix}"
             jobs.append(Job(name, RunKind.REWARD, study.id, participant_id, reward))
             milestone = filter_due(settings, count)
             if milestone and name in succeeded and study.material is None:  # no simulator, no filter
-                ending = suffix if milestone == settings.labels_per_participant else ""
-                name = f"filter/participant-{participant_id}/labels-{milestone}{ending}"
+                name = filter_name(settings, participant_id, count, newest[participant_id])
                 jobs.append(Job(name, RunKind.FILTER, study.id, participant_id, milestone))
         if suffix and study.material is None:
             jobs += _missing_from_evaluation(study, participant_id, f"labels-{reward}{suffix}", succeeded)
@@ -186,22 +184,3 @@ def _missing_from_evaluation(study: Study, participant_id: int, ending: str, suc
     if f"filter/participant-{participant_id}/{ending}" in succeeded:
         jobs += film_work.due(study, participant_id, ending, succeeded)
     return jobs
-
-
-def reward_due(settings: StudySettings, answered: int) -> int:
-    """The number of labels the newest reward model should have seen; 0 while there is nothing to learn from."""
-    if answered >= settings.labels_per_participant:
-        return settings.labels_per_participant
-    return answered // settings.retrain_every_labels * settings.retrain_every_labels
-
-
-def filter_due(settings: StudySettings, answered: int) -> int:
-    """The newest milestone that has been passed; 0 before the first. Milestones passed in the meantime are skipped."""
-    return max((milestone for milestone in settings.milestones if milestone <= answered), default=0)
-
-
-def _last_answers(session: Session, study: Study) -> dict[int, int]:
-    """The number of everybody's last answer that is learned from."""
-    events = select(Query.participant_id, func.max(LabelEvent.id)).join(LabelEvent)
-    events = events.where(Query.participant_id.in_(_present_ids(study)), Query.purpose.in_(LEARNED_FROM))
-    return dict(session.execute(events.group_by(Query.participant_id)).all())

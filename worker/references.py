@@ -2,14 +2,15 @@
 
 from app.domain.studies import Method, StudySettings
 from worker import laboratory, lessons
-from worker.compute import Compute, Lane
+from worker.compute import Lane
 from worker.ml import filter_problem
 from worker.personalisation import CHUNK, reference_blocks
 from worker.trajectory import Trajectory
+from worker.turns import Computing
 
 
 def make_ready(
-    compute: Compute, references: dict[tuple[str, range], list[Trajectory]], task: str, settings: StudySettings
+    compute: Computing, references: dict[tuple[str, range], list[Trajectory]], task: str, settings: StudySettings
 ) -> None:
     """Make what is missing behind everything else that is learning, a few episodes at a time.
 

@@ -17,7 +17,7 @@ from worker import laboratory, lessons
 from worker.ml import controller, filter_problem, methods
 from worker.ml.action_filter import FilterWeights
 from worker.ml.candidate_ranking import can_rank
-from worker.ml.checkpoint import Checkpoint
+from worker.ml.checkpoint import Checkpoint, Paused, begin_again
 from worker.ml.controller import Blinded
 from worker.ml.filter_problem import Act, FilterProblem
 from worker.ml.methods import MethodConfig, Setting
@@ -48,18 +48,26 @@ class Rival:
 
 @dataclass(frozen=True)
 class FittedRival:
-    """A fitted method."""
+    """A fitted method, or as much of it as was done before a pause."""
 
-    controller: bytes
+    controller: bytes | None
+    """None: it paused at a checkpoint"""
     notes: tuple[str, ...]
     seconds: float
 
 
 def fit(rival: Rival, folder: Path) -> FittedRival:
-    """Fit it on one core, keeping checkpoints in the folder. Raises Abandoned when the folder is removed."""
+    """Fit it on one core, keeping checkpoints in the folder, until it is done or asked to pause.
+
+    Raises Abandoned when the folder is removed.
+    """
     torch.set_num_threads(1)
     started = time.perf_counter()
-    fitted = methods.fit(rival.method, _setting(rival, Checkpoint(folder)))
+    begin_again(folder)
+    try:
+        fitted = methods.fit(rival.method, _setting(rival, Checkpoint(folder)))
+    except Paused:
+        return FittedRival(None, (), round(time.perf_counter() - started, 1))
     stored = controller.of_act(fitted.act, observations(rival.task))
     return FittedRival(stored, fitted.notes, round(time.perf_counter() - started, 1))
 

@@ -6,7 +6,8 @@ import math
 import os
 import threading
 import time
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from functools import partial
 from pathlib import Path
@@ -23,6 +24,8 @@ from worker import engine, erasure, laboratory, lessons, orphans, querying, reco
 from worker.compute import Compute, ComputeLost, Interrupted, Lane
 from worker.records import Job
 from worker.stopping import Stop
+from worker.turns import Turns
+from worker.urgency import Level, WhoWaits
 from worker.workflows import Workshop, as_arguments
 from worker.workplace import Workplace
 
@@ -35,6 +38,8 @@ PRESENCE_S = 5.0
 CLEARING_S = 24 * 3600.0
 LOOK_AGAIN_S = 10.0
 """What is still due after this long may have been forgotten by the engine, or given up."""
+BEGINS_WITHIN_S = 30.0
+"""A job the engine was told of takes up a place for so long; one of an earlier version it may never begin."""
 
 
 class WorkerAlreadyRunning(AppError):
@@ -54,7 +59,8 @@ def run(settings: Settings) -> int:
         database = Database(settings.sqlalchemy_url)
         compute = Compute(settings.compute_processes, stop.asked)
         stop.at_once = compute.kill
-        workshop = Workshop(Workplace(database, ArtefactStore(settings.data_dir / "artefacts"), compute))
+        place = Workplace(database, ArtefactStore(settings.data_dir / "artefacts"), compute)
+        workshop = Workshop(place, Turns(compute))
         try:
             compute.warm_up(Lane.CLIPS, laboratory.warm_up)
             with engine.running(settings, database) as bond:
@@ -94,6 +100,7 @@ class _Rounds:
         self._workshop = workshop
         self._place = workshop.place
         self._started: dict[str, float] = {}  # what the engine has been told already, and when it was last asked
+        self._told_at: dict[str, float] = {}
         self._signed_at = -math.inf
         self._cleared_at = -math.inf
         self._rested_at = -math.inf
@@ -133,6 +140,7 @@ class _Rounds:
             self._cleared_at = time.monotonic()
 
     def _round(self) -> None:
+        turns = self._workshop.turns
         with self._place.database.reading() as session:
             lost_files = self._place.store.lost()
             due = list(reconcile.findings(session, lost_files))
@@ -140,8 +148,8 @@ class _Rounds:
             lost = reconcile.abandoned(session, self._workshop.in_hand)
             answered = reconcile.studies_with_answers(session)
             withdrawn = erasure.unfinished(session)
-        for job, attempt in due:
-            self._start(job, reconcile.workflow_name(job.finding, attempt))
+            turns.who_waits = WhoWaits.look(session)
+        self._start_most_urgent(due)
         for participant_id in hungry - self._refused:
             self._refill(participant_id)
         for participant_id in withdrawn:
@@ -152,7 +160,7 @@ class _Rounds:
             if study.id not in self._prepared:
                 self._prepared.add(study.id)
                 for lane in (Lane.REWARDS, Lane.LEARNING):
-                    self._place.compute.warm_up(lane, partial(lessons.warm_up, study.task))
+                    turns.compute.warm_up(lane, partial(lessons.warm_up, study.task))
                 threading.Thread(target=self._make_references, args=(study.task, study.settings), daemon=True).start()
 
     def _make_references(self, task: str, settings: StudySettings) -> None:
@@ -176,6 +184,21 @@ class _Rounds:
         except AppError as refusal:  # one study that cannot go on must not stop the others
             log.warning("participant %d gets no further pairs: %s", participant_id, refusal.message)
             self._refused.add(participant_id)
+
+    def _start_most_urgent(self, due: Sequence[tuple[Job, int]]) -> None:
+        """Tell the engine only of what can be begun now, so that whoever comes to wait later stands before the rest.
+
+        What the engine was told and has not begun is still due, and counts, unless it seems to have forgotten it.
+        """
+        begun = Counter(finding.partition("/")[0] for finding in self._workshop.in_hand)
+        for job, attempt in sorted(due, key=lambda each: self._workshop.turns.who_waits.urgency(each[0])):
+            level = self._workshop.turns.who_waits.urgency(job).level
+            places = engine.QUEUES[job.kind] + (engine.RESERVE if level <= Level.ANSWERING else 0)
+            if job.finding in self._workshop.in_hand or begun[job.kind] >= places:
+                continue
+            name = reconcile.workflow_name(job.finding, attempt)
+            self._start(job, name)
+            begun[job.kind] += time.monotonic() - self._told_at.setdefault(name, time.monotonic()) < BEGINS_WITHIN_S
 
     def _start(self, job: Job, name: str) -> None:
         """Have the engine do it; once, unless it turns out to be due still and in nobody's hands."""

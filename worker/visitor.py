@@ -79,6 +79,11 @@ class Visitor:
         form = self._page.form_to(_QUERY)
         return None if form is None else int(form.target.group(1))
 
+    @property
+    def text(self) -> str:
+        """The page as it was sent."""
+        return self._page.text
+
     def answer(self, response: str) -> float:
         """Press a button; returns the seconds until the next page was there."""
         form = self._page.form_to(_QUERY)
@@ -143,7 +148,7 @@ class _Page(HTMLParser):
 
     def __init__(self, address: str, text: str) -> None:
         super().__init__()
-        self.address = address
+        self.address, self.text = address, text
         self.forms: list[tuple[str, dict[str, str]]] = []
         self.feed(text)
 

@@ -25,6 +25,7 @@ from worker.filter_work import train_filter
 from worker.method_work import train_method
 from worker.records import Job
 from worker.reward_work import train_reward
+from worker.turns import Turns
 from worker.workplace import Step, Workplace
 
 log = logging.getLogger("worker")
@@ -51,9 +52,9 @@ class ParticipantWithdrew(AppError):
 class Workshop(DBOSConfiguredInstance):
     """Does jobs at one workplace."""
 
-    def __init__(self, place: Workplace) -> None:
+    def __init__(self, place: Workplace, turns: Turns) -> None:
         super().__init__("workshop")
-        self.place = place
+        self.place, self.turns = place, turns
         self.in_hand: set[str] = set()
         """findings that this process is working on"""
         self.stored: dict[str, set[str]] = {}
@@ -69,7 +70,7 @@ class Workshop(DBOSConfiguredInstance):
             run_id = _step("begin", self._begin, arguments)
             if run_id is None:
                 return
-            place = self.place.noting(self.stored.setdefault(job.finding, set()))
+            place = self.place.noting(self.stored.setdefault(job.finding, set())).computing(self.turns.of(job))
             _BODIES[RunKind(job.kind)](place, job, run_id, _step)
             _step("finish", self._finish, run_id)
             self.stored.pop(job.finding, None)

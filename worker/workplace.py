@@ -9,8 +9,8 @@ from typing import Any, Protocol
 from app.db import Database
 from app.storage import ArtefactStore, hash_of_file
 from worker import records
-from worker.compute import Compute
 from worker.trajectory import Trajectory
+from worker.turns import Computing
 
 
 class Step(Protocol):
@@ -48,13 +48,17 @@ class Workplace:
 
     database: Database
     store: ArtefactStore
-    compute: Compute
+    compute: Computing
     references: dict[tuple[str, range], list[Trajectory]] = field(default_factory=dict)
     """rollouts of the frozen policy by scenarios: the same for everybody, so each worker makes them once"""
 
     def noting(self, noted: set[str]) -> "Workplace":
         """The same place, remembering the artefacts that are stored through it."""
         return replace(self, store=NotingStore(self.store, noted))
+
+    def computing(self, compute: Computing) -> "Workplace":
+        """The same place with another way to the compute processes."""
+        return replace(self, compute=compute)
 
     def report(self, run_id: int, stage: str, progress: float) -> None:
         """Say in a few words, and as a share between 0 and 1, where a run is."""

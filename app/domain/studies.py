@@ -233,6 +233,14 @@ PREVIEW_NUMBERS = 900_000
 """Previews are counted from here, so that they take no participant's number: the numbers balance the evaluation."""
 
 
+class Awaited(StrEnum):
+    """What a waiting page waits for."""
+
+    PAIR = "pair"
+    ROBOTS = "robots"
+    DEBRIEF = "debrief"
+
+
 class Participant(Base):
     """One person in one study, known by a code. The link's token is stored only as a hash."""
 
@@ -249,6 +257,9 @@ class Participant(Base):
     seed: Mapped[int]
     created_at: Mapped[datetime] = mapped_column(default=now)
     last_seen_at: Mapped[datetime | None]
+    waiting_for: Mapped[str | None] = mapped_column(String(20))
+    """One of Awaited while the page they looked at last was a waiting page; last_seen_at says whether they still do."""
+    waiting_since: Mapped[datetime | None]
     consented_at: Mapped[datetime | None]
     consent_version: Mapped[str | None] = mapped_column(String(40))
     instructed_at: Mapped[datetime | None]

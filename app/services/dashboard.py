@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import NamedTuple, TypeVar
 
 from sqlalchemy import ColumnElement, func, or_, select
-from sqlalchemy.orm import Session
+from sqlalchemy.orm import Session, joinedload
 
 from app.db import now
 from app.domain.clips import Clip, Rollout
@@ -18,9 +18,9 @@ from app.domain.models import Bundle, Model, ModelKind, Run, RunKind, RunStatus,
 from app.domain.participation import StageRecord
 from app.domain.preferences import LEARNED_FROM, LabelEvent, Response, count_labels
 from app.domain.protocol import Stage
-from app.domain.studies import Participant, Study
+from app.domain.studies import Awaited, Participant, Study
 from app.falls import Falls, noted
-from app.services import accuracy, damage, results, stages, watching
+from app.services import accuracy, damage, preparing, results, stages, watching
 from app.services.tallies import Tallies
 from app.storage import ArtefactStore
 
@@ -79,6 +79,8 @@ class ParticipantRow:
     run: Run | None
     """What the worker is doing for them, or what failed; None when nothing is to be said."""
     newest_filter: results.FilterVersion | None
+    preparation: preparing.Preparation | None
+    """How far the robots are of somebody who waits for them, here or elsewhere."""
     watched: watching.Watched
 
 
@@ -244,6 +246,7 @@ def _rows(session: Session, study: Study, people: Sequence[Participant], tallies
     ids = [person.id for person in people]
     told, runs, wanted = tallies.of(session, ids), _noteworthy_runs(session, ids), study.settings.labels_per_participant
     where = watching.where_they_are(session, study.settings, people, {each: told[each].answered for each in ids})
+    preparations = _preparations(session, ids)
     return [
         ParticipantRow(
             participant=person,
@@ -255,10 +258,18 @@ def _rows(session: Session, study: Study, people: Sequence[Participant], tallies
             curve=told[person.id].curve,
             run=runs.get(person.id),
             newest_filter=told[person.id].newest_filter,
+            preparation=preparations.get(person.id),
             watched=told[person.id].watched,
         )
         for person in people
     ]
+
+
+def _preparations(session: Session, ids: Sequence[int]) -> Mapping[int, preparing.Preparation]:
+    """By participant id."""
+    waiting = select(Participant).where(Participant.id.in_(ids), Participant.waiting_for == Awaited.ROBOTS)
+    people = session.scalars(waiting.options(joinedload(Participant.study)))
+    return {person.id: preparing.preparation(session, person) for person in people}
 
 
 def _versions(session: Session, participant: Participant) -> Sequence[results.FilterVersion]:

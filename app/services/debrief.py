@@ -15,6 +15,16 @@ from app.services import evaluating, results
 MOST_LESSONS = 4
 """More would not be read."""
 MOST_PERCENT = 100
+NOTICED_PERCENT = 5
+"""Of what it was before: smaller differences of speed or force are hardly noticed, however certain they are."""
+_TOGETHER = {
+    ("less", "more"): "pace-quicker",
+    ("more", "less"): "pace-calmer",
+    ("less", "less"): "pace-less-motion",
+    ("more", "more"): "pace-more-motion",
+}
+"""Distance from the person and motion, C_d and C_v, both changed: one sentence, for two would seem to contradict each
+other. C_v adds up to the way gone, so whoever moves more may still be longer away from the person."""
 
 
 @dataclass(frozen=True)
@@ -27,20 +37,12 @@ class BeforeAndAfter:
 
 @dataclass(frozen=True)
 class Lesson:
-    """One thing that the person's robot does otherwise than before, beyond chance."""
+    """One thing that the person's robot does otherwise than before, beyond chance and enough to be noticed."""
 
-    cost: str
-    """One of results.COST_SYMBOLS."""
-    more: bool
+    words: str
+    """Names the sentence among the texts of participants: debrief-..."""
     percent: int
     """By how much, of what it was before."""
-
-    @property
-    def direction(self) -> str:
-        """less, more, or much: more than double is a multiple of little, and its percentage would only frighten."""
-        if not self.more:
-            return "less"
-        return "much" if self.percent > MOST_PERCENT else "more"
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,8 @@ class Learned:
 
     scenarios: int
     lessons: Sequence[Lesson]
+    is_reference: bool
+    """Nothing was surely better for the person, so theirs is the robot that everybody meets."""
 
 
 def before_and_after(session: Session, participant: Participant) -> BeforeAndAfter | None:
@@ -83,14 +87,34 @@ def learned(session: Session, participant: Participant) -> Learned | None:
     version = results.filter_version(*row)
     if version.scenarios is None or not version.costs:
         return None
-    lessons = [_lesson(cost) for cost in version.costs]
-    certain = sorted((lesson for lesson in lessons if lesson is not None), key=lambda lesson: -lesson.percent)
-    return Learned(version.scenarios, certain[:MOST_LESSONS])
+    return Learned(version.scenarios, lessons_of(version.costs)[:MOST_LESSONS], version.uses_reference)
 
 
-def _lesson(change: results.Change) -> Lesson | None:
-    """None when the interval allows no difference, or when it is too small to be seen."""
-    if change.low <= 0 <= change.high or not change.reference:
-        return None
-    percent = round(100 * abs(change.delta) / abs(change.reference))
-    return Lesson(change.symbol, change.delta > 0, percent) if percent >= 1 else None
+def lessons_of(changes: Sequence[results.Change]) -> Sequence[Lesson]:
+    """What is to be said about measured changes of the six costs, the largest first; no two contradict each other."""
+    noticed = {change.symbol: _percent(change) for change in changes if _is_noticed(change)}
+    more = {change.symbol: change.delta > 0 for change in changes}
+    lessons = []
+    if {"C_d", "C_v"} <= noticed.keys():
+        distance, motion = ("more" if more[symbol] else "less" for symbol in ("C_d", "C_v"))
+        noticed.pop("C_d")
+        lessons.append(Lesson(_TOGETHER[distance, motion], noticed.pop("C_v")))
+    lessons += [Lesson(f"{symbol}-{_how(more[symbol], percent)}", percent) for symbol, percent in noticed.items()]
+    return sorted(lessons, key=lambda lesson: -lesson.percent)
+
+
+def _is_noticed(change: results.Change) -> bool:
+    """Whether the interval allows no other direction, and the difference is large enough to be seen or felt."""
+    certain = change.low > 0 or change.high < 0
+    return certain and bool(change.reference) and _percent(change) >= NOTICED_PERCENT
+
+
+def _percent(change: results.Change) -> int:
+    return round(100 * abs(change.delta) / abs(change.reference)) if change.reference else 0
+
+
+def _how(more: bool, percent: int) -> str:
+    """less, more, or much: more than double is a multiple of little, and its percentage would only frighten."""
+    if not more:
+        return "less"
+    return "much" if percent > MOST_PERCENT else "more"

@@ -23,7 +23,6 @@ from sqlalchemy.orm import Session, joinedload
 
 from app.db import now
 from app.domain.evaluation import Assignment, Controller, Film, Rating, Trial
-from app.domain.models import Model, ModelKind, Run, RunKind, RunStatus
 from app.domain.protocol import EvaluatedMethod, EvaluationMode, EvaluationSettings
 from app.domain.studies import Participant, Study
 from app.storage import ArtefactStore
@@ -68,20 +67,6 @@ class Turn:
     """Its film loaded. None while the robots are prepared, and at the end."""
     correctable: Trial | None
     """The trial rated last, whose rating can still be changed."""
-
-
-@dataclass(frozen=True)
-class Preparation:
-    """How far the robots of one participant are."""
-
-    step: str
-    """learning, training, filming or packing"""
-    share: float
-    robots_ready: int
-    robots: int
-    seconds_left: int | None
-    trouble: bool
-    """Something has failed; it is tried again by itself, or when somebody asks for it."""
 
 
 def settings_of(study: Study) -> EvaluationSettings | None:
@@ -182,12 +167,12 @@ def next_turn(session: Session, store: ArtefactStore, participant: Participant) 
 
 def _state(session: Session, store: ArtefactStore, participant: Participant, trials: Sequence[Trial]) -> State:
     settings = settings_of(participant.study)
-    if settings is None or not is_ready(session, store, settings, participant.id, trials):
+    ratings = ratings_of(session, participant.id)
+    trial = next((each for each in trials if each.id not in ratings), None)
+    if settings is None or trial is None or not is_ready(session, store, settings, participant.id, trial):
         return State.PREPARING
     if settings.mode is EvaluationMode.VIDEO:
         return State.WATCHING
-    ratings = ratings_of(session, participant.id)
-    trial = next(each for each in trials if each.id not in ratings)
     if trial.finished_at is not None:
         return State.RATING
     return State.COMING if trial.started_at is None else State.MOVING
@@ -198,13 +183,12 @@ def is_ready(
     store: ArtefactStore,
     settings: EvaluationSettings,
     participant_id: int,
-    trials: Sequence[Trial],
+    trial: Trial,
 ) -> bool:
-    """Whether every robot can be shown: all films are there, or all controllers."""
+    """Whether the trial's robot can be shown: its film is there (others may still be made), or all controllers."""
     if settings.mode is EvaluationMode.PHYSICAL:
         return len(controllers_of(session, participant_id)) >= len(settings.methods)
-    films = [trial.film for trial in trials]
-    return bool(films) and all(film is not None and store.has(film.video_sha256) for film in films)
+    return trial.film is not None and store.has(trial.film.video_sha256)
 
 
 def controllers_of(session: Session, participant_id: int) -> dict[str, Controller]:
@@ -216,65 +200,6 @@ def controllers_of(session: Session, participant_id: int) -> dict[str, Controlle
         .order_by(Assignment.letter)
     )
     return {letter: controller for letter, controller in rows}  # noqa: C416  (a typed row is not a typed pair)
-
-
-def preparation(session: Session, participant: Participant) -> Preparation:
-    """How far the robots are, counted from what is there and what is at work; the study is loaded."""
-    study = participant.study
-    settings = settings_of(study)
-    methods = settings.methods if settings else ()
-    runs = _newest_runs(session, participant.id)
-    final = study.settings.labels_per_participant
-    own = _is_trained(session, participant.id, final, ModelKind.FILTER)
-    training = [method for method in methods if method in TRAINED]
-    trained = [method for method in training if _is_trained(session, participant.id, final, ModelKind.METHOD, method)]
-    filming = _at_work(runs.get(RunKind.FILMS))
-    current = _at_work(runs.get(RunKind.METHOD))
-    work = _FILTER + _METHOD * len(training) + _FILMS
-    done = _FILTER * (1.0 if own else _at_work(runs.get(RunKind.FILTER)))
-    done += _METHOD * (len(trained) + (current if len(trained) < len(training) else 0.0))
-    ready = own and len(trained) == len(training)
-    done += _FILMS * filming if ready else 0.0
-    last = "packing" if settings and settings.mode is EvaluationMode.PHYSICAL else "filming"
-    return Preparation(
-        step="learning" if not own else last if ready else "training",
-        share=min(done / work, 0.99),
-        robots_ready=len(methods) - (0 if own else EvaluatedMethod.PBARL in methods) - len(training) + len(trained),
-        robots=len(methods),
-        seconds_left=_seconds_left(runs.get(RunKind.METHOD), len(training) - len(trained)),
-        trouble=any(run.status == RunStatus.FAILED for run in runs.values()),
-    )
-
-
-_FILTER, _METHOD, _FILMS = 1.0, 4.0, 1.0
-"""How long the parts take, roughly, in units of the first."""
-_PACE_KNOWN_FROM = 0.05
-
-
-def _newest_runs(session: Session, participant_id: int) -> dict[str, Run]:
-    runs = select(Run).where(Run.participant_id == participant_id).order_by(Run.id)
-    return {run.kind: run for run in session.scalars(runs)}
-
-
-def _at_work(run: Run | None) -> float:
-    return run.progress if run is not None and run.status == RunStatus.RUNNING else 0.0
-
-
-def _is_trained(
-    session: Session, participant_id: int, labels: int, kind: ModelKind, method: EvaluatedMethod | None = None
-) -> bool:
-    models = session.scalars(
-        select(Model).where(Model.participant_id == participant_id, Model.kind == kind, Model.label_count >= labels)
-    )
-    return any(method is None or model.metrics.get("method") == method for model in models)
-
-
-def _seconds_left(run: Run | None, missing: int) -> int | None:
-    """From the pace of the training at work; None while too little is known."""
-    if run is None or run.status != RunStatus.RUNNING or run.progress < _PACE_KNOWN_FROM or missing < 1:
-        return None
-    one_s = (now() - run.started_at).total_seconds() / run.progress
-    return round(one_s * (missing - run.progress))
 
 
 def rated_count(session: Session, participant_id: int) -> int:

@@ -12,7 +12,7 @@ from sqlalchemy.orm import Session, aliased, joinedload
 
 from app.db import now
 from app.domain.preferences import LabelEvent, Purpose, Query
-from app.domain.studies import Participant
+from app.domain.studies import Awaited, Participant
 from app.services import participant_events
 from app.services.participant_events import EventKind
 from app.storage import ArtefactStore
@@ -49,8 +49,8 @@ class Progress:
 
     answered: int
     wanted: int
-    seconds_left: int | None
-    """At the person's own recent pace; None while too little is known."""
+    pace_s: float | None
+    """From one answer to the next, the median of the newest ones; None while too little is known."""
     practised: int = 0
     practice_wanted: int = 0
 
@@ -122,14 +122,12 @@ def answers_given(session: Session, participant: Participant) -> Given:
 
 
 def progress_of(participant: Participant, given: Given) -> Progress:
-    """Given and wanted answers, and the time the rest will take."""
+    """Given and wanted answers, and how fast they come."""
     settings = participant.study.settings
-    pace_s = _pace_s(given.times)
-    left = max(0, settings.question_count - given.count)
     return Progress(
         answered=given.count,
         wanted=settings.question_count,
-        seconds_left=None if pace_s is None else round(pace_s * left),
+        pace_s=_pace_s(given.times),
         practised=given.practised,
         practice_wanted=settings.practice_pairs,
     )
@@ -155,6 +153,16 @@ def seen(participant: Participant) -> None:
     """Remember that the participant's browser was here."""
     if participant.last_seen_at is None or now() - participant.last_seen_at > SEEN_EVERY:
         participant.last_seen_at = now()
+
+
+def waits(participant: Participant, awaited: Awaited | None) -> None:
+    """Remember that the page shown now makes the participant wait, or (None) that it does not: work is ordered by it.
+
+    Whoever leaves and comes back to the same waiting page has waited all the time.
+    """
+    if participant.waiting_for != awaited:
+        participant.waiting_for = awaited
+        participant.waiting_since = None if awaited is None else now()
 
 
 def _ready(session: Session, store: ArtefactStore, participant: Participant) -> Iterator[Query]:

@@ -74,6 +74,8 @@ class FilterVersion:
     gate: float | None
     mode: Sequence[tuple[str, float]]
     notes: Sequence[str]
+    uses_reference: bool
+    """It changes nothing: what was learned was not surely better, or not without a price."""
     scenarios: int | None
     success: Change | None
     preference: Change | None
@@ -111,6 +113,7 @@ class _Filter(_Metrics):
     mode: dict[str, float] = Field(default_factory=dict)
     method: str | None = None
     notes: list[str] = Field(default_factory=list)
+    uses_reference: bool = False
 
 
 class _Weight(_Metrics):
@@ -141,6 +144,7 @@ def filter_version(model: Model, bundle: Bundle | None) -> FilterVersion:
         gate=metrics.gate,
         mode=sorted(metrics.mode.items()),
         notes=metrics.notes,
+        uses_reference=metrics.uses_reference,
         scenarios=evaluation.scenarios,
         success=_change("Success", "", evaluation.success, more_is_better=True),
         preference=_change("Preference, as the model sees it", "", evaluation.preference, more_is_better=True),

@@ -10,8 +10,8 @@ from pydantic import BaseModel, BeforeValidator, Field
 
 from app.domain.evaluation import Film, Rating, Trial
 from app.domain.protocol import LIKERT_POINTS, Stage
-from app.domain.studies import Participant
-from app.services import evaluating, querying, rating
+from app.domain.studies import Awaited, Participant
+from app.services import evaluating, preparing, querying, rating
 from app.services.evaluating import State, Turn
 from app.web.deps import NotYet, RowId, StudioDep, WritingSession
 from app.web.error_pages import wants_json
@@ -52,10 +52,11 @@ def show_evaluation(
     """The robot to watch and rate now, or how far the robots are."""
     querying.seen(participant)
     turn = evaluating.next_turn(session, studio.store, participant)
+    querying.waits(participant, Awaited.ROBOTS if turn.state is State.PREPARING else None)
     if wants_json(request):
         return JSONResponse(_for_script(request, turn))
     if turn.trial is None:
-        context: dict[str, Any] = {"turn": turn, "preparation": evaluating.preparation(session, participant)}
+        context: dict[str, Any] = {"turn": turn, "preparation": preparing.preparation(session, participant)}
         return participant_page(request, _TEMPLATES[State.PREPARING], participant, context)
     return _trial_page(request, participant, turn, turn.trial, None, _TEMPLATES[turn.state])
 

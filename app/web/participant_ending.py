@@ -7,8 +7,8 @@ from fastapi import APIRouter, Request
 from fastapi.responses import Response
 
 from app.domain.protocol import Stage
-from app.domain.studies import Participant
-from app.services import completion, dashboard, debrief, querying, stages
+from app.domain.studies import Awaited, Participant
+from app.services import completion, dashboard, debrief, preparing, querying, stages
 from app.web.deps import CurrentParticipant, NotYet, StudioDep, WritingSession
 from app.web.participant_pages import back_from, go, has_reached, participant_page
 
@@ -20,8 +20,12 @@ AtDebrief = Annotated[Participant, has_reached(Stage.DEBRIEF)]
 @router.get("/debrief", name="show_debrief")
 def show_debrief(request: Request, participant: AtDebrief, session: WritingSession) -> Response:
     """The person's own robot before and after, side by side, and what it learned; or that it is still being made."""
+    querying.seen(participant)
+    films = debrief.before_and_after(session, participant)
+    querying.waits(participant, None if films else Awaited.DEBRIEF)
     context = {
-        "films": debrief.before_and_after(session, participant),
+        "films": films,
+        "seconds_left": None if films else preparing.until_debrief_s(session, participant),
         "learned": debrief.learned(session, participant),
         "back_path": back_from(request, participant.study.settings, Stage.DEBRIEF),
     }
@@ -31,6 +35,7 @@ def show_debrief(request: Request, participant: AtDebrief, session: WritingSessi
 @router.post("/debrief", name="finish_debrief")
 def finish_debrief(request: Request, participant: AtDebrief, session: WritingSession) -> Response:
     """On to the end."""
+    querying.waits(participant, None)
     stages.finish(session, participant, Stage.DEBRIEF)
     return go(request, "show_next")
 

@@ -13,9 +13,10 @@ from sqlalchemy.orm import Session
 from app.domain import preferences
 from app.domain.clips import Clip
 from app.domain.preferences import Purpose, SkipReason
-from app.domain.studies import Participant
-from app.services import labelling, participant_events, querying
+from app.domain.studies import Awaited, Participant
+from app.services import estimates, labelling, participant_events, querying, time_left
 from app.services.participant_events import EventKind
+from app.services.time_left import TimeLeft
 from app.web.deps import CurrentParticipant, RowId, Studio, StudioDep, WritingSession
 from app.web.error_pages import wants_json
 from app.web.participant_pages import go, participant_page
@@ -76,12 +77,15 @@ def show_turn(request: Request, session: Session, studio: Studio, participant: P
     """
     querying.seen(participant)
     turn = querying.next_turn(session, studio.store, participant)
-    state = _turn_for_script(request, turn, wording_of(participant))
+    querying.waits(participant, Awaited.PAIR if _state(turn) == "waiting" else None)
+    state = _turn_for_script(request, session, participant, turn)
     if wants_json(request):
         return JSONResponse(state)
     if turn.break_due:
         participant_events.note_once(session, participant, EventKind.BREAK_BEGUN, turn.progress.answered)
     context: dict[str, Any] = {"turn": turn, "state": state, "undo_uuid": uuid4()}
+    if state["state"] == "waiting":
+        context["seconds_left"] = estimates.until_pair_s(session, participant.study)
     if turn.query is not None:
         context |= {"pair": _pair(request, turn.query), "client_uuid": uuid4(), "reasons": list(SkipReason)}
     return participant_page(request, f"participant/{_template(turn)}.html", participant, context)
@@ -135,13 +139,15 @@ def note_event(
     return Response(status_code=HTTPStatus.NO_CONTENT)
 
 
-def time_left(say: Wording, seconds: int) -> str:
-    """A remaining time in words, rounded as roughly as it is known."""
-    if seconds < 1.5 * _MINUTE_S:
-        return say("pair-time-left-minute")
-    if seconds < 1.5 * _HOUR_S:
-        return say("pair-time-left-minutes", minutes=round(seconds / _MINUTE_S))
-    return say("pair-time-left-hours", hours=round(seconds / _HOUR_S, 1))
+def in_words(say: Wording, left: TimeLeft) -> str:
+    """A remaining time, rounded as roughly as it is known; of the comparing alone while the rest is not known."""
+    if left.seconds < 1.5 * _MINUTE_S:
+        time = say("pair-time-left-minute")
+    elif left.seconds < 1.5 * _HOUR_S:
+        time = say("pair-time-left-minutes", minutes=round(left.seconds / _MINUTE_S))
+    else:
+        time = say("pair-time-left-hours", hours=round(left.seconds / _HOUR_S, 1))
+    return time if left.is_all else say("pair-time-left-comparing", time=time)
 
 
 def _template(turn: querying.Turn) -> str:
@@ -158,18 +164,21 @@ def _go_on(request: Request, session: Session, studio: Studio, participant: Part
     if not wants_json(request):
         return go(request, "show_next")
     turn = querying.next_turn(session, studio.store, participant)
-    return JSONResponse(_turn_for_script(request, turn, wording_of(participant)))
+    querying.waits(participant, Awaited.PAIR if _state(turn) == "waiting" else None)
+    return JSONResponse(_turn_for_script(request, session, participant, turn))
 
 
-def _turn_for_script(request: Request, turn: querying.Turn, say: Wording) -> dict[str, Any]:
-    progress = turn.progress
+def _turn_for_script(
+    request: Request, session: Session, participant: Participant, turn: querying.Turn
+) -> dict[str, Any]:
+    progress, left = turn.progress, time_left.time_left(session, participant, turn.progress)
     practising = progress.practising
     return {
         "state": _state(turn),
         "practising": practising,
         "answered": progress.practised if practising else progress.answered,
         "wanted": progress.practice_wanted if practising else progress.wanted,
-        "time_left": None if progress.seconds_left is None else time_left(say, progress.seconds_left),
+        "time_left": None if left is None else in_words(wording_of(participant), left),
         "pair": None if turn.query is None else vars(_pair(request, turn.query)),
         "following": [vars(_pair(request, query)) for query in turn.following],
         "undo_path": None

@@ -105,25 +105,30 @@ debrief-films-making = Die Filme entstehen gerade
 debrief-films-making-text = Ihr Roboter hat gelernt; nun wird er gefilmt. Sie brauchen nicht zu warten: Gehen Sie weiter, und öffnen Sie Ihren Link später noch einmal, um ihn zu sehen.
 debrief-learned = Was er von Ihnen gelernt hat
 debrief-learned-how = Verglichen mit dem Roboter vorher, über { $count } Situationen, die neu für ihn waren:
+debrief-learned-reference = Wir haben in { $count } Situationen, die für den Roboter neu waren, ausprobiert, was Ihre Antworten nahelegten. Nichts davon war sicher besser für Sie, ohne einen Nachteil zu haben. Ihr Roboter ist deshalb der, den alle kennenlernen: Beide Filme zeigen denselben Roboter.
 debrief-learned-nothing = Über { $count } Situationen, die neu für ihn waren, bewegt er sich ganz ähnlich wie der Roboter vorher. Entweder mochten Sie jenen, oder Ihre Antworten zogen in verschiedene Richtungen; beides ist in Ordnung.
+debrief-pace-quicker = Er bewegt sich schneller ({ $percent } % mehr) und ist eher bei Ihnen.
+debrief-pace-calmer = Er bewegt sich langsamer ({ $percent } % weniger) und lässt sich auf dem Weg zu Ihnen mehr Zeit.
+debrief-pace-less-motion = Er bewegt sich weniger ({ $percent } % weniger) und ist trotzdem eher bei Ihnen.
+debrief-pace-more-motion = Er bewegt sich mehr ({ $percent } % mehr) und braucht doch länger bis zu Ihnen.
 debrief-C_d-less = Er ist eher bei Ihnen.
 debrief-C_d-more = Er lässt sich auf dem Weg zu Ihnen mehr Zeit.
 debrief-C_d-much = Er lässt sich auf dem Weg zu Ihnen viel mehr Zeit.
 debrief-C_v-less = Er bewegt sich langsamer ({ $percent } % weniger).
 debrief-C_v-more = Er bewegt sich schneller ({ $percent } % mehr).
 debrief-C_v-much = Er bewegt sich viel schneller.
-debrief-C_f-less = Er berührt Sie seltener, wo er nicht soll ({ $percent } % weniger).
-debrief-C_f-more = Er berührt Sie unterwegs öfter ({ $percent } % mehr).
-debrief-C_f-much = Er berührt Sie unterwegs viel öfter.
-debrief-C_hf-less = Er drückt weniger stark ({ $percent } % weniger).
-debrief-C_hf-more = Er drückt stärker ({ $percent } % mehr).
-debrief-C_hf-much = Er drückt viel stärker.
+debrief-C_f-less = Er berührt Sie weniger, wo er nicht soll ({ $percent } % weniger).
+debrief-C_f-more = Er berührt Sie mehr, wo er nicht soll ({ $percent } % mehr).
+debrief-C_f-much = Er berührt Sie viel mehr, wo er nicht soll.
+debrief-C_hf-less = Wo er Sie berühren soll, drückt er weniger stark ({ $percent } % weniger).
+debrief-C_hf-more = Wo er Sie berühren soll, drückt er stärker ({ $percent } % mehr).
+debrief-C_hf-much = Wo er Sie berühren soll, drückt er viel stärker.
 debrief-C_fd-less = Er verschüttet weniger auf Sie ({ $percent } % weniger).
 debrief-C_fd-more = Er verschüttet mehr auf Sie ({ $percent } % mehr).
 debrief-C_fd-much = Er verschüttet viel mehr auf Sie.
-debrief-C_fdv-less = Was er bringt, kommt langsamer zu Ihnen ({ $percent } % weniger).
-debrief-C_fdv-more = Was er bringt, kommt schneller zu Ihnen ({ $percent } % mehr).
-debrief-C_fdv-much = Was er bringt, kommt viel schneller zu Ihnen.
+debrief-C_fdv-less = Essen oder Trinken kommt langsamer in Ihren Mund ({ $percent } % weniger).
+debrief-C_fdv-more = Essen oder Trinken kommt schneller in Ihren Mund ({ $percent } % mehr).
+debrief-C_fdv-much = Essen oder Trinken kommt viel schneller in Ihren Mund.
 debrief-done = Abschließen
 
 ## Das Ende
@@ -218,6 +223,7 @@ pair-right-clip = Rechtes Video
 pair-progress = Ihr Fortschritt
 pair-count = { $answered } von { $wanted }
 pair-time-left = noch { $time }
+pair-time-left-comparing = { $time } zum Vergleichen
 pair-time-left-minute = etwa eine Minute
 pair-time-left-minutes = etwa { $minutes } min
 pair-time-left-hours = etwa { $hours } h
@@ -280,6 +286,17 @@ break-left-unknown = Noch { $count }.
 break-go-on = Weiter
 break-key = Die Eingabetaste geht weiter
 
+## Warten (prefix wait-)
+
+evaluation-minutes-left =
+    { $minutes ->
+        [one] Noch etwa eine Minute.
+       *[other] Noch etwa { $minutes } Minuten.
+    }
+wait-hours = Noch etwa { $hours } Stunden.
+wait-unknown = Wie lange es dauert, lässt sich noch nicht sagen: Mit diesen Einstellungen ist es das erste Mal.
+wait-others-first = Es kann länger dauern, weil andere schon vor Ihnen warten.
+
 ## Bewertung (Vorsilbe evaluation-)
 
 evaluation-progress = Bewertete Roboter
@@ -319,17 +336,14 @@ evaluation-moving = Roboter { $letter } bewegt sich, bitte schauen Sie zu
 evaluation-moving-text = Sobald er fertig ist, werden Sie nach Ihrer Meinung gefragt.
 evaluation-waiting-title = Ihre Roboter werden vorbereitet
 evaluation-waiting-text = Sie lernen aus Ihren Antworten. Wenn sie fertig sind, sehen Sie jeden bei der Arbeit und bewerten ihn. Sie kennen sie nur unter Buchstaben.
+evaluation-next-title = Der nächste Roboter wird vorbereitet
+evaluation-next-text = { $rated } von { $wanted } Bewertungen sind sicher gespeichert. Der nächste Film entsteht gerade; es geht von selbst weiter.
 evaluation-waiting-progress = Wie weit Ihre Roboter sind
 evaluation-step-learning = Aus Ihren Antworten wird gelernt
 evaluation-step-training = Die Roboter werden trainiert
 evaluation-step-filming = Die Roboter werden gefilmt
 evaluation-step-packing = Die Roboter werden bereitgestellt
 evaluation-robots-ready = { $ready } von { $count } Robotern sind trainiert; { $percent } % der ganzen Arbeit sind getan.
-evaluation-minutes-left =
-    { $minutes ->
-        [one] Noch etwa eine Minute, länger, wenn andere vor Ihnen sind.
-       *[other] Noch etwa { $minutes } Minuten, länger, wenn andere vor Ihnen sind.
-    }
 evaluation-may-close = Sie können diese Seite schließen: Ihre Antworten sind sicher gespeichert, und die Arbeit geht ohne Sie weiter. Ihr Link bringt Sie hierher zurück. Wenn Sie die Seite offen lassen, geht sie von selbst weiter.
 evaluation-trouble = Etwas ist schiefgegangen. Es wird noch einmal versucht, und die Person, von der Sie den Link haben, kann es sehen. Nichts von Ihnen ist verloren.
 evaluation-done-title = Alle Roboter sind bewertet

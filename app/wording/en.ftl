@@ -107,7 +107,12 @@ debrief-films-making = The films are still being made
 debrief-films-making-text = Your robot has learned; now it is being filmed. You need not wait: go on, and open your link again later to see it.
 debrief-learned = What it learned from you
 debrief-learned-how = Compared with the robot before, over { $count } situations it had not met:
+debrief-learned-reference = We tried what your answers suggested in { $count } situations that were new to the robot. Nothing there was surely better for you without a drawback, so your robot is the one that everybody meets: both films show the same robot.
 debrief-learned-nothing = Over { $count } situations it had not met, it moves much like the robot before. Either you liked that one, or your answers pulled in several directions; both are fine.
+debrief-pace-quicker = It moves more quickly ({ $percent } % more) and is with you sooner.
+debrief-pace-calmer = It moves more slowly ({ $percent } % less) and takes more time on its way to you.
+debrief-pace-less-motion = It moves less ({ $percent } % less) and is with you sooner all the same.
+debrief-pace-more-motion = It moves more ({ $percent } % more) and yet takes longer to be with you.
 debrief-C_d-less = It is with you sooner.
 debrief-C_d-more = It takes more time on its way to you.
 debrief-C_d-much = It takes much more time on its way to you.
@@ -115,17 +120,17 @@ debrief-C_v-less = It moves more slowly ({ $percent } % less).
 debrief-C_v-more = It moves more quickly ({ $percent } % more).
 debrief-C_v-much = It moves much more quickly.
 debrief-C_f-less = It touches you less where it should not ({ $percent } % less).
-debrief-C_f-more = It touches you more on its way ({ $percent } % more).
-debrief-C_f-much = It touches you much more on its way.
-debrief-C_hf-less = It presses less hard ({ $percent } % less).
-debrief-C_hf-more = It presses harder ({ $percent } % more).
-debrief-C_hf-much = It presses much harder.
+debrief-C_f-more = It touches you more where it should not ({ $percent } % more).
+debrief-C_f-much = It touches you much more where it should not.
+debrief-C_hf-less = Where it is meant to touch you, it presses less hard ({ $percent } % less).
+debrief-C_hf-more = Where it is meant to touch you, it presses harder ({ $percent } % more).
+debrief-C_hf-much = Where it is meant to touch you, it presses much harder.
 debrief-C_fd-less = It spills less on you ({ $percent } % less).
 debrief-C_fd-more = It spills more on you ({ $percent } % more).
 debrief-C_fd-much = It spills much more on you.
-debrief-C_fdv-less = What it brings comes to you more slowly ({ $percent } % less).
-debrief-C_fdv-more = What it brings comes to you more quickly ({ $percent } % more).
-debrief-C_fdv-much = What it brings comes to you much more quickly.
+debrief-C_fdv-less = Food or drink enters your mouth more slowly ({ $percent } % less).
+debrief-C_fdv-more = Food or drink enters your mouth more quickly ({ $percent } % more).
+debrief-C_fdv-much = Food or drink enters your mouth much more quickly.
 debrief-done = Finish
 
 ## The end
@@ -220,6 +225,7 @@ pair-right-clip = Right clip
 pair-progress = Your progress
 pair-count = { $answered } of { $wanted }
 pair-time-left = { $time } left
+pair-time-left-comparing = { $time } of comparing
 pair-time-left-minute = about a minute
 pair-time-left-minutes = about { $minutes } min
 pair-time-left-hours = about { $hours } h
@@ -282,6 +288,17 @@ break-left-unknown = { $count } to go.
 break-go-on = Go on
 break-key = Enter goes on
 
+## Waiting (prefix wait-)
+
+evaluation-minutes-left =
+    { $minutes ->
+        [one] About a minute to go.
+       *[other] About { $minutes } minutes to go.
+    }
+wait-hours = About { $hours } hours to go.
+wait-unknown = How long this takes is not known yet: it has not been done before with these settings.
+wait-others-first = It can take longer, because others have been waiting before you.
+
 ## Evaluation (prefix evaluation-)
 
 evaluation-progress = Robots you have rated
@@ -321,17 +338,14 @@ evaluation-moving = Robot { $letter } is moving, please watch
 evaluation-moving-text = You will be asked about it as soon as it is done.
 evaluation-waiting-title = Your robots are being prepared
 evaluation-waiting-text = They are trained on your answers. When they are ready you will watch each of them at work and rate it. You will know them by letters only.
+evaluation-next-title = The next robot is being prepared
+evaluation-next-text = { $rated } of { $wanted } ratings are safely stored. The next film is in the making, and this page goes on by itself.
 evaluation-waiting-progress = How far your robots are
 evaluation-step-learning = Learning from your answers
 evaluation-step-training = Training the robots
 evaluation-step-filming = Filming the robots
 evaluation-step-packing = Getting the robots ready
 evaluation-robots-ready = { $ready } of { $count } robots are trained; { $percent } % of everything is done.
-evaluation-minutes-left =
-    { $minutes ->
-        [one] About a minute to go, longer if others are before you.
-       *[other] About { $minutes } minutes to go, longer if others are before you.
-    }
 evaluation-may-close = You may close this page: your answers are safely stored, and the work goes on without you. Your link brings you back here. If you leave the page open, it goes on by itself.
 evaluation-trouble = Something went wrong. It is being tried again, and the person who sent you the link can see it. Nothing of yours is lost.
 evaluation-done-title = All robots are rated

@@ -1,5 +1,8 @@
 """The person's own robot before and after, what it learned, and honesty while it is still being made."""
 
+import itertools
+import re
+from collections.abc import Iterable
 from typing import Any
 
 import pytest
@@ -7,10 +10,11 @@ import pytest
 from app.domain.models import Model, ModelKind
 from app.domain.participation import StageRecord
 from app.domain.preferences import Query
-from app.domain.protocol import Stage
+from app.domain.protocol import Language, Stage
 from app.domain.studies import Participant, Study
-from app.services import debrief
+from app.services import debrief, results
 from app.storage import ArtefactStore
+from app.web.wording import Wording
 from tests import factories
 from tests.app.conftest import TakingPart
 
@@ -55,10 +59,57 @@ def test_before_and_after_are_shown_side_by_side_in_one_scenario(at_debrief: Tak
 def test_what_is_certain_is_said_in_plain_words_and_nothing_else(at_debrief: TakingPart) -> None:
     add_filter(at_debrief, factories.filter_metrics())
     page = at_debrief.browser.get("/p/debrief").text
-    assert "It moves more slowly (41\N{NO-BREAK SPACE}% less)." in page
-    assert "It presses less hard (63\N{NO-BREAK SPACE}% less)." in page
-    assert "It takes more time on its way to you." in page
+    assert "It moves more slowly (41\N{NO-BREAK SPACE}% less) and takes more time on its way to you." in page
+    assert "it presses less hard (63\N{NO-BREAK SPACE}% less)." in page
     assert "touches you" not in page, "its interval holds zero"
+
+
+PACE = re.compile(r"quick|slow|sooner|more time|longer|moves|schnell|langsam|eher|Zeit|länger|bewegt")
+MOUTH = re.compile(r"mouth|Mund")
+ABOUT = (
+    PACE,
+    re.compile(r"where it should not|wo er nicht soll"),
+    re.compile(r"presses|drückt"),
+    re.compile(r"spill|verschüttet"),
+    MOUTH,
+)
+"""What a sentence can be about: the way to the person, touching on it, pressing at its end, spilling, the mouthful."""
+SAYS = {
+    "C_d": ("sooner|eher bei", "time on its way|longer|Zeit|länger"),
+    "C_v": ("slowly|moves less|langsamer|weniger", "quickly|moves more|schneller|mehr"),
+}
+"""For the two costs that share sentences, how a decrease and an increase is said."""
+LEAST = debrief.NOTICED_PERCENT / 100
+
+
+def measured(sizes: Iterable[float]) -> list[results.Change]:
+    """Changes of the six costs by these shares of what they were, all of them certain."""
+    return [
+        results.Change("", symbol, False, 2.0, 2.0 * (1 + size), 2.0 * size, 1.9 * size, 2.1 * size)
+        for symbol, size in zip(results.COST_SYMBOLS, sizes, strict=True)
+    ]
+
+
+@pytest.mark.parametrize("language", Language)
+def test_no_two_sentences_contradict_each_other_whatever_was_measured(language: Language) -> None:
+    say = Wording(language)
+    for sizes in itertools.product((-0.6, 0.03, 0.4, 3.0), repeat=len(results.COST_SYMBOLS)):
+        lessons = debrief.lessons_of(measured(sizes))
+        sentences = [say(f"debrief-{lesson.words}", percent=lesson.percent) for lesson in lessons]
+        about_the_way = [each for each in sentences if PACE.search(each) and not MOUTH.search(each)]
+        assert len(about_the_way) <= 1, about_the_way
+        for topic in ABOUT[1:]:
+            assert sum(bool(topic.search(each)) for each in sentences) <= 1, sentences
+        noticed = {symbol: size for symbol, size in zip(results.COST_SYMBOLS, sizes, strict=True) if abs(size) >= LEAST}
+        said = len(noticed) - ({"C_d", "C_v"} <= noticed.keys())
+        assert len(sentences) == said, "every noticeable change is said, and nothing else"
+        for symbol, (less, more) in SAYS.items():
+            if symbol in noticed:
+                assert re.search(more if noticed[symbol] > 0 else less, " ".join(about_the_way)), (symbol, sentences)
+
+
+def test_a_change_too_small_to_be_noticed_is_not_spoken_of_however_certain() -> None:
+    assert debrief.lessons_of(measured([-LEAST, LEAST - 0.01, 0, 0, 0, 0])) == [debrief.Lesson("C_d-less", 5)]
 
 
 def test_a_multiple_of_almost_nothing_is_called_much_and_not_a_percentage(at_debrief: TakingPart) -> None:
@@ -77,6 +128,13 @@ def test_a_robot_that_learned_nothing_certain_is_not_made_more_of(at_debrief: Ta
         cost |= {"low": -1.0, "high": 1.0}
     add_filter(at_debrief, metrics)
     assert "much like the robot before" in at_debrief.browser.get("/p/debrief").text
+
+
+def test_a_robot_that_is_the_reference_is_called_that(at_debrief: TakingPart) -> None:
+    add_filter(at_debrief, factories.filter_metrics() | {"uses_reference": True})
+    page = at_debrief.browser.get("/p/debrief").text
+    assert "your robot is the one that everybody meets" in page
+    assert "slowly" not in page
 
 
 def test_metrics_that_cannot_be_read_are_no_lesson(at_debrief: TakingPart) -> None:

@@ -18,7 +18,9 @@ from app.domain.preferences import LabelEvent, Query, Response
 from app.domain.studies import Participant, Study, StudySettings
 from app.settings import Settings
 from app.storage import ArtefactStore
+from worker.compute import Compute
 from worker.trajectory import COSTS, SIGNALS, Trajectory
+from worker.turns import Turns
 from worker.workflows import Workshop
 from worker.workplace import Workplace
 
@@ -28,7 +30,7 @@ STEPS = 20
 @cache
 def the_workshop() -> Workshop:
     """The engine knows one workshop per process; whoever borrows it gives it a place."""
-    return Workshop(cast("Workplace", None))
+    return Workshop(cast("Workplace", None), Turns(Compute(1)))
 
 
 def make_trajectory(scenario: int, behaviour: int, steps: int = STEPS) -> Trajectory:

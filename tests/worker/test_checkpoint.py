@@ -10,7 +10,7 @@ import pytest
 from tests.worker import invented
 from tests.worker.test_methods import POLICY, REWARD, World
 from worker.ml import checkpoint, preference_rl, prefft
-from worker.ml.checkpoint import Abandoned, Checkpoint
+from worker.ml.checkpoint import Abandoned, Checkpoint, Paused
 from worker.ml.policies import GaussianPolicy
 from worker.ml.prefft import FineTuning
 
@@ -59,6 +59,19 @@ def test_a_killed_training_goes_on_and_makes_only_the_missing_steps(tmp_path: Pa
     seen = invented.observations(100, np.random.default_rng(0))
     assert np.abs(policy.mean(seen) - POLICY.mean(seen)).max() > 1e-3
     assert np.isfinite(policy.mean(seen)).all()
+
+
+def test_a_training_that_is_asked_to_pause_keeps_what_it_has_and_goes_on_later(tmp_path: Path) -> None:
+    checkpoint.ask_to_pause(tmp_path)
+    with pytest.raises(Paused):
+        tuned(World, Checkpoint(tmp_path))
+    kept = Checkpoint(tmp_path).read()
+    assert kept is not None
+    assert kept[1]["steps"] < CONFIG.steps
+    checkpoint.begin_again(tmp_path)
+    CountedWorld.steps = 0
+    tuned(CountedWorld, Checkpoint(tmp_path))
+    assert CountedWorld.steps <= CONFIG.steps - kept[1]["steps"] + 2 * CONFIG.environments
 
 
 def test_keeping_checkpoints_does_not_change_the_result(tmp_path: Path) -> None:

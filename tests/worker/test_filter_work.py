@@ -7,12 +7,15 @@ import pytest
 from sqlalchemy import func, select
 
 from app.db import Database
+from app.domain.clips import Clip
 from app.domain.models import Model, ModelKind, RunKind
-from app.domain.studies import Participant
+from app.domain.preferences import Query, Response
+from app.domain.studies import Participant, Study
 from app.storage import ArtefactStore
 from worker import records
 from worker.compute import Compute
 from worker.filter_work import NothingToLearnFrom, train_filter
+from worker.outdated import is_outdated
 from worker.records import Job
 from worker.workplace import Workplace
 
@@ -53,6 +56,51 @@ def test_a_filter_that_has_seen_the_same_labels_is_not_trained_again(
     job, run_id = begin(place, participant, RunKind.FILTER, "filter/participant-1/labels-10")
     train_filter(place, job, run_id, at_once)
     assert count_filters(place) == 1
+
+
+@pytest.fixture
+def answered(
+    add_clips: Callable[[int, int], list[Clip]], answer: Callable[[Clip, Clip, Response], Query]
+) -> Callable[[int], None]:
+    """Give so many answers."""
+    clips = [clip for scenario in range(6) for clip in add_clips(scenario, 4)]
+
+    def say(how_many: int) -> None:
+        for index in range(how_many):
+            answer(clips[index], clips[index + 1], Response.LEFT)
+
+    return say
+
+
+def outdated_at(place: Workplace, participant: Participant, milestone: int, *, begun: bool) -> bool:
+    name = f"filter/participant-{participant.id}/labels-{milestone}"
+    job = Job(name, RunKind.FILTER, participant.study_id, participant.id, milestone)
+    with place.database.reading() as session:
+        return is_outdated(session, job, begun=begun)
+
+
+def test_of_two_milestones_that_were_passed_only_the_newer_filter_is_trained(
+    place: Workplace, participant: Participant, answered: Callable[[int], None]
+) -> None:
+    answered(15)
+    assert not outdated_at(place, participant, 10, begun=False)
+    save_model(place, participant, ModelKind.REWARD, "ten labels")
+    with place.database.writing() as session:
+        study = session.get_one(Study, participant.study_id)
+        study.stored_settings = {**study.stored_settings, "filter_milestones": [10, 15]}
+    job, run_id = begin(place, participant, RunKind.FILTER, f"filter/participant-{participant.id}/labels-10")
+    train_filter(place, job, run_id, at_once)
+    assert count_filters(place) == 0, "the one of 15 is due"
+    assert not outdated_at(place, participant, 10, begun=True), "one that has begun is finished while they answer"
+    assert not outdated_at(place, participant, 15, begun=False)
+
+
+def test_after_the_last_answer_an_earlier_filter_is_not_even_finished(
+    place: Workplace, participant: Participant, answered: Callable[[int], None]
+) -> None:
+    answered(20)
+    assert outdated_at(place, participant, 10, begun=True)
+    assert not outdated_at(place, participant, 20, begun=True)
 
 
 def test_without_a_reward_model_the_run_says_why_there_is_no_filter(place: Workplace, participant: Participant) -> None:

@@ -10,7 +10,7 @@ from app.domain.clips import Clip
 from app.domain.models import Run, RunKind, RunStatus
 from app.domain.preferences import LabelEvent, Query, Response
 from app.domain.studies import Participant, Study, StudySettings
-from worker import reconcile, records
+from worker import outdated, reconcile, records
 
 AddClips = Callable[..., list[Clip]]
 Answer = Callable[[Clip, Clip, Response], Query]
@@ -139,7 +139,7 @@ def test_a_failed_run_is_tried_again_a_few_times_and_then_only_when_somebody_ask
 
 def test_milestones_that_were_passed_in_the_meantime_are_skipped() -> None:
     settings = StudySettings(filter_milestones=(50, 100))
-    assert [reconcile.filter_due(settings, count) for count in (49, 50, 99, 130, 199, 200)] == [
+    assert [outdated.filter_due(settings, count) for count in (49, 50, 99, 130, 199, 200)] == [
         0,
         50,
         50,
@@ -151,7 +151,7 @@ def test_milestones_that_were_passed_in_the_meantime_are_skipped() -> None:
 
 def test_the_end_is_a_retraining_even_when_the_cadence_does_not_divide_it() -> None:
     settings = StudySettings(labels_per_participant=25, retrain_every_labels=10)
-    assert [reconcile.reward_due(settings, count) for count in (9, 10, 24, 25)] == [0, 10, 20, 25]
+    assert [outdated.reward_due(settings, count) for count in (9, 10, 24, 25)] == [0, 10, 20, 25]
 
 
 def test_queries_are_made_ahead_but_never_more_than_planned(

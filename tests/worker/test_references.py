@@ -1,6 +1,7 @@
 """The reference policy's rollouts are there before the first filter of a study needs them."""
 
 from collections.abc import Iterator
+from typing import cast
 
 import numpy as np
 import pytest
@@ -18,9 +19,9 @@ SETTINGS = StudySettings(evaluation_scenarios=10)
 
 @pytest.fixture
 def place(database: Database, store: ArtefactStore) -> Iterator[Workplace]:
-    place = Workplace(database, store, Compute(2))
-    yield place
-    place.compute.close()
+    compute = Compute(2)
+    yield Workplace(database, store, compute)
+    compute.close()
 
 
 def fitting(place: Workplace) -> Fitting:
@@ -41,7 +42,7 @@ def test_they_are_those_a_filter_would_make_for_itself(place: Workplace) -> None
     own = fitting(place).reference(evaluation)
     del place.references["feeding", evaluation]
     make_ready(place.compute, place.references, "feeding", SETTINGS)
-    place.compute.close()  # whatever was missing now could not be made any more
+    cast("Compute", place.compute).close()  # whatever was missing now could not be made any more
     for scenarios in reference_blocks("feeding", SETTINGS):
         assert [each.scenario for each in fitting(place).reference(scenarios)] == list(scenarios)
     for ahead, mine in zip(fitting(place).reference(evaluation), own, strict=True):
@@ -52,7 +53,7 @@ def test_they_are_those_a_filter_would_make_for_itself(place: Workplace) -> None
 def test_what_is_there_is_not_made_again(place: Workplace) -> None:
     for scenarios in reference_blocks("feeding", SETTINGS):
         place.references["feeding", scenarios] = []
-    place.compute.close()
+    cast("Compute", place.compute).close()
     make_ready(place.compute, place.references, "feeding", SETTINGS)
     assert set(map(len, place.references.values())) == {0}
 

@@ -176,6 +176,7 @@ def _manifest(contents: BundleContents) -> dict[str, Any]:
         "residual_share": weights.residual_share if weights.encoder else 0.0,
         "reward_kind": contents.reward.kind,
         "signals": list(SIGNALS),
+        "uses_reference_policy": bool(contents.metrics.get("uses_reference")),
         "learned_weights": contents.metrics.get("weights"),
         "learned_costs": contents.metrics.get("costs"),
         "evaluation": contents.metrics.get("evaluation"),

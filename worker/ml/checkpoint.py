@@ -15,13 +15,17 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-STATE_FILE, NOTE_FILE = "state.safetensors", "share"
+STATE_FILE, NOTE_FILE, PAUSE_FILE = "state.safetensors", "share", "pause"
 EVERY_S = 45.0
 NOTE_EVERY_S = 1.0
 
 
 class Abandoned(RuntimeError):
     """The folder of this training has been removed, so its result is not wanted any more."""
+
+
+class Paused(RuntimeError):
+    """Somebody else needs the process; the training goes on from its checkpoint later."""
 
 
 @dataclass
@@ -32,14 +36,17 @@ class Checkpoint:
     every_s: float = EVERY_S
     _written_at: float = field(default_factory=time.monotonic)
     _noted_at: float = float("-inf")
+    pause_is_asked: bool = field(default=False, init=False)
+    """as of the last note"""
 
     def note(self, share: float) -> None:
-        """Say which share of the training is done; at most once a second. Raises Abandoned."""
+        """Say which share of the training is done, and see whether to pause; once a second. Raises Abandoned."""
         if time.monotonic() - self._noted_at < NOTE_EVERY_S:
             return
         if not self.folder.is_dir():
             raise Abandoned(" ".join((Abandoned.__doc__ or "").split()))
         self._noted_at = time.monotonic()
+        self.pause_is_asked = (self.folder / PAUSE_FILE).exists()
         self._replace(NOTE_FILE, lambda path: path.write_text(f"{share:.4f}"))
 
     @property
@@ -70,6 +77,17 @@ class Checkpoint:
         except FileNotFoundError as error:
             raise Abandoned(" ".join((Abandoned.__doc__ or "").split())) from error
         temporary.replace(self.folder / name)
+
+
+def ask_to_pause(folder: Path) -> None:
+    """Have the training in this folder write a checkpoint and raise Paused; forgotten when it begins again."""
+    if folder.is_dir():
+        (folder / PAUSE_FILE).touch()
+
+
+def begin_again(folder: Path) -> None:
+    """Forget that anybody asked for a pause."""
+    (folder / PAUSE_FILE).unlink(missing_ok=True)
 
 
 def share_done(folder: Path) -> float:

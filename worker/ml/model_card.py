@@ -51,7 +51,7 @@ def model_card(manifest: Mapping[str, Any]) -> str:
     """Markdown, from the manifest."""
     sections = [
         _what(manifest),
-        _way(manifest),
+        _REFERENCE if manifest.get("uses_reference_policy") else _way(manifest),
         _matters(manifest),
         _measured(manifest.get("evaluation")),
         _notes(manifest),
@@ -59,6 +59,13 @@ def model_card(manifest: Mapping[str, Any]) -> str:
         _LIMITS,
     ]
     return "\n\n".join(section for section in sections if section) + "\n"
+
+
+_REFERENCE = """## This is the reference policy
+
+**The filter in this bundle changes nothing: every action is the reference policy's own.** Nothing that was learned from
+this person's comparisons was surely better for them without a price in success, force, speed or spills; the notes say
+what was tried."""
 
 
 def _what(manifest: Mapping[str, Any]) -> str:

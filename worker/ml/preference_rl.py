@@ -14,7 +14,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from worker.ml.checkpoint import Checkpoint
+from worker.ml.checkpoint import Checkpoint, Paused
 from worker.ml.policies import GaussianPolicy
 from worker.ml.reward_models import RewardModel
 from worker.ml.sac import Learner, Replay, SacConfig
@@ -107,12 +107,14 @@ class PreferenceRl:
 
     def _keep_state(self, learner: Learner, checkpoint: Checkpoint) -> None:
         checkpoint.note(self.steps / self.config.total_steps)
-        if checkpoint.is_due:
+        if checkpoint.is_due or checkpoint.pause_is_asked:
             rows = self.replay.rows[: self.replay.count]
             tensors = {**learner.state(), "replay": rows, "torch_rng": torch.get_rng_state()}
             rng = self.rng.bit_generator.state
             counts = {"steps": self.steps, "updates": learner.updates, "rng": rng}
             checkpoint.write(tensors, {**counts, "target_entropy": learner.config.target_entropy})
+        if checkpoint.pause_is_asked:
+            raise Paused(Paused.__doc__)
 
     def close(self) -> None:
         """Free the environments."""

@@ -1,0 +1,128 @@
+"""Prints how long a participant waits from the last answer to the first robot, and how good what they are told is.
+
+A scripted participant takes the paper's protocol with small settings while another study, which nobody has opened, is
+short of clips. From the last answer on they look at the waiting page like a browser without script.
+
+Usage: python tests/benchmarks/first_robot.py [fine-tuning steps] [participants one after the other]
+"""
+
+import re
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from sqlalchemy import select
+
+from app.db import Database
+from app.domain.evaluation import Film, Trial
+from app.domain.models import Run, RunKind, RunStatus
+from app.domain.protocol import EvaluationSettings
+from app.domain.studies import PAPER_PROTOCOL, StudySettings
+from app.services import enrolment, evaluating, studies
+from app.storage import ArtefactStore
+from worker.ml.teachers import TASTES, Manner
+from worker.own_studio import OwnStudio, wait_until
+from worker.scripted_person import ScriptedPerson
+from worker.visitor import Visitor
+
+LABELS, TRIALS = 12, 1
+PACE_S = 2.0
+"""Between two answers: slow enough for a filter to be in the making when the last one comes."""
+PATIENCE_S = 3600.0
+TOLD = re.compile(r"bout (a|\d+) minutes? to go")
+
+
+def main() -> None:
+    steps = int(sys.argv[1]) if len(sys.argv) > 1 else 1_000
+    people = int(sys.argv[2]) if len(sys.argv) > 2 else 2
+    small = {
+        "labels_per_participant": LABELS,
+        "introduction_pairs": 2,
+        "filter_milestones": (6,),
+        "pool_scenarios": 2,
+        "evaluation_scenarios": 10,
+        "retrain_every_labels": 6,
+        "evaluation": EvaluationSettings(fine_tuning_steps=steps, trials=TRIALS),
+    }
+    with tempfile.TemporaryDirectory() as directory, OwnStudio(Path(directory)) as studio:
+        database = Database(studio.settings.sqlalchemy_url)
+        with database.writing() as session:
+            studies.create_study(session, "Nobody's", StudySettings(pool_scenarios=200), seed=1)
+            study = studies.create_study(
+                session, "Somebody's", StudySettings(**{**PAPER_PROTOCOL.model_dump(), **small}), seed=2
+            )
+            tokens = [enrolment.add_participant(session, study) for _ in range(people)]
+        for participant, token in tokens:
+            store = ArtefactStore(Path(directory) / "artefacts")
+            person = ScriptedPerson(database, store, study, TASTES["cautious"], Manner(), participant.number)
+            with Visitor(studio.settings.base_url, f"/p/{token}") as visitor:
+                visitor.come_in()
+                for _ in range(study.settings.practice_pairs + study.settings.question_count):
+                    query_id = wait_until(PATIENCE_S, "no pair to label", visitor.query_id)
+                    time.sleep(PACE_S)
+                    visitor.answer(person.answer(query_id))
+                _wait(database, visitor, participant.id)
+            _report_runs(database, participant.id)
+        database.dispose()
+
+
+def _wait(database: Database, visitor: Visitor, participant_id: int) -> None:
+    """Look at the waiting page until there is a robot to rate, then see when the rest is there."""
+    began = time.monotonic()
+    told: list[tuple[float, float]] = []
+
+    def robot() -> int | None:
+        found = visitor.trial_id()
+        words = TOLD.search(visitor.text)
+        if found is None and words:
+            told.append((time.monotonic() - began, 60.0 * (1 if words[1] == "a" else int(words[1]))))
+        return found
+
+    wait_until(PATIENCE_S, "no robot to rate", robot)
+    first_s = time.monotonic() - began
+    _say(f"first robot after      {first_s:6.0f} s")
+    for share in (0.1, 0.25, 0.5, 0.75):
+        late = [each for each in told if each[0] >= share * first_s]
+        if late:
+            at_s, left_s = late[0]
+            _say(f"  told at {at_s:4.0f} s: {left_s / 60:.0f} min to go, in truth {(first_s - at_s) / 60:.1f}")
+    wait_until(PATIENCE_S, "not all robots", lambda: _all_films(database, participant_id) or None)
+    _say(f"every robot after      {time.monotonic() - began:6.0f} s")
+    wait_until(PATIENCE_S, "no before and after", lambda: _debriefed(database, participant_id) or None)
+    _say(f"before and after after {time.monotonic() - began:6.0f} s")
+
+
+def _all_films(database: Database, participant_id: int) -> bool:
+    with database.reading() as session:
+        films = session.scalars(select(Trial.film_id).where(Trial.participant_id == participant_id)).all()
+    return bool(films) and None not in films
+
+
+def _debriefed(database: Database, participant_id: int) -> bool:
+    with database.reading() as session:
+        films = session.scalars(
+            select(Film.id).where(
+                Film.participant_id == participant_id, Film.scenario.in_(evaluating.COMPARISON_SCENARIOS)
+            )
+        ).all()
+    return len(films) >= 2 * evaluating.COMPARED
+
+
+def _report_runs(database: Database, participant_id: int) -> None:
+    with database.reading() as session:
+        runs = session.scalars(select(Run).where(Run.participant_id == participant_id).order_by(Run.id)).all()
+        for run in runs:
+            if run.finished_at and run.kind != RunKind.REWARD:
+                _say(f"    {run.workflow_id}: {(run.finished_at - run.started_at).total_seconds():.0f} s")
+        clips = session.scalars(select(Run).where(Run.kind == RunKind.CLIPS, Run.status == RunStatus.SUCCEEDED)).all()
+    _say(f"    (runs that made clips for studies so far: {len(clips)})")
+
+
+def _say(text: str) -> None:
+    sys.stdout.write(f"{text}\n")
+    sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,234 @@
+"""Whoever waits comes first: found from the rows alone, kept in the lanes, and nobody else is held up for good."""
+
+import threading
+from collections.abc import Callable
+from datetime import timedelta
+from itertools import count
+from typing import Any
+
+import pytest
+from sqlalchemy.orm import Session
+
+from app.db import Database, now
+from app.domain.models import RunKind
+from app.domain.studies import Awaited, Participant, Study
+from worker.compute import Compute, Lane
+from worker.records import Job
+from worker.turns import Turns
+from worker.urgency import Gate, Level, Urgency, WhoWaits
+
+
+def add_study(session: Session, slug: str, study: Study) -> Study:
+    other = Study(slug=slug, name=slug, stored_settings=study.stored_settings, seed=1)
+    session.add(other)
+    session.flush()
+    return other
+
+
+_numbers = count(2)
+
+
+def add_person(session: Session, study: Study, awaited: Awaited | None = None, **ago_s: float) -> Participant:
+    """Somebody last seen, and waiting since, so many seconds ago; never seen without."""
+    number = next(_numbers)
+    person = Participant(study_id=study.id, number=number, token_sha256=f"{number:064x}", seed=number)
+    person.waiting_for = awaited
+    person.last_seen_at = now() - timedelta(seconds=ago_s["seen"]) if "seen" in ago_s else None
+    person.waiting_since = now() - timedelta(seconds=ago_s["waiting"]) if "waiting" in ago_s else None
+    session.add(person)
+    session.flush()
+    return person
+
+
+def films(person: Participant, what: str = "trials") -> Job:
+    finding = f"films/participant-{person.id}/{what}/labels-20/answer-9"
+    return Job(finding, RunKind.FILMS, person.study_id, person.id, 20)
+
+
+def clips(study: Study) -> Job:
+    return Job(f"clips/study-{study.id}/scenario-1", RunKind.CLIPS, study.id)
+
+
+def level(database: Database, job: Job) -> Level:
+    with database.reading() as session:
+        return WhoWaits.look(session).urgency(job).level
+
+
+def test_work_is_ordered_by_who_waits_and_how_long_and_not_by_study(database: Database, study: Study) -> None:
+    with database.writing() as session:
+        idle, busy, third = study, add_study(session, "busy", study), add_study(session, "third", study)
+        gone = add_person(session, idle, Awaited.ROBOTS, seen=3600, waiting=4000)
+        later = add_person(session, busy, Awaited.ROBOTS, seen=2, waiting=30)
+        longer = add_person(session, busy, Awaited.ROBOTS, seen=20, waiting=500)
+        answering = add_person(session, third, seen=5)
+        unopened = add_study(session, "unopened", study)
+    report = Job("report/study-1/basis-0", RunKind.REPORT, idle.id)
+    asked = Job("export/study-1/1", RunKind.EXPORT, idle.id)
+    wanted = [films(longer), films(later), films(answering), asked, films(gone), clips(idle), clips(unopened), report]
+    with database.reading() as session:
+        waits = WhoWaits.look(session)
+    mixed = [*reversed(wanted)]
+    assert sorted(mixed, key=waits.urgency) == wanted
+
+
+def test_of_one_person_what_the_first_robot_needs_comes_before_the_debrief(database: Database, study: Study) -> None:
+    with database.writing() as session:
+        person = add_person(session, study, Awaited.ROBOTS, seen=1, waiting=60)
+    learning = Job("filter/x", RunKind.FILTER, study.id, person.id, 20)
+    wanted = [learning, films(person), films(person, "before-after")]
+    with database.reading() as session:
+        waits = WhoWaits.look(session)
+    mixed = [*reversed(wanted)]
+    assert sorted(mixed, key=waits.urgency) == wanted
+    assert [waits.urgency(job).level for job in wanted] == [Level.WAITING, Level.WAITING, Level.ANSWERING]
+
+
+def test_whoever_looks_at_the_debrief_waits_for_its_films(database: Database, study: Study) -> None:
+    with database.writing() as session:
+        person = add_person(session, study, Awaited.DEBRIEF, seen=1, waiting=60)
+    assert level(database, films(person, "before-after")) is Level.WAITING
+
+
+@pytest.mark.parametrize(
+    ("awaited", "ago_s", "expected"),
+    [
+        (Awaited.PAIR, {"seen": 2, "waiting": 9}, Level.WAITING),
+        (None, {"seen": 2}, Level.ANSWERING),
+        (Awaited.ROBOTS, {"seen": 2, "waiting": 9}, Level.POOL),
+        (Awaited.PAIR, {"seen": 600, "waiting": 900}, Level.POOL),
+        (None, {}, Level.POOL),
+    ],
+)
+def test_clips_are_as_urgent_as_whoever_needs_pairs_of_them(
+    database: Database, study: Study, awaited: Awaited | None, ago_s: dict[str, float], expected: Level
+) -> None:
+    assert level(database, clips(study)) is Level.UNOPENED
+    with database.writing() as session:
+        add_person(session, study, awaited, **ago_s)
+    assert level(database, clips(study)) is expected
+
+
+def test_a_report_is_asked_for_once_the_study_is_unblinded(database: Database, study: Study) -> None:
+    report = Job("report/study-1/basis-0", RunKind.REPORT, study.id)
+    assert level(database, report) is Level.UNREAD
+    with database.writing() as session:
+        session.get_one(Study, study.id).unblinded_at = now()
+    assert level(database, report) is Level.ASKED
+
+
+def at(what: Level) -> Callable[[], Urgency]:
+    return lambda: Urgency(what, now(), 0)
+
+
+def test_a_gate_lets_the_most_urgent_in_first_however_late_they_came() -> None:
+    gate, order = Gate(1), list[Level]()
+    threads = []
+
+    def go(what: Level) -> None:
+        with gate.passed(at(what)):
+            order.append(what)
+
+    with gate.passed(at(Level.DUE)):
+        for what in (Level.UNREAD, Level.POOL, Level.WAITING, Level.DUE):
+            thread = threading.Thread(target=go, args=(what,))
+            thread.start()
+            threads.append(thread)
+            while len(gate._waiting) < len(threads):
+                threading.Event().wait(0.01)
+        assert gate.is_awaited_above(Level.DUE)
+        assert not gate.is_awaited_above(Level.WAITING)
+    for thread in threads:
+        thread.join()
+    assert order == [Level.WAITING, Level.DUE, Level.POOL, Level.UNREAD]
+
+
+class Slowly(Compute):
+    """Works in this process, one task at a time, each when it is told to."""
+
+    def __init__(self) -> None:
+        super().__init__(1)
+        self.order: list[str] = []
+        self.go_on = threading.Semaphore(0)
+
+    def run(self, lane: Lane, beat: Callable[[], None], function: Any, *args: Any, **kwargs: Any) -> Any:
+        """See Compute."""
+        self.go_on.acquire()
+        return function(*args, **kwargs)
+
+
+def test_a_long_job_that_began_earlier_gives_way_within_one_task(database: Database, study: Study) -> None:
+    with database.writing() as session:
+        away = add_person(session, study, seen=3600)
+        waiting = add_person(session, study, Awaited.ROBOTS, seen=1, waiting=5)
+    compute = Slowly()
+    turns = Turns(compute)
+    with database.reading() as session:
+        turns.who_waits = WhoWaits.look(session)
+
+    def work(person: Participant, name: str, tasks: int) -> threading.Thread:
+        turn = turns.of(films(person))
+        arguments = [(f"{name}{index}",) for index in range(tasks)]
+        thread = threading.Thread(target=turn.run_all, args=(Lane.CLIPS, lambda: None, compute.order.append, arguments))
+        thread.start()
+        return thread
+
+    gate = turns.gate(Lane.CLIPS)
+    long = work(away, "long", 6)
+    while gate._free > 0:
+        threading.Event().wait(0.01)
+    urgent = work(waiting, "urgent", 2)
+    while not gate.is_awaited_above(Level.DUE):
+        threading.Event().wait(0.01)
+    for _ in range(8):
+        compute.go_on.release()
+    long.join()
+    urgent.join()
+    places = compute.size(Lane.CLIPS) + 1
+    assert {"urgent0", "urgent1"} <= set(compute.order[: places + 2]), "after the tasks that were already in the lane"
+    assert len(compute.order) == 8, "and the long job is finished afterwards"
+
+
+def test_while_somebody_waits_no_lane_takes_what_nobody_is_here_for(database: Database, study: Study) -> None:
+    with database.writing() as session:
+        waiting = add_person(session, study, Awaited.ROBOTS, seen=1, waiting=5)
+        unopened = add_study(session, "unopened", study)
+    turns = Turns(Compute(1))
+    with database.reading() as session:
+        turns.who_waits = WhoWaits.look(session)
+    done = threading.Event()
+
+    def make_clips() -> None:
+        with turns.gate(Lane.CLIPS).passed(lambda: turns.who_waits.urgency(clips(unopened))):
+            done.set()
+
+    with turns.working(Lane.LEARNING, films(waiting)):
+        thread = threading.Thread(target=make_clips)
+        thread.start()
+        while not turns.gate(Lane.CLIPS)._waiting:
+            threading.Event().wait(0.01)
+        with turns.gate(Lane.CLIPS).passed(lambda: turns.who_waits.urgency(films(waiting))):
+            assert not done.is_set(), "there is room, but the processors are needed"
+    thread.join()
+    assert done.is_set()
+
+
+def test_a_training_of_many_minutes_does_not_stop_the_other_lanes(database: Database, study: Study) -> None:
+    with database.writing() as session:
+        waiting = add_person(session, study, Awaited.ROBOTS, seen=1, waiting=5)
+    turns = Turns(Compute(1))
+    with database.reading() as session:
+        turns.who_waits = WhoWaits.look(session)
+    with (
+        turns.working(Lane.PATIENT, films(waiting)),
+        turns.gate(Lane.CLIPS).passed(lambda: turns.who_waits.urgency(clips(study))),
+    ):
+        pass
+
+
+def test_what_goes_wrong_in_one_task_reaches_the_job(database: Database, study: Study) -> None:
+    compute = Slowly()
+    for _ in range(3):
+        compute.go_on.release()
+    turn = Turns(compute).of(clips(study))
+    with pytest.raises(ZeroDivisionError):
+        turn.run_all(Lane.CLIPS, lambda: None, divmod, [(1, 1), (1, 0)])
