@@ -17,7 +17,16 @@ from app.db import now
 from app.domain.models import Export, RunKind
 from app.domain.studies import Deviation, Participant, Study
 from app.errors import AppError
-from app.services import archive, export_requests, export_rows, export_tables, exporting, reports, unblinding
+from app.services import (
+    archive,
+    export_requests,
+    export_rows,
+    export_tables,
+    exporting,
+    planning,
+    reports,
+    unblinding,
+)
 from app.services.export_requests import ExportKind
 from app.services.exporting import Kind, Provenance, Table
 from worker import preference_arrays
@@ -195,6 +204,7 @@ def _readme(
         version=provenance.software_version,
         moment=provenance.exported_at.isoformat(timespec="seconds"),
         blinded=blinded,
+        plan=planning.plan_of(session, study).in_words,
         deviations=listed,
         figures=", ".join(pictures) or "none yet",
         people=", ".join(people) or "nobody yet",
@@ -216,6 +226,9 @@ Exported {moment} by PbARL Studio {version}. Lock hash of settings and plan: {lo
 
 Open the tables with `pandas.read_parquet("parquet/ratings.parquet")` or, in R, `arrow::read_parquet` or `read.csv`.
 Participants who withdrew are tombstones in `participants`, and nothing of them is anywhere else.
+
+## What was planned
+{plan}
 
 ## Deviations from the locked plan
 {deviations}
