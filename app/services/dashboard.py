@@ -74,6 +74,12 @@ class ParticipantRow:
     newest_filter: results.FilterVersion | None
     watched: watching.Watched
 
+    @property
+    def flags(self) -> Sequence[str]:
+        """What deserves a look: of the model first, then of the answers."""
+        of_model = ["guessing"] if self.curve.foresight is accuracy.Foresight.GUESSING else []
+        return [*of_model, *self.watched.consistency.flags]
+
 
 @dataclass(frozen=True)
 class StudyLine:
@@ -110,7 +116,6 @@ class ParticipantDetail:
 
     study: Study
     row: ParticipantRow
-    median_response_ms: int | None
     versions: Sequence[results.FilterVersion]
     """The newest first."""
     weights: Sequence[results.Weight]
@@ -119,14 +124,6 @@ class ParticipantDetail:
     """The newest first."""
     liked: watching.Liked | None
     stage_times: Sequence[watching.StageTime]
-
-
-@dataclass(frozen=True)
-class _Answer:
-    response: Response
-    predicted_right: float | None
-    response_time_ms: int | None
-    drawn_at_random: bool
 
 
 def machine(session: Session, data_dir: Path) -> Machine:
@@ -219,13 +216,10 @@ def study_overview(session: Session, study: Study) -> StudyOverview:
 
 def participant_detail(session: Session, study: Study, participant: Participant) -> ParticipantDetail:
     """One participant: answers, models, filters, runs."""
-    answers = _answers(session, [participant.id])[participant.id]
-    times = sorted(answer.response_time_ms for answer in answers if answer.response_time_ms is not None)
     model = _newest_reward_model(session, participant)
     return ParticipantDetail(
         study=study,
         row=_rows(session, study, [participant])[0],
-        median_response_ms=times[len(times) // 2] if times else None,
         versions=_versions(session, [participant.id])[participant.id],
         weights=results.learned_weights(model),
         taste=results.taste(model),
@@ -233,6 +227,11 @@ def participant_detail(session: Session, study: Study, participant: Participant)
         liked=watching.liked_clips(session, study, model),
         stage_times=watching.stage_times(session, participant),
     )
+
+
+def curve_of(session: Session, participant_id: int) -> accuracy.Curve:
+    """How well the models of one participant foresaw the answers, up to now."""
+    return accuracy.curve(accuracy.hits(_answers(session, [participant_id])[participant_id]))
 
 
 def _rows(session: Session, study: Study, people: Sequence[Participant]) -> Sequence[ParticipantRow]:
@@ -249,7 +248,7 @@ def _rows(session: Session, study: Study, people: Sequence[Participant]) -> Sequ
             answered=len(answers[person.id]),
             wanted=wanted,
             counts=_counts(answers[person.id]),
-            curve=accuracy.curve(_hits(answers[person.id])),
+            curve=accuracy.curve(accuracy.hits(answers[person.id])),
             run=runs.get(person.id),
             newest_filter=versions[person.id][0] if versions[person.id] else None,
             watched=watching.watched(session, person.id),
@@ -258,27 +257,12 @@ def _rows(session: Session, study: Study, people: Sequence[Participant]) -> Sequ
     ]
 
 
-def _counts(answers: Iterable[_Answer]) -> Mapping[Response, int]:
+def _counts(answers: Iterable[accuracy.Predicted]) -> Mapping[Response, int]:
     counted = Counter(answer.response for answer in answers)
     return {response: counted[response] for response in Response}
 
 
-def _hits(answers: Iterable[_Answer]) -> Sequence[bool]:
-    """Whether each predicted answer that prefers a side was foreseen; only on pairs that were drawn at random.
-
-    What a model chose to ask is where it is worst: on that, every way of choosing well would look bad.
-    """
-    decided = [
-        answer for answer in answers if answer.drawn_at_random and answer.response in (Response.LEFT, Response.RIGHT)
-    ]
-    return [
-        (answer.predicted_right > 0.5) == (answer.response is Response.RIGHT)
-        for answer in decided
-        if answer.predicted_right is not None
-    ]
-
-
-def _answers(session: Session, participant_ids: Sequence[int]) -> dict[int, list[_Answer]]:
+def _answers(session: Session, participant_ids: Sequence[int]) -> dict[int, list[accuracy.Predicted]]:
     """The labels that count, by participant, in the order of the queries."""
     newest = (
         select(LabelEvent.query_id, func.max(LabelEvent.revision).label("revision"))
@@ -292,7 +276,6 @@ def _answers(session: Session, participant_ids: Sequence[int]) -> dict[int, list
             Query.participant_id,
             LabelEvent.response,
             Query.predicted_right,
-            LabelEvent.response_time_ms,
             Query.strategy == Strategy.UNIFORM,
         )
         .join(LabelEvent, LabelEvent.query_id == Query.id)
@@ -300,11 +283,11 @@ def _answers(session: Session, participant_ids: Sequence[int]) -> dict[int, list
         .where(Query.purpose.in_(LEARNED_FROM))
         .order_by(Query.participant_id, Query.ordinal)
     )
-    answers: dict[int, list[_Answer]] = defaultdict(list)
-    for participant_id, response, predicted_right, response_time_ms, at_random in rows:
+    answers: dict[int, list[accuracy.Predicted]] = defaultdict(list)
+    for participant_id, response, predicted_right, at_random in rows:
         if response is None:  # taken back
             continue
-        answers[participant_id].append(_Answer(Response(response), predicted_right, response_time_ms, at_random))
+        answers[participant_id].append(accuracy.Predicted(Response(response), predicted_right, at_random))
     return answers
 
 
