@@ -73,6 +73,15 @@ export class LockStep {
     else await this.#playBoth();
   }
 
+  // Milliseconds of the left and of the right clip that have been played, at whatever speed; what was played twice
+  // counts once.
+  get watchedMs() {
+    return this.videos.map(({ played }) => {
+      const lengths = Array.from({ length: played.length }, (_, range) => played.end(range) - played.start(range));
+      return Math.round(1000 * lengths.reduce((sum, each) => sum + each, 0));
+    });
+  }
+
   pause() {
     this.#halt();
   }

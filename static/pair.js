@@ -196,6 +196,7 @@ async function answer(button) {
 
 async function give(response, elapsed, reason, button = null) {
   if (!usable(response)) return;
+  const [leftWatchedMs, rightWatchedMs] = player.watchedMs;
   const entry = outbox.add(turn.pair.label_path, {
     response,
     reason,
@@ -208,6 +209,8 @@ async function give(response, elapsed, reason, button = null) {
     playback_rate: controls.rate,
     scrub_count: watching.scrubs,
     watched_whole: player.seenWhole,
+    left_watched_ms: leftWatchedMs,
+    right_watched_ms: rightWatchedMs,
   });
   page.querySelector(`figure[data-side="${response}"]`)?.setAttribute("data-chosen", "");
   await send(entry, button);

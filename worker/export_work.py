@@ -23,6 +23,7 @@ from app.services import (
     export_rows,
     export_tables,
     exporting,
+    planning,
     reports,
     sealing,
     unblinding,
@@ -208,6 +209,7 @@ def _provenance(session: Session, study: Study, provenance: Provenance) -> dict[
             | {"before": each.before, "after": each.after}
             for each in deviations
         ],
+        "plan_in_words": planning.plan_of(session, study).in_words,
         "blinded": unblinding.is_blinded(study),
         "unblinded_at": study.unblinded_at.isoformat() if study.unblinded_at else None,
         "evaluation_key": study.key_secret if study.unblinded_at else None,
@@ -233,6 +235,7 @@ def _readme(
         version=provenance.software_version,
         moment=provenance.exported_at.isoformat(timespec="seconds"),
         blinded=blinded,
+        plan=about["plan_in_words"],
         deviations="\n".join(listed) or "None.",
         missing="\n".join(lost) or "Nothing.",
         figures=", ".join(pictures) or "none yet",
@@ -255,6 +258,9 @@ Exported {moment} by PbARL Studio {version}. Lock hash of settings and plan: {lo
 
 Open the tables with `pandas.read_parquet("parquet/ratings.parquet")` or, in R, `arrow::read_parquet` or `read.csv`.
 Participants who withdrew are tombstones in `participants`, and nothing of them is anywhere else.
+
+## What was planned
+{plan}
 
 ## Deviations from the locked plan
 {deviations}

@@ -1,8 +1,11 @@
 """Filters: from the participant's reward model to an evaluated, published bundle."""
 
+from collections.abc import Sequence
+
 from app.domain.models import ModelKind
 from app.domain.studies import Method, Participant, RewardKind, Study
 from app.errors import AppError
+from app.services import accuracy, dashboard
 from app.services.exporting import provenance_of
 from worker import dataset, lessons, outdated, personalisation, records
 from worker.compute import Lane
@@ -107,6 +110,7 @@ def _publish(place: Workplace, run_id: int, job: Job, reward: str, draft: str) -
         version = records.next_version(session, job.participant)
         run = records.seen_labels(session, run_id)
         export = provenance_of(session, study)
+        notes = notes_on_foresight(dashboard.curve_of(session, job.participant))
     provenance = Provenance(
         study=study.name,
         participant=participant.code,
@@ -118,11 +122,24 @@ def _publish(place: Workplace, run_id: int, job: Job, reward: str, draft: str) -
         lock_hash=export.lock_hash,
         deviations=export.deviations,
     )
-    finished = fitting.finish(_draft(place, draft), provenance, model.metrics if model else {})
+    learned = {**(model.metrics if model else {}), "foresight_notes": notes}
+    finished = fitting.finish(_draft(place, draft), provenance, learned)
     model_artefact, bundle_artefact = place.store.put(finished.filter_weights), place.store.put(finished.bundle)
     with place.database.writing() as session:
         saved = records.save_model(session, run_id, ModelKind.FILTER, model_artefact, finished.metrics)
         records.save_bundle(session, saved, version, bundle_artefact, len(finished.bundle))
+
+
+def notes_on_foresight(curve: accuracy.Curve) -> Sequence[str]:
+    """What the model card has to say about a reward model that nobody may rely on yet."""
+    if curve.proven:
+        return []
+    foreseen = f"{curve.overall.correct:g} of {curve.overall.scored}" if curve.overall else "none"
+    return [
+        "The reward model behind this filter has not been shown to be better than guessing: before they were given it"
+        f" foresaw {foreseen} of this person's preferences on pairs drawn at random. What it says about the person, the"
+        " learned preference included, may mean nothing."
+    ]
 
 
 def _draft(place: Workplace, artefact: str) -> FilterDraft:

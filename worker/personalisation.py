@@ -89,9 +89,10 @@ class Fitting:
         return self.compute.run(Lane.LEARNING, self.beat, printed_filter.fit_printed, self.problem, transitions)
 
     def finish(self, draft: FilterDraft, provenance: Provenance, learned: Mapping[str, Any]) -> Finished:
-        """Export, drive through unseen scenarios, pack. ``learned``: the reward model's metrics, for the model card.
+        """Export, drive through unseen scenarios, pack. A studio's filter that does not meet the burden of proof
+        (worker.analysis.proof) is replaced by the reference.
 
-        A studio's filter that does not meet the burden of proof (worker.analysis.proof) is replaced by the reference.
+        ``learned``: the reward model's metrics and what to say of its foresight (``foresight_notes``), for the card.
         """
         started = time.perf_counter()
         self.progress("driving the filter through unseen scenarios", 0.88)
@@ -111,7 +112,11 @@ class Fitting:
             **_strengths(draft.weights),
             "mode": dict(draft.weights.mode),
             "method": draft.weights.method,
-            "notes": [*draft.notes, *_warnings(evaluation, self.settings.success_tolerance)],
+            "notes": [
+                *draft.notes,
+                *learned.get("foresight_notes", ()),
+                *_warnings(evaluation, self.settings.success_tolerance),
+            ],
             "trials": [asdict(trial) for trial in draft.trials],
             "seconds": {**draft.seconds, "evaluation": round(time.perf_counter() - started, 1)},
             "weights": learned.get("weights"),

@@ -21,9 +21,9 @@ from app.domain.models import Bundle, Model, Run, RunKind, RunStatus
 from app.domain.preferences import LEARNED_FROM, Query
 from app.domain.protocol import EvaluationMode
 from app.domain.studies import Study, StudySettings, TaskName
-from app.services import accounts, enrolment, studies
+from app.services import accounts, dashboard, enrolment, studies
 from app.storage import ArtefactStore
-from worker import conclusion, dataset
+from worker import conclusion
 from worker.conclusion import Conclusion
 from worker.ml.teachers import Manner, Taste
 from worker.own_studio import PATIENCE_S, wait_until
@@ -236,10 +236,6 @@ class Rehearsal:
 
 
 def _prequential_accuracy(session: Session, participant_id: int) -> float | None:
-    """Share of decided labels that had been predicted before they were given."""
-    scored = [
-        (label.query.predicted_right > 0.5) == (dataset.target_of(label.response) == 1.0)
-        for label in dataset.labels_with_clips(session, participant_id)
-        if label.query.predicted_right is not None and dataset.target_of(label.response) in (0.0, 1.0)
-    ]
-    return float(np.mean(scored)) if scored else None
+    """As on the dashboard."""
+    overall = dashboard.curve_of(session, participant_id).overall
+    return overall.value if overall else None

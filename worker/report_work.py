@@ -17,8 +17,19 @@ from app.domain.evaluation import Rating, Trial
 from app.domain.models import Model, Report, Run, RunKind, RunStatus
 from app.domain.preferences import LabelEvent, Query
 from app.domain.studies import Participant, Study
-from app.services import evaluating, export_rows, export_tables, exporting, unblinding, withdrawal
-from worker.analysis.report import VERSION, Tables, make_report
+from app.services import (
+    accuracy,
+    answer_figures,
+    evaluating,
+    export_rows,
+    export_tables,
+    exporting,
+    planning,
+    unblinding,
+    withdrawal,
+)
+from app.services.reports import VERSION
+from worker.analysis.report import Tables, make_report
 from worker.compute import Lane
 from worker.records import Job
 from worker.workplace import Step, Workplace
@@ -70,7 +81,8 @@ def basis_of(session: Session, study: Study) -> str | None:
     if not any(newest):
         return None
     gone = session.scalars(people.where(Participant.withdrawn_at.is_not(None)).order_by(Participant.id)).all()
-    basis = (VERSION, newest, list(gone), unblinding.is_blinded(study), study.lock_hash, study.stored_settings)
+    blinded, plan = unblinding.is_blinded(study), _plan(session, study)
+    basis = (VERSION, newest, list(gone), blinded, study.lock_hash, study.stored_settings, plan)
     return hashlib.sha256(repr(basis).encode()).hexdigest()
 
 
@@ -99,20 +111,30 @@ def _make(place: Workplace, study_id: int, run_id: int) -> list[str]:
 
 
 def tables_of(session: Session, study: Study) -> Tables:
-    """What the statistics are computed from: the rows that are exported, and nothing else."""
+    """What the statistics are computed from: the rows that are exported, and the dashboard's figures of each person."""
     settings, blinded = evaluating.settings_of(study), unblinding.is_blinded(study)
     groups: Sequence[str] = [method.value for method in settings.methods] if settings else []
-    wanted = {name: export_tables.BY_NAME[name] for name in ("ratings", "queries", "evaluations")}
+    wanted = {name: export_tables.BY_NAME[name] for name in ("ratings", "evaluations")}
     provenance = exporting.provenance_of(session, study)
     rows = {name: list(exporting.records(table, session, study, provenance)) for name, table in wanted.items()}
+    people = [each for each in export_rows.everybody(session, study) if each.withdrawn_at is None]
     return Tables(
-        participants=[each.code for each in export_rows.everybody(session, study) if each.withdrawn_at is None],
+        participants=[each.code for each in people],
+        answers=[answer_figures.figures_of(session, each) for each in people],
+        window=accuracy.WINDOW,
+        version=VERSION,
         groups=list(evaluating.LETTERS[: len(groups)]) if blinded else groups,
         blinded=blinded,
-        planned=[test.value for test in study.settings.planned_tests],
+        plan=_plan(session, study),
         columns={name: [column.name for column in table.all_columns] for name, table in wanted.items()},
-        **rows,
+        ratings=rows["ratings"],
+        evaluations=rows["evaluations"],
     )
+
+
+def _plan(session: Session, study: Study) -> dict[str, Any]:
+    plan = planning.plan_of(session, study)
+    return {"standing": plan.standing.value, "planned": list(plan.planned), "in_words": plan.in_words}
 
 
 def _gone(session: Session, study_id: int) -> Collection[int]:

@@ -122,6 +122,9 @@ class LabelEvent(Base):
     scrub_count: Mapped[int | None]
     watched_whole: Mapped[bool | None]
     """Whether both clips were seen from beginning to end before the answer."""
+    left_watched_ms: Mapped[int | None]
+    right_watched_ms: Mapped[int | None]
+    """How much of each clip was played before the answer, in the clip's own time: no matter how fast or how often."""
     created_at: Mapped[datetime] = mapped_column(default=now)
 
 

@@ -1,28 +1,40 @@
 """How far a person's answers can be trusted: flags for people to look at. Nothing is ever deleted or left out by them.
 
-Pure functions on answers in the order in which they were asked. Intervals are 95 %: Wilson score intervals for shares
-(accuracy.wilson), normal ones where said so. None means that there is too little to say anything, never that all is
-well.
+Pure functions on answers in the order in which they were asked; pages and reports take these figures from here.
+Intervals are 95 %: Wilson score intervals for shares (accuracy.wilson), normal ones where said so. None means that
+there is too little to say anything, never that all is well. How often flags are raised at people who deserve none is
+measured in docs/results/error_rates.md.
 """
 
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby
-from math import exp, log, sqrt
+from math import comb, exp, log, sqrt
+from statistics import median
+from typing import Any
 
-from app.domain.preferences import Purpose, Response
-from app.services.accuracy import Share, wilson
+from sqlalchemy import Row
+
+from app.domain.preferences import Label, LabelEvent, Purpose, Response
+from app.services.accuracy import ENOUGH_EVIDENCE, Share, evidence_against_a_fair_coin, wilson
 
 _Z = 1.959964
 """Standard normal quantile of a two-sided 95 % interval."""
 
 TOO_FAST = 0.5
-"""Answers given before this share of the clip could have been seen (at the speed it played) are too fast."""
+"""Answers given before this share of both clips was played are too fast."""
+FASTEST = 2.0
+"""The highest speed that the page offers."""
+SLIPS = 0.02
+"""As often as anybody may answer an obvious pair the wrong way."""
 LONG_RUN = 12
 """So many times the same answer in a row is a straight line; by chance once in some thousand answers left or right."""
 FEWEST_FOR_A_TREND = 20
-FEWEST_REPEATS = 2
+FEWEST_REPEATS = 5
+"""Pairs asked twice, for kappa and for the best accuracy possible; fewer say nothing about either."""
+FEWEST_TIMED = 10
+"""Answers, before anybody is said to be too fast."""
 
 _SIDES = (Response.LEFT, Response.RIGHT)
 _OTHER_SIDE = {Response.LEFT: Response.RIGHT, Response.RIGHT: Response.LEFT}
@@ -43,7 +55,8 @@ class Answer:
     response_time_ms: int | None = None
     clip_ms: int | None = None
     """How long the longer clip lasts in real time."""
-    playback_rate: float | None = None
+    seen: float | None = None
+    """At most this share of the clip of which less was played; None when not measured."""
 
     @property
     def chosen_clip_id(self) -> int | None:
@@ -105,14 +118,17 @@ class Consistency:
     late_agreement: Share | None
     """Agreement of the repeats in the first and the second half: less in the second speaks for fatigue."""
     balance: dict[Response, int]
+    median_response_ms: float | None
+    working_ms: int | None
+    """All response times together."""
 
     @property
     def flags(self) -> Sequence[str]:
-        """Names of what deserves a look; each is stricter than its interval alone would be."""
+        """Names of what deserves a look; each is stricter than its interval alone would be, for one looks often."""
         raised = {
-            "catch_errors": self.catch_errors is not None and self.catch_errors.low > 0.1,
-            "side_bias": self.left is not None and not self.left.low <= 0.5 <= self.left.high,
-            "too_fast": self.too_fast is not None and self.too_fast.low > 0.1,
+            "catch_errors": self.catch_errors is not None and _no_slips(self.catch_errors),
+            "side_bias": self.left is not None and _no_fair_coin(self.left),
+            "too_fast": self.too_fast is not None and self.too_fast.scored >= FEWEST_TIMED and self.too_fast.low > 0.1,
             "straight_line": self.longest_run >= LONG_RUN,
             "inconsistent": self.repeats.kappa is not None and self.repeats.kappa.high < 0.4,
             "slowing": self.slowing is not None and self.slowing.per_hundred.low > 25.0,
@@ -121,12 +137,52 @@ class Consistency:
         return [name for name, is_raised in raised.items() if is_raised]
 
 
+def answers_of(labels: Sequence[Label]) -> list[Answer]:
+    """From rows as preferences.current_answers gives them, clips loaded; in the order of the queries."""
+    return [
+        Answer(
+            ordinal=each.query.ordinal,
+            query_id=each.query.id,
+            purpose=Purpose(each.query.purpose),
+            response=each.response,
+            left_clip_id=each.query.left_clip_id,
+            right_clip_id=each.query.right_clip_id,
+            repeats_query_id=each.query.repeats_query_id,
+            expected=None if each.query.expected is None else Response(each.query.expected),
+            response_time_ms=each.event.response_time_ms,
+            clip_ms=max(each.query.left_clip.duration_ms, each.query.right_clip.duration_ms),
+            seen=seen(each.event, each.query.left_clip.duration_ms, each.query.right_clip.duration_ms),
+        )
+        for each in labels
+    ]
+
+
+def seen(event: LabelEvent | Row[Any], left_ms: int, right_ms: int) -> float | None:
+    """The share that was played of the clip of which less was, at whatever speed; of an event, or its columns.
+
+    Unknown when somebody moved through the clips by hand. Of answers from before this was recorded, what the time
+    would have been enough for at the highest speed.
+    """
+    left_ms, right_ms = max(1, left_ms), max(1, right_ms)
+    if event.watched_whole:
+        return 1.0
+    if event.left_watched_ms is not None and event.right_watched_ms is not None:
+        if event.scrub_count:
+            return None
+        return min(1.0, event.left_watched_ms / left_ms, event.right_watched_ms / right_ms)
+    if event.response_time_ms is None:
+        return None
+    return min(1.0, event.response_time_ms * FASTEST / max(left_ms, right_ms))
+
+
 def consistency(answers: Sequence[Answer]) -> Consistency:
     """Judge one person's answers. Practice is left out of everything."""
     earnest = [answer for answer in answers if answer.purpose is not Purpose.PRACTICE]
     pairs = repeated(earnest)
     half = len(pairs) // 2
+    halves = (pairs[:half], pairs[half:]) if half >= FEWEST_REPEATS else ([], [])
     counted = Counter(answer.response for answer in earnest)
+    times_ms = [answer.response_time_ms for answer in earnest if answer.response_time_ms is not None]
     return Consistency(
         answered=len(earnest),
         repeats=repeats(pairs),
@@ -135,9 +191,11 @@ def consistency(answers: Sequence[Answer]) -> Consistency:
         too_fast=too_fast(earnest),
         longest_run=longest_run(earnest),
         slowing=slowing(earnest),
-        early_agreement=agreement(pairs[:half]),
-        late_agreement=agreement(pairs[half:]) if half else None,
+        early_agreement=agreement(halves[0]),
+        late_agreement=agreement(halves[1]),
         balance={response: counted[response] for response in Response},
+        median_response_ms=median(times_ms) if times_ms else None,
+        working_ms=sum(times_ms) if times_ms else None,
     )
 
 
@@ -162,7 +220,7 @@ def repeats(pairs: Sequence[tuple[Answer, Answer]]) -> Repeats:
         agreement=agreement(pairs),
         decided=of_decided,
         kappa=kappa(pairs),
-        ceiling=None if of_decided is None else noise_ceiling(of_decided),
+        ceiling=noise_ceiling(of_decided),
         swapped=agreement(exchanged),
         unswapped=agreement(same_side),
     )
@@ -177,35 +235,33 @@ def agreement(pairs: Sequence[tuple[Answer, Answer]]) -> Share | None:
 
 
 def kappa(pairs: Sequence[tuple[Answer, Answer]]) -> Interval | None:
-    """Cohen's kappa (1960) of test and retest with the simple large-sample interval (normal).
+    """Cohen's kappa (1960) of test and retest, with Wilson's interval of the agreement carried through.
 
     The table is made symmetric, since which clip of a pair is the first means nothing: chance agreement then follows
-    from how often somebody says "equal". With p observed and e expected agreement of n pairs,
-    kappa = (p - e) / (1 - e), standard error sqrt(p (1 - p) / (n (1 - e)^2)). None for fewer than two pairs, and when
-    every answer was the same, where kappa is not defined.
+    from how often somebody says "equal". With p observed and e expected agreement, kappa = (p - e) / (1 - e). None for
+    fewer than FEWEST_REPEATS pairs, and when every answer was "equal", where kappa is not defined.
     """
-    told = _told(pairs)
-    if len(told) < FEWEST_REPEATS:
+    observed, told = agreement(pairs), _told(pairs)
+    if observed is None or len(told) < FEWEST_REPEATS:
         return None
     verdicts = [(_verdict(before, before), _verdict(again, before)) for before, again in told]
-    count = len(verdicts)
-    observed = sum(first == second for first, second in verdicts) / count
-    equal = sum((first == 0) + (second == 0) for first, second in verdicts) / (2 * count)
+    equal = sum((first == 0) + (second == 0) for first, second in verdicts) / (2 * len(verdicts))
     expected = equal**2 + (1 - equal) ** 2 / 2  # either clip is as likely to be the preferred one
     if expected >= 1.0:
         return None
-    value = (observed - expected) / (1 - expected)
-    half = _Z * sqrt(observed * (1 - observed) / count) / (1 - expected)
-    return Interval(value, max(-1.0, value - half), min(1.0, value + half))
+    value, low, high = ((share - expected) / (1 - expected) for share in (observed.value, observed.low, observed.high))
+    return Interval(value, low, high)
 
 
-def noise_ceiling(decided: Share) -> Interval:
+def noise_ceiling(decided: Share | None) -> Interval | None:
     """How often the best of models could foresee this person, if every answer is the opposite at one fixed rate.
 
-    With q the chance of the true answer, two answers agree with c = q^2 + (1 - q)^2, so q = (1 + sqrt(2 c - 1)) / 2;
-    below c = 1/2 it is 1/2. The interval is that of c (Wilson), carried through. Pairs differ in how hard they are, so
-    it is approximate.
+    With q the chance of the true answer, two answers agree with c = q^2 + (1 - q)^2, so q = (1 + sqrt(2 c - 1)) / 2.
+    The interval is that of c (Wilson), carried through. Pairs differ in how hard they are, so it is approximate. None
+    for fewer than FEWEST_REPEATS pairs, and while c may be 1/2 or less: it then says nothing.
     """
+    if decided is None or decided.scored < FEWEST_REPEATS or decided.low <= 0.5:
+        return None
     return Interval(_ceiling(decided.value), _ceiling(decided.low), _ceiling(decided.high))
 
 
@@ -230,13 +286,9 @@ def left_share(answers: Sequence[Answer]) -> Share | None:
 
 
 def too_fast(answers: Sequence[Answer]) -> Share | None:
-    """Share of answers given before TOO_FAST of the clip can have been seen at its speed (Wilson)."""
-    timed = [
-        answer.response_time_ms * (answer.playback_rate or 1.0) / answer.clip_ms
-        for answer in answers
-        if answer.response_time_ms is not None and answer.clip_ms
-    ]
-    return wilson(sum(share < TOO_FAST for share in timed), len(timed)) if timed else None
+    """Share of answers given before TOO_FAST of both clips was played (Wilson)."""
+    seen = [answer.seen for answer in answers if answer.seen is not None]
+    return wilson(sum(share < TOO_FAST for share in seen), len(seen)) if seen else None
 
 
 def longest_run(answers: Sequence[Answer]) -> int:
@@ -276,7 +328,19 @@ def _verdict(answer: Answer, before: Answer) -> int:
 
 
 def _ceiling(agreeing: float) -> float:
-    return (1.0 + sqrt(max(0.0, 2.0 * agreeing - 1.0))) / 2.0
+    return (1.0 + sqrt(2.0 * agreeing - 1.0)) / 2.0
+
+
+def _no_slips(errors: Share) -> bool:
+    """Whether so many errors happen by slips in less than 5 % of cases."""
+    wrong, asked = int(errors.correct), errors.scored
+    fewer = sum(comb(asked, count) * SLIPS**count * (1 - SLIPS) ** (asked - count) for count in range(wrong))
+    return 1.0 - fewer < 0.05
+
+
+def _no_fair_coin(left: Share) -> bool:
+    """Whether nobody without a side would get so far from one half, even if one looked after every answer."""
+    return evidence_against_a_fair_coin(int(left.correct), left.scored) >= ENOUGH_EVIDENCE
 
 
 def _log_ratio(response_time_ms: int | None, clip_ms: int | None) -> float:

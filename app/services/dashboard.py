@@ -16,7 +16,7 @@ from app.domain.clips import Clip, Rollout
 from app.domain.evaluation import Film, Rating, Trial
 from app.domain.models import Bundle, Model, ModelKind, Run, RunKind, RunStatus, WorkerPresence
 from app.domain.participation import StageRecord
-from app.domain.preferences import LEARNED_FROM, LabelEvent, Response, count_labels
+from app.domain.preferences import LabelEvent, Response, count_labels
 from app.domain.protocol import Stage
 from app.domain.studies import Awaited, Participant, Study
 from app.falls import Falls, noted
@@ -83,6 +83,12 @@ class ParticipantRow:
     """How far the robots are of somebody who waits for them, here or elsewhere."""
     watched: watching.Watched
 
+    @property
+    def flags(self) -> Sequence[str]:
+        """What deserves a look: of the model first, then of the answers."""
+        of_model = ["guessing"] if self.curve.foresight is accuracy.Foresight.GUESSING else []
+        return [*of_model, *self.watched.consistency.flags]
+
 
 @dataclass(frozen=True)
 class StudyLine:
@@ -119,7 +125,6 @@ class ParticipantDetail:
 
     study: Study
     row: ParticipantRow
-    median_response_ms: int | None
     versions: Sequence[results.FilterVersion]
     """The newest first."""
     weights: Sequence[results.Weight]
@@ -225,14 +230,10 @@ def participant_detail(
     session: Session, study: Study, participant: Participant, tallies: Tallies | None = None
 ) -> ParticipantDetail:
     """One participant: answers, models, filters, runs."""
-    given = watching.answers_given(session, [participant.id])[participant.id]
-    labels = [each.answer for each in given if each.answer.purpose in LEARNED_FROM]
-    times = sorted(label.response_time_ms for label in labels if label.response_time_ms is not None)
     model = _newest_reward_model(session, participant)
     return ParticipantDetail(
         study=study,
         row=_rows(session, study, [participant], tallies or Tallies())[0],
-        median_response_ms=times[len(times) // 2] if times else None,
         versions=_versions(session, participant),
         weights=results.learned_weights(model),
         taste=results.taste(model),
@@ -240,6 +241,11 @@ def participant_detail(
         liked=watching.liked_clips(session, study, model),
         stage_times=watching.stage_times(session, participant),
     )
+
+
+def curve_of(session: Session, participant_id: int) -> accuracy.Curve:
+    """How well the models of one participant foresaw the answers, up to now."""
+    return Tallies().of(session, [participant_id])[participant_id].curve
 
 
 def _rows(session: Session, study: Study, people: Sequence[Participant], tallies: Tallies) -> Sequence[ParticipantRow]:

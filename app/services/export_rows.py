@@ -131,6 +131,8 @@ def labels(session: Session, study: Study) -> Rows:
                 event.scrub_count,
                 event.playback_rate,
                 event.watched_whole,
+                event.left_watched_ms,
+                event.right_watched_ms,
                 event.play_error_count,
                 event.stall_count,
                 event.stalled_ms,

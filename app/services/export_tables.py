@@ -112,6 +112,8 @@ TABLES: Sequence[Table] = (
             Column("scrub_count", I, "How often somebody moved through the clips by hand."),
             Column("playback_rate", N, "Speed at the moment of the answer; 1 is real time.", allowed="0.25 to 2"),
             Column("watched_whole", B, "Whether both clips had been seen from beginning to end."),
+            Column("left_watched_ms", I, "How much of the left clip had been played, in its own time.", "ms"),
+            Column("right_watched_ms", I, "How much of the right clip had been played, in its own time.", "ms"),
             Column("play_error_count", I, "Clips that could not be loaded or played."),
             Column("stall_count", I, "How often a clip had to wait for the network."),
             Column("stalled_ms", I, "How long altogether.", "ms"),

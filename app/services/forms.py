@@ -1,6 +1,6 @@
 """Forms: questions that a study asks besides the pairs. Every answer may be left out, corrected, and is kept."""
 
-import math
+import re
 from collections.abc import Mapping, Sequence
 from enum import StrEnum
 
@@ -12,6 +12,8 @@ from app.domain.protocol import LIKERT_POINTS, FormItem, Stage
 from app.domain.studies import Participant, StudySettings
 
 MOST_CHARACTERS = 4000
+_NUMBER = re.compile(r"[+\-\N{MINUS SIGN}]?[0-9]{1,12}([.,][0-9]{1,12})?")
+"""28, 28.5 and 28,5."""
 
 
 class Problem(StrEnum):
@@ -54,7 +56,7 @@ def _problem(item: FormItem, text: str) -> Problem | None:
     if not text:
         return None
     if item.kind == "number":
-        return None if _number(text) is not None else Problem.NUMBER
+        return None if _NUMBER.fullmatch(text) else Problem.NUMBER
     if item.kind == "text":
         return Problem.LONG if len(text) > MOST_CHARACTERS else None
     possible = item.choices if item.kind == "choice" else [str(point + 1) for point in range(LIKERT_POINTS)]
@@ -62,15 +64,7 @@ def _problem(item: FormItem, text: str) -> Problem | None:
 
 
 def _stored(item: FormItem, text: str) -> str | None:
+    """As it was typed; only the decimal sign becomes a point."""
     if not text:
         return None
-    return f"{_number(text):g}" if item.kind == "number" else text
-
-
-def _number(text: str) -> float | None:
-    """28, 28.5 and 28,5; None for anything else."""
-    try:
-        number = float(text.replace(",", "."))
-    except ValueError:
-        return None
-    return number if math.isfinite(number) and abs(number) < 1e6 else None
+    return text.replace(",", ".").replace("\N{MINUS SIGN}", "-") if item.kind == "number" else text

@@ -52,6 +52,8 @@ class Watching:
     playback_rate: float | None = None
     scrub_count: int | None = None
     watched_whole: bool | None = None
+    left_watched_ms: int | None = None
+    right_watched_ms: int | None = None
 
 
 def record_label(

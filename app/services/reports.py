@@ -10,6 +10,9 @@ from app.domain.studies import Study
 from app.errors import AppError
 from app.storage import ArtefactStore
 
+VERSION = 2
+"""Of the contents of a report. An older one is not shown but made again: numbers in it were computed otherwise."""
+
 FORMATS = {"svg": "image/svg+xml", "png": "image/png"}
 
 
@@ -20,8 +23,15 @@ class FigureNotFound(AppError):
 
 
 def newest(session: Session, study: Study) -> Report | None:
-    """The report to show; None before the first."""
-    return session.scalar(select(Report).where(Report.study_id == study.id).order_by(Report.id.desc()).limit(1))
+    """The report to show; None before the first of this version."""
+    report = _last(session, study)
+    return report if report is not None and _is_current(report) else None
+
+
+def is_outdated(session: Session, study: Study) -> bool:
+    """Whether there is a report, but of an earlier version."""
+    report = _last(session, study)
+    return report is not None and not _is_current(report)
 
 
 def figure(session: Session, store: ArtefactStore, study: Study, name: str, kind: str) -> bytes:
@@ -39,3 +49,11 @@ def run_in_hand(session: Session, study: Study) -> Run | None:
         select(Run).where(Run.study_id == study.id, Run.kind == RunKind.REPORT).order_by(Run.id.desc()).limit(1)
     )
     return run if run is not None and run.status != RunStatus.SUCCEEDED else None
+
+
+def _last(session: Session, study: Study) -> Report | None:
+    return session.scalar(select(Report).where(Report.study_id == study.id).order_by(Report.id.desc()).limit(1))
+
+
+def _is_current(report: Report) -> bool:
+    return bool(report.contents.get("version") == VERSION)

@@ -14,6 +14,7 @@ from sqlalchemy.orm import Session
 from app.domain.models import Bundle, Model, ModelKind
 from app.domain.preferences import LEARNED_FROM, LabelEvent, Query, Response
 from app.services import accuracy, results, watching
+from app.services.accuracy import Predicted
 from app.services.watching import Given
 
 Mark = tuple[int | None, ...]
@@ -79,24 +80,14 @@ def _tally(given: Sequence[Given], models: Sequence[Model], newest_filter: resul
     return Tally(
         answered=len(labels),
         counts=counts,
-        curve=accuracy.curve(hits(labels)),
+        curve=accuracy.curve(
+            accuracy.hits(
+                Predicted(each.answer.response, each.predicted_right, each.drawn_at_random) for each in labels
+            )
+        ),
         newest_filter=newest_filter,
         watched=watching.judged(given, models),
     )
-
-
-def hits(labels: Sequence[Given]) -> Sequence[bool]:
-    """Whether each predicted answer that prefers a side was foreseen; only on pairs that were drawn at random.
-
-    What a model chose to ask is where it is worst: on that, every way of choosing well would look bad.
-    """
-    return [
-        (label.predicted_right > 0.5) == (label.answer.response is Response.RIGHT)
-        for label in labels
-        if label.predicted_right is not None
-        and label.drawn_at_random
-        and label.answer.response in (Response.LEFT, Response.RIGHT)
-    ]
 
 
 def _newest_filters(session: Session, participant_ids: Sequence[int]) -> dict[int, results.FilterVersion]:

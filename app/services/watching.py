@@ -23,7 +23,7 @@ from app.domain.protocol import Stage
 from app.domain.studies import Participant, Strategy, Study, StudySettings
 from app.services import advisor, stages
 from app.services.advisor import Advice
-from app.services.consistency import Answer, Consistency, consistency
+from app.services.consistency import Answer, Consistency, consistency, seen
 
 INVITED, FINISHED, WITHDRAWN = "invited", "finished", "withdrawn"
 STAGES_IN_WORDS: Mapping[Stage, str] = {
@@ -96,8 +96,10 @@ def answers_given(session: Session, participant_ids: Sequence[int]) -> dict[int,
         select(
             Query.participant_id,
             *(Query.ordinal, Query.id, Query.purpose, Query.left_clip_id, Query.right_clip_id, Query.repeats_query_id),
-            *(Query.expected, Query.predicted_right, Query.strategy, left.duration_ms, right.duration_ms),
-            *(LabelEvent.response, LabelEvent.response_time_ms, LabelEvent.playback_rate, LabelEvent.created_at),
+            *(Query.expected, Query.predicted_right, Query.strategy),
+            *(left.duration_ms.label("left_ms"), right.duration_ms.label("right_ms")),
+            *(LabelEvent.response, LabelEvent.response_time_ms, LabelEvent.created_at, LabelEvent.watched_whole),
+            *(LabelEvent.left_watched_ms, LabelEvent.right_watched_ms, LabelEvent.scrub_count),
         )
         .join(LabelEvent, LabelEvent.query_id == Query.id)
         .join(left, left.id == Query.left_clip_id)
@@ -106,22 +108,22 @@ def answers_given(session: Session, participant_ids: Sequence[int]) -> dict[int,
         .order_by(Query.participant_id, Query.ordinal)
     )  # columns, not objects: of 20 000 answers objects take two seconds
     given: dict[int, list[Given]] = {each: [] for each in participant_ids}
-    for person, ordinal, query, purpose, left_id, right_id, repeats, expected, predicted, strategy, *rest in rows:
-        left_ms, right_ms, response, time_ms, rate, moment = rest
+    for row in rows:
         answer = Answer(
-            ordinal=ordinal,
-            query_id=query,
-            purpose=_PURPOSES[purpose],
-            response=_RESPONSES[response],
-            left_clip_id=left_id,
-            right_clip_id=right_id,
-            repeats_query_id=repeats,
-            expected=None if expected is None else _RESPONSES[expected],
-            response_time_ms=time_ms,
-            clip_ms=max(left_ms, right_ms),
-            playback_rate=rate,
+            ordinal=row.ordinal,
+            query_id=row.id,
+            purpose=_PURPOSES[row.purpose],
+            response=_RESPONSES[row.response],
+            left_clip_id=row.left_clip_id,
+            right_clip_id=row.right_clip_id,
+            repeats_query_id=row.repeats_query_id,
+            expected=None if row.expected is None else _RESPONSES[row.expected],
+            response_time_ms=row.response_time_ms,
+            clip_ms=max(row.left_ms, row.right_ms),
+            seen=seen(row, row.left_ms, row.right_ms),
         )
-        given[person].append(Given(answer, moment, predicted, strategy == Strategy.UNIFORM))
+        drawn_at_random = row.strategy == Strategy.UNIFORM
+        given[row.participant_id].append(Given(answer, row.created_at, row.predicted_right, drawn_at_random))
     return given
 
 

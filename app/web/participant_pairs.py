@@ -46,6 +46,8 @@ class LabelForm(BaseModel):
     playback_rate: Annotated[float | None, _Missing, Field(gt=0, le=16)] = None
     scrub_count: _Count = None
     watched_whole: Annotated[bool | None, _Missing] = None
+    left_watched_ms: _Milliseconds = None
+    right_watched_ms: _Milliseconds = None
 
 
 class EventForm(BaseModel):

@@ -18,6 +18,7 @@ from app.services import (
     export_tables,
     exporting,
     locking,
+    planning,
     reports,
     roles,
     sealing,
@@ -51,12 +52,6 @@ METHOD_NAMES = {
     "pbarl": "PbARL",
     "pbarl_printed": "PbARL as printed",
 }
-TESTS = {
-    "two_sample_t": "Two-sample t, as in the paper",
-    "paired_t": "Paired t",
-    "wilcoxon": "Wilcoxon signed-rank",
-    "mixed_model": "Linear mixed model",
-}
 FIGURES = {
     "ratings": ("Mean ratings, as in the paper", ""),
     "ratings_of_each_person": (
@@ -69,7 +64,8 @@ FIGURES = {
     ),
     "success_against_preference": (
         "What the filters change",
-        "One point per person with 95 % intervals: right is more preferred, up is more often successful.",
+        "One point per person with 95 % intervals: right is more preferred, up is more often successful. Hollow: the "
+        "model that says so has not been shown to be better than guessing.",
     ),
     "cost_changes": (
         "The paper\N{RIGHT SINGLE QUOTATION MARK}s costs",
@@ -102,6 +98,7 @@ def results_context(session: Session, study: Study) -> dict[str, Any]:
         "settings": study.settings,
         "report": report,
         "contents": report.contents if report else None,
+        "outdated": report is None and reports.is_outdated(session, study),
         "run": reports.run_in_hand(session, study),
         "blinded": unblinding.is_blinded(study),
         "evaluated": evaluating.settings_of(study) is not None,
@@ -110,7 +107,8 @@ def results_context(session: Session, study: Study) -> dict[str, Any]:
         "p_value": _p_value,
         "two_decimals": _two_decimals,
         "statistic": _statistic,
-        "tests": TESTS,
+        "tests": planning.TEST_NAMES,
+        "plan": planning.plan_of(session, study),
         "figures": {name: FIGURES[name] for name in FIGURES if report is not None and name in report.figures},
     }
 

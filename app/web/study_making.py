@@ -12,7 +12,7 @@ from sqlalchemy.orm import Session
 from app.domain.people import Experimenter
 from app.domain.protocol import Language
 from app.domain.studies import Study, TaskName
-from app.services import browser_sessions, enrolment, locking, studies
+from app.services import browser_sessions, enrolment, locking, planning, studies
 from app.services.studies import ClipsTooLong
 from app.web import study_form, task_words
 from app.web.deps import (
@@ -165,7 +165,7 @@ def _lock_page(
         "experimenter": experimenter,
         "contents": contents,
         "hash": study.lock_hash or locking.hash_of(contents),
-        "deviations": locking.deviations(session, study),
+        "plan": planning.plan_of(session, study),
         "error": error,
     }
     return page(request, "experimenter/lock.html", context, status)

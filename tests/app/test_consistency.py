@@ -5,7 +5,8 @@ from itertools import count
 
 import pytest
 
-from app.domain.preferences import Purpose, Response
+from app.domain.clips import Clip
+from app.domain.preferences import Label, LabelEvent, Purpose, Query, Response
 from app.services import consistency
 from app.services.consistency import Answer, Consistency
 
@@ -77,7 +78,29 @@ def test_kappa_of_a_worked_example() -> None:
     found = of(asked_twice(*said)).repeats.kappa
     assert found is not None
     assert found.value == pytest.approx(0.385 / 0.585)
-    assert found.high - found.value == pytest.approx(1.959964 * (0.8 * 0.2 / 20) ** 0.5 / 0.585)
+    assert found.low == pytest.approx((0.58398 - 0.415) / 0.585, abs=1e-4)  # Wilson of 16 of 20: .58398 to .91933
+    assert found.high == pytest.approx((0.91933 - 0.415) / 0.585, abs=1e-4)
+
+
+def test_eight_of_eight_alike_are_no_certainty() -> None:
+    found = of(asked_twice(*[(LEFT, LEFT), (RIGHT, RIGHT)] * 4)).repeats
+    assert found.kappa is not None
+    assert found.kappa.value == 1.0
+    assert found.kappa.high == pytest.approx(1.0)
+    assert found.kappa.low == pytest.approx(2 * 0.67559 - 1, abs=1e-4)  # Wilson of 8 of 8: .67559 to 1
+
+
+@pytest.mark.parametrize("alike", [True, False])
+def test_of_a_few_pairs_asked_twice_nothing_is_said_but_how_many(alike: bool) -> None:
+    found = of(asked_twice(*[(LEFT, LEFT if alike else RIGHT)] * 4)).repeats
+    assert (found.kappa, found.ceiling) == (None, None)
+    assert found.agreement is not None
+    assert found.agreement.scored == 4
+
+
+def test_a_ceiling_that_may_be_guessing_is_not_shown() -> None:
+    """4 of 8 alike: the best accuracy possible would be 50 % [50 %, 79 %]."""
+    assert of(asked_twice(*[(LEFT, LEFT), (LEFT, RIGHT)] * 4)).repeats.ceiling is None
 
 
 def test_nobody_who_always_says_equal_gets_a_kappa() -> None:
@@ -99,6 +122,19 @@ def test_only_the_worse_side_of_a_catch_pair_is_an_error() -> None:
     assert (errors.correct, errors.scored) == (1, 3)
 
 
+@pytest.mark.parametrize(("wrong", "asked", "flagged"), [(1, 2, True), (1, 4, False), (2, 8, True), (0, 8, False)])
+def test_more_errors_on_obvious_pairs_than_slips_explain_are_a_flag(wrong: int, asked: int, flagged: bool) -> None:
+    said = [RIGHT] * wrong + [LEFT] * (asked - wrong)
+    judged = of([answer(each, purpose=Purpose.CATCH, expected=LEFT) for each in said])
+    assert ("catch_errors" in judged.flags) is flagged
+
+
+@pytest.mark.parametrize("count", range(1, 6))
+def test_a_few_answers_to_one_side_are_no_side_bias(count: int) -> None:
+    """Four times left comes by chance to every eighth person who has no side."""
+    assert "side_bias" not in of([answer(LEFT) for _ in range(count)]).flags
+
+
 def test_always_left_is_a_side_bias_and_a_straight_line() -> None:
     judged = of([answer(LEFT) for _ in range(20)])
     assert judged.left is not None
@@ -108,14 +144,46 @@ def test_always_left_is_a_side_bias_and_a_straight_line() -> None:
 
 
 def test_left_and_right_in_turn_raise_no_flag() -> None:
-    assert of([answer(side, response_time_ms=6000, clip_ms=6000) for side in [LEFT, RIGHT] * 15]).flags == []
+    assert of([answer(side, response_time_ms=6000, clip_ms=6000, seen=1.0) for side in [LEFT, RIGHT] * 15]).flags == []
 
 
-def test_an_answer_before_half_of_the_clip_is_too_fast_but_not_at_double_speed() -> None:
-    quick = answer(response_time_ms=2000, clip_ms=6000)
-    judged = of([quick, replace(quick, playback_rate=2.0), answer(response_time_ms=7000, clip_ms=6000), answer()])
+def test_an_answer_before_half_of_the_clip_was_played_is_too_fast() -> None:
+    judged = of([answer(seen=0.4), answer(seen=0.5), answer(seen=1.0), answer(seen=None)])
     assert judged.too_fast is not None
     assert (judged.too_fast.correct, judged.too_fast.scored) == (1, 3)
+
+
+@pytest.mark.parametrize(("count", "flagged"), [(9, False), (10, True)])
+def test_nobody_is_called_too_fast_before_ten_answers(count: int, flagged: bool) -> None:
+    assert ("too_fast" in of([answer(side, seen=0.1) for side in [LEFT, RIGHT] * 5][:count]).flags) is flagged
+
+
+def watched(**columns: object) -> float | None:
+    """What counts as seen of two clips of 6 and 4 s."""
+    event = LabelEvent(**columns)
+    query = Query(
+        id=1, ordinal=1, purpose="preference", left_clip=Clip(duration_ms=6000), right_clip=Clip(duration_ms=4000)
+    )
+    (found,) = consistency.answers_of([Label(query, event, LEFT)])
+    return found.seen
+
+
+def test_what_was_played_counts_and_not_the_last_speed() -> None:
+    """Watched whole at double speed, then set to a quarter: at that speed 3.2 s are enough for .8 s of clip."""
+    played = {"left_watched_ms": 6000, "right_watched_ms": 4000}
+    assert watched(response_time_ms=3200, playback_rate=0.25, **played) == 1.0
+    assert watched(response_time_ms=60_000, playback_rate=2.0, left_watched_ms=1500, right_watched_ms=1500) == 0.25
+
+
+def test_who_moved_through_the_clips_by_hand_may_have_seen_everything() -> None:
+    assert watched(left_watched_ms=0, right_watched_ms=0, scrub_count=3) is None
+
+
+def test_an_answer_from_before_this_was_recorded_gets_the_benefit_of_the_doubt() -> None:
+    assert watched(response_time_ms=3200, playback_rate=0.25) == 1.0
+    assert watched(response_time_ms=1200, playback_rate=0.25) == pytest.approx(0.4)
+    assert watched(response_time_ms=1200, watched_whole=True) == 1.0
+    assert watched() is None
 
 
 def test_who_gets_slower_with_every_answer_is_seen_to() -> None:
@@ -127,7 +195,7 @@ def test_who_gets_slower_with_every_answer_is_seen_to() -> None:
 
 
 def test_less_agreement_in_the_second_half_is_there_to_be_seen() -> None:
-    judged = of(asked_twice(*[(LEFT, LEFT)] * 4, *[(LEFT, RIGHT)] * 4))
+    judged = of(asked_twice(*[(LEFT, LEFT)] * 5, *[(LEFT, RIGHT)] * 5))
     assert judged.early_agreement is not None
     assert judged.late_agreement is not None
     assert (judged.early_agreement.value, judged.late_agreement.value) == (1.0, 0.0)

@@ -231,6 +231,14 @@ class TestForms:
         assert self.answers(way) == [("age", "28"), ("hand", "left"), ("robot_experience", None), ("age", "29.5")]
         assert 'value="29.5"' in way.browser.get("/p/demographics").text
 
+    @pytest.mark.parametrize(
+        ("typed", "kept"),
+        [("12345.678", "12345.678"), ("0.10", "0.10"), ("007", "007"), ("28,50", "28.50"), (" -3 ", "-3")],
+    )
+    def test_a_number_is_kept_as_it_was_typed(self, way: OnTheWay, typed: str, kept: str) -> None:
+        way.browser.post("/p/demographics", data={"age": typed})
+        assert self.answers(way)[0] == ("age", kept)
+
     def test_an_answer_can_be_taken_away_again(self, way: OnTheWay) -> None:
         way.browser.post("/p/demographics", data={"robot_experience": "4"})
         way.browser.post("/p/demographics", data={"robot_experience": ""})
@@ -241,6 +249,8 @@ class TestForms:
         [
             ("age", "old", "Please write a number"),
             ("age", "nan", "Please write a number"),
+            ("age", "1_000", "Please write a number"),
+            ("age", "1e3", "Please write a number"),
             ("hand", "foot", "Please choose one"),
             ("robot_experience", "6", "Please choose one"),
         ],

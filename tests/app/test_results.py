@@ -1,19 +1,26 @@
 """The page of results: honest while there is nothing, by letters while blinded, planned tests marked."""
 
+import re
 from collections.abc import Callable
+from datetime import timedelta
 from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
+from sqlalchemy import select
 
-from app.db import Database
+from app.db import Database, now
 from app.domain.models import Report, RunStatus
-from app.domain.studies import Study
+from app.domain.preferences import Response
+from app.domain.protocol import PlannedTest
+from app.domain.studies import Study, TaskName
+from app.services import dashboard, locking
 from app.storage import ArtefactStore
 from tests import factories
 from tests.finished_study import make_finished_study
 from worker import report_work
 from worker.analysis.report import make_report
+from worker.analysis.statistics import MEASURED_ERROR_PERCENT
 
 Finished = Callable[..., Study]
 
@@ -23,9 +30,12 @@ def finished(database: Database, store: ArtefactStore, monkeypatch: pytest.Monke
     """Makes a finished study with the report that the worker would make, without pictures but one."""
     monkeypatch.setattr("worker.analysis.figures.all_figures", lambda _contents: {})
 
-    def make(people: int = 3, *, unblinded: bool = True) -> Study:
+    def make(people: int = 3, *, unblinded: bool = True, locked: bool = False) -> Study:
         with database.writing() as session:
             study = make_finished_study(session, store, people, labels=4, unblinded=unblinded)
+            if locked:
+                locking.lock(session, study, study.slug, "Ada")
+                study.locked_at = now() - timedelta(days=1)
             contents, _ = make_report(report_work.tables_of(session, study))
             run = factories.make_run(session, study, kind="report")
             figures: dict[str, Any] = {"ratings": {"svg": store.put(b"<svg/>"), "png": store.put(b"png")}}
@@ -48,21 +58,84 @@ def test_without_answers_the_page_says_what_it_waits_for(database: Database, exp
 
 
 def test_planned_tests_are_marked_and_all_others_are_exploratory(experimenter: TestClient, finished: Finished) -> None:
-    text = results(experimenter, finished())
+    text = results(experimenter, finished(locked=True))
     comparisons, scales, kinds = 3, 2, 4
     assert text.count('tag-planned">planned') == comparisons * scales
     assert text.count(">exploratory<") == comparisons * scales * (kinds - 1)
-    assert "never locked, so nothing proves it" in text
+    assert "Planned tests were locked before the first answer." in text
+
+
+def test_no_test_of_a_study_that_was_never_locked_is_called_planned(
+    experimenter: TestClient, finished: Finished
+) -> None:
+    text = results(experimenter, finished())
+    assert "tag-planned" not in text
+    assert "The study was never locked" in text
+
+
+def test_a_test_named_under_the_lock_is_exploratory_and_the_change_is_listed(
+    database: Database, store: ArtefactStore, experimenter: TestClient, finished: Finished
+) -> None:
+    study = finished(locked=True)
+    with database.writing() as session:
+        locked = session.get_one(Study, study.id)
+        settings = locked.settings.model_copy(update={"planned_tests": (PlannedTest.WILCOXON,)})
+        name, task = locked.name, TaskName(locked.task)
+        locking.change(
+            session, store, locked, name=name, task=task, seed=None, settings=settings, actor="Ada", reason="Nicer."
+        )
+    text = results(experimenter, study)
+    assert re.search(r"Paired t<span class=\"tag tag-planned\">planned", text)
+    assert re.search(r"Wilcoxon signed-rank<span class=\"tag \">exploratory", text)
+    assert "Nicer." in text
+    assert "after the first rating" in text
+
+
+def test_the_page_says_which_test_to_rely_on_and_how_often_the_papers_errs(
+    experimenter: TestClient, finished: Finished
+) -> None:
+    text = " ".join(results(experimenter, finished()).split())
+    assert "Rely on the paired t test" in text
+    for row in MEASURED_ERROR_PERCENT:
+        assert f'<th scope="row">{row["people"]}</th><td data-label="Two-sample t, as in the paper">' in text
+        assert f"{row['two_sample_t']:.1f} %" in text
+
+
+def test_a_report_of_an_earlier_version_is_not_shown_but_made_again(
+    database: Database, experimenter: TestClient, finished: Finished
+) -> None:
+    study = finished()
+    with database.writing() as session:
+        report = session.scalars(select(Report)).one()
+        report.contents = {**report.contents, "version": 1}
+    assert "The report is being made again" in results(experimenter, study)
+
+
+def test_dashboard_and_results_have_the_same_figures_of_a_person(
+    database: Database, experimenter: TestClient, finished: Finished
+) -> None:
+    study = finished(people=1)
+    with database.reading() as session:
+        (row,) = dashboard.study_overview(session, session.get_one(Study, study.id)).rows
+        (person,) = session.scalars(select(Report)).one().contents["answers"]["participants"]
+    judged, curve = row.watched.consistency, row.curve
+    assert person["median_response_ms"] == judged.median_response_ms
+    assert {each.value: person[each.value] for each in Response} == row.counts
+    assert curve.overall is not None
+    assert (person["accuracy"]["correct"], person["accuracy"]["low"]) == (curve.overall.correct, curve.overall.low)
+    assert person["curve"] == [[point.scored, point.recent.value] for point in curve.points]
+    assert person["foresight"] == curve.foresight
+    assert judged.repeats.agreement is not None
+    assert (person["test_retest"]["same"], person["test_retest"]["asked"]) == (
+        judged.repeats.agreement.correct,
+        judged.repeats.agreement.scored,
+    )
 
 
 def test_tests_that_need_more_people_say_how_many(experimenter: TestClient, finished: Finished) -> None:
-    text = results(experimenter, finished(people=3))
-    assert "Not computable because 3 people have rated what is compared; 5 are needed." in text
-    assert "the paired tests and the mixed model compare each person with themselves" in text
-
-
-def test_two_people_get_no_paired_tests(experimenter: TestClient, finished: Finished) -> None:
-    assert "2 people have rated what is compared; 3 are needed" in results(experimenter, finished(people=2))
+    text = results(experimenter, finished(people=2))
+    assert "Not computable because 2 people have rated both; 3 are needed." in text
+    assert "paired tests and the mixed model compare each person with themselves" in text
 
 
 def test_a_blinded_study_shows_letters_and_no_tests(experimenter: TestClient, finished: Finished) -> None:

@@ -88,7 +88,7 @@ def test_flags_and_the_noise_ceiling_stand_beside_the_accuracy(
         for query in queries:
             query.predicted_right = 0.2
             factories.make_label(session, query, Response.LEFT, response_time_ms=5000)
-        for query in queries[:4]:
+        for query in queries[:5]:
             left, right = (session.get_one(Clip, each) for each in (query.left_clip_id, query.right_clip_id))
             again = factories.make_query(session, participant, left, right)
             again.purpose, again.repeats_query_id = Purpose.REPEAT, query.id
@@ -99,7 +99,41 @@ def test_flags_and_the_noise_ceiling_stand_beside_the_accuracy(
     assert "of at most&nbsp;100" in page
     detail = experimenter.get("/studies/pilot/participants/P01").text
     assert "Prefers one side of the screen" in detail
-    assert "of 4 pairs asked twice" in detail
+    assert "of 5 pairs asked twice" in detail
+
+
+def test_a_useless_model_is_a_flag_and_what_rests_on_it_is_grey(
+    experimenter: TestClient, participant: Participant, study: Study, database: Database, store: ArtefactStore
+) -> None:
+    """One of seven foreseen, one of two obvious pairs missed, and a filter that the model thinks well of."""
+    with database.writing() as session:
+        for number, query in enumerate(factories.make_queries(session, store, participant, 9)):
+            query.predicted_right = 0.9 if number else 0.1
+            if number > 6:
+                query.purpose, query.expected = Purpose.CATCH, Response.LEFT if number == 7 else Response.RIGHT
+            factories.make_label(session, query, Response.LEFT)
+        factories.make_model(session, study, participant, ModelKind.REWARD, factories.reward_metrics())
+        factories.make_model(session, study, participant, ModelKind.FILTER, factories.filter_metrics())
+    page = experimenter.get("/studies/pilot").text
+    assert "model may be guessing" in page
+    assert "misses obvious pairs" in page
+    assert "verdict-unproven" in page
+    assert "verdict-better" not in page
+    detail = experimenter.get("/studies/pilot/participants/P01").text
+    assert detail.count("not been shown to be better than guessing (1 of 7 preferences foreseen)") == 2
+    assert 'class="card stack unproven"' in detail
+
+
+def test_what_rests_on_a_model_that_foresees_answers_is_not_grey(
+    experimenter: TestClient, participant: Participant, study: Study, database: Database, store: ArtefactStore
+) -> None:
+    with database.writing() as session:
+        for query in factories.make_queries(session, store, participant, 10):
+            query.predicted_right = 0.1
+            factories.make_label(session, query, Response.LEFT)
+        factories.make_model(session, study, participant, ModelKind.FILTER, factories.filter_metrics())
+    assert "verdict-better" in experimenter.get("/studies/pilot").text
+    assert "guessing (" not in experimenter.get("/studies/pilot/participants/P01").text
 
 
 def test_answers_to_pairs_a_model_chose_do_not_count_for_the_accuracy(

@@ -133,6 +133,24 @@ def test_answers_open_when_both_clips_have_been_seen_once(invited: Invited, new_
 
 
 @SEEN_FIRST
+def test_what_was_played_of_each_clip_is_noted_whatever_the_speed_at_the_end(
+    invited: Invited, new_page: NewPage
+) -> None:
+    page = new_page()
+    page.goto(invited.link)
+    page.keyboard.press("4")
+    wait_ready(page, 0)  # both have been played once, at double speed
+    page.keyboard.press("1")
+    page.keyboard.press("ArrowLeft")
+    wait_ready(page, 1)
+    (event,) = invited.events()
+    assert event.playback_rate == 0.25
+    whole_ms = 1000 * factories.FRAMES / factories.FPS
+    for watched_ms in (event.left_watched_ms, event.right_watched_ms):
+        assert watched_ms == pytest.approx(whole_ms, abs=2 * 1000 / factories.FPS), "once, however often it was played"
+
+
+@SEEN_FIRST
 def test_clips_that_break_off_do_not_lock_the_answers(invited: Invited, new_page: NewPage) -> None:
     page = new_page()
     page.goto(invited.link)

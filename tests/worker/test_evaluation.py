@@ -1,12 +1,14 @@
-"""Numbers about a filter: paired differences, their intervals, and the accuracy of predictions."""
+"""Numbers about a filter: paired differences, and their intervals."""
 
 import json
 
 import numpy as np
 import pytest
+from statsmodels.stats.proportion import proportion_confint
 
+from app.services import accuracy
 from tests.worker import invented
-from worker.analysis.agreement import prequential, wilson_interval
+from worker.analysis.agreement import wilson_interval
 from worker.analysis.evaluation import evaluate, mean_change, success_change
 from worker.trajectory import COSTS, Trajectory
 
@@ -23,20 +25,11 @@ def test_a_proportion_of_nothing_is_refused(correct: int, scored: int) -> None:
         wilson_interval(correct, scored)
 
 
-def test_prequential_accuracy_scores_decided_answers_that_were_predicted() -> None:
-    found = prequential([np.nan, 0.9, 0.2, 0.7, 0.6], [1.0, 1.0, 1.0, 0.5, 1.0])
-    assert (found["overall"]["correct"], found["overall"]["scored"]) == (2, 3)
-    assert found["overall"]["low"] < 2 / 3 < found["overall"]["high"]
-
-
-def test_prequential_accuracy_is_unknown_before_anything_was_scored() -> None:
-    assert prequential([np.nan], [1.0])["overall"]["accuracy"] is None
-
-
-def test_the_window_looks_at_the_newest_labels_only() -> None:
-    found = prequential([0.1] * 30 + [0.9] * 30, [1.0] * 60, window=30)
-    assert found["recent"]["accuracy"] == 1.0
-    assert found["overall"]["accuracy"] == 0.5
+@pytest.mark.parametrize(("correct", "scored"), [(0, 1), (1, 1), (2.5, 7), (8, 8), (30, 200)])
+def test_both_servers_have_the_same_interval_and_it_is_that_of_statsmodels(correct: float, scored: int) -> None:
+    here, there = wilson_interval(correct, scored), accuracy.wilson(correct, scored)
+    assert here == pytest.approx(proportion_confint(correct, scored, method="wilson"))
+    assert here == pytest.approx((there.low, there.high))
 
 
 def episodes(count: int, rng: np.random.Generator, cost: float = 0.0, success: bool = True) -> list[Trajectory]:

@@ -10,18 +10,6 @@ from worker.analysis.answers import answer_report, change_report
 from worker.analysis.report import Tables, make_report
 from worker.analysis.statistics import rating_report
 
-QUERY_COLUMNS = (
-    "strategy",
-    "participant",
-    "ordinal",
-    "purpose",
-    "repeats_ordinal",
-    "sides_swapped",
-    "response",
-    "predicted_right",
-    "response_time_ms",
-)
-
 
 @pytest.fixture(scope="module")
 def contents() -> dict[str, Any]:
@@ -41,26 +29,23 @@ def contents() -> dict[str, Any]:
         for number in range(1, 5)
         for measure in ("success", "preference", "C_d", "C_v")
     ]
-    queries = [
+    answers = [
         {
-            **dict.fromkeys(QUERY_COLUMNS),
             "participant": f"P{number:02d}",
-            "ordinal": ordinal,
-            "purpose": "preference",
-            "strategy": "uniform",
-            "response": "left",
-            "predicted_right": 0.2 if ordinal % 4 else 0.9,
+            "labels": 40,
+            "accuracy": {"accuracy": 0.75},
+            "foresight": "better",
+            "curve": [[count, 0.5 + count / 100] for count in range(5, 41)],
+            "test_retest": {"asked": 0, "same": 0},
         }
         for number in (1, 2)
-        for ordinal in range(1, 41)
     ]
     tables = Tables(
         participants=[f"P{number:02d}" for number in range(1, 5)],
         ratings=[{**row, "counts": True} for row in ratings().to_dict("records")],
-        queries=queries,
+        answers=answers,
         evaluations=evaluations,
         groups=METHODS,
-        planned=["paired_t"],
     )
     return make_report(tables)[0]
 
@@ -98,11 +83,11 @@ def test_significant_comparisons_have_a_star_and_others_say_so(contents: dict[st
 
 def test_figures_of_a_blinded_study_know_letters_only() -> None:
     rows = ratings().assign(letter=lambda each: each.method.map(dict(zip(METHODS, "ABC", strict=True))))
-    report = rating_report(rows, "ABC", [], by="letter", compare=False)
+    report = rating_report(rows, "ABC", by="letter", compare=False)
     nothing = rows.iloc[:0].assign(newest=True, measure="")
     contents = {
         "ratings": report,
-        "answers": answer_report(nothing.reindex(columns=list(QUERY_COLUMNS)), []),
+        "answers": answer_report([], 30),
         "change": change_report(nothing, []),
     }
     drawn = figures.all_figures(contents)
@@ -121,7 +106,6 @@ def test_a_study_without_anything_has_no_figures() -> None:
             [],
             [],
             columns={
-                "queries": QUERY_COLUMNS,
                 "evaluations": ["participant", "newest", "measure"],
                 "ratings": ["participant", "method", "satisfaction", "personalisation"],
             },

@@ -11,10 +11,11 @@ from app.domain.clips import Clip
 from app.domain.models import Model, ModelKind, RunKind
 from app.domain.preferences import Query, Response
 from app.domain.studies import Participant, Study
+from app.services import accuracy
 from app.storage import ArtefactStore
 from worker import records
 from worker.compute import Compute
-from worker.filter_work import NothingToLearnFrom, train_filter
+from worker.filter_work import NothingToLearnFrom, notes_on_foresight, train_filter
 from worker.outdated import is_outdated
 from worker.records import Job
 from worker.workplace import Workplace
@@ -107,3 +108,16 @@ def test_without_a_reward_model_the_run_says_why_there_is_no_filter(place: Workp
     job, run_id = begin(place, participant, RunKind.FILTER, "filter/participant-1/labels-10")
     with pytest.raises(NothingToLearnFrom, match="can't tell"):
         train_filter(place, job, run_id, at_once)
+
+
+@pytest.mark.parametrize(
+    ("hits", "said"), [([1.0] + [0.0] * 6, "foresaw 1 of 7"), ([], "foresaw none"), ([0.5] * 3, "foresaw 1.5 of 3")]
+)
+def test_the_card_of_a_filter_says_that_its_model_may_be_guessing(hits: list[float], said: str) -> None:
+    (note,) = notes_on_foresight(accuracy.curve(hits))
+    assert "not been shown to be better than guessing" in note
+    assert said in note
+
+
+def test_a_model_that_foresees_answers_needs_no_note() -> None:
+    assert notes_on_foresight(accuracy.curve([1.0] * 10)) == []

@@ -1,7 +1,7 @@
-"""What the answers of a study say: foresight of the models, times, agreement of people with themselves, change.
+"""What the answers of a study say together, and what its filters change.
 
-The inputs are tables as they are exported: ``queries.csv`` with the answer that counts for each pair, and
-``evaluations.csv`` with what was measured of each filter. Layouts are with each function; unknown is None.
+The figures of one person come as the dashboard has them (app/services/answer_figures.py), what filters change as the
+table ``evaluations.csv`` that is exported. Layouts are with each function; unknown is None.
 """
 
 from collections.abc import Mapping, Sequence
@@ -11,114 +11,29 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from worker.analysis.agreement import prequential, wilson_interval
-from worker.analysis.statistics import mean_interval, plain
+from worker.analysis.hypothesis_tests import plain
+from worker.analysis.statistics import mean_interval
 
 Floats = npt.NDArray[np.float64]
 Result = dict[str, Any]
 
-WINDOW = 30
-"""Answers in the running accuracy, as on the dashboard."""
-FIRST_POINT = 5
-LEARNED_FROM = ("introduction", "preference")
-AT_RANDOM = "uniform"
-"""Strategy of pairs that count for accuracy: those a model chose are the ones it is worst at."""
-_TARGETS = {"left": 0.0, "equal": 0.5, "right": 1.0}
-_MIRRORED = {"left": "right", "right": "left"}
 
+def answer_report(people: Sequence[Mapping[str, Any]], window: int) -> Result:
+    """``people`` as they come, and pooled: mean_accuracy with its t interval over ``people``, and sums.
 
-def answer_report(queries: pd.DataFrame, participants: Sequence[str]) -> Result:
-    """Per participant and pooled.
-
-    Accuracy is over pairs that were drawn at random, whatever else the study asks.
-    participants[]: participant, labels, left, right, equal, skip, median_response_ms, working_minutes, accuracy
-    {correct, scored, accuracy, low, high} and curve [[scored, accuracy], ...], test_retest {...}; pooled: mean_accuracy
-    with its t interval over people, accuracy of all answers together, test_retest of all repeats together.
+    ``window``: answers in the running accuracy of each.
     """
-    answered = queries[queries["response"].notna()]
-    rows = [_participant(answered[answered["participant"] == code], code) for code in participants]
-    shares = np.array([row["accuracy"]["accuracy"] for row in rows if row["accuracy"]["accuracy"] is not None])
+    shares = np.array([each["accuracy"]["accuracy"] for each in people if each["accuracy"]["accuracy"] is not None])
     low, high = mean_interval(shares)
     pooled = {
         "people": len(shares),
         "mean_accuracy": plain(shares.mean()) if len(shares) else None,
         "mean_low": low,
         "mean_high": high,
-        "labels": int(answered["purpose"].isin(LEARNED_FROM).sum()),
-        "test_retest": test_retest(answered),
+        "labels": sum(each["labels"] for each in people),
+        **{name: sum(each["test_retest"][name] for each in people) for name in ("asked", "same")},
     }
-    return {"participants": rows, "pooled": pooled, "window": WINDOW}
-
-
-def _participant(answered: pd.DataFrame, code: str) -> Result:
-    labels = answered[answered["purpose"].isin(LEARNED_FROM)].sort_values("ordinal")
-    said = labels[(labels["response"] != "skip") & (labels["strategy"] == AT_RANDOM)]
-    targets = np.array([_TARGETS[response] for response in said["response"]])
-    predicted = said["predicted_right"].to_numpy(np.float64, na_value=np.nan)
-    counts = labels["response"].value_counts()
-    times_ms = answered["response_time_ms"].dropna().to_numpy(np.float64)
-    return {
-        "participant": code,
-        "labels": len(labels),
-        **{response: int(counts.get(response, 0)) for response in ("left", "right", "equal", "skip")},
-        "median_response_ms": plain(np.median(times_ms)) if len(times_ms) else None,
-        "working_minutes": plain(times_ms.sum() / 60_000) if len(times_ms) else None,
-        "accuracy": prequential(predicted, targets)["overall"],
-        "curve": curve(predicted, targets),
-        "test_retest": test_retest(answered),
-    }
-
-
-def curve(predicted_right: Floats, targets: Floats) -> list[list[float]]:
-    """The share of the last WINDOW scored answers that was foreseen, after each of them: [scored, accuracy]."""
-    scored = np.isfinite(predicted_right) & (targets != 0.5)
-    hits = ((predicted_right > 0.5) == (targets > 0.5))[scored]
-    return [
-        [float(count), float(hits[max(0, count - WINDOW) : count].mean())]
-        for count in range(FIRST_POINT, len(hits) + 1)
-    ]
-
-
-def test_retest(answered: pd.DataFrame) -> Result:
-    """How often people said the same of a pair that was asked twice, whichever side the clips were on.
-
-    asked, same, share, low, high (Wilson; repeats of several people are counted as independent), kappa (Cohen's, over
-    first clip, second clip, equal, can't tell).
-    """
-    first = answered.set_index(["participant", "ordinal"])["response"]
-    repeats = answered[(answered["purpose"] == "repeat") & answered["repeats_ordinal"].notna()]
-    pairs = []
-    for row in repeats.itertuples():
-        earlier = first.get((row.participant, int(row.repeats_ordinal)))
-        if earlier is not None:
-            pairs.append(
-                (str(earlier), _MIRRORED.get(row.response, row.response) if row.sides_swapped else row.response)
-            )
-    if not pairs:
-        return {"asked": 0, "same": 0, "share": None, "low": None, "high": None, "kappa": None}
-    same = sum(before == after for before, after in pairs)
-    low, high = wilson_interval(same, len(pairs))
-    return {
-        "asked": len(pairs),
-        "same": same,
-        "share": same / len(pairs),
-        "low": low,
-        "high": high,
-        "kappa": kappa(pairs),
-    }
-
-
-test_retest.__test__ = False  # type: ignore[attr-defined]  # a measure of that name, and no test of pytest's
-
-
-def kappa(pairs: Sequence[tuple[str, str]]) -> float | None:
-    """Cohen's kappa of two answers to the same pairs; None when chance alone would make them agree."""
-    words = sorted({word for pair in pairs for word in pair})
-    table = np.zeros((len(words), len(words)))
-    for before, after in pairs:
-        table[words.index(before), words.index(after)] += 1 / len(pairs)
-    expected = float(table.sum(axis=0) @ table.sum(axis=1))
-    return None if expected >= 1 else float((np.trace(table) - expected) / (1 - expected))
+    return {"participants": [dict(each) for each in people], "pooled": pooled, "window": window}
 
 
 def change_report(evaluations: pd.DataFrame, participants: Sequence[str]) -> Result:

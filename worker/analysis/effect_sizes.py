@@ -48,22 +48,29 @@ def rank_biserial(differences: Floats) -> float:
 
 
 def rank_biserial_interval(correlation: float, n: int) -> tuple[float | None, float | None]:
-    """Approximate interval: Fisher's z with the signed-rank statistic's standard error, as R's effectsize has it.
+    """Approximate interval by Fisher's z.
 
+    The standard error of the signed-rank statistic, with which R's effectsize has it, is that of signs that are
+    positive half the time; of others it is sqrt(1 - r^2) as large, which Fisher's z divides by 1 - r^2. Without this
+    the interval missed the truth in 10 to 12 % (docs/results/error_rates.md has what it does now).
     (None, None) when all n differences point the same way: the approximation then claims certainty from few people.
     """
     if abs(correlation) >= 1:
         return None, None
-    error = (n * (n + 1) * (2 * n + 1) / 6) ** 0.5 / (n * (n + 1) / 2)
+    error = (n * (n + 1) * (2 * n + 1) / 6) ** 0.5 / (n * (n + 1) / 2) / (1 - correlation**2) ** 0.5
     middle = np.arctanh(correlation)
     return float(np.tanh(middle - Z_95 * error)), float(np.tanh(middle + Z_95 * error))
 
 
-def holm(p_values: Sequence[float]) -> list[float]:
-    """Holm's (1979) step-down p values in the order given."""
-    order = sorted(range(len(p_values)), key=lambda index: p_values[index])
-    corrected, largest = [0.0] * len(p_values), 0.0
-    for place, index in enumerate(order):
-        largest = max(largest, min(1.0, p_values[index] * (len(p_values) - place)))
+def holm(p_values: Sequence[float | None]) -> list[float | None]:
+    """Holm's (1979) step-down p values in the order given; None stands for a test that could not be computed.
+
+    The family is what was to be tested: a test without a result counts in it, as one with p = 1 would.
+    """
+    known = [index for index, p in enumerate(p_values) if p is not None]
+    corrected: list[float | None] = [None] * len(p_values)
+    largest = 0.0
+    for place, index in enumerate(sorted(known, key=lambda index: p_values[index] or 0.0)):
+        largest = max(largest, min(1.0, (p_values[index] or 0.0) * (len(p_values) - place)))
         corrected[index] = largest
     return corrected

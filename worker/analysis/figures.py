@@ -235,16 +235,18 @@ def success_against_preference(contents: Mapping[str, Any]) -> Figure | None:
     ]
     if not people:
         return None
+    proven = {each["participant"] for each in contents["answers"]["participants"] if each["foresight"] == "better"}
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(5.2, 3.6), layout="constrained")
         axes = figure.subplots()
         axes.axhline(0, color=INK, linewidth=0.8)
         axes.axvline(0, color=INK, linewidth=0.8)
-        for _, preference, success in people:
+        for code, preference, success in people:
             x, y = preference["delta"], success["delta"] * 100
             axes.plot([preference["low"], preference["high"]], [y, y], color=GREY, linewidth=0.9, zorder=2)
             axes.plot([x, x], [success["low"] * 100, success["high"] * 100], color=GREY, linewidth=0.9, zorder=2)
-            axes.plot(x, y, "o", color=LINE_COLOURS[2], markersize=6, zorder=3)
+            inside, edge = (LINE_COLOURS[2], LINE_COLOURS[2]) if code in proven else ("white", GREY)
+            axes.plot(x, y, "o", color=inside, markeredgecolor=edge, markersize=6, zorder=3)
         axes.set_xlabel("Change of preference (SD of the reference's return,\nas the person's own model sees it)")
         axes.set_ylabel("Change of success (percentage points)")
         axes.margins(0.12)

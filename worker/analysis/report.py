@@ -1,10 +1,11 @@
 """One report: tables in, contents and figures out. The one function that the worker's processes run.
 
-Contents (stored as Report.contents): ``version``, ``blinded``, ``planned``, ``ratings`` (see statistics), ``answers``
-and ``change`` (see answers). Figures by name, each as SVG and PNG (see figures).
+Contents (stored as Report.contents): ``version``, ``blinded``, ``plan`` (standing, planned tests, in_words: see
+app.services.planning), ``ratings`` (see statistics), ``answers`` and ``change`` (see answers). Figures by name, each as
+SVG and PNG (see figures).
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,7 +13,6 @@ import pandas as pd
 
 from worker.analysis import answers, figures, statistics
 
-VERSION = 1
 Row = dict[str, Any]
 
 
@@ -23,12 +23,17 @@ class Tables:
     participants: Sequence[str]
     """codes of everybody who takes part and has not withdrawn"""
     ratings: Sequence[Row]
-    queries: Sequence[Row]
+    answers: Sequence[Row]
+    """a row per participant, see app.services.answer_figures"""
     evaluations: Sequence[Row]
     groups: Sequence[str]
     """methods in their order, or letters while blinded; empty in a study without evaluation"""
     blinded: bool = False
-    planned: Sequence[str] = ()
+    plan: Mapping[str, Any] = field(default_factory=dict)
+    window: int = 30
+    """answers in the running accuracy"""
+    version: int = 0
+    """of the contents, see app.services.reports"""
     columns: dict[str, Sequence[str]] = field(default_factory=dict)
     """of each table by name: an empty table has no rows to read them from"""
 
@@ -36,17 +41,16 @@ class Tables:
 def make_report(tables: Tables) -> tuple[dict[str, Any], dict[str, dict[str, bytes]]]:
     """The contents, and the figures as {name: {format: file}}."""
     contents = {
-        "version": VERSION,
+        "version": tables.version,
         "blinded": tables.blinded,
-        "planned": list(tables.planned),
+        "plan": dict(tables.plan),
         "ratings": statistics.rating_report(
             _frame(tables, "ratings"),
             tables.groups,
-            tables.planned,
             by="letter" if tables.blinded else "method",
             compare=not tables.blinded,
         ),
-        "answers": answers.answer_report(_frame(tables, "queries"), tables.participants),
+        "answers": answers.answer_report(tables.answers, tables.window),
         "change": answers.change_report(_frame(tables, "evaluations"), tables.participants),
     }
     return contents, figures.all_figures(contents)

@@ -7,17 +7,17 @@ Layout of what ``rating_report`` returns, which is ``contents["ratings"]`` of a 
 
     groups, participants, ratings       the groups in their order; how many people and ratings there are
     explanation                         the sentence on why two kinds of tests stand side by side
+    recommended                         which of TESTS to rely on
+    measured_error_percent[]            people, and per test: how often it errs where nothing differs
     scales.<scale>.means[]              group, ratings, participants, mean, sd, participant_mean, low, high
     scales.<scale>.people[]             participant, means {group: that person's mean}
     scales.<scale>.comparisons[]        first, second, and a result for each of TESTS
-    scales.<scale>.mixed_model          the fit behind the last: converged, notes, variances, n
 
-Every result of a test says ``planned`` and has either its numbers or ``not_computable``: the reason in words. A
-difference is always second minus first. Nothing here is NaN or infinite; what is unknown is None.
+Every result of a test has either its numbers or ``not_computable``: the reason in words. A difference is always second
+minus first. Nothing here is NaN or infinite; what is unknown is None.
 """
 
-import warnings
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Sequence
 from itertools import combinations
 from typing import Any
 
@@ -27,30 +27,34 @@ import pandas as pd
 from scipy import stats
 
 from worker.analysis.effect_sizes import d_z_interval, holm, rank_biserial, rank_biserial_interval
+from worker.analysis.hypothesis_tests import (
+    FEWEST_PAIRED,
+    STAR_BELOW,
+    TESTS,
+    mixed_model,
+    paired_t,
+    plain,
+    two_sample_t,
+    wilcoxon,
+)
 
 Floats = npt.NDArray[np.float64]
 Result = dict[str, Any]
 
 SCALES = ("satisfaction", "personalisation")
-TESTS = ("two_sample_t", "paired_t", "wilcoxon", "mixed_model")
-"""Names as in app.domain.protocol.PlannedTest."""
 
-STAR_BELOW = 0.01
-"""The paper's star: p < .01."""
-FEWEST_RATINGS = 2
-"""Of each group, for the paper's test."""
-FEWEST_PAIRED = 3
-"""People who rated both groups; with two, one difference decides everything."""
-FEWEST_FOR_MODEL = 5
-"""People in a mixed model: the spread between people cannot be told from fewer."""
-
-OPTIMISERS = ["bfgs", "lbfgs", "cg", "powell"]
-"""statsmodels' own three, tried in turn until one converges, and one more that needs no gradient."""
+RECOMMENDED = "paired_t"
+MEASURED_ERROR_PERCENT: Sequence[Result] = (
+    {"people": 4, "two_sample_t": 8.1, "paired_t": 4.6, "wilcoxon": 0.0, "mixed_model": 4.6},
+    {"people": 8, "two_sample_t": 7.5, "paired_t": 5.5, "wilcoxon": 2.9, "mixed_model": 5.5},
+    {"people": 20, "two_sample_t": 6.8, "paired_t": 5.7, "wilcoxon": 5.2, "mixed_model": 5.7},
+)
+"""From docs/results/error_rates.csv (a test compares): 5 % is what every test promises."""
 
 EXPLANATION = (
     "The paper's test counts every rating as if a different person had given it, although several come from the same "
-    "person and resemble each other; the paired tests and the mixed model compare each person with themselves and "
-    "count people, so where the two disagree, these are the ones to trust."
+    "person and resemble each other. The paired tests and the mixed model compare each person with themselves and "
+    "count people."
 )
 ERROR_BARS = (
     "Bars are means of all ratings, error bars one standard deviation of all ratings (the paper does not say what its "
@@ -58,9 +62,7 @@ ERROR_BARS = (
 )
 
 
-def rating_report(
-    ratings: pd.DataFrame, groups: Sequence[str], planned: Collection[str], *, by: str = "method", compare: bool = True
-) -> Result:
+def rating_report(ratings: pd.DataFrame, groups: Sequence[str], *, by: str = "method", compare: bool = True) -> Result:
     """Means and tests of both scales. See the layout above.
 
     ``by``: the column that names the groups; ``compare``: False while letters hide methods, for then a letter is
@@ -73,32 +75,26 @@ def rating_report(
         "participants": int(rows["participant"].nunique()),
         "ratings": len(rows),
         "explanation": EXPLANATION,
+        "recommended": RECOMMENDED,
+        "measured_error_percent": list(MEASURED_ERROR_PERCENT),
         "error_bars": ERROR_BARS,
         "star_below": STAR_BELOW,
-        "scales": {scale: _scale_report(rows, scale, by, groups, planned, compare) for scale in SCALES},
+        "scales": {scale: _scale_report(rows, scale, by, groups, compare) for scale in SCALES},
     }
 
 
-def _scale_report(
-    rows: pd.DataFrame, scale: str, by: str, groups: Sequence[str], planned: Collection[str], compare: bool
-) -> Result:
-    means = [_mean_of(rows[rows[by] == group], scale, group) for group in groups]
-    people = _people(rows, scale, by)
-    if not compare:
-        return {"means": means, "people": people, "comparisons": [], "mixed_model": None}
-    fit = mixed_model(rows, scale, by, groups)
+def _scale_report(rows: pd.DataFrame, scale: str, by: str, groups: Sequence[str], compare: bool) -> Result:
     comparisons: list[Result] = [
         {"first": first, "second": second, **_tests(rows, scale, by, first, second)}
-        for first, second in combinations(groups, 2)
+        for first, second in (combinations(groups, 2) if compare else ())
     ]
-    for comparison, contrast in zip(comparisons, fit.pop("contrasts"), strict=True):
-        comparison["mixed_model"] = contrast
     for test in TESTS[1:]:
         _correct([comparison[test] for comparison in comparisons])
-    for comparison in comparisons:
-        for test in TESTS:
-            comparison[test]["planned"] = test in planned
-    return {"means": means, "people": people, "comparisons": comparisons, "mixed_model": fit}
+    return {
+        "means": [_mean_of(rows[rows[by] == group], scale, group) for group in groups],
+        "people": _people(rows, scale, by),
+        "comparisons": comparisons,
+    }
 
 
 def _people(rows: pd.DataFrame, scale: str, by: str) -> list[Result]:
@@ -136,11 +132,40 @@ def mean_interval(values: Floats) -> tuple[float | None, float | None]:
 def _tests(rows: pd.DataFrame, scale: str, by: str, first: str, second: str) -> dict[str, Result]:
     every = {group: _floats(rows[rows[by] == group][scale]) for group in (first, second)}
     differences = paired_differences(rows, scale, by, first, second)
-    return {
+    results = {
         "two_sample_t": two_sample_t(every[first], every[second]),
         "paired_t": paired_t(differences),
         "wilcoxon": wilcoxon(differences),
+        "mixed_model": mixed_model(*ratings_of_each(rows, scale, by, first, second)),
     }
+    if "p" in results["paired_t"]:
+        results["paired_t"] |= _cohens_d_z(results["paired_t"], differences)
+    if "p" in results["wilcoxon"]:
+        results["wilcoxon"] |= _rank_biserial(differences)
+    return results
+
+
+def _cohens_d_z(test: Result, differences: Floats) -> Result:
+    low, high = d_z_interval(test["statistic"], len(differences))
+    d_z = differences.mean() / differences.std(ddof=1)
+    return {"d_z": plain(d_z), "d_z_low": plain(low), "d_z_high": plain(high)}
+
+
+def _rank_biserial(differences: Floats) -> Result:
+    correlation = rank_biserial(differences)
+    low, high = rank_biserial_interval(correlation, int(np.count_nonzero(differences)))
+    return {"rank_biserial": plain(correlation), "rank_biserial_low": plain(low), "rank_biserial_high": plain(high)}
+
+
+def ratings_of_each(
+    rows: pd.DataFrame, scale: str, by: str, first: str, second: str
+) -> tuple[list[Floats], list[Floats]]:
+    """Everybody's ratings of ``first`` and of ``second``, by participant; only who rated both."""
+    cells = {name: _floats(values) for name, values in rows.groupby(["participant", by])[scale]}
+    people = [
+        person for person in dict.fromkeys(rows["participant"]) if {(person, first), (person, second)} <= set(cells)
+    ]
+    return [cells[person, first] for person in people], [cells[person, second] for person in people]
 
 
 def paired_differences(rows: pd.DataFrame, scale: str, by: str, first: str, second: str) -> Floats:
@@ -152,172 +177,11 @@ def paired_differences(rows: pd.DataFrame, scale: str, by: str, first: str, seco
     return _floats((means[second] - means[first]).dropna().round(12))
 
 
-def two_sample_t(first: Floats, second: Floats) -> Result:
-    """The paper's test: Student's, equal variances, every rating counted as independent."""
-    if min(len(first), len(second)) < FEWEST_RATINGS:
-        return _not(f"there are {len(first)} and {len(second)} ratings; {FEWEST_RATINGS} of each are needed")
-    if first.std() == 0 and second.std() == 0:
-        return _not("all ratings of each of the two are the same, so there is no spread to compare with")
-    outcome = stats.ttest_ind(second, first, equal_var=True)
-    return {
-        "n_first": len(first),
-        "n_second": len(second),
-        "difference": plain(second.mean() - first.mean()),
-        "statistic": plain(outcome.statistic),
-        "degrees_of_freedom": plain(outcome.df),
-        "p": plain(outcome.pvalue),
-        "star": bool(outcome.pvalue < STAR_BELOW),
-    }
-
-
-def paired_t(differences: Floats) -> Result:
-    """Student's paired t-test on per-person means, with Cohen's d_z. (P,)"""
-    n = len(differences)
-    if n < FEWEST_PAIRED:
-        return _not(_too_few(n, FEWEST_PAIRED))
-    if np.ptp(differences) == 0:
-        return _not(f"all {n} people have the same difference, so there is no spread to compare with")
-    outcome = stats.ttest_1samp(differences, 0.0)
-    interval = outcome.confidence_interval(0.95)
-    low, high = d_z_interval(float(outcome.statistic), n)
-    return {
-        "n": n,
-        "difference": plain(differences.mean()),
-        "low": plain(interval.low),
-        "high": plain(interval.high),
-        "statistic": plain(outcome.statistic),
-        "degrees_of_freedom": n - 1,
-        "p": plain(outcome.pvalue),
-        "d_z": plain(differences.mean() / differences.std(ddof=1)),
-        "d_z_low": plain(low),
-        "d_z_high": plain(high),
-    }
-
-
-def wilcoxon(differences: Floats) -> Result:
-    """Wilcoxon's signed-rank test on per-person means, zeros dropped, with the matched-pairs rank-biserial. (P,)"""
-    n, moved = len(differences), int(np.count_nonzero(differences))
-    if n < FEWEST_PAIRED:
-        return _not(_too_few(n, FEWEST_PAIRED))
-    if moved == 0:
-        return _not(f"none of {n} people rated the two differently")
-    with warnings.catch_warnings():  # scipy warns of few values; ``smallest_p`` says the same in a number
-        warnings.simplefilter("ignore", UserWarning)
-        outcome = stats.wilcoxon(differences)
-    correlation = rank_biserial(differences)
-    low, high = rank_biserial_interval(correlation, moved)
-    return {
-        "n": n,
-        "n_without_ties": moved,
-        "median": plain(np.median(differences)),
-        "statistic": plain(outcome.statistic),
-        "p": plain(outcome.pvalue),
-        "smallest_p": 2.0 ** (1 - moved),
-        "rank_biserial": plain(correlation),
-        "rank_biserial_low": plain(low),
-        "rank_biserial_high": plain(high),
-    }
-
-
-def mixed_model(rows: pd.DataFrame, scale: str, by: str, groups: Sequence[str]) -> Result:
-    """Linear mixed model, rating ~ group + (1 | participant), by REML; ``contrasts`` in the order of combinations()."""
-    pairs = list(combinations(groups, 2))
-    reason = _why_no_model(rows, scale, by, groups)
-    if reason is not None:
-        return {**_not(reason), "contrasts": [_not(reason) for _ in pairs]}
-    try:
-        fit, notes = _fit(rows, scale, by, groups)
-    except np.linalg.LinAlgError as error:
-        reason = f"the model cannot be solved for these ratings ({error})"
-        return {**_not(reason), "contrasts": [_not(reason) for _ in pairs]}
-    return {
-        "n_ratings": len(rows),
-        "n": int(rows["participant"].nunique()),
-        "converged": bool(fit.converged),
-        "notes": notes,
-        "variance_between_people": plain(np.asarray(fit.cov_re)[0, 0]),
-        "variance_within_people": plain(fit.scale),
-        "contrasts": [_contrast(fit, groups, first, second) for first, second in pairs],
-    }
-
-
-def _why_no_model(rows: pd.DataFrame, scale: str, by: str, groups: Sequence[str]) -> str | None:
-    people = int(rows["participant"].nunique())
-    if people < FEWEST_FOR_MODEL:
-        return _too_few(people, FEWEST_FOR_MODEL)
-    missing = [group for group in groups if not (rows[by] == group).any()]
-    if missing:
-        return f"nobody has rated {' and '.join(missing)} yet"
-    if _floats(rows[scale]).std() == 0:
-        return "all ratings are the same"
-    return None
-
-
-def _fit(rows: pd.DataFrame, scale: str, by: str, groups: Sequence[str]) -> tuple[Any, list[str]]:
-    """The fitted model, and in words whatever statsmodels warned of."""
-    from statsmodels.regression.mixed_linear_model import MixedLM  # seconds to load, and only a report needs it
-
-    design = np.column_stack([np.ones(len(rows)), *(_floats(rows[by] == group) for group in groups[1:])])
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        fit = MixedLM(_floats(rows[scale]), design, groups=rows["participant"].to_numpy()).fit(
-            reml=True, method=OPTIMISERS
-        )
-    messages = dict.fromkeys(str(each.message).split("\n")[0] for each in caught)
-    notes = [message for message in messages if not message.startswith("Retrying")]
-    if float(np.asarray(fit.cov_re)[0, 0]) < 1e-6:
-        notes.append("The spread between people was estimated as zero: the model then is a regression on all ratings.")
-    return fit, notes
-
-
-def _contrast(fit: Any, groups: Sequence[str], first: str, second: str) -> Result:
-    """Second minus first, from the model's fixed effects."""
-    row = np.zeros((1, len(groups)))
-    for group, sign in ((first, -1.0), (second, 1.0)):
-        if group != groups[0]:
-            row[0, groups.index(group)] = sign
-    outcome = fit.t_test(row)
-    error = plain(np.squeeze(outcome.sd))
-    if error is None:
-        return _not("the standard error of this difference could not be computed (see the notes of the model)")
-    low, high = np.squeeze(outcome.conf_int(alpha=0.05))
-    return {
-        "difference": plain(np.squeeze(outcome.effect)),
-        "standard_error": error,
-        "low": plain(low),
-        "high": plain(high),
-        "statistic": plain(np.squeeze(outcome.tvalue)),
-        "p": plain(np.squeeze(outcome.pvalue)),
-        "converged": bool(fit.converged),
-        "n": len(fit.model.group_labels),
-    }
-
-
 def _correct(results: Sequence[Result]) -> None:
-    """Add Holm's p over the comparisons of one scale that could be computed."""
-    computed = [result for result in results if result.get("p") is not None]
-    for result, corrected in zip(computed, holm([result["p"] for result in computed]), strict=True):
-        result["p_holm"], result["corrected_over"] = corrected, len(computed)
-
-
-def plain(value: Any) -> float | None:
-    """A number that JSON can hold; None for what is unknown or not finite."""
-    if value is None or not np.isfinite(float(value)):
-        return None
-    return float(value)
-
-
-def is_computed(result: Mapping[str, Any]) -> bool:
-    """Whether a test has numbers."""
-    return "not_computable" not in result
-
-
-def _not(reason: str) -> Result:
-    return {"not_computable": reason}
-
-
-def _too_few(people: int, needed: int) -> str:
-    return f"{people} {'person has' if people == 1 else 'people have'} rated what is compared; {needed} are needed"
+    """Add Holm's p over all comparisons of one scale; one that could not be computed still counts in the family."""
+    for result, corrected in zip(results, holm([result.get("p") for result in results]), strict=True):
+        if corrected is not None:
+            result["p_holm"], result["corrected_over"] = corrected, len(results)
 
 
 def _floats(values: Any) -> Floats:

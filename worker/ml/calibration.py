@@ -70,7 +70,8 @@ def expected_calibration_error(probabilities: Floats, answers: Floats) -> float:
     Confidence is P of the more probable side, in five equal bins from 1/2 to 1; an answer "equal" is half right.
     """
     confidence = np.maximum(probabilities, 1.0 - probabilities)
-    right = np.where(probabilities >= 0.5, answers, 1.0 - answers)
+    right = np.where(probabilities > 0.5, answers, 1.0 - answers)
+    right[probabilities == 0.5] = 0.5  # no opinion: half right
     place = np.minimum(((confidence - 0.5) * 2 * _BINS).astype(int), _BINS - 1)
     gaps = [abs(float((confidence - right)[place == each].sum())) for each in range(_BINS)]
     return sum(gaps) / len(answers)

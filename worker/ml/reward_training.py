@@ -154,7 +154,9 @@ def _accuracy(model: RewardModel, pairs: SegmentPairs, answers: Floats) -> float
     decided = answers != 0.5
     if not decided.any():
         return None
-    return float(((model.probability_right(pairs) > 0.5) == (answers > 0.5))[decided].mean())
+    right = model.probability_right(pairs)
+    hits = np.where(right == 0.5, 0.5, (right > 0.5) == (answers > 0.5))  # no opinion: half right
+    return float(hits[decided].mean())
 
 
 def _normalised_over_segments(model: RewardModel, pairs: SegmentPairs) -> RewardModel:

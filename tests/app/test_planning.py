@@ -1,0 +1,136 @@
+"""What was planned, as the locked document and the times of the data tell it; and what pages say of it."""
+
+from collections.abc import Callable
+from datetime import datetime, timedelta
+
+import pytest
+from fastapi.testclient import TestClient
+from sqlalchemy import update
+
+from app.db import Database, now
+from app.domain.evaluation import Rating
+from app.domain.preferences import LabelEvent
+from app.domain.protocol import PlannedTest
+from app.domain.studies import Deviation, Study, TaskName
+from app.services import exporting, locking, planning
+from app.services.planning import Plan, Standing
+from app.storage import ArtefactStore
+from tests import factories
+from tests.finished_study import make_finished_study
+
+START = datetime.fromisoformat("2026-03-01T09:00:00+00:00")
+ANSWERED, RATED, UNBLINDED = (START + timedelta(days=days) for days in (10, 20, 30))
+
+Planned = Callable[..., Study]
+
+
+@pytest.fixture
+def planned(database: Database, store: ArtefactStore) -> Planned:
+    """A study answered, rated and unblinded ten days after each other, and locked so many days after its start."""
+
+    def make(locked_on_day: int | None) -> Study:
+        with database.writing() as session:
+            study = make_finished_study(session, store, 3, labels=4)
+            session.execute(update(LabelEvent).values(created_at=ANSWERED))
+            session.execute(update(Rating).values(created_at=RATED))
+            study.unblinded_at = UNBLINDED
+            if locked_on_day is not None:
+                locking.lock(session, study, study.slug, "Ada")
+                study.locked_at = START + timedelta(days=locked_on_day)
+        return study
+
+    return make
+
+
+def plan_of(database: Database, study: Study) -> Plan:
+    with database.reading() as session:
+        return planning.plan_of(session, session.get_one(Study, study.id))
+
+
+@pytest.mark.parametrize(
+    ("locked_on_day", "standing", "may_be_called_planned"),
+    [
+        (None, Standing.NOT_LOCKED, False),
+        (5, Standing.BEFORE_DATA, True),
+        (10, Standing.BEFORE_RATINGS, True),
+        (15, Standing.BEFORE_RATINGS, True),
+        (20, Standing.AFTER_RATINGS, False),
+        (25, Standing.AFTER_RATINGS, False),
+        (30, Standing.AFTER_UNBLINDING, False),
+        (35, Standing.AFTER_UNBLINDING, False),
+    ],
+)
+def test_only_what_was_locked_before_the_first_rating_is_called_planned(
+    database: Database,
+    planned: Planned,
+    locked_on_day: int | None,
+    standing: Standing,
+    may_be_called_planned: bool,
+) -> None:
+    study = planned(locked_on_day)
+    plan = plan_of(database, study)
+    assert plan.standing is standing
+    assert list(plan.planned) == (["paired_t"] if may_be_called_planned else [])
+    assert ("every test is exploratory" in plan.in_words) is not may_be_called_planned
+
+
+def test_answers_to_practice_and_of_previews_are_no_data(database: Database, store: ArtefactStore) -> None:
+    with database.writing() as session:
+        study = factories.make_study(session, evaluation={})
+        person, _ = factories.make_participant(session, study)
+        (query,) = factories.make_queries(session, store, person, 1)
+        query.purpose = "practice"
+        factories.make_label(session, query)
+        guest, _ = factories.make_participant(session, study)
+        guest.is_preview = True
+        (query,) = factories.make_queries(session, store, guest, 1)
+        factories.make_label(session, query)
+        locking.lock(session, study, study.slug, "Ada")
+    assert plan_of(database, study).standing is Standing.BEFORE_DATA
+
+
+def test_a_test_that_was_named_under_the_lock_is_not_planned(
+    database: Database, store: ArtefactStore, planned: Planned
+) -> None:
+    study = planned(5)
+    with database.writing() as session:
+        locked = session.get_one(Study, study.id)
+        settings = locked.settings.model_copy(update={"planned_tests": (PlannedTest.WILCOXON,)})
+        locking.change(
+            session,
+            store,
+            locked,
+            name=locked.name,
+            task=TaskName(locked.task),
+            seed=None,
+            settings=settings,
+            actor="Ada",
+            reason="It looks better.",
+        )
+    plan = plan_of(database, study)
+    assert (list(plan.planned), list(plan.added)) == (["paired_t"], ["wilcoxon"])
+    assert "Named only after locking, and so not planned: Wilcoxon" in plan.in_words
+    assert "Changes after locking: 1, of which 1 when there were ratings already." in plan.in_words
+
+
+def test_a_change_before_anything_was_rated_is_told_apart(database: Database, planned: Planned) -> None:
+    study = planned(5)
+    with database.writing() as session:
+        for at in (START + timedelta(days=6), now()):
+            session.add(Deviation(study_id=study.id, at=at, actor="Ada", reason="So.", before={}, after={}))
+    plan = plan_of(database, study)
+    assert [plan.seen_before(each) for each in plan.deviations] == [False, True]
+
+
+def test_provenance_of_an_export_lists_the_changes(database: Database, planned: Planned) -> None:
+    study = planned(5)
+    with database.writing() as session:
+        session.add(Deviation(study_id=study.id, actor="Ada", reason="Fewer people came.", before={}, after={}))
+        assert "Fewer people came." in exporting.provenance_of(session, session.get_one(Study, study.id)).deviations
+
+
+def test_whoever_locks_after_the_first_rating_is_told_what_that_is_worth(
+    experimenter: TestClient, planned: Planned
+) -> None:
+    study = planned(None)
+    assert "A study that is locked now has no planned tests" in experimenter.get(f"/studies/{study.slug}/lock").text

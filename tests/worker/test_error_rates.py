@@ -1,0 +1,53 @@
+"""The simulation of error rates, small; and that the page shows what the large one measured."""
+
+import csv
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from tests.benchmarks import error_rates
+from tests.benchmarks.error_rates import SPREAD, UNEQUAL, Truth
+from worker.analysis.hypothesis_tests import TESTS
+from worker.analysis.statistics import MEASURED_ERROR_PERCENT, RECOMMENDED
+
+STUDIES = 250
+MISSING = replace(SPREAD, name="spread .5, trials missing", missing=0.3, dropouts=0.1)
+
+
+@pytest.mark.parametrize("truth", [SPREAD, UNEQUAL, MISSING], ids=lambda truth: truth.name)
+def test_tests_that_count_people_err_as_often_as_they_promise(truth: Truth) -> None:
+    """Within three standard errors; three comparisons of one study are not independent, so counted as one."""
+    most = 5.0 + 3 * (5.0 * 95.0 / STUDIES) ** 0.5
+    found = {row["test"]: row for row in error_rates.rates(truth, STUDIES)}
+    for test in TESTS[1:]:
+        assert found[test]["false_alarms_percent"] <= most
+        assert found[test]["false_alarms_of_family_percent"] <= most
+
+
+def test_the_command_writes_every_table(tmp_path: Path) -> None:
+    error_rates.main(["--studies", "10", "--to", str(tmp_path)])
+    page = (tmp_path / "error_rates.md").read_text()
+    assert page.count("| spread .5 | 8 |") == 3
+    assert "kappa" in page
+    assert {each.name for each in tmp_path.iterdir()} == {
+        "error_rates.csv",
+        "error_rates.md",
+        "error_rates_of_intervals.csv",
+    }
+
+
+def test_the_page_shows_what_was_measured() -> None:
+    with (error_rates.RESULTS / "error_rates.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if row["truth"] == error_rates.WHOLE.name]
+    measured = {(int(row["people"]), row["test"]): float(row["false_alarms_percent"]) for row in rows}
+    shown = {(each["people"], test): each[test] for each in MEASURED_ERROR_PERCENT for test in TESTS}
+    assert shown == measured
+
+
+def test_what_is_recommended_never_erred_clearly_more_often_than_promised() -> None:
+    with (error_rates.RESULTS / "error_rates.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if row["test"] == RECOMMENDED]
+    assert rows
+    for row in rows:
+        assert float(row["false_alarms_percent"]) <= 5.0 + 3 * (5.0 * 95.0 / int(row["studies"])) ** 0.5
