@@ -20,6 +20,7 @@ from app.web import (
     importing,
     invitations,
     joining,
+    languages,
     live,
     login,
     media,
@@ -55,6 +56,7 @@ EXPERIMENTER_PARTS = (
 )
 PARTICIPANT_PARTS = (
     joining,
+    languages,
     participant_consent,
     participant_forms,
     participant_pairs,

@@ -43,7 +43,9 @@ const controls = new PlayerControls(find("player"), () => player, words, {
 start();
 
 async function start() {
+  find("late").remove();
   find("replay").hidden = false;
+  for (const button of [...buttons, undo.querySelector("button")]) button.disabled = false; // aria-disabled tells from here on
   answers.addEventListener("submit", (event) => {
     event.preventDefault();
     answer(event.submitter);

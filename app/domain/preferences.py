@@ -122,6 +122,8 @@ class LabelEvent(Base):
     scrub_count: Mapped[int | None]
     watched_whole: Mapped[bool | None]
     """Whether both clips were seen from beginning to end before the answer."""
+    by_script: Mapped[bool | None]
+    """Whether the page's script sent it, and so saw to it that the clips had been shown; None: it was not noted yet."""
     created_at: Mapped[datetime] = mapped_column(default=now)
 
 

@@ -91,6 +91,7 @@ class StudySettings(BaseModel):
     question: str = Field(default="Which robot would you rather have?", min_length=1, max_length=200)
     consent_version: str = Field(default="1", min_length=1, max_length=40)
     language: Language = Language.ENGLISH
+    languages: tuple[Language, ...] = Field(default=tuple(Language), description="In which the pages may be read.")
     wording: dict[str, str] = Field(default_factory=dict, description="Texts of the pages in the study's own words.")
     demographics: tuple[FormItem, ...] = ()
     practice_pairs: int = Field(default=0, ge=0, le=5, description="Before the first label; never learned from.")
@@ -124,6 +125,11 @@ class StudySettings(BaseModel):
                 f"{max(self.labels_per_participant, short)} labels asked for{also}. Add scenarios or behaviours."
             )
         return self
+
+    @property
+    def offered_languages(self) -> tuple[Language, ...]:
+        """Languages people may choose from: the study's own first, which is always one of them."""
+        return (self.language, *(each for each in Language if each in self.languages and each != self.language))
 
     @property
     def pairs_per_scenario(self) -> int:

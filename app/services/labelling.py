@@ -52,6 +52,8 @@ class Watching:
     playback_rate: float | None = None
     scrub_count: int | None = None
     watched_whole: bool | None = None
+    by_script: bool | None = None
+    """Whether a script measured at all; a browser without one sends the plain form."""
 
 
 def record_label(

@@ -56,7 +56,7 @@ def save_consent_copy(request: Request, participant: CurrentParticipant, session
     record = consent.newest(session, participant)
     wording = wording_of(participant)
     text = record.text if record else consent_text(wording, participant)
-    lines = [participant.study.name, participant.code, *([_agreed(wording, record)] if record else []), "", text, ""]
+    lines = [participant.code, *([_agreed(wording, record)] if record else []), "", text, ""]
     name = f"{wording('consent-copy-file')}-{participant.code}.txt"
     headers = {"content-disposition": f'attachment; filename="{_plain(name)}"'}
     return PlainTextResponse("\n".join(lines), headers=headers)

@@ -4,7 +4,8 @@ Texts are plain; templates escape them like everything else. ``app/wording/*.ftl
 """
 
 import logging
-from collections.abc import Iterable, Mapping
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,10 @@ log = logging.getLogger("app.wording")
 FOLDER = Path(__file__).resolve().parents[1] / "wording"
 NAMES = {Language.ENGLISH: "English", Language.GERMAN: "Deutsch"}
 """Each language in itself."""
+
+
+_ASKED = re.compile(r"(?:^|,)\s*([a-z]{2,8})(?:-[a-z0-9-]*)?\s*(?:;\s*q\s*=\s*(\d(?:\.\d{0,3})?))?")
+"""One language of an Accept-Language header, without its region, and how much it is wanted."""
 
 
 class WordingBroken(ValueError):
@@ -77,15 +82,16 @@ def wording_of(participant: Participant) -> Wording:
 
 
 def wording_for(settings: StudySettings, chosen: str | None = None) -> Wording:
-    """The texts of a study in the language somebody chose, or in its own."""
-    language = Language(chosen) if chosen in set(Language) else settings.language
+    """The texts of a study in the language somebody chose, if it is offered, or in its own."""
+    language = Language(chosen) if chosen in settings.offered_languages else settings.language
     return _remembered(language, tuple(sorted(settings.wording.items())), settings.language)
 
 
-def preferred(accept_language: str) -> Language:
-    """The language for somebody of whom we know only what their browser asks for."""
-    asked = (part.split(";")[0].strip()[:2].lower() for part in accept_language.split(","))
-    return next((Language(code) for code in asked if code in set(Language)), Language.ENGLISH)
+def preferred(accept_language: str, offered: Sequence[Language] = tuple(Language)) -> Language:
+    """The language for somebody of whom we know only what their browser asks for; the first offered one otherwise."""
+    asked = [(code, float(weight or 1)) for code, weight in _ASKED.findall(accept_language.lower())]
+    asked.sort(key=lambda each: -each[1])  # of equals the first stays first
+    return next((Language(code) for code, weight in asked if code in offered and weight > 0), offered[0])
 
 
 @pass_context

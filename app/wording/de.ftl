@@ -3,11 +3,13 @@
 ## Jede Seite
 
 page-title = { $title } · PbARL Studio
-foot-language = Sprache
+page-language = Sprache
 foot-withdraw = Teilnahme widerrufen
 foot-code = Sie sind { $code }
 back = Zurück
 go-on = Weiter
+page-incomplete = Diese Seite wurde nicht vollständig geladen.
+page-load-again = Neu laden
 saved = Gespeichert
 
 ## Begrüßung und Einwilligung
@@ -50,6 +52,7 @@ form-problems =
     }
 form-likert-low = überhaupt nicht
 form-likert-high = sehr
+scale-end = { $point }: { $meaning }
 form-age = Wie alt sind Sie?
 form-gender = Welches Geschlecht haben Sie?
 form-robot_experience = Wie viel Erfahrung haben Sie mit Robotern?

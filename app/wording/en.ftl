@@ -5,11 +5,13 @@
 ## Every page
 
 page-title = { $title } · PbARL Studio
-foot-language = Language
+page-language = Language
 foot-withdraw = Withdraw
 foot-code = You are { $code }
 back = Back
 go-on = Go on
+page-incomplete = This page has not loaded completely.
+page-load-again = Load it again
 saved = Saved
 
 ## Welcome and consent
@@ -52,6 +54,7 @@ form-problems =
     }
 form-likert-low = not at all
 form-likert-high = very much
+scale-end = { $point }: { $meaning }
 form-age = How old are you?
 form-gender = What is your gender?
 form-robot_experience = How much experience do you have with robots?

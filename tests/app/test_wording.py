@@ -92,13 +92,6 @@ def test_numbers_are_written_as_the_language_writes_them() -> None:
 
 
 @pytest.mark.parametrize(
-    ("asked", "given"), [("de-AT,de;q=0.9,en;q=0.8", "de"), ("fr,en;q=0.5", "en"), ("", "en"), ("xx", "en")]
-)
-def test_without_a_choice_the_browser_is_asked(asked: str, given: str) -> None:
-    assert wording.preferred(asked) == given
-
-
-@pytest.mark.parametrize(
     ("address", "headers", "said"),
     [
         ("/p/next", {"Accept-Language": "de"}, "Wer sind Sie?"),
