@@ -32,6 +32,7 @@ from app.web import (
     participant_pairs,
     results,
     study_making,
+    translations,
     withdrawing,
 )
 from app.web.deps import Studio
@@ -46,6 +47,7 @@ EXPERIMENTER_PARTS = (
     login,
     accounts,
     study_making,
+    translations,
     invitations,
     experimenter,
     operator,

@@ -113,7 +113,7 @@ class Visitor:
         raise WentAstray(f"The way to the end ended at {self._page.address}.")
 
     def _send_first(self, filled_in: dict[str, str]) -> None:
-        """Send the page's first form, but that for the language, with these fields filled in, the others as they are."""
+        """Send the page's first form, that for the language left out, with these fields filled in."""
         forms = [form for form in self._page.forms if not _LANGUAGE.search(form[0])]
         if not forms:
             raise WentAstray(f"There is nothing to press on {self._page.address}.")

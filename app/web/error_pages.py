@@ -12,6 +12,7 @@ from sqlalchemy.exc import OperationalError
 from starlette.exceptions import HTTPException
 
 from app.errors import AppError
+from app.web import languages
 from app.web.deps import (
     EXPERIMENTER_COOKIE,
     PARTICIPANT_COOKIE,
@@ -19,7 +20,6 @@ from app.web.deps import (
     NotYet,
     PasswordChangeDue,
 )
-from app.web import languages
 from app.web.guard import HEADERS
 from app.web.templating import page
 from app.web.wording import Wording

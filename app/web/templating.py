@@ -14,6 +14,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from starlette.datastructures import URLPath
 
 from app.db import now
+from app.web.own_texts import missing_facts, missing_translations
 from app.web.task_words import words_of
 from app.web.wording import page_language, say, study_question
 
@@ -141,7 +142,7 @@ def make_environment(path_for: Callable[..., URLPath]) -> Environment:
     words = (ago, time_left, moment, seconds, bytes_in_words, in_words, task_title)
     environment.filters.update({word.__name__: word for word in (*numbers, *words)})
     environment.globals["path_for"] = path_for
-    for word in (say, page_language, study_question, imports_of):
+    for word in (say, page_language, study_question, imports_of, missing_facts, missing_translations):
         environment.globals[word.__name__] = word
     return environment
 

@@ -15,7 +15,7 @@ from fluent.syntax import FluentSerializer, ast
 from jinja2 import pass_context
 from jinja2.runtime import Context
 
-from app.domain.protocol import Language
+from app.domain.protocol import CONSENT_FACTS, Language
 from app.domain.studies import Participant, StudySettings
 
 log = logging.getLogger("app.wording")
@@ -69,6 +69,13 @@ class Wording:
         """Whether the study has written this text itself, for this language or for all."""
         return key in self._own
 
+    def own_variables(self, key: str) -> set[str]:
+        """What the study's own text asks for; nothing when it has none, or one that is broken."""
+        try:
+            return variables_of(_parsed(self._own[key])) if key in self._own else set()
+        except WordingBroken:
+            return set()
+
     def _warn(self, key: str, error: WordingBroken) -> None:
         if key not in self._warned:
             log.warning("the study's own text of %s is broken, the built-in one is shown: %s", key, error)
@@ -117,9 +124,9 @@ def study_question(context: Context) -> str:
 
 
 def question_of(wording: Wording, settings: StudySettings) -> str:
-    """What is asked about every pair: the study's own question, or the usual one in the language of the page."""
-    usual = StudySettings.model_fields["question"].default
-    return wording("pair-question") if settings.question == usual else settings.question
+    """What is asked about every pair: the study's question, translated if it is, or ours in the page's language."""
+    ours = settings.question == StudySettings.model_fields["question"].default
+    return wording("pair-question") if ours or wording.is_own("pair-question") else settings.question
 
 
 def broken_texts(own: Mapping[str, str]) -> dict[str, str]:
@@ -128,7 +135,7 @@ def broken_texts(own: Mapping[str, str]) -> dict[str, str]:
     for key, text in own.items():
         prefix, _, name = key.rpartition(":")
         try:
-            if not _built_in(Language.ENGLISH).has_message(name) and not name.startswith("form-"):
+            if not _built_in(Language.ENGLISH).has_message(name) and not name.startswith(("form-", "fact-")):
                 raise WordingBroken("there is no text of this name")
             if prefix not in {"", *Language}:
                 raise WordingBroken(f"there is no language {prefix}")
@@ -190,7 +197,8 @@ def _built_in(language: Language) -> FluentBundle:
 @cache
 def _known_variables(name: str) -> frozenset[str]:
     message = built_in_texts(Language.ENGLISH).get(name)
-    return frozenset() if message is None else frozenset(variables_of(message))
+    facts = CONSENT_FACTS if name == "consent-body" else ()
+    return frozenset(facts) if message is None else frozenset({*variables_of(message), *facts})
 
 
 @lru_cache(maxsize=64)

@@ -22,7 +22,11 @@ consent-body =
     - { $count } Paare, verteilt auf so viele Sitzungen, wie Sie möchten. Ihr Link bringt Sie immer dorthin zurück, wo Sie waren.
     - Gespeichert werden Ihre Antworten, wann Sie sie gegeben haben und wie lange es gedauert hat, unter dem Kürzel { $code }. Kein Name, keine Kamera, kein Mikrofon.
     - Sie können jederzeit ohne Angabe von Gründen aufhören: Schließen Sie einfach die Seite. Wenn Sie unten auf einer Seite „Teilnahme widerrufen“ wählen, wird alles über Sie gelöscht.
-    - Fragen? Wenden Sie sich an die Person, von der Sie den Link haben.
+consent-duration = Dauer: { $duration }.
+consent-payment = Dafür erhalten Sie: { $payment }.
+consent-ethics = Ethikvotum: { $ethics }.
+consent-contact = Fragen? Wenden Sie sich bitte an { $contact }.
+consent-contact-unknown = Fragen? Wenden Sie sich bitte an die Menschen, die Sie zu dieser Studie eingeladen haben.
 consent-version = Informationen für Teilnehmende, Version { $version }
 consent-agree = Ich willige ein und nehme teil
 consent-changed = Dieser Text hat sich geändert, seit Sie ihn zuletzt gesehen haben. Bitte lesen Sie ihn noch einmal.

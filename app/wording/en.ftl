@@ -24,7 +24,11 @@ consent-body =
     - { $count } pairs, in as many sittings as you like. Your link brings you back to where you were.
     - What is kept: your answers, when you gave them and how long they took, under the code { $code }. No name, no camera, no microphone.
     - You are free to stop at any time, without giving a reason: just close the page. If you choose “Withdraw” at the foot of a page, everything about you is erased.
-    - Questions? Ask the person who sent you the link.
+consent-duration = It takes { $duration }.
+consent-payment = For taking part you receive: { $payment }.
+consent-ethics = Ethics approval: { $ethics }.
+consent-contact = Questions? Please contact { $contact }.
+consent-contact-unknown = Questions? Please ask the people who invited you to the study.
 consent-version = Information for participants, version { $version }
 consent-agree = I agree to take part
 consent-changed = This text has changed since you saw it last. Please read it again.

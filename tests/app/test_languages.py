@@ -1,6 +1,7 @@
 """In which language somebody reads: what they chose, else what their browser asks for; on every page, to the end."""
 
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
@@ -20,7 +21,7 @@ GERMAN = {"Accept-Language": "de-AT,de;q=0.9,en;q=0.5"}
 def invite(database: Database) -> Callable[..., str]:
     """Makes a study with these settings; gives the path of its first participant's link."""
 
-    def make(**settings: object) -> str:
+    def make(**settings: Any) -> str:
         with database.writing() as session:
             study = factories.make_study(session, **settings)
             _, token = factories.make_participant(session, study, ready=False)

@@ -112,6 +112,11 @@ def test_without_script_the_form_leads_to_the_next_robot(rating: AtTheRobots) ->
     path = f"/p/evaluation/trials/{rating.trials[0].id}/rating"
     answer = rating.browser.post(path, data={**form, "satisfaction": "3", "personalisation": "3"})
     assert (answer.status_code, answer.headers["location"]) == (303, "/p/evaluation")
+    rating.look()
+    rating.rate(rating.trials[1])
+    with rating.database.reading() as session:
+        marks = session.scalars(select(Rating.by_script).order_by(Rating.id)).all()
+    assert marks == [False, True]
 
 
 def test_a_retry_after_a_lost_response_counts_once(rating: AtTheRobots) -> None:
