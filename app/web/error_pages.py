@@ -27,13 +27,13 @@ from app.web.wording import Wording
 log = logging.getLogger("app.web")
 
 _TITLES = {
-    HTTPStatus.UNAUTHORIZED: "Who are you?",
+    HTTPStatus.UNAUTHORIZED: "Please log in",
     HTTPStatus.FORBIDDEN: "That is not allowed",
-    HTTPStatus.NOT_FOUND: "Nothing here",
-    HTTPStatus.CONFLICT: "That no longer fits",
+    HTTPStatus.NOT_FOUND: "Page not found",
+    HTTPStatus.CONFLICT: "That is no longer possible",
     HTTPStatus.TOO_MANY_REQUESTS: "A moment, please",
     HTTPStatus.SERVICE_UNAVAILABLE: "A moment, please",
-    HTTPStatus.INTERNAL_SERVER_ERROR: "Something broke",
+    HTTPStatus.INTERNAL_SERVER_ERROR: "Something went wrong",
 }
 _MESSAGES = {
     HTTPStatus.NOT_FOUND: "There is no page at this address.",

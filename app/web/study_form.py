@@ -34,11 +34,11 @@ class StudyForm(BaseModel):
     labels_per_participant: _Text = ""
     language: _Text = ""
     languages: _Several = []
-    consent_version: _Text = ""
     consent_duration: _Text = ""
     consent_payment: _Text = ""
-    consent_ethics: _Text = ""
     consent_contact: _Text = ""
+    consent_ethics: _Text = ""
+    consent_version: _Text = ""
     consent_text: _Lines = ""
     demographics: _Lines = ""
     questionnaire: _Lines = ""

@@ -44,7 +44,7 @@ def test_a_break_stands_between_two_pairs_until_the_person_goes_on(
     taking_part.answer(taking_part.queries[0])
     assert taking_part.answer(taking_part.queries[1]).json()["state"] == "break"
     page = taking_part.browser.get("/p/next").text
-    assert "2 answers are done" in page
+    assert "2 answers done" in page
     assert taking_part.browser.post("/p/break").headers["location"] == "/p/next"
     assert taking_part.turn().json()["pair"]["query_id"] == taking_part.queries[2].id
     assert [(event.kind, event.detail) for event in events(database)] == [

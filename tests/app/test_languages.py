@@ -96,8 +96,8 @@ def test_the_page_after_withdrawing_keeps_the_language_and_can_change_it(taking_
     browser.post("/p/language", data={"language": "de"})
     browser.headers["Accept-Language"] = "en"
     browser.get(browser.post("/p/withdraw").headers["location"])
-    assert "Es ist gelöscht" in browser.get("/p/withdrawn").text
-    assert "Es ist gelöscht" in browser.get(browser.get(f"/p/{taking_part.token}").headers["location"]).text
+    assert "Ihre Daten sind gelöscht" in browser.get("/p/withdrawn").text
+    assert "Ihre Daten sind gelöscht" in browser.get(browser.get(f"/p/{taking_part.token}").headers["location"]).text
     browser.post("/p/language", data={"language": "en", "here": "/p/withdrawn"})
     assert language_of(browser.get("/p/withdrawn").text) == "en"
 

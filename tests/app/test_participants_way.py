@@ -239,8 +239,8 @@ class TestForms:
     @pytest.mark.parametrize(
         ("item", "typed", "said"),
         [
-            ("age", "old", "Please write a number"),
-            ("age", "nan", "Please write a number"),
+            ("age", "old", "Please enter a number"),
+            ("age", "nan", "Please enter a number"),
             ("hand", "foot", "Please choose one"),
             ("robot_experience", "6", "Please choose one"),
         ],

@@ -82,7 +82,7 @@ def test_after_the_last_pair_the_evaluation_is_next(rating: AtTheRobots) -> None
     assert rating.browser.get("/p/next").headers["location"] == "/p/evaluation"
     page = rating.look()
     assert "Robot A" in page
-    assert "Time 1 of 3 with this robot" in page
+    assert "Round 1 of 3 with this robot" in page
     assert f'action="/p/evaluation/trials/{rating.trials[0].id}/rating"' in page
 
 
@@ -102,7 +102,7 @@ def test_a_rating_is_stored_and_leads_to_the_next_robot(rating: AtTheRobots) -> 
     answer = rating.rate(rating.trials[0], 5, personalisation=1, response_time_ms=8123)
     assert (answer.status_code, answer.json()["next_path"]) == (200, "/p/evaluation")
     assert rating.ratings(rating.trials[0]) == [(1, 5, 1)]
-    assert "Time 2 of 3" in rating.look()
+    assert "Round 2 of 3" in rating.look()
     with rating.database.reading() as session:
         assert session.scalars(select(Rating)).one().response_time_ms == 8123
 

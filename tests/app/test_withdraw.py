@@ -200,7 +200,7 @@ def test_afterwards_browser_and_link_find_only_the_page_that_is_left(
     traced: TakingPart, new_browser: Callable[[], TestClient]
 ) -> None:
     answer = traced.browser.post("/p/withdraw")
-    assert "It is erased" in traced.browser.get(answer.headers["location"]).text
+    assert "Your data have been erased" in traced.browser.get(answer.headers["location"]).text
     assert traced.browser.get("/p/next").status_code == 401
     link = new_browser().get(f"/p/{traced.token}")
     assert (link.status_code, link.headers["location"]) == (303, "/p/withdrawn")

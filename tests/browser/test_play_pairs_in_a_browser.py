@@ -218,10 +218,10 @@ def test_after_some_answers_a_break_is_offered_once_and_enter_goes_on(invited: I
     for number in range(2):
         wait_ready(page, number)
         page.keyboard.press("ArrowLeft")
-    expect(page.get_by_role("heading", name="2 answers are done")).to_be_visible()
+    expect(page.get_by_role("heading", name="2 answers done")).to_be_visible()
     assert serious_findings(page) == []
     page.goto(invited.link)  # on another day
-    expect(page.get_by_role("heading", name="2 answers are done")).to_be_visible()
+    expect(page.get_by_role("heading", name="2 answers done")).to_be_visible()
     page.keyboard.press("Enter")
     wait_ready(page, 2)
     page.keyboard.press("z")

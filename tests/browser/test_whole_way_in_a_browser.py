@@ -223,7 +223,7 @@ def test_in_german_from_the_welcome_to_the_withdrawal(open_study: Callable[..., 
     expect(page.get_by_role("heading", level=1)).to_have_text("Es ist gelöscht")
     page.goto(study.address.rsplit("/join", 1)[0] + "/p/next")
     at(page, "error")
-    expect(page.get_by_role("heading", level=1)).to_have_text("Wer sind Sie?")
+    expect(page.get_by_role("heading", level=1)).to_have_text("Bitte öffnen Sie Ihren Link noch einmal")
     assert study.person().withdrawn_at is not None
 
 
