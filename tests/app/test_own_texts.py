@@ -29,7 +29,7 @@ GERMAN = {
     "de:form-trust-high": "immer",
     "de:pair-question": "Welcher ist sanfter?",
 }
-OWN = {"demographics": (HAND, TRUST), "question": "Which one is gentler?"}
+OWN: dict[str, Any] = {"demographics": (HAND, TRUST), "question": "Which one is gentler?"}
 
 
 @pytest.fixture
@@ -102,25 +102,26 @@ def test_a_study_without_own_words_and_one_of_a_single_language_miss_nothing() -
     assert missing_translations(StudySettings(languages=(Language.ENGLISH,), question="Which?")) == {}
 
 
-class TestTheConsentText:
-    FACTS = {
-        "consent_duration": "about 45 minutes",
-        "consent_payment": "12 € per hour",
-        "consent_ethics": "Board 7, 2026-117",
-        "consent_contact": "Ada, ada@example.org",
-    }
+FACTS: dict[str, Any] = {
+    "consent_duration": "about 45 minutes",
+    "consent_payment": "12 € per hour",
+    "consent_ethics": "Board 7, 2026-117",
+    "consent_contact": "Ada, ada@example.org",
+}
 
+
+class TestTheConsentText:
     def test_it_says_what_the_study_says_and_is_kept_word_for_word_as_it_was_shown(
         self, come_in: Callable[..., TestClient], database: Database
     ) -> None:
-        browser = come_in(**self.FACTS)
+        browser = come_in(**FACTS)
         page = browser.get("/p/consent").text
         agree(browser)
         (record,) = stored(database, ConsentRecord)
         shown = " ".join(re.sub(r"<[^>]+>", " ", page.split("<h1>")[1].split("<form")[0]).split())
         kept = " ".join(line.removeprefix("- ") for line in record.text.splitlines() if line)
         assert " ".join(kept.split()) == shown
-        assert all(fact in record.text for fact in self.FACTS.values())
+        assert all(fact in record.text for fact in FACTS.values())
 
     def test_it_reads_well_when_only_some_is_known(self, come_in: Callable[..., TestClient]) -> None:
         page = come_in(consent_payment="12 € pro Stunde").get("/p/consent").text
@@ -130,19 +131,19 @@ class TestTheConsentText:
 
     def test_own_text_says_it_where_it_wants_and_the_rest_follows(self, come_in: Callable[..., TestClient]) -> None:
         body = "It takes { $duration }.\n\n- One thing."
-        page = come_in(**self.FACTS, wording={"consent-body": body}).get("/p/consent").text
+        page = come_in(**FACTS, wording={"consent-body": body}).get("/p/consent").text
         assert "It takes about 45 minutes." in page
         assert page.count("about 45 minutes") == 1
         assert "<li>One thing.</li><li>Vergütung: 12 € per hour</li>" in re.sub(r">\s+<", "><", page)
 
     def test_what_it_says_is_translated_too(self, come_in: Callable[..., TestClient]) -> None:
-        page = come_in(**self.FACTS, wording={"de:fact-duration": "etwa 45 Minuten"}).get("/p/consent").text
+        page = come_in(**FACTS, wording={"de:fact-duration": "etwa 45 Minuten"}).get("/p/consent").text
         assert "Dauer: etwa 45 Minuten" in page
         assert "about 45" not in page
 
     def test_what_is_missing_is_known(self) -> None:
         assert missing_facts(StudySettings()) == ["duration", "payment", "ethics", "contact"]
-        assert missing_facts(StudySettings(**self.FACTS)) == []
+        assert missing_facts(StudySettings(**FACTS)) == []
         own = StudySettings(wording={"consent-body": "Ask { $contact }. It takes an hour."})
         assert missing_facts(own) == ["contact"]
 
