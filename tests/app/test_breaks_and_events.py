@@ -156,10 +156,8 @@ def test_events_of_nobody_are_refused(client: TestClient, database: Database) ->
     assert events(database) == []
 
 
-def test_pages_in_german_say_the_time_left_in_german(
-    taking_part: TakingPart, settle: Callable[..., None], database: Database, store: ArtefactStore
-) -> None:
-    settle(language="de")
+def test_pages_in_german_say_the_time_left_in_german(taking_part: TakingPart, database: Database) -> None:
+    taking_part.browser.post("/p/language", data={"language": "de"})
     with database.writing() as session:
         for number, query in enumerate(taking_part.queries[:7]):
             factories.make_label(session, query, ago=timedelta(seconds=1000 - 60 * number))

@@ -133,7 +133,7 @@ def test_an_old_page_with_other_values_is_refused_in_words_and_nothing_is_overwr
     rating.rate(rating.trials[0], 4, uuid)
     for answer in (rating.rate(rating.trials[0], 1, uuid), rating.rate(rating.trials[0], 1)):
         assert answer.status_code == 409
-        assert "has a rating already" in answer.json()["detail"]
+        assert "have already rated this robot" in answer.json()["detail"]
     assert rating.ratings(rating.trials[0]) == [(1, 4, 2)]
 
 
@@ -289,7 +289,7 @@ def test_a_film_whose_file_is_lost_is_waited_for(rating: AtTheRobots, store: Art
 def test_the_pages_are_there_in_german(rating: AtTheRobots, database: Database) -> None:
     with database.writing() as session:
         session.get_one(Participant, rating.participant.id).language = "de"
-    assert "Wie zufrieden sind Sie mit diesem Roboter" in rating.look()
+    assert "Wie zufrieden sind Sie insgesamt mit diesem Roboter" in rating.look()
 
 
 # -- a physical robot -------------------------------------------------------------------------------------------------

@@ -213,7 +213,7 @@ def test_withdrawing_is_offered_on_every_page_in_the_persons_language(taking_par
     assert 'href="/p/withdraw"' in page
     assert "Teilnahme widerrufen" in page
     left = taking_part.browser.post("/p/withdraw")
-    assert "Es ist gelöscht" in taking_part.browser.get(left.headers["location"]).text
+    assert "Ihre Daten sind gelöscht" in taking_part.browser.get(left.headers["location"]).text
 
 
 def test_an_experimenter_can_erase_at_somebodys_request(traced: TakingPart, store: ArtefactStore) -> None:
