@@ -7,6 +7,7 @@ tell who is asking: before joining, after withdrawing, and where something went 
 import re
 from collections.abc import Sequence
 from datetime import timedelta
+from http import HTTPStatus
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Form, Request
@@ -32,12 +33,14 @@ def choose_language(
     here: Annotated[str, Form(max_length=4000)] = "",
 ) -> Response:
     """From now on every page in this language, on every device; back to the page one was on."""
-    participant = participant_or_nobody(request, session)
-    if participant is not None:
-        participant.language = language
     back = here if _OUR_PAGE.fullmatch(here) else request.app.url_path_for("show_next")
-    response = RedirectResponse(back, 303)
-    remember(response, studio.settings, language)
+    response = RedirectResponse(back, HTTPStatus.SEE_OTHER)
+    participant = participant_or_nobody(request, session)
+    if participant is None:
+        remember(response, studio.settings, language)
+    elif language in participant.study.settings.offered_languages:
+        participant.language = language
+        remember(response, studio.settings, language)
     return response
 
 

@@ -14,7 +14,6 @@ from app.domain.participation import ParticipantEvent
 from app.domain.preferences import Purpose, Query, count_labels, current_answers, current_labels
 from app.domain.studies import Participant, Study
 from app.services import participant_events
-from app.storage import ArtefactStore
 from tests import factories
 from tests.app.conftest import JSON, TakingPart
 

@@ -68,7 +68,8 @@ def test_a_language_the_study_does_not_offer_is_neither_spoken_nor_to_be_chosen(
     assert language_of(page) == "en"
     assert "Deutsch" not in page
     client.post("/p/language", data={"language": "de"})
-    assert language_of(client.get("/p/consent").text) == "en"
+    for address in ("/p/consent", "/p/nowhere"):
+        assert language_of(client.get(address, headers={"Accept": "text/html"}).text) == "en"
 
 
 def test_the_studys_own_language_is_always_offered() -> None:

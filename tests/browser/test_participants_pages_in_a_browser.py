@@ -1,4 +1,4 @@
-"""The participants' pages for eyes, fingers, keyboards and screen readers: enlarging, the order of Tab, what is read."""
+"""The participants' pages for eyes, fingers, keyboards and screen readers: enlarging, order of Tab, what is read."""
 
 import re
 
