@@ -140,7 +140,7 @@ def test_the_whole_way_with_the_keyboard_alone_and_back_to_the_panel(
     press(page, "Save and go on")
     expect(page.get_by_role("alert")).to_contain_text("another look")
     at(page, "demographics")
-    focus(page, "How old are you?")
+    expect(page.get_by_label("How old are you?")).to_be_focused()  # where another look is needed
     page.keyboard.press("ControlOrMeta+A")
     page.keyboard.type("28")
     pick(page, "How much experience do you have with robots?", 4)
@@ -205,9 +205,11 @@ def test_in_german_from_the_welcome_to_the_withdrawal(open_study: Callable[..., 
     study = open_study(panel_parameter="")
     page = new_page(**DARK, viewport=PHONE)
     page.goto(study.address)
-    at(page, "joined")
-    press(page, "Go on")
+    at(page, "joined")  # German from here on: so the browser asks for
+    press(page, "Weiter")
     at(page, "consent")
+    press(page, "English")
+    expect(page.get_by_role("heading", level=1)).to_have_text("Taking part")
     press(page, "Deutsch")
     expect(page.get_by_role("heading", level=1)).to_have_text("Teilnahme")
     expect(page.locator("html")).to_have_attribute("lang", "de")
