@@ -20,6 +20,7 @@ from app.web import (
     importing,
     invitations,
     joining,
+    languages,
     live,
     login,
     media,
@@ -31,6 +32,7 @@ from app.web import (
     participant_pairs,
     results,
     study_making,
+    translations,
     withdrawing,
 )
 from app.web.deps import Studio
@@ -46,6 +48,7 @@ EXPERIMENTER_PARTS = (
     login,
     accounts,
     study_making,
+    translations,
     invitations,
     experimenter,
     operator,
@@ -56,6 +59,7 @@ EXPERIMENTER_PARTS = (
 )
 PARTICIPANT_PARTS = (
     joining,
+    languages,
     participant_consent,
     participant_forms,
     participant_pairs,

@@ -28,6 +28,7 @@ let since = performance.now();
 let sending = false;
 let film = null;
 
+find("late").remove();
 addEventListener("pageshow", (event) => event.persisted && location.reload());
 form.addEventListener("submit", (event) => {
   event.preventDefault();

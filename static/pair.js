@@ -2,6 +2,7 @@
 // anything on the page says so. Practice is the same page with a strip that explains the keys.
 
 import { keepOnly, makeVideo, preload } from "./clips.js";
+import { Enlarging } from "./enlarging.js";
 import { Events } from "./events.js";
 import { listen } from "./hotkeys.js";
 import { LockStep } from "./lock_step.js";
@@ -35,6 +36,7 @@ let phase = "loading"; // loading, watching, ready, unplayable, saving
 let skippedAfterMs = ""; // when "can't tell" was pressed, while the reason is asked for
 
 const practice = find("practice") && new Practice(find("practice"), say, (count) => events.note("keys_used", { count }));
+const enlarging = new Enlarging(page);
 const controls = new PlayerControls(find("player"), () => player, words, {
   scrubbed: () => watching && (watching.scrubs += 1),
   used: (name) => practice?.used(name),
@@ -43,7 +45,9 @@ const controls = new PlayerControls(find("player"), () => player, words, {
 start();
 
 async function start() {
+  find("late").remove();
   find("replay").hidden = false;
+  for (const button of [...buttons, undo.querySelector("button")]) button.disabled = false; // aria-disabled tells from here on
   answers.addEventListener("submit", (event) => {
     event.preventDefault();
     answer(event.submitter);
@@ -145,6 +149,7 @@ async function go(next) {
   const videos = await (prepared?.queryId === turn.pair.query_id ? prepared.videos : videosOf(turn.pair));
   prepared = null;
   player?.stop();
+  enlarging.show(null);
   page.querySelectorAll("figure").forEach((figure, index) => {
     const old = figure.querySelector("video");
     old.replaceWith(videos[index]);

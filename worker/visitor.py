@@ -15,6 +15,7 @@ from app.errors import AppError
 _QUERY = re.compile(r"/p/queries/(\d+)/label")
 _BREAK = re.compile(r"/p/break$")
 _RATING = re.compile(r"/p/evaluation/trials/(\d+)/rating")
+_LANGUAGE = re.compile(r"/p/language$")
 _END = "/p/finished"
 _MOST_PAGES = 12
 """Forms between the pairs and the end."""
@@ -117,10 +118,11 @@ class Visitor:
         raise WentAstray(f"The way to the end ended at {self._page.address}.")
 
     def _send_first(self, filled_in: dict[str, str]) -> None:
-        """Send the page's first form with these fields filled in, the others as they are."""
-        if not self._page.forms:
+        """Send the page's first form, that for the language left out, with these fields filled in."""
+        forms = [form for form in self._page.forms if not _LANGUAGE.search(form[0])]
+        if not forms:
             raise WentAstray(f"There is nothing to press on {self._page.address}.")
-        action, fields = self._page.forms[0]
+        action, fields = forms[0]
         self._send(action, {**fields, **filled_in})
 
     def _open(self, path: str) -> None:

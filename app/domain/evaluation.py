@@ -104,4 +104,6 @@ class Rating(Base):
     personalisation: Mapped[int]
     client_uuid: Mapped[str] = mapped_column(String(36), unique=True)
     response_time_ms: Mapped[int | None]
+    by_script: Mapped[bool | None]
+    """Whether the page's script sent it, and so saw to it that the film had been shown; None: it was not noted yet."""
     created_at: Mapped[datetime] = mapped_column(default=now)

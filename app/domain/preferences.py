@@ -125,6 +125,8 @@ class LabelEvent(Base):
     left_watched_ms: Mapped[int | None]
     right_watched_ms: Mapped[int | None]
     """How much of each clip was played before the answer, in the clip's own time: no matter how fast or how often."""
+    by_script: Mapped[bool | None]
+    """Whether the page's script sent it, and so saw to it that the clips had been shown; None: it was not noted yet."""
     created_at: Mapped[datetime] = mapped_column(default=now)
 
 

@@ -102,6 +102,9 @@ class PlannedTest(StrEnum):
     MIXED_MODEL = "mixed_model"
 
 
+CONSENT_FACTS = ("duration", "payment", "ethics", "contact")
+"""What an ethics board asks of a consent text and only the study knows: settings ``consent_duration`` and so on."""
+
 LIKERT_POINTS = 5
 
 PAPER_DEMOGRAPHICS = (

@@ -35,6 +35,11 @@ LONGEST_CLIP_STEPS = {TaskName.FEEDING: 100, TaskName.DRINKING: 130, TaskName.SC
 """A whole episode."""
 
 
+def longest_clip_steps(task: str) -> int | None:
+    """Of a task by its name; None for one that is not simulated here."""
+    return {name.value: steps for name, steps in LONGEST_CLIP_STEPS.items()}.get(task)
+
+
 def usual_clip_steps(task: str) -> int:
     """Of a task by its name; a task under construction, which has no row here yet, is shown as long as Feeding."""
     return {name.value: steps for name, steps in USUAL_CLIP_STEPS.items()}.get(task, USUAL_CLIP_STEPS[TaskName.FEEDING])
@@ -99,7 +104,12 @@ class StudySettings(BaseModel):
     evaluation_scenarios: int = Field(default=100, ge=10, le=1000)
     question: str = Field(default="Which robot would you rather have?", min_length=1, max_length=200)
     consent_version: str = Field(default="1", min_length=1, max_length=40)
+    consent_duration: str = Field(default="", max_length=200, description="How long it takes, in the consent text.")
+    consent_payment: str = Field(default="", max_length=200, description="What people are given, in the consent text.")
+    consent_ethics: str = Field(default="", max_length=200, description="Who approved it and under which number.")
+    consent_contact: str = Field(default="", max_length=200, description="Whom to ask, in the consent text.")
     language: Language = Language.ENGLISH
+    languages: tuple[Language, ...] = Field(default=tuple(Language), description="In which the pages may be read.")
     wording: dict[str, str] = Field(default_factory=dict, description="Texts of the pages in the study's own words.")
     demographics: tuple[FormItem, ...] = ()
     practice_pairs: int = Field(default=0, ge=0, le=5, description="Before the first label; never learned from.")
@@ -133,6 +143,11 @@ class StudySettings(BaseModel):
                 f"{max(self.labels_per_participant, short)} labels asked for{also}. Add scenarios or behaviours."
             )
         return self
+
+    @property
+    def offered_languages(self) -> tuple[Language, ...]:
+        """Languages people may choose from: the study's own first, which is always one of them."""
+        return (self.language, *(each for each in Language if each in self.languages and each != self.language))
 
     @property
     def pairs_per_scenario(self) -> int:
@@ -212,7 +227,7 @@ class Study(Base):
     @property
     def whole_clip_steps(self) -> int | None:
         """Steps of a clip of a whole episode; None for a task that is not simulated here."""
-        return {str(name): steps for name, steps in LONGEST_CLIP_STEPS.items()}.get(self.task)
+        return longest_clip_steps(self.task)
 
 
 class Deviation(Base):

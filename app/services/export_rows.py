@@ -137,6 +137,7 @@ def labels(session: Session, study: Study) -> Rows:
                 event.stall_count,
                 event.stalled_ms,
                 event.largest_drift_ms,
+                event.by_script,
                 event.created_at,
             )
 
@@ -191,6 +192,7 @@ def ratings(session: Session, study: Study) -> Rows:
                 rating is not None and newest[trial.id] == rating.revision,
                 rating.revision if rating else None,
                 rating.response_time_ms if rating else None,
+                rating.by_script if rating else None,
                 rating.created_at if rating else None,
                 trial.shown_at,
                 trial.started_at,

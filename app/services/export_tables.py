@@ -12,6 +12,10 @@ from app.services.exporting import Column, Kind, Table
 PARTICIPANT = Column("participant", Kind.TEXT, "Code of the participant.", allowed="P01, P02, ...")
 ORDINAL = Column("ordinal", Kind.INTEGER, "Place of the pair in this participant's order.", allowed="from 1")
 SHA256 = "64 hexadecimal digits"
+WITHOUT_SCRIPT = (
+    "Whether the page's script sent it. False: a browser without script, where nothing is measured and nothing "
+    "waits until the clips were seen. Empty: taken back, or from a version that did not note it."
+)
 
 
 def _words(values: type[Any]) -> str:
@@ -123,6 +127,7 @@ TABLES: Sequence[Table] = (
                 "How far the two clips were apart at worst, before they were brought together.",
                 "ms",
             ),
+            Column("by_script", B, WITHOUT_SCRIPT),
             Column("created_at", W, "When it reached the server."),
         ),
         export_rows.labels,
@@ -186,6 +191,7 @@ TABLES: Sequence[Table] = (
             Column("counts", B, "Whether this rating counts: false for a corrected one, and where there is none."),
             Column("revision", I, "First, second, ... rating of this trial.", allowed="from 1"),
             Column("response_time_ms", I, "From showing the scales to sending.", "ms"),
+            Column("by_script", B, WITHOUT_SCRIPT),
             Column("rated_at", W, "When it reached the server."),
             Column("shown_at", W, "Video: when the film was first shown."),
             Column("started_at", W, "Physical: when the operator started the robot."),

@@ -54,6 +54,8 @@ class Watching:
     watched_whole: bool | None = None
     left_watched_ms: int | None = None
     right_watched_ms: int | None = None
+    by_script: bool | None = None
+    """Whether a script measured at all; a browser without one sends the plain form."""
 
 
 def record_label(

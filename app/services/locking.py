@@ -16,7 +16,7 @@ from app.db import now
 from app.domain.clips import Rollout
 from app.domain.evaluation import Assignment
 from app.domain.preferences import Query
-from app.domain.studies import LONGEST_CLIP_STEPS, Deviation, Participant, Study, StudySettings, TaskName
+from app.domain.studies import Deviation, Participant, Study, StudySettings, longest_clip_steps
 from app.errors import AppError
 from app.services import audit, exporting, withdrawal
 from app.services.enrolment import participant_seed
@@ -74,7 +74,7 @@ def change(
     study: Study,
     *,
     name: str,
-    task: TaskName,
+    task: str,
     seed: int | None,
     settings: StudySettings,
     actor: str,
@@ -85,7 +85,7 @@ def change(
     ``seed`` None: as it is. Previews whose pairs would not fit any more are ended.
     Raises SettingsFixed, ClipsTooLong and ReasonMissing.
     """
-    before = _everything(study.name, study.task, study.seed, study.stored_settings)
+    before = _everything(study.name, study.task, study.seed, study.settings.model_dump(mode="json"))
     seed = study.seed if seed is None else seed
     after = _everything(name, task, seed, settings.model_dump(mode="json"))
     changed = [key for key in after if before.get(key) != after[key]]
@@ -93,7 +93,7 @@ def change(
     refused = [key for key in changed if key in fixed]
     if refused:
         raise SettingsFixed(" ".join(sorted({f"{key.replace('_', ' ')}: {fixed[key]}" for key in refused})))
-    if settings.clip_steps > LONGEST_CLIP_STEPS[task]:
+    if settings.clip_steps > (longest_clip_steps(task) or settings.clip_steps):
         raise ClipsTooLong
     if not changed:
         return []

@@ -62,6 +62,7 @@ def rate(
     *,
     corrects: int = 0,
     response_time_ms: int | None = None,
+    by_script: bool | None = None,
 ) -> Rating:
     """Store one rating and return it; sent again, it is the same one. The study is loaded.
 
@@ -88,6 +89,7 @@ def rate(
         personalisation=score.personalisation,
         client_uuid=str(client_uuid),
         response_time_ms=response_time_ms,
+        by_script=by_script,
     )
     return _append(session, trial, rating)
 

@@ -27,7 +27,7 @@ from app.web.turns import Turns
 PARTICIPANT_COOKIE = "studio_participant"
 EXPERIMENTER_COOKIE = "studio_experimenter"
 LANGUAGE_COOKIE = "studio_language"
-"""The language a participant has chosen in this browser, for pages that cannot tell who is asking."""
+"""The language of the pages in this browser, for those that cannot tell who is asking."""
 
 
 class LinkNeeded(AppError):
@@ -96,11 +96,17 @@ ReadingSession = Annotated[Session, Depends(_reading_session, scope="function")]
 WritingSession = Annotated[Session, Depends(_writing_session, scope="function")]
 
 
-def participant_asking(request: Request, session: Session) -> Participant:
-    """The participant whose browser this is, study loaded. Raises LinkNeeded."""
+def participant_or_nobody(request: Request, session: Session) -> Participant | None:
+    """The participant whose browser this is, study loaded."""
     cookie = request.cookies.get(PARTICIPANT_COOKIE)
     participant = browser_sessions.participant_of(session, cookie) if cookie else None
-    if participant is None or participant.withdrawn_at is not None:
+    return None if participant is None or participant.withdrawn_at is not None else participant
+
+
+def participant_asking(request: Request, session: Session) -> Participant:
+    """The participant whose browser this is, study loaded. Raises LinkNeeded."""
+    participant = participant_or_nobody(request, session)
+    if participant is None:
         raise LinkNeeded
     return participant
 

@@ -12,9 +12,9 @@ from sqlalchemy.exc import OperationalError
 from starlette.exceptions import HTTPException
 
 from app.errors import AppError
+from app.web import languages
 from app.web.deps import (
     EXPERIMENTER_COOKIE,
-    LANGUAGE_COOKIE,
     PARTICIPANT_COOKIE,
     LoginNeeded,
     NotYet,
@@ -22,18 +22,18 @@ from app.web.deps import (
 )
 from app.web.guard import HEADERS
 from app.web.templating import page
-from app.web.wording import Wording, preferred
+from app.web.wording import Wording
 
 log = logging.getLogger("app.web")
 
 _TITLES = {
-    HTTPStatus.UNAUTHORIZED: "Who are you?",
+    HTTPStatus.UNAUTHORIZED: "Please log in",
     HTTPStatus.FORBIDDEN: "That is not allowed",
-    HTTPStatus.NOT_FOUND: "Nothing here",
-    HTTPStatus.CONFLICT: "That no longer fits",
+    HTTPStatus.NOT_FOUND: "Page not found",
+    HTTPStatus.CONFLICT: "That is no longer possible",
     HTTPStatus.TOO_MANY_REQUESTS: "A moment, please",
     HTTPStatus.SERVICE_UNAVAILABLE: "A moment, please",
-    HTTPStatus.INTERNAL_SERVER_ERROR: "Something broke",
+    HTTPStatus.INTERNAL_SERVER_ERROR: "Something went wrong",
 }
 _MESSAGES = {
     HTTPStatus.NOT_FOUND: "There is no page at this address.",
@@ -125,6 +125,10 @@ def _answer(
         known = (EXPERIMENTER_COOKIE if wording is None else PARTICIPANT_COOKIE) in request.cookies
         onward = request.app.url_path_for("show_studies" if wording is None else "show_next")
         context = {"title": title, "message": message, "status": int(status), "wording": wording}
+        if wording is not None:
+            context |= languages.switch(request)
+            if request.method != "GET":
+                context["here"] = request.app.url_path_for("show_next")
         context |= {"onward_path": onward if known and status != HTTPStatus.UNAUTHORIZED else None}
         answer = page(request, "error.html", context, status)
     answer.headers.update(headers or {})
@@ -132,10 +136,10 @@ def _answer(
 
 
 def _wording(request: Request) -> Wording | None:
-    """On the participants' pages: the language last chosen in this browser, else the one it asks for."""
+    """On the participants' pages: in the language last used in this browser, else the one it asks for."""
     if not request.url.path.startswith(("/p/", "/join/")):
         return None
-    return Wording(preferred(request.cookies.get(LANGUAGE_COOKIE) or request.headers.get("accept-language", "")))
+    return Wording(languages.of_browser(request))
 
 
 def _for_participants(wording: Wording, status: HTTPStatus, message: str, key: str) -> tuple[str, str]:

@@ -105,6 +105,7 @@ def rate_trial(
         form.client_uuid,
         corrects=form.corrects,
         response_time_ms=form.response_time_ms,
+        by_script=wants_json(request),
     )
     querying.seen(participant)
     turn = evaluating.next_turn(session, studio.store, participant)

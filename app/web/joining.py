@@ -8,6 +8,7 @@ from fastapi.responses import Response
 
 from app.services import browser_sessions, panel, querying
 from app.services.panel import Joined, PanelIdMissing
+from app.web import languages
 from app.web.deps import PARTICIPANT_COOKIE, StudioDep, Token, WritingSession, set_cookie
 from app.web.participant_pages import go, participant_page
 from app.web.templating import page
@@ -25,14 +26,18 @@ def join_study(request: Request, token: Token, session: WritingSession, studio: 
     try:
         joined = panel.join(session, study, request.query_params)
     except PanelIdMissing:
-        context = {"wording": wording_for(study.settings), "parameter": study.settings.panel_parameter}
+        offered = study.settings.offered_languages
+        wording = wording_for(study.settings, languages.of_browser(request, offered))
+        context = {**languages.nobodys(request, wording, offered), "parameter": study.settings.panel_parameter}
         return page(request, "participant/panel_id_missing.html", context, HTTPStatus.BAD_REQUEST)
     joined.participant.study = study
+    language = languages.settle(request, joined.participant, languages.chosen_here(request))
     response = _first_page(request, studio.settings.base_url, joined)
     lifetime = timedelta(days=studio.settings.session_days)
     cookie = browser_sessions.open_for_participant(session, joined.participant, lifetime)
     querying.seen(joined.participant)
     set_cookie(response, studio.settings, PARTICIPANT_COOKIE, cookie, lifetime)
+    languages.remember(response, studio.settings, language)
     response.headers["referrer-policy"] = "no-referrer"
     return response
 

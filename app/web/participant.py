@@ -1,17 +1,16 @@
-"""The participant's way: the personal link, the page one should be on, instructions, the language."""
+"""The participant's way: the personal link, the page one should be on, instructions."""
 
 from datetime import timedelta
 from typing import Annotated
 
-from fastapi import APIRouter, Form, Request
+from fastapi import APIRouter, Request
 from fastapi.responses import Response
 
-from app.domain.protocol import Language, Stage
+from app.domain.protocol import Stage
 from app.domain.studies import Participant
 from app.services import browser_sessions, enrolment, querying, stages
-from app.web import participant_pairs
+from app.web import languages, participant_pairs
 from app.web.deps import (
-    LANGUAGE_COOKIE,
     PARTICIPANT_COOKIE,
     CurrentParticipant,
     StudioDep,
@@ -55,17 +54,6 @@ def finish_instructions(request: Request, participant: AtInstructions, session: 
     return go(request, "show_next")
 
 
-@router.post("/language", name="choose_language")
-def choose_language(
-    request: Request, participant: CurrentParticipant, studio: StudioDep, language: Annotated[Language, Form()]
-) -> Response:
-    """From now on every page in this language, on every device."""
-    participant.language = language
-    response = go(request, "show_next")
-    set_cookie(response, studio.settings, LANGUAGE_COOKIE, language, timedelta(days=studio.settings.session_days))
-    return response
-
-
 # The last one: every other address below /p/ goes before a token.
 @router.get("/{token}", name="open_link")
 def open_link(request: Request, token: Token, session: WritingSession, studio: StudioDep) -> Response:
@@ -76,7 +64,9 @@ def open_link(request: Request, token: Token, session: WritingSession, studio: S
     lifetime = timedelta(days=studio.settings.session_days)
     cookie = browser_sessions.open_for_participant(session, participant, lifetime)
     querying.seen(participant)
+    language = languages.settle(request, participant)
     response = go(request, "show_next")
     set_cookie(response, studio.settings, PARTICIPANT_COOKIE, cookie, lifetime)
+    languages.remember(response, studio.settings, language)
     response.headers["referrer-policy"] = "no-referrer"
     return response

@@ -9,6 +9,7 @@ from app.domain.participation import ConsentRecord
 from app.domain.protocol import Stage
 from app.domain.studies import Participant
 from app.services import consent, stages
+from app.web.consent_text import consent_text
 from app.web.deps import CurrentParticipant, WritingSession
 from app.web.participant_pages import go, participant_page
 from app.web.templating import moment
@@ -34,7 +35,7 @@ def give_consent(
 ) -> Response:
     """Store the agreement to the text that was on the screen; if it has changed meanwhile, show the new one."""
     wording = wording_of(participant)
-    text = consent_text(wording, participant)
+    text = consent_text(wording, participant).whole
     if shown != consent.fingerprint(text):
         return _consent_page(request, participant, changed=True)
     consent.give(session, participant, text, wording.language)
@@ -45,7 +46,7 @@ def give_consent(
 def show_consent_copy(request: Request, participant: CurrentParticipant, session: WritingSession) -> Response:
     """The text to keep: as it was agreed to, or as it will be asked."""
     record = consent.newest(session, participant)
-    text = record.text if record else consent_text(wording_of(participant), participant)
+    text = record.text if record else consent_text(wording_of(participant), participant).whole
     context = {"record": record, "text": text, "language_of_text": record.language if record else None}
     return participant_page(request, "participant/consent_copy.html", participant, context)
 
@@ -55,28 +56,16 @@ def save_consent_copy(request: Request, participant: CurrentParticipant, session
     """The same as a file."""
     record = consent.newest(session, participant)
     wording = wording_of(participant)
-    text = record.text if record else consent_text(wording, participant)
-    lines = [participant.study.name, participant.code, *([_agreed(wording, record)] if record else []), "", text, ""]
+    text = record.text if record else consent_text(wording, participant).whole
+    lines = [participant.code, *([_agreed(wording, record)] if record else []), "", text, ""]
     name = f"{wording('consent-copy-file')}-{participant.code}.txt"
     headers = {"content-disposition": f'attachment; filename="{_plain(name)}"'}
     return PlainTextResponse("\n".join(lines), headers=headers)
 
 
-def consent_text(wording: Wording, participant: Participant) -> str:
-    """Every word that is agreed to, in the language of the page."""
-    settings = participant.study.settings
-    parts = (
-        wording("consent-title"),
-        wording("consent-welcome"),
-        wording("consent-body", count=settings.question_count, code=participant.code),
-        wording("consent-version", version=settings.consent_version),
-    )
-    return "\n\n".join(parts)
-
-
 def _consent_page(request: Request, participant: Participant, *, changed: bool) -> Response:
     text = consent_text(wording_of(participant), participant)
-    context: dict[str, Any] = {"shown": consent.fingerprint(text), "changed": changed}
+    context: dict[str, Any] = {"text": text, "shown": consent.fingerprint(text.whole), "changed": changed}
     return participant_page(request, "participant/consent.html", participant, context)
 
 

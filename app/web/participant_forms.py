@@ -14,6 +14,7 @@ from app.domain.studies import Participant
 from app.services import forms, stages
 from app.services.forms import MOST_CHARACTERS, Problem
 from app.web.deps import WritingSession
+from app.web.own_texts import choice_key
 from app.web.participant_pages import back_from, go, has_reached, participant_page
 from app.web.wording import Wording, wording_of
 
@@ -38,7 +39,8 @@ class Field:
     name: str
     kind: str
     question: str
-    choices: list[str]
+    choices: list[tuple[str, str]]
+    """What is stored, and what is shown."""
     low_label: str
     high_label: str
     value: str
@@ -97,7 +99,8 @@ def _form(
         "form": form.value,
         "action": request.url.path,
         "fields": fields,
-        "points": range(1, LIKERT_POINTS + 1),
+        "points": [(str(point), str(point)) for point in range(1, LIKERT_POINTS + 1)],
+        "first_wrong": next(iter(wrong), None),
         "problem_count": len(wrong),
         "most_characters": MOST_CHARACTERS,
         "back_path": back_from(request, settings, form),
@@ -111,7 +114,7 @@ def _field(wording: Wording, item: FormItem, values: Mapping[str, str], problem:
         name=item.name,
         kind=item.kind,
         question=_question(wording, item),
-        choices=list(item.choices),
+        choices=[(choice, _choice(wording, item, place)) for place, choice in enumerate(item.choices, 1)],
         low_label=_label(wording, item, "low", item.low_label),
         high_label=_label(wording, item, "high", item.high_label),
         value=values.get(item.name, ""),
@@ -125,6 +128,11 @@ def _question(wording: Wording, item: FormItem) -> str:
     if item.question and not wording.is_own(key):
         return item.question
     return wording(key) if key in wording else item.name.replace("_", " ").capitalize()
+
+
+def _choice(wording: Wording, item: FormItem, place: int) -> str:
+    key = choice_key(item, place)
+    return wording(key) if wording.is_own(key) else item.choices[place - 1]
 
 
 def _label(wording: Wording, item: FormItem, end: str, own: str) -> str:

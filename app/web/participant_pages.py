@@ -10,9 +10,10 @@ from fastapi.responses import RedirectResponse, Response
 from app.domain.protocol import Stage
 from app.domain.studies import Participant, StudySettings
 from app.services import stages
+from app.web import languages
 from app.web.deps import CurrentParticipant, NotYet, WritingSession
 from app.web.templating import page
-from app.web.wording import NAMES, wording_of
+from app.web.wording import wording_of
 
 ADDRESSES = {
     Stage.CONSENT: "show_consent",
@@ -40,13 +41,17 @@ def participant_page(
     context: Mapping[str, Any] | None = None,
     status: int = HTTPStatus.OK,
 ) -> Response:
-    """A page with what every participant's page needs: study, settings, participant, wording and languages."""
+    """A page with what every participant's page needs: study, settings, participant, wording and languages.
+
+    ``who`` keeps apart what a browser remembers of several people, without naming the study.
+    """
     shared = {
         "study": participant.study,
         "settings": participant.study.settings,
         "participant": participant,
         "wording": wording_of(participant),
-        "languages": NAMES,
+        **languages.switch(request, participant.study.settings.offered_languages),
+        "who": f"{participant.code}-{participant.created_at.timestamp():.0f}",
     }
     return page(request, template, {**shared, **(context or {})}, status)
 

@@ -103,7 +103,8 @@ def label_query(
     studio: StudioDep,
 ) -> Response:
     """Record the answer; the transaction is committed before this response leaves."""
-    watching = labelling.Watching(**form.model_dump(exclude={"response", "client_uuid", "reason"}))
+    measured = form.model_dump(exclude={"response", "client_uuid", "reason"})
+    watching = labelling.Watching(**measured, by_script=wants_json(request))
     labelling.record_label(session, participant, query_id, form.response, form.client_uuid, watching, form.reason)
     return _go_on(request, session, studio, participant)
 

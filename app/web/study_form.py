@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from app.domain.protocol import FormItem
 from app.domain.studies import LONGEST_CLIP_STEPS, PAPER_PROTOCOL, USUAL_CLIP_STEPS, StudySettings, TaskName
 from app.web import form_lines
+from app.web.own_texts import CONSENT
 from app.web.wording import broken_texts
 
 _Value = TypeVar("_Value")
@@ -32,6 +33,11 @@ class StudyForm(BaseModel):
     question: _Text = ""
     labels_per_participant: _Text = ""
     language: _Text = ""
+    languages: _Several = []
+    consent_duration: _Text = ""
+    consent_payment: _Text = ""
+    consent_contact: _Text = ""
+    consent_ethics: _Text = ""
     consent_version: _Text = ""
     consent_text: _Lines = ""
     demographics: _Lines = ""
@@ -95,6 +101,10 @@ _WORDS = (
     "question",
     "language",
     "consent_version",
+    "consent_duration",
+    "consent_payment",
+    "consent_ethics",
+    "consent_contact",
     "completion_code",
     "return_url",
     "panel_parameter",
@@ -103,7 +113,6 @@ _WORDS = (
 )
 _SWITCHES = ("pooled_prior", "answer_after_first_play", "debrief")
 _ITEMS = ("demographics", "questionnaire")
-_CONSENT = "consent-body"
 _EXPLAINED = {
     "return_url": "Enter an address that begins with http:// or https://, or leave it empty.",
     "panel_parameter": "Use letters, digits and underscores, such as PROLIFIC_PID.",
@@ -165,7 +174,7 @@ def form_of(name: str, task: str, seed: int | None, settings: StudySettings) -> 
         seed="" if seed is None else str(seed),
         **values,
         filter_milestones=", ".join(str(count) for count in settings.filter_milestones),
-        consent_text=own.pop(_CONSENT, ""),
+        consent_text=own.pop(CONSENT, ""),
         wording=form_lines.lines_of_texts(own),
         evaluation=_switch(settings.evaluation is not None),
         evaluation_methods=[method.value for method in usual.methods],
@@ -173,6 +182,7 @@ def form_of(name: str, task: str, seed: int | None, settings: StudySettings) -> 
         evaluation_mode=usual.mode.value,
         evaluation_fine_tuning_steps=str(usual.fine_tuning_steps),
         planned_tests=[test.value for test in settings.planned_tests],
+        languages=[each.value for each in settings.offered_languages],
     )
 
 
@@ -188,6 +198,7 @@ def typed_study(form: StudyForm) -> Typed:
     values["wording"] = _wording(errors, form)
     values["evaluation"] = _evaluation(errors, form) if form.evaluation == "yes" else None
     values["planned_tests"] = tuple(form.planned_tests)
+    values["languages"] = tuple(form.languages)
     name = " ".join(form.name.split())
     if not 1 <= len(name) <= NAME_LENGTH:
         errors["name"] = f"Give the study a name of at most {NAME_LENGTH} characters."
@@ -255,12 +266,12 @@ def _wording(errors: dict[str, str], form: StudyForm) -> dict[str, str]:
     consent = form.consent_text.replace("\r\n", "\n").strip()
     if not consent:
         return own
-    if _CONSENT in own:
-        errors["wording"] = f"{_CONSENT} has its own field above."
-    broken = broken_texts({_CONSENT: consent})
+    if CONSENT in own:
+        errors["wording"] = f"{CONSENT} has its own field above."
+    broken = broken_texts({CONSENT: consent})
     if broken:
-        errors["consent_text"] = f"This text cannot be shown: {broken[_CONSENT]}."
-    return own | {_CONSENT: consent}
+        errors["consent_text"] = f"This text cannot be shown: {broken[CONSENT]}."
+    return own | {CONSENT: consent}
 
 
 def _read(errors: dict[str, str], name: str, reader: Callable[[str], _Value], typed: str, otherwise: _Value) -> _Value:

@@ -1,7 +1,9 @@
 """Pages from templates: one Jinja environment, strict about what is missing, and the words for numbers and times."""
 
+import re
 from collections.abc import Callable, Mapping
 from datetime import datetime
+from functools import cache
 from math import floor, log10
 from pathlib import Path
 from typing import Any
@@ -12,6 +14,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from starlette.datastructures import URLPath
 
 from app.db import now
+from app.web.own_texts import missing_facts, missing_translations
 from app.web.task_words import words_of
 from app.web.wording import page_language, say, study_question
 
@@ -26,6 +29,7 @@ _UNITS = {
     "_n": "N",
     "_rad": "rad",
 }
+_IMPORT = re.compile(r"""^import .* from "\./([a-z_]+\.js)";$""", re.MULTILINE)
 _MINUTE_S, _HOUR_S, _DAY_S = 60, 3600, 86400
 
 
@@ -115,6 +119,13 @@ def fragment(request: Request, template: str, context: Mapping[str, Any]) -> str
     return environment.get_template(template).render(context)
 
 
+@cache
+def imports_of(script: str) -> tuple[str, ...]:
+    """The modules that a script of ours imports, and those that they import, each once and by name."""
+    direct = _IMPORT.findall((ROOT / "static" / script).read_text(encoding="utf-8"))
+    return tuple(dict.fromkeys(name for each in direct for name in (each, *imports_of(each))))
+
+
 def make_environment(path_for: Callable[..., URLPath]) -> Environment:
     """The environment of every template: escapes everything, and refuses names that were not given.
 
@@ -131,8 +142,8 @@ def make_environment(path_for: Callable[..., URLPath]) -> Environment:
     words = (ago, time_left, moment, seconds, bytes_in_words, in_words, task_title)
     environment.filters.update({word.__name__: word for word in (*numbers, *words)})
     environment.globals["path_for"] = path_for
-    for text in (say, page_language, study_question):
-        environment.globals[text.__name__] = text
+    for word in (say, page_language, study_question, imports_of, missing_facts, missing_translations):
+        environment.globals[word.__name__] = word
     return environment
 
 

@@ -7,10 +7,11 @@ from fastapi.responses import RedirectResponse, Response
 from starlette.background import BackgroundTask
 
 from app.services import withdrawal
+from app.web import languages
 from app.web.deps import PARTICIPANT_COOKIE, CurrentParticipant, StudioDep, WritingSession
 from app.web.participant_pages import participant_page
 from app.web.templating import page
-from app.web.wording import Wording, preferred, wording_of
+from app.web.wording import Wording, wording_of
 
 router = APIRouter(prefix="/p")
 
@@ -32,14 +33,15 @@ def withdraw(
     language = wording_of(participant).language
     withdrawal.withdraw(session, studio.store, participant, actor=participant.code)
     address = request.app.url_path_for("show_withdrawn")
-    response = RedirectResponse(f"{address}?language={language}", HTTPStatus.SEE_OTHER)
+    response = RedirectResponse(address, HTTPStatus.SEE_OTHER)
+    languages.remember(response, studio.settings, language)
     response.background = BackgroundTask(studio.database.forget_erased)  # after the commit
     response.delete_cookie(PARTICIPANT_COOKIE)
     return response
 
 
 @router.get("/withdrawn", name="show_withdrawn")
-def show_withdrawn(request: Request, language: str = "") -> Response:
+def show_withdrawn(request: Request) -> Response:
     """All that is left. Says nothing of anybody, so anybody may see it."""
-    chosen = preferred(language or request.headers.get("accept-language", ""))
-    return page(request, "participant/withdrawn.html", {"wording": Wording(chosen)})
+    context = languages.nobodys(request, Wording(languages.of_browser(request)))
+    return page(request, "participant/withdrawn.html", context)

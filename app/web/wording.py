@@ -4,7 +4,8 @@ Texts are plain; templates escape them like everything else. ``app/wording/*.ftl
 """
 
 import logging
-from collections.abc import Iterable, Mapping
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from fluent.syntax import FluentSerializer, ast
 from jinja2 import pass_context
 from jinja2.runtime import Context
 
-from app.domain.protocol import Language
+from app.domain.protocol import CONSENT_FACTS, Language
 from app.domain.studies import Participant, StudySettings
 
 log = logging.getLogger("app.wording")
@@ -22,6 +23,10 @@ log = logging.getLogger("app.wording")
 FOLDER = Path(__file__).resolve().parents[1] / "wording"
 NAMES = {Language.ENGLISH: "English", Language.GERMAN: "Deutsch"}
 """Each language in itself."""
+
+
+_ASKED = re.compile(r"(?:^|,)\s*([a-z]{2,8})(?:-[a-z0-9-]*)?\s*(?:;\s*q\s*=\s*(\d(?:\.\d{0,3})?))?")
+"""One language of an Accept-Language header, without its region, and how much it is wanted."""
 
 
 class WordingBroken(ValueError):
@@ -64,6 +69,13 @@ class Wording:
         """Whether the study has written this text itself, for this language or for all."""
         return key in self._own
 
+    def own_variables(self, key: str) -> set[str]:
+        """What the study's own text asks for; nothing when it has none, or one that is broken."""
+        try:
+            return variables_of(_parsed(self._own[key])) if key in self._own else set()
+        except WordingBroken:
+            return set()
+
     def _warn(self, key: str, error: WordingBroken) -> None:
         if key not in self._warned:
             log.warning("the study's own text of %s is broken, the built-in one is shown: %s", key, error)
@@ -77,15 +89,16 @@ def wording_of(participant: Participant) -> Wording:
 
 
 def wording_for(settings: StudySettings, chosen: str | None = None) -> Wording:
-    """The texts of a study in the language somebody chose, or in its own."""
-    language = Language(chosen) if chosen in set(Language) else settings.language
+    """The texts of a study in the language somebody chose, if it is offered, or in its own."""
+    language = Language(chosen) if chosen in settings.offered_languages else settings.language
     return _remembered(language, tuple(sorted(settings.wording.items())), settings.language)
 
 
-def preferred(accept_language: str) -> Language:
-    """The language for somebody of whom we know only what their browser asks for."""
-    asked = (part.split(";")[0].strip()[:2].lower() for part in accept_language.split(","))
-    return next((Language(code) for code in asked if code in set(Language)), Language.ENGLISH)
+def preferred(accept_language: str, offered: Sequence[Language] = tuple(Language)) -> Language:
+    """The language for somebody of whom we know only what their browser asks for; the first offered one otherwise."""
+    asked = [(code, float(weight or 1)) for code, weight in _ASKED.findall(accept_language.lower())]
+    asked.sort(key=lambda each: -each[1])  # of equals the first stays first
+    return next((Language(code) for code, weight in asked if code in offered and weight > 0), offered[0])
 
 
 @pass_context
@@ -111,9 +124,9 @@ def study_question(context: Context) -> str:
 
 
 def question_of(wording: Wording, settings: StudySettings) -> str:
-    """What is asked about every pair: the study's own question, or the usual one in the language of the page."""
-    usual = StudySettings.model_fields["question"].default
-    return wording("pair-question") if settings.question == usual else settings.question
+    """What is asked about every pair: the study's question, translated if it is, or ours in the page's language."""
+    ours = settings.question == StudySettings.model_fields["question"].default
+    return wording("pair-question") if ours or wording.is_own("pair-question") else settings.question
 
 
 def broken_texts(own: Mapping[str, str]) -> dict[str, str]:
@@ -122,7 +135,7 @@ def broken_texts(own: Mapping[str, str]) -> dict[str, str]:
     for key, text in own.items():
         prefix, _, name = key.rpartition(":")
         try:
-            if not _built_in(Language.ENGLISH).has_message(name) and not name.startswith("form-"):
+            if not _built_in(Language.ENGLISH).has_message(name) and not name.startswith(("form-", "fact-")):
                 raise WordingBroken("there is no text of this name")
             if prefix not in {"", *Language}:
                 raise WordingBroken(f"there is no language {prefix}")
@@ -184,7 +197,8 @@ def _built_in(language: Language) -> FluentBundle:
 @cache
 def _known_variables(name: str) -> frozenset[str]:
     message = built_in_texts(Language.ENGLISH).get(name)
-    return frozenset() if message is None else frozenset(variables_of(message))
+    facts = CONSENT_FACTS if name == "consent-body" else ()
+    return frozenset(facts) if message is None else frozenset({*variables_of(message), *facts})
 
 
 @lru_cache(maxsize=64)

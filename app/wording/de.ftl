@@ -3,46 +3,52 @@
 ## Jede Seite
 
 page-title = { $title } · PbARL Studio
-foot-language = Sprache
+page-language = Sprache
 foot-withdraw = Teilnahme widerrufen
 foot-code = Sie sind { $code }
 back = Zurück
 go-on = Weiter
+page-incomplete = Diese Seite wurde nicht vollständig geladen.
+page-load-again = Neu laden
 saved = Gespeichert
 
 ## Begrüßung und Einwilligung
 
 consent-title = Teilnahme
-consent-welcome = Herzlich willkommen, und danke für Ihr Interesse.
+consent-welcome = Herzlich willkommen und vielen Dank für Ihr Interesse.
 consent-body =
-    Sie sehen Paare kurzer Filme eines Assistenzroboters und sagen jeweils, welcher Ihnen lieber ist. Aus Ihren Antworten lernt ein Roboter, die Aufgabe so auszuführen, wie Sie es mögen.
+    Sie sehen Paare kurzer Videos, in denen ein Roboter einem Menschen hilft, und sagen jeweils, welcher Roboter Ihnen lieber ist. Aus Ihren Antworten lernt ein Roboter, die Aufgabe so auszuführen, wie Sie es mögen.
 
-    - { $count } Paare, verteilt auf so viele Sitzungen, wie Sie möchten. Ihr Link bringt Sie immer dorthin zurück, wo Sie waren.
-    - Gespeichert werden Ihre Antworten, wann Sie sie gegeben haben und wie lange es gedauert hat, unter dem Kürzel { $code }. Kein Name, keine Kamera, kein Mikrofon.
-    - Sie können jederzeit ohne Angabe von Gründen aufhören: Schließen Sie einfach die Seite. Wenn Sie unten auf einer Seite „Teilnahme widerrufen“ wählen, wird alles über Sie gelöscht.
-    - Fragen? Wenden Sie sich an die Person, von der Sie den Link haben.
+    - Sie vergleichen { $count } Paare. Machen Sie so viele Pausen, wie Sie möchten, auch tagelange: Ihr Link bringt Sie dorthin zurück, wo Sie waren.
+    - Gespeichert werden Ihre Antworten, wann Sie sie gegeben haben und wie lange Sie dafür gebraucht haben, unter dem Kürzel { $code }. Wir fragen nicht nach Ihrem Namen und benutzen weder Kamera noch Mikrofon. Wenn Sie über ein Teilnahmeportal kommen, speichern wir auch die Kennung, unter der Sie dort geführt werden.
+    - Die Teilnahme ist freiwillig. Sie können jederzeit ohne Angabe von Gründen aufhören: Schließen Sie einfach die Seite. Wenn Sie unten auf einer Seite „Teilnahme widerrufen“ wählen, wird alles über Sie gelöscht.
+consent-duration = Dauer: { $duration }
+consent-payment = Vergütung: { $payment }
+consent-ethics = Ethikvotum: { $ethics }
+consent-contact = Fragen? Wenden Sie sich bitte an { $contact }
+consent-contact-unknown = Fragen? Wenden Sie sich bitte an die Personen, die Sie zu dieser Studie eingeladen haben.
 consent-version = Informationen für Teilnehmende, Version { $version }
 consent-agree = Ich willige ein und nehme teil
 consent-changed = Dieser Text hat sich geändert, seit Sie ihn zuletzt gesehen haben. Bitte lesen Sie ihn noch einmal.
-consent-copy-link = Eine Kopie zum Aufheben
+consent-copy-link = Kopie speichern oder drucken
 consent-copy-title = Worin Sie eingewilligt haben
-consent-copy-before = Worum wir Sie bitten werden
-consent-copy-agreed = Sie haben in diesen Text am { $date } eingewilligt.
+consent-copy-before = Der Text, in den Sie einwilligen sollen
+consent-copy-agreed = In diesen Text haben Sie am { $date } eingewilligt.
 consent-copy-print = Drucken
-consent-copy-save = Als Datei sichern
+consent-copy-save = Als Datei speichern
 consent-copy-file = einwilligung
 
 ## Fragebögen: zur Person und zur Studie
 
 demographics-title = Zu Ihrer Person
-demographics-lead = Einige Fragen, damit wir berichten können, wer teilgenommen hat. Lassen Sie aus, was Sie möchten.
+demographics-lead = Einige Fragen zu Ihnen, damit wir beschreiben können, wer teilgenommen hat. Sie können jede Frage auslassen.
 questionnaire-title = Wie war es?
-questionnaire-lead = Das Vergleichen ist geschafft. Noch einige letzte Fragen; lassen Sie aus, was Sie möchten.
+questionnaire-lead = Sie haben es fast geschafft. Zum Schluss noch einige Fragen; Sie können jede auslassen.
 form-save = Speichern und weiter
 form-no-answer = Keine Angabe
-form-number-problem = Bitte schreiben Sie hier eine Zahl, oder lassen Sie das Feld leer.
-form-long-problem = Bitte kürzen Sie dies auf { $count } Zeichen.
-form-choice-problem = Bitte wählen Sie eine dieser Möglichkeiten.
+form-number-problem = Bitte geben Sie eine Zahl ein, oder lassen Sie das Feld leer.
+form-long-problem = Bitte kürzen Sie diesen Text auf höchstens { $count } Zeichen.
+form-choice-problem = Bitte wählen Sie eine der Antworten.
 form-problems =
     { $count ->
         [one] Bitte sehen Sie sich eine Antwort noch einmal an. Es ist nichts verloren.
@@ -50,6 +56,7 @@ form-problems =
     }
 form-likert-low = überhaupt nicht
 form-likert-high = sehr
+scale-end = { $point }: { $meaning }
 form-age = Wie alt sind Sie?
 form-gender = Welches Geschlecht haben Sie?
 form-robot_experience = Wie viel Erfahrung haben Sie mit Robotern?
@@ -62,17 +69,17 @@ form-felt_safe = Mit diesem Roboter würde ich mich sicher fühlen.
 form-felt_safe-low = überhaupt nicht
 form-felt_safe-high = vollkommen
 form-would_use = Ich würde einen solchen Roboter benutzen.
-form-would_use-low = niemals
-form-would_use-high = sehr gern
-form-comments = Möchten Sie uns sonst noch etwas sagen?
+form-would_use-low = auf keinen Fall
+form-would_use-high = auf jeden Fall
+form-comments = Möchten Sie uns sonst noch etwas mitteilen?
 
 ## Anleitung
 
-instructions-title = So geht es
-task-feeding = Ein Roboterarm reicht einer sitzenden Person mit einem Löffel Essen. Jedes Paar zeigt dieselbe Situation auf zwei verschiedene Weisen: Der Roboter kann schneller oder langsamer sein, auf einem anderen Weg kommen, mehr oder weniger weit in den Mund gehen oder etwas Essen verlieren. Stellen Sie sich vor, dass Sie selbst gefüttert werden.
-task-drinking = Ein Roboterarm bringt einer sitzenden Person einen Becher Wasser und neigt ihn, sodass sie trinken kann; das Wasser ist blau. Jedes Paar zeigt dieselbe Situation auf zwei verschiedene Weisen: Der Roboter kann schneller oder langsamer sein, auf einem anderen Weg kommen, vor dem Mund warten, mehr oder weniger auf einmal geben oder etwas verschütten. Stellen Sie sich vor, dass Sie selbst trinken.
-task-scratching = Ein Roboterarm kratzt eine juckende Stelle, den rötlichen Fleck am rechten Arm einer sitzenden Person. Jedes Paar zeigt dieselbe Situation auf zwei verschiedene Weisen: Der Roboter kann schneller oder langsamer sein, auf einem anderen Weg kommen, vor der Berührung warten, stärker oder schwächer drücken, ruhiger oder flotter kratzen. Stellen Sie sich vor, dass es Ihr Arm ist.
-task-other = Ein Roboterarm hilft einer sitzenden Person. Jedes Paar zeigt dieselbe Situation auf zwei verschiedene Weisen. Stellen Sie sich vor, dass Ihnen selbst geholfen wird.
+instructions-title = So funktioniert es
+task-feeding = Ein Roboterarm reicht einer sitzenden Person mit einem Löffel Essen an. Jedes Paar zeigt dieselbe Situation in zwei Ausführungen: Der Roboter kann schneller oder langsamer sein, einen anderen Weg nehmen, den Löffel mehr oder weniger weit in den Mund führen oder etwas Essen verlieren. Stellen Sie sich vor, dass Sie selbst das Essen gereicht bekommen.
+task-drinking = Ein Roboterarm bringt einer sitzenden Person einen Becher Wasser und neigt ihn, sodass sie trinken kann; das Wasser ist blau dargestellt. Jedes Paar zeigt dieselbe Situation in zwei Ausführungen: Der Roboter kann schneller oder langsamer sein, einen anderen Weg nehmen, vor dem Mund warten, mehr oder weniger auf einmal geben oder etwas verschütten. Stellen Sie sich vor, dass Sie selbst trinken.
+task-scratching = Ein Roboterarm kratzt eine juckende Stelle, den rötlichen Fleck am rechten Arm einer sitzenden Person. Jedes Paar zeigt dieselbe Situation in zwei Ausführungen: Der Roboter kann schneller oder langsamer sein, einen anderen Weg nehmen, vor der Berührung warten, stärker oder schwächer drücken, ruhiger oder flotter kratzen. Stellen Sie sich vor, dass es Ihr Arm ist.
+task-other = Ein Roboterarm hilft einer sitzenden Person. Jedes Paar zeigt dieselbe Situation in zwei Ausführungen. Stellen Sie sich vor, dass Ihnen selbst geholfen wird.
 instructions-keys = Antworten und ihre Tasten
 instructions-key = Taste
 instructions-answer = Antwort
@@ -80,13 +87,13 @@ instructions-left = Links ist besser
 instructions-top = Oben: Der obere ist besser
 instructions-right = Rechts ist besser
 instructions-bottom = Unten: Der untere ist besser
-instructions-equal = Gleich: Für mich sind beide gleich gut
-instructions-skip = Weiß nicht: Ich konnte es nicht beurteilen; dieses Paar zählt nicht
+instructions-equal = Gleich gut: Für mich sind beide gleich gut
+instructions-skip = Weiß nicht: Ich konnte dieses Paar nicht beurteilen; es zählt nicht
 instructions-replay = Von vorn abspielen
 instructions-undo = Letzte Antwort zurücknehmen
-instructions-space = Leer
-instructions-player = Anhalten und weiter; mit den Schaltflächen unter den Filmen gehen Sie schrittweise und ändern die Geschwindigkeit
-instructions-taste = Es gibt keine richtige Antwort; nur Ihr eigener Geschmack zählt. Ein Druck antwortet und bringt das nächste Paar.
+instructions-space = Leertaste
+instructions-player = Anhalten oder abspielen; mit den Schaltflächen unter den Videos gehen Sie Bild für Bild und ändern das Tempo
+instructions-taste = Es gibt kein Richtig oder Falsch; nur Ihr eigener Geschmack zählt. Ein Tastendruck oder Tippen genügt, und das nächste Paar erscheint.
 instructions-buttons = Die Schaltflächen bewirken dasselbe wie die Tasten.
 instructions-start = Mit dem Vergleichen beginnen
 instructions-practice = Mit der Übung beginnen
@@ -140,9 +147,9 @@ finished-code = Ihr Abschlusscode
 finished-copy = Kopieren
 finished-copied = Kopiert.
 finished-return = Jetzt zurückkehren
-finished-return-lead = Ein letzter Schritt: Kehren Sie dorthin zurück, woher Sie gekommen sind, damit man dort weiß, dass Sie fertig sind.
-finished-return-soon = In wenigen Sekunden geht es von selbst dorthin.
-finished-stay = Hier bleiben
+finished-return-lead = Ein letzter Schritt: Kehren Sie zu der Seite zurück, von der Sie gekommen sind, damit man dort weiß, dass Sie fertig sind.
+finished-return-soon = In wenigen Sekunden werden Sie dorthin weitergeleitet.
+finished-stay = Hierbleiben
 finished-sending = Einen Moment: Ihre letzte Antwort ist noch unterwegs.
 finished-debrief = Ihren Roboter ansehen
 finished-robot-ready = Ihr Roboter ist fertig
@@ -155,58 +162,58 @@ finished-undo = Meine letzte Antwort zurücknehmen
 ## Widerruf
 
 withdraw-title = Teilnahme widerrufen
-withdraw-lead = Sie können jederzeit gehen und brauchen keinen Grund zu nennen. Dann geschieht Folgendes:
+withdraw-lead = Sie können jederzeit aufhören und brauchen keinen Grund zu nennen. Wenn Sie widerrufen, geschieht Folgendes:
 withdraw-body =
-    - Alles, was Sie uns gesagt haben, wird gelöscht: Ihre Antworten, Ihre Fragebögen, der Text Ihrer Einwilligung, Ihre Bewertungen.
-    - Alles, was daraus entstanden ist, wird gelöscht: der Roboter, der von Ihnen gelernt hat, seine Filme und Dateien.
-    - Es bleibt nur, dass { $code } teilgenommen und widerrufen hat, und wann. Nicht wer, nicht was.
-    - Ergebnisse, die vorher veröffentlicht wurden, lassen sich nicht zurückrufen.
-withdraw-average = Die Roboter von Menschen, die später kamen, können mit einem Durchschnitt begonnen haben, zu dem Ihrer beigetragen hat. Auf Sie zurückführen lässt er sich nicht.
+    - Alles, was Sie uns mitgeteilt haben, wird gelöscht: Ihre Antworten, Ihre Fragebögen, der Text Ihrer Einwilligung, Ihre Bewertungen.
+    - Alles, was daraus entstanden ist, wird gelöscht: der Roboter, der von Ihnen gelernt hat, seine Videos und Dateien.
+    - Es bleibt nur der Vermerk, dass { $code } teilgenommen und widerrufen hat und wann das war. Daraus geht weder hervor, wer Sie sind, noch, was Sie uns mitgeteilt haben.
+    - Ergebnisse, die schon veröffentlicht sind, lassen sich nicht zurückholen.
+withdraw-average = Die Roboter von Menschen, die nach Ihnen kamen, sind möglicherweise von einem Durchschnitt ausgegangen, zu dem Ihrer beigetragen hat. Auf Sie zurückführen lässt er sich nicht.
 withdraw-final = Das lässt sich nicht rückgängig machen, auch nicht von uns.
 withdraw-confirm = Alles über mich löschen
-withdraw-keep = Nein, behalten und zurück
-withdrawn-title = Es ist gelöscht
-withdrawn-lead = Sie haben Ihre Teilnahme widerrufen, und alles über Sie wurde gelöscht. Danke, dass Sie hereingeschaut haben.
-withdrawn-text = Die letzten Spuren auf dem Rechner verschwinden innerhalb von Minuten. Sie können diese Seite schließen; Ihr Link führt von jetzt an hierher.
+withdraw-keep = Nein, alles behalten und zurück
+withdrawn-title = Ihre Daten sind gelöscht
+withdrawn-lead = Sie haben Ihre Teilnahme widerrufen, und alles über Sie wurde gelöscht. Vielen Dank für Ihre Zeit.
+withdrawn-text = Die letzten Spuren auf unseren Rechnern verschwinden innerhalb von Minuten. Sie können diese Seite schließen; Ihr Link führt von jetzt an hierher.
 
 ## Teilnahme über ein Panel oder eine offene Adresse
 
 join-title = Herzlich willkommen
 join-missing-title = In dieser Adresse fehlt etwas
-join-missing = Wir können nicht erkennen, wer Sie sind: Die Adresse sollte { $parameter } mitbringen. Bitte öffnen Sie die Studie noch einmal von der Seite aus, die sie Ihnen angeboten hat. Hilft das nicht, wenden Sie sich an die Betreiber jener Seite.
-join-link-lead = Dies ist Ihr persönlicher Link. Heben Sie ihn auf, falls Sie später oder auf einem anderen Gerät weitermachen möchten; niemand sonst sollte ihn haben.
+join-missing = Wir können nicht erkennen, wer Sie sind: Die Adresse sollte { $parameter } enthalten. Bitte öffnen Sie die Studie noch einmal über die Seite, auf der sie Ihnen angeboten wurde. Wenn das nicht hilft, wenden Sie sich an deren Betreiber.
+join-link-lead = Dies ist Ihr persönlicher Link. Bewahren Sie ihn auf, falls Sie später oder auf einem anderen Gerät weitermachen möchten, und geben Sie ihn nicht weiter.
 join-link-label = Ihr persönlicher Link
 join-link-copy = Kopieren
 
 ## Was schiefgehen kann
 
-error-title-401 = Wer sind Sie?
+error-title-401 = Bitte öffnen Sie Ihren Link noch einmal
 error-title-403 = Das ist nicht erlaubt
-error-title-404 = Hier ist nichts
-error-title-409 = Das passt nicht mehr
-error-title-500 = Etwas ist kaputtgegangen
-error-title-503 = Einen Moment bitte
+error-title-404 = Seite nicht gefunden
+error-title-409 = Das geht nicht mehr
+error-title-500 = Bei uns ist etwas schiefgegangen
+error-title-503 = Einen Moment, bitte
 error-title-other = Das hat nicht geklappt
 error-number = Fehler { $status }
-error-onward = Weiter, wo ich war
+error-onward = Dorthin zurück, wo ich war
 error-link-needed = Wir können nicht erkennen, wer Sie sind. Bitte öffnen Sie Ihren persönlichen Link noch einmal: Sie machen genau dort weiter, wo Sie waren.
-error-link-not-valid = Dieser Link ist nicht gültig. Vielleicht wurde er durch einen neueren ersetzt; bitte fragen Sie die Person, von der Sie ihn haben.
-error-joining-closed = An dieser Studie kann man über diese Adresse nicht (mehr) teilnehmen. Bitte fragen Sie die Menschen, von denen Sie sie haben.
-error-not-yet = Etwas anderes kommt zuerst. Sie werden dorthin gebracht.
-error-query-not-found = Dieses Paar gibt es für Sie nicht. Bitte machen Sie mit dem Paar weiter, das Ihnen gezeigt wird.
+error-link-not-valid = Dieser Link ist nicht gültig. Vielleicht wurde er durch einen neueren ersetzt; bitte fragen Sie die Person, die ihn Ihnen geschickt hat.
+error-joining-closed = Über diese Adresse kann man an keiner Studie (mehr) teilnehmen. Bitte fragen Sie die Personen, von denen Sie die Adresse haben.
+error-not-yet = Vorher kommt noch etwas anderes. Sie werden dorthin weitergeleitet.
+error-query-not-found = Dieses Paar gehört nicht zu Ihren Paaren. Bitte machen Sie mit dem Paar weiter, das Ihnen gezeigt wird.
 error-query-not-shown = Dieses Paar wurde Ihnen noch nicht gezeigt. Bitte machen Sie mit dem Paar weiter, das Ihnen gezeigt wird.
 error-answer-misdirected = Diese Antwort wurde schon zu einem anderen Paar gegeben. Bitte laden Sie die Seite neu und antworten Sie noch einmal.
-error-undo-too-late = Nur Ihre letzte Antwort lässt sich zurücknehmen, und dies ist eine frühere.
-error-trial-not-found = Diesen Roboter gibt es für Sie nicht zu bewerten. Bitte machen Sie mit dem weiter, der Ihnen gezeigt wird.
+error-undo-too-late = Nur Ihre neueste Antwort lässt sich zurücknehmen, und dies ist eine frühere.
+error-trial-not-found = Dieser Roboter gehört nicht zu denen, die Sie bewerten sollen. Bitte machen Sie mit dem weiter, der Ihnen gezeigt wird.
 error-trial-not-shown = Diesen Roboter haben Sie noch nicht gesehen. Bitte machen Sie mit dem weiter, der Ihnen gezeigt wird.
-error-rated-already = Dieser Roboter ist schon bewertet, und diese Bewertung zählt. Die letzte Bewertung können Sie noch ändern.
+error-rated-already = Diesen Roboter haben Sie schon bewertet, und diese Bewertung zählt. Ihre letzte Bewertung können Sie noch ändern.
 error-correction-too-late = Nur die letzte Bewertung lässt sich ändern, und dies ist eine frühere.
 error-rating-misdirected = Diese Bewertung wurde schon zu einem anderen Roboter abgegeben. Bitte laden Sie die Seite neu und bewerten Sie noch einmal.
 error-foreign-form = Diese Anfrage kam von einer anderen Website und wurde abgelehnt. Bitte benutzen Sie die Seiten dieser Website.
 error-page-not-found = Unter dieser Adresse gibt es keine Seite.
-error-not-understood = Etwas in diesem Formular fehlt oder ist nicht gültig. Bitte gehen Sie zurück und prüfen Sie es.
-error-database-busy = Die Datenbank ist beschäftigt oder noch nicht bereit. Es wurde nichts gespeichert; bitte versuchen Sie es gleich noch einmal.
-error-unforeseen = Das ist unser Fehler, und er steht im Protokoll. Bei diesem Schritt wurde nichts gespeichert; bitte versuchen Sie es noch einmal.
+error-not-understood = In diesem Formular fehlt etwas, oder etwas ist nicht gültig. Bitte gehen Sie zurück und prüfen Sie es.
+error-database-busy = Der Server ist beschäftigt oder noch nicht bereit. Es wurde nichts gespeichert; bitte versuchen Sie es gleich noch einmal.
+error-unforeseen = Das ist unser Fehler, und er wurde festgehalten. Bei diesem Schritt wurde nichts gespeichert; bitte versuchen Sie es noch einmal.
 
 ## Paare (Vorsilbe pair-)
 
@@ -220,6 +227,7 @@ pair-equal = Gleich gut
 pair-skip = Weiß nicht
 pair-left-clip = Linkes Video
 pair-right-clip = Rechtes Video
+pair-enlarge = Dieses Video vergrößern
 pair-progress = Ihr Fortschritt
 pair-count = { $answered } von { $wanted }
 pair-time-left = noch { $time }
@@ -239,12 +247,12 @@ pair-speed = Tempo
 pair-speed-value = { $rate }-faches Tempo
 pair-play-both = Beide abspielen
 pair-play-again = Noch einmal
-pair-watch-first = Erst beide einmal ansehen, dann antworten
-pair-now-answer = Sie können jetzt antworten
+pair-watch-first = Bitte sehen Sie sich zuerst beide einmal an
+pair-now-answer = Jetzt können Sie antworten
 pair-saving = Wird gespeichert …
 pair-saving-earlier = Eine frühere Antwort wird gespeichert …
 pair-saved = Gespeichert. { $answered } von { $wanted }.
-pair-not-saved = Noch nicht gespeichert. Neuer Versuch …
+pair-not-saved = Noch nicht gespeichert. Wird noch einmal versucht …
 pair-taken-back = Zurückgenommen. Bitte antworten Sie noch einmal.
 pair-unplayable = Diese Videos konnten nicht geladen werden.
 pair-broken-off = Diese Videos sind stehen geblieben. Sie können sie neu laden oder antworten, wenn Sie genug gesehen haben.
@@ -254,7 +262,7 @@ pair-try-again = Noch einmal versuchen
 pair-why = Warum können Sie es nicht sagen?
 pair-why-no_difference_seen = Ich sehe keinen Unterschied
 pair-why-both_bad = Beide sind schlecht
-pair-why-not_comparable = Zu verschieden zum Vergleichen
+pair-why-not_comparable = Zu verschieden, um sie zu vergleichen
 pair-why-not_seen = Ich konnte es nicht gut sehen
 pair-why-other = Ein anderer Grund
 pair-why-none = Möchte ich nicht sagen
@@ -268,23 +276,27 @@ waiting-answered = { $answered } von { $wanted } Antworten sind sicher gespeiche
 practice-title = Übung
 practice-count = Übung { $answered } von { $wanted }
 practice-lead = Dies ist eine Übung und zählt nicht. Probieren Sie die Tasten aus:
-practice-lead-touch = Dies ist eine Übung und zählt nicht. Spielen Sie ab, halten Sie an, ziehen Sie am Balken, dann tippen Sie auf eine Antwort.
+practice-lead-touch = Dies ist eine Übung und zählt nicht. Spielen Sie ab, halten Sie an, verschieben Sie den Regler; tippen Sie dann auf eine Antwort.
 practice-key-pause = anhalten
 practice-key-speed = Tempo
 practice-key-replay = von vorn
 practice-key-answer = antworten
 practice-key-step = ein Bild
-practice-key-used = { $key }: haben Sie benutzt
-practice-all-used = Sie haben alle Tasten benutzt. Antworten Sie, wann Sie mögen.
+practice-key-used = { $key }: ausprobiert
+practice-all-used = Sie haben alle Tasten ausprobiert. Antworten Sie, wann Sie möchten.
 
 ## Pausen (Vorsilbe break-)
 
-break-heading = { $answered } Antworten sind geschafft
-break-lead = Alle sind sicher gespeichert. Schauen Sie aus dem Fenster, strecken Sie sich, trinken Sie etwas. Kommen Sie wieder, wann Sie mögen, auch an einem anderen Tag: Ihr Link führt hierher zurück.
+break-heading =
+    { $answered ->
+        [one] Eine Antwort ist geschafft
+       *[other] { $answered } Antworten sind geschafft
+    }
+break-lead = Alle sind sicher gespeichert. Schauen Sie aus dem Fenster, strecken Sie sich, trinken Sie ein Glas Wasser. Kommen Sie wieder, wann Sie möchten, auch an einem anderen Tag: Ihr Link führt hierher zurück.
 break-left = Noch { $count }, { $time }.
 break-left-unknown = Noch { $count }.
 break-go-on = Weiter
-break-key = Die Eingabetaste geht weiter
+break-key = oder Eingabetaste drücken
 
 ## Warten (prefix wait-)
 
@@ -303,36 +315,40 @@ evaluation-progress = Bewertete Roboter
 evaluation-count = { $rated } von { $wanted } bewertet
 evaluation-robot = Roboter { $letter }
 evaluation-film = Roboter { $letter } bei der Arbeit
-evaluation-repetition = { $number }. von { $count } Malen mit diesem Roboter.
-evaluation-satisfaction = Wie zufrieden sind Sie mit diesem Roboter insgesamt?
+evaluation-repetition =
+    { $count ->
+        [one] Diesen Roboter sehen Sie einmal.
+       *[other] Durchgang { $number } von { $count } mit diesem Roboter
+    }
+evaluation-satisfaction = Wie zufrieden sind Sie insgesamt mit diesem Roboter?
 evaluation-satisfaction-low = überhaupt nicht zufrieden
 evaluation-satisfaction-high = völlig zufrieden
-evaluation-personalisation = Wie sehr ist das, was er tut, auf Sie persönlich zugeschnitten?
+evaluation-personalisation = Wie sehr wirkt sein Verhalten auf Sie persönlich zugeschnitten?
 evaluation-personalisation-low = überhaupt nicht auf mich zugeschnitten
 evaluation-personalisation-high = völlig auf mich zugeschnitten
 evaluation-save = Speichern und weiter
 evaluation-save-change = Änderung speichern
 evaluation-changing = Sie ändern Ihre letzte Bewertung.
-evaluation-keep = So lassen, wie es war
+evaluation-keep = So lassen, wie es ist
 evaluation-change-last = Meine letzte Bewertung ändern (Roboter { $letter })
 evaluation-rate-now = Bitte bewerten Sie, was der Roboter eben getan hat.
-evaluation-watch-first = Bitte einmal bis zum Ende ansehen, dann bewerten
-evaluation-now-rate = Sie können jetzt bewerten
-evaluation-keys = Tasten: 1 bis 5, zweimal, dann Enter. Die Rücktaste nimmt eine zurück.
+evaluation-watch-first = Bitte sehen Sie ihn sich zuerst einmal bis zum Ende an
+evaluation-now-rate = Jetzt können Sie bewerten
+evaluation-keys = Tasten: zweimal 1 bis 5, dann die Eingabetaste. Die Rücktaste nimmt die letzte Eingabe zurück.
 evaluation-saving = Wird gespeichert …
-evaluation-not-saved = Noch nicht gespeichert. Neuer Versuch …
-evaluation-refused = Das wurde nicht gespeichert, weil der Roboter auf dieser Seite nicht mehr an der Reihe ist. Die Seite wird neu geladen …
-evaluation-unplayable = Dieser Film konnte nicht geladen werden.
-evaluation-load-again = Noch einmal laden
+evaluation-not-saved = Noch nicht gespeichert. Wird noch einmal versucht …
+evaluation-refused = Das wurde nicht gespeichert, weil dieser Roboter nicht mehr an der Reihe ist. Die Seite wird neu geladen …
+evaluation-unplayable = Dieses Video konnte nicht geladen werden.
+evaluation-load-again = Neu laden
 evaluation-play = Abspielen
 evaluation-pause = Anhalten
-evaluation-position = Stelle im Film
+evaluation-position = Stelle im Video
 evaluation-position-value = { $seconds } von { $total } Sekunden
-evaluation-speed = Geschwindigkeit
-evaluation-speed-value = { $rate }-fache Echtzeit
+evaluation-speed = Tempo
+evaluation-speed-value = { $rate }-faches Tempo
 evaluation-coming = Als Nächstes kommt Roboter { $letter }
-evaluation-coming-text = Bitte warten Sie einen Moment, bis er gestartet wird. Diese Seite geht von selbst weiter.
-evaluation-moving = Roboter { $letter } bewegt sich, bitte schauen Sie zu
+evaluation-coming-text = Er wird gleich gestartet. Dann geht es hier von selbst weiter.
+evaluation-moving = Roboter { $letter } bewegt sich. Bitte schauen Sie zu
 evaluation-moving-text = Sobald er fertig ist, werden Sie nach Ihrer Meinung gefragt.
 evaluation-waiting-title = Ihre Roboter werden vorbereitet
 evaluation-waiting-text = Sie lernen aus Ihren Antworten. Wenn sie fertig sind, sehen Sie jeden bei der Arbeit und bewerten ihn. Sie kennen sie nur unter Buchstaben.
@@ -355,4 +371,4 @@ evaluation-done-text =
 
 ## Preview by an experimenter
 
-preview-mark = Vorschau: nichts hiervon wird gezählt
+preview-mark = Vorschau: Nichts hiervon zählt

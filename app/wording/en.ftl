@@ -5,11 +5,13 @@
 ## Every page
 
 page-title = { $title } · PbARL Studio
-foot-language = Language
-foot-withdraw = Withdraw
+page-language = Language
+foot-withdraw = Withdraw from the study
 foot-code = You are { $code }
 back = Back
 go-on = Go on
+page-incomplete = This page has not loaded completely.
+page-load-again = Load it again
 saved = Saved
 
 ## Welcome and consent
@@ -17,16 +19,20 @@ saved = Saved
 consent-title = Taking part
 consent-welcome = Welcome, and thank you for your interest.
 consent-body =
-    You will watch pairs of short clips of an assistive robot and say which one you prefer. From your answers a robot learns to do the task the way you like it.
+    You will watch pairs of short videos in which a robot helps a person, and say each time which robot you prefer. From your answers a robot learns to do the task the way you like it.
 
-    - { $count } pairs, in as many sittings as you like. Your link brings you back to where you were.
-    - What is kept: your answers, when you gave them and how long they took, under the code { $code }. No name, no camera, no microphone.
-    - You are free to stop at any time, without giving a reason: just close the page. If you choose “Withdraw” at the foot of a page, everything about you is erased.
-    - Questions? Ask the person who sent you the link.
+    - You compare { $count } pairs. Take as many breaks as you like, even for days: your link brings you back to where you were.
+    - We store your answers, when you gave them and how long you took, under the code { $code }. We do not ask for your name, and we use neither camera nor microphone. If a recruitment panel sent you here, we also keep the ID it uses for you.
+    - Taking part is voluntary. You may stop at any time without giving a reason: just close the page. If you choose “Withdraw from the study” at the foot of a page, everything about you is erased.
+consent-duration = Duration: { $duration }
+consent-payment = Payment: { $payment }
+consent-ethics = Ethics approval: { $ethics }
+consent-contact = Questions? Please contact { $contact }
+consent-contact-unknown = Questions? Please ask the people who invited you to the study.
 consent-version = Information for participants, version { $version }
 consent-agree = I agree to take part
 consent-changed = This text has changed since you saw it last. Please read it again.
-consent-copy-link = A copy to keep
+consent-copy-link = Save or print a copy
 consent-copy-title = What you agreed to
 consent-copy-before = What you will be asked to agree to
 consent-copy-agreed = You agreed to this text on { $date }.
@@ -37,14 +43,14 @@ consent-copy-file = consent
 ## Forms: questions about the person, and about the study
 
 demographics-title = About you
-demographics-lead = A few questions, so that we can say who took part. Leave out whatever you like.
+demographics-lead = A few questions about you, so that we can describe who took part. You may skip any of them.
 questionnaire-title = How was it?
-questionnaire-lead = The comparing is done. A few last questions; leave out whatever you like.
+questionnaire-lead = You are almost done. A few last questions; you may skip any of them.
 form-save = Save and go on
 form-no-answer = No answer
-form-number-problem = Please write a number here, or leave it empty.
-form-long-problem = Please shorten this to { $count } characters.
-form-choice-problem = Please choose one of these.
+form-number-problem = Please enter a number, or leave this empty.
+form-long-problem = Please shorten this to { $count } characters at most.
+form-choice-problem = Please choose one of the answers.
 form-problems =
     { $count ->
         [one] One answer needs another look. Nothing is lost.
@@ -52,29 +58,30 @@ form-problems =
     }
 form-likert-low = not at all
 form-likert-high = very much
+scale-end = { $point }: { $meaning }
 form-age = How old are you?
 form-gender = What is your gender?
 form-robot_experience = How much experience do you have with robots?
 form-robot_experience-low = none
 form-robot_experience-high = a lot
-form-felt_understood = The robot understood what I want.
+form-felt_understood = The robot understood what I wanted.
 form-felt_understood-low = not at all
 form-felt_understood-high = completely
 form-felt_safe = I would feel safe with this robot.
 form-felt_safe-low = not at all
 form-felt_safe-high = completely
-form-would_use = I would use such a robot.
-form-would_use-low = never
-form-would_use-high = gladly
+form-would_use = I would use a robot like this.
+form-would_use-low = definitely not
+form-would_use-high = definitely
 form-comments = Is there anything else you would like to tell us?
 
 ## Instructions
 
 instructions-title = How it works
-task-feeding = A robot arm feeds a seated person with a spoon. Every pair shows the same situation, carried out in two different ways: the robot may be quicker or slower, come by another path, go more or less into the mouth, or lose some food. Imagine it is you who is being fed.
-task-drinking = A robot arm brings a cup of water to a seated person and tips it so that they can drink; the water is blue. Every pair shows the same situation, carried out in two different ways: the robot may be quicker or slower, come by another path, wait before the mouth, pour more or less at once, or spill some. Imagine it is you who is drinking.
-task-scratching = A robot arm scratches an itch, the reddish spot on a seated person’s right arm. Every pair shows the same situation, carried out in two different ways: the robot may be quicker or slower, come by another path, wait before it touches the skin, press more or less, or stroke more calmly or more briskly. Imagine it is your arm.
-task-other = A robot arm helps a seated person. Every pair shows the same situation, carried out in two different ways. Imagine it is you who is being helped.
+task-feeding = A robot arm feeds a seated person with a spoon. Each pair shows the same situation handled in two different ways: the robot may be faster or slower, take a different path, move the spoon less or more deeply into the mouth, or drop some food. Imagine that you are the one being fed.
+task-drinking = A robot arm brings a cup of water to a seated person and tips it so that they can drink; the water is shown in blue. Each pair shows the same situation handled in two different ways: the robot may be faster or slower, take a different path, wait in front of the mouth, pour less or more at a time, or spill some. Imagine that you are the one drinking.
+task-scratching = A robot arm scratches an itch, the reddish spot on a seated person’s right arm. Each pair shows the same situation handled in two different ways: the robot may be faster or slower, take a different path, wait before it touches the skin, press more lightly or more firmly, or stroke more slowly or more briskly. Imagine that it is your arm.
+task-other = A robot arm helps a seated person. Each pair shows the same situation handled in two different ways. Imagine that you are the one being helped.
 instructions-keys = Answers and their keys
 instructions-key = Key
 instructions-answer = Answer
@@ -82,13 +89,13 @@ instructions-left = Left is better
 instructions-top = Top: the upper one is better
 instructions-right = Right is better
 instructions-bottom = Bottom: the lower one is better
-instructions-equal = Equal: both are as good for me
-instructions-skip = Can’t tell: I could not judge; this pair is left out
+instructions-equal = Equal: both are equally good to me
+instructions-skip = Can’t tell: I could not judge this pair; it does not count
 instructions-replay = Replay from the start
-instructions-undo = Undo the last answer
+instructions-undo = Take back the last answer
 instructions-space = space
-instructions-player = Pause and go on; the buttons below the clips step and change the speed
-instructions-taste = There is no right answer; only your own taste counts. One press answers and brings the next pair.
+instructions-player = Pause or play; the buttons below the videos move frame by frame and change the speed
+instructions-taste = There are no right or wrong answers; only what you prefer counts. One press gives your answer and brings the next pair.
 instructions-buttons = The buttons do the same as the keys.
 instructions-start = Start comparing
 instructions-practice = Start with practice
@@ -141,9 +148,9 @@ finished-lead-pairs = All { $count } of your answers are safely stored. You can 
 finished-code = Your completion code
 finished-copy = Copy
 finished-copied = Copied.
-finished-return = Go back now
-finished-return-lead = One last step: go back to where you came from, so that they know you are done.
-finished-return-soon = You are taken there in a few seconds.
+finished-return = Return now
+finished-return-lead = One last step: return to the site you came from, so that it knows you have finished.
+finished-return-soon = You will be taken there in a few seconds.
 finished-stay = Stay here
 finished-sending = One moment: your last answer is still on its way.
 finished-debrief = See your robot
@@ -157,58 +164,58 @@ finished-undo = Take back my last answer
 ## Withdrawing
 
 withdraw-title = Withdraw from the study
-withdraw-lead = You may leave at any time and need not say why. This is what happens then:
+withdraw-lead = You may leave at any time and need not say why. If you do, this is what happens:
 withdraw-body =
     - Everything you told us is erased: your answers, your forms, the text you agreed to, your ratings.
-    - Everything made from it is erased: the robot that learned from you, its films and files.
-    - All that stays is that { $code } took part and withdrew, and when. Not who, not what.
-    - Results that were published before cannot be called back.
-withdraw-average = The robots of people who came later may have begun with an average to which yours had contributed. It cannot be traced back to you.
+    - Everything made from it is erased: the robot that learned from you, its videos and its files.
+    - All that remains is a note that { $code } took part and withdrew, and when. It says neither who you are nor what you told us.
+    - Results that have already been published cannot be taken back.
+withdraw-average = The robots of people who came after you may have started from an average to which yours contributed. It cannot be traced back to you.
 withdraw-final = It cannot be undone, not even by us.
 withdraw-confirm = Erase everything about me
 withdraw-keep = No, keep it and go back
-withdrawn-title = It is erased
-withdrawn-lead = You have withdrawn, and everything about you has been erased. Thank you for having looked in.
-withdrawn-text = The last traces on the computing machine go within minutes. You can close this page; your link leads here from now on.
+withdrawn-title = Your data have been erased
+withdrawn-lead = You have withdrawn from the study, and everything about you has been erased. Thank you for your time.
+withdrawn-text = The last traces on our computers will be gone within minutes. You can close this page; from now on your link leads here.
 
 ## Joining through a panel or an open address
 
 join-title = Welcome
 join-missing-title = Something is missing in this address
-join-missing = We cannot tell who you are: the address should bring along { $parameter }. Please open the study again from the page that offered it to you. If that does not help, tell the people who run that page.
-join-link-lead = This is your personal link. Keep it if you may want to go on later or on another device; nobody else should have it.
+join-missing = We cannot tell who you are: the address should contain { $parameter }. Please open the study again from the page that offered it to you. If that does not help, contact the people who run that page.
+join-link-lead = This is your personal link. Keep it if you may want to go on later or on another device, and do not share it with anybody.
 join-link-label = Your personal link
 join-link-copy = Copy
 
 ## What can go wrong
 
-error-title-401 = Who are you?
+error-title-401 = Please open your link again
 error-title-403 = That is not allowed
-error-title-404 = Nothing here
-error-title-409 = That no longer fits
-error-title-500 = Something broke
+error-title-404 = Page not found
+error-title-409 = That is no longer possible
+error-title-500 = Something went wrong on our side
 error-title-503 = A moment, please
 error-title-other = That did not work
 error-number = Error { $status }
-error-onward = Go on where I was
-error-link-needed = We cannot tell who you are. Please open your personal link again: you go on exactly where you were.
+error-onward = Back to where I was
+error-link-needed = We cannot tell who you are. Please open your personal link once more: you will go on exactly where you were.
 error-link-not-valid = This link is not valid. It may have been replaced by a newer one; please ask the person who sent it to you.
-error-joining-closed = This study cannot be joined by this address (any more). Please ask the people who gave it to you.
-error-not-yet = Something else comes first. You are taken there.
-error-query-not-found = There is no such pair for you. Please go on with the pair you are shown.
+error-joining-closed = A study cannot be joined, or can no longer be joined, through this address. Please ask the people who gave it to you.
+error-not-yet = Something else comes first. You are being taken there.
+error-query-not-found = This is not one of your pairs. Please go on with the pair you are shown.
 error-query-not-shown = This pair has not been shown to you yet. Please go on with the pair you are shown.
 error-answer-misdirected = This answer was already given to another pair. Please reload the page and answer again.
-error-undo-too-late = Only your newest answer can be taken back, and this is an older one.
-error-trial-not-found = There is no such robot for you to rate. Please go on with the one you are shown.
+error-undo-too-late = Only your latest answer can be taken back, and this is an earlier one.
+error-trial-not-found = This is not one of the robots you are asked to rate. Please go on with the one you are shown.
 error-trial-not-shown = You have not seen this robot yet. Please go on with the one you are shown.
-error-rated-already = This robot has a rating already, and that is the one which counts. The last rating can still be changed.
+error-rated-already = You have already rated this robot, and that rating counts. You can still change your last rating.
 error-correction-too-late = Only the last rating can be changed, and this is an earlier one.
 error-rating-misdirected = This rating was already given to another robot. Please reload the page and rate again.
 error-foreign-form = This request came from another website and was refused. Please use the pages of this site.
 error-page-not-found = There is no page at this address.
-error-not-understood = Something in this form is missing or not valid. Please go back and check it.
-error-database-busy = The database is busy or not ready. Nothing was saved; please try again in a moment.
-error-unforeseen = This is our fault, and it is in the log. Nothing was saved by this step; please try again.
+error-not-understood = Something on this form is missing or not valid. Please go back and check it.
+error-database-busy = The server is busy or not ready yet. Nothing was saved; please try again in a moment.
+error-unforeseen = This is our fault, and we have a record of it. Nothing was saved in this step; please try again.
 
 ## Pairs (prefix pair-)
 
@@ -220,8 +227,9 @@ pair-top = Top
 pair-bottom = Bottom
 pair-equal = Equal
 pair-skip = Can’t tell
-pair-left-clip = Left clip
-pair-right-clip = Right clip
+pair-left-clip = Left video
+pair-right-clip = Right video
+pair-enlarge = Enlarge this video
 pair-progress = Your progress
 pair-count = { $answered } of { $wanted }
 pair-time-left = { $time } left
@@ -235,10 +243,10 @@ pair-play = Play
 pair-pause = Pause
 pair-back = One frame back
 pair-forward = One frame forward
-pair-position = Position in both clips
+pair-position = Position in both videos
 pair-position-value = { $seconds } of { $total } seconds
 pair-speed = Speed
-pair-speed-value = { $rate } times real time
+pair-speed-value = { $rate } times normal speed
 pair-play-both = Play both
 pair-play-again = Play again
 pair-watch-first = Watch both once, then answer
@@ -248,8 +256,8 @@ pair-saving-earlier = Saving an earlier answer …
 pair-saved = Saved. { $answered } of { $wanted }.
 pair-not-saved = Not saved yet. Trying again …
 pair-taken-back = Taken back. Please answer again.
-pair-unplayable = These clips could not be loaded.
-pair-broken-off = These clips stopped playing. You can load them again, or answer if you have seen enough.
+pair-unplayable = These videos could not be loaded.
+pair-broken-off = These videos stopped playing. You can load them again, or answer if you have seen enough.
 pair-load-again = Load them again
 pair-go-on = Go on
 pair-try-again = Try again
@@ -259,7 +267,7 @@ pair-why-both_bad = Both are bad
 pair-why-not_comparable = Too different to compare
 pair-why-not_seen = I could not see it well
 pair-why-other = Another reason
-pair-why-none = Rather not say
+pair-why-none = I’d rather not say
 pair-why-back = Back to the pair
 waiting-heading = Your next pair is being prepared
 waiting-text = The robot is recording clips. This page goes on by itself; there is nothing you need to do.
@@ -270,23 +278,27 @@ waiting-answered = { $answered } of { $wanted } answers are safely stored.
 practice-title = Practice
 practice-count = Practice { $answered } of { $wanted }
 practice-lead = This is practice and does not count. Try the keys:
-practice-lead-touch = This is practice and does not count. Play, pause, drag along the bar, then tap an answer.
+practice-lead-touch = This is practice and does not count. Play, pause and move the slider, then tap an answer.
 practice-key-pause = pause
 practice-key-speed = speed
 practice-key-replay = replay
 practice-key-answer = answer
 practice-key-step = one frame
-practice-key-used = { $key }: you have used it
-practice-all-used = You have used every key. Answer when you like.
+practice-key-used = { $key }: done
+practice-all-used = You have tried every key. Answer whenever you like.
 
 ## Breaks (prefix break-)
 
-break-heading = { $answered } answers are done
-break-lead = All of them are safely stored. Look out of the window, stretch, have some water. Come back whenever you like, also on another day: your link brings you here.
+break-heading =
+    { $answered ->
+        [one] One answer done
+       *[other] { $answered } answers done
+    }
+break-lead = They are all safely stored. Look out of the window, stretch, have a glass of water. Come back whenever you like, even on another day: your link brings you back here.
 break-left = { $count } to go, { $time }.
 break-left-unknown = { $count } to go.
 break-go-on = Go on
-break-key = Enter goes on
+break-key = or press Enter
 
 ## Waiting (prefix wait-)
 
@@ -305,17 +317,21 @@ evaluation-progress = Robots you have rated
 evaluation-count = { $rated } of { $wanted } rated
 evaluation-robot = Robot { $letter }
 evaluation-film = Robot { $letter } at work
-evaluation-repetition = Time { $number } of { $count } with this robot.
-evaluation-satisfaction = How satisfied are you with this robot, overall?
+evaluation-repetition =
+    { $count ->
+        [one] You will see this robot once.
+       *[other] Round { $number } of { $count } with this robot
+    }
+evaluation-satisfaction = How satisfied are you with this robot overall?
 evaluation-satisfaction-low = not satisfied at all
-evaluation-satisfaction-high = totally satisfied
-evaluation-personalisation = How personalised to you is what it does?
+evaluation-satisfaction-high = completely satisfied
+evaluation-personalisation = How personalised does its behaviour feel to you?
 evaluation-personalisation-low = not personalised at all
-evaluation-personalisation-high = totally personalised
+evaluation-personalisation-high = completely personalised
 evaluation-save = Save and go on
 evaluation-save-change = Save the change
 evaluation-changing = You are changing your last rating.
-evaluation-keep = Leave it as it was
+evaluation-keep = Leave it as it is
 evaluation-change-last = Change my last rating (Robot { $letter })
 evaluation-rate-now = Please rate what the robot has just done.
 evaluation-watch-first = Watch it once to the end, then rate
@@ -323,18 +339,18 @@ evaluation-now-rate = You can rate now
 evaluation-keys = Keys: 1 to 5, twice, then Enter. Backspace takes one back.
 evaluation-saving = Saving …
 evaluation-not-saved = Not saved yet. Trying again …
-evaluation-refused = This was not saved, because the robot on this page is no longer the one to rate. Loading the page again …
-evaluation-unplayable = This film could not be loaded.
+evaluation-refused = This was not saved, because it is no longer this robot’s turn. The page is loading again …
+evaluation-unplayable = This video could not be loaded.
 evaluation-load-again = Load it again
 evaluation-play = Play
 evaluation-pause = Pause
-evaluation-position = Position in the film
+evaluation-position = Position in the video
 evaluation-position-value = { $seconds } of { $total } seconds
 evaluation-speed = Speed
-evaluation-speed-value = { $rate } times real time
+evaluation-speed-value = { $rate } times normal speed
 evaluation-coming = Robot { $letter } is next
-evaluation-coming-text = Please wait a moment until the operator starts it. This page goes on by itself.
-evaluation-moving = Robot { $letter } is moving, please watch
+evaluation-coming-text = It will be started in a moment. This page continues by itself.
+evaluation-moving = Robot { $letter } is moving. Please watch
 evaluation-moving-text = You will be asked about it as soon as it is done.
 evaluation-waiting-title = Your robots are being prepared
 evaluation-waiting-text = They are trained on your answers. When they are ready you will watch each of them at work and rate it. You will know them by letters only.
@@ -357,4 +373,4 @@ evaluation-done-text =
 
 ## Preview by an experimenter
 
-preview-mark = Preview: nothing of this is counted
+preview-mark = Preview: nothing here counts

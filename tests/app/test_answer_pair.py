@@ -92,6 +92,16 @@ def test_an_answer_meant_for_one_pair_is_not_taken_for_another(taking_part: Taki
     assert taking_part.events(taking_part.queries[1]) == []
 
 
+def test_what_came_without_a_script_is_marked_as_unmeasured(taking_part: TakingPart) -> None:
+    first, second, *_ = taking_part.queries
+    taking_part.turn()
+    form = {"response": "left", "client_uuid": str(uuid4())}
+    taking_part.browser.post(f"/p/queries/{first.id}/label", data=form)
+    taking_part.turn()
+    taking_part.answer(second, "right", response_time_ms=2000)
+    assert [taking_part.events(query)[0].by_script for query in (first, second)] == [False, True]
+
+
 def test_the_back_button_and_a_reload_change_nothing(taking_part: TakingPart) -> None:
     old_page = taking_part.browser.get("/p/next")
     taking_part.answer(taking_part.queries[0], "left")

@@ -14,7 +14,6 @@ from app.domain.participation import ParticipantEvent
 from app.domain.preferences import Purpose, Query, count_labels, current_answers, current_labels
 from app.domain.studies import Participant, Study
 from app.services import participant_events
-from app.storage import ArtefactStore
 from tests import factories
 from tests.app.conftest import JSON, TakingPart
 
@@ -44,7 +43,7 @@ def test_a_break_stands_between_two_pairs_until_the_person_goes_on(
     taking_part.answer(taking_part.queries[0])
     assert taking_part.answer(taking_part.queries[1]).json()["state"] == "break"
     page = taking_part.browser.get("/p/next").text
-    assert "2 answers are done" in page
+    assert "2 answers done" in page
     assert taking_part.browser.post("/p/break").headers["location"] == "/p/next"
     assert taking_part.turn().json()["pair"]["query_id"] == taking_part.queries[2].id
     assert [(event.kind, event.detail) for event in events(database)] == [
@@ -156,10 +155,8 @@ def test_events_of_nobody_are_refused(client: TestClient, database: Database) ->
     assert events(database) == []
 
 
-def test_pages_in_german_say_the_time_left_in_german(
-    taking_part: TakingPart, settle: Callable[..., None], database: Database, store: ArtefactStore
-) -> None:
-    settle(language="de")
+def test_pages_in_german_say_the_time_left_in_german(taking_part: TakingPart, database: Database) -> None:
+    taking_part.browser.post("/p/language", data={"language": "de"})
     with database.writing() as session:
         for number, query in enumerate(taking_part.queries[:7]):
             factories.make_label(session, query, ago=timedelta(seconds=1000 - 60 * number))

@@ -247,10 +247,10 @@ class TestForms:
     @pytest.mark.parametrize(
         ("item", "typed", "said"),
         [
-            ("age", "old", "Please write a number"),
-            ("age", "nan", "Please write a number"),
-            ("age", "1_000", "Please write a number"),
-            ("age", "1e3", "Please write a number"),
+            ("age", "old", "Please enter a number"),
+            ("age", "nan", "Please enter a number"),
+            ("age", "1_000", "Please enter a number"),
+            ("age", "1e3", "Please enter a number"),
             ("hand", "foot", "Please choose one"),
             ("robot_experience", "6", "Please choose one"),
         ],
@@ -285,7 +285,7 @@ def test_whatever_language_a_page_has_no_other_is_left_on_it(whole_way: OnTheWay
     whole_way.browser.post("/p/language", data={"language": "de"})
     page = whole_way.browser.get("/p/consent").text
     assert "Ich willige ein" in page
-    assert not any(word in page for word in ("agree", "Welcome", "Withdraw", "copy to keep"))
+    assert not any(word in page for word in ("agree", "Welcome", "Withdraw", "print a copy"))
 
 
 def test_a_chosen_language_is_remembered_on_every_device(

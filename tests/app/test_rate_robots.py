@@ -82,7 +82,7 @@ def test_after_the_last_pair_the_evaluation_is_next(rating: AtTheRobots) -> None
     assert rating.browser.get("/p/next").headers["location"] == "/p/evaluation"
     page = rating.look()
     assert "Robot A" in page
-    assert "Time 1 of 3 with this robot" in page
+    assert "Round 1 of 3 with this robot" in page
     assert f'action="/p/evaluation/trials/{rating.trials[0].id}/rating"' in page
 
 
@@ -102,7 +102,7 @@ def test_a_rating_is_stored_and_leads_to_the_next_robot(rating: AtTheRobots) -> 
     answer = rating.rate(rating.trials[0], 5, personalisation=1, response_time_ms=8123)
     assert (answer.status_code, answer.json()["next_path"]) == (200, "/p/evaluation")
     assert rating.ratings(rating.trials[0]) == [(1, 5, 1)]
-    assert "Time 2 of 3" in rating.look()
+    assert "Round 2 of 3" in rating.look()
     with rating.database.reading() as session:
         assert session.scalars(select(Rating)).one().response_time_ms == 8123
 
@@ -112,6 +112,11 @@ def test_without_script_the_form_leads_to_the_next_robot(rating: AtTheRobots) ->
     path = f"/p/evaluation/trials/{rating.trials[0].id}/rating"
     answer = rating.browser.post(path, data={**form, "satisfaction": "3", "personalisation": "3"})
     assert (answer.status_code, answer.headers["location"]) == (303, "/p/evaluation")
+    rating.look()
+    rating.rate(rating.trials[1])
+    with rating.database.reading() as session:
+        marks = session.scalars(select(Rating.by_script).order_by(Rating.id)).all()
+    assert marks == [False, True]
 
 
 def test_a_retry_after_a_lost_response_counts_once(rating: AtTheRobots) -> None:
@@ -128,7 +133,7 @@ def test_an_old_page_with_other_values_is_refused_in_words_and_nothing_is_overwr
     rating.rate(rating.trials[0], 4, uuid)
     for answer in (rating.rate(rating.trials[0], 1, uuid), rating.rate(rating.trials[0], 1)):
         assert answer.status_code == 409
-        assert "has a rating already" in answer.json()["detail"]
+        assert "have already rated this robot" in answer.json()["detail"]
     assert rating.ratings(rating.trials[0]) == [(1, 4, 2)]
 
 
@@ -284,7 +289,7 @@ def test_a_film_whose_file_is_lost_is_waited_for(rating: AtTheRobots, store: Art
 def test_the_pages_are_there_in_german(rating: AtTheRobots, database: Database) -> None:
     with database.writing() as session:
         session.get_one(Participant, rating.participant.id).language = "de"
-    assert "Wie zufrieden sind Sie mit diesem Roboter" in rating.look()
+    assert "Wie zufrieden sind Sie insgesamt mit diesem Roboter" in rating.look()
 
 
 # -- a physical robot -------------------------------------------------------------------------------------------------

@@ -132,6 +132,9 @@ def test_the_first_of_several_wrong_fields_is_one_link_away(experimenter: TestCl
     form = typed(experimenter, seed="x", task="cooking", practice_pairs="x")
     answer = experimenter.post("/studies/new", data=form).text
     assert 'Please check <a href="#task">the 3 marked fields</a>' in answer
+    answer = experimenter.post("/studies/new", data=typed(experimenter, seed="x", practice_pairs="x")).text
+    (first,) = re.findall(r'id="(\w+)"[^>]*autofocus', answer)
+    assert first == "practice_pairs"
 
 
 def test_the_fields_of_the_form_are_declared_in_the_order_of_the_page(experimenter: TestClient) -> None:

@@ -200,7 +200,7 @@ def test_afterwards_browser_and_link_find_only_the_page_that_is_left(
     traced: TakingPart, new_browser: Callable[[], TestClient]
 ) -> None:
     answer = traced.browser.post("/p/withdraw")
-    assert "It is erased" in traced.browser.get(answer.headers["location"]).text
+    assert "Your data have been erased" in traced.browser.get(answer.headers["location"]).text
     assert traced.browser.get("/p/next").status_code == 401
     link = new_browser().get(f"/p/{traced.token}")
     assert (link.status_code, link.headers["location"]) == (303, "/p/withdrawn")
@@ -213,7 +213,7 @@ def test_withdrawing_is_offered_on_every_page_in_the_persons_language(taking_par
     assert 'href="/p/withdraw"' in page
     assert "Teilnahme widerrufen" in page
     left = taking_part.browser.post("/p/withdraw")
-    assert "Es ist gelöscht" in taking_part.browser.get(left.headers["location"]).text
+    assert "Ihre Daten sind gelöscht" in taking_part.browser.get(left.headers["location"]).text
 
 
 def test_an_experimenter_can_erase_at_somebodys_request(traced: TakingPart, store: ArtefactStore) -> None:

@@ -92,20 +92,13 @@ def test_numbers_are_written_as_the_language_writes_them() -> None:
 
 
 @pytest.mark.parametrize(
-    ("asked", "given"), [("de-AT,de;q=0.9,en;q=0.8", "de"), ("fr,en;q=0.5", "en"), ("", "en"), ("xx", "en")]
-)
-def test_without_a_choice_the_browser_is_asked(asked: str, given: str) -> None:
-    assert wording.preferred(asked) == given
-
-
-@pytest.mark.parametrize(
     ("address", "headers", "said"),
     [
-        ("/p/next", {"Accept-Language": "de"}, "Wer sind Sie?"),
+        ("/p/next", {"Accept-Language": "de"}, "Bitte öffnen Sie Ihren Link noch einmal"),
         ("/p/" + "x" * 43, {"Accept-Language": "de-AT"}, "Dieser Link ist nicht gültig"),
-        ("/p/nowhere", {"Cookie": "studio_language=de"}, "Hier ist nichts"),
-        ("/join/" + "x" * 30, {"Accept-Language": "de"}, "nicht (mehr) teilnehmen"),
-        ("/p/next", {}, "Who are you?"),
+        ("/p/nowhere", {"Cookie": "studio_language=de"}, "Seite nicht gefunden"),
+        ("/join/" + "x" * 30, {"Accept-Language": "de"}, "an keiner Studie (mehr) teilnehmen"),
+        ("/p/next", {}, "Please open your link again"),
         ("/studies/none", {"Accept-Language": "de", "Accept": "application/json"}, "log in"),
     ],
 )

@@ -224,7 +224,7 @@ def test_clips_that_cannot_be_loaded_can_be_loaded_again_and_are_counted(invited
     page = new_page()
     page.route("**/media/*.mp4", lambda route: route.abort())
     page.goto(invited.link)
-    expect(page.get_by_text("These clips could not be loaded.")).to_be_visible()
+    expect(page.get_by_text("These videos could not be loaded.")).to_be_visible()
     page.keyboard.press("ArrowLeft")  # nobody can prefer what they have not seen
     assert invited.responses() == []
     page.unroute("**/media/*.mp4")
@@ -258,7 +258,7 @@ def test_clips_that_never_load_can_be_passed_over(invited: Invited, new_page: Ne
     page = new_page()
     page.route("**/media/*.mp4", lambda route: route.abort())
     page.goto(invited.link)
-    expect(page.get_by_text("These clips could not be loaded.")).to_be_visible()
+    expect(page.get_by_text("These videos could not be loaded.")).to_be_visible()
     page.keyboard.press("s")
     expect(page.locator("[data-count]")).to_have_text("1 of 10")
     assert invited.responses() == ["skip"]

@@ -74,7 +74,7 @@ def test_number_keys_set_the_speed_of_both_which_stays_for_the_next_pair_and_is_
     page.keyboard.press("1")
     assert page.evaluate(RATES) == [pytest.approx(0.25, rel=0.35)] * 2
     page.keyboard.press("4")
-    expect(page.get_by_role("button", name="2 times real time")).to_have_attribute("aria-pressed", "true")
+    expect(page.get_by_role("button", name="2 times normal speed")).to_have_attribute("aria-pressed", "true")
     page.keyboard.press("ArrowLeft")
     wait_ready(page, 1)
     assert page.evaluate(RATES) == [pytest.approx(2.0, rel=0.35)] * 2
@@ -85,7 +85,7 @@ def test_one_bar_scrubs_both_and_the_arrows_answer_again_afterwards(invited: Inv
     page = new_page()
     page.goto(invited.link)
     wait_ready(page, 0)
-    bar = page.get_by_role("slider", name="Position in both clips")
+    bar = page.get_by_role("slider", name="Position in both videos")
     box = bar.bounding_box()
     assert box is not None
     page.mouse.move(box["x"] + 20, box["y"] + box["height"] / 2)
@@ -106,7 +106,7 @@ def test_whoever_came_to_the_bar_by_keyboard_moves_it_by_keyboard(invited: Invit
     page = new_page()
     page.goto(invited.link)
     wait_ready(page, 0)
-    page.get_by_role("slider", name="Position in both clips").focus()
+    page.get_by_role("slider", name="Position in both videos").focus()
     page.keyboard.press("ArrowRight")
     page.keyboard.press("ArrowLeft")
     assert invited.responses() == []
@@ -156,7 +156,7 @@ def test_clips_that_break_off_do_not_lock_the_answers(invited: Invited, new_page
     page.goto(invited.link)
     expect(page.locator("[data-phase=watching]")).to_be_visible()
     page.evaluate("document.querySelector('video').dispatchEvent(new Event('error'))")
-    expect(page.get_by_text("These clips stopped playing.")).to_be_visible()
+    expect(page.get_by_text("These videos stopped playing.")).to_be_visible()
     page.keyboard.press("ArrowRight")
     expect(page.locator("[data-count]")).to_have_text("1 of 10")
     (event,) = invited.events()
@@ -236,10 +236,10 @@ def test_after_some_answers_a_break_is_offered_once_and_enter_goes_on(invited: I
     for number in range(2):
         wait_ready(page, number)
         page.keyboard.press("ArrowLeft")
-    expect(page.get_by_role("heading", name="2 answers are done")).to_be_visible()
+    expect(page.get_by_role("heading", name="2 answers done")).to_be_visible()
     assert serious_findings(page) == []
     page.goto(invited.link)  # on another day
-    expect(page.get_by_role("heading", name="2 answers are done")).to_be_visible()
+    expect(page.get_by_role("heading", name="2 answers done")).to_be_visible()
     page.keyboard.press("Enter")
     wait_ready(page, 2)
     page.keyboard.press("z")
