@@ -103,19 +103,19 @@ def _clips_again(place: Workplace, run_id: int, rollout_id: int) -> None:
         clips = session.scalars(select(Clip).where(Clip.rollout_id == rollout_id)).all()
         may_differ = not _answered(session, clips)
         study = session.get_one(Study, rollout.study_id)
-        task, settings = study.task, study.settings
+        task, settings, quality = study.task, study.settings, study.settings.clip_quality.value
     whole = place.store.has(rollout.trajectory_sha256)
     if whole:
         trajectory = place.store.read(rollout.trajectory_sha256)
     else:
         drawn = laboratory.behaviours(task, rollout.scenario, settings.behaviours_per_scenario)[rollout.behaviour]
-        shot = (task, rollout.scenario, drawn, 0, settings.clip_steps)
+        shot = (task, quality, rollout.scenario, drawn, 0, settings.clip_steps)
         trajectory = place.compute.run(Lane.CLIPS, place.beat(run_id), laboratory.record_clip, *shot).trajectory
     sha256 = hashlib.sha256(trajectory).hexdigest()
     if sha256 != rollout.trajectory_sha256 and not may_differ:
         raise NotTheSameAgain
     lost = [clip for clip in clips if sha256 != rollout.trajectory_sha256 or not _is_whole(place, clip)]
-    shots = [(trajectory, clip.first_step, clip.step_count) for clip in lost]
+    shots = [(quality, trajectory, clip.first_step, clip.step_count) for clip in lost]
     filmed = place.compute.run_all(Lane.CLIPS, place.beat(run_id), laboratory.film_again, shots)
     place.store.put(trajectory)
     columns = [stored(place, each) for each in filmed]
@@ -130,11 +130,13 @@ def _clips_again(place: Workplace, run_id: int, rollout_id: int) -> None:
 def _film_again(place: Workplace, run_id: int, film_id: int) -> None:
     with place.database.reading() as session:
         film = session.get_one(Film, film_id)
+        study = session.get_one(Study, session.get_one(Participant, film.participant_id).study_id)
+        quality = study.settings.clip_quality.value
     if not place.store.has(film.trajectory_sha256):
         raise FilmLost
     trajectory = place.store.read(film.trajectory_sha256)
     steps = len(Trajectory.load(io.BytesIO(trajectory)))
-    filmed = place.compute.run(Lane.CLIPS, place.beat(run_id), laboratory.film_again, trajectory, 0, steps)
+    filmed = place.compute.run(Lane.CLIPS, place.beat(run_id), laboratory.film_again, quality, trajectory, 0, steps)
     columns = stored(place, filmed)
     with place.database.writing() as session:
         _change(session.get_one(Film, film_id), columns)
