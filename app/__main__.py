@@ -131,13 +131,25 @@ def up(settings: Settings) -> int:
     database.dispose()
     return _Programs(greeting).run(
         {
-            "web": [
-                *("-m", "uvicorn", "app.main:create_app", "--factory", "--no-access-log", "--log-level", "warning"),
-                *("--host", settings.host, "--port", str(settings.port), "--timeout-graceful-shutdown", "5"),
-            ],
+            "web": web_server(settings),
             "worker": ["-m", "worker", "run"],
         }
     )
+
+
+def web_server(settings: Settings) -> list[str]:
+    """What Python is to run. Nobody is believed about where a request comes from, except the proxies of the settings.
+
+    Left alone, uvicorn believes whoever asks from this machine.
+    """
+    proxies = (
+        ["--forwarded-allow-ips", settings.trusted_proxies] if settings.trusted_proxies else ["--no-proxy-headers"]
+    )
+    return [
+        *("-m", "uvicorn", "app.main:create_app", "--factory", "--no-access-log", "--log-level", "warning"),
+        *("--host", settings.host, "--port", str(settings.port), "--timeout-graceful-shutdown", "5"),
+        *(("--forwarded-allow-ips", trusted) if trusted else ("--no-proxy-headers",)),
+    ]
 
 
 def _database(settings: Settings) -> Database:

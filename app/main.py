@@ -41,6 +41,8 @@ from app.web.templating import ROOT, make_environment
 from app.web.turns import Turns
 
 MAX_BODY_BYTES = 256 * 1024
+WRONG_TOKENS = 600
+"""A minute, from everywhere together; right ones always pass."""
 EXPERIMENTER_PARTS = (
     login,
     accounts,
@@ -76,12 +78,14 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         store=ArtefactStore(settings.data_dir / "artefacts"),
         turns=Turns(database),
         login_attempts=LoginAttempts(settings.login_attempts_per_minute),
+        token_attempts=LoginAttempts(settings.login_attempts_per_minute, WRONG_TOKENS, WRONG_TOKENS),
     )
 
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
         with live.closing_on_signals(studio.closing):
             yield
+        studio.hashing.close()
         database.dispose()
 
     app = FastAPI(

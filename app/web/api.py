@@ -89,7 +89,7 @@ def _caller(
         token, experimenter = api_tokens.find(session, credentials.credentials)
     except TokenInvalid:
         address = request.client.host if request.client else "unknown"
-        if not studio.login_attempts.allow(address):
+        if not studio.token_attempts.allow(address):
             raise TooManyWrongTokens from None
         raise
     if api_tokens.use_is_worth_noting(token):
