@@ -142,9 +142,7 @@ def web_server(settings: Settings) -> list[str]:
 
     Left alone, uvicorn believes whoever asks from this machine.
     """
-    proxies = (
-        ["--forwarded-allow-ips", settings.trusted_proxies] if settings.trusted_proxies else ["--no-proxy-headers"]
-    )
+    trusted = settings.trusted_proxies
     return [
         *("-m", "uvicorn", "app.main:create_app", "--factory", "--no-access-log", "--log-level", "warning"),
         *("--host", settings.host, "--port", str(settings.port), "--timeout-graceful-shutdown", "5"),
