@@ -16,6 +16,30 @@ from app.web.guard import HEADERS
 log = logging.getLogger("app.web")
 
 
+_REPLACED = {"offset": "offset is gone, because answers between two pages would shift it: follow next instead."}
+
+
+class ParameterUnknown(AppError):
+    """This address does not know one of the parameters."""
+
+    status = HTTPStatus.UNPROCESSABLE_ENTITY
+
+
+async def only_known_parameters(request: Request) -> None:
+    """A parameter that is ignored is an answer to another question than the one that was asked.
+
+    Raises ParameterUnknown, which names those that are known.
+    """
+    documented = request.app.openapi()["paths"][request.scope["route"].path][request.method.lower()]
+    known = [each["name"] for each in documented.get("parameters", ()) if each["in"] == "query"]
+    unknown = sorted(set(request.query_params) - set(known))
+    if unknown:
+        named = ", ".join(name[:40] for name in unknown[:5])
+        replaced = [_REPLACED[name] for name in unknown if name in _REPLACED]
+        words = f"It knows {', '.join(known)}." if known else "It takes none after the question mark."
+        raise ParameterUnknown(" ".join([f"This address does not know: {named}.", words, *replaced]))
+
+
 def add_problems(api: FastAPI) -> None:
     """Have every error of this application answered so."""
 
