@@ -167,6 +167,9 @@ withdrawn-text = Die letzten Spuren auf dem Rechner verschwinden innerhalb von M
 ## Teilnahme über ein Panel oder eine offene Adresse
 
 join-title = Herzlich willkommen
+join-start-lead = Sie sind eingeladen, an einer Studie teilzunehmen.
+join-start-text = Über die Schaltfläche gelangen Sie zur Studie. Dort lesen Sie zuerst, was die Teilnahme bedeutet, und entscheiden dann. Bis Sie darauf drücken, wird nichts gespeichert.
+join-start = Zur Studie
 join-missing-title = In dieser Adresse fehlt etwas
 join-missing = Wir können nicht erkennen, wer Sie sind: Die Adresse sollte { $parameter } mitbringen. Bitte öffnen Sie die Studie noch einmal von der Seite aus, die sie Ihnen angeboten hat. Hilft das nicht, wenden Sie sich an die Betreiber jener Seite.
 join-link-lead = Dies ist Ihr persönlicher Link. Heben Sie ihn auf, falls Sie später oder auf einem anderen Gerät weitermachen möchten; niemand sonst sollte ihn haben.

@@ -169,6 +169,9 @@ withdrawn-text = The last traces on the computing machine go within minutes. You
 ## Joining through a panel or an open address
 
 join-title = Welcome
+join-start-lead = You are invited to take part in a study.
+join-start-text = Press the button to come in. You will then read what taking part means and can decide; until you press it, nothing is stored.
+join-start = Come in
 join-missing-title = Something is missing in this address
 join-missing = We cannot tell who you are: the address should bring along { $parameter }. Please open the study again from the page that offered it to you. If that does not help, tell the people who run that page.
 join-link-lead = This is your personal link. Keep it if you may want to go on later or on another device; nobody else should have it.
