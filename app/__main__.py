@@ -22,10 +22,10 @@ from sqlalchemy.orm import Session
 
 from app.db import Database
 from app.domain.studies import USUAL_CLIP_STEPS, Study, StudySettings, TaskName
-from app.errors import AppError
+from app.errors import EXPLAINED, AppError, in_words
 from app.services import accounts, archive, audit, enrolment, export_tables, exporting, studies
 from app.settings import Settings
-from app.storage import ArtefactStore
+from app.storage import ArtefactStore, keep_private
 
 GRACE_S = 20.0
 FALLS_ALLOWED = 3
@@ -51,10 +51,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     chosen = vars(parser.parse_args(arguments))
     act, _ = chosen.pop("act"), chosen.pop("command")
     try:
-        result: int = act(Settings(), **chosen)
+        settings = Settings()
+        keep_private(settings)
+        result: int = act(settings, **chosen)
         return result
-    except AppError as error:
-        _say(f"Error: {error.message}")
+    except EXPLAINED as error:
+        words = in_words(error)
+        if words is None:
+            raise
+        _say(f"Error: {words}")
         return 1
 
 

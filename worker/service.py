@@ -16,12 +16,12 @@ from types import FrameType
 from dbos import DBOS, SetWorkflowID
 from sqlalchemy.exc import OperationalError
 
-from app.db import Database, Watch
+from app.db import Database, Watch, complaints
 from app.domain.models import RunKind
 from app.domain.studies import StudySettings
-from app.errors import AppError
+from app.errors import AppError, OncePerMinute
 from app.settings import Settings
-from app.storage import ArtefactStore
+from app.storage import ArtefactStore, keep_private
 from worker import erasure, laboratory, lessons, orphans, querying, reconcile, records, references
 from worker.compute import Compute, ComputeLost, Interrupted, Lane
 from worker.records import Job
@@ -62,10 +62,13 @@ class WorkerAlreadyRunning(AppError):
 def run(settings: Settings) -> int:
     """Keep studies supplied with clips, queries, models and bundles until told to stop."""
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
-    logging.getLogger("dbos").setLevel(logging.ERROR)
+    engine_log = logging.getLogger("dbos")
+    engine_log.setLevel(logging.ERROR)
+    engine_log.addFilter(OncePerMinute())
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, _setter(stop))
+    keep_private(settings)
     with _only_one(settings):
         database = Database(settings.sqlalchemy_url)
         compute = Compute(settings.compute_processes)
@@ -157,7 +160,7 @@ class _Rounds:
                 self._rested_at = time.monotonic() + REST * (time.monotonic() - started)
             self._clear_away()
         except OperationalError as error:
-            log.warning("the database could not be reached, trying again: %s", error.orig)
+            complaints.warning("the database could not be reached, trying again: %s", error.orig)
 
     def _sign(self) -> None:
         if time.monotonic() - self._signed_at >= PRESENCE_S:

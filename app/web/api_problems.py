@@ -1,6 +1,5 @@
 """Errors of the API as problem details (RFC 9457): in words what happened and what to do."""
 
-import logging
 from collections.abc import Mapping
 from http import HTTPStatus
 
@@ -10,11 +9,9 @@ from fastapi.responses import JSONResponse, Response
 from sqlalchemy.exc import OperationalError
 from starlette.exceptions import HTTPException
 
+from app.db import complaints
 from app.errors import AppError
 from app.web.guard import HEADERS
-
-log = logging.getLogger("app.web")
-
 
 _REPLACED = {"offset": "offset is gone, because answers between two pages would shift it: follow next instead."}
 
@@ -69,7 +66,7 @@ def add_problems(api: FastAPI) -> None:
 
     @api.exception_handler(OperationalError)
     def database_busy(_request: Request, error: OperationalError) -> Response:
-        log.error("the database did not answer: %s", error.orig)
+        complaints.error("the database did not answer: %s", error.orig)
         message = "The database is busy or not ready. Nothing was saved; please try again in a moment."
         return problem(HTTPStatus.SERVICE_UNAVAILABLE, message, {"retry-after": "2"})
 
