@@ -70,10 +70,10 @@ class TestSentences:
         done = run(studio.main, ["migrate"], DATA_DIR=str(tmp_path), DATABASE_URL=url)
         assert says_what_to_do(done, "cannot be opened")
 
-    def test_the_worker_says_the_same(self, run: Run, tmp_path: Path) -> None:
-        url = f"sqlite:///{tmp_path}/nowhere/studio.sqlite3"
-        done = run(worker.main, ["import-clips", "x.zip"], DATA_DIR=str(tmp_path), DATABASE_URL=url)
-        assert says_what_to_do(done, "cannot be opened")
+    def test_the_worker_says_the_same(self, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr("worker.service.signal.signal", lambda *_: None)  # pytest's own stay
+        (tmp_path / "data").write_text("A file of this name is in the way.")
+        assert says_what_to_do(run(worker.main, ["run"], DATA_DIR=str(tmp_path / "data")), "DATA_DIR=")
 
     @pytest.mark.parametrize(("main", "command"), [(studio.main, "migrate"), (worker.main, "run")])
     def test_a_setting_that_is_not_valid_is_named(
@@ -125,7 +125,8 @@ class TestFiles:
             (tmp_path / name).chmod(0o644)
         for name in ("artefacts", "unfinished", "backups"):
             (tmp_path / name).mkdir(mode=0o755)
-        (tmp_path / "README.txt").write_text("Not ours.")
+        (tmp_path / "README.txt").touch()
+        (tmp_path / "README.txt").chmod(0o644)  # not ours
         assert run(studio.main, ["migrate"], DATA_DIR=str(tmp_path))[0] == 0
         assert self.open_to_others(tmp_path) == ["README.txt"]
 
