@@ -89,6 +89,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         with live.closing_on_signals(studio.closing):
             yield
         studio.hashing.close()
+        studio.hashing_for_known.close()
         database.dispose()
 
     app = FastAPI(

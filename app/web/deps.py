@@ -66,6 +66,8 @@ class Studio:
     token_attempts: LoginAttempts
     """Of their own: a program with an old token must not lock out the people who log in from the same address."""
     hashing: Hashing = field(default_factory=Hashing)
+    hashing_for_known: Hashing = field(default_factory=Hashing)
+    """For people whose browser is known or who are logged in: they do not queue behind strangers who guess."""
     link_desk: LinkDesk = field(default_factory=LinkDesk)
     closing: Event = field(default_factory=Event)
     """Set when the server is asked to stop, so that open event streams end by themselves."""

@@ -87,7 +87,7 @@ async def change_password(
         _count_attempt(request, studio, experimenter.name, browser=f"logged in/{experimenter.id}")
         if new != again:
             raise accounts.PasswordUnacceptable("The two new passwords differ. Please type the same one twice.")
-        password_hash = await studio.hashing.run(accounts.hash_of_new, experimenter, current=current, new=new)
+        password_hash = await studio.hashing_for_known.run(accounts.hash_of_new, experimenter, current=current, new=new)
     except (accounts.WrongNameOrPassword, accounts.PasswordUnacceptable, TooManyAttempts) as error:
         status = error.status if isinstance(error, TooManyAttempts) else HTTPStatus.UNPROCESSABLE_ENTITY
         context = {"experimenter": experimenter, "error": error.message}
@@ -101,9 +101,10 @@ async def _verified(request: Request, studio: Studio, name: str, password: str) 
     """Raises WrongNameOrPassword and TooManyAttempts."""
     async with studio.turns.reading() as session:
         account = await run_in_threadpool(accounts.by_name, session, name)
-    mark = request.cookies.get(KNOWN_BROWSER_COOKIE, "")
-    _count_attempt(request, studio, name, known_browsers.name_in(mark, account))
-    return await studio.hashing.run(accounts.verify, account, password)
+    browser = known_browsers.name_in(request.cookies.get(KNOWN_BROWSER_COOKIE, ""), account)
+    _count_attempt(request, studio, name, browser)
+    hashing = studio.hashing if browser is None else studio.hashing_for_known
+    return await hashing.run(accounts.verify, account, password)
 
 
 def _count_attempt(request: Request, studio: Studio, account: str, browser: str | None) -> None:

@@ -109,6 +109,15 @@ class TestKnownBrowsers:
         assert client.get("/studies").status_code == 303
         assert log_in(client, "wrong").status_code == 401
 
+    def test_a_known_browser_does_not_queue_behind_those_who_guess(
+        self, client: TestClient, password: str, studio_app: FastAPI
+    ) -> None:
+        log_in(client, password)
+        go_on = threading.Event()
+        studio_app.state.studio.hashing._executor.submit(go_on.wait)
+        assert log_in(client, password).status_code == 303
+        go_on.set()
+
     def test_marks_are_good_for_one_account_and_one_password(self) -> None:
         pat, kim = Experimenter(id=1, password_hash="one"), Experimenter(id=2, password_hash="one")
         mark = known_browsers.new_mark(pat)
