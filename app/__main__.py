@@ -13,11 +13,11 @@ from sqlalchemy.orm import Session
 from app import upgrading
 from app.db import Database
 from app.domain.studies import USUAL_CLIP_STEPS, Study, StudySettings, TaskName
-from app.errors import AppError
+from app.errors import EXPLAINED, AppError, in_words
 from app.programs import Programs, say
 from app.services import accounts, audit, damage, enrolment, export_tables, exporting, studies, study_import
 from app.settings import Settings
-from app.storage import ArtefactStore
+from app.storage import ArtefactStore, keep_private
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -36,10 +36,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     chosen = vars(parser.parse_args(arguments))
     act, _ = chosen.pop("act"), chosen.pop("command")
     try:
-        result: int = act(Settings(), **chosen)
+        settings = Settings()
+        keep_private(settings)
+        result: int = act(settings, **chosen)
         return result
-    except AppError as error:
-        say(f"Error: {error.message}")
+    except EXPLAINED as error:
+        words = in_words(error)
+        if words is None:
+            raise
+        say(f"Error: {words}")
         return 1
 
 
@@ -126,13 +131,23 @@ def up(settings: Settings) -> int:
         greeting,
         settings.data_dir,
         {
-            "web": [
-                *("-m", "uvicorn", "app.main:create_app", "--factory", "--no-access-log", "--log-level", "warning"),
-                *("--host", settings.host, "--port", str(settings.port), "--timeout-graceful-shutdown", "5"),
-            ],
+            "web": web_server(settings),
             "worker": ["-m", "worker", "run"],
         },
     ).run()
+
+
+def web_server(settings: Settings) -> list[str]:
+    """What Python is to run. Nobody is believed about where a request comes from, except the proxies of the settings.
+
+    Left alone, uvicorn believes whoever asks from this machine.
+    """
+    trusted = settings.trusted_proxies
+    return [
+        *("-m", "uvicorn", "app.main:create_app", "--factory", "--no-access-log", "--log-level", "warning"),
+        *("--host", settings.host, "--port", str(settings.port), "--timeout-graceful-shutdown", "5"),
+        *(("--forwarded-allow-ips", trusted) if trusted else ("--no-proxy-headers",)),
+    ]
 
 
 def _database(settings: Settings) -> Database:

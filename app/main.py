@@ -39,11 +39,14 @@ from app.web.deps import Studio
 from app.web.error_pages import add_error_pages, error_page
 from app.web.guard import Guard
 from app.web.login_attempts import LoginAttempts
+from app.web.readiness import Readiness
 from app.web.screens import Screens
 from app.web.templating import ROOT, make_environment
 from app.web.turns import Turns
 
 MAX_BODY_BYTES = 256 * 1024
+WRONG_TOKENS = 600
+"""A minute, from everywhere together; right ones always pass."""
 EXPERIMENTER_PARTS = (
     login,
     accounts,
@@ -81,13 +84,18 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         store=ArtefactStore(settings.data_dir / "artefacts"),
         turns=Turns(database),
         login_attempts=LoginAttempts(settings.login_attempts_per_minute),
+        token_attempts=LoginAttempts(settings.login_attempts_per_minute, WRONG_TOKENS, WRONG_TOKENS),
         screens=Screens(database),
     )
+
+    readiness = Readiness(database, settings.data_dir)
 
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
         with live.closing_on_signals(studio.closing):
             yield
+        studio.hashing.close()
+        studio.hashing_for_known.close()
         database.dispose()
 
     app = FastAPI(
@@ -109,8 +117,15 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         return RedirectResponse(app.url_path_for("show_studies"), HTTPStatus.SEE_OTHER)
 
     @app.get("/health", name="show_health")
-    def show_health() -> PlainTextResponse:
-        """Whether the server answers."""
+    async def show_health() -> PlainTextResponse:
+        """Whether answers can be kept: 200, or 503 with the reason. For load balancers and whoever watches."""
+        complaint = await readiness.complaint()
+        status = HTTPStatus.OK if complaint is None else HTTPStatus.SERVICE_UNAVAILABLE
+        return PlainTextResponse(complaint or "ok", status)
+
+    @app.get("/health/live", name="show_life")
+    async def show_life() -> PlainTextResponse:
+        """Whether the server answers at all. For whatever restarts it: that mends no full disk."""
         return PlainTextResponse("ok")
 
     return app

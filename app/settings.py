@@ -1,8 +1,9 @@
 """Everything an operator may set, from the environment or a .env file, with units in the names."""
 
+from ipaddress import ip_network
 from pathlib import Path
 
-from pydantic import Field
+from pydantic import Field, field_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 
@@ -20,8 +21,23 @@ class Settings(BaseSettings):
     session_days: int = Field(default=30, ge=1, description="How long a participant's browser is remembered.")
     login_hours: int = Field(default=12, ge=1, description="How long an experimenter stays logged in.")
     login_attempts_per_minute: int = Field(default=10, ge=1, description="Password attempts per address.")
+    trusted_proxies: str = Field(default="", description="Addresses or networks whose X-Forwarded-For is believed.")
     worker_name: str = Field(default="worker-1", description="Stable name: a restart resumes its own work.")
     compute_processes: int = Field(default=2, ge=1, description="Processes for simulation and training.")
+
+    @field_validator("trusted_proxies")
+    @classmethod
+    def _only_addresses(cls, text: str) -> str:
+        """Whoever is believed here says who asks, so nobody is believed by accident: no names, no "everybody"."""
+        named = [part.strip() for part in text.split(",") if part.strip()]
+        for each in named:
+            try:
+                network = ip_network(each)
+            except ValueError as error:
+                raise ValueError(f"{each} is neither an address nor a network such as 10.0.0.0/8.") from error
+            if network.prefixlen == 0:
+                raise ValueError(f"{each} is everybody. Name the proxy's own address.")
+        return ",".join(named)
 
     @property
     def sqlalchemy_url(self) -> str:

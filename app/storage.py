@@ -4,6 +4,7 @@ import hashlib
 import logging
 import os
 import re
+import stat
 import tempfile
 import time
 from contextlib import suppress
@@ -12,9 +13,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 from app.errors import AppError
+from app.settings import Settings
 
 log = logging.getLogger("app.storage")
 
+_OTHERS = 0o077
+_OURS = ("engine.sqlite3*", "*.lock", "artefacts", "unfinished", "backup*")
+"""In the data directory, beside the database. Closing a directory closes what is in it."""
 _WRITING = ".writing-"
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 
@@ -31,6 +36,23 @@ class ArtefactMissing(AppError):
 
 class ArtefactDamaged(ArtefactMissing):
     """A stored file is damaged: it no longer holds what was stored. Ask the experimenter to look at the dashboard."""
+
+
+def keep_private(settings: Settings) -> None:
+    """What people said and did is nobody else's on this machine: files are made for this account alone from now on.
+
+    Those that an earlier version has made readable for all are closed.
+    """
+    os.umask(_OTHERS)
+    found = [each for pattern in _OURS for each in settings.data_dir.glob(pattern)]
+    database = settings.sqlalchemy_url.partition("sqlite:///")[2].partition("?")[0]
+    if database:
+        found += Path(database).parent.glob(f"{Path(database).name}*")
+    for path in found:
+        with suppress(PermissionError, FileNotFoundError):  # another account's, which can close it; or just gone
+            mode = stat.S_IMODE(path.stat().st_mode)
+            if mode & _OTHERS:
+                path.chmod(mode & ~_OTHERS)
 
 
 class ArtefactStore:

@@ -11,14 +11,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code."""
     # Compute processes import this module again when they start. What they need they load themselves, and most of
     # what we need (torch, the engine) they do not.
-    from app.errors import AppError
+    from app.errors import EXPLAINED, in_words
     from worker import commands, stopping
 
     stopping.any_signal_is_ctrl_c()
     try:
         return commands.run(arguments)
-    except AppError as error:
-        sys.stderr.write(f"Error: {error.message}\n")
+    except EXPLAINED as error:
+        words = in_words(error)
+        if words is None:
+            raise
+        sys.stderr.write(f"Error: {words}\n")
         return 1
     except KeyboardInterrupt:
         sys.stderr.write("Interrupted.\n")

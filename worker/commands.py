@@ -13,7 +13,7 @@ from app.db import Database
 from app.domain.protocol import EvaluationSettings
 from app.domain.studies import PAPER_PROTOCOL, ClipQuality, Method, RewardKind, Strategy, StudySettings
 from app.settings import Settings
-from app.storage import ArtefactStore
+from app.storage import ArtefactStore, keep_private
 from worker import benchmark, exploration, foresight, import_work, laboratory, pretraining, rehearsal, service
 from worker.contest import INDIRECT_USERS, OPPOSED_USERS, PAPER_USERS
 from worker.ml import acquisition, reward_training
@@ -55,6 +55,7 @@ def _add_service(commands: _Commands) -> None:
 
 def _import_clips(options: argparse.Namespace) -> int:
     settings = Settings()
+    keep_private(settings)
     database = Database(settings.sqlalchemy_url)
     slug = import_work.import_clips(database, ArtefactStore(settings.data_dir / "artefacts"), options.path)
     sys.stdout.write(f"Imported: {settings.base_url}/studies/{slug}\n")

@@ -15,11 +15,11 @@ from pathlib import Path
 from dbos import DBOS, SetWorkflowID
 from sqlalchemy.exc import OperationalError
 
-from app.db import Database, Watch, now
+from app.db import Database, Watch, complaints, now
 from app.domain.studies import StudySettings
-from app.errors import AppError
+from app.errors import AppError, OncePerMinute
 from app.settings import Settings
-from app.storage import ArtefactStore
+from app.storage import ArtefactStore, keep_private
 from worker import engine, erasure, laboratory, lessons, orphans, querying, reconcile, records, references
 from worker.compute import Compute, ComputeLost, Interrupted, Lane
 from worker.records import Job
@@ -53,8 +53,11 @@ class KeepsFelling(AppError):
 def run(settings: Settings) -> int:
     """Keep studies supplied with clips, queries, models and bundles until told to stop."""
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
-    logging.getLogger("dbos").setLevel(logging.ERROR)
+    engine_log = logging.getLogger("dbos")
+    engine_log.setLevel(logging.ERROR)
+    engine_log.addFilter(OncePerMinute())
     stop = Stop()
+    keep_private(settings)
     with _only_one(settings):
         database = Database(settings.sqlalchemy_url)
         compute = Compute(settings.compute_processes, stop.asked)
@@ -122,7 +125,7 @@ class _Rounds:
                 self._rested_at = time.monotonic() + REST * (time.monotonic() - started)
             self._clear_away()
         except OperationalError as error:
-            log.warning("the database could not be reached, trying again: %s", error.orig)
+            complaints.warning("the database could not be reached, trying again: %s", error.orig)
 
     def _sign(self) -> None:
         if time.monotonic() - self._signed_at >= PRESENCE_S:

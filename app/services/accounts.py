@@ -67,7 +67,7 @@ def create_first_experimenter(session: Session) -> str | None:
 
 def reset_password(session: Session, name: str) -> str:
     """Give the account a new one-time password and end all its logins. Raises ExperimenterNotFound."""
-    experimenter = _by_name(session, name)
+    experimenter = by_name(session, name)
     if experimenter is None:
         raise ExperimenterNotFound
     one_time = new_one_time_password()
@@ -94,12 +94,17 @@ def find(session: Session, experimenter_id: int) -> Experimenter:
     return experimenter
 
 
+def by_name(session: Session, name: str) -> Experimenter | None:
+    """The account of exactly this name."""
+    return session.scalar(select(Experimenter).where(Experimenter.name == name))
+
+
 def add(session: Session, name: str, role: Role, password: OneTimePassword, actor: str) -> Experimenter:
     """A new account. Raises NameUnacceptable."""
     name = " ".join(name.split())
     if not 1 <= len(name) <= LONGEST_NAME or not name.isprintable():
         raise NameUnacceptable(f"Give the account a name of at most {LONGEST_NAME} characters.")
-    if _by_name(session, name) is not None:
+    if by_name(session, name) is not None:
         raise NameUnacceptable("There is an account of this name already.")
     experimenter = Experimenter(name=name, role=role, password_hash=password.hash)
     session.add(experimenter)
@@ -141,9 +146,11 @@ def enable(session: Session, experimenter: Experimenter, actor: str) -> None:
         audit.record(session, actor, "account enabled", experimenter.name)
 
 
-def verify(session: Session, name: str, password: str) -> Experimenter:
-    """The experimenter of that name. Raises WrongNameOrPassword, as slowly for unknown names as for known ones."""
-    experimenter = _by_name(session, name)
+def verify(experimenter: Experimenter | None, password: str) -> Experimenter:
+    """The experimenter, if this is their password. Takes most of a second: hold no session meanwhile.
+
+    Raises WrongNameOrPassword, as slowly for an unknown name (None) as for a known one.
+    """
     stored = experimenter.password_hash if experimenter is not None else _HASH_OF_NOTHING
     try:
         _hasher().verify(stored, password)
@@ -170,17 +177,14 @@ def hash_of_new(experimenter: Experimenter, *, current: str, new: str) -> str:
     return _hasher().hash(new)
 
 
-def set_password(session: Session, experimenter: Experimenter, password_hash: str) -> None:
+def set_password(session: Session, experimenter: Experimenter, password_hash: str) -> Experimenter:
     """Replace the password and end every login, the present one included: the caller opens a new one."""
     account = session.get_one(Experimenter, experimenter.id)
     account.password_hash = password_hash
     account.must_change_password = False
     _end_logins(session, account)
     audit.record(session, account.name, "password changed", account.name)
-
-
-def _by_name(session: Session, name: str) -> Experimenter | None:
-    return session.scalar(select(Experimenter).where(Experimenter.name == name))
+    return account
 
 
 def _leave_an_owner(session: Session, experimenter: Experimenter) -> None:

@@ -3,9 +3,13 @@
 from collections.abc import Sequence
 from typing import Any
 
-from app.domain.models import ModelKind
-from app.domain.preferences import Purpose, Response, SkipReason
+from app.domain.clips import Clip
+from app.domain.evaluation import Rating, Trial
+from app.domain.models import Model, ModelKind
+from app.domain.participation import ConsentRecord, FormAnswer, ParticipantEvent, StageRecord
+from app.domain.preferences import LabelEvent, Purpose, Query, Response, SkipReason
 from app.domain.protocol import EvaluatedMethod, Stage
+from app.domain.studies import Deviation, Participant
 from app.services import export_rows
 from app.services.exporting import Column, Kind, Table
 
@@ -43,6 +47,7 @@ TABLES: Sequence[Table] = (
             Column("withdrawn_at", W, "When they withdrew; nothing else is kept of them."),
         ),
         export_rows.participants,
+        (Participant,),
     ),
     Table(
         "stages",
@@ -56,6 +61,7 @@ TABLES: Sequence[Table] = (
             ),
         ),
         export_rows.stages,
+        (StageRecord,),
     ),
     Table(
         "queries",
@@ -99,6 +105,7 @@ TABLES: Sequence[Table] = (
             Column("is_label", B, "Whether the answer is learned from."),
         ),
         export_rows.queries,
+        (Query, LabelEvent),
     ),
     Table(
         "labels",
@@ -131,6 +138,7 @@ TABLES: Sequence[Table] = (
             Column("created_at", W, "When it reached the server."),
         ),
         export_rows.labels,
+        (LabelEvent,),
     ),
     Table(
         "forms",
@@ -144,6 +152,7 @@ TABLES: Sequence[Table] = (
             Column("created_at", W, "When it reached the server."),
         ),
         export_rows.forms,
+        (FormAnswer,),
     ),
     Table(
         "consent",
@@ -156,6 +165,7 @@ TABLES: Sequence[Table] = (
             Column("text", T, "The text, word for word."),
         ),
         export_rows.consent,
+        (ConsentRecord,),
     ),
     Table(
         "events",
@@ -167,6 +177,7 @@ TABLES: Sequence[Table] = (
             Column("detail", J, "Numbers that belong to it."),
         ),
         export_rows.events,
+        (ParticipantEvent,),
     ),
     Table(
         "ratings",
@@ -199,6 +210,7 @@ TABLES: Sequence[Table] = (
             Column("success", B, "Video: whether the robot succeeded; empty until the study is unblinded."),
         ),
         export_rows.ratings,
+        (Trial, Rating),
     ),
     Table(
         "models",
@@ -216,6 +228,7 @@ TABLES: Sequence[Table] = (
             Column("metrics", J, "What was measured while training."),
         ),
         export_rows.models,
+        (Model,),
     ),
     Table(
         "evaluations",
@@ -240,6 +253,7 @@ TABLES: Sequence[Table] = (
             Column("high", N, "Upper end."),
         ),
         export_rows.evaluations,
+        (Model,),
     ),
     Table(
         "clips",
@@ -257,6 +271,7 @@ TABLES: Sequence[Table] = (
             Column("trajectory_sha256", T, "The stored trajectory.", allowed=SHA256),
         ),
         export_rows.clips,
+        (Clip,),
     ),
     Table(
         "deviations",
@@ -269,6 +284,7 @@ TABLES: Sequence[Table] = (
             Column("after", J, "And as it is since."),
         ),
         export_rows.deviations,
+        (Deviation,),
     ),
 )
 BY_NAME = {table.name: table for table in TABLES}

@@ -14,9 +14,10 @@ from typing import Any
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from app.db import now
+from app.db import Base, now
 from app.domain.studies import Deviation, Study
 from app.services.csv_cells import csv_line, json_text, moment
+from app.services.paging import EVERYTHING, Key, KeyedRows, Window
 
 NOT_LOCKED = "not locked"
 
@@ -45,12 +46,18 @@ class Column:
 
 @dataclass(frozen=True)
 class Table:
-    """One table of an export; ``rows`` yields values in the order of the columns."""
+    """One table of an export; ``keyed_rows`` yields values in the order of the columns, each with its key."""
 
     name: str
     meaning: str
     columns: Sequence[Column]
-    rows: Callable[[Session, Study], Iterator[Sequence[Any]]]
+    keyed_rows: Callable[[Session, Study, Window], KeyedRows]
+    made_of: Sequence[type[Base]]
+    """The database's tables whose rows, old or new, decide which rows there are and which of them count."""
+
+    def rows(self, session: Session, study: Study) -> Iterator[Sequence[Any]]:
+        """Everything, in the order of the columns."""
+        return (values for _, values in self.keyed_rows(session, study, EVERYTHING))
 
     @property
     def all_columns(self) -> Sequence[Column]:
@@ -128,9 +135,17 @@ def json_lines(table: Table, session: Session, study: Study, provenance: Provena
 
 def records(table: Table, session: Session, study: Study, provenance: Provenance) -> Iterator[dict[str, Any]]:
     """The rows as plain values by column."""
+    return (record for _, record in keyed_records(table, session, study, provenance, EVERYTHING))
+
+
+def keyed_records(
+    table: Table, session: Session, study: Study, provenance: Provenance, window: Window
+) -> Iterator[tuple[Key, dict[str, Any]]]:
+    """The rows that are wanted as plain values by column, each with its key."""
     names = [column.name for column in table.all_columns]
-    for values in _complete(table, session, study, provenance):
-        yield {name: _plain(value) for name, value in zip(names, values, strict=True)}
+    for key, values in table.keyed_rows(session, study, window):
+        whole = (*values, *provenance.values)
+        yield key, {name: _plain(value) for name, value in zip(names, whole, strict=True)}
 
 
 def dictionary(tables: Iterable[Table]) -> list[dict[str, str]]:

@@ -59,17 +59,25 @@ def find_study(session: Session, join_token: str) -> Study:
     return study
 
 
+def panel_id_in(study: Study, parameters: Mapping[str, str]) -> str | None:
+    """Who the panel says this is; None for a study without a panel. Raises PanelIdMissing."""
+    name = study.settings.panel_parameter
+    if not name:
+        return None
+    panel_id = parameters.get(name, "").strip()
+    if not panel_id or len(panel_id) > LONGEST_PANEL_ID:
+        raise PanelIdMissing
+    return panel_id
+
+
 def join(session: Session, study: Study, parameters: Mapping[str, str]) -> Joined:
     """The participant for these parameters of the panel: whoever has this id already, else somebody new.
 
     Without a panel parameter in the settings everybody is new. Raises PanelIdMissing.
     """
-    name = study.settings.panel_parameter
-    if not name:
+    panel_id = panel_id_in(study, parameters)
+    if panel_id is None:
         return _add(session, study, None, parameters)
-    panel_id = parameters.get(name, "").strip()
-    if not panel_id or len(panel_id) > LONGEST_PANEL_ID:
-        raise PanelIdMissing
     known = _known(session, study, panel_id)
     if known is not None:
         return Joined(known, None)

@@ -4,13 +4,14 @@ from http import HTTPStatus
 from typing import Annotated
 
 from fastapi import APIRouter, Form, Request
+from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import RedirectResponse, Response
 from sqlalchemy.orm import Session
 
 from app.domain.people import Experimenter, Role
 from app.errors import AppError
 from app.services import accounts
-from app.web.deps import CurrentOwner, ReadingSession, RowId, StudioDep
+from app.web.deps import CurrentOwner, OwnerBriefly, ReadingSession, RowId, StudioDep
 from app.web.templating import page
 
 router = APIRouter(prefix="/accounts")
@@ -23,31 +24,43 @@ def show_accounts(request: Request, owner: CurrentOwner, session: ReadingSession
 
 
 @router.post("", name="add_account")
-def add_account(
+async def add_account(
     request: Request,
-    owner: CurrentOwner,
+    owner: OwnerBriefly,
     studio: StudioDep,
     name: Annotated[str, Form(max_length=200)],
     role: Annotated[Role, Form()],
 ) -> Response:
     """Add somebody and show their one-time password, this one time."""
-    password = accounts.new_one_time_password()
-    with studio.database.writing() as session:
-        try:
-            added = accounts.add(session, name, role, password, owner.name)
-        except accounts.NameUnacceptable as error:
-            return _page(request, owner, session, typed=name, error=error)
-        return _page(request, owner, session, shown=(added.name, password.text))
+    password = await studio.hashing_for_known.run(accounts.new_one_time_password)
+    async with studio.turns.writing() as session:
+        return await run_in_threadpool(_add, request, session, owner, name, role, password)
+
+
+def _add(
+    request: Request, session: Session, owner: Experimenter, name: str, role: Role, password: accounts.OneTimePassword
+) -> Response:
+    try:
+        added = accounts.add(session, name, role, password, owner.name)
+    except accounts.NameUnacceptable as error:
+        return _page(request, owner, session, typed=name, error=error)
+    return _page(request, owner, session, shown=(added.name, password.text))
 
 
 @router.post("/{account_id}/password", name="reset_account")
-def reset_account(request: Request, account_id: RowId, owner: CurrentOwner, studio: StudioDep) -> Response:
+async def reset_account(request: Request, account_id: RowId, owner: OwnerBriefly, studio: StudioDep) -> Response:
     """A new one-time password; the old one and every login of the account end."""
-    password = accounts.new_one_time_password()
-    with studio.database.writing() as session:
-        account = accounts.find(session, account_id)
-        accounts.use_one_time_password(session, account, password, owner.name)
-        return _page(request, owner, session, shown=(account.name, password.text))
+    password = await studio.hashing_for_known.run(accounts.new_one_time_password)
+    async with studio.turns.writing() as session:
+        return await run_in_threadpool(_reset, request, session, owner, account_id, password)
+
+
+def _reset(
+    request: Request, session: Session, owner: Experimenter, account_id: int, password: accounts.OneTimePassword
+) -> Response:
+    account = accounts.find(session, account_id)
+    accounts.use_one_time_password(session, account, password, owner.name)
+    return _page(request, owner, session, shown=(account.name, password.text))
 
 
 @router.post("/{account_id}/role", name="change_account_role")

@@ -24,6 +24,7 @@ from app.services import (
     export_requests,
     export_tables,
     exporting,
+    paging,
     publishing,
     reports,
     roles,
@@ -33,11 +34,12 @@ from app.services import (
 from app.services.api_tokens import TokenInvalid
 from app.services.export_requests import ExportKind
 from app.web import api_answers as answers
-from app.web.api_problems import add_problems
+from app.web.api_problems import add_problems, only_known_parameters
 from app.web.deps import Code, ReadingSession, RowId, Slug, Studio, StudioDep, WritingSession
 
 PREFIX = "/api/v1"
 LARGEST_PAGE = 1000
+TABLE_READ = "table read by the API"
 DESCRIPTION = """\
 Everything that the pages show and the exports hold, for programs.
 
@@ -47,6 +49,10 @@ also read tables, download bundles, add participants and ask for files. Times ar
 Errors are problem details (RFC 9457) whose `detail` says in words what happened and what to do. Too many wrong tokens
 from one address are answered with 429 for a minute. Until a study is unblinded, methods of the evaluation are letters
 here as everywhere.
+
+Tables come in pages: follow `next`, whose `cursor` says where to go on. Together the pages are the table as it was when
+the first one was asked for. There is no `offset` any more (what people answer between two pages would shift it), and a
+parameter that an address does not know is refused with 422 instead of being ignored.
 """
 
 bearer = HTTPBearer(auto_error=False, description="A token from the page of API tokens.")
@@ -89,7 +95,7 @@ def _caller(
         token, experimenter = api_tokens.find(session, credentials.credentials)
     except TokenInvalid:
         address = request.client.host if request.client else "unknown"
-        if not studio.login_attempts.allow(address):
+        if not studio.token_attempts.allow(address):
             raise TooManyWrongTokens from None
         raise
     if api_tokens.use_is_worth_noting(token):
@@ -114,7 +120,7 @@ _PROBLEMS: dict[int | str, dict[str, Any]] = {
     for code, words in ((401, "No valid token"), (403, "Not with this role"), (404, "Nothing here"), (422, "Not valid"))
 }
 _ZIP: dict[int | str, dict[str, Any]] = {200: {"content": {"application/zip": {}}, "description": "The file"}}
-router = APIRouter(responses=_PROBLEMS)
+router = APIRouter(responses=_PROBLEMS, dependencies=[Depends(only_known_parameters)])
 
 
 @router.get("/me", tags=["account"])
@@ -291,18 +297,34 @@ def read_table(
     table: Annotated[str, Path(pattern=r"^[a-z]{1,40}$", examples=["ratings"])],
     caller: ActingCaller,
     session: ReadingSession,
-    offset: Annotated[int, Query(ge=0, le=10**9)] = 0,
+    studio: StudioDep,
+    cursor: Annotated[str, Query(pattern=r"^[A-Za-z0-9_-]*$", max_length=paging.LONGEST_CURSOR)] = "",
     limit: Annotated[int, Query(ge=1, le=LARGEST_PAGE)] = 100,
 ) -> answers.Page:
-    """Rows of a table, as in the exported files. Follow `next` until it is null."""
+    """Rows of a table, as in the exported files. Follow `next` until it is null: no row comes twice and none is lost,
+    however much is answered meanwhile. A page takes as long at the end of a table as at its beginning."""
     study = studies.find_study(session, slug)
     if table not in export_tables.BY_NAME:
         raise TableUnknown
+    wanted, whose = export_tables.BY_NAME[table], f"{study.id}/{table}"
+    made_of = wanted.made_of
+    window = paging.window_of(cursor, whose, made_of) if cursor else paging.first_window(session, made_of)
     provenance = exporting.provenance_of(session, study)
-    rows = exporting.records(export_tables.BY_NAME[table], session, study, provenance)
-    found = list(islice(rows, offset, offset + limit + 1))
-    following = f"{PREFIX}/studies/{slug}/tables/{table}?offset={offset + limit}&limit={limit}"
-    return answers.Page(table=table, offset=offset, rows=found[:limit], next=following if len(found) > limit else None)
+    rows = exporting.keyed_records(wanted, session, study, provenance, window)
+    found = list(islice(rows, limit + 1))
+    _note_reading(studio, session, caller, f"{slug}/{table}")
+    following = None
+    if len(found) > limit:
+        place = paging.cursor_of(whose, window, found[limit - 1][0])
+        following = f"{PREFIX}/studies/{slug}/tables/{table}?limit={limit}&cursor={place}"
+    return answers.Page(table=table, rows=[row for _, row in found[:limit]], next=following)
+
+
+def _note_reading(studio: Studio, session: Session, caller: Experimenter, subject: str) -> None:
+    """Kept before anything is given away. Seldom enough that it need not wait for its turn in the event loop."""
+    if audit.is_worth_noting(session, caller.name, TABLE_READ, subject):
+        with studio.database.writing() as writing:
+            audit.record(writing, caller.name, TABLE_READ, subject)
 
 
 @router.get("/studies/{slug}/exports", tags=["exports"])

@@ -65,16 +65,15 @@ class Invitation(BaseModel):
 
 
 class Page(BaseModel):
-    """Some rows of a table."""
+    """Some rows of a table. All pages together are the rows that were there when the first one was read."""
 
     table: str = Field(examples=["ratings"])
-    offset: int
     rows: list[dict[str, Any]] = Field(
         examples=[[{"participant": "P01", "letter": "A", "repetition": 1, "satisfaction": 4, "personalisation": 3}]]
     )
     next: str | None = Field(
         description="Address of the rows that follow; null at the end.",
-        examples=["/api/v1/studies/feeding-at-home/tables/ratings?offset=100&limit=100"],
+        examples=["/api/v1/studies/feeding-at-home/tables/ratings?limit=100&cursor=eyJvZiI6ImZlZWRpbmct..."],
     )
 
 

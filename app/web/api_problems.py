@@ -1,6 +1,5 @@
 """Errors of the API as problem details (RFC 9457): in words what happened and what to do."""
 
-import logging
 from collections.abc import Mapping
 from http import HTTPStatus
 
@@ -10,10 +9,32 @@ from fastapi.responses import JSONResponse, Response
 from sqlalchemy.exc import OperationalError
 from starlette.exceptions import HTTPException
 
+from app.db import complaints
 from app.errors import AppError
 from app.web.guard import HEADERS
 
-log = logging.getLogger("app.web")
+_REPLACED = {"offset": "offset is gone, because answers between two pages would shift it: follow next instead."}
+
+
+class ParameterUnknown(AppError):
+    """This address does not know one of the parameters."""
+
+    status = HTTPStatus.UNPROCESSABLE_ENTITY
+
+
+async def only_known_parameters(request: Request) -> None:
+    """A parameter that is ignored is an answer to another question than the one that was asked.
+
+    Raises ParameterUnknown, which names those that are known.
+    """
+    documented = request.app.openapi()["paths"][request.scope["route"].path][request.method.lower()]
+    known = [each["name"] for each in documented.get("parameters", ()) if each["in"] == "query"]
+    unknown = sorted(set(request.query_params) - set(known))
+    if unknown:
+        named = ", ".join(name[:40] for name in unknown[:5])
+        replaced = [_REPLACED[name] for name in unknown if name in _REPLACED]
+        words = f"It knows {', '.join(known)}." if known else "It takes none after the question mark."
+        raise ParameterUnknown(" ".join([f"This address does not know: {named}.", words, *replaced]))
 
 
 def add_problems(api: FastAPI) -> None:
@@ -45,7 +66,7 @@ def add_problems(api: FastAPI) -> None:
 
     @api.exception_handler(OperationalError)
     def database_busy(_request: Request, error: OperationalError) -> Response:
-        log.error("the database did not answer: %s", error.orig)
+        complaints.error("the database did not answer: %s", error.orig)
         message = "The database is busy or not ready. Nothing was saved; please try again in a moment."
         return problem(HTTPStatus.SERVICE_UNAVAILABLE, message, {"retry-after": "2"})
 

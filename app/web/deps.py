@@ -8,6 +8,7 @@ from threading import Event
 from typing import Annotated
 
 from fastapi import Depends, Path, Request, Response
+from fastapi.concurrency import run_in_threadpool
 from sqlalchemy.orm import Session
 
 from app.db import Database
@@ -18,6 +19,7 @@ from app.services import browser_sessions, roles
 from app.services.tallies import Tallies
 from app.settings import Settings
 from app.storage import ArtefactStore
+from app.web.hashing import Hashing
 from app.web.import_desk import ImportDesk
 from app.web.link_desk import LinkDesk
 from app.web.login_attempts import LoginAttempts
@@ -26,6 +28,7 @@ from app.web.turns import Turns
 
 PARTICIPANT_COOKIE = "studio_participant"
 EXPERIMENTER_COOKIE = "studio_experimenter"
+KNOWN_BROWSER_COOKIE = "studio_known_browser"
 LANGUAGE_COOKIE = "studio_language"
 """The language of the pages in this browser, for those that cannot tell who is asking."""
 
@@ -64,6 +67,11 @@ class Studio:
     turns: Turns
     login_attempts: LoginAttempts
     screens: Screens
+    token_attempts: LoginAttempts
+    """Of their own: a program with an old token must not lock out the people who log in from the same address."""
+    hashing: Hashing = field(default_factory=Hashing)
+    hashing_for_known: Hashing = field(default_factory=Hashing)
+    """For people whose browser is known or who are logged in: they do not queue behind strangers who guess."""
     link_desk: LinkDesk = field(default_factory=LinkDesk)
     imports: ImportDesk = field(default_factory=ImportDesk)
     tallies: Tallies = field(default_factory=Tallies)
@@ -142,6 +150,16 @@ def _owner(request: Request, session: ReadingSession) -> Experimenter:
     return experimenter
 
 
+async def _owner_briefly(request: Request, studio: StudioDep) -> Experimenter:
+    async with studio.turns.reading() as session:
+        return await run_in_threadpool(_owner, request, session)
+
+
+async def _logged_in_briefly(request: Request, studio: StudioDep) -> Experimenter:
+    async with studio.turns.reading() as session:
+        return await run_in_threadpool(experimenter_logged_in, request, session)
+
+
 def _acting_experimenter(request: Request, session: WritingSession) -> Experimenter:
     experimenter = experimenter_asking(request, session)
     roles.require(experimenter, Role.EXPERIMENTER)
@@ -159,6 +177,10 @@ CurrentExperimenter = Annotated[Experimenter, Depends(_experimenter, scope="func
 ActingExperimenter = Annotated[Experimenter, Depends(_acting_experimenter, scope="function")]
 """In the request's writing session; at least an experimenter: for whatever changes something or leaves the studio."""
 CurrentOwner = Annotated[Experimenter, Depends(_owner, scope="function")]
+OwnerBriefly = Annotated[Experimenter, Depends(_owner_briefly)]
+"""Like CurrentOwner, and no turn is held when the route begins: for what hashes a password."""
+LoggedInBriefly = Annotated[Experimenter, Depends(_logged_in_briefly)]
+"""Whoever is logged in, a one-time password is enough; no turn is held either."""
 OwnAccount = Annotated[Experimenter, Depends(_own_account, scope="function")]
 """In the request's writing session, whatever their role: for what concerns nobody but themselves."""
 

@@ -1,6 +1,5 @@
 """Every error as a page a person can do something with, or as a problem (RFC 9457) for scripts."""
 
-import logging
 import re
 from collections.abc import Mapping
 from http import HTTPStatus
@@ -11,6 +10,7 @@ from fastapi.responses import JSONResponse, RedirectResponse, Response
 from sqlalchemy.exc import OperationalError
 from starlette.exceptions import HTTPException
 
+from app.db import complaints
 from app.errors import AppError
 from app.web import languages
 from app.web.deps import (
@@ -23,8 +23,6 @@ from app.web.deps import (
 from app.web.guard import HEADERS
 from app.web.templating import page
 from app.web.wording import Wording
-
-log = logging.getLogger("app.web")
 
 _TITLES = {
     HTTPStatus.UNAUTHORIZED: "Please log in",
@@ -97,7 +95,7 @@ def add_error_pages(app: FastAPI) -> None:
 
     @app.exception_handler(OperationalError)
     def database_busy(request: Request, error: OperationalError) -> Response:
-        log.error("the database did not answer: %s", error.orig)
+        complaints.error("the database did not answer: %s", error.orig)
         message = "The database is busy or not ready. Nothing was saved; please try again in a moment."
         return _answer(request, HTTPStatus.SERVICE_UNAVAILABLE, message, {"retry-after": "2"}, "DatabaseBusy")
 

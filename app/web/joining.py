@@ -1,15 +1,21 @@
-"""Joining a study by its open address: through a recruitment panel, or without one."""
+"""Joining a study by its open address: through a recruitment panel, or without one.
+
+Opening the address only shows a page: mail and chat programs open every link to look at it, and are nobody.
+"""
 
 from datetime import timedelta
 from http import HTTPStatus
+from typing import Any
 
 from fastapi import APIRouter, Request
 from fastapi.responses import Response
+from sqlalchemy.orm import Session
 
+from app.domain.studies import Study
 from app.services import browser_sessions, panel, querying
 from app.services.panel import Joined, PanelIdMissing
 from app.web import languages
-from app.web.deps import PARTICIPANT_COOKIE, StudioDep, Token, WritingSession, set_cookie
+from app.web.deps import PARTICIPANT_COOKIE, ReadingSession, StudioDep, Token, WritingSession, set_cookie
 from app.web.participant_pages import go, participant_page
 from app.web.templating import page
 from app.web.wording import wording_for
@@ -18,18 +24,30 @@ router = APIRouter()
 
 
 @router.get("/join/{token}", name="join_study")
+def show_joining_page(request: Request, token: Token, session: ReadingSession) -> Response:
+    """The button that lets one in; whoever is in already, in this browser, goes on without it."""
+    study = panel.find_study(session, token)
+    try:
+        panel_id = panel.panel_id_in(study, request.query_params)
+    except PanelIdMissing:
+        return _id_missing(request, study)
+    if _is_in_already(request, session, study, panel_id):
+        return go(request, "show_next")
+    # The address as it came: the panel's parameters are read again when the button is pressed.
+    context = {**_for_nobody(request, study), "action": f"{request.url.path}?{request.url.query}"}
+    return page(request, "participant/join.html", context)
+
+
+@router.post("/join/{token}", name="join_study_now")
 def join_study(request: Request, token: Token, session: WritingSession, studio: StudioDep) -> Response:
     """Come in, once per panel id or, without one, once per browser; then on to where one should be."""
     study = panel.find_study(session, token)
-    if not study.settings.panel_parameter and _is_in_already(request, session, study.id):
+    if not study.settings.panel_parameter and _is_in_already(request, session, study, None):
         return go(request, "show_next")
     try:
         joined = panel.join(session, study, request.query_params)
     except PanelIdMissing:
-        offered = study.settings.offered_languages
-        wording = wording_for(study.settings, languages.of_browser(request, offered))
-        context = {**languages.nobodys(request, wording, offered), "parameter": study.settings.panel_parameter}
-        return page(request, "participant/panel_id_missing.html", context, HTTPStatus.BAD_REQUEST)
+        return _id_missing(request, study)
     joined.participant.study = study
     language = languages.settle(request, joined.participant, languages.chosen_here(request))
     response = _first_page(request, studio.settings.base_url, joined)
@@ -42,6 +60,17 @@ def join_study(request: Request, token: Token, session: WritingSession, studio: 
     return response
 
 
+def _id_missing(request: Request, study: Study) -> Response:
+    context = {**_for_nobody(request, study), "parameter": study.settings.panel_parameter}
+    return page(request, "participant/panel_id_missing.html", context, HTTPStatus.BAD_REQUEST)
+
+
+def _for_nobody(request: Request, study: Study) -> dict[str, Any]:
+    """What a page needs for somebody who is not in the study yet: its words in their browser's language."""
+    offered = study.settings.offered_languages
+    return languages.nobodys(request, wording_for(study.settings, languages.of_browser(request, offered)), offered)
+
+
 def _first_page(request: Request, base_url: str, joined: Joined) -> Response:
     """Whoever has no panel to come back through is given the personal link, this one time."""
     if joined.participant.panel_id is not None or joined.token is None:
@@ -50,7 +79,10 @@ def _first_page(request: Request, base_url: str, joined: Joined) -> Response:
     return participant_page(request, "participant/joined.html", joined.participant, {"link": link})
 
 
-def _is_in_already(request: Request, session: WritingSession, study_id: int) -> bool:
+def _is_in_already(request: Request, session: Session, study: Study, panel_id: str | None) -> bool:
+    """Whether this browser's participant is in the study; of people who share a browser, the one the panel names."""
     cookie = request.cookies.get(PARTICIPANT_COOKIE)
     participant = browser_sessions.participant_of(session, cookie) if cookie else None
-    return participant is not None and participant.study_id == study_id
+    if participant is None or participant.study_id != study.id:
+        return False
+    return panel_id is None or participant.panel_id == panel_id

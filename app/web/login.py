@@ -4,19 +4,21 @@ from datetime import timedelta
 from http import HTTPStatus
 from typing import Annotated
 
-from fastapi import APIRouter, Depends, Form, Request
+from fastapi import APIRouter, Form, Request
+from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import RedirectResponse, Response
+from sqlalchemy.orm import Session
 
 from app.domain.people import Experimenter
 from app.errors import AppError
-from app.services import accounts, audit, browser_sessions
+from app.services import accounts, audit, browser_sessions, known_browsers
 from app.web.deps import (
     EXPERIMENTER_COOKIE,
-    ReadingSession,
+    KNOWN_BROWSER_COOKIE,
+    LoggedInBriefly,
     Studio,
     StudioDep,
     WritingSession,
-    experimenter_logged_in,
     set_cookie,
 )
 from app.web.templating import page
@@ -27,17 +29,9 @@ _Password = Annotated[str, Form(max_length=accounts.MAX_PASSWORD_LENGTH)]
 
 
 class TooManyAttempts(AppError):
-    """Too many attempts from your address. Please wait a minute, then try again."""
+    """Too many attempts. Please wait a minute, then try again."""
 
     status = HTTPStatus.TOO_MANY_REQUESTS
-
-
-def _logged_in(request: Request, session: ReadingSession) -> Experimenter:
-    return experimenter_logged_in(request, session)
-
-
-LoggedIn = Annotated[Experimenter, Depends(_logged_in, scope="function")]
-"""Like CurrentExperimenter, but a one-time password is enough."""
 
 
 @router.get("/login", name="show_login")
@@ -47,23 +41,21 @@ def show_login(request: Request, next: str = "") -> Response:
 
 
 @router.post("/login", name="log_in")
-def log_in(
+async def log_in(
     request: Request,
     studio: StudioDep,
-    session: ReadingSession,
     name: Annotated[str, Form(max_length=80)],
     password: _Password,
     next: Annotated[str, Form(max_length=300)] = "",
 ) -> Response:
-    """Check the password without holding up writers, then open a session."""
+    """Check the password while holding neither a turn nor a thread that others need, then open a session."""
     try:
-        _count_attempt(request, studio)
-        experimenter = accounts.verify(session, name, password)
+        experimenter = await _verified(request, studio, name, password)
+        return await _enter(request, studio, experimenter, _inside(next), "logged in")
     except (accounts.WrongNameOrPassword, TooManyAttempts) as error:
         context = {"next": _inside(next), "name": name, "error": error.message}
         status = error.status if isinstance(error, TooManyAttempts) else HTTPStatus.UNAUTHORIZED
         return page(request, "experimenter/login.html", context, status)
-    return _open(request, studio, experimenter, _inside(next), "logged in")
 
 
 @router.post("/logout", name="log_out")
@@ -76,44 +68,70 @@ def log_out(request: Request, session: WritingSession) -> Response:
 
 
 @router.get("/password", name="show_password")
-def show_password(request: Request, experimenter: LoggedIn) -> Response:
+def show_password(request: Request, experimenter: LoggedInBriefly) -> Response:
     """The form to choose a password."""
     return page(request, "experimenter/password.html", {"experimenter": experimenter, "error": None})
 
 
 @router.post("/password", name="change_password")
-def change_password(
-    request: Request, studio: StudioDep, experimenter: LoggedIn, current: _Password, new: _Password, again: _Password
+async def change_password(
+    request: Request,
+    studio: StudioDep,
+    experimenter: LoggedInBriefly,
+    current: _Password,
+    new: _Password,
+    again: _Password,
 ) -> Response:
     """Change the password; every other login of this account ends."""
     try:
-        _count_attempt(request, studio)
+        _count_attempt(request, studio, experimenter.name, browser=f"logged in/{experimenter.id}")
         if new != again:
             raise accounts.PasswordUnacceptable("The two new passwords differ. Please type the same one twice.")
-        password_hash = accounts.hash_of_new(experimenter, current=current, new=new)
+        password_hash = await studio.hashing_for_known.run(accounts.hash_of_new, experimenter, current=current, new=new)
     except (accounts.WrongNameOrPassword, accounts.PasswordUnacceptable, TooManyAttempts) as error:
         status = error.status if isinstance(error, TooManyAttempts) else HTTPStatus.UNPROCESSABLE_ENTITY
         context = {"experimenter": experimenter, "error": error.message}
         return page(request, "experimenter/password.html", context, status)
-    with studio.database.writing() as session:
-        accounts.set_password(session, experimenter, password_hash)
-    return _open(request, studio, experimenter, _inside(""), "logged in with the new password")
+    async with studio.turns.writing() as session:
+        changed = await run_in_threadpool(accounts.set_password, session, experimenter, password_hash)
+    return await _enter(request, studio, changed, _inside(""), "logged in with the new password")
 
 
-def _count_attempt(request: Request, studio: Studio) -> None:
+async def _verified(request: Request, studio: Studio, name: str, password: str) -> Experimenter:
+    """Raises WrongNameOrPassword and TooManyAttempts."""
+    async with studio.turns.reading() as session:
+        account = await run_in_threadpool(accounts.by_name, session, name)
+    browser = known_browsers.name_in(request.cookies.get(KNOWN_BROWSER_COOKIE, ""), account)
+    _count_attempt(request, studio, name, browser)
+    hashing = studio.hashing if browser is None else studio.hashing_for_known
+    return await hashing.run(accounts.verify, account, password)
+
+
+def _count_attempt(request: Request, studio: Studio, account: str, browser: str | None) -> None:
     address = request.client.host if request.client else "unknown"
-    if not studio.login_attempts.allow(address):
+    if not studio.login_attempts.allow(address, account, browser):
         raise TooManyAttempts
 
 
-def _open(request: Request, studio: Studio, experimenter: Experimenter, target: str, act: str) -> Response:
+async def _enter(request: Request, studio: Studio, experimenter: Experimenter, target: str, act: str) -> Response:
+    """Raises WrongNameOrPassword when the password was replaced while it was being checked."""
     lifetime = timedelta(hours=studio.settings.login_hours)
-    with studio.database.writing() as session:
-        cookie = browser_sessions.open_for_experimenter(session, experimenter, lifetime)
-        audit.record(session, experimenter.name, act, experimenter.name)
+    async with studio.turns.writing() as session:
+        cookie = await run_in_threadpool(_open_session, session, experimenter, lifetime, act)
     response = RedirectResponse(target or request.app.url_path_for("show_studies"), HTTPStatus.SEE_OTHER)
     set_cookie(response, studio.settings, EXPERIMENTER_COOKIE, cookie, lifetime)
+    mark = known_browsers.new_mark(experimenter)
+    set_cookie(response, studio.settings, KNOWN_BROWSER_COOKIE, mark, known_browsers.LIFETIME)
     return response
+
+
+def _open_session(session: Session, experimenter: Experimenter, lifetime: timedelta, act: str) -> str:
+    stored = session.get(Experimenter, experimenter.id)
+    if stored is None or stored.password_hash != experimenter.password_hash:
+        raise accounts.WrongNameOrPassword
+    cookie = browser_sessions.open_for_experimenter(session, stored, lifetime)
+    audit.record(session, stored.name, act, stored.name)
+    return cookie
 
 
 def _inside(target: str) -> str:

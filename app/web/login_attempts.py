@@ -1,17 +1,80 @@
-"""Counts password attempts, so that guessing is slow and cannot keep the server busy with hashing."""
+"""Counts attempts to get in, so that guessing is slow, cannot keep the server busy, and shuts nobody out for long.
 
-from limits import RateLimitItemPerMinute
-from limits.storage import MemoryStorage
-from limits.strategies import MovingWindowRateLimiter
+Strangers share limits: per address, per account whatever the address, and all together. A browser that has logged in to
+the account before (services/known_browsers) is counted by itself, so whoever guesses at a name from many addresses
+slows down other strangers and not the person whose name it is.
+"""
+
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from ipaddress import IPv6Address, ip_address
+from threading import Lock
+
+WINDOW_S = 60.0
+ADDRESSES_PER_ACCOUNT = 3
+"""One address alone cannot use up what strangers may try at one account."""
+ADDRESSES_IN_TOTAL = 6
+
+
+@dataclass(frozen=True)
+class _Attempt:
+    at_s: float
+    address: str
+    account: str
+    browser: str | None
 
 
 class LoginAttempts:
-    """So many attempts per minute and address."""
+    """So many attempts per minute. Only what was allowed is remembered, so the limits bound the memory as well."""
 
-    def __init__(self, per_minute: int) -> None:
-        self._limit = RateLimitItemPerMinute(per_minute)
-        self._limiter = MovingWindowRateLimiter(MemoryStorage())
+    def __init__(
+        self,
+        per_address: int,
+        per_account: int | None = None,
+        in_total: int | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._per_address = per_address
+        self._per_account = per_account or ADDRESSES_PER_ACCOUNT * per_address
+        self._in_total = in_total or ADDRESSES_IN_TOTAL * per_address
+        self._clock = clock
+        self._lock = Lock()
+        self._recent: deque[_Attempt] = deque()
 
-    def allow(self, address: str) -> bool:
-        """Count one attempt; False when there were too many."""
-        return self._limiter.hit(self._limit, "password", address)
+    def allow(self, address: str, account: str = "", browser: str | None = None) -> bool:
+        """Count one attempt; False, and not counted, when there were too many. ``browser``: one the account knows."""
+        attempt = _Attempt(self._clock(), _network(address), account, browser)
+        with self._lock:
+            while self._recent and self._recent[0].at_s <= attempt.at_s - WINDOW_S:
+                self._recent.popleft()
+            allowed = self._is_allowed(attempt)
+            if allowed:
+                self._recent.append(attempt)
+            return allowed
+
+    def __len__(self) -> int:
+        return len(self._recent)
+
+    def _is_allowed(self, attempt: _Attempt) -> bool:
+        if attempt.browser is not None:
+            return sum(each.browser == attempt.browser for each in self._recent) < self._per_address
+        strangers = [each for each in self._recent if each.browser is None]
+        return (
+            len(strangers) < self._in_total
+            and sum(each.address == attempt.address for each in strangers) < self._per_address
+            and sum(each.account == attempt.account for each in strangers) < self._per_account
+        )
+
+
+def _network(address: str) -> str:
+    """Whoever has one IPv6 address has the 2**64 beside it, too."""
+    try:
+        parsed = ip_address(address)
+    except ValueError:
+        return address
+    if not isinstance(parsed, IPv6Address):
+        return address
+    mapped = parsed.ipv4_mapped
+    return str(mapped) if mapped else parsed.exploded[:19]

@@ -179,6 +179,9 @@ withdrawn-text = Die letzten Spuren auf unseren Rechnern verschwinden innerhalb 
 ## Teilnahme über ein Panel oder eine offene Adresse
 
 join-title = Herzlich willkommen
+join-start-lead = Sie sind eingeladen, an einer Studie teilzunehmen.
+join-start-text = Über die Schaltfläche gelangen Sie zur Studie. Dort lesen Sie zuerst, was die Teilnahme bedeutet, und entscheiden dann. Bis Sie darauf drücken, wird nichts gespeichert.
+join-start = Zur Studie
 join-missing-title = In dieser Adresse fehlt etwas
 join-missing = Wir können nicht erkennen, wer Sie sind: Die Adresse sollte { $parameter } enthalten. Bitte öffnen Sie die Studie noch einmal über die Seite, auf der sie Ihnen angeboten wurde. Wenn das nicht hilft, wenden Sie sich an deren Betreiber.
 join-link-lead = Dies ist Ihr persönlicher Link. Bewahren Sie ihn auf, falls Sie später oder auf einem anderen Gerät weitermachen möchten, und geben Sie ihn nicht weiter.

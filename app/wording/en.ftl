@@ -181,6 +181,9 @@ withdrawn-text = The last traces on our computers will be gone within minutes. Y
 ## Joining through a panel or an open address
 
 join-title = Welcome
+join-start-lead = You are invited to take part in a study.
+join-start-text = Press the button to come in. You will then read what taking part means and can decide; until you press it, nothing is stored.
+join-start = Come in
 join-missing-title = Something is missing in this address
 join-missing = We cannot tell who you are: the address should contain { $parameter }. Please open the study again from the page that offered it to you. If that does not help, contact the people who run that page.
 join-link-lead = This is your personal link. Keep it if you may want to go on later or on another device, and do not share it with anybody.

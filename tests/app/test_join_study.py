@@ -1,5 +1,6 @@
 """Joining by the open address of a study, and going back to where one came from."""
 
+import html
 import re
 import threading
 from collections.abc import Callable
@@ -7,6 +8,7 @@ from collections.abc import Callable
 import httpx2
 import pytest
 from fastapi.testclient import TestClient
+from httpx2 import Response as Answer
 from sqlalchemy import select
 
 from app.db import Database
@@ -34,11 +36,44 @@ def everybody(database: Database) -> list[Participant]:
         return list(session.scalars(select(Participant).order_by(Participant.id)))
 
 
+def press(browser: TestClient, address: str) -> Answer:
+    """Open the address and press the button on its page."""
+    action = re.search(r'<form[^>]+method="post"[^>]+action="([^"]+)"', browser.get(address).text)
+    assert action is not None
+    return browser.post(html.unescape(action[1]))
+
+
 class TestThroughAPanel:
+    def test_looking_at_the_address_makes_nobody_and_leaves_no_cookie(
+        self, open_study: Callable[..., str], client: TestClient, database: Database
+    ) -> None:
+        """Mail and chat programs open every link they see."""
+        answer = client.get(open_study() + "?PROLIFIC_PID=abc")
+        assert answer.status_code == 200
+        assert "set-cookie" not in answer.headers
+        assert everybody(database) == []
+
+    def test_parameters_with_any_characters_survive_the_button(
+        self, open_study: Callable[..., str], client: TestClient, database: Database
+    ) -> None:
+        press(client, open_study() + "?PROLIFIC_PID=a%26b%22%3E%3Cb%3E&x=%C3%A4+%2B&y=%0D%0AX:1")
+        (person,) = everybody(database)
+        assert person.panel_id == 'a&b"><b>'
+        assert person.panel_parameters == {"PROLIFIC_PID": 'a&b"><b>', "x": "ä +", "y": "\r\nX:1"}
+
+    def test_another_person_at_the_same_browser_is_not_taken_for_the_first(
+        self, open_study: Callable[..., str], client: TestClient, database: Database
+    ) -> None:
+        address = open_study()
+        press(client, address + "?PROLIFIC_PID=abc")
+        assert client.get(address + "?PROLIFIC_PID=abc").headers["location"] == "/p/next"
+        press(client, address + "?PROLIFIC_PID=def")
+        assert [person.panel_id for person in everybody(database)] == ["abc", "def"]
+
     def test_an_id_of_the_panel_comes_in_and_all_parameters_are_kept(
         self, open_study: Callable[..., str], client: TestClient, database: Database
     ) -> None:
-        answer = client.get(open_study() + "?PROLIFIC_PID=abc&STUDY_ID=s1&SESSION_ID=x")
+        answer = press(client, open_study() + "?PROLIFIC_PID=abc&STUDY_ID=s1&SESSION_ID=x")
         assert (answer.status_code, answer.headers["location"]) == (303, "/p/next")
         assert client.get("/p/next").headers["location"] == "/p/consent"
         (person,) = everybody(database)
@@ -53,10 +88,10 @@ class TestThroughAPanel:
         new_browser: Callable[[], TestClient],
     ) -> None:
         address = open_study() + "?PROLIFIC_PID=abc"
-        client.get(address)
+        press(client, address)
         agree(client)
         other = new_browser()
-        other.get(address)
+        press(other, address)
         assert other.get("/p/next").headers["location"] == "/p/instructions"
         assert len(everybody(database)) == 1
 
@@ -65,7 +100,7 @@ class TestThroughAPanel:
     ) -> None:
         join = address + open_study() + "?PROLIFIC_PID=abc"
         codes: list[int] = []
-        threads = [threading.Thread(target=lambda: codes.append(httpx2.get(join).status_code)) for _ in range(10)]
+        threads = [threading.Thread(target=lambda: codes.append(httpx2.post(join).status_code)) for _ in range(10)]
         for thread in threads:
             thread.start()
         for thread in threads:
@@ -89,17 +124,18 @@ class TestThroughAPanel:
     def test_without_an_id_there_is_a_page_that_says_what_is_missing(
         self, open_study: Callable[..., str], client: TestClient, database: Database, query: str
     ) -> None:
-        answer = client.get(open_study() + query)
-        assert answer.status_code == 400
-        assert "PROLIFIC_PID" in answer.text
-        assert "set-cookie" not in answer.headers
+        address = open_study() + query
+        for answer in (client.get(address), client.post(address)):
+            assert answer.status_code == 400
+            assert "PROLIFIC_PID" in answer.text
+            assert "set-cookie" not in answer.headers
         assert everybody(database) == []
 
     def test_two_studies_may_have_the_same_person(
         self, open_study: Callable[..., str], client: TestClient, database: Database
     ) -> None:
-        client.get(open_study() + "?PROLIFIC_PID=abc")
-        client.get(open_study() + "?PROLIFIC_PID=abc")
+        press(client, open_study() + "?PROLIFIC_PID=abc")
+        press(client, open_study() + "?PROLIFIC_PID=abc")
         assert [person.panel_id for person in everybody(database)] == ["abc", "abc"]
 
 
@@ -107,7 +143,7 @@ class TestWithoutAPanel:
     def test_anybody_comes_in_and_is_given_the_personal_link_to_keep(
         self, open_study: Callable[..., str], client: TestClient, new_browser: Callable[[], TestClient]
     ) -> None:
-        page = client.get(open_study(panel_parameter="")).text
+        page = press(client, open_study(panel_parameter="")).text
         link = re.search(r'value="http://[^/]+(/p/[\w-]+)"', page)
         assert link is not None
         agree(client)
@@ -119,7 +155,8 @@ class TestWithoutAPanel:
         self, open_study: Callable[..., str], client: TestClient, database: Database
     ) -> None:
         address = open_study(panel_parameter="")
-        client.get(address)
+        press(client, address)
+        assert client.post(address).headers["location"] == "/p/next"
         assert client.get(address).headers["location"] == "/p/next"
         assert len(everybody(database)) == 1
 
@@ -130,9 +167,9 @@ def test_an_address_that_was_closed_lets_nobody_in(
     address = open_study()
     with database.writing() as session:
         panel.close_joining(session, session.scalars(select(Study)).one(), actor="pat")
-    answer = client.get(address + "?PROLIFIC_PID=abc")
-    assert answer.status_code == 404
-    assert "cannot be joined" in answer.text
+    for answer in (client.get(address + "?PROLIFIC_PID=abc"), client.post(address + "?PROLIFIC_PID=abc")):
+        assert answer.status_code == 404
+        assert "cannot be joined" in answer.text
 
 
 @pytest.mark.parametrize(

@@ -103,7 +103,7 @@ def _label(base_url: str, token: str, answers: int, together: threading.Barrier)
 def _await_health(base_url: str) -> None:
     for _ in range(1000):
         try:
-            httpx2.get(f"{base_url}/health").raise_for_status()
+            httpx2.get(f"{base_url}/health/live").raise_for_status()
         except httpx2.TransportError:
             time.sleep(0.02)
         else:

@@ -128,6 +128,8 @@ def test_the_whole_way_with_the_keyboard_alone_and_back_to_the_panel(
     page.on("request", lambda request: foreign.append(request.url))
 
     page.goto(study.address + "?PROLIFIC_PID=abc")
+    at(page, "join")
+    press(page, "Come in")
     at(page, "consent")
     press(page, "Save or print a copy")
     at(page, "consent-copy")
@@ -189,6 +191,8 @@ def test_whoever_wants_to_stay_is_not_taken_away(open_study: Callable[..., Open]
     study = open_study(return_url="https://panel.example/done")
     page = new_page()
     page.goto(study.address + "?PROLIFIC_PID=abc")
+    page.get_by_role("button", name="Come in").click()
+    page.wait_for_url("**/p/*")
     study.give_pairs()
     with study.database.writing() as session:
         person = session.scalars(select(Participant)).one()
@@ -205,7 +209,8 @@ def test_in_german_from_the_welcome_to_the_withdrawal(open_study: Callable[..., 
     study = open_study(panel_parameter="")
     page = new_page(**DARK, viewport=PHONE)
     page.goto(study.address)
-    at(page, "joined")  # German from here on: so the browser asks for
+    press(page, "Zur Studie")  # German from the first page on: so the browser asks for
+    at(page, "joined")
     press(page, "Weiter")
     at(page, "consent")
     press(page, "English")
