@@ -13,10 +13,12 @@ from app.settings import Settings
 from app.storage import ArtefactStore
 from app.web import (
     accounts,
+    answers,
     api,
     api_pages,
     evaluation,
     experimenter,
+    help_page,
     importing,
     invitations,
     joining,
@@ -30,6 +32,8 @@ from app.web import (
     participant_forms,
     participant_pairs,
     results,
+    retiring,
+    selection,
     study_making,
     withdrawing,
 )
@@ -44,8 +48,12 @@ MAX_BODY_BYTES = 256 * 1024
 EXPERIMENTER_PARTS = (
     login,
     accounts,
+    answers,
     study_making,
     invitations,
+    selection,
+    retiring,
+    help_page,
     experimenter,
     operator,
     results,

@@ -4,7 +4,7 @@ Nothing here is remembered between two rounds, so a lost message, a killed worke
 anything undone or do it twice: each finding has one name, and work is started under that name at most once.
 """
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from datetime import datetime, timedelta
 from typing import NamedTuple
 
@@ -14,8 +14,9 @@ from sqlalchemy.orm import Session
 from app.db import now
 from app.domain.clips import Clip, Rollout
 from app.domain.models import Run, RunKind, RunStatus
-from app.domain.preferences import LEARNED_FROM, LabelEvent, Query, count_labels
+from app.domain.preferences import LEARNED_FROM, Exclusion, LabelEvent, Query, count_labels
 from app.domain.studies import Participant, Study, StudySettings
+from app.services import evaluating
 from worker import export_work, film_work, method_work, report_work
 from worker.clip_work import WHOLE
 from worker.records import ATTEMPTS, LEASE, Job, next_queries
@@ -24,6 +25,7 @@ CLIPS_AHEAD = 2
 """Scenarios per study in the making at a time: enough to keep busy, few enough that studies share fairly."""
 
 RETRY_AFTER = timedelta(seconds=10)
+_AT_WORK = (Study.deleted_at.is_(None), Study.put_away_at.is_(None))
 
 
 class _Attempted(NamedTuple):
@@ -39,12 +41,22 @@ def findings(session: Session) -> Iterator[tuple[Job, int]]:
     known = session.execute(select(Run.workflow_id, Run.status, Run.attempt, Run.finished_at))
     runs = {name: _Attempted(status, attempt, finished) for name, status, attempt, finished in known}
     succeeded = {name for name, run in runs.items() if run.status == RunStatus.SUCCEEDED}
-    for study in session.scalars(select(Study).order_by(Study.id)).all():
-        jobs = (*_missing_clips(session, study), *_stale_models(session, study, succeeded))
-        for job in (*jobs, *report_work.due(session, study), *export_work.due(session, study)):
+    for study in session.scalars(select(Study).where(Study.deleted_at.is_(None)).order_by(Study.id)).all():
+        if study.put_away_at is not None:
+            jobs: Iterable[Job] = export_work.due(session, study)  # somebody has asked for those
+        else:
+            jobs = _all_due(session, study, succeeded)
+        for job in jobs:
             attempt = _attempt_due(runs.get(job.finding), now())
             if attempt is not None:
                 yield job, attempt
+
+
+def _all_due(session: Session, study: Study, succeeded: Collection[str]) -> Iterator[Job]:
+    yield from _missing_clips(session, study)
+    yield from _stale_models(session, study, succeeded)
+    yield from report_work.due(session, study)
+    yield from export_work.due(session, study)
 
 
 def abandoned(session: Session, in_hand: Collection[str]) -> list[str]:
@@ -66,7 +78,7 @@ def workflow_name(finding: str, attempt: int) -> str:
 def studies_with_answers(session: Session) -> list[Study]:
     """The simulated studies in which somebody has answered: their first retraining is not far."""
     answered = select(Participant.study_id).join(Query).join(LabelEvent)
-    found = session.scalars(select(Study).where(Study.id.in_(answered)).order_by(Study.id))
+    found = session.scalars(select(Study).where(Study.id.in_(answered), *_AT_WORK).order_by(Study.id))
     return [study for study in found if study.material is None]
 
 
@@ -74,7 +86,7 @@ def short_of_queries(session: Session) -> list[int]:
     """Participants who could soon run out of queries."""
     return [
         participant_id
-        for study in session.scalars(select(Study)).all()
+        for study in session.scalars(select(Study).where(*_AT_WORK)).all()
         for participant_id in _without_all_queries(session, study)
         if next_queries(session, participant_id, study.settings)[1] > 0
     ]
@@ -138,31 +150,40 @@ def scenario_seed(study_seed: int, index: int) -> int:
 
 def _stale_models(session: Session, study: Study, succeeded: Collection[str]) -> list[Job]:
     jobs, settings = [], study.settings
-    last_answers = _last_answers(session, study)
+    last_answers, exclusions = _last_answers(session, study), _last_exclusions(session, study)
+    begun = evaluating.begun(session, study)
     for participant_id, count in sorted(count_labels(session, _present_ids(study)).items()):
-        # A last answer that is changed afterwards makes the last model's name new.
-        suffix = f"/answer-{last_answers[participant_id]}" if count >= settings.labels_per_participant else ""
+        # A last answer that is changed afterwards makes the last model's name new, and so does every exclusion.
+        complete = count >= settings.labels_per_participant
+        marks = [f"answer-{last_answers[participant_id]}"] if complete else []
+        marks += [f"exclusion-{exclusions[participant_id]}"] if participant_id in exclusions else []
+        suffix = "/" + "-".join(marks) if marks else ""
         reward = reward_due(settings, count)
         if reward:
             name = f"reward/participant-{participant_id}/labels-{reward}{suffix}"
             jobs.append(Job(name, RunKind.REWARD, study.id, participant_id, reward))
             milestone = filter_due(settings, count)
             if milestone and name in succeeded and study.material is None:  # no simulator, no filter
-                ending = suffix if milestone == settings.labels_per_participant else ""
-                name = f"filter/participant-{participant_id}/labels-{milestone}{ending}"
+                name = f"filter/participant-{participant_id}/labels-{milestone}{suffix}"
                 jobs.append(Job(name, RunKind.FILTER, study.id, participant_id, milestone))
-        if suffix and study.material is None:
-            jobs += _missing_from_evaluation(study, participant_id, f"labels-{reward}{suffix}", succeeded)
+        if complete and study.material is None:
+            robots_shown = participant_id in begun
+            jobs += _missing_from_evaluation(study, participant_id, f"labels-{reward}{suffix}", succeeded, robots_shown)
     return jobs
 
 
-def _missing_from_evaluation(study: Study, participant_id: int, ending: str, succeeded: Collection[str]) -> list[Job]:
-    """What is to be trained, filmed or packed for somebody who has given all labels."""
+def _missing_from_evaluation(
+    study: Study, participant_id: int, ending: str, succeeded: Collection[str], robots_shown: bool
+) -> list[Job]:
+    """What is to be trained, filmed or packed for somebody who has given all labels.
+
+    Whoever has been shown robots rates those: other ones, learned without an excluded answer, would be for nobody.
+    """
     if f"reward/participant-{participant_id}/{ending}" not in succeeded:
         return []
-    jobs = method_work.due(study, participant_id, ending)
+    jobs = [] if robots_shown else method_work.due(study, participant_id, ending)
     if f"filter/participant-{participant_id}/{ending}" in succeeded:
-        jobs += film_work.due(study, participant_id, ending, succeeded)
+        jobs += film_work.due(study, participant_id, ending, succeeded, robots_shown)
     return jobs
 
 
@@ -176,6 +197,13 @@ def reward_due(settings: StudySettings, answered: int) -> int:
 def filter_due(settings: StudySettings, answered: int) -> int:
     """The newest milestone that has been passed; 0 before the first. Milestones passed in the meantime are skipped."""
     return max((milestone for milestone in settings.milestones if milestone <= answered), default=0)
+
+
+def _last_exclusions(session: Session, study: Study) -> dict[int, int]:
+    """The number of the last word about an answer that is learned from, of everybody about whom there is one."""
+    words = select(Query.participant_id, func.max(Exclusion.id)).join(LabelEvent, LabelEvent.query_id == Query.id)
+    words = words.join(Exclusion).where(Query.purpose.in_(LEARNED_FROM), Query.participant_id.in_(_present_ids(study)))
+    return dict(session.execute(words.group_by(Query.participant_id)).all())
 
 
 def _last_answers(session: Session, study: Study) -> dict[int, int]:

@@ -187,6 +187,11 @@ class Study(Base):
     lock_document: Mapped[dict[str, Any] | None]
     """Settings, plan of pairs, stop rule and planned tests as they were locked; lock_hash is the hash of this."""
     unblinded_at: Mapped[datetime | None]
+    put_away_at: Mapped[datetime | None]
+    """Since then the study is not in the list, takes nobody in, and the worker does nothing for it."""
+    deleted_at: Mapped[datetime | None]
+    """Everybody in it is erased then; this row stays until the worker has removed the last traces, see erased_at."""
+    erased_at: Mapped[datetime | None]
 
     @property
     def settings(self) -> StudySettings:

@@ -43,8 +43,8 @@ SECRETS = {"study": {"join_token"}, "participant": {"token_sha256"}}
 KEY_TABLES = {"assignment", "trial"}
 """Letters with their methods, and with their films."""
 _REMADE = (RunKind.REPORT, RunKind.EXPORT)
-_PLACES = {"participant": "participant", "study": "study", "answer": "label_event"}
-"""What the numbers in names of runs are ids of: reward/participant-12/labels-200/answer-345."""
+_PLACES = {"participant": "participant", "study": "study", "answer": "label_event", "exclusion": "exclusion"}
+"""What the numbers in names of runs are ids of: reward/participant-12/labels-200/answer-345-exclusion-6."""
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 
 

@@ -15,7 +15,7 @@ from app.domain.clips import Clip, Rollout
 from app.domain.evaluation import Film, Rating, Trial
 from app.domain.models import Bundle, Model, ModelKind, Run, RunKind, RunStatus, WorkerPresence
 from app.domain.participation import StageRecord
-from app.domain.preferences import LEARNED_FROM, LabelEvent, Query, Response
+from app.domain.preferences import LEARNED_FROM, Exclusion, LabelEvent, Query, Response, is_excluded
 from app.domain.protocol import Stage
 from app.domain.studies import Participant, Strategy, Study
 from app.services import accuracy, results, stages, watching
@@ -127,6 +127,8 @@ class _Answer:
     predicted_right: float | None
     response_time_ms: int | None
     drawn_at_random: bool
+    excluded: bool
+    """By an experimenter: it was given, and nothing is concluded from it."""
 
 
 def machine(session: Session, data_dir: Path) -> Machine:
@@ -141,6 +143,7 @@ def fingerprint(session: Session) -> str:
     """Changes whenever a page of the dashboard would: one cheap query instead of drawing everything again."""
     newest = (
         select(func.max(LabelEvent.id)).scalar_subquery(),
+        select(func.max(Exclusion.id)).scalar_subquery(),
         select(func.max(Model.id)).scalar_subquery(),
         select(func.max(Bundle.id)).scalar_subquery(),
         select(func.max(Clip.id)).scalar_subquery(),
@@ -151,6 +154,8 @@ def fingerprint(session: Session) -> str:
         select(func.max(Run.finished_at)).scalar_subquery(),
         select(func.count(Run.id)).where(Run.status == RunStatus.RETRY).scalar_subquery(),
         select(func.max(Study.id)).scalar_subquery(),
+        select(func.max(Study.deleted_at)).scalar_subquery(),
+        select(func.count(Study.put_away_at)).scalar_subquery(),
         select(func.max(StageRecord.id)).scalar_subquery(),
         select(func.max(StageRecord.finished_at)).scalar_subquery(),
         select(func.max(Participant.completed_at)).scalar_subquery(),
@@ -164,15 +169,16 @@ def fingerprint(session: Session) -> str:
     return repr(tuple(session.execute(select(*newest)).one()))
 
 
-def study_lines(session: Session) -> Sequence[StudyLine]:
-    """Every study, the newest first."""
+def study_lines(session: Session, *, put_away: bool = False) -> Sequence[StudyLine]:
+    """Every study that is at work, or every one that is put away; the newest first."""
     counted = session.execute(select(Rollout.study_id, func.count(Clip.id)).join(Clip).group_by(Rollout.study_id))
     clips = {study_id: count for study_id, count in counted}  # noqa: C416  (a typed row is not a typed pair)
     people: dict[int, list[Participant]] = defaultdict(list)
     for participant in session.scalars(select(Participant).where(Participant.is_preview.is_(False))):
         people[participant.study_id].append(participant)
     lines = []
-    for study in session.scalars(select(Study).order_by(Study.id.desc())):
+    kept = Study.put_away_at.is_not(None) if put_away else Study.put_away_at.is_(None)
+    for study in session.scalars(select(Study).where(Study.deleted_at.is_(None), kept).order_by(Study.id.desc())):
         answers = _answers(session, [person.id for person in people[study.id]])
         given = [len(answers[person.id]) for person in people[study.id]]
         wanted = study.settings.labels_per_participant
@@ -220,7 +226,8 @@ def study_overview(session: Session, study: Study) -> StudyOverview:
 def participant_detail(session: Session, study: Study, participant: Participant) -> ParticipantDetail:
     """One participant: answers, models, filters, runs."""
     answers = _answers(session, [participant.id])[participant.id]
-    times = sorted(answer.response_time_ms for answer in answers if answer.response_time_ms is not None)
+    counting = [answer for answer in answers if not answer.excluded]
+    times = sorted(answer.response_time_ms for answer in counting if answer.response_time_ms is not None)
     model = _newest_reward_model(session, participant)
     return ParticipantDetail(
         study=study,
@@ -269,7 +276,9 @@ def _hits(answers: Iterable[_Answer]) -> Sequence[bool]:
     What a model chose to ask is where it is worst: on that, every way of choosing well would look bad.
     """
     decided = [
-        answer for answer in answers if answer.drawn_at_random and answer.response in (Response.LEFT, Response.RIGHT)
+        answer
+        for answer in answers
+        if answer.drawn_at_random and not answer.excluded and answer.response in (Response.LEFT, Response.RIGHT)
     ]
     return [
         (answer.predicted_right > 0.5) == (answer.response is Response.RIGHT)
@@ -294,6 +303,7 @@ def _answers(session: Session, participant_ids: Sequence[int]) -> dict[int, list
             Query.predicted_right,
             LabelEvent.response_time_ms,
             Query.strategy == Strategy.UNIFORM,
+            is_excluded(),
         )
         .join(LabelEvent, LabelEvent.query_id == Query.id)
         .join(newest, (newest.c.query_id == LabelEvent.query_id) & (newest.c.revision == LabelEvent.revision))
@@ -301,10 +311,11 @@ def _answers(session: Session, participant_ids: Sequence[int]) -> dict[int, list
         .order_by(Query.participant_id, Query.ordinal)
     )
     answers: dict[int, list[_Answer]] = defaultdict(list)
-    for participant_id, response, predicted_right, response_time_ms, at_random in rows:
+    for participant_id, response, predicted_right, response_time_ms, at_random, excluded in rows:
         if response is None:  # taken back
             continue
-        answers[participant_id].append(_Answer(Response(response), predicted_right, response_time_ms, at_random))
+        said = _Answer(Response(response), predicted_right, response_time_ms, at_random, excluded)
+        answers[participant_id].append(said)
     return answers
 
 

@@ -10,7 +10,7 @@ from app.domain.clips import Clip, Rollout
 from app.domain.evaluation import Rating, Trial
 from app.domain.models import Bundle, Model, ModelKind
 from app.domain.participation import ConsentRecord, FormAnswer, ParticipantEvent, StageRecord
-from app.domain.preferences import LEARNED_FROM, LabelEvent, Query
+from app.domain.preferences import LEARNED_FROM, Exclusion, LabelEvent, Query
 from app.domain.studies import Deviation, Participant, Study
 from app.services import results, unblinding
 
@@ -61,19 +61,28 @@ def queries(session: Session, study: Study) -> Rows:
         shown = select(Query).where(Query.participant_id == person.id).order_by(Query.ordinal)
         clips = (joinedload(side).joinedload(Clip.rollout) for side in (Query.left_clip, Query.right_clip))
         queries = {query.id: query for query in session.scalars(shown.options(*clips))}
-        answers = _last_events(session, person)
+        answers, exclusions = _last_events(session, person), _exclusions(session, person)
         theirs = select(Model.id, Model.label_count).where(Model.participant_id == person.id)
         seen = dict(session.execute(theirs).all())
         for query in queries.values():
+            answer = answers.get(query.id)
             yield (
                 person.code,
-                *_query(query, queries, answers.get(query.id), seen.get(query.predicted_by_model_id or 0)),
+                *_query(query, queries, answer, seen.get(query.predicted_by_model_id or 0)),
+                *_learned_from(query, answer, exclusions.get(answer.id) if answer is not None else None),
             )
 
 
 def _last_events(session: Session, person: Participant) -> dict[int, LabelEvent]:
     events = select(LabelEvent).join(Query).where(Query.participant_id == person.id).order_by(LabelEvent.revision)
     return {event.query_id: event for event in session.scalars(events)}
+
+
+def _exclusions(session: Session, person: Participant) -> dict[int, Exclusion]:
+    """The newest word about every answer that is left out, by the answer's id."""
+    words = select(Exclusion).join(LabelEvent).join(Query).where(Query.participant_id == person.id)
+    newest = {word.label_event_id: word for word in session.scalars(words.order_by(Exclusion.id))}
+    return {event_id: word for event_id, word in newest.items() if word.excluded}
 
 
 def _query(query: Query, queries: dict[int, Query], last: LabelEvent | None, model_labels: int | None) -> Sequence[Any]:
@@ -104,13 +113,21 @@ def _query(query: Query, queries: dict[int, Query], last: LabelEvent | None, mod
         answer.response_time_ms if answer else None,
         answer.created_at if answer else None,
         last.revision if last else 0,
-        answer is not None and query.purpose in LEARNED_FROM,
     )
+
+
+def _learned_from(query: Query, last: LabelEvent | None, exclusion: Exclusion | None) -> Sequence[Any]:
+    """Whether the answer is a label, whether it is excluded, and why."""
+    answered = last is not None and last.response is not None
+    excluded = answered and exclusion is not None
+    reason = exclusion.reason if excluded and exclusion is not None else None
+    return answered and not excluded and query.purpose in LEARNED_FROM, excluded, reason
 
 
 def labels(session: Session, study: Study) -> Rows:
     for person in _present(session, study):
         newest = {event.id for event in _last_events(session, person).values()}
+        exclusions = _exclusions(session, person)
         rows = session.execute(
             select(Query, LabelEvent)
             .join(LabelEvent, LabelEvent.query_id == Query.id)
@@ -136,6 +153,7 @@ def labels(session: Session, study: Study) -> Rows:
                 event.stalled_ms,
                 event.largest_drift_ms,
                 event.created_at,
+                event.id in exclusions,
             )
 
 

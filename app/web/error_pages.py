@@ -31,6 +31,7 @@ _TITLES = {
     HTTPStatus.FORBIDDEN: "That is not allowed",
     HTTPStatus.NOT_FOUND: "Nothing here",
     HTTPStatus.CONFLICT: "That no longer fits",
+    HTTPStatus.GONE: "This study is closed",
     HTTPStatus.TOO_MANY_REQUESTS: "A moment, please",
     HTTPStatus.SERVICE_UNAVAILABLE: "A moment, please",
     HTTPStatus.INTERNAL_SERVER_ERROR: "Something broke",
@@ -125,7 +126,8 @@ def _answer(
         known = (EXPERIMENTER_COOKIE if wording is None else PARTICIPANT_COOKIE) in request.cookies
         onward = request.app.url_path_for("show_studies" if wording is None else "show_next")
         context = {"title": title, "message": message, "status": int(status), "wording": wording}
-        context |= {"onward_path": onward if known and status != HTTPStatus.UNAUTHORIZED else None}
+        leads_on = known and status not in (HTTPStatus.UNAUTHORIZED, HTTPStatus.GONE)
+        context |= {"onward_path": onward if leads_on else None}
         answer = page(request, "error.html", context, status)
     answer.headers.update(headers or {})
     return answer

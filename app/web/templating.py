@@ -1,6 +1,6 @@
 """Pages from templates: one Jinja environment, strict about what is missing, and the words for numbers and times."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from datetime import datetime
 from math import floor, log10
 from pathlib import Path
@@ -99,6 +99,11 @@ def in_words(name: str) -> str:
     return name.replace("_", " ")
 
 
+def named(values: Iterable[str], names: Mapping[str, str] | None = None) -> list[tuple[str, str]]:
+    """Values with what people call them, as the options of a select need them."""
+    return [(str(value), (names or {}).get(str(value), str(value))) for value in values]
+
+
 def task_title(task: str) -> str:
     """What people call a task."""
     return words_of(task).title
@@ -128,7 +133,7 @@ def make_environment(path_for: Callable[..., URLPath]) -> Environment:
         lstrip_blocks=True,
     )
     numbers = (percent, signed_points, quantity, signed)
-    words = (ago, time_left, moment, seconds, bytes_in_words, in_words, task_title)
+    words = (ago, time_left, moment, seconds, bytes_in_words, in_words, named, task_title)
     environment.filters.update({word.__name__: word for word in (*numbers, *words)})
     environment.globals["path_for"] = path_for
     for text in (say, page_language, study_question):
