@@ -1,4 +1,4 @@
-"""The table of a study's participants: sorted and filtered by what the address says, so that it works without script."""
+"""The table of a study's participants: what the address says is what is shown, so that it works without script."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
