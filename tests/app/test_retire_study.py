@@ -59,6 +59,7 @@ class TestPuttingAway:
         assert "closed at the moment" in answer.text
         assert 'href="/p/withdraw"' in answer.text
         assert browser.get("/p/withdraw").status_code == 200
+        assert browser.get("/p/instructions").headers["location"] == "/p/next", "no page goes on"
         assert browser.get("/p/next", headers=JSON).status_code == 410
         post(experimenter, "back")
         assert browser.get("/p/next").status_code == 200
