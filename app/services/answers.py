@@ -37,7 +37,7 @@ class ReasonMissing(AppError):
 class Mark(StrEnum):
     """What an answer can be looked up by."""
 
-    UNFORESEEN = "unforeseen"
+    MISPREDICTED = "mispredicted"
     """The model had expected the other side."""
     CONTRADICTS = "contradicts"
     """Says something else about a pair than the same person before."""
@@ -202,7 +202,7 @@ def _neighbour(session: Session, study: Study, wanted: Wanted, place: tuple[int,
 def _marked(mark: Mark) -> ColumnElement[bool]:
     """Whether an answer, LabelEvent with its Query, bears the mark; decided by the database, for pages to be quick."""
     conditions: Mapping[Mark, ColumnElement[bool]] = {
-        Mark.UNFORESEEN: _unforeseen(),
+        Mark.MISPREDICTED: _mispredicted(),
         Mark.CONTRADICTS: _contradicts(),
         Mark.MISSED_CATCH: and_(Query.expected.is_not(None), LabelEvent.response.in_(_SIDES))
         & (LabelEvent.response != Query.expected),
@@ -212,7 +212,7 @@ def _marked(mark: Mark) -> ColumnElement[bool]:
     return func.coalesce(conditions[mark], False)  # what is not known is not marked
 
 
-def _unforeseen() -> ColumnElement[bool]:
+def _mispredicted() -> ColumnElement[bool]:
     return or_(
         and_(LabelEvent.response == Response.LEFT, Query.predicted_right > 0.5),
         and_(LabelEvent.response == Response.RIGHT, Query.predicted_right < 0.5),

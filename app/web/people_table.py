@@ -95,7 +95,7 @@ def people_table(overview: StudyOverview, view: View) -> PeopleTable:
     alarming = sum(needs_a_look(row) for row in found)
     choices = [
         Choice(EVERYBODY, "all", len(found)),
-        Choice(ATTENTION, "to look at", alarming),
+        Choice(ATTENTION, "needing attention", alarming),
         *(Choice(stage, stage, count) for stage, count in overview.stage_counts),
     ]
     return PeopleTable(rows, apart, choices, view)

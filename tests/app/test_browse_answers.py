@@ -75,7 +75,7 @@ class TestLooking:
         [
             ({"code": "P02"}, [("P02", 1)]),
             ({"response": Response.EQUAL}, [("P02", 1)]),
-            ({"mark": Mark.UNFORESEEN}, [("P01", 3)]),
+            ({"mark": Mark.MISPREDICTED}, [("P01", 3)]),
             ({"mark": Mark.QUICK}, []),
             ({"purpose": Purpose.CATCH}, []),
         ],
@@ -150,7 +150,7 @@ class TestLooking:
     ) -> None:
         text = experimenter.get(f"/studies/pilot/answers/{queries[2].id}?participant=P01").text
         assert text.count("<video") == 2
-        assert "not foreseen" in text
+        assert "predicted wrongly" in text
         assert f"/answers/{queries[1].id}?participant=P01" in text
         assert f"/answers/{queries[3].id}?participant=P01" in text
 

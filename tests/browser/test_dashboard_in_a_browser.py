@@ -201,7 +201,7 @@ def test_without_script_answers_are_excluded_and_words_explained(page: Page, chr
     plain.goto(page.url + "/pilot/answers?participant=P01")
     meaning = plain.get_by_text("before they answered")
     expect(meaning).to_be_hidden()
-    plain.get_by_role("button", name=re.compile("guess. means")).click()
+    plain.get_by_role("button", name=re.compile("prediction. means")).click()
     expect(meaning).to_be_visible()
     plain.keyboard.press("Escape")
     plain.get_by_role("link", name="P01, pair 3").click()
