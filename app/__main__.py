@@ -67,7 +67,7 @@ def participant_link(settings: Settings) -> int:
     """Add a participant to the newest study and print the personal link."""
     migrate(settings)
     with _database(settings).writing() as session:
-        study = session.scalar(select(Study).order_by(Study.id.desc()))
+        study = session.scalar(select(Study).where(Study.deleted_at.is_(None)).order_by(Study.id.desc()))
         if study is None:
             raise AppError("There is no study yet. Start the studio once, or create a study on the dashboard.")
         _, token = enrolment.add_participant(session, study)

@@ -15,8 +15,8 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session, contains_eager, joinedload
 
 from app.domain.clips import Clip, Rollout
-from app.domain.preferences import Label, Query, Response, current_labels
-from app.domain.studies import Study
+from app.domain.preferences import Label, Query, Response, count_labels, current_labels
+from app.domain.studies import Participant, Study
 from app.errors import AppError
 from app.storage import ArtefactStore
 from worker.ml import acquisition
@@ -55,7 +55,7 @@ class Preferences:
     targets: Array
     """(N,) in {0, 1/2, 1}"""
     label_count: int
-    """How many labels were given, those without a target included."""
+    """How many labels were given, those without a target and those that were excluded included."""
     label_hash: str
 
 
@@ -69,12 +69,13 @@ def label_hash(labels: Sequence[Label]) -> str:
 
 
 def labels_with_clips(session: Session, participant_id: int) -> Sequence[Label]:
-    """The participant's current labels, each with its clips and their rollouts loaded."""
+    """The participant's current labels that are not excluded, each with its clips and their rollouts loaded."""
     return current_labels(session, participant_id, *CLIPS_AND_ROLLOUTS)
 
 
 def load_preferences(session: Session, store: ArtefactStore, participant_id: int) -> Preferences:
-    """The participant's labels as arrays; pairs without a target are left out."""
+    """The participant's labels as arrays; pairs without a target, and excluded ones, are left out."""
+    given = count_labels(session, select(Participant.id).where(Participant.id == participant_id))
     labels = labels_with_clips(session, participant_id)
     said = [(label, target) for label in labels if (target := target_of(label.response)) is not None]
     return Preferences(
@@ -82,7 +83,7 @@ def load_preferences(session: Session, store: ArtefactStore, participant_id: int
         if said
         else None,
         targets=np.array([target for _, target in said], np.float32),
-        label_count=len(labels),
+        label_count=given.get(participant_id, 0),
         label_hash=label_hash(labels),
     )
 

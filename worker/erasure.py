@@ -6,18 +6,18 @@ work for the person is cancelled and waited for, and what it left is erased befo
 
 import logging
 import re
-from collections.abc import Collection, Iterator, Mapping, MutableMapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, MutableMapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from dbos import DBOS, WorkflowStatus
-from sqlalchemy import select
+from sqlalchemy import select, update
 from sqlalchemy.orm import Session
 
 from app import upgrading
 from app.db import file_of, now, rewrite
 from app.domain.models import RunKind
-from app.domain.studies import Participant
+from app.domain.studies import Participant, Study
 from app.services import withdrawal
 from worker import engine
 from worker.records import Job
@@ -41,10 +41,15 @@ class Progress:
 
 
 def unfinished(session: Session) -> Sequence[int]:
-    """Participants of whom traces may be left."""
-    return session.scalars(
-        select(Participant.id).where(Participant.withdrawn_at.is_not(None), Participant.erased_at.is_(None))
-    ).all()
+    """Participants of whom traces may be left; those of deleted studies are erased with these."""
+    theirs = select(Participant.id).join(Study, Study.id == Participant.study_id).where(Study.deleted_at.is_(None))
+    left = theirs.where(Participant.withdrawn_at.is_not(None), Participant.erased_at.is_(None))
+    return session.scalars(left).all()
+
+
+def unfinished_studies(session: Session) -> Sequence[int]:
+    """Deleted studies of which traces may be left."""
+    return session.scalars(select(Study.id).where(Study.deleted_at.is_not(None), Study.erased_at.is_(None))).all()
 
 
 def erase_traces(
@@ -60,7 +65,60 @@ def erase_traces(
     """
     with place.database.reading() as session:
         study_id = session.get_one(Participant, participant_id).study_id
-    jobs = dict(_workflows(participant_id, study_id))
+
+    def concerns(job: Job) -> bool:
+        of_study = job.kind in _OF_WHOLE_STUDIES and job.study_id == study_id
+        return job.participant_id == participant_id or of_study
+
+    def erase(session: Session) -> None:
+        withdrawal.erase(session, place.store, session.get_one(Participant, participant_id))
+
+    def finish(session: Session) -> None:
+        session.get_one(Participant, participant_id).erased_at = now()
+        log.info("participant %d has withdrawn: the last traces are erased", participant_id)
+
+    return _erase(place, concerns, erase, finish, in_hand, stored, engine_file)
+
+
+def erase_traces_of_study(
+    place: Workplace,
+    study_id: int,
+    in_hand: Collection[str],
+    stored: MutableMapping[str, set[str]],
+    engine_file: Path | None,
+) -> Progress:
+    """The same for a study that was deleted, and for everybody in it at once."""
+
+    def concerns(job: Job) -> bool:
+        return job.study_id == study_id
+
+    def erase(session: Session) -> None:
+        withdrawal.erase_study(session, place.store, session.get_one(Study, study_id))
+
+    def finish(session: Session) -> None:
+        session.get_one(Study, study_id).erased_at = now()
+        session.execute(update(Participant).where(Participant.study_id == study_id).values(erased_at=now()))
+        log.info("study %d was deleted: the last traces are erased", study_id)
+
+    return _erase(place, concerns, erase, finish, in_hand, stored, engine_file)
+
+
+Erase = Callable[
+    [Workplace, int, Collection[str], MutableMapping[str, set[str]], Path | None],
+    Progress,
+]
+
+
+def _erase(
+    place: Workplace,
+    concerns: Callable[[Job], bool],
+    erase: Callable[[Session], None],
+    finish: Callable[[Session], None],
+    in_hand: Collection[str],
+    stored: MutableMapping[str, set[str]],
+    engine_file: Path | None,
+) -> Progress:
+    jobs = dict(_workflows(concerns))
     active = [name for name, (_, status) in jobs.items() if status in _ACTIVE]
     if active:
         DBOS.cancel_workflows(active)  # and look again: one of them may just be beginning
@@ -70,7 +128,7 @@ def erase_traces(
     for job, _ in jobs.values():
         left_over |= stored.pop(job.finding, set())
     with place.database.writing() as session:
-        withdrawal.erase(session, place.store, session.get_one(Participant, participant_id))
+        erase(session)
         for sha256 in left_over - withdrawal.in_use(session, left_over):
             place.store.delete(sha256)
     DBOS.delete_workflows(list(jobs))
@@ -82,8 +140,7 @@ def erase_traces(
     if database_file is not None:
         upgrading.forget_copies(database_file)
     with place.database.writing() as session:
-        session.get_one(Participant, participant_id).erased_at = now()
-    log.info("participant %d has withdrawn: the last traces are erased", participant_id)
+        finish(session)
     return Progress(finished=True, forgotten=frozenset(jobs))
 
 
@@ -93,12 +150,11 @@ def drafts() -> set[str]:
     return {sha256 for workflow in unfinished_work for sha256 in _artefacts_of_steps(workflow.workflow_id)}
 
 
-def _workflows(participant_id: int, study_id: int) -> Iterator[tuple[str, tuple[Job, str]]]:
-    """Names, jobs and states of every workflow that was for this person, or for the whole study's data."""
+def _workflows(concerns: Callable[[Job], bool]) -> Iterator[tuple[str, tuple[Job, str]]]:
+    """Names, jobs and states of every workflow whose job is of concern."""
     for workflow in DBOS.list_workflows(load_input=True, load_output=False):
         job = _job(workflow)
-        of_study = job is not None and job.kind in _OF_WHOLE_STUDIES and job.study_id == study_id
-        if job is not None and (job.participant_id == participant_id or of_study):
+        if job is not None and concerns(job):
             yield workflow.workflow_id, (job, workflow.status)
 
 

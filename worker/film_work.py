@@ -37,10 +37,15 @@ class Robot:
     controller: bytes
 
 
-def due(study: Study, participant_id: int, ending: str, succeeded: Collection[str]) -> list[Job]:
-    """What is to be filmed or packed for somebody whose last filter is there. ``ending``: labels and last answer."""
+def due(
+    study: Study, participant_id: int, ending: str, succeeded: Collection[str], robots_shown: bool = False
+) -> list[Job]:
+    """What is to be filmed or packed for somebody whose last filter is there. ``ending``: labels and last answer.
+
+    ``robots_shown``: they have begun to rate, so that what they rate stays.
+    """
     wanted = [BEFORE_AFTER] if study.material is None else []
-    settings = evaluating.settings_of(study)
+    settings = None if robots_shown else evaluating.settings_of(study)
     if settings and method_work.all_trained(study, participant_id, ending, succeeded):
         wanted.append(TRIALS if settings.mode is EvaluationMode.VIDEO else CONTROLLERS)
     labels = study.settings.labels_per_participant

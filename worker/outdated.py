@@ -4,7 +4,7 @@ from sqlalchemy import Select, func, select
 from sqlalchemy.orm import Session
 
 from app.domain.models import RunKind
-from app.domain.preferences import LEARNED_FROM, LabelEvent, Query, count_labels
+from app.domain.preferences import LEARNED_FROM, Exclusion, LabelEvent, Query, count_labels
 from app.domain.studies import Participant, Study, StudySettings
 from worker.records import Job
 
@@ -33,11 +33,23 @@ def filter_due(settings: StudySettings, answered: int) -> int:
     return max((milestone for milestone in settings.milestones if milestone <= answered), default=0)
 
 
-def filter_name(settings: StudySettings, participant_id: int, answered: int, last_answer: int) -> str:
-    """The name of the filter that is due; a last answer that is changed afterwards makes the last one's new."""
-    milestone = filter_due(settings, answered)
-    ending = f"/answer-{last_answer}" if milestone == settings.labels_per_participant else ""
-    return f"filter/participant-{participant_id}/labels-{milestone}{ending}"
+def last_exclusions(session: Session, people: Select[int]) -> dict[int, int]:
+    """The number of the last word about an answer that is learned from, of everybody about whom there is one."""
+    words = select(Query.participant_id, func.max(Exclusion.id)).join(LabelEvent, LabelEvent.query_id == Query.id)
+    words = words.join(Exclusion).where(Query.participant_id.in_(people), Query.purpose.in_(LEARNED_FROM))
+    return dict(session.execute(words.group_by(Query.participant_id)).all())
+
+
+def ending(settings: StudySettings, answered: int, last_answer: int, last_exclusion: int | None) -> str:
+    """Of the names of models: a last answer that is changed afterwards makes them new, and so does every exclusion."""
+    marks = [f"answer-{last_answer}"] if answered >= settings.labels_per_participant else []
+    marks += [] if last_exclusion is None else [f"exclusion-{last_exclusion}"]
+    return "/" + "-".join(marks) if marks else ""
+
+
+def filter_name(participant_id: int, milestone: int, name_ending: str) -> str:
+    """The name of the filter of a milestone."""
+    return f"filter/participant-{participant_id}/labels-{milestone}{name_ending}"
 
 
 def is_outdated(session: Session, job: Job, *, begun: bool = False) -> bool:
@@ -54,5 +66,5 @@ def is_outdated(session: Session, job: Job, *, begun: bool = False) -> bool:
         return False
     if job.kind == RunKind.FILTER and filter_due(settings, answered) > (job.label_count or 0):
         return True
-    last = last_answers(session, mine).get(job.participant, 0)
-    return "/answer-" in job.finding and not job.finding.endswith(f"/answer-{last}")
+    last, excluded = (each(session, mine).get(job.participant) for each in (last_answers, last_exclusions))
+    return not job.finding.endswith(ending(settings, answered, last or 0, excluded))

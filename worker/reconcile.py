@@ -4,7 +4,7 @@ Nothing here is remembered between two rounds, so a lost message, a killed worke
 anything undone or do it twice: each finding has one name, and work is started under that name at most once.
 """
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from datetime import datetime, timedelta
 from typing import NamedTuple
 
@@ -16,15 +16,17 @@ from app.domain.clips import Clip, Rollout
 from app.domain.models import Run, RunKind, RunStatus
 from app.domain.preferences import LabelEvent, Query, count_labels
 from app.domain.studies import Participant, Study
+from app.services import evaluating
 from worker import export_work, film_work, mending, method_work, report_work
 from worker.clip_work import WHOLE
-from worker.outdated import filter_due, filter_name, last_answers, present_ids, reward_due
+from worker.outdated import ending, filter_due, filter_name, last_answers, last_exclusions, present_ids, reward_due
 from worker.records import ATTEMPTS, LEASE, Job, next_queries
 
 CLIPS_AHEAD = 2
 """Scenarios per study in the making at a time: enough to keep busy, few enough that studies share fairly."""
 
 RETRY_AFTER = timedelta(seconds=10)
+_AT_WORK = (Study.deleted_at.is_(None), Study.put_away_at.is_(None))
 
 
 class _Attempted(NamedTuple):
@@ -45,17 +47,23 @@ def findings(session: Session, lost: Mapping[str, int] | None = None) -> Iterato
     filters = select(Run.participant_id).where(Run.kind == RunKind.FILTER, Run.status == RunStatus.RUNNING)
     being_filtered = set(session.scalars(filters.where(Run.heartbeat_at >= now() - LEASE)))
     succeeded = {name for name, run in runs.items() if run.status == RunStatus.SUCCEEDED}
-    for study in session.scalars(select(Study).order_by(Study.id)).all():
-        jobs = (
-            *mending.due(session, study, lost or {}),
-            *_missing_clips(session, study),
-            *_stale_models(session, study, succeeded),
-        )
-        for job in (*jobs, *report_work.due(session, study), *export_work.due(session, study)):
+    for study in session.scalars(select(Study).where(Study.deleted_at.is_(None)).order_by(Study.id)).all():
+        if study.put_away_at is not None:
+            jobs: Iterable[Job] = export_work.due(session, study)  # somebody has asked for those
+        else:
+            jobs = (*mending.due(session, study, lost or {}), *_all_due(session, study, succeeded))
+        for job in jobs:
             attempt = _attempt_due(runs.get(job.finding), now())
             one_at_a_time = job.kind == RunKind.FILTER and job.participant_id in being_filtered
             if attempt is not None and not one_at_a_time:
                 yield job, attempt
+
+
+def _all_due(session: Session, study: Study, succeeded: Collection[str]) -> Iterator[Job]:
+    yield from _missing_clips(session, study)
+    yield from _stale_models(session, study, succeeded)
+    yield from report_work.due(session, study)
+    yield from export_work.due(session, study)
 
 
 def abandoned(session: Session, in_hand: Collection[str]) -> list[tuple[Job, int]]:
@@ -80,7 +88,7 @@ def workflow_name(finding: str, attempt: int) -> str:
 def studies_with_answers(session: Session) -> list[Study]:
     """The simulated studies in which somebody has answered: their first retraining is not far."""
     answered = select(Participant.study_id).join(Query).join(LabelEvent)
-    found = session.scalars(select(Study).where(Study.id.in_(answered)).order_by(Study.id))
+    found = session.scalars(select(Study).where(Study.id.in_(answered), *_AT_WORK).order_by(Study.id))
     return [study for study in found if study.material is None]
 
 
@@ -88,7 +96,7 @@ def short_of_queries(session: Session) -> list[int]:
     """Participants who could soon run out of queries."""
     return [
         participant_id
-        for study in session.scalars(select(Study)).all()
+        for study in session.scalars(select(Study).where(*_AT_WORK)).all()
         for participant_id in _without_all_queries(session, study)
         if next_queries(session, participant_id, study.settings)[1] > 0
     ]
@@ -159,28 +167,34 @@ def scenario_seed(study_seed: int, index: int) -> int:
 
 def _stale_models(session: Session, study: Study, succeeded: Collection[str]) -> list[Job]:
     jobs, settings = [], study.settings
-    newest = last_answers(session, present_ids(study))
+    answers, exclusions = last_answers(session, present_ids(study)), last_exclusions(session, present_ids(study))
+    begun = evaluating.begun(session, study)
     for participant_id, count in sorted(count_labels(session, present_ids(study)).items()):
-        # A last answer that is changed afterwards makes the last model's name new.
-        suffix = f"/answer-{newest[participant_id]}" if count >= settings.labels_per_participant else ""
+        suffix = ending(settings, count, answers[participant_id], exclusions.get(participant_id))
         reward = reward_due(settings, count)
         if reward:
             name = f"reward/participant-{participant_id}/labels-{reward}{suffix}"
             jobs.append(Job(name, RunKind.REWARD, study.id, participant_id, reward))
             milestone = filter_due(settings, count)
             if milestone and name in succeeded and study.material is None:  # no simulator, no filter
-                name = filter_name(settings, participant_id, count, newest[participant_id])
+                name = filter_name(participant_id, milestone, suffix)
                 jobs.append(Job(name, RunKind.FILTER, study.id, participant_id, milestone))
-        if suffix and study.material is None:
-            jobs += _missing_from_evaluation(study, participant_id, f"labels-{reward}{suffix}", succeeded)
+        if count >= settings.labels_per_participant and study.material is None:
+            robots_shown = participant_id in begun
+            jobs += _missing_from_evaluation(study, participant_id, f"labels-{reward}{suffix}", succeeded, robots_shown)
     return jobs
 
 
-def _missing_from_evaluation(study: Study, participant_id: int, ending: str, succeeded: Collection[str]) -> list[Job]:
-    """What is to be trained, filmed or packed for somebody who has given all labels."""
+def _missing_from_evaluation(
+    study: Study, participant_id: int, ending: str, succeeded: Collection[str], robots_shown: bool
+) -> list[Job]:
+    """What is to be trained, filmed or packed for somebody who has given all labels.
+
+    Whoever has been shown robots rates those: other ones, learned without an excluded answer, would be for nobody.
+    """
     if f"reward/participant-{participant_id}/{ending}" not in succeeded:
         return []
-    jobs = method_work.due(study, participant_id, ending)
+    jobs = [] if robots_shown else method_work.due(study, participant_id, ending)
     if f"filter/participant-{participant_id}/{ending}" in succeeded:
-        jobs += film_work.due(study, participant_id, ending, succeeded)
+        jobs += film_work.due(study, participant_id, ending, succeeded, robots_shown)
     return jobs

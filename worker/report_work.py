@@ -15,7 +15,7 @@ from sqlalchemy.orm import Session
 from app.db import now
 from app.domain.evaluation import Rating, Trial
 from app.domain.models import Model, Report, Run, RunKind, RunStatus
-from app.domain.preferences import LabelEvent, Query
+from app.domain.preferences import Exclusion, LabelEvent, Query
 from app.domain.studies import Participant, Study
 from app.services import (
     accuracy,
@@ -80,6 +80,8 @@ def basis_of(session: Session, study: Study) -> str | None:
     ]
     if not any(newest):
         return None
+    words = select(func.max(Exclusion.id)).join(LabelEvent).join(Query).where(Query.participant_id.in_(people))
+    newest.append(session.scalar(words))
     gone = session.scalars(people.where(Participant.withdrawn_at.is_not(None)).order_by(Participant.id)).all()
     blinded, plan = unblinding.is_blinded(study), _plan(session, study)
     basis = (VERSION, newest, list(gone), blinded, study.lock_hash, study.stored_settings, plan)

@@ -150,13 +150,15 @@ class _Rounds:
             hungry = {*reconcile.short_of_queries(session), *reconcile.with_lost_queries(session, lost_files)}
             lost = reconcile.abandoned(session, self._workshop.in_hand)
             answered = reconcile.studies_with_answers(session)
-            withdrawn = erasure.unfinished(session)
+            withdrawn, deleted = erasure.unfinished(session), erasure.unfinished_studies(session)
             turns.who_waits = WhoWaits.look(session)
         self._start_most_urgent(due)
         for participant_id in hungry - self._refused:
             self._refill(participant_id)
         for participant_id in withdrawn:
-            self._erase(participant_id)
+            self._erase(erasure.erase_traces, participant_id)
+        for study_id in deleted:
+            self._erase(erasure.erase_traces_of_study, study_id)
         for job, attempt in lost:
             self._take_over(job, reconcile.workflow_name(job.finding, attempt))
         for study in answered:
@@ -175,9 +177,9 @@ class _Rounds:
         except ComputeLost:
             log.warning("rollouts of the reference policy were lost; the first filter of %s will make them", task)
 
-    def _erase(self, participant_id: int) -> None:
+    def _erase(self, erase: erasure.Erase, row_id: int) -> None:
         shop = self._workshop
-        progress = erasure.erase_traces(self._place, participant_id, shop.in_hand, shop.stored, self._engine_file)
+        progress = erase(self._place, row_id, shop.in_hand, shop.stored, self._engine_file)
         for name in progress.forgotten:
             self._started.pop(name, None)
 

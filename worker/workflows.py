@@ -45,7 +45,7 @@ _BODIES: dict[RunKind, Callable[[Workplace, Job, int, Step], None]] = {
 
 
 class ParticipantWithdrew(AppError):
-    """The participant has withdrawn, so there is nothing to be done for them."""
+    """The participant has withdrawn, or the study was deleted, so there is nothing to be done."""
 
 
 @DBOS.dbos_class()
@@ -80,7 +80,7 @@ class Workshop(DBOSConfiguredInstance):
             _step("fail", self._fail, job.finding, refusal.message)
         except Exception as error:  # the worker's edge: one failed job must not stop the others
             if self._is_pointless(job):
-                log.info("%s is abandoned: the participant has withdrawn", job.finding)
+                log.info("%s is abandoned: the participant has withdrawn, or the study was deleted", job.finding)
                 return
             log.exception("%s failed", job.finding)
             _step("fail", self._fail, job.finding, f"{type(error).__name__}: {error}", not _is_the_machine_s(error))
@@ -122,9 +122,11 @@ def _is_the_machine_s(error: Exception) -> bool:
 
 
 def _has_withdrawn(session: Session, job: Job) -> bool:
-    if job.participant_id is None:
-        return False
-    return session.get_one(Participant, job.participant_id).withdrawn_at is not None
+    if session.get_one(Study, job.study_id).deleted_at is not None:
+        return True
+    return job.participant_id is not None and (
+        session.get_one(Participant, job.participant_id).withdrawn_at is not None
+    )
 
 
 def _seed(session: Session, job: Job) -> int:

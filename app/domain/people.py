@@ -13,7 +13,7 @@ class Role(StrEnum):
     """What an experimenter may do; each may do what the next one may."""
 
     OWNER = "owner"
-    """Accounts, and everything below."""
+    """Accounts, deleting whole studies, and everything below."""
     EXPERIMENTER = "experimenter"
     """Studies: make, lock, invite, unblind, export."""
     READER = "reader"

@@ -12,7 +12,9 @@ from sqlalchemy import (
     Select,
     String,
     Subquery,
+    Text,
     UniqueConstraint,
+    false,
     func,
     select,
 )
@@ -130,6 +132,22 @@ class LabelEvent(Base):
     created_at: Mapped[datetime] = mapped_column(default=now)
 
 
+class Exclusion(Base):
+    """An experimenter's word that an answer is left out of learning and statistics, or counts again.
+
+    Append-only: the newest word about an answer counts. Whoever answers the pair anew gives an answer that counts.
+    """
+
+    __tablename__ = "exclusion"
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    label_event_id: Mapped[int] = mapped_column(ForeignKey("label_event.id"), index=True)
+    excluded: Mapped[bool]
+    reason: Mapped[str] = mapped_column(Text)
+    actor: Mapped[str] = mapped_column(String(80))
+    at: Mapped[datetime] = mapped_column(default=now)
+
+
 @dataclass(frozen=True)
 class Label:
     """The answer that counts for one query, whatever the query was for."""
@@ -140,7 +158,7 @@ class Label:
 
 
 def current_labels(session: Session, participant_id: int, *options: ExecutableOption) -> Sequence[Label]:
-    """Every label of the participant that has not been undone, in the order of the queries.
+    """Every label of the participant that was neither undone nor excluded, in the order of the queries.
 
     Labels are answers that are learned from; ``options`` say what to load with each query.
     """
@@ -148,14 +166,15 @@ def current_labels(session: Session, participant_id: int, *options: ExecutableOp
 
 
 def current_answers(session: Session, participant_id: int, *options: ExecutableOption) -> Sequence[Label]:
-    """Like current_labels, with practice, repeats and catch pairs: everything that was answered and not undone."""
+    """Like current_labels, with practice, repeats and catch pairs: all that was answered and not undone or excluded."""
     return _answered(session, participant_id, tuple(Purpose), options)
 
 
 def count_labels(session: Session, people: Select[int]) -> dict[int, int]:
-    """How many current_labels each of these participants has; whoever has none is left out.
+    """How many labels each of these participants has given and not undone; whoever has given none is left out.
 
-    ``people`` selects their ids. Counted by the database, for all at once: the worker asks for it all the time.
+    Excluded ones are among them: they were given, and nobody has to give others. ``people`` selects the ids.
+    Counted by the database, for all at once: the worker asks for it all the time.
     """
     newest = _newest(Query.participant_id.in_(people))
     counting = (
@@ -166,6 +185,19 @@ def count_labels(session: Session, people: Select[int]) -> dict[int, int]:
         .group_by(Query.participant_id)
     )
     return dict(session.execute(counting).all())
+
+
+def is_excluded() -> ColumnElement[bool]:
+    """Whether the LabelEvent of the enclosing statement is left out."""
+    newest = (
+        select(Exclusion.excluded)
+        .where(Exclusion.label_event_id == LabelEvent.id)
+        .order_by(Exclusion.id.desc())
+        .limit(1)
+        .correlate(LabelEvent)
+        .scalar_subquery()
+    )
+    return func.coalesce(newest, false())
 
 
 def _newest(of_interest: ColumnElement[bool]) -> Subquery:
@@ -187,7 +219,7 @@ def _answered(
         select(Query, LabelEvent)
         .join(LabelEvent, LabelEvent.query_id == Query.id)
         .join(newest, (newest.c.query_id == LabelEvent.query_id) & (newest.c.revision == LabelEvent.revision))
-        .where(LabelEvent.response.is_not(None), Query.purpose.in_(purposes))
+        .where(LabelEvent.response.is_not(None), Query.purpose.in_(purposes), ~is_excluded())
         .order_by(Query.ordinal)
         .options(*options)
     )

@@ -218,6 +218,11 @@ class Study(Base):
     unblinded_at: Mapped[datetime | None]
     key_secret: Mapped[str] = mapped_column(String(64), default=new_key_secret)
     """Decides which letter hides which method. Shown to nobody before the study is unblinded."""
+    put_away_at: Mapped[datetime | None]
+    """Since then the study is not in the list, takes nobody in, and the worker does nothing for it."""
+    deleted_at: Mapped[datetime | None]
+    """Everybody in it is erased then; this row stays until the worker has removed the last traces, see erased_at."""
+    erased_at: Mapped[datetime | None]
 
     @property
     def settings(self) -> StudySettings:

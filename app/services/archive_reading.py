@@ -52,8 +52,8 @@ LARGEST_TABLE_BYTES = 4 << 30
 LARGEST_FILE_BYTES = 4 << 30
 MOST_ROWS = 3_000_000
 """Of all tables together that others refer to: their ids are held in memory."""
-REFERRED_BY_RUNS = "label_event"
-"""Its ids stand in names of runs: reward/participant-12/labels-200/answer-345."""
+REFERRED_BY_RUNS = {"answer": "label_event", "exclusion": "exclusion"}
+"""Tables whose ids stand in names of runs, by their word: reward/participant-12/labels-200/answer-345-exclusion-6."""
 _SMALLEST_ID, _LARGEST_ID = 1, 2**63 - 1
 _OLDEST_VERSION = 1
 _WORDS: Mapping[tuple[str, str], type[StrEnum]] = {
@@ -263,7 +263,7 @@ class _Check:
         """By table and id the participant a row belongs to; 0: the study as a whole."""
         self._referred = {
             key.column.table.name for table in Base.metadata.sorted_tables for key in table.foreign_keys
-        } | {REFERRED_BY_RUNS}
+        } | set(REFERRED_BY_RUNS.values())
         self._study: dict[str, Any] | None = None
 
     def table(self, table: Table, path: Path) -> None:

@@ -16,7 +16,7 @@ from app.domain.clips import Clip, Rollout
 from app.domain.evaluation import Film, Rating, Trial
 from app.domain.models import Bundle, Model, ModelKind, Run, RunKind, RunStatus, WorkerPresence
 from app.domain.participation import StageRecord
-from app.domain.preferences import LabelEvent, Response, count_labels
+from app.domain.preferences import Exclusion, LabelEvent, Response, count_labels
 from app.domain.protocol import Stage
 from app.domain.studies import Awaited, Participant, Study
 from app.falls import Falls, noted
@@ -148,6 +148,7 @@ def fingerprint(session: Session) -> str:
     """Changes whenever a page of the dashboard would: one cheap query instead of drawing everything again."""
     newest = (
         select(func.max(LabelEvent.id)).scalar_subquery(),
+        select(func.max(Exclusion.id)).scalar_subquery(),
         select(func.max(Model.id)).scalar_subquery(),
         select(func.max(Bundle.id)).scalar_subquery(),
         select(func.max(Clip.id)).scalar_subquery(),
@@ -158,6 +159,8 @@ def fingerprint(session: Session) -> str:
         select(func.max(Run.finished_at)).scalar_subquery(),
         select(func.count(Run.id)).where(Run.status == RunStatus.RETRY).scalar_subquery(),
         select(func.max(Study.id)).scalar_subquery(),
+        select(func.max(Study.deleted_at)).scalar_subquery(),
+        select(func.count(Study.put_away_at)).scalar_subquery(),
         select(func.max(StageRecord.id)).scalar_subquery(),
         select(func.max(StageRecord.finished_at)).scalar_subquery(),
         select(func.max(Participant.completed_at)).scalar_subquery(),
@@ -171,8 +174,8 @@ def fingerprint(session: Session) -> str:
     return repr(tuple(session.execute(select(*newest)).one()))
 
 
-def study_lines(session: Session) -> Sequence[StudyLine]:
-    """Every study, the newest first."""
+def study_lines(session: Session, *, put_away: bool = False) -> Sequence[StudyLine]:
+    """Every study that is at work, or every one that is put away; the newest first."""
     counted = session.execute(select(Rollout.study_id, func.count(Clip.id)).join(Clip).group_by(Rollout.study_id))
     clips = {study_id: count for study_id, count in counted}  # noqa: C416  (a typed row is not a typed pair)
     everybody = select(Participant).where(Participant.is_preview.is_(False))
@@ -182,7 +185,8 @@ def study_lines(session: Session) -> Sequence[StudyLine]:
     labels = count_labels(session, everybody.with_only_columns(Participant.id))
     failed = Counter(run.study_id for run in _unmended(session))
     lines = []
-    for study in session.scalars(select(Study).order_by(Study.id.desc())):
+    kept = Study.put_away_at.is_not(None) if put_away else Study.put_away_at.is_(None)
+    for study in session.scalars(select(Study).where(Study.deleted_at.is_(None), kept).order_by(Study.id.desc())):
         given = [labels.get(person.id, 0) for person in people[study.id]]
         wanted = study.settings.labels_per_participant
         lines.append(

@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
-from sqlalchemy import func, select
+from sqlalchemy import func, or_, select
 from sqlalchemy.orm import Session, joinedload
 
 from app.db import now
@@ -139,6 +139,13 @@ def assignments_of(session: Session, participant_id: int) -> Sequence[Assignment
     """Which letter hides which method, by letter."""
     theirs = select(Assignment).where(Assignment.participant_id == participant_id)
     return session.scalars(theirs.order_by(Assignment.letter)).all()
+
+
+def begun(session: Session, study: Study) -> set[int]:
+    """Ids of participants to whom a robot has been shown."""
+    shown = select(Trial.participant_id).join(Participant, Participant.id == Trial.participant_id)
+    seen = or_(Trial.shown_at.is_not(None), Trial.started_at.is_not(None))
+    return set(session.scalars(shown.where(Participant.study_id == study.id, seen)))
 
 
 def ratings_of(session: Session, participant_id: int) -> dict[int, Rating]:

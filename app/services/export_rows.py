@@ -13,7 +13,7 @@ from app.domain.clips import Clip, Rollout
 from app.domain.evaluation import Rating, Trial
 from app.domain.models import Bundle, Model, ModelKind
 from app.domain.participation import ConsentRecord, FormAnswer, ParticipantEvent, StageRecord
-from app.domain.preferences import LEARNED_FROM, LabelEvent, Query
+from app.domain.preferences import LEARNED_FROM, Exclusion, LabelEvent, Query
 from app.domain.studies import Deviation, Participant, Study
 from app.services import results, unblinding
 from app.services.paging import EVERYTHING, KeyedRows, Window
@@ -75,19 +75,28 @@ def queries(session: Session, study: Study, window: Window = EVERYTHING) -> Keye
         shown = select(Query).where(Query.participant_id == person.id, wanted.known(Query)).order_by(Query.ordinal)
         clips = (joinedload(side).joinedload(Clip.rollout) for side in (Query.left_clip, Query.right_clip))
         queries = {query.id: query for query in session.scalars(shown.options(*clips))}
-        answers = _last_events(session, person, wanted)
+        answers, exclusions = _last_events(session, person, wanted), _exclusions(session, person, wanted)
         theirs = select(Model.id, Model.label_count).where(Model.participant_id == person.id)
         seen = dict(session.execute(theirs).all())
         for query in queries.values():
             if (query.ordinal,) > wanted.after:
-                labels_seen = seen.get(query.predicted_by_model_id or 0)
-                values = _query(query, queries, answers.get(query.id), labels_seen)
-                yield (person.number, query.ordinal), (person.code, *values)
+                answer = answers.get(query.id)
+                values = _query(query, queries, answer, seen.get(query.predicted_by_model_id or 0))
+                learned = _learned_from(query, answer, exclusions.get(answer.id) if answer is not None else None)
+                yield (person.number, query.ordinal), (person.code, *values, *learned)
 
 
 def _last_events(session: Session, person: Participant, wanted: Window) -> dict[int, LabelEvent]:
     events = select(LabelEvent).join(Query).where(Query.participant_id == person.id, wanted.known(LabelEvent))
     return {event.query_id: event for event in session.scalars(events.order_by(LabelEvent.revision))}
+
+
+def _exclusions(session: Session, person: Participant, wanted: Window) -> dict[int, Exclusion]:
+    """The newest word about every answer that is left out, by the answer's id."""
+    words = select(Exclusion).join(LabelEvent).join(Query)
+    words = words.where(Query.participant_id == person.id, wanted.known(Exclusion))
+    newest = {word.label_event_id: word for word in session.scalars(words.order_by(Exclusion.id))}
+    return {event_id: word for event_id, word in newest.items() if word.excluded}
 
 
 def _query(query: Query, queries: dict[int, Query], last: LabelEvent | None, model_labels: int | None) -> Sequence[Any]:
@@ -118,13 +127,21 @@ def _query(query: Query, queries: dict[int, Query], last: LabelEvent | None, mod
         answer.response_time_ms if answer else None,
         answer.created_at if answer else None,
         last.revision if last else 0,
-        answer is not None and query.purpose in LEARNED_FROM,
     )
+
+
+def _learned_from(query: Query, last: LabelEvent | None, exclusion: Exclusion | None) -> Sequence[Any]:
+    """Whether the answer is a label, whether it is excluded, and why."""
+    answered = last is not None and last.response is not None
+    excluded = answered and exclusion is not None
+    reason = exclusion.reason if excluded and exclusion is not None else None
+    return answered and not excluded and query.purpose in LEARNED_FROM, excluded, reason
 
 
 def labels(session: Session, study: Study, window: Window = EVERYTHING) -> KeyedRows:
     for person, wanted in _present(session, study, window):
         newest = {event.id for event in _last_events(session, person, wanted).values()}
+        exclusions = _exclusions(session, person, wanted)
         rows = session.execute(
             select(Query, LabelEvent)
             .join(LabelEvent, LabelEvent.query_id == Query.id)
@@ -156,6 +173,7 @@ def labels(session: Session, study: Study, window: Window = EVERYTHING) -> Keyed
                     event.largest_drift_ms,
                     event.by_script,
                     event.created_at,
+                    event.id in exclusions,
                 ),
             )
 

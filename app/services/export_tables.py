@@ -103,6 +103,8 @@ TABLES: Sequence[Table] = (
             Column("answered_at", W, "When that answer reached the server."),
             Column("revisions", I, "Answers and undos of this pair; table labels has them all."),
             Column("is_label", B, "Whether the answer is learned from."),
+            Column("excluded", B, "Whether an experimenter has left the answer out of learning and statistics."),
+            Column("exclusion_reason", T, "Why, in their words."),
         ),
         export_rows.queries,
         (Query, LabelEvent),
@@ -136,6 +138,7 @@ TABLES: Sequence[Table] = (
             ),
             Column("by_script", B, WITHOUT_SCRIPT),
             Column("created_at", W, "When it reached the server."),
+            Column("excluded", B, "Whether an experimenter has left this answer out of learning and statistics."),
         ),
         export_rows.labels,
         (LabelEvent,),
@@ -218,7 +221,11 @@ TABLES: Sequence[Table] = (
         (
             PARTICIPANT,
             Column("kind", T, "What it is.", allowed=_words(ModelKind)),
-            Column("label_count", I, "Answers it has learned from, those without a preference included."),
+            Column(
+                "label_count",
+                I,
+                "Answers given by then, those without a preference and excluded ones included.",
+            ),
             Column("label_hash", T, "Fingerprint of these answers.", allowed=SHA256),
             Column("seed", I, "Of the training."),
             Column(

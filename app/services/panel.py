@@ -54,7 +54,7 @@ def close_joining(session: Session, study: Study, actor: str) -> None:
 def find_study(session: Session, join_token: str) -> Study:
     """The study that is joined by this address. Raises JoiningClosed."""
     study = session.scalar(select(Study).where(Study.join_token == join_token))
-    if study is None:
+    if study is None or study.put_away_at is not None:
         raise JoiningClosed
     return study
 

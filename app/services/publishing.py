@@ -1,5 +1,6 @@
 """Finding what was published, and asking for failed work again."""
 
+from collections.abc import Sequence
 from http import HTTPStatus
 
 from sqlalchemy import select
@@ -30,6 +31,15 @@ def find_bundle(session: Session, store: ArtefactStore, participant: Participant
     if bundle is None or not store.has(bundle.artefact_sha256):
         raise BundleNotFound
     return bundle
+
+
+def newest_bundles(
+    session: Session, store: ArtefactStore, people: Sequence[Participant]
+) -> Sequence[tuple[Participant, Bundle]]:
+    """The newest bundle of each of these people that is there, in their order."""
+    theirs = select(Bundle).where(Bundle.participant_id.in_([each.id for each in people])).order_by(Bundle.version)
+    newest = {bundle.participant_id: bundle for bundle in session.scalars(theirs) if store.has(bundle.artefact_sha256)}
+    return [(each, newest[each.id]) for each in people if each.id in newest]
 
 
 def retry_run(session: Session, study: Study, run_id: int, actor: str) -> Run:

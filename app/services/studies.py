@@ -4,15 +4,19 @@ import re
 import secrets
 import unicodedata
 from http import HTTPStatus
+from typing import TypeVar
 
-from sqlalchemy import select
+from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
+from app.db import Base
+from app.domain.clips import Clip, Rollout
 from app.domain.studies import LONGEST_CLIP_STEPS, Study, StudySettings, TaskName
 from app.errors import AppError
 from app.services import audit
 
 _SEED_LIMIT = 2**31
+_Row = TypeVar("_Row", bound=Base)
 
 
 class ClipsTooLong(AppError):
@@ -56,10 +60,42 @@ def create_study(
 
 def find_study(session: Session, slug: str) -> Study:
     """The study of that slug. Raises StudyNotFound."""
-    study = session.scalar(select(Study).where(Study.slug == slug))
+    study = session.scalar(select(Study).where(Study.slug == slug, Study.deleted_at.is_(None)))
     if study is None:
         raise StudyNotFound
     return study
+
+
+def others_named(session: Session, name: str, study: Study | None = None) -> bool:
+    """Whether another study has this name, however it is capitalised."""
+    known = session.execute(select(Study.id, Study.name).where(Study.deleted_at.is_(None)))
+    return any(other != (study.id if study else None) and each.casefold() == name.casefold() for other, each in known)
+
+
+def count_put_away(session: Session) -> int:
+    """How many studies are put away."""
+    away = select(func.count(Study.id)).where(Study.put_away_at.is_not(None), Study.deleted_at.is_(None))
+    return session.scalar(away) or 0
+
+
+def copy_material(session: Session, source: Study, study: Study) -> None:
+    """Give a study the clips of another one that were made elsewhere; clips that are simulated it makes itself."""
+    study.material = source.material
+    if source.material is None:
+        return
+    for rollout in session.scalars(select(Rollout).where(Rollout.study_id == source.id).order_by(Rollout.id)).all():
+        clips = session.scalars(select(Clip).where(Clip.rollout_id == rollout.id).order_by(Clip.id)).all()
+        copy = _copied(rollout, study_id=study.id)
+        session.add(copy)
+        session.flush()
+        session.add_all(_copied(clip, rollout_id=copy.id) for clip in clips)
+    session.flush()
+
+
+def _copied(row: _Row, **columns: object) -> _Row:
+    """A new row like this one, but for these columns."""
+    names = [column.key for column in row.__table__.columns if column.key != "id"]
+    return type(row)(**{name: getattr(row, name) for name in names} | columns)
 
 
 def new_seed() -> int:

@@ -24,8 +24,8 @@ from app.services.withdrawal import in_use
 from app.storage import ArtefactStore
 
 _ROWS_AT_ONCE = 500
-_PLACES = {"participant": "participant", "study": "study", "answer": REFERRED_BY_RUNS}
-"""What the numbers in names of runs are ids of: reward/participant-12/labels-200/answer-345."""
+_PLACES = {"participant": "participant", "study": "study", **REFERRED_BY_RUNS}
+"""What the numbers in names of runs are ids of."""
 
 Ids = dict[str, dict[int, int]]
 """By table the new id of every old one."""

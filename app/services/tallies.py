@@ -1,6 +1,6 @@
 """What is counted from each participant's answers and models, remembered until there are more of them.
 
-Answers and models are only ever added, or erased with the person: how many there are, and the newest of them, tell
+Answers, words about them, and models are only ever added, or erased with the person: how many there are, and the newest of them, tell
 whether what was counted still holds. Judging 20 000 answers takes half a second, finding out who has new ones 15 ms.
 """
 
@@ -8,11 +8,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from threading import Lock
 
-from sqlalchemy import func, select
+from sqlalchemy import Select, func, select
 from sqlalchemy.orm import Session
 
 from app.domain.models import Bundle, Model, ModelKind
-from app.domain.preferences import LEARNED_FROM, LabelEvent, Query, Response
+from app.domain.preferences import LEARNED_FROM, Exclusion, LabelEvent, Query, Response
 from app.services import accuracy, results, watching
 from app.services.accuracy import Predicted
 from app.services.watching import Given
@@ -55,6 +55,7 @@ def _marks(session: Session, participant_ids: Sequence[int]) -> dict[int, Mark]:
     marks: dict[int, Mark] = dict.fromkeys(participant_ids, ())
     for whose, counted in (
         (Query.participant_id, select(Query.participant_id, func.count(), func.max(LabelEvent.id)).join(LabelEvent)),
+        (Query.participant_id, _exclusions()),
         (Model.participant_id, select(Model.participant_id, func.count(), func.max(Model.id))),
         (Bundle.participant_id, select(Bundle.participant_id, func.count(), func.max(Bundle.id))),
     ):
@@ -63,6 +64,11 @@ def _marks(session: Session, participant_ids: Sequence[int]) -> dict[int, Mark]:
         for each in participant_ids:
             marks[each] += rows.get(each, (0, None))
     return marks
+
+
+def _exclusions() -> Select[int, int, int | None]:
+    words = select(Query.participant_id, func.count(), func.max(Exclusion.id))
+    return words.join(LabelEvent, LabelEvent.query_id == Query.id).join(Exclusion)
 
 
 def _count(session: Session, participant_ids: Sequence[int]) -> dict[int, Tally]:
@@ -74,6 +80,7 @@ def _count(session: Session, participant_ids: Sequence[int]) -> dict[int, Tally]
 
 def _tally(given: Sequence[Given], models: Sequence[Model], newest_filter: results.FilterVersion | None) -> Tally:
     labels = [each for each in given if each.answer.purpose in LEARNED_FROM]
+    counting = [each for each in labels if not each.excluded]
     counts = dict.fromkeys(Response, 0)
     for label in labels:
         counts[label.answer.response] += 1
@@ -82,7 +89,7 @@ def _tally(given: Sequence[Given], models: Sequence[Model], newest_filter: resul
         counts=counts,
         curve=accuracy.curve(
             accuracy.hits(
-                Predicted(each.answer.response, each.predicted_right, each.drawn_at_random) for each in labels
+                Predicted(each.answer.response, each.predicted_right, each.drawn_at_random) for each in counting
             )
         ),
         newest_filter=newest_filter,

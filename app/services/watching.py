@@ -18,7 +18,7 @@ from app.domain.clips import Clip, Rollout
 from app.domain.evaluation import Controller, Film
 from app.domain.models import Bundle, Export, Model, ModelKind
 from app.domain.participation import StageRecord
-from app.domain.preferences import LabelEvent, Purpose, Query, Response
+from app.domain.preferences import LabelEvent, Purpose, Query, Response, is_excluded
 from app.domain.protocol import Stage
 from app.domain.studies import Participant, Strategy, Study, StudySettings
 from app.services import advisor, stages
@@ -62,6 +62,8 @@ class Given:
     moment: datetime
     predicted_right: float | None
     drawn_at_random: bool
+    excluded: bool
+    """By an experimenter: it was given, and nothing is concluded from it."""
 
 
 @dataclass(frozen=True)
@@ -100,6 +102,7 @@ def answers_given(session: Session, participant_ids: Sequence[int]) -> dict[int,
             *(left.duration_ms.label("left_ms"), right.duration_ms.label("right_ms")),
             *(LabelEvent.response, LabelEvent.response_time_ms, LabelEvent.created_at, LabelEvent.watched_whole),
             *(LabelEvent.left_watched_ms, LabelEvent.right_watched_ms, LabelEvent.scrub_count),
+            is_excluded().label("excluded"),
         )
         .join(LabelEvent, LabelEvent.query_id == Query.id)
         .join(left, left.id == Query.left_clip_id)
@@ -123,7 +126,9 @@ def answers_given(session: Session, participant_ids: Sequence[int]) -> dict[int,
             seen=seen(row, row.left_ms, row.right_ms),
         )
         drawn_at_random = row.strategy == Strategy.UNIFORM
-        given[row.participant_id].append(Given(answer, row.created_at, row.predicted_right, drawn_at_random))
+        given[row.participant_id].append(
+            Given(answer, row.created_at, row.predicted_right, drawn_at_random, row.excluded)
+        )
     return given
 
 
@@ -142,7 +147,7 @@ def judged(given: Sequence[Given], models: Sequence[Model]) -> Watched:
     gaps = [(later - earlier).total_seconds() for earlier, later in pairwise(moments)]
     working = [gap for gap in gaps if gap <= BREAK_S]
     return Watched(
-        consistency=consistency([each.answer for each in given]),
+        consistency=consistency([each.answer for each in given if not each.excluded]),
         pace_s=median(working) if len(working) >= 3 else None,
         advice=advisor.advice_of(models),
     )

@@ -5,10 +5,10 @@ What the worker keeps for itself (its engine's notes, results of work that was s
 """
 
 import shutil
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
-from sqlalchemy import ColumnElement, Table, delete, select, update
+from sqlalchemy import ColumnElement, Table, delete, func, select, update
 from sqlalchemy.orm import InstrumentedAttribute, Session
 
 from app.db import Base, now
@@ -16,7 +16,7 @@ from app.domain import participation, preferences  # noqa: F401  (their tables b
 from app.domain.clips import Clip, Rollout
 from app.domain.evaluation import Controller, Film
 from app.domain.models import Bundle, Export, Model, Report, Run, RunKind
-from app.domain.studies import Participant, Study
+from app.domain.studies import Participant, Study, StudySettings
 from app.services import audit
 from app.storage import ArtefactStore
 
@@ -38,6 +38,7 @@ KEPT_COLUMNS = frozenset(
     {"id", "study_id", "number", "token_sha256", "seed", "created_at", "is_preview", "withdrawn_at", "erased_at"}
 )
 """Of the tombstone: what makes the code, and what lets the old link end at a page that says what happened."""
+_NOT_EMPTIED = frozenset({"created_at", "deleted_at", "erased_at"})
 
 
 def withdraw(session: Session, store: ArtefactStore, participant: Participant, actor: str) -> None:
@@ -68,18 +69,49 @@ def erase(session: Session, store: ArtefactStore, participant: Participant) -> N
     shutil.rmtree(store.unfinished(participant.id), ignore_errors=True)
 
 
+def erase_study(session: Session, store: ArtefactStore, study: Study) -> None:
+    """Erase everything of a study that is deleted, and everybody in it. Doing it again erases what has come in since.
+
+    Links of participants go on leading to a page that says what happened, so tombstones of them and of the study stay.
+    """
+    rows = dict(_rows_below(Study.__tablename__, study.id))
+    artefacts = set(_artefacts_in(session, rows))
+    people = rows.pop(Base.metadata.tables[Participant.__tablename__])
+    for table, theirs in reversed(list(rows.items())):
+        session.execute(delete(table).where(theirs))
+    nothing = {column.name: None for column in Participant.__table__.columns if column.name not in KEPT_COLUMNS}
+    withdrawn_at = func.coalesce(Participant.withdrawn_at, study.deleted_at)
+    session.execute(update(Participant).where(people).values(nothing | {"withdrawn_at": withdrawn_at}))
+    for column in Study.__table__.columns:
+        if column.nullable and column.name not in _NOT_EMPTIED:
+            setattr(study, column.name, None)
+    study.slug, study.name = f"deleted-{study.id}", ""
+    study.stored_settings = StudySettings(language=study.settings.language).model_dump(mode="json")
+    session.flush()
+    session.expire_all()
+    for sha256 in artefacts - in_use(session, artefacts):
+        store.delete(sha256)
+    for participant_id in session.scalars(select(Participant.id).where(Participant.study_id == study.id)):
+        shutil.rmtree(store.unfinished(participant_id), ignore_errors=True)
+
+
 def personal_rows(participant_id: int) -> Iterator[tuple[Table, ColumnElement[bool]]]:
-    """Every table that holds something about participants, with which rows are this one's; parents first.
+    """Every table that holds something about participants, with which rows are this one's; parents first."""
+    return _rows_below(Participant.__tablename__, participant_id)
+
+
+def _rows_below(root_name: str, root_id: int) -> Iterator[tuple[Table, ColumnElement[bool]]]:
+    """Every table with rows that belong to one row, and which those are; parents first.
 
     Read from the schema, so that a new table belongs to it by its foreign key.
     """
-    people = Base.metadata.tables[Participant.__tablename__]
-    found: dict[Table, ColumnElement[bool]] = {people: people.c.id == participant_id}
+    root = Base.metadata.tables[root_name]
+    found: dict[Table, ColumnElement[bool]] = {root: root.c.id == root_id}
     for table in Base.metadata.sorted_tables:
-        if table is people:
+        if table is root:
             continue
         parents = [key for key in table.foreign_keys if key.column.table in found and key.column.table is not table]
-        direct = [key for key in parents if key.column.table is people]
+        direct = [key for key in parents if key.column.table is root]
         for key in direct or parents[:1]:
             found[table] = key.parent.in_(select(key.column).where(found[key.column.table]))
             yield table, found[table]
@@ -111,15 +143,23 @@ def _erase_made_of_everybody(session: Session, study_id: int) -> None:
 
 def _artefacts(session: Session, participant: Participant) -> Iterator[str]:
     """What rows of this person, and everything that was made of the whole study, refer to."""
-    rows = dict(personal_rows(participant.id))
-    for column in ARTEFACT_COLUMNS:
-        table = column.class_.__table__
-        if table in rows:
-            yield from session.scalars(select(column).where(rows[table], column.is_not(None)))
+    yield from _artefacts_in(session, dict(personal_rows(participant.id)))
     exports = select(Export.artefact_sha256).where(Export.study_id == participant.study_id)
     yield from (sha256 for sha256 in session.scalars(exports) if sha256 is not None)
     for figures in session.scalars(select(Report.figures).where(Report.study_id == participant.study_id)):
         yield from _hashes(figures)
+
+
+def _artefacts_in(session: Session, rows: Mapping[Table, ColumnElement[bool]]) -> Iterator[str]:
+    """What these rows refer to."""
+    for column in ARTEFACT_COLUMNS:
+        table = column.class_.__table__
+        if table in rows:
+            yield from session.scalars(select(column).where(rows[table], column.is_not(None)))
+    reports = Base.metadata.tables[Report.__tablename__]
+    if reports in rows:
+        for figures in session.scalars(select(Report.figures).where(rows[reports])):
+            yield from _hashes(figures)
 
 
 def _hashes(figures: dict[str, Any]) -> set[str]:

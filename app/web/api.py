@@ -134,7 +134,7 @@ def show_account(caller: Caller) -> answers.Account:
 @router.get("/studies", tags=["studies"])
 def list_studies(_caller: Caller, session: ReadingSession) -> list[answers.StudyLine]:
     """Every study, the newest first."""
-    found = session.scalars(select(Study).order_by(Study.id.desc()))
+    found = session.scalars(select(Study).where(Study.deleted_at.is_(None)).order_by(Study.id.desc()))
     return [answers.StudyLine(**_study_line(study)) for study in found]
 
 

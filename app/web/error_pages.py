@@ -29,6 +29,7 @@ _TITLES = {
     HTTPStatus.FORBIDDEN: "That is not allowed",
     HTTPStatus.NOT_FOUND: "Page not found",
     HTTPStatus.CONFLICT: "That is no longer possible",
+    HTTPStatus.GONE: "This study is closed",
     HTTPStatus.TOO_MANY_REQUESTS: "A moment, please",
     HTTPStatus.SERVICE_UNAVAILABLE: "A moment, please",
     HTTPStatus.INTERNAL_SERVER_ERROR: "Something went wrong",
@@ -127,7 +128,8 @@ def _answer(
             context |= languages.switch(request)
             if request.method != "GET":
                 context["here"] = request.app.url_path_for("show_next")
-        context |= {"onward_path": onward if known and status != HTTPStatus.UNAUTHORIZED else None}
+        leads_on = known and status not in (HTTPStatus.UNAUTHORIZED, HTTPStatus.GONE)
+        context |= {"onward_path": onward if leads_on else None}
         answer = page(request, "error.html", context, status)
     answer.headers.update(headers or {})
     return answer

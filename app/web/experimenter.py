@@ -1,5 +1,6 @@
 """The experimenter's pages: studies, one study, one participant. Each is whole without script."""
 
+from collections import Counter
 from collections.abc import AsyncIterator, Mapping
 from http import HTTPStatus
 from typing import Annotated, Any
@@ -10,8 +11,8 @@ from fastapi.sse import EventSourceResponse, ServerSentEvent
 from jinja2 import Environment
 from sqlalchemy.orm import Session
 
-from app.services import audit, dashboard, debrief, enrolment, publishing, studies
-from app.web import charts, live, task_words
+from app.services import audit, dashboard, debrief, enrolment, form_summaries, publishing, studies, study_state
+from app.web import charts, form_words, live, task_words
 from app.web.deps import (
     ActingExperimenter,
     Code,
@@ -24,13 +25,24 @@ from app.web.deps import (
     WritingSession,
     experimenter_asking,
 )
+from app.web.people_table import View, WantedView, people_table
 from app.web.templating import page
 
 router = APIRouter(prefix="/studies")
 
 LIST_PARTS = ("machine", "study_list")
 STUDY_PARTS = ("machine", "jobs", "pool", "participants")
-PARTICIPANT_PARTS = ("machine", "participant_summary", "trust", "accuracy", "weights", "liked", "filters", "runs")
+PARTICIPANT_PARTS = (
+    "machine",
+    "participant_summary",
+    "trust",
+    "accuracy",
+    "participant_forms",
+    "weights",
+    "liked",
+    "filters",
+    "runs",
+)
 
 
 def _may_stream(request: Request, studio: StudioDep) -> None:
@@ -44,20 +56,26 @@ MayStream = Annotated[None, Depends(_may_stream)]
 
 @router.get("", name="show_studies")
 def show_studies(
-    request: Request, experimenter: CurrentExperimenter, session: ReadingSession, studio: StudioDep
+    request: Request,
+    experimenter: CurrentExperimenter,
+    session: ReadingSession,
+    studio: StudioDep,
+    put_away: bool = False,
 ) -> Response:
-    """Every study."""
-    context = _list_context(session, studio) | {"experimenter": experimenter, "parts": LIST_PARTS}
+    """Every study that is at work, or those that are put away."""
+    context = _list_context(session, studio, put_away) | {"experimenter": experimenter, "parts": LIST_PARTS}
     return page(request, "experimenter/studies.html", context)
 
 
 @router.get("/live", name="stream_studies", response_class=EventSourceResponse)
-async def stream_studies(request: Request, studio: StudioDep, _allowed: MayStream) -> AsyncIterator[ServerSentEvent]:
+async def stream_studies(
+    request: Request, studio: StudioDep, _allowed: MayStream, put_away: bool = False
+) -> AsyncIterator[ServerSentEvent]:
     """The list of studies as it changes."""
     templates = request.app.state.templates  # and nothing else of the request: what is drawn is for all who look
 
     def draw(session: Session) -> Mapping[str, str]:
-        return _draw(templates, LIST_PARTS, _list_context(session, studio))
+        return _draw(templates, LIST_PARTS, _list_context(session, studio, put_away))
 
     async for event in live.redrawn_parts(request, studio, draw):
         yield event
@@ -65,22 +83,27 @@ async def stream_studies(request: Request, studio: StudioDep, _allowed: MayStrea
 
 @router.get("/{slug}", name="show_study")
 def show_study(
-    request: Request, slug: Slug, experimenter: CurrentExperimenter, session: ReadingSession, studio: StudioDep
+    request: Request,
+    slug: Slug,
+    view: WantedView,
+    experimenter: CurrentExperimenter,
+    session: ReadingSession,
+    studio: StudioDep,
 ) -> Response:
     """One study: its pool and everybody in it."""
-    context = _study_context(session, studio, slug) | {"experimenter": experimenter, "parts": STUDY_PARTS}
+    context = _study_context(session, studio, slug, view) | {"experimenter": experimenter, "parts": STUDY_PARTS}
     return page(request, "experimenter/study.html", context)
 
 
 @router.get("/{slug}/live", name="stream_study", response_class=EventSourceResponse)
 async def stream_study(
-    request: Request, slug: Slug, studio: StudioDep, _allowed: MayStream
+    request: Request, slug: Slug, view: WantedView, studio: StudioDep, _allowed: MayStream
 ) -> AsyncIterator[ServerSentEvent]:
-    """One study as it changes."""
+    """One study as it changes, in the view that the page was asked for."""
     templates = request.app.state.templates  # and nothing else of the request: what is drawn is for all who look
 
     def draw(session: Session) -> Mapping[str, str]:
-        return _draw(templates, STUDY_PARTS, _study_context(session, studio, slug))
+        return _draw(templates, STUDY_PARTS, _study_context(session, studio, slug, view))
 
     async for event in live.redrawn_parts(request, studio, draw):
         yield event
@@ -143,19 +166,27 @@ def download_bundle(
     return FileResponse(studio.store.path(bundle.artefact_sha256), media_type="application/zip", filename=filename)
 
 
-def _list_context(session: Session, studio: Studio) -> dict[str, Any]:
+def _list_context(session: Session, studio: Studio, put_away: bool) -> dict[str, Any]:
+    lines = dashboard.study_lines(session, put_away=put_away)
+    names = Counter(line.study.name.casefold() for line in lines)
     return {
         "machine": dashboard.machine(session, studio.settings.data_dir),
-        "lines": dashboard.study_lines(session),
+        "lines": lines,
+        "standings": study_state.standings(session, lines),
+        "twice": {line.study.id for line in lines if names[line.study.name.casefold()] > 1},
+        "put_away": put_away,
+        "put_away_count": studies.count_put_away(session),
     }
 
 
-def _study_context(session: Session, studio: Studio, slug: str) -> dict[str, Any]:
+def _study_context(session: Session, studio: Studio, slug: str, view: View) -> dict[str, Any]:
     study = studies.find_study(session, slug)
+    overview = dashboard.study_overview(session, study, studio.tallies)
     return {
         "study": study,
         "settings": study.settings,
-        "overview": dashboard.study_overview(session, study, studio.tallies),
+        "overview": overview,
+        "table": people_table(overview, view),
         "machine": dashboard.machine(session, studio.settings.data_dir),
         "sparkline": charts.sparkline,
     }
@@ -174,6 +205,7 @@ def _participant_context(session: Session, studio: Studio, slug: str, code: str)
         "chart": charts.accuracy_chart(detail.row.curve, study.settings.labels_per_participant),
         "interval": charts.interval,
         "words": task_words.words_of(study.task),
+        "forms": form_words.sheets(study, form_summaries.sheets_of(session, study, participant)),
     }
 
 

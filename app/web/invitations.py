@@ -43,7 +43,7 @@ def add_participants(
     """Add people to the study and lead to their links."""
     study = studies.find_study(session, slug)
     added = [enrolment.add_participant(session, study, experimenter.name) for _ in range(count)]
-    links = [Link(participant.code, _link(request, studio, token)) for participant, token in added]
+    links = [Link(participant.code, link_of(request, studio, token)) for participant, token in added]
     return _see(request, "show_links", slug=slug, key=studio.link_desk.leave(experimenter.id, links))
 
 
@@ -60,7 +60,7 @@ def renew_link(
     study = studies.find_study(session, slug)
     participant = enrolment.find_by_code(session, study, code)
     token = enrolment.renew_link(session, study, participant, experimenter.name)
-    links = [Link(participant.code, _link(request, studio, token))]
+    links = [Link(participant.code, link_of(request, studio, token))]
     return _see(request, "show_links", slug=slug, key=studio.link_desk.leave(experimenter.id, links))
 
 
@@ -190,7 +190,7 @@ def _base(request: Request, studio: Studio) -> str:
     return (studio.settings.public_url or str(request.base_url)).rstrip("/")
 
 
-def _link(request: Request, studio: Studio, token: str) -> str:
+def link_of(request: Request, studio: Studio, token: str) -> str:
     return _base(request, studio) + str(request.app.url_path_for("open_link", token=token))
 
 

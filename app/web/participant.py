@@ -1,6 +1,7 @@
 """The participant's way: the personal link, the page one should be on, instructions."""
 
 from datetime import timedelta
+from http import HTTPStatus
 from typing import Annotated
 
 from fastapi import APIRouter, Request
@@ -9,6 +10,7 @@ from fastapi.responses import Response
 from app.domain.protocol import Stage
 from app.domain.studies import Participant
 from app.services import browser_sessions, enrolment, querying, stages
+from app.services.retirement import StudyDeleted, StudyPutAway
 from app.web import languages, participant_pairs
 from app.web.deps import (
     PARTICIPANT_COOKIE,
@@ -32,6 +34,8 @@ def show_next(
 ) -> Response:
     """Where this person should be: the pair to compare now, or on to the page of their stage."""
     querying.seen(participant)
+    if participant.study.put_away_at is not None:
+        return _closed(request, participant)
     stage = stages.current_stage(session, participant)
     for_script = wants_json(request) and stages.reached(session, participant, Stage.PAIRS)
     if stage in (Stage.PRACTICE, Stage.PAIRS) or for_script:
@@ -54,11 +58,20 @@ def finish_instructions(request: Request, participant: AtInstructions, session: 
     return go(request, "show_next")
 
 
+def _closed(request: Request, participant: Participant) -> Response:
+    """In a study that is put away: why it does not go on, and the way to withdraw."""
+    if wants_json(request):
+        raise StudyPutAway
+    return participant_page(request, "participant/closed.html", participant, {}, HTTPStatus.GONE)
+
+
 # The last one: every other address below /p/ goes before a token.
 @router.get("/{token}", name="open_link")
 def open_link(request: Request, token: Token, session: WritingSession, studio: StudioDep) -> Response:
     """Exchange the personal link for a cookie and leave its address, so that the token stays in no history."""
     participant = enrolment.find_by_token(session, token)
+    if participant.study.deleted_at is not None:
+        raise StudyDeleted
     if participant.withdrawn_at is not None:
         return go(request, "show_withdrawn")
     lifetime = timedelta(days=studio.settings.session_days)

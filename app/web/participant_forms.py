@@ -113,16 +113,16 @@ def _field(wording: Wording, item: FormItem, values: Mapping[str, str], problem:
     return Field(
         name=item.name,
         kind=item.kind,
-        question=_question(wording, item),
+        question=question_of(wording, item),
         choices=[(choice, _choice(wording, item, place)) for place, choice in enumerate(item.choices, 1)],
-        low_label=_label(wording, item, "low", item.low_label),
-        high_label=_label(wording, item, "high", item.high_label),
+        low_label=label_of(wording, item, "low", item.low_label),
+        high_label=label_of(wording, item, "high", item.high_label),
         value=values.get(item.name, ""),
         problem=wording(problem, count=MOST_CHARACTERS) if problem else None,
     )
 
 
-def _question(wording: Wording, item: FormItem) -> str:
+def question_of(wording: Wording, item: FormItem) -> str:
     """The study's wording in this language, else its own question, else the built-in one, else the plain name."""
     key = f"form-{item.name}"
     if item.question and not wording.is_own(key):
@@ -135,7 +135,8 @@ def _choice(wording: Wording, item: FormItem, place: int) -> str:
     return wording(key) if wording.is_own(key) else item.choices[place - 1]
 
 
-def _label(wording: Wording, item: FormItem, end: str, own: str) -> str:
+def label_of(wording: Wording, item: FormItem, end: str, own: str) -> str:
+    """What one end of a scale means: as question_of."""
     key = f"form-{item.name}-{end}"
     if own and not wording.is_own(key):
         return own

@@ -64,8 +64,8 @@ def go(request: Request, name: str) -> RedirectResponse:
 def has_reached(stage: Stage) -> Any:
     """A dependency that gives the participant, if they are in this stage or through with it; else leads them back."""
 
-    def check(participant: CurrentParticipant, session: WritingSession) -> Participant:
-        if not stages.reached(session, participant, stage):
+    def check(request: Request, participant: CurrentParticipant, session: WritingSession) -> Participant:
+        if _closed(request, participant) or not stages.reached(session, participant, stage):
             raise NotYet
         return participant
 
@@ -75,12 +75,17 @@ def has_reached(stage: Stage) -> Any:
 def is_in(stage: Stage) -> Any:
     """A dependency that gives the participant, if this is the stage they are in; else leads them to where they are."""
 
-    def check(participant: CurrentParticipant, session: WritingSession) -> Participant:
-        if stages.current_stage(session, participant) != stage:
+    def check(request: Request, participant: CurrentParticipant, session: WritingSession) -> Participant:
+        if _closed(request, participant) or stages.current_stage(session, participant) != stage:
             raise NotYet
         return participant
 
     return Depends(check, scope="function")
+
+
+def _closed(request: Request, participant: Participant) -> bool:
+    """In a study that is put away no page is shown; what somebody sends from an open one is still kept."""
+    return participant.study.put_away_at is not None and request.method == "GET"
 
 
 def back_from(request: Request, settings: StudySettings, stage: Stage) -> str | None:

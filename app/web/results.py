@@ -12,11 +12,13 @@ from app.domain.people import Experimenter, Role
 from app.domain.studies import Study
 from app.errors import AppError
 from app.services import (
+    answers,
     audit,
     evaluating,
     export_requests,
     export_tables,
     exporting,
+    form_summaries,
     locking,
     planning,
     reports,
@@ -26,7 +28,7 @@ from app.services import (
     unblinding,
 )
 from app.services.export_requests import ExportKind
-from app.web import task_words
+from app.web import form_words, task_words
 from app.web.deps import (
     ActingExperimenter,
     CurrentExperimenter,
@@ -109,6 +111,8 @@ def results_context(session: Session, study: Study) -> dict[str, Any]:
         "statistic": _statistic,
         "tests": planning.TEST_NAMES,
         "plan": planning.plan_of(session, study),
+        "forms": form_words.summaries(study, form_summaries.summaries_of(session, study)),
+        "excluded": answers.count_excluded(session, study),
         "figures": {name: FIGURES[name] for name in FIGURES if report is not None and name in report.figures},
     }
 

@@ -76,6 +76,14 @@ class StudyForm(BaseModel):
     planned_tests: _Several = []
     reason: _Lines = ""
     """Why a locked study is changed."""
+    preset: _Text = ""
+    """Where the form has started from."""
+    switch_to: _Text = ""
+    """The preset to start from instead; what was typed stays."""
+    like: _Text = ""
+    """The short name of the study that is duplicated."""
+    same_name: _Text = ""
+    """Whether another study may have this name."""
 
 
 TypedStudy = Annotated[StudyForm, Form()]
@@ -156,6 +164,23 @@ class Typed:
 def form_with_defaults(preset: Preset = Preset.LEARNING) -> StudyForm:
     """The form as it is first shown; the length of clips is left to the task."""
     return form_of("", TaskName.FEEDING, None, PRESETS[preset]).model_copy(update={"clip_steps": ""})
+
+
+def with_preset(form: StudyForm, preset: Preset) -> StudyForm:
+    """The form started from another preset: what is as the earlier preset has it changes, what was typed stays."""
+    known = {each.value: each for each in Preset}
+    before = form_with_defaults(known.get(form.preset, Preset.LEARNING))
+    untouched = {name for name in StudyForm.model_fields if _plain(form, name) == _plain(before, name)}
+    fresh = form_with_defaults(preset).model_dump(include=untouched)
+    return form.model_copy(update=fresh | {"preset": preset.value, "switch_to": ""})
+
+
+def _plain(form: StudyForm, name: str) -> object:
+    """What a field says, whichever way a browser sends it: switches that are off are not sent at all."""
+    value = getattr(form, name)
+    if name in (*_SWITCHES, "evaluation"):
+        return value == "yes"
+    return value.replace("\r\n", "\n").strip() if isinstance(value, str) else value
 
 
 def form_of(name: str, task: str, seed: int | None, settings: StudySettings) -> StudyForm:

@@ -5,7 +5,7 @@ from datetime import timedelta
 from http import HTTPStatus
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Form, Request
+from fastapi import APIRouter, Form, Query, Request
 from fastapi.responses import RedirectResponse, Response
 from sqlalchemy.orm import Session
 
@@ -36,23 +36,38 @@ _Reason = Annotated[str, Form(max_length=2000)]
 
 
 @router.get("/new", name="show_new_study")
-def show_new_study(request: Request, experimenter: CurrentExperimenter, preset: Preset = Preset.LEARNING) -> Response:
-    """The form, filled in with what usually works or with the paper's protocol."""
-    return _form_page(request, experimenter, study_form.form_with_defaults(preset), preset=preset)
+def show_new_study(
+    request: Request,
+    experimenter: CurrentExperimenter,
+    session: ReadingSession,
+    preset: Preset = Preset.LEARNING,
+    like: Annotated[str, Query(max_length=80)] = "",
+) -> Response:
+    """The form, filled in with what usually works, with the paper's protocol, or with another study's settings."""
+    if like:
+        return _form_page(request, experimenter, _form_like(studies.find_study(session, like)))
+    form = study_form.form_with_defaults(preset).model_copy(update={"preset": preset.value})
+    return _form_page(request, experimenter, form)
 
 
 @router.post("/new", name="create_study")
 def create_study(
     request: Request, form: TypedStudy, experimenter: ActingExperimenter, session: WritingSession
 ) -> Response:
-    """Open the study, or show the form again with what is wrong with it."""
+    """Open the study, or show the form again: with what is wrong with it, or started from another preset."""
+    if form.switch_to in set(Preset):
+        return _form_page(request, experimenter, study_form.with_preset(form, Preset(form.switch_to)))
+    source = studies.find_study(session, form.like) if form.like else None
     try:
         typed = study_form.typed_study(form)
+        _check_name(session, form, typed.name)
     except FormInvalid as invalid:
         return _form_page(request, experimenter, form, errors=invalid.errors)
     study = studies.create_study(
         session, typed.name, typed.settings, seed=typed.seed, actor=experimenter.name, task=typed.task
     )
+    if source is not None:
+        studies.copy_material(session, source, study)
     return _see(request, "show_study", slug=study.slug)
 
 
@@ -85,6 +100,7 @@ def change_settings(
     form = _with_fixed(session, study, form)
     try:
         typed = study_form.typed_study(form)
+        _check_name(session, form, typed.name, study)
         locking.change(
             session,
             studio.store,
@@ -175,6 +191,20 @@ def _form_of(study: Study) -> StudyForm:
     return study_form.form_of(study.name, study.task, study.seed, study.settings)
 
 
+def _form_like(source: Study) -> StudyForm:
+    """Everything but what belongs to one study alone: its name, its seed, its people."""
+    name = f"{source.name}, copy"[: study_form.NAME_LENGTH]
+    form = study_form.form_of(name, source.task, None, source.settings)
+    return form.model_copy(update={"like": source.slug})
+
+
+def _check_name(session: Session, form: StudyForm, name: str, study: Study | None = None) -> None:
+    """Two studies of one name are told apart by their addresses only. Raises FormInvalid until that is meant."""
+    unchanged = study is not None and study.name == name
+    if not unchanged and form.same_name != "yes" and studies.others_named(session, name, study):
+        raise FormInvalid({"name": "Another study has this name. Change it, or say below that it is meant."})
+
+
 def _with_fixed(session: Session, study: Study, form: StudyForm) -> StudyForm:
     """What cannot be changed any more is not sent by the page, and not taken from anybody."""
     return form.model_copy(update=_stored(study, locking.fixed_settings(session, study)))
@@ -196,7 +226,6 @@ def _form_page(
     form: StudyForm,
     *,
     errors: Mapping[str, str] | None = None,
-    preset: Preset | None = None,
     study: Study | None = None,
     session: Session | None = None,
 ) -> Response:
@@ -207,7 +236,6 @@ def _form_page(
         "errors": errors or {},
         "first_wrong": next((each for each in StudyForm.model_fields if each in (errors or {})), None),
         "tasks": [(name, task_words.words_of(name)) for name in TaskName],
-        "preset": preset,
         "presets": list(Preset),
         "study": study,
         "fixed": {each: fixed[_setting(each)] for each in StudyForm.model_fields if _setting(each) in fixed},

@@ -1,7 +1,7 @@
 """Pages from templates: one Jinja environment, strict about what is missing, and the words for numbers and times."""
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from datetime import datetime
 from functools import cache
 from math import floor, log10
@@ -103,6 +103,11 @@ def in_words(name: str) -> str:
     return name.replace("_", " ")
 
 
+def named(values: Iterable[str], names: Mapping[str, str] | None = None) -> list[tuple[str, str]]:
+    """Values with what people call them, as the options of a select need them."""
+    return [(str(value), (names or {}).get(str(value), str(value))) for value in values]
+
+
 def task_title(task: str) -> str:
     """What people call a task."""
     return words_of(task).title
@@ -139,7 +144,7 @@ def make_environment(path_for: Callable[..., URLPath]) -> Environment:
         lstrip_blocks=True,
     )
     numbers = (percent, signed_points, quantity, signed)
-    words = (ago, time_left, moment, seconds, bytes_in_words, in_words, task_title)
+    words = (ago, time_left, moment, seconds, bytes_in_words, in_words, named, task_title)
     environment.filters.update({word.__name__: word for word in (*numbers, *words)})
     environment.globals["path_for"] = path_for
     for word in (say, page_language, study_question, imports_of, missing_facts, missing_translations):

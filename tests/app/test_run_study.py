@@ -41,7 +41,9 @@ def test_what_is_typed_is_what_is_stored(experimenter: TestClient, database: Dat
 
 
 def test_two_studies_of_one_name_have_two_addresses(experimenter: TestClient) -> None:
-    answers = [experimenter.post("/studies/new", data=typed(experimenter, name="New")) for _ in range(2)]
+    answers = [
+        experimenter.post("/studies/new", data=typed(experimenter, name="New", same_name="yes")) for _ in range(2)
+    ]
     assert [answer.headers["location"] for answer in answers] == ["/studies/new-2", "/studies/new-3"]
 
 

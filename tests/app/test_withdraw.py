@@ -14,7 +14,7 @@ from app.domain.evaluation import Assignment, Controller, Film, Rating, Trial
 from app.domain.models import Export, Model, ModelKind, Report, RunKind
 from app.domain.participation import ConsentRecord, FormAnswer, ParticipantEvent, StageRecord
 from app.domain.people import AuditEvent
-from app.domain.preferences import LabelEvent
+from app.domain.preferences import Exclusion, LabelEvent
 from app.domain.studies import Participant, Study
 from app.services import withdrawal
 from app.settings import Settings
@@ -38,7 +38,8 @@ def leave_traces(database: Database, store: ArtefactStore, participant_id: int) 
         person.panel_id, person.panel_parameters = marked("panel"), {"SESSION_ID": marked("session")}
         left, right = (factories.make_clip(session, store, study) for _ in range(2))
         query = factories.make_query(session, person, left, right)
-        factories.make_label(session, query, reason=marked("reason"))
+        label = factories.make_label(session, query, reason=marked("reason"))
+        session.add(Exclusion(label_event_id=label.id, excluded=True, reason=marked("exclusion"), actor="pat"))
         factories.make_run(session, study, person, error=marked("error"), stage=marked("stage"))
         model = factories.make_model(session, study, person, ModelKind.FILTER, {"notes": [marked("metrics")]})
         model.artefact_sha256 = store.put(marked("model").encode())

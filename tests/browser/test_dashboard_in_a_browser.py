@@ -1,5 +1,6 @@
 """The experimenter's pages in a real browser: they update themselves, and everybody can use them."""
 
+import re
 from collections.abc import Iterator
 
 import pytest
@@ -125,6 +126,11 @@ def test_no_page_shuts_anybody_out(page: Page, scheme: str) -> None:
         "/studies/pilot/lock",
         "/studies/pilot/joining",
         "/studies/pilot/unblind",
+        "/studies/pilot/answers",
+        "/studies/pilot/answers/1",
+        "/studies/pilot/results",
+        "/studies/pilot/away",
+        "/help",
         "/studies/pilot/participants/P01",
         "/studies/pilot/participants/P01/erase",
         "/studies/pilot/participants/P01/operate",
@@ -152,3 +158,65 @@ def test_a_task_is_chosen_with_the_keyboard_alone(page: Page) -> None:
     page.keyboard.press("Enter")
     expect(page.get_by_role("heading", name="Itches")).to_be_visible()
     expect(page.locator(".page-sub")).to_contain_text("Itch scratching")
+
+
+def test_ticks_survive_an_update_and_new_links_ask_first(page: Page, study: Study, database: Database) -> None:
+    page.goto("/studies/pilot")
+    expect(page.locator("[data-live-state]")).to_have_text("live")
+    page.get_by_label("Tick P01").check()
+    with database.writing() as session:
+        factories.make_participant(session, study)
+    expect(page.get_by_role("link", name="P02")).to_be_visible()
+    expect(page.get_by_label("Tick P01")).to_be_checked()
+    asked: list[str] = []
+    page.once("dialog", lambda dialog: (asked.append(dialog.message), dialog.dismiss()))
+    page.get_by_role("button", name="New links and sheet").click()
+    assert "stop working at once" in asked[0]
+    page.once("dialog", lambda dialog: dialog.accept())
+    page.get_by_role("button", name="New links and sheet").click()
+    expect(page.get_by_role("heading", name="Personal links")).to_be_visible()
+
+
+def test_an_answer_is_played_on_one_clock_and_excluded(page: Page) -> None:
+    page.goto("/studies/pilot/answers")
+    page.get_by_role("link", name="P01, pair 3").click()
+    player = page.get_by_role("button", name="Pause")
+    expect(player).to_be_visible()
+    player.click()
+    page.get_by_label("Position").focus()
+    page.keyboard.press("Home")
+    page.get_by_role("button", name="One frame forward").click()
+    times = "[...document.querySelectorAll('video')].map((each) => each.currentTime)"
+    page.wait_for_function(f"(() => {{ const [one, other] = {times}; return one > 0 && one === other; }})()")
+    page.get_by_label("Reason").fill("Was on the phone.")
+    page.get_by_role("button", name="Exclude").click()
+    expect(page.get_by_role("heading", name="Excluded")).to_be_visible()
+    page.get_by_role("button", name="Take this answer in again").click()
+    expect(page.get_by_role("heading", name="Exclude this answer")).to_be_visible()
+
+
+def test_without_script_answers_are_excluded_and_words_explained(page: Page, chromium: Browser) -> None:
+    context = chromium.new_context(storage_state=page.context.storage_state(), java_script_enabled=False)
+    plain = context.new_page()
+    plain.goto(page.url + "/pilot/answers?participant=P01")
+    meaning = plain.get_by_text("before they answered")
+    expect(meaning).to_be_hidden()
+    plain.get_by_role("button", name=re.compile("prediction. means")).click()
+    expect(meaning).to_be_visible()
+    plain.keyboard.press("Escape")
+    plain.get_by_role("link", name="P01, pair 3").click()
+    plain.get_by_label("Reason").fill("Was on the phone.")
+    plain.get_by_role("button", name="Exclude").click()
+    expect(plain.get_by_role("heading", name="Excluded")).to_be_visible()
+    context.close()
+
+
+def test_a_preset_is_chosen_by_its_button_only_and_keeps_what_was_typed(page: Page) -> None:
+    page.goto("/studies/new")
+    page.get_by_label("Name of the study").fill("Mine")
+    page.get_by_role("button", name="Paper protocol").click()
+    expect(page.get_by_role("button", name="Paper protocol")).to_have_attribute("aria-pressed", "true")
+    expect(page.get_by_label("Name of the study")).to_have_value("Mine")
+    page.get_by_label("Name of the study").press("Enter")
+    expect(page.get_by_role("heading", name="Mine")).to_be_visible()
+    expect(page.get_by_text("3 methods, 3 trials each")).to_be_visible()

@@ -4,10 +4,11 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from sqlalchemy import select
 
 from app.db import Database
 from app.domain.clips import Clip
-from app.domain.preferences import LabelEvent, Query, Response
+from app.domain.preferences import Exclusion, LabelEvent, Query, Response
 from app.domain.studies import Participant
 from app.storage import ArtefactStore
 from tests.worker.conftest import STEPS, make_trajectory
@@ -69,6 +70,24 @@ def test_an_undone_answer_does_not_count(
         session.add(LabelEvent(query_id=undone.id, revision=3, response=Response.RIGHT, client_uuid="again"))
     with database.reading() as session:
         assert dataset.load_preferences(session, store, participant.id).targets.tolist() == [0.0, 1.0]
+
+
+def test_an_excluded_answer_is_not_learned_from_and_was_still_given(
+    database: Database, store: ArtefactStore, participant: Participant, add_clips: AddClips, answer: Answer
+) -> None:
+    first, second, third, _ = add_clips(7)
+    answer(first, second, Response.LEFT)
+    excluded = answer(first, third, Response.RIGHT)
+    with database.reading() as session:
+        before = dataset.load_preferences(session, store, participant.id)
+    with database.writing() as session:
+        event = session.scalars(select(LabelEvent).where(LabelEvent.query_id == excluded.id)).one()
+        session.add(Exclusion(label_event_id=event.id, excluded=True, reason="phone", actor="x"))
+    with database.reading() as session:
+        after = dataset.load_preferences(session, store, participant.id)
+    assert (before.targets.tolist(), after.targets.tolist()) == ([0.0, 1.0], [0.0])
+    assert after.label_count == 2
+    assert after.label_hash != before.label_hash
 
 
 def test_the_fingerprint_depends_on_what_was_shown_and_said_and_on_nothing_else(

@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 from dbos import DBOS, SetWorkflowID
 
-from app.db import Database
+from app.db import Database, now
 from app.domain.models import ModelKind, RunKind
-from app.domain.studies import Participant
-from app.services import withdrawal
+from app.domain.studies import Participant, Study
+from app.services import retirement, withdrawal
 from app.settings import Settings
 from app.storage import ArtefactStore
 from tests.worker.conftest import the_workshop
@@ -177,6 +177,46 @@ def test_what_the_worker_keeps_of_others_stays(
     assert until(lambda: erase(workshop, settings, participant.id))
     assert [each.workflow_id for each in DBOS.list_workflows()] == ["filter/of-another#1"]
     assert len(traces(settings.data_dir)) == 3, "the other's draft, model, and row"
+
+
+def test_of_a_deleted_study_neither_drafts_nor_late_results_nor_notes_are_left_and_others_keep_theirs(
+    workshop: Workshop, work: Work, job: Job, participant: Participant, settings: Settings
+) -> None:
+    place, file = workshop.place, engine.file_of(settings)
+    start(workshop, job)
+    assert work.waits.wait(PATIENCE_S)
+    with place.database.writing() as session:
+        study = session.get_one(Study, participant.study_id)
+        retirement.delete(session, place.store, study, study.slug, "x")
+        other = Study(slug="other", name="Other", stored_settings=study.stored_settings, seed=4)
+        session.add(other)
+
+    def erase_study() -> bool:
+        shop = workshop
+        return erasure.erase_traces_of_study(place, 1, shop.in_hand, shop.stored, file).finished
+
+    with place.database.reading() as session:
+        assert (erasure.unfinished_studies(session), erasure.unfinished(session)) == ([1], [])
+    assert not erase_study(), "it is still being worked on"
+    work.may_go_on.set()
+    assert until(erase_study)
+    assert traces(settings.data_dir) == []
+    assert DBOS.list_workflows() == []
+    with place.database.reading() as session:
+        assert erasure.unfinished_studies(session) == []
+        assert session.get_one(Participant, participant.id).erased_at is not None
+        assert session.get_one(Study, other.id).name == "Other"
+
+
+def test_work_for_a_deleted_study_does_nothing(
+    workshop: Workshop, work: Work, participant: Participant, settings: Settings
+) -> None:
+    place = workshop.place
+    with place.database.writing() as session:
+        session.get_one(Study, participant.study_id).deleted_at = now()
+    start(workshop, Job("filter/of-the-study", RunKind.FILTER, participant.study_id))
+    assert until(lambda: [each.status for each in DBOS.list_workflows()] == ["SUCCESS"])
+    assert not work.waits.is_set()
 
 
 def test_nothing_is_due_for_somebody_who_has_withdrawn(

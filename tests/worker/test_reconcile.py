@@ -4,11 +4,12 @@ from collections.abc import Callable
 from datetime import timedelta
 
 import pytest
+from sqlalchemy import select
 
 from app.db import Database, now
 from app.domain.clips import Clip
 from app.domain.models import Run, RunKind, RunStatus
-from app.domain.preferences import LabelEvent, Query, Response
+from app.domain.preferences import Exclusion, LabelEvent, Query, Response
 from app.domain.studies import Participant, Study, StudySettings
 from worker import outdated, reconcile, records
 
@@ -168,3 +169,48 @@ def test_pool_scenarios_never_meet_the_ones_filters_are_evaluated_on() -> None:
     from worker.ml.filter_problem import SCENARIO_BLOCKS
 
     assert max(SCENARIO_BLOCKS.values()) + 1_000_000 <= reconcile.scenario_seed(0, 0)
+
+
+def exclude(database: Database, query: Query, *, excluded: bool = True) -> None:
+    with database.writing() as session:
+        event = session.scalars(select(LabelEvent).where(LabelEvent.query_id == query.id)).one()
+        session.add(Exclusion(label_event_id=event.id, excluded=excluded, reason="phone", actor="x"))
+
+
+def test_an_excluded_answer_makes_the_models_stale_and_so_does_taking_it_in_again(
+    database: Database, labels: Callable[[int], list[Query]], found: Callable[[], dict[str, int]]
+) -> None:
+    given = labels(11)
+    succeed(database, "reward/participant-1/labels-10")
+    succeed(database, "filter/participant-1/labels-10")
+    assert found() == {}
+    exclude(database, given[3])
+    assert found() == {"reward/participant-1/labels-10/exclusion-1": 1}
+    succeed(database, "reward/participant-1/labels-10/exclusion-1")
+    assert found() == {"filter/participant-1/labels-10/exclusion-1": 1}
+    exclude(database, given[3], excluded=False)
+    assert found() == {"reward/participant-1/labels-10/exclusion-2": 1}
+
+
+def test_an_excluded_last_answer_leaves_nobody_short_of_labels(
+    database: Database, labels: Callable[[int], list[Query]], found: Callable[[], dict[str, int]]
+) -> None:
+    given = labels(20)
+    exclude(database, given[-1])
+    assert found() == {"reward/participant-1/labels-20/answer-20-exclusion-1": 1}
+
+
+def test_nothing_is_done_for_a_study_that_is_put_away_or_deleted(
+    database: Database, study: Study, labels: Callable[[int], list[Query]], found: Callable[[], dict[str, int]]
+) -> None:
+    labels(10)
+    for column in ("put_away_at", "deleted_at"):
+        with database.writing() as session:
+            setattr(session.get_one(Study, study.id), column, now())
+        assert found() == {}
+        with database.reading() as session:
+            assert reconcile.short_of_queries(session) == []
+            assert reconcile.studies_with_answers(session) == []
+        with database.writing() as session:
+            setattr(session.get_one(Study, study.id), column, None)
+    assert found() == {"reward/participant-1/labels-10": 1}
