@@ -157,7 +157,7 @@ def answers_of(labels: Sequence[Label]) -> list[Answer]:
     ]
 
 
-def seen(event: LabelEvent | Row[Any], left_ms: int, right_ms: int) -> float | None:
+def seen(event: LabelEvent | Row[*tuple[Any, ...]], left_ms: int, right_ms: int) -> float | None:
     """The share that was played of the clip of which less was, at whatever speed; of an event, or its columns.
 
     Unknown when somebody moved through the clips by hand. Of answers from before this was recorded, what the time

@@ -14,7 +14,7 @@ from app.errors import AppError, in_words
 from app.settings import Settings
 from app.storage import ArtefactStore, keep_private
 from worker import __main__ as worker
-from worker import service
+from worker import engine
 
 APP = [["migrate"], ["reset-password"], ["link"], ["demo"], ["import-study", "study.zip"], ["up"]]
 
@@ -132,7 +132,7 @@ class TestFiles:
 
     def test_the_worker_keeps_its_engine_for_itself(self, tmp_path: Path) -> None:
         settings = Settings(_env_file=None, data_dir=tmp_path)
-        path = service.engine_file(settings)
+        path = engine.file_of(settings)
         assert path is not None
         path.touch(0o644)
         keep_private(settings)

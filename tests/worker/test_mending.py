@@ -124,8 +124,8 @@ def test_another_recording_takes_its_place_only_where_nobody_has_answered(
     assert not place.store.has(before)
     simulate = laboratory.record_clip
 
-    def differently(name: str, scenario: int, *shot: Any) -> laboratory.RecordedClip:
-        return simulate(name, scenario + 1, *shot)
+    def differently(name: str, quality: str, scenario: int, *shot: Any) -> laboratory.RecordedClip:
+        return simulate(name, quality, scenario + 1, *shot)
 
     monkeypatch.setattr(laboratory, "record_clip", differently)
     (job,) = to_mend(place)
