@@ -54,9 +54,9 @@ def test_the_open_address_lets_people_in_until_it_is_closed(
     experimenter.post("/studies/pilot/joining/open")
     page = experimenter.get("/studies/pilot/joining").text
     (address,) = re.findall(r'value="(http://testserver/join/[\w-]+)\?PID=', page)
-    assert new_browser().get(f"{address}?PID=abc").headers["location"] == "/p/next"
+    assert new_browser().post(f"{address}?PID=abc").headers["location"] == "/p/next"
     experimenter.post("/studies/pilot/joining/close")
-    assert new_browser().get(f"{address}?PID=def").status_code == 404
+    assert new_browser().post(f"{address}?PID=def").status_code == 404
 
 
 class TestErasingOnRequest:
