@@ -43,33 +43,25 @@ def due(session: Session, study: Study, lost: Mapping[str, int]) -> list[Job]:
     """What is to be made again. ``lost``: as ArtefactStore.lost() gives it."""
     if study.material is not None or not lost:
         return []  # videos of other robots come from outside
-    hashes = list(lost)
-    rollouts = (
-        select(Rollout)
-        .outerjoin(Clip, Clip.rollout_id == Rollout.id)
-        .where(Rollout.study_id == study.id)
-        .where(or_(*(each.in_(hashes) for each in (Rollout.trajectory_sha256, Clip.video_sha256, Clip.poster_sha256))))
-        .distinct()
-    )
-    films = select(Film).join(Participant, Participant.id == Film.participant_id)
+    recorded, filmed = Rollout.trajectory_sha256, (Clip.video_sha256, Clip.poster_sha256)
+    pool = select(Rollout.id, recorded, *filmed).outerjoin(Clip, Clip.rollout_id == Rollout.id)
+    pool = pool.where(Rollout.study_id == study.id, or_(*(each.in_(lost) for each in (recorded, *filmed))))
+    rendered = (Film.video_sha256, Film.poster_sha256)
+    films = select(Film.id, Film.participant_id, *rendered).join(Participant, Participant.id == Film.participant_id)
     films = films.where(Participant.study_id == study.id, Participant.withdrawn_at.is_(None))
-    films = films.where(or_(Film.video_sha256.in_(hashes), Film.poster_sha256.in_(hashes)))
-    when = max(lost.values())  # the same file may be lost twice, and work of one name is done once
-    return [
-        *(
-            Job(f"clips/study-{study.id}/{AGAIN}-{rollout.id}-{when}", RunKind.CLIPS, study.id)
-            for rollout in session.scalars(rollouts)
-        ),
-        *(
-            Job(
-                f"films/participant-{film.participant_id}/{AGAIN}-{film.id}-{when}",
-                RunKind.FILMS,
-                study.id,
-                film.participant_id,
-            )
-            for film in session.scalars(films)
-        ),
+    films = films.where(or_(*(each.in_(lost) for each in rendered)))
+    stamps: dict[int, int] = {}  # the same file may be lost twice, and work of one name is done once
+    for rollout, *hashes in session.execute(pool):
+        stamps[rollout] = max(stamps.get(rollout, 0), *(lost.get(sha256, 0) for sha256 in hashes))
+    jobs = [
+        Job(f"clips/study-{study.id}/{AGAIN}-{rollout}-{stamp}", RunKind.CLIPS, study.id)
+        for rollout, stamp in stamps.items()
     ]
+    for film, person, *hashes in session.execute(films):
+        stamp = max(lost.get(sha256, 0) for sha256 in hashes)
+        name = f"films/participant-{person}/{AGAIN}-{film}-{stamp}"
+        jobs.append(Job(name, RunKind.FILMS, study.id, person))
+    return jobs
 
 
 def is_about(job: Job) -> bool:

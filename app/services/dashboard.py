@@ -372,6 +372,10 @@ def _jobs(session: Session, study: Study) -> Sequence[Job]:
 
 def _work_of(run: Run | _Glance) -> str:
     """What a later run of the same work makes good: of films and methods each has its own, and so has every export."""
+    if (
+        "/again-" in run.workflow_id
+    ):  # lost files made again, see worker.mending; the last number says when they were lost
+        return run.workflow_id.rpartition("-")[0]
     if run.kind in (RunKind.METHOD, RunKind.FILMS):
         return run.workflow_id.rpartition("/")[0]
     return run.workflow_id if run.kind == RunKind.EXPORT else run.kind

@@ -26,8 +26,8 @@ router = APIRouter()
 
 LONGEST_SEAL_KEY = 100
 LARGEST_ARCHIVE_BYTES = 16 * 1024**3
-ROOM_LEFT_BYTES = 2 * 1024**3
-"""What an upload must leave free on the disk of temporary files."""
+MOST_OF_THE_DISK = 0.9
+"""Of what is free where temporary files lie, the share that an upload may take."""
 PATIENCE_S = 60.0
 """An upload of which nothing arrives for so long was given up."""
 
@@ -108,7 +108,7 @@ def _require_room(request: Request) -> None:
     announced = request.headers.get("content-length", "")
     if not announced.isdecimal():
         raise SizeUnknown
-    if int(announced) > shutil.disk_usage(tempfile.gettempdir()).free - ROOM_LEFT_BYTES:
+    if int(announced) > MOST_OF_THE_DISK * shutil.disk_usage(tempfile.gettempdir()).free:
         raise NoRoomForUpload
 
 

@@ -83,7 +83,7 @@ def test_nothing_is_read_from_another_site(address: str, experimenter_cookie: st
 def test_nothing_is_read_that_has_no_room(
     address: str, experimenter_cookie: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(importing, "ROOM_LEFT_BYTES", 10**15)
+    monkeypatch.setattr(importing, "MOST_OF_THE_DISK", 0.0)
     with announced(address, experimenter_cookie) as connection:
         assert status_of(connection) == 413
         assert "Free some space" in rest_of(connection)
