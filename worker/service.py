@@ -120,7 +120,8 @@ class _Rounds:
     def _sign(self) -> None:
         if time.monotonic() - self._signed_at >= PRESENCE_S:
             moment = now()
-            self._bond.promise(moment)
+            if not self._bond.promise(moment):
+                return
             with self._place.database.writing() as session:
                 records.sign_presence(session, self._worker_name, moment)
             self._bond.signed(moment)

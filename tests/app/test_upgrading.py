@@ -250,7 +250,8 @@ def test_without_space_for_a_copy_nothing_is_upgraded(
 
 
 def test_the_copy_holds_what_was_committed_while_others_write(settings: Settings, path: Path) -> None:
-    stop, written = threading.Event(), []
+    stop = threading.Event()
+    written: list[None] = []
 
     def write() -> None:
         database = Database(settings.sqlalchemy_url)
