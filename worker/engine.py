@@ -129,7 +129,8 @@ def resume(name: str) -> bool:
     if _is_over(known):
         DBOS.delete_workflow(name)
         return False
-    DBOS.resume_workflow(name)
+    if known.status == "PENDING":  # whatever waits in a queue is going to be done
+        DBOS.resume_workflow(name)
     return True
 
 

@@ -94,6 +94,7 @@ class _Rounds:
         self._workshop = workshop
         self._place = workshop.place
         self._started: dict[str, float] = {}  # what the engine has been told already, and when it was last asked
+        self._born_at = time.monotonic()
         self._signed_at = -math.inf
         self._cleared_at = -math.inf
         self._rested_at = -math.inf
@@ -186,7 +187,13 @@ class _Rounds:
             self._go_on(job, name)
 
     def _take_over(self, job: Job, name: str) -> None:
-        """Go on with what was begun; anew where the engine does not know how far it had come."""
+        """Go on with what was begun; anew where the engine does not know how far it had come.
+
+        Not right after the start: then the engine takes up by itself, and counts, what this worker was doing.
+        """
+        if time.monotonic() - self._started.get(name, self._born_at) < LOOK_AGAIN_S:
+            return
+        self._started[name] = time.monotonic()
         if engine.gave_up(name):
             log.warning("%s: %s", name, KeepsFelling().message)
             with self._place.database.writing() as session:

@@ -80,6 +80,7 @@ def due(monkeypatch: pytest.MonkeyPatch, job: Job) -> Job:
 
     monkeypatch.setattr(reconcile, "findings", findings)
     monkeypatch.setattr(reconcile, "short_of_queries", lambda _session: [])
+    monkeypatch.setattr(reconcile, "RETRY_AFTER", timedelta(seconds=0.2))
     monkeypatch.setattr(service, "LOOK_AGAIN_S", 0.2)
     monkeypatch.setattr(service, "REST", 0.0)
     return job
