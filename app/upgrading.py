@@ -132,7 +132,7 @@ def _copy(path: Path, newest: str) -> None:
     free = shutil.disk_usage(path.parent).free
     if free < needed:
         raise NoSpaceToUpgrade(f"{_words(NoSpaceToUpgrade)} Free {(needed - free) / 1024**2:.0f} MiB on its disk.")
-    target = path.with_name(f"{path.name}{_COPY}{newest}-{now():%Y%m%dT%H%M%S}")
+    target = path.with_name(f"{path.name}{_COPY}{newest}-{now():%Y%m%dT%H%M%S.%f}")
     draft = _draft(path)
     draft.unlink(missing_ok=True)
     os.close(os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600))  # SQLite fills an empty file as it is
