@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 from dbos import DBOS, SetWorkflowID
-from sqlalchemy import select
+from sqlalchemy import select, text
 
 from app.db import Database, now
 from app.domain.models import Run, RunKind, RunStatus, WorkerPresence
@@ -28,7 +28,7 @@ from worker.records import Job
 from worker.workflows import Workshop, as_arguments
 from worker.workplace import Step, Workplace
 
-PATIENCE_S = 60.0
+PATIENCE_S = 300.0
 
 Damage = Callable[[Path], None]
 
@@ -297,6 +297,16 @@ def test_work_that_fills_the_disk_is_tried_until_there_is_space(
         assert until(lambda: status_of(database, due) == RunStatus.SUCCEEDED)
     with database.reading() as session:
         assert session.scalars(select(Run.attempt).where(Run.workflow_id == due.finding)).one() == 1
+
+
+def test_a_sign_of_life_that_cannot_be_written_does_not_end_the_work(
+    database: Database, store: ArtefactStore, job: Job
+) -> None:
+    with database.writing() as session:
+        run_id = records.begin_run(session, job, seed=1)
+    with database.writing() as session:
+        session.execute(text("DROP TABLE run"))
+    Workplace(database, store, Compute(1)).beat(run_id)()
 
 
 def test_work_in_the_middle_of_which_the_worker_falls_again_and_again_counts_as_a_failed_attempt(
