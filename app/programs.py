@@ -19,8 +19,8 @@ from app.falls import Falls, note
 GRACE_S = 9.0
 """Both programs end by themselves within eight seconds of being asked."""
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 1.0, 60.0
-STEADY_S = 60.0
-"""Whoever has run for so long has recovered, and falls before that are forgotten."""
+STEADY_S = 600.0
+"""Whoever has run for so long has recovered, and falls before that are forgotten. A start alone may take a minute."""
 _LOOK_S = 0.2
 _LONGEST_WORDS = 300
 _PR_SET_PDEATHSIG = 1
