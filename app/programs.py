@@ -19,8 +19,8 @@ from app.falls import Falls, note
 GRACE_S = 9.0
 """Both programs end by themselves within eight seconds of being asked."""
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 1.0, 60.0
-STEADY_S = 60.0
-"""Whoever has run for so long has recovered, and falls before that are forgotten."""
+STEADY_S = 600.0
+"""Whoever has run for so long has recovered, and falls before that are forgotten. A start alone may take a minute."""
 _LOOK_S = 0.2
 _LONGEST_WORDS = 300
 _PR_SET_PDEATHSIG = 1
@@ -42,7 +42,7 @@ class Programs:
 
     def run(self) -> int:
         """Until somebody stops it; returns the exit code."""
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        for number in asking():
             signal.signal(number, self._on_signal)
         note(self._data_dir, [])
         for program in self._programs:
@@ -81,8 +81,20 @@ class _Program:
         """when it was started, or is to be started again"""
 
     def start(self) -> None:
-        # An own process group: Ctrl-C in the terminal reaches only us, and we stop the children in good order.
-        self._child = subprocess.Popen(
+        """In a process group of its own: Ctrl-C in the terminal reaches only us, and we stop it in good order."""
+        try:
+            self._child = self._new_process()
+        except OSError as error:  # no memory, most likely
+            self._words.append(f"could not be started: {error.strerror}")
+            self._has_fallen(error.errno)
+            return
+        self._moment = time.monotonic()
+        if self._child.stdout is not None:
+            self._reader = threading.Thread(target=self._forward, args=(self._child.stdout,), daemon=True)
+            self._reader.start()
+
+    def _new_process(self) -> "subprocess.Popen[str]":
+        return subprocess.Popen(
             [sys.executable, *self._arguments],
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
@@ -93,18 +105,15 @@ class _Program:
             start_new_session=True,
             preexec_fn=end_with_parent,
         )
-        self._moment = time.monotonic()
-        if self._child.stdout is not None:
-            self._reader = threading.Thread(target=self._forward, args=(self._child.stdout,), daemon=True)
-            self._reader.start()
 
     def look(self) -> bool:
         """Start it again if that is due; whether there is something new to tell about its falls."""
         moment = time.monotonic()
         if self._child is None:
-            if moment >= self._moment:
-                self.start()
-            return False
+            if moment < self._moment:
+                return False
+            self.start()
+            return self._child is None
         if self._child.poll() is not None:
             self._has_fallen(self._child.returncode)
             return True
@@ -113,7 +122,7 @@ class _Program:
             return True
         return False
 
-    def _has_fallen(self, code: int) -> None:
+    def _has_fallen(self, code: int | None) -> None:
         if self._reader is not None:
             self._reader.join(timeout=1.0)  # its last words may still be on their way
         count = 1 if self.falls is None else self.falls.count + 1
@@ -144,6 +153,12 @@ class _Program:
             say(f"{colour}{self.name:<6}{reset} {line.rstrip()}")
             if line.strip():
                 self._words.append(line.strip()[:_LONGEST_WORDS])
+
+
+def asking() -> list[signal.Signals]:
+    """The signals that ask a program to stop. Not a closed terminal if somebody has seen to that (nohup)."""
+    hung_up = [] if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN else [signal.SIGHUP]
+    return [signal.SIGINT, signal.SIGTERM, *hung_up]
 
 
 def end_with_parent() -> None:

@@ -69,14 +69,20 @@ def upgrade(settings: Settings) -> None:
 
 def forget_copies(path: Path) -> None:
     """Erase the copies made before upgrades: somebody who has withdrawn is still in them."""
-    for copy in copies(path):
-        copy.unlink(missing_ok=True)
-        log.warning("%s is erased: somebody who is in it has withdrawn", copy.name)
+    for copy in [*copies(path), _draft(path)]:
+        if copy.exists():
+            copy.unlink()
+            log.warning("%s is erased: somebody who is in it has withdrawn", copy.name)
 
 
 def copies(path: Path) -> list[Path]:
     """The copies made before upgrades, the oldest first."""
     return sorted(path.parent.glob(f"{path.name}{_COPY}*"), key=lambda copy: copy.stat().st_mtime_ns)
+
+
+def _draft(path: Path) -> Path:
+    """A copy in the making, or what is left of one that was killed."""
+    return path.with_name(f"{path.name}.copying")
 
 
 def _config(settings: Settings) -> Config:
@@ -126,8 +132,8 @@ def _copy(path: Path, newest: str) -> None:
     free = shutil.disk_usage(path.parent).free
     if free < needed:
         raise NoSpaceToUpgrade(f"{_words(NoSpaceToUpgrade)} Free {(needed - free) / 1024**2:.0f} MiB on its disk.")
-    target = path.with_name(f"{path.name}{_COPY}{newest}-{now():%Y%m%dT%H%M%S}")
-    draft = path.with_name(f"{path.name}.copying")
+    target = path.with_name(f"{path.name}{_COPY}{newest}-{now():%Y%m%dT%H%M%S.%f}")
+    draft = _draft(path)
     draft.unlink(missing_ok=True)
     os.close(os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600))  # SQLite fills an empty file as it is
     try:

@@ -13,6 +13,7 @@ import app.domain.people
 import app.domain.preferences
 import app.domain.studies  # noqa: F401  (all of them fill Base.metadata)
 from app.db import Base, UtcDateTime
+from app.errors import AppError
 from app.settings import Settings
 
 PATIENCE_S = 600
@@ -72,7 +73,11 @@ def _begin_for_real(engine: Engine) -> None:
 def _check_references(connection: Connection) -> None:
     broken = connection.execute(text("PRAGMA foreign_key_check")).all()
     if broken:
-        raise RuntimeError(f"After the migration {len(broken)} rows would refer to nothing: {broken[:3]}")
+        tables = ", ".join(sorted({row[0] for row in broken}))
+        raise AppError(
+            f"The database was not upgraded and is as it was: {len(broken)} of its rows refer to others that are not "
+            f"there ({tables}). Restore it from a backup."
+        )
 
 
 run()

@@ -71,7 +71,7 @@ def running(settings: Settings, database: Database) -> Iterator["Bond"]:
     path = file_of(settings)
     if path is None:
         launch(settings)
-        yield Bond(None, settings.worker_name)
+        yield Bond(None, settings.worker_name, None)
         return
     with path.with_name("engine.lock").open("w") as lock:
         alone = _alone(lock.fileno())
@@ -82,10 +82,12 @@ def running(settings: Settings, database: Database) -> Iterator["Bond"]:
             launch(settings)
         except DatabaseError as error:
             DBOS.destroy()
-            _replace(path, str(error.orig), alone)
+            if not isinstance(error.orig, sqlite3.DatabaseError) or not _is_damage(error.orig):
+                raise EngineInUse(f"The engine's file cannot be written: {error.orig}.") from error
+            _replace(path, f"cannot be used ({error.orig})", alone)
             launch(settings)
         fcntl.flock(lock, fcntl.LOCK_SH)
-        yield Bond(path, settings.worker_name)
+        yield Bond(path, settings.worker_name, _last_sign(database, settings.worker_name))
 
 
 def launch(settings: Settings) -> None:
@@ -129,7 +131,8 @@ def resume(name: str) -> bool:
     if _is_over(known):
         DBOS.delete_workflow(name)
         return False
-    DBOS.resume_workflow(name)
+    if known.status == "PENDING":  # whatever waits in a queue is going to be done
+        DBOS.resume_workflow(name)
     return True
 
 
@@ -146,31 +149,40 @@ class Bond:
     done work would otherwise go on in a database that has never heard of its first half.
     """
 
-    def __init__(self, path: Path | None, worker_name: str) -> None:
+    def __init__(self, path: Path | None, worker_name: str, signed: str | None) -> None:
+        """``signed``: the last sign in the database."""
         self._path, self._worker = path, worker_name
-        self._inode = path.stat().st_ino if path else 0
-        self._signed: str | None = None
+        self._signed = signed
+        self._promised: str | None = None
 
-    def promise(self, moment: datetime) -> None:
-        """Note the sign that is about to be written to the database. Raises EngineLost."""
+    def promise(self, moment: datetime) -> bool:
+        """Note the sign that is about to be written to the database; False when it must wait. Raises EngineLost."""
         if self._path is None:
-            return
+            return True
+        promised = _as_text(moment)
         try:
-            if self._path.stat().st_ino != self._inode:
-                raise EngineLost
             with closing(_connect(self._path)) as connection:
+                connection.execute("SELECT version FROM dbos_migrations")
                 connection.execute(
                     "CREATE TABLE IF NOT EXISTS studio_bond (worker TEXT PRIMARY KEY, promised TEXT, signed TEXT)"
                 )
-                row = (self._worker, _as_text(moment), self._signed)
+                if self._is_another(connection):
+                    raise EngineLost
+                row = (self._worker, promised, self._signed)
                 connection.execute("INSERT OR REPLACE INTO studio_bond VALUES (?, ?, ?)", row)
-        except FileNotFoundError as error:
-            raise EngineLost from error
         except sqlite3.DatabaseError as error:
             if not _is_damage(error):
                 log.warning("the engine's file could not be written, trying again: %s", error)
-                return
+                return False
             raise EngineLost from error
+        self._promised = promised
+        return True
+
+    def _is_another(self, connection: sqlite3.Connection) -> bool:
+        """Whether this is not the file of the last promise any more, but an older one in its place."""
+        asked = "SELECT promised FROM studio_bond WHERE worker = ?"
+        found = connection.execute(asked, (self._worker,)).fetchone()
+        return self._promised is not None and (found is None or found[0] != self._promised)
 
     def signed(self, moment: datetime) -> None:
         """The database has it as well."""

@@ -128,7 +128,8 @@ def _attempt_due(run: _Attempted | None, moment: datetime) -> int | None:
     if run.status == RunStatus.RETRY:
         return run.attempt
     failed_since = moment - (run.finished_at or moment)
-    if run.status == RunStatus.FAILED and run.attempt <= ATTEMPTS and failed_since > RETRY_AFTER * (run.attempt - 1):
+    pause = RETRY_AFTER * max(1, run.attempt - 1)
+    if run.status == RunStatus.FAILED and run.attempt <= ATTEMPTS and failed_since > pause:
         return run.attempt
     return None
 

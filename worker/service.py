@@ -104,6 +104,7 @@ class _Rounds:
         self._place = workshop.place
         self._started: dict[str, float] = {}  # what the engine has been told already, and when it was last asked
         self._told_at: dict[str, float] = {}
+        self._born_at = time.monotonic()
         self._signed_at = -math.inf
         self._cleared_at = -math.inf
         self._rested_at = -math.inf
@@ -130,7 +131,8 @@ class _Rounds:
     def _sign(self) -> None:
         if time.monotonic() - self._signed_at >= PRESENCE_S:
             moment = now()
-            self._bond.promise(moment)
+            if not self._bond.promise(moment):
+                return
             with self._place.database.writing() as session:
                 records.sign_presence(session, self._worker_name, moment)
             self._bond.signed(moment)
@@ -214,7 +216,13 @@ class _Rounds:
             self._go_on(job, name)
 
     def _take_over(self, job: Job, name: str) -> None:
-        """Go on with what was begun; anew where the engine does not know how far it had come."""
+        """Go on with what was begun; anew where the engine does not know how far it had come.
+
+        Not right after the start: then the engine takes up by itself, and counts, what this worker was doing.
+        """
+        if time.monotonic() - self._started.get(name, self._born_at) < LOOK_AGAIN_S:
+            return
+        self._started[name] = time.monotonic()
         if engine.gave_up(name):
             log.warning("%s: %s", name, KeepsFelling().message)
             with self._place.database.writing() as session:

@@ -13,9 +13,10 @@ import time
 from collections.abc import Callable
 from types import FrameType
 
+from app.programs import asking
+
 log = logging.getLogger("worker")
 
-_ASKING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 GOOD_ORDER_S = 7.0
 """Longer than this nobody waits; the supervisor (``python -m app up``) kills soon afterwards."""
 
@@ -27,11 +28,11 @@ def any_signal_is_ctrl_c() -> None:
     """
 
     def interrupt(_number: int, _frame: FrameType | None) -> None:
-        for number in _ASKING:
+        for number in asking():
             signal.signal(number, signal.SIG_IGN)
         raise KeyboardInterrupt
 
-    for number in _ASKING:
+    for number in asking():
         signal.signal(number, interrupt)
 
 
@@ -46,7 +47,7 @@ class Stop:
         mouth.setblocking(False)
         self._mouth = mouth  # or it would be closed
         signal.set_wakeup_fd(mouth.fileno(), warn_on_full_buffer=False)
-        for number in _ASKING:
+        for number in asking():
             signal.signal(number, lambda _number, _frame: None)
         threading.Thread(target=self._listen, args=(ear,), name="stop", daemon=True).start()
 

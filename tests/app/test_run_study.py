@@ -8,12 +8,14 @@ import pytest
 from fastapi.testclient import TestClient
 from sqlalchemy import select
 
+from app import falls
 from app.db import Database, now
 from app.domain.models import ModelKind, Run, RunKind, RunStatus, WorkerPresence
 from app.domain.people import AuditEvent
 from app.domain.preferences import Response
 from app.domain.studies import Participant, Study
 from app.services import enrolment
+from app.settings import Settings
 from app.storage import ArtefactStore
 from tests import factories
 from tests.app.conftest import agree
@@ -255,6 +257,24 @@ class TestWatching:
         with database.writing() as session:
             session.get_one(WorkerPresence, "worker-1").last_seen_at = now() - timedelta(seconds=16)
         assert "No worker is running" in experimenter.get("/studies/pilot").text
+
+    def test_a_worker_that_keeps_falling_is_noticed_with_its_last_words(
+        self, experimenter: TestClient, participant: Participant, settings: Settings
+    ) -> None:
+        since = now() - timedelta(minutes=3)
+        falls.note(settings.data_dir, [falls.Falls("worker", 4, since, "MemoryError: <b>no</b> room")])
+        page = experimenter.get("/studies/pilot").text
+        assert "The worker has stopped 4 times</strong>, first 3 min ago" in page
+        assert "MemoryError: &lt;b&gt;no&lt;/b&gt; room" in page
+        falls.note(settings.data_dir, [])
+        assert "has stopped" not in experimenter.get("/studies/pilot").text
+
+    def test_falls_that_cannot_be_read_are_no_falls(
+        self, experimenter: TestClient, participant: Participant, settings: Settings
+    ) -> None:
+        for damaged in ("", "[", "[{}]", "{}", '[{"program": "worker"}]', "[1]", "\x00\xff"):
+            (settings.data_dir / "falls.json").write_text(damaged)
+            assert experimenter.get("/studies/pilot").status_code == 200
 
     def test_a_full_disk_is_noticed(
         self, experimenter: TestClient, study: Study, monkeypatch: pytest.MonkeyPatch

@@ -152,6 +152,20 @@ def test_finished_work_is_forgotten_and_its_drafts_are_erased(
     assert traces(settings.data_dir) == []
 
 
+def test_copies_made_before_upgrades_and_engine_s_files_that_were_set_aside_go_as_well(
+    workshop: Workshop, participant: Participant, settings: Settings
+) -> None:
+    place = workshop.place
+    for name in ("studio.sqlite3.before-0002-20260101T000000", "studio.sqlite3.copying"):
+        (settings.data_dir / name).write_bytes(MARK)
+    for name in ("engine.sqlite3.set-aside-20260101T000000", "engine.sqlite3-journal.set-aside-20260101T000000"):
+        (settings.data_dir / name).write_bytes(MARK)
+    assert len(traces(settings.data_dir)) == 4
+    withdraw(place.database, place.store, participant.id)
+    assert until(lambda: erase(workshop, settings, participant.id))
+    assert traces(settings.data_dir) == []
+
+
 def test_work_that_begins_after_the_withdrawal_does_nothing(
     workshop: Workshop, work: Work, job: Job, participant: Participant, settings: Settings
 ) -> None:

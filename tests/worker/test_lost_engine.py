@@ -1,6 +1,7 @@
 """The engine's file is lost, damaged or of another time than the database: work goes on, nothing by halves."""
 
 import errno
+import fcntl
 import os
 import shutil
 import sqlite3
@@ -13,7 +14,7 @@ from pathlib import Path
 
 import pytest
 from dbos import DBOS, SetWorkflowID
-from sqlalchemy import select
+from sqlalchemy import select, text
 
 from app.db import Database, now
 from app.domain.models import Run, RunKind, RunStatus, WorkerPresence
@@ -27,7 +28,7 @@ from worker.records import Job
 from worker.workflows import Workshop, as_arguments
 from worker.workplace import Step, Workplace
 
-PATIENCE_S = 60.0
+PATIENCE_S = 300.0
 
 Damage = Callable[[Path], None]
 
@@ -79,6 +80,7 @@ def due(monkeypatch: pytest.MonkeyPatch, job: Job) -> Job:
 
     monkeypatch.setattr(reconcile, "findings", findings)
     monkeypatch.setattr(reconcile, "short_of_queries", lambda _session: [])
+    monkeypatch.setattr(reconcile, "RETRY_AFTER", timedelta(seconds=0.2))
     monkeypatch.setattr(service, "LOOK_AGAIN_S", 0.2)
     monkeypatch.setattr(service, "REST", 0.0)
     return job
@@ -187,6 +189,12 @@ def without_its_tables(path: Path) -> None:
         connection.commit()
 
 
+def replaced_by_an_older_one(path: Path) -> None:
+    with closing(sqlite3.connect(path)) as connection:
+        connection.execute("UPDATE studio_bond SET promised = '2026-01-01'")
+        connection.commit()
+
+
 def a_folder(path: Path) -> None:
     path.unlink()
     path.mkdir()
@@ -291,6 +299,16 @@ def test_work_that_fills_the_disk_is_tried_until_there_is_space(
         assert session.scalars(select(Run.attempt).where(Run.workflow_id == due.finding)).one() == 1
 
 
+def test_a_sign_of_life_that_cannot_be_written_does_not_end_the_work(
+    database: Database, store: ArtefactStore, job: Job
+) -> None:
+    with database.writing() as session:
+        run_id = records.begin_run(session, job, seed=1)
+    with database.writing() as session:
+        session.execute(text("DROP TABLE run"))
+    Workplace(database, store, Compute(1)).beat(run_id)()
+
+
 def test_work_in_the_middle_of_which_the_worker_falls_again_and_again_counts_as_a_failed_attempt(
     settings: Settings, database: Database, store: ArtefactStore, work: Work, due: Job
 ) -> None:
@@ -307,3 +325,41 @@ def test_work_in_the_middle_of_which_the_worker_falls_again_and_again_counts_as_
         assert until(lambda: status_of(database, due) == RunStatus.SUCCEEDED)
     with database.reading() as session:
         assert session.scalars(select(Run.attempt)).one() == 2
+
+
+RUNNING_DAMAGES = [removed, overwritten, emptied, another_program_s, replaced_by_an_older_one]
+
+
+@pytest.mark.parametrize("damage", RUNNING_DAMAGES, ids=lambda damage: damage.__name__)
+def test_a_file_that_goes_while_the_worker_runs_is_noticed_at_the_next_sign_of_life(
+    damage: Damage, settings: Settings, database: Database
+) -> None:
+    path = engine.file_of(settings)
+    assert path is not None
+    with engine.running(settings, database) as bond:
+        DBOS.destroy()  # so that nothing writes to it but we
+        assert bond.promise(now())
+        damage(path)
+        with pytest.raises(engine.EngineLost, match="starts again"):
+            bond.promise(now())
+
+
+def test_a_damaged_file_that_another_worker_uses_is_left_to_it(settings: Settings, database: Database) -> None:
+    path = engine.file_of(settings)
+    assert path is not None
+    path.write_bytes(b"damaged" * 1000)
+    with path.with_name("engine.lock").open("w") as other:
+        fcntl.flock(other, fcntl.LOCK_SH)
+        with pytest.raises(engine.EngineInUse, match="Stop all workers"), engine.running(settings, database):
+            pytest.fail("it was started")
+    assert path.read_bytes() == b"damaged" * 1000
+
+
+def test_of_files_that_were_set_aside_the_newest_are_kept(settings: Settings, database: Database) -> None:
+    path = engine.file_of(settings)
+    assert path is not None
+    for number in range(engine.KEPT + 2):
+        path.write_bytes(b"%d" % number * 5000)
+        engine._replace(path, "is damaged", alone=True)
+    kept = [aside.read_bytes()[:1] for aside in sorted(path.parent.glob("engine.sqlite3.set-aside-*"))]
+    assert kept == [b"2", b"3", b"4"]

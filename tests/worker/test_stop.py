@@ -46,7 +46,8 @@ def descendants(pid: int) -> list[int]:
     found = []
     for stat in Path("/proc").glob("[0-9]*/stat"):
         with suppress(OSError):
-            if int(stat.read_text().rsplit(")", 1)[1].split()[1]) == pid:
+            mine = int(stat.read_text().rsplit(")", 1)[1].split()[1]) == pid
+            if mine and "spawn_main" in stat.with_name("cmdline").read_text():
                 found.append(int(stat.parent.name))
     return found
 
