@@ -51,9 +51,11 @@ class Turns:
     who_waits: WhoWaits = field(default_factory=WhoWaits)
 
     def __post_init__(self) -> None:
-        self._in_hand: list[Job] = []
+        self._in_hand: list[tuple[Lane, Job]] = []
         self._gates = {
-            lane: Gate(self.compute.size(lane) + (AHEAD if lane != Lane.PATIENT else 0), self._holds_back)
+            lane: Gate(
+                self.compute.size(lane) + (AHEAD if lane != Lane.PATIENT else 0), partial(self._holds_back, lane)
+            )
             for lane in Lane
         }
 
@@ -67,16 +69,19 @@ class Turns:
         if lane == Lane.PATIENT:
             yield
             return
-        self._in_hand.append(job)
+        self._in_hand.append((lane, job))
         try:
             yield
         finally:
-            self._in_hand.remove(job)
+            self._in_hand.remove((lane, job))
 
-    def _holds_back(self, level: Level) -> bool:
-        return level > Level.ASKED and any(
-            self.who_waits.urgency(job).level == Level.WAITING for job in tuple(self._in_hand)
-        )
+    def _holds_back(self, lane: Lane, level: Level) -> bool:
+        """In a lane whose work somebody waits for, everything else; in the others, what nobody is here for."""
+        awaited = {where for where, job in tuple(self._in_hand) if self._level(job) == Level.WAITING}
+        return (level > Level.WAITING and lane in awaited) or (level > Level.ASKED and bool(awaited))
+
+    def _level(self, job: Job) -> Level:
+        return self.who_waits.urgency(job).level
 
     def gate(self, lane: Lane) -> Gate:
         """The way into a lane."""
