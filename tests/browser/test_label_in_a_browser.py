@@ -283,10 +283,9 @@ def test_whoever_prefers_stillness_plays_on_demand(invited: Invited, new_page: N
 def test_everything_works_without_script(invited: Invited, new_page: NewPage) -> None:
     page = new_page(java_script_enabled=False)
     page.goto(invited.link)
-    page.get_by_role("button", name="Left").click()
-    page.get_by_role("button", name="Right").click()
-    page.get_by_role("button", name="Undo").click()
-    page.get_by_role("button", name="Can\u2019t tell").click()
+    for number, name in enumerate(["Left", "Right", "Undo", "Can\u2019t tell"]):
+        page.get_by_role("button", name=name).click()
+        expect(page.locator("[data-count]")).to_have_text(f"{[1, 2, 1, 2][number]} of 10")
     assert invited.responses() == ["left", "skip"]
 
 
