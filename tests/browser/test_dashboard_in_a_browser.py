@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 import pytest
 from axe_playwright_python.sync_playwright import Axe
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Browser, Dialog, Page, expect
 
 from app.db import Database
 from app.domain.models import ModelKind, RunStatus
@@ -169,7 +169,12 @@ def test_ticks_survive_an_update_and_new_links_ask_first(page: Page, study: Stud
     expect(page.get_by_role("link", name="P02")).to_be_visible()
     expect(page.get_by_label("Tick P01")).to_be_checked()
     asked: list[str] = []
-    page.once("dialog", lambda dialog: (asked.append(dialog.message), dialog.dismiss()))
+
+    def refuse(dialog: Dialog) -> None:
+        asked.append(dialog.message)
+        dialog.dismiss()
+
+    page.once("dialog", refuse)
     page.get_by_role("button", name="New links and sheet").click()
     assert "stop working at once" in asked[0]
     page.once("dialog", lambda dialog: dialog.accept())
