@@ -288,4 +288,5 @@ def test_pages_of_a_hundred_people_with_two_hundred_answers_each_are_cut_by_the_
     with database.reading() as session:
         page = answers.find(session, study, Wanted(page=700))
     assert (page.count, page.pages, len(page.answers)) == (20_000, 800, answers.PAGE_SIZE)
-    assert len(asked) == 4, "however many there are: how many, which, their pairs, their exclusions"
+    questions = [each for each in asked if each.startswith("SELECT")]
+    assert len(questions) == 4, "however many there are: how many, which, their pairs, their exclusions"

@@ -8,8 +8,10 @@ from sqlalchemy import select
 
 from app.db import Database, now
 from app.domain.clips import Clip
+from app.domain.evaluation import Trial
 from app.domain.models import Run, RunKind, RunStatus
 from app.domain.preferences import Exclusion, LabelEvent, Query, Response
+from app.domain.protocol import EvaluationSettings
 from app.domain.studies import Participant, Study, StudySettings
 from worker import outdated, reconcile, records
 
@@ -198,6 +200,24 @@ def test_an_excluded_last_answer_leaves_nobody_short_of_labels(
     given = labels(20)
     exclude(database, given[-1])
     assert found() == {"reward/participant-1/labels-20/answer-20-exclusion-1": 1}
+
+
+def test_whoever_has_been_shown_robots_keeps_them_when_an_answer_is_excluded(
+    database: Database, study: Study, labels: Callable[[int], list[Query]], found: Callable[[], dict[str, int]]
+) -> None:
+    with database.writing() as session:
+        settings = study.settings.model_copy(update={"evaluation": EvaluationSettings()})
+        session.get_one(Study, study.id).stored_settings = settings.model_dump(mode="json")
+    given = labels(20)
+    exclude(database, given[3])
+    ending = "labels-20/answer-20-exclusion-1"
+    succeed(database, f"reward/participant-1/{ending}")
+    succeed(database, f"filter/participant-1/{ending}")
+    before_after = f"films/participant-1/before-after/{ending}"
+    assert set(found()) == {before_after, f"method/participant-1/prefft/{ending}"}
+    with database.writing() as session:
+        session.add(Trial(participant_id=1, ordinal=1, letter="A", repetition=1, scenario=1, shown_at=now()))
+    assert set(found()) == {before_after}
 
 
 def test_nothing_is_done_for_a_study_that_is_put_away_or_deleted(

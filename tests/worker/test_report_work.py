@@ -12,6 +12,7 @@ from sqlalchemy import select
 
 from app.db import Database, now
 from app.domain.models import Report, Run, RunKind, RunStatus
+from app.domain.preferences import Exclusion, LabelEvent, Query
 from app.domain.studies import Participant, Study
 from app.services import export_tables, exporting, withdrawal
 from app.storage import ArtefactStore
@@ -102,6 +103,17 @@ def test_a_new_rating_makes_a_new_report_but_not_at_once(place: Workplace, finis
     with place.database.reading() as session:
         runs = session.scalars(select(Run).where(Run.kind == RunKind.REPORT)).all()
         assert [run.id for run in runs] == [second.run_id], "older reports go with their runs"
+
+
+def test_an_excluded_answer_makes_a_new_report_without_it(place: Workplace, finished: Study) -> None:
+    before = make_report(place, finished).contents["answers"]["participants"][0]
+    age(place, timedelta(hours=1))
+    with place.database.writing() as session:
+        first = session.scalars(select(LabelEvent).join(Query).where(Query.ordinal == 2)).first()
+        assert first is not None
+        session.add(Exclusion(label_event_id=first.id, excluded=True, reason="phone", actor="x"))
+    after = make_report(place, finished).contents["answers"]["participants"][0]
+    assert (before["labels"], after["labels"]) == (6, 5)
 
 
 def test_on_a_busy_machine_reports_do_not_keep_people_s_models_waiting(place: Workplace, finished: Study) -> None:
