@@ -1,7 +1,8 @@
 """What is counted from each participant's answers and models, remembered until there are more of them.
 
 Answers, words about them, and models are only ever added, or erased with the person: how many there are, and the
-newest of them, tell whether what was counted still holds. Judging 20 000 answers takes half a second, finding out who has new ones 15 ms.
+newest of them, tell whether what was counted still holds. Judging 20 000 answers takes half a second, finding out who
+has new ones 15 ms.
 """
 
 from collections.abc import Sequence
