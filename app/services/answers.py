@@ -8,14 +8,15 @@ from dataclasses import dataclass
 from enum import StrEnum
 from http import HTTPStatus
 
-from sqlalchemy import ColumnElement, Row, Select, and_, case, func, or_, select
-from sqlalchemy.orm import Session, aliased, joinedload
+from sqlalchemy import ColumnElement, Row, ScalarSelect, Select, and_, case, func, or_, select
+from sqlalchemy.orm import InstrumentedAttribute, Session, aliased, joinedload
 
 from app.domain.clips import Clip
 from app.domain.preferences import Exclusion, LabelEvent, Purpose, Query, Response, is_excluded
 from app.domain.studies import Participant, Study
 from app.errors import AppError
 from app.services import audit
+from app.services.consistency import FASTEST, TOO_FAST
 
 PAGE_SIZE = 25
 LONGEST_REASON = 500
@@ -220,11 +221,20 @@ def _mispredicted() -> ColumnElement[bool]:
 
 
 def _quick() -> ColumnElement[bool]:
-    """The time is what the browser measured, from the first frames on; whoever has seen both clips whole was not."""
+    """Given before TOO_FAST of both clips had been played; consistency.seen, in the database."""
+    left_ms, right_ms = (_duration_ms(side) for side in (Query.left_clip_id, Query.right_clip_id))
+    played = LabelEvent.left_watched_ms, LabelEvent.right_watched_ms
+    measured = and_(*(each.is_not(None) for each in played))
+    little = or_(played[0] < TOO_FAST * left_ms, played[1] < TOO_FAST * right_ms)
+    could = LabelEvent.response_time_ms * FASTEST
+    too_little = or_(could < TOO_FAST * left_ms, could < TOO_FAST * right_ms)
+    unseen = case((measured, and_(func.coalesce(LabelEvent.scrub_count, 0) == 0, little)), else_=too_little)
+    return and_(LabelEvent.watched_whole.is_not(True), unseen)
+
+
+def _duration_ms(clip_id: InstrumentedAttribute[int]) -> ScalarSelect[int]:
     clip = aliased(Clip)
-    longer = select(func.max(clip.duration_ms)).where(clip.id.in_((Query.left_clip_id, Query.right_clip_id)))
-    shown = longer.correlate(Query).scalar_subquery()
-    return and_(LabelEvent.watched_whole.is_not(True), LabelEvent.response_time_ms * 2 < shown)
+    return select(clip.duration_ms).where(clip.id == clip_id).correlate(Query).scalar_subquery()
 
 
 def _contradicts() -> ColumnElement[bool]:

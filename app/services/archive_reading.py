@@ -349,6 +349,8 @@ class _Check:
             StudySettings.model_validate(row["stored_settings"])
         except (ValidationError, KeyError) as error:
             raise _Wrong("this version cannot read the study's settings") from error
+        if row.get("deleted_at") is not None:
+            raise _Wrong("the study was deleted")
         material = row.get("material")
         if material is not None and not _describes_recordings(material):
             raise _Wrong("it does not say what its clips are made of")

@@ -85,7 +85,7 @@ def erase_study(session: Session, store: ArtefactStore, study: Study) -> None:
     for column in Study.__table__.columns:
         if column.nullable and column.name not in _NOT_EMPTIED:
             setattr(study, column.name, None)
-    study.slug, study.name = f"deleted-{study.id}", ""
+    study.slug, study.name, study.key_secret = f"deleted-{study.id}", "", ""
     study.stored_settings = StudySettings(language=study.settings.language).model_dump(mode="json")
     session.flush()
     session.expire_all()

@@ -103,7 +103,7 @@ def people_table(overview: StudyOverview, view: View) -> PeopleTable:
 
 def needs_a_look(row: ParticipantRow) -> bool:
     """Whether something has failed for this person, or a flag is raised."""
-    return _failed(row) or bool(row.watched.consistency.flags and row.stage != WITHDRAWN)
+    return _failed(row) or bool(row.flags and row.stage != WITHDRAWN)
 
 
 def _failed(row: ParticipantRow) -> bool:
@@ -116,7 +116,7 @@ def _is_shown(row: ParticipantRow, show: str) -> bool:
 
 def _urgency(row: ParticipantRow) -> Any:
     gone = row.stage == WITHDRAWN
-    return gone, not _failed(row), -len(row.watched.consistency.flags), not row.active, row.participant.number
+    return gone, not _failed(row), -len(row.flags), not row.active, row.participant.number
 
 
 def _seen(row: ParticipantRow) -> Any:

@@ -159,6 +159,7 @@ FORGERIES: dict[str, Change] = {
     "a task that leads out of its folder": _set("study", "task", "../../etc"),
     "settings that nobody can read": _set("study", "stored_settings", {"labels_per_participant": "many"}),
     "a secret that can be guessed": _set("study", "key_secret", "0"),
+    "a study that was deleted": _set("study", "deleted_at", "2026-01-01T00:00:00+00:00"),
     "material without signals": _set("study", "material", {"rate_hz": 10}),
     "an answer that cannot be given": _set("label_event", "response", "both"),
     "a letter that is none": _set("trial", "letter", "<"),
