@@ -16,7 +16,7 @@ from sqlalchemy import create_engine, inspect, text
 from sqlalchemy.exc import DatabaseError, OperationalError
 
 from app.db import BUSY_TIMEOUT_S, file_of, now
-from app.errors import AppError
+from app.errors import AppError, in_words
 from app.settings import Settings
 
 log = logging.getLogger(__name__)
@@ -64,6 +64,8 @@ def upgrade(settings: Settings) -> None:
         try:
             command.upgrade(config, "head")
         except OperationalError as error:
+            if in_words(error) is not None:  # nothing to do with what is in the database
+                raise
             raise UpgradeFailed(f"{_words(UpgradeFailed)} The database says: {error.orig}.") from error
 
 

@@ -56,9 +56,9 @@ def run(settings: Settings) -> int:
     engine_log = logging.getLogger("dbos")
     engine_log.setLevel(logging.ERROR)
     engine_log.addFilter(OncePerMinute())
-    stop = Stop()
     keep_private(settings)
     with _only_one(settings):
+        stop = Stop()
         database = Database(settings.sqlalchemy_url)
         compute = Compute(settings.compute_processes, stop.asked)
         stop.at_once = compute.kill

@@ -70,8 +70,7 @@ class TestSentences:
         done = run(studio.main, ["migrate"], DATA_DIR=str(tmp_path), DATABASE_URL=url)
         assert says_what_to_do(done, "cannot be opened")
 
-    def test_the_worker_says_the_same(self, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr("worker.service.signal.signal", lambda *_: None)  # pytest's own stay
+    def test_the_worker_says_the_same(self, run: Run, tmp_path: Path) -> None:
         (tmp_path / "data").write_text("A file of this name is in the way.")
         assert says_what_to_do(run(worker.main, ["run"], DATA_DIR=str(tmp_path / "data")), "DATA_DIR=")
 
