@@ -14,6 +14,7 @@ from app.domain.preferences import LabelEvent
 from app.storage import ArtefactStore
 from tests import factories
 from tests.app.conftest import JSON, TakingPart
+from tests.waiting import PATIENCE_S
 
 
 def test_the_answer_is_stored_with_how_it_was_watched(taking_part: TakingPart) -> None:
@@ -166,14 +167,14 @@ def test_of_twenty_racing_answers_exactly_one_is_kept(database: Database, store:
         study = factories.make_study(session)
         participant, token = factories.make_participant(session, study)
         query = factories.make_queries(session, store, participant, 3)[0]
-    with httpx2.Client(base_url=address) as browser:
+    with httpx2.Client(base_url=address, timeout=PATIENCE_S) as browser:
         browser.get(f"/p/{token}")
         browser.get("/p/next")
         cookies = dict(browser.cookies)
     together = Barrier(20)
 
     def race(number: int) -> int:
-        with httpx2.Client(base_url=address, cookies=cookies) as racer:
+        with httpx2.Client(base_url=address, cookies=cookies, timeout=PATIENCE_S) as racer:
             form = {"response": ("left", "right")[number % 2], "client_uuid": str(uuid4())}
             together.wait()
             return racer.post(f"/p/queries/{query.id}/label", data=form, headers=JSON).status_code
@@ -215,7 +216,7 @@ def test_sixty_people_who_answer_at_once_all_get_through(
     together = Barrier(people)
 
     def answer(number: int) -> int:
-        with httpx2.Client(base_url=address, timeout=60) as browser:
+        with httpx2.Client(base_url=address, timeout=PATIENCE_S) as browser:
             browser.get(f"/p/{tokens[number]}")
             form = {"response": "left", "client_uuid": str(uuid4())}
             together.wait()

@@ -2,6 +2,7 @@
 
 import io
 import re
+import sys
 import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -15,8 +16,9 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from app.db import Database, now
+from app.domain.clips import Rollout
 from app.domain.evaluation import Assignment, Trial
-from app.domain.models import Report
+from app.domain.models import Model, Report
 from app.domain.people import Experimenter
 from app.domain.studies import Participant, Study
 from app.services import api_tokens, archive, evaluating, export_tables
@@ -44,7 +46,7 @@ Answers = dict[str, bytes]
 
 @pytest.fixture
 def study(database: Database, store: ArtefactStore) -> Study:
-    """Finished and blinded, with films of every trial and of before and after."""
+    """Finished and blinded, with films of every trial and of before and after; no file of it is missing."""
     with database.writing() as session:
         study = make_finished_study(session, store, people=3, labels=6, unblinded=False)
         for person in session.scalars(select(Participant).where(Participant.study_id == study.id)):
@@ -54,6 +56,10 @@ def study(database: Database, store: ArtefactStore) -> Study:
                 trial.film = factories.make_film(session, store, person, method, scenario=trial.scenario)
             for method in ("reference", "pbarl"):
                 factories.make_film(session, store, person, method)
+        for model in session.scalars(select(Model)):
+            model.artefact_sha256 = store.put(f"model {model.id}".encode())
+        for rollout in session.scalars(select(Rollout)):
+            rollout.trajectory_sha256 = store.put(f"trajectory {rollout.id}".encode())
         return study
 
 
@@ -74,7 +80,8 @@ def everything(
     monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,
 ) -> Callable[[], Answers]:
-    """Makes a report, and gathers every page, answer of the API, figure and file."""
+    """Makes a report, and gathers every page, answer of the API, figure and file, all at the same moment."""
+    _stop_the_clock(monkeypatch)
     monkeypatch.setattr(figures, "DPI", 40)
     monkeypatch.setattr(preference_arrays, "arrays_of", lambda *_: None)  # nobody has moved in this study
 
@@ -149,11 +156,18 @@ def test_the_same_look_finds_the_key_once_the_study_is_unblinded(
     assert {f"/studies/{study.slug}/unblind", "data csv/ratings.csv", "data report/report.json"} <= changed
 
 
+def _stop_the_clock(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pages say how long ago something was, who is active and how long the rest takes: from now on always the same."""
+    moment = now()
+    for module in [each for each in sys.modules.values() if getattr(each, "now", None) is now]:
+        monkeypatch.setattr(module, "now", lambda: moment)
+
+
 def _addresses(application: FastAPI, prefix: str, slug: str) -> Iterator[str]:
     """Every address that can be looked at or downloaded; endless streams and what does not exist yet left out."""
     tables = [{"table": table.name, "kind": kind} for table in export_tables.TABLES for kind in ("csv", "jsonl")]
     drawn = [{"name": name, "kind": kind} for name in ("ratings", "ratings_of_each_person") for kind in ("svg", "png")]
-    single = {"slug": slug, "code": "P01", "version": "1", "letter": "A"}
+    single = {"slug": slug, "code": "P01", "version": "1", "letter": "A", "query_id": "1"}
     for route in iter_route_contexts(application.routes):
         path = route.path or ""
         left_out = ("/live", "/links/", "/export/files/", "/exports/{", "/controllers/")

@@ -2,7 +2,6 @@
 
 import asyncio
 import os
-import socket
 import subprocess
 import sys
 import threading
@@ -26,6 +25,7 @@ from app.settings import Settings
 from app.web.hashing import Hashing
 from app.web.login_attempts import WINDOW_S, LoginAttempts
 from tests.app.conftest import TakingPart
+from tests.waiting import PATIENCE_S, free_port
 
 NAME = accounts.FIRST_EXPERIMENTER
 
@@ -246,7 +246,7 @@ class TestProxies:
                     f"{address}/login",
                     data={"name": NAME, "password": "wrong"},
                     headers={"X-Forwarded-For": f"203.0.113.{number}"},
-                    timeout=60.0,
+                    timeout=PATIENCE_S,
                 ).status_code
                 for number in range(4)
             ]
@@ -256,17 +256,14 @@ class TestProxies:
 @contextmanager
 def _server(directory: Path, trusted_proxies: str) -> Iterator[str]:
     """The web server as ``python -m app up`` starts it, three attempts per minute; gives its address."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    settings = Settings(_env_file=None, port=port, trusted_proxies=trusted_proxies)
+    settings = Settings(_env_file=None, port=free_port(), trusted_proxies=trusted_proxies)
     environment = {name: value for name, value in os.environ.items() if name != "DATABASE_URL"}
     environment |= {"DATA_DIR": str(directory), "LOGIN_ATTEMPTS_PER_MINUTE": "3", "FORWARDED_ALLOW_IPS": "127.0.0.1"}
     server = subprocess.Popen([sys.executable, *web_server(settings)], env=environment)
     try:
         while True:
             try:
-                httpx2.get(f"{settings.base_url}/login", timeout=60.0)
+                httpx2.get(f"{settings.base_url}/login", timeout=PATIENCE_S)
                 break
             except httpx2.ConnectError:
                 assert server.poll() is None

@@ -17,6 +17,7 @@ from app.services import completion, panel
 from app.storage import ArtefactStore
 from tests import factories
 from tests.app.conftest import agree
+from tests.waiting import PATIENCE_S
 
 
 @pytest.fixture
@@ -100,7 +101,10 @@ class TestThroughAPanel:
     ) -> None:
         join = address + open_study() + "?PROLIFIC_PID=abc"
         codes: list[int] = []
-        threads = [threading.Thread(target=lambda: codes.append(httpx2.post(join).status_code)) for _ in range(10)]
+        threads = [
+            threading.Thread(target=lambda: codes.append(httpx2.post(join, timeout=PATIENCE_S).status_code))
+            for _ in range(10)
+        ]
         for thread in threads:
             thread.start()
         for thread in threads:

@@ -1,7 +1,6 @@
 """A server killed under load has forgotten no answer that it said was saved, and doubles none on the way back."""
 
 import os
-import socket
 import subprocess
 import sys
 import threading
@@ -20,6 +19,7 @@ from app.domain.preferences import LabelEvent
 from app.settings import Settings
 from app.storage import ArtefactStore
 from tests import factories
+from tests.waiting import PATIENCE_S, free_port
 
 PEOPLE = 4
 LABELS = 40
@@ -28,9 +28,7 @@ KILL_AFTER = 50
 
 @pytest.fixture
 def settings(tmp_path: Path) -> Settings:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return Settings(_env_file=None, data_dir=tmp_path, port=probe.getsockname()[1])
+    return Settings(_env_file=None, data_dir=tmp_path, port=free_port())
 
 
 @pytest.fixture
@@ -82,7 +80,7 @@ class Labeller(threading.Thread):
         self.acknowledged, self.everybody = acknowledged, everybody
 
     def run(self) -> None:
-        with httpx2.Client(base_url=self.address, headers={"Accept": "application/json"}) as client:
+        with httpx2.Client(base_url=self.address, headers={"Accept": "application/json"}, timeout=PATIENCE_S) as client:
             self._persist(client, "GET", f"/p/{self.token}", {})
             path = self._persist(client, "GET", "/p/next", {}).json()["pair"]["label_path"]
             while path:
@@ -115,14 +113,14 @@ def test_no_acknowledged_answer_is_lost_and_none_is_doubled_when_the_server_is_k
     for labeller in labellers:
         labeller.start()
     for _ in range(KILL_AFTER):
-        assert answers.acquire(timeout=60)
+        assert answers.acquire(timeout=PATIENCE_S)
     server.kill()
     with database.reading() as session:
         stored = set(session.scalars(select(LabelEvent.client_uuid)))
     assert set(acknowledged) <= stored, "an answer that was said to be saved is gone"
     server.start()
     for labeller in labellers:
-        labeller.join(timeout=120)
+        labeller.join(timeout=PATIENCE_S)
     server.kill()
     with database.reading() as session:
         per_query = Counter(session.scalars(select(LabelEvent.query_id)))

@@ -21,6 +21,7 @@ from app.services.tallies import Tallies
 from app.storage import ArtefactStore
 from tests import factories
 from tests.conftest import serving
+from tests.waiting import PATIENCE_S
 
 
 @pytest.fixture
@@ -33,7 +34,9 @@ def study(database: Database) -> Study:
 
 @pytest.fixture
 def browser(address: str, study: Study, experimenter_cookie: str) -> Iterator[httpx2.Client]:
-    with httpx2.Client(base_url=address, cookies={"studio_experimenter": experimenter_cookie}, timeout=30) as browser:
+    with httpx2.Client(
+        base_url=address, cookies={"studio_experimenter": experimenter_cookie}, timeout=PATIENCE_S
+    ) as browser:
         yield browser
 
 
@@ -119,7 +122,7 @@ def test_all_who_look_are_sent_the_same_whatever_their_role(
         session.add(reader)
         session.flush()
         cookie = browser_sessions.open_for_experimenter(session, reader, timedelta(hours=1))
-    with httpx2.Client(base_url=address, cookies={"studio_experimenter": cookie}, timeout=30) as other:
+    with httpx2.Client(base_url=address, cookies={"studio_experimenter": cookie}, timeout=PATIENCE_S) as other:
         for page in ("/studies", "/studies/pilot", "/studies/pilot/participants/P01"):
             pages = [fragments_of(each.get(page).text) for each in (browser, other)]
             assert pages[0] == pages[1] != []
@@ -164,13 +167,13 @@ def test_fifty_open_dashboards_leave_room_for_everybody_else(browser: httpx2.Cli
     def watch() -> None:
         with browser.stream("GET", "/studies/live") as stream:
             next(stream.iter_lines())
-            opened.wait(30)
-            done.wait(30)
+            opened.wait(PATIENCE_S)
+            done.wait(PATIENCE_S)
 
     watchers = [threading.Thread(target=watch) for _ in range(50)]
     for watcher in watchers:
         watcher.start()
-    opened.wait(30)
+    opened.wait(PATIENCE_S)
     assert browser.get("/studies").status_code == 200
     done.set()
     for watcher in watchers:
@@ -183,7 +186,7 @@ def test_the_server_stops_at_once_although_dashboards_are_open(
     cookies = {"studio_experimenter": experimenter_cookie}
     with (
         serving(studio_app) as address,
-        httpx2.Client(base_url=address, cookies=cookies, timeout=30) as browser,
+        httpx2.Client(base_url=address, cookies=cookies, timeout=PATIENCE_S) as browser,
         browser.stream("GET", "/studies/live") as stream,
     ):
         lines = stream.iter_lines()

@@ -22,6 +22,7 @@ from app.domain.studies import Participant, Study
 from app.storage import ArtefactStore
 from tests import factories
 from tests.app.conftest import JSON
+from tests.waiting import PATIENCE_S
 
 METHODS = (EvaluatedMethod.REFERENCE, EvaluatedMethod.PREFFT, EvaluatedMethod.PBARL)
 
@@ -238,7 +239,7 @@ def test_twenty_racing_ratings_of_a_robot_leave_one(
         values = 3 if same else 1 + number % 5
         chosen = uuid if same else uuid4()
         form = {"satisfaction": values, "personalisation": values, "client_uuid": str(chosen)}
-        with httpx2.Client(cookies=cookies, timeout=30.0) as client:
+        with httpx2.Client(cookies=cookies, timeout=PATIENCE_S) as client:
             barrier.wait()
             return client.post(path, data=form, headers=JSON).status_code
 

@@ -14,6 +14,7 @@ from app.domain.studies import Deviation, Study
 from app.storage import ArtefactStore
 from app.web.turns import READERS
 from tests import factories
+from tests.waiting import PATIENCE_S
 
 LONG_REASON = "Because. " * 4000
 PEOPLE = 300
@@ -42,7 +43,7 @@ def stalled(address: str, path: str, cookie: str) -> Iterator[socket.socket]:
     server = urlsplit(address)
     with socket.socket() as connection:
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-        connection.settimeout(60)
+        connection.settimeout(PATIENCE_S)
         connection.connect((server.hostname or "", server.port or 0))
         head = f"GET {path} HTTP/1.1\r\nHost: {server.netloc}\r\nCookie: studio_experimenter={cookie}\r\n\r\n"
         connection.sendall(head.encode())
@@ -59,7 +60,7 @@ def test_stalled_downloads_leave_the_database_to_everybody_else(
             for path in ("/studies/pilot/export/participants.csv", "/studies/pilot/export/participants.jsonl", video):
                 stack.enter_context(stalled(address, path, experimenter_cookie))
         cookies = {"studio_experimenter": experimenter_cookie}
-        with httpx2.Client(base_url=address, cookies=cookies, timeout=30) as browser:
+        with httpx2.Client(base_url=address, cookies=cookies, timeout=PATIENCE_S) as browser:
             assert browser.get(video).status_code == 200
             assert browser.get("/studies").status_code == 200
         while not database.forget_erased():  # possible only while nobody holds a snapshot of the database
@@ -68,7 +69,7 @@ def test_stalled_downloads_leave_the_database_to_everybody_else(
 
 def test_a_slow_reader_gets_everything(address: str, experimenter_cookie: str, study: Study) -> None:
     cookies = {"studio_experimenter": experimenter_cookie}
-    with httpx2.Client(base_url=address, cookies=cookies, timeout=60) as browser:
+    with httpx2.Client(base_url=address, cookies=cookies, timeout=PATIENCE_S) as browser:
         with browser.stream("GET", "/studies/pilot/export/participants.csv") as slow:
             pieces = slow.iter_bytes(1000)
             first = next(pieces)

@@ -4,7 +4,6 @@ import fcntl
 import os
 import re
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -16,8 +15,7 @@ from urllib.request import urlopen
 import pytest
 
 from app.falls import noted
-
-PATIENCE_S = 300.0
+from tests.waiting import PATIENCE_S, free_port
 
 Start = Callable[[], "Studio"]
 
@@ -69,9 +67,7 @@ class Studio:
 @pytest.fixture
 def start(tmp_path: Path) -> Iterator[Start]:
     studios: list[Studio] = []
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = free_port()
 
     def begin() -> Studio:
         studios.append(Studio(tmp_path, port))

@@ -17,6 +17,7 @@ from app.services import archive
 from app.storage import ArtefactStore
 from app.web import importing
 from tests import factories
+from tests.waiting import PATIENCE_S
 
 GIGABYTES = 3 * 10**9
 HEAD = b'--x\r\nContent-Disposition: form-data; name="file"; filename="study.zip"\r\n\r\n'
@@ -45,7 +46,7 @@ def announced(address: str, cookie: str = "", byte_count: int = GIGABYTES, **hea
         **{name.replace("_", "-"): text for name, text in headers.items()},
     }
     request = "".join(f"{name}: {text}\r\n" for name, text in lines.items())
-    with socket.create_connection((server.hostname or "", server.port or 0), timeout=60) as connection:
+    with socket.create_connection((server.hostname or "", server.port or 0), timeout=PATIENCE_S) as connection:
         connection.sendall(f"POST /import HTTP/1.1\r\n{request}\r\n".encode())
         yield connection
 

@@ -7,6 +7,7 @@ predicted return over all modes. True: how much less than the best mode the pick
 in % of what the user minds and likes under the reference policy. Minutes.
 """
 
+import argparse
 import sys
 from pathlib import Path
 
@@ -29,6 +30,8 @@ WORK = Path("data/benchmark/rollouts")
 
 def main() -> None:
     """Print one Markdown row per task and user."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.parse_args()
     torch.set_num_threads(1)
     sys.stdout.write("| task, user | " + " | ".join(map(str, COUNTS)) + " |\n" + "|---" * (1 + len(COUNTS)) + "|\n")
     for task in ENVIRONMENTS:

@@ -1,10 +1,12 @@
 """How long a page takes over the API at the beginning and at the end of a table.
 
-``python -m tests.benchmarks.api_pages``, with 100 people and 200 answers each unless told otherwise (people, answers).
+    python -m tests.benchmarks.api_pages --people 100 --answers 200
+
 The ratio is what counts: it does not depend on the machine. With offsets instead of cursors the last page read
 everything before it.
 """
 
+import argparse
 import sys
 import tempfile
 import time
@@ -22,18 +24,21 @@ from app.services import accounts, api_tokens
 from app.settings import Settings
 from tests import factories
 
-PEOPLE, ANSWERS = 100, 200
 TABLES = ("labels", "queries")
 ROUNDS = 9
 
 
-def main(people: int, answers: int) -> None:
+def main() -> None:
     """Fill a studio, page through its tables, and print the times."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--people", type=int, default=100)
+    parser.add_argument("--answers", type=int, default=200, help="of each")
+    options = parser.parse_args()
     with tempfile.TemporaryDirectory() as directory:
         settings = Settings(_env_file=None, data_dir=Path(directory))
         migrate(settings)
         application = create_app(settings)
-        slug, token = _fill(application.state.studio, people, answers)
+        slug, token = _fill(application.state.studio, options.people, options.answers)
         browser = TestClient(application, headers={"Authorization": f"Bearer {token}"})
         for table in TABLES:
             _measure(browser, f"/api/v1/studies/{slug}/tables/{table}?limit=100")
@@ -92,4 +97,4 @@ def _fill(studio, people: int, answers: int) -> tuple[str, str]:  # type: ignore
 
 
 if __name__ == "__main__":
-    main(*(int(given) for given in sys.argv[1:3] or (PEOPLE, ANSWERS)))
+    main()

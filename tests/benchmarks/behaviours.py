@@ -1,6 +1,6 @@
 """Do the behaviours of a pool differ in ways people have opinions on?
 
-Run: python -m tests.benchmarks.behaviours [--task drinking] [--scenarios 100]    (one to three minutes per task)
+    python -m tests.benchmarks.behaviours --task drinking --scenarios 100    (one to three minutes per task)
 
 For every task: success of the behaviours a study's pool would show, what each end of each mode axis does, and how often
 two users prefer the same clip of a matched pair. Users are the paper's three with the calibrated and the paper's cost
@@ -27,7 +27,6 @@ from worker.trajectory import SIGNALS, Trajectory
 
 FIRST_SCENARIO = 10_700_000
 PER_SCENARIO = 4
-AXIS_SCENARIOS = 20
 REACHED_M = 0.06
 
 Floats = npt.NDArray[np.float64]
@@ -38,11 +37,12 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--task", nargs="+", choices=ENVIRONMENTS, default=list(ENVIRONMENTS))
     parser.add_argument("--scenarios", type=int, default=100)
+    parser.add_argument("--axis-scenarios", type=int, default=20, help="in which the ends of the axes are tried")
     parser.add_argument("--steps", type=int, nargs="+", default=[60, 100], help="control steps shown, from the start")
     options = parser.parse_args()
     for name in options.task:
         task, pool = laboratory.task(name), _pool(name, options.scenarios)
-        sys.stdout.write(f"## {task.title}\n\n{_successes(name, pool)}\n\n{_axes(name)}\n\n")
+        sys.stdout.write(f"## {task.title}\n\n{_successes(name, pool)}\n\n{_axes(name, options.axis_scenarios)}\n\n")
         found = [_agreements(task, pool, steps) for steps in options.steps]
         sys.stdout.write("| prefer the same clip | " + " | ".join(f"first {steps / 10:g} s" for steps in options.steps))
         sys.stdout.write(" |\n" + "|---" * (1 + len(found)) + "|\n")
@@ -71,7 +71,7 @@ def _successes(name: str, pool: list[Trajectory]) -> str:
     return f"Success of the pool's behaviours: **{100 * overall:.1f} %** ({'; '.join(parts)})."
 
 
-def _axes(name: str) -> str:
+def _axes(name: str, scenarios: int) -> str:
     """What each end of each mode axis does, over a few scenarios."""
     family, environment = laboratory.task(name).modes, laboratory.environment(name)
     lines = [
@@ -82,7 +82,7 @@ def _axes(name: str) -> str:
     ends += [(f"{axis.name} {end:+g}", {axis.name: end}) for axis in family.axes for end in (axis.low, axis.high)]
     for label, mode in ends:
         act = laboratory.act_in_mode(name, family.vector(mode))
-        made = [rollout(environment, act, FIRST_SCENARIO + 5000 + each) for each in range(AXIS_SCENARIOS)]
+        made = [rollout(environment, act, FIRST_SCENARIO + 5000 + each) for each in range(scenarios)]
         lines.append(f"| {label} | " + " | ".join(_figures(made)) + " |")
     return "\n".join(lines)
 

@@ -1,4 +1,6 @@
-"""Pictures to look at: `python -m tests.benchmarks.contact_sheet FOLDER [TASK ...]`.
+"""Pictures to look at.
+
+    python -m tests.benchmarks.contact_sheet some_folder feeding drinking
 
 Writes people.png (every body in every skin tone) and, for each task, TASK.png: one row per film, its frames from start
 to end, the films drawn from the pool of behaviours that participants see.
@@ -19,7 +21,7 @@ from worker.sim.human import BODY_SHAPES
 from worker.sim.render import ClipRenderer
 from worker.trajectory import BODIES, SKIN_TONES, Trajectory
 
-FILMS, FRAMES, STEPS = 6, 5, 60
+FRAMES = 5
 TILE = (400, 300)
 
 
@@ -28,19 +30,23 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("tasks", nargs="*", default=list(ENVIRONMENTS))
+    parser.add_argument("--films", type=int, default=6, help="of each task")
+    parser.add_argument("--steps", type=int, default=60, help="of a film")
+    parser.add_argument("--people", action=argparse.BooleanOptionalAction, default=True, help="people.png as well")
     options = parser.parse_args()
     options.folder.mkdir(parents=True, exist_ok=True)
     renderer = ClipRenderer()
     for task in options.tasks:
-        rows = [strip(renderer, film) for film in films(task, FILMS)]
+        rows = [strip(renderer, film, options.steps) for film in films(task, options.films)]
         _save(rows, options.folder / f"{task}.png")
-    _save(people(renderer, next(films(options.tasks[0], 1))), options.folder / "people.png")
+    if options.people:
+        _save(people(renderer, next(films(options.tasks[0], 1))), options.folder / "people.png")
     renderer.close()
 
 
-def strip(renderer: ClipRenderer, film: Trajectory) -> list[Image.Image]:
+def strip(renderer: ClipRenderer, film: Trajectory, steps: int) -> list[Image.Image]:
     """Frames from the start to the end of what participants see of a film."""
-    pictures = [picture.resize(TILE) for picture in renderer.pictures(film, 0, min(STEPS, len(film)))]
+    pictures = [picture.resize(TILE) for picture in renderer.pictures(film, 0, min(steps, len(film)))]
     return [pictures[index] for index in np.linspace(0, len(pictures) - 1, FRAMES).astype(int)]
 
 

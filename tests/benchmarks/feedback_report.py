@@ -5,8 +5,8 @@
 writes feedback_efficiency-<task>.md beside every feedback_efficiency-<task>.csv, and feedback_efficiency.svg.
 """
 
+import argparse
 import csv
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -181,4 +181,6 @@ def _cell(values: Sequence[float], digits: int) -> str:
 
 
 if __name__ == "__main__":
-    write(Path(sys.argv[1]))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    write(parser.parse_args().folder)

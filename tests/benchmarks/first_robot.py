@@ -3,9 +3,10 @@
 A scripted participant takes the paper's protocol with small settings while another study, which nobody has opened, is
 short of clips. From the last answer on they look at the waiting page like a browser without script.
 
-Usage: python tests/benchmarks/first_robot.py [fine-tuning steps] [participants one after the other]
+    python -m tests.benchmarks.first_robot --steps 1000 --people 2
 """
 
+import argparse
 import re
 import sys
 import tempfile
@@ -34,8 +35,10 @@ TOLD = re.compile(r"bout (a|\d+) minutes? to go")
 
 
 def main() -> None:
-    steps = int(sys.argv[1]) if len(sys.argv) > 1 else 1_000
-    people = int(sys.argv[2]) if len(sys.argv) > 2 else 2
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--steps", type=int, default=1_000, help="of fine-tuning")
+    parser.add_argument("--people", type=int, default=2, help="one after the other")
+    options = parser.parse_args()
     small = {
         "labels_per_participant": LABELS,
         "introduction_pairs": 2,
@@ -43,7 +46,7 @@ def main() -> None:
         "pool_scenarios": 2,
         "evaluation_scenarios": 10,
         "retrain_every_labels": 6,
-        "evaluation": EvaluationSettings(fine_tuning_steps=steps, trials=TRIALS),
+        "evaluation": EvaluationSettings(fine_tuning_steps=options.steps, trials=TRIALS),
     }
     with tempfile.TemporaryDirectory() as directory, OwnStudio(Path(directory)) as studio:
         database = Database(studio.settings.sqlalchemy_url)
@@ -52,7 +55,7 @@ def main() -> None:
             study = studies.create_study(
                 session, "Somebody's", StudySettings(**{**PAPER_PROTOCOL.model_dump(), **small}), seed=2
             )
-            tokens = [enrolment.add_participant(session, study) for _ in range(people)]
+            tokens = [enrolment.add_participant(session, study) for _ in range(options.people)]
         for participant, token in tokens:
             store = ArtefactStore(Path(directory) / "artefacts")
             person = ScriptedPerson(database, store, study, TASTES["cautious"], Manner(), participant.number)

@@ -7,6 +7,7 @@ Needs nothing of this project but this file and docs/arrays.md, whose snippet it
 out once. With preferences the wrong way round the network learns the opposite, which is printed beside it.
 """
 
+import argparse
 import contextlib
 import re
 import sys
@@ -18,8 +19,6 @@ from typing import Any
 import gymnasium
 import numpy as np
 import torch
-from imitation.algorithms import preference_comparisons
-from imitation.rewards.reward_nets import BasicRewardNet
 
 EPOCHS = 20
 FOLDS = 5
@@ -53,6 +52,9 @@ def _as_documented(archive: Path, participant: str) -> dict[str, Any]:
 
 def _foreseen(fragments: Any, truth: Any, said: Any, fold: int) -> Any:
     """Which of the fold's decided answers a network foresees that has learned from what was ``said`` in the others."""
+    from imitation.algorithms import preference_comparisons  # here, so that --help needs no environment of its own
+    from imitation.rewards.reward_nets import BasicRewardNet
+
     rows = np.arange(len(truth))
     learned, held_out = rows[rows % FOLDS != fold], rows[(rows % FOLDS == fold) & (truth != 0.5)]
     torch.manual_seed(fold)
@@ -73,4 +75,8 @@ def _foreseen(fragments: Any, truth: Any, said: Any, fold: int) -> Any:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]).resolve(), sys.argv[2])
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("archive", type=Path, help="an exported study")
+    parser.add_argument("participant", help="such as P01")
+    options = parser.parse_args()
+    main(options.archive.resolve(), options.participant)

@@ -1,11 +1,12 @@
 """Prints what open dashboards cost those who answer, and how long the pages of a large study take.
 
-Usage: python tests/benchmarks/onlookers.py [participants] [labels each] [labellers] [dashboards] [seconds per phase]
+    python -m tests.benchmarks.onlookers --people 100 --labels 200 --labellers 40 --dashboards 3 --seconds 20
 
-Labellers save an answer and fetch the next pair, then think for 1 to 3 s. Phases without and with dashboards take
+Labellers save an answer and fetch the next pair, then think for a while. Phases without and with dashboards take
 turns within one run, so that the machine's mood falls out of the ratio.
 """
 
+import argparse
 import os
 import random
 import subprocess
@@ -34,22 +35,20 @@ from app.services import browser_sessions
 from app.settings import Settings
 from app.storage import ArtefactStore
 from tests import factories
-from tests.benchmarks.save_latency import _await_health, _free_port, _rss_mb, _say
+from tests.benchmarks.save_latency import _await_health, _rss_mb, _say
+from tests.waiting import free_port
 
-PEOPLE, LABELS, LABELLERS, ONLOOKERS, PHASE_S = (
-    int(given) if given else usual
-    for given, usual in zip((*sys.argv[1:6], *[""] * 5), (100, 200, 40, 3, 20), strict=False)
-)
 OPENING = -1
 """A phase that is not counted: dashboards open or close."""
 STUDY = "/studies/feeding-at-home"
 
 
 def main() -> None:
+    options = _options()
     with tempfile.TemporaryDirectory() as directory:
-        settings = Settings(_env_file=None, data_dir=Path(directory), port=_free_port())
+        settings = Settings(_env_file=None, data_dir=Path(directory), port=free_port())
         migrate(settings)
-        tokens, cookie = _study(settings)
+        tokens, cookie = _study(settings, options)
         server = subprocess.Popen(
             [
                 *(sys.executable, "-m", "uvicorn", "app.main:create_app", "--factory", "--no-access-log"),
@@ -60,23 +59,27 @@ def main() -> None:
         try:
             _await_health(settings.base_url)
             _pages(settings.base_url, cookie, server.pid)
-            _labelling(settings.base_url, cookie, tokens, server.pid)
+            _labelling(settings.base_url, cookie, tokens, server.pid, options)
             _say(f"memory of the web server {_rss_mb(server.pid):.0f} MB")
         finally:
             server.terminate()
             server.wait()
 
 
-def _study(settings: Settings) -> tuple[list[str], str]:
+def _study(settings: Settings, options: argparse.Namespace) -> tuple[list[str], str]:
     """People with all their answers, and labellers with pairs waiting; the links of these, a cookie."""
     database, store = Database(settings.sqlalchemy_url), ArtefactStore(settings.data_dir / "artefacts")
     rng = random.Random(1)  # noqa: S311
     with database.writing() as session:
         study = factories.make_study(
-            session, labels_per_participant=LABELS, pool_scenarios=500, retrain_every_labels=10
+            session,
+            labels_per_participant=max(10, options.labels),
+            pool_scenarios=500,
+            retrain_every_labels=10,
+            break_every=0,
         )
         clips = [factories.make_clip(session, store, study).id for _ in range(20)]
-        for _ in range(PEOPLE):
+        for _ in range(options.people):
             person, _ = factories.make_participant(session, study)
             queries = [
                 {
@@ -88,7 +91,7 @@ def _study(settings: Settings) -> tuple[list[str], str]:
                     "propensity": 1.0,
                     "predicted_right": rng.random(),
                 }
-                for place in range(LABELS)
+                for place in range(options.labels)
                 for left, right in [rng.sample(clips, 2)]
             ]
             ids = session.scalars(insert(Query).returning(Query.id, sort_by_parameter_order=True), queries).all()
@@ -107,11 +110,12 @@ def _study(settings: Settings) -> tuple[list[str], str]:
                     for place, query in enumerate(ids)
                 ],
             )
-            for labels in range(10, LABELS + 1, 10):
+            for labels in range(10, options.labels + 1, 10):
                 factories.make_model(session, study, person, ModelKind.REWARD, factories.reward_metrics(), labels)
-            model = factories.make_model(session, study, person, ModelKind.FILTER, factories.filter_metrics(), LABELS)
+            metrics = factories.filter_metrics()
+            model = factories.make_model(session, study, person, ModelKind.FILTER, metrics, options.labels)
             factories.make_bundle(session, store, model)
-        tokens = [_labeller(session, study, clips) for _ in range(LABELLERS)]
+        tokens = [_labeller(session, study, clips, options.labels) for _ in range(options.labellers)]
         account = Experimenter(name="experimenter", password_hash="-", must_change_password=False)
         session.add(account)
         session.flush()
@@ -120,7 +124,7 @@ def _study(settings: Settings) -> tuple[list[str], str]:
     return tokens, cookie
 
 
-def _labeller(session: Session, study: Study, clips: list[int]) -> str:
+def _labeller(session: Session, study: Study, clips: list[int], labels: int) -> str:
     person, token = factories.make_participant(session, study)
     session.execute(
         insert(Query),
@@ -133,7 +137,7 @@ def _labeller(session: Session, study: Study, clips: list[int]) -> str:
                 "strategy": "uniform",
                 "propensity": 1.0,
             }
-            for place in range(LABELS)
+            for place in range(labels)
         ],
     )
     return token
@@ -158,45 +162,53 @@ def _pages(base_url: str, cookie: str, pid: int) -> None:
         )
 
 
-def _labelling(base_url: str, cookie: str, tokens: list[str], pid: int) -> None:
-    times: dict[int, list[float]] = {0: [], ONLOOKERS: [], OPENING: []}
+def _labelling(base_url: str, cookie: str, tokens: list[str], pid: int, options: argparse.Namespace) -> None:
+    phase_s, onlookers = options.seconds, options.dashboards
+    times: dict[int, list[float]] = {0: [], onlookers: [], OPENING: []}
     phase, done = [0], threading.Event()
     ready = threading.Barrier(len(tokens) + 1)
-    labellers = [threading.Thread(target=_label, args=(base_url, token, times, phase, ready, done)) for token in tokens]
+    labellers = [
+        threading.Thread(target=_label, args=(base_url, token, options.thought, times, phase, ready, done))
+        for token in tokens
+    ]
     for labeller in labellers:
         labeller.start()
     ready.wait()
-    received, used_s = [0], {0: 0.0, ONLOOKERS: 0.0}
+    received, used_s = [0], {0: 0.0, onlookers: 0.0}
     for _ in range(2):
         used_s[0] -= _cpu_s(pid)
         phase[0] = 0
-        time.sleep(PHASE_S)
+        time.sleep(phase_s)
         phase[0] = OPENING
         used_s[0] += _cpu_s(pid)
-        with _dashboards(base_url, cookie, received):
-            used_s[ONLOOKERS] -= _cpu_s(pid)
-            phase[0] = ONLOOKERS
-            time.sleep(PHASE_S)
+        with _dashboards(base_url, cookie, onlookers, received):
+            used_s[onlookers] -= _cpu_s(pid)
+            phase[0] = onlookers
+            time.sleep(phase_s)
             phase[0] = OPENING
-            used_s[ONLOOKERS] += _cpu_s(pid)
+            used_s[onlookers] += _cpu_s(pid)
     done.set()
     for labeller in labellers:
         labeller.join()
     p95 = {}
-    for count in (0, ONLOOKERS):
+    for count in (0, onlookers):
+        if len(times[count]) < 2:
+            _say(f"{count} dashboards: too few answers in {2 * phase_s:g} s")
+            return
         cuts = quantiles(times[count], n=100)
         p95[count] = cuts[94]
         _say(
-            f"{LABELLERS} labellers, {count} dashboards: save and next p50 {cuts[49]:.0f} ms, p95 {cuts[94]:.0f} ms, "
-            f"{len(times[count]) / (2 * PHASE_S):.1f} answers per second, {used_s[count] / (2 * PHASE_S):.0%} of a core"
+            f"{len(tokens)} labellers, {count} dashboards: save and next p50 {cuts[49]:.0f} ms, p95 {cuts[94]:.0f} ms, "
+            f"{len(times[count]) / (2 * phase_s):.1f} answers per second, {used_s[count] / (2 * phase_s):.0%} of a core"
         )
-    _say(f"p95 with {ONLOOKERS} dashboards: {p95[ONLOOKERS] / p95[0]:.2f} times that without")
-    _say(f"a dashboard received {received[0] / 1000 / ONLOOKERS / (2 * PHASE_S):.1f} kB per second")
+    _say(f"p95 with {onlookers} dashboards: {p95[onlookers] / p95[0]:.2f} times that without")
+    _say(f"a dashboard received {received[0] / 1000 / onlookers / (2 * phase_s):.1f} kB per second")
 
 
 def _label(
     base_url: str,
     token: str,
+    thought_s: float,
     times: dict[int, list[float]],
     phase: list[int],
     ready: threading.Barrier,
@@ -207,7 +219,7 @@ def _label(
         browser.get(f"/p/{token}")
         pair = browser.get("/p/next").json()["pair"]
         ready.wait()
-        while pair and not done.wait(rng.uniform(1.0, 3.0)):
+        while pair and not done.wait(rng.uniform(thought_s / 3, thought_s)):
             form = {"response": "left", "client_uuid": str(uuid4()), "response_time_ms": "4000"}
             during, started = phase[0], time.perf_counter()
             answer = browser.post(pair["label_path"], data=form)
@@ -216,10 +228,10 @@ def _label(
 
 
 @contextmanager
-def _dashboards(base_url: str, cookie: str, received: list[int]) -> Iterator[None]:
+def _dashboards(base_url: str, cookie: str, count: int, received: list[int]) -> Iterator[None]:
     """Open pages of the study that are told what changes; their page and first drawing have arrived."""
     done = threading.Event()
-    opened = threading.Barrier(ONLOOKERS + 1)
+    opened = threading.Barrier(count + 1)
 
     def watch() -> None:
         with httpx2.Client(base_url=base_url, cookies={"studio_experimenter": cookie}, timeout=120) as browser:
@@ -231,7 +243,7 @@ def _dashboards(base_url: str, cookie: str, received: list[int]) -> Iterator[Non
                 while not done.is_set():
                     received[0] += len(next(pieces))
 
-    watchers = [threading.Thread(target=watch) for _ in range(ONLOOKERS)]
+    watchers = [threading.Thread(target=watch) for _ in range(count)]
     for watcher in watchers:
         watcher.start()
     opened.wait()
@@ -245,6 +257,17 @@ def _cpu_s(pid: int) -> float:
     """Processor time that the server has used so far; unlike waiting times, it does not depend on who else computes."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def _options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--people", type=int, default=100, help="who have given all their answers")
+    parser.add_argument("--labels", type=int, default=200, help="of each")
+    parser.add_argument("--labellers", type=int, default=40)
+    parser.add_argument("--dashboards", type=int, default=3)
+    parser.add_argument("--thought", type=float, default=3.0, help="most seconds per pair; at least a third")
+    parser.add_argument("--seconds", type=float, default=20.0, help="of each of the four phases")
+    return parser.parse_args()
 
 
 if __name__ == "__main__":

@@ -117,8 +117,10 @@ def main() -> None:
     parser.add_argument("--task", choices=ENVIRONMENTS, default="feeding")
     parser.add_argument("--first", type=int, required=True)
     parser.add_argument("--scenarios", type=int, required=True)
+    parser.add_argument("--directory", type=Path, default=DIRECTORY, help="where they are kept")
     options = parser.parse_args()
-    pool_rollouts(options.task, options.first, options.scenarios, laboratory.task(options.task).episode_steps)
+    steps = laboratory.task(options.task).episode_steps
+    pool_rollouts(options.task, options.first, options.scenarios, steps, options.directory)
 
 
 if __name__ == "__main__":

@@ -3,11 +3,12 @@
 The worker is the real one: database, rounds, durable engine, queues, lanes of compute processes. Its tasks only occupy
 one of two processors for as long as such tasks took on two quiet cores (docs/results/rehearsal.md, retraining.md), in
 slices of a tenth of a second, so that lanes share processors as they would. A study that nobody has opened is short of
-clips all the time. Run it on a machine of any load; with an older tree on PYTHONPATH it measures that one.
+clips all the time. Run it on a machine of any load; copied into an older tree it measures that one.
 
-    python tests/benchmarks/replayed_waiting.py
+    python -m tests.benchmarks.replayed_waiting
 """
 
+import argparse
 import fcntl
 import os
 import subprocess
@@ -194,13 +195,19 @@ class Lab:
 
 
 def main() -> None:
-    if sys.argv[1:] == ["serve"]:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("part", nargs="?", choices=["serve"], help="the worker alone, as this program starts it")
+    if parser.parse_args().part == "serve":
         serve()
         return
     with tempfile.TemporaryDirectory() as directory:
         lab = Lab(Path(directory))
         environment = {**os.environ, "DATA_DIR": directory}
-        worker = subprocess.Popen([sys.executable, __file__, "serve"], env=environment, stderr=subprocess.DEVNULL)
+        worker = subprocess.Popen(
+            [sys.executable, "-m", "tests.benchmarks.replayed_waiting", "serve"],
+            env=environment,
+            stderr=subprocess.DEVNULL,
+        )
         try:
             time.sleep(20.0)  # the idle study's clips are under way
             for number in (1, 2, 3):

@@ -1,11 +1,12 @@
 """Prints what a look at the database costs a worker, by the number of participants who have finished.
 
-Usage: PYTHONPATH=. python tests/benchmarks/rounds.py [numbers of participants ...]
+    python -m tests.benchmarks.rounds 1 10 60
 
 Nothing is left to do for them, so this is what a studio pays for its past: milliseconds of processor time for a round
 (reconcile), which follows every change of the database, and for finding out that nothing has changed (Database.watch).
 """
 
+import argparse
 import sys
 import tempfile
 import time
@@ -29,7 +30,9 @@ REPEATS = 20
 
 def main() -> None:
     """See the module."""
-    for people in [int(count) for count in sys.argv[1:]] or [1, 10, 60]:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("people", type=int, nargs="*", default=[1, 10, 60], help="numbers of them")
+    for people in parser.parse_args().people:
         with tempfile.TemporaryDirectory() as directory:
             database = _finished_study(Path(directory), people)
             with closing(database.watch()) as watch:

@@ -1,10 +1,10 @@
 """Prints how long saving an answer and getting the next pair takes, how fast the web server starts, and its memory.
 
-Usage: python tests/benchmarks/save_latency.py [answers per client] [numbers of clients ...]
+python -m tests.benchmarks.save_latency 200 1 8
 """
 
+import argparse
 import os
-import socket
 import subprocess
 import sys
 import tempfile
@@ -23,16 +23,19 @@ from app.programs import end_with_parent
 from app.settings import Settings
 from app.storage import ArtefactStore
 from tests import factories
-
-CLIENTS = tuple(int(count) for count in sys.argv[2:]) or (1, 8)
+from tests.waiting import PATIENCE_S, free_port
 
 
 def main() -> None:
-    answers = int(sys.argv[1]) if len(sys.argv) > 1 else 200
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("answers", type=int, nargs="?", default=200, help="of each client")
+    parser.add_argument("clients", type=int, nargs="*", default=[1, 8], help="numbers of them, one after the other")
+    options = parser.parse_args()
+    answers = options.answers
     with tempfile.TemporaryDirectory() as directory:
-        settings = Settings(_env_file=None, data_dir=Path(directory), port=_free_port())
+        settings = Settings(_env_file=None, data_dir=Path(directory), port=free_port())
         migrate(settings)
-        tokens = _participants(settings, sum(CLIENTS), answers)
+        tokens = _participants(settings, sum(options.clients), answers)
         started = time.perf_counter()
         server = subprocess.Popen(
             [
@@ -46,7 +49,7 @@ def main() -> None:
             _await_health(settings.base_url)
             _say(f"first answer of the web server after {time.perf_counter() - started:.2f} s")
             _say(f"memory after the start  {_rss_mb(server.pid):.0f} MB")
-            for clients in CLIENTS:
+            for clients in options.clients:
                 mine = [tokens.pop() for _ in range(clients)]
                 times, wall_s = _race(settings.base_url, mine, answers)
                 cuts = quantiles(times, n=100)
@@ -63,7 +66,9 @@ def main() -> None:
 def _participants(settings: Settings, count: int, answers: int) -> list[str]:
     database, store = Database(settings.sqlalchemy_url), ArtefactStore(settings.data_dir / "artefacts")
     with database.writing() as session:
-        study = factories.make_study(session, labels_per_participant=max(10, answers), pool_scenarios=500)
+        study = factories.make_study(
+            session, labels_per_participant=max(10, answers), pool_scenarios=500, break_every=0
+        )
         clips = [factories.make_clip(session, store, study) for _ in range(20)]
         tokens = []
         for _ in range(count):
@@ -87,7 +92,7 @@ def _race(base_url: str, tokens: list[str], answers: int) -> tuple[list[float], 
 def _label(base_url: str, token: str, answers: int, together: threading.Barrier) -> list[float]:
     times = []
     headers = {"Accept": "application/json"}
-    with httpx2.Client(base_url=base_url, headers=headers, timeout=60) as browser:
+    with httpx2.Client(base_url=base_url, headers=headers, timeout=PATIENCE_S) as browser:
         browser.get(f"/p/{token}")
         pair = browser.get("/p/next").json()["pair"]
         together.wait()
@@ -101,7 +106,7 @@ def _label(base_url: str, token: str, answers: int, together: threading.Barrier)
 
 
 def _await_health(base_url: str) -> None:
-    for _ in range(1000):
+    for _ in range(int(50 * PATIENCE_S)):
         try:
             httpx2.get(f"{base_url}/health/live").raise_for_status()
         except httpx2.TransportError:
@@ -115,12 +120,6 @@ def _rss_mb(pid: int) -> float:
     status = Path(f"/proc/{pid}/status").read_text()
     line = next(line for line in status.splitlines() if line.startswith("VmRSS"))
     return int(line.split()[1]) / 1024
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def _say(text: str) -> None:

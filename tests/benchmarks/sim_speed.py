@@ -1,6 +1,8 @@
 """How fast the simulations are on one core, beside the benchmark's (Assistive Gym v1.0) figures.
 
-Run: python -m tests.benchmarks.sim_speed [--resets 10000]    (a minute; prints what docs/results/simulation.md shows)
+    python -m tests.benchmarks.sim_speed --resets 10000
+
+prints in a minute what docs/results/simulation.md shows:
 
 CPU seconds of this process, with random actions as in the benchmark's measurement and with the shipped policy's. Steps
 are timed without resets. The physics share is the time inside the engine's own stepping, the floor that no Python can
@@ -27,7 +29,6 @@ BENCHMARK_STEPS_PER_S = {"feeding": 160.0, "drinking": 21.0, "scratching": 268.0
 WANTED_RATIO = {"feeding": 10, "drinking": 20, "scratching": 12}
 PELLETS = (16, 32, 64)
 
-EPISODES = 20
 RESETS = 300
 CHECKPOINTS = Path(worker.__file__).parent / "checkpoints"
 
@@ -36,26 +37,27 @@ def main() -> None:
     """Print one row per task and number of pellets, then how memory grows over many resets."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--resets", type=int, default=10_000, help="resets over which memory must not grow")
-    resets = parser.parse_args().resets
+    parser.add_argument("--episodes", type=int, default=20, help="whose steps are timed")
+    options = parser.parse_args()
     sys.stdout.write("| task | random steps/s | x benchmark (wanted) | physics share | policy steps/s | reset ms |\n")
     sys.stdout.write("|---|---|---|---|---|---|\n")
     for name, kind in ENVIRONMENTS.items():
         if name == "drinking":
             for pellets in PELLETS:
-                _row(f"{name}, {pellets} pellets", name, partial(DrinkingEnv, pellets=pellets))
+                _row(f"{name}, {pellets} pellets", name, partial(DrinkingEnv, pellets=pellets), options.episodes)
         else:
-            _row(name, name, kind)
+            _row(name, name, kind, options.episodes)
     for name, kind in ENVIRONMENTS.items():
-        sys.stdout.write(f"{name}: {_growth_kib(kind(), resets):+d} KiB over {resets} resets\n")
+        sys.stdout.write(f"{name}: {_growth_kib(kind(), options.resets):+d} KiB over {options.resets} resets\n")
 
 
-def _row(label: str, name: str, make: Callable[[], AssistiveEnv]) -> None:
+def _row(label: str, name: str, make: Callable[[], AssistiveEnv], episodes: int) -> None:
     env, rng = make(), np.random.default_rng(0)
     policy = GaussianPolicy.load(CHECKPOINTS / name / "policy.safetensors")
     env.reset(seed=0)
     reset_s = _cpu_s(lambda: [env.reset(seed=scenario) for scenario in range(RESETS)]) / RESETS
-    acting_s, physics_share = _stepping(env, lambda _: rng.uniform(-1, 1, 7).astype(np.float32))
-    policy_s, _ = _stepping(env, policy.mean)
+    acting_s, physics_share = _stepping(env, lambda _: rng.uniform(-1, 1, 7).astype(np.float32), episodes)
+    policy_s, _ = _stepping(env, policy.mean, episodes)
     ratio = 1 / acting_s / BENCHMARK_STEPS_PER_S[name]
     sys.stdout.write(
         f"| {label} | {1 / acting_s:.0f} | {ratio:.1f} ({WANTED_RATIO[name]}) | {100 * physics_share:.0f} % "
@@ -65,12 +67,12 @@ def _row(label: str, name: str, make: Callable[[], AssistiveEnv]) -> None:
     env.close()
 
 
-def _stepping(env: AssistiveEnv, act: Callable[[np.ndarray], np.ndarray]) -> tuple[float, float]:
+def _stepping(env: AssistiveEnv, act: Callable[[np.ndarray], np.ndarray], episodes: int) -> tuple[float, float]:
     """CPU seconds per environment step, and the share of it inside the engine's stepping."""
     engine = _Stopwatch(env._world.step)
     env._world.step = engine  # type: ignore[method-assign]
     spent, steps = 0.0, env.task.episode_steps
-    for scenario in range(EPISODES):
+    for scenario in range(episodes):
         observation, _ = env.reset(seed=scenario)
         actions_s = 0.0
         start = time.process_time()
@@ -81,7 +83,7 @@ def _stepping(env: AssistiveEnv, act: Callable[[np.ndarray], np.ndarray]) -> tup
             observation, *_ = env.step(action)
         spent += time.process_time() - start - actions_s
     del env._world.step  # the class' own method again
-    return spent / (EPISODES * steps), engine.seconds / spent
+    return spent / (episodes * steps), engine.seconds / spent
 
 
 def _growth_kib(env: AssistiveEnv, resets: int) -> int:

@@ -18,26 +18,27 @@ from worker.sim.rollout import Act, rollout
 from worker.trajectory import COSTS
 
 FACTORS = (0.8, 0.9, 1.0, 1.1, 1.2)
-SCENARIOS = range(3_000_000, 3_000_200)
+FIRST_SCENARIO = 3_000_000
 
 
 def main() -> None:
     """Print each item's mean sum per factor, its slope over the logarithm of the factor, and the weight."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--task", choices=ENVIRONMENTS, default="feeding")
-    task = parser.parse_args().task
+    parser.add_argument("--scenarios", type=int, default=200)
+    options = parser.parse_args()
+    task, scenarios = options.task, range(FIRST_SCENARIO, FIRST_SCENARIO + options.scenarios)
     env = laboratory.environment(task)
     sums = np.zeros((len(FACTORS), len(COSTS)))
     for row, factor in enumerate(FACTORS):
         successes = 0
-        for scenario in SCENARIOS:
+        for scenario in scenarios:
             episode = rollout(env, scaled(task, factor), scenario)
-            sums[row] += cost_items(laboratory.task(task), episode.costs, episode.signals, "calibrated").sum(0) / len(
-                SCENARIOS
-            )
+            items = cost_items(laboratory.task(task), episode.costs, episode.signals, "calibrated").sum(0)
+            sums[row] += items / len(scenarios)
             successes += episode.success
-        items = "  ".join(f"{name} {value:7.3f}" for name, value in zip(COSTS, sums[row], strict=True))
-        sys.stdout.write(f"x{factor:.1f}  success {successes / len(SCENARIOS):.3f}  {items}\n")
+        printed = "  ".join(f"{name} {value:7.3f}" for name, value in zip(COSTS, sums[row], strict=True))
+        sys.stdout.write(f"x{factor:.1f}  success {successes / len(scenarios):.3f}  {printed}\n")
     slopes = np.polyfit(np.log(FACTORS), sums, 1)[0]
     speed = COSTS.index("C_v")
     others = sum(BASE_WEIGHTS[name] * slope for name, slope in zip(COSTS, slopes, strict=True) if name != "C_v")

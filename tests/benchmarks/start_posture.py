@@ -1,6 +1,8 @@
 """Search for a task's start posture: which elbow configuration keeps clear of the person all the way to the target.
 
-Run: python -m tests.benchmarks.start_posture [--task feeding]    (seconds; prints candidates for the task's Start)
+    python -m tests.benchmarks.start_posture --task feeding
+
+prints candidates for the task's Start in seconds.
 """
 
 import argparse
@@ -16,7 +18,6 @@ from worker.sim.seated_person import PERSON
 
 FloatArray = npt.NDArray[np.float64]
 
-RESTARTS = 4000
 SCENARIOS = 4
 """Targets of so many scenarios lie on the way."""
 LIMITED_JOINTS = [1, 3, 5]
@@ -26,16 +27,18 @@ def main() -> None:
     """Score random restarts by manipulability, clearance and joint margins; print the best."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--task", choices=ENVIRONMENTS, default="feeding")
-    kind = ENVIRONMENTS[parser.parse_args().task]
+    parser.add_argument("--restarts", type=int, default=4000)
+    options = parser.parse_args()
+    kind, restarts = ENVIRONMENTS[options.task], options.restarts
     rng, robot = np.random.default_rng(1), kind.robot
     orientation = robot.mount_rotation.T @ np.array(kind.start.tool_axes).T
     low, high = np.maximum(robot.lower_rad, -np.pi), np.minimum(robot.upper_rad, 1.5 * np.pi)
-    seeds = rng.uniform(low, high, (RESTARTS, len(robot.joints)))
+    seeds = rng.uniform(low, high, (restarts, len(robot.joints)))
     chain: list[FloatArray] = []
     errors: list[FloatArray] = []
     for goal in robot.in_base_frame(np.array([kind.start.centre_m, *_targets(kind)])):
         start = chain[0] if chain else seeds
-        solved, error = robot.solve_pose(start, np.tile(goal, (RESTARTS, 1)), orientation, kind.tool, 100)
+        solved, error = robot.solve_pose(start, np.tile(goal, (restarts, 1)), orientation, kind.tool, 100)
         chain.append(solved)
         errors.append(error)
     env = kind()

@@ -33,6 +33,18 @@ def chromium() -> Iterator[Browser]:
 
 
 NewPage = Callable[..., Page]
+PATIENCE_MS = 120_000
+"""Until a state must have come. No test depends on how fast the machine is, so this only ends tests that fail."""
+expect.set_options(timeout=PATIENCE_MS)
+HELD = """(() => {
+    const own = Object.getOwnPropertyDescriptor(HTMLMediaElement.prototype, "playbackRate");
+    Object.defineProperty(HTMLMediaElement.prototype, "playbackRate", {
+        ...own,
+        set(wanted) { own.set.call(this, window.mayRun || this.currentTime > 1 ? wanted : 0); },
+    });
+    addEventListener("play", ({ target }) => (target.playbackRate = 1), true);
+})()"""
+"""Clips play, but stand still at their beginning, until they may run; from the middle on they run as ever."""
 SETTLED = """() => Promise.all(
     document.getAnimations()
         .filter((each) => each.effect.getComputedTiming().endTime !== Infinity)
@@ -86,6 +98,7 @@ def new_page(chromium: Browser) -> Iterator[NewPage]:
 
     def open_page(**options: object) -> Page:
         context = chromium.new_context(**{"viewport": {"width": 1366, "height": 768}, **options})  # type: ignore[arg-type]
+        context.set_default_timeout(PATIENCE_MS)
         contexts.append(context)
         page = context.new_page()
         page.on("pageerror", lambda error: errors.append(str(error)))
@@ -98,14 +111,30 @@ def new_page(chromium: Browser) -> Iterator[NewPage]:
     assert errors == []
 
 
+def hold_clips(page: Page) -> None:
+    """Whatever opens from now on does not get past the first moment of a clip: what is done meanwhile may take long."""
+    page.add_init_script(HELD)
+
+
+def let_clips_run(page: Page) -> None:
+    """Those that were held, from where they are."""
+    page.evaluate(
+        "window.mayRun = true; document.querySelectorAll('video').forEach((video) => (video.playbackRate = 1))"
+    )
+
+
 def wait_ready(page: Page, answered: int) -> None:
     """Until this many answers are given and the next pair plays."""
     expect(page.locator("[data-count]")).to_have_text(f"{answered} of 10")
-    expect(page.locator("[data-phase=ready]")).to_be_visible(timeout=15_000)
+    expect(page.locator("[data-phase=ready]")).to_be_visible()
 
 
 def serious_findings(page: Page) -> list[str]:
-    """What axe finds wrong in either theme for people who use assistive technology, once nothing moves any more."""
+    """What axe finds wrong in either theme for people who use assistive technology, once nothing moves any more.
+
+    Whoever has just left a page first waits for something that only the next one has.
+    """
+    page.wait_for_load_state()  # styles are there
     found = []
     for scheme in ("light", "dark", None):
         page.emulate_media(color_scheme=scheme or "null")

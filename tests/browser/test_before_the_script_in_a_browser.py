@@ -71,7 +71,7 @@ def test_no_pair_can_be_answered_before_the_script_is_there(invited: Invited, ne
     assert invited.events() == []
     held.let_go()
     expect(left).to_be_enabled()
-    expect(page.locator("[data-phase=ready]")).to_be_visible(timeout=60_000)
+    expect(page.locator("[data-phase=ready]")).to_be_visible()
     assert invited.events() == []
 
 
@@ -113,7 +113,7 @@ def test_a_page_whose_script_never_comes_offers_to_load_it_again(invited: Invite
     page.route("**/outbox.js", lambda route: route.abort())
     page.goto(invited.link)
     again = page.get_by_role("link", name="Load it again")
-    expect(again).to_be_visible(timeout=60_000)
+    expect(again).to_be_visible()
     page.unroute("**/outbox.js")
     again.click()
     wait_ready(page, 0)

@@ -14,6 +14,7 @@ from app.domain.studies import Study
 from app.services import enrolment
 from app.storage import ArtefactStore
 from tests import factories
+from tests.browser.conftest import PATIENCE_MS
 from tests.conftest import PASSWORD
 
 pytestmark = pytest.mark.browser
@@ -41,6 +42,7 @@ def page(chromium: Browser, address: str, study: Study) -> Iterator[Page]:
     """Logged in, by typing."""
     errors: list[str] = []
     context = chromium.new_context(base_url=address, viewport={"width": 1366, "height": 768})
+    context.set_default_timeout(PATIENCE_MS)
     page = context.new_page()
     page.on("pageerror", lambda error: errors.append(str(error)))
     page.goto("/studies")
@@ -109,8 +111,12 @@ def test_new_links_and_their_sheet_shut_nobody_out(page: Page) -> None:
             assert Axe().run(page).response["violations"] == []
             assert page.evaluate("document.documentElement.scrollWidth - innerWidth") <= 0
         page.get_by_role("link", name="Sheet with QR codes").click()
+        expect(page.get_by_role("link", name="Back to the links")).to_be_visible()
+        page.wait_for_load_state()
         assert Axe().run(page).response["violations"] == []
         page.get_by_role("link", name="Back to the links").click()
+        expect(page.get_by_role("heading", name="Personal links")).to_be_visible()
+        page.wait_for_load_state()
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])

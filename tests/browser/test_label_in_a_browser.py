@@ -24,6 +24,7 @@ def test_from_the_link_to_the_tenth_answer_and_on_the_dashboard(
     assert invited.token not in page.url
     assert serious_findings(page) == []
     page.get_by_role("button", name="I agree to take part").click()
+    expect(page.get_by_role("button", name="Start comparing")).to_be_visible()
     assert serious_findings(page) == []
     page.get_by_role("button", name="Start comparing").click()
     given = ["left", "right", "equal", "skip", "left", "right", "left", "equal", "left", "right"]
@@ -241,7 +242,7 @@ def test_a_pair_whose_clip_is_damaged_gives_way_to_the_next(
     page = new_page()
     page.route("**/media/*.mp4", lambda route: route.abort())
     page.goto(invited.link)
-    expect(page.get_by_text("These clips could not be loaded.")).to_be_visible()
+    expect(page.get_by_text("These videos could not be loaded.")).to_be_visible()
     with invited.database.reading() as session:
         first, second = session.scalars(select(Query).order_by(Query.ordinal).limit(2))
         clip = session.get_one(Clip, first.left_clip_id)
@@ -275,7 +276,7 @@ def test_whoever_prefers_stillness_plays_on_demand(invited: Invited, new_page: N
     assert invited.responses() == []
     play.click()
     wait_ready(page, 0)
-    expect(page.get_by_role("button", name="Play again")).to_be_visible(timeout=10_000)
+    expect(page.get_by_role("button", name="Play again")).to_be_visible()
     page.keyboard.press("ArrowLeft")
     expect(page.locator("[data-count]")).to_have_text("1 of 10")
 

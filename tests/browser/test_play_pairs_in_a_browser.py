@@ -7,13 +7,14 @@ from sqlalchemy import select
 from app.domain.participation import ParticipantEvent
 from app.domain.preferences import Purpose, Query
 from tests import factories
-from tests.browser.conftest import Invited, NewPage, serious_findings, wait_ready
+from tests.browser.conftest import Invited, NewPage, hold_clips, let_clips_run, serious_findings, wait_ready
 
 pytestmark = pytest.mark.browser
 
 LAST_FRAME_S = (factories.FRAMES - 1) / factories.FPS
 TIMES = "() => [...document.querySelectorAll('video')].map((video) => video.currentTime)"
 RATES = "() => [...document.querySelectorAll('video')].map((video) => video.playbackRate)"
+AT_THE_BEGINNING = "() => [...document.querySelectorAll('video')].every((video) => video.currentTime === 0)"
 PAUSED = "() => [...document.querySelectorAll('video')].every((video) => video.paused)"
 SEEN_FIRST = pytest.mark.parametrize("invited", [{"answer_after_first_play": True}], indirect=True)
 
@@ -115,6 +116,7 @@ def test_whoever_came_to_the_bar_by_keyboard_moves_it_by_keyboard(invited: Invit
 @SEEN_FIRST
 def test_answers_open_when_both_clips_have_been_seen_once(invited: Invited, new_page: NewPage) -> None:
     page = new_page()
+    hold_clips(page)
     page.goto(invited.link)
     expect(page.locator("[data-phase=watching]")).to_be_visible()
     expect(page.get_by_role("status")).to_have_text("Watch both once, then answer")
@@ -122,14 +124,16 @@ def test_answers_open_when_both_clips_have_been_seen_once(invited: Invited, new_
     page.keyboard.press("ArrowLeft")
     scrub(page, 990)  # the end alone is not the whole
     page.keyboard.press("Space")
+    page.wait_for_function(AT_THE_BEGINNING)  # of the next round
     page.keyboard.press("ArrowLeft")
     assert invited.responses() == []
-    page.keyboard.press("r")
+    let_clips_run(page)
     wait_ready(page, 0)
     expect(page.get_by_role("status")).to_have_text("You can answer now")
     page.keyboard.press("ArrowLeft")
     expect(page.locator("[data-count]")).to_have_text("1 of 10")
-    assert invited.events()[0].watched_whole is True
+    (event,) = invited.events()
+    assert event.watched_whole is True
 
 
 @SEEN_FIRST
@@ -153,6 +157,7 @@ def test_what_was_played_of_each_clip_is_noted_whatever_the_speed_at_the_end(
 @SEEN_FIRST
 def test_clips_that_break_off_do_not_lock_the_answers(invited: Invited, new_page: NewPage) -> None:
     page = new_page()
+    hold_clips(page)
     page.goto(invited.link)
     expect(page.locator("[data-phase=watching]")).to_be_visible()
     page.evaluate("document.querySelector('video').dispatchEvent(new Event('error'))")

@@ -14,7 +14,7 @@ from app.domain.protocol import EvaluatedMethod, EvaluationMode, EvaluationSetti
 from app.domain.studies import Participant, Study
 from app.storage import ArtefactStore
 from tests import factories
-from tests.browser.conftest import NewPage, serious_findings
+from tests.browser.conftest import NewPage, hold_clips, let_clips_run, serious_findings
 
 pytestmark = pytest.mark.browser
 
@@ -67,19 +67,22 @@ def test_films_are_rated_by_keyboard_alone_after_they_were_seen(
 ) -> None:
     invited = invite(watch_first=True)
     page = new_page()
+    hold_clips(page)
     page.goto(invited.link)
     expect(page.get_by_role("heading", name="Robot A")).to_be_visible()
     expect(page.get_by_text("Watch it once to the end, then rate")).to_be_visible()
     page.keyboard.press("4")
     assert page.locator("input:checked").count() == 0
-    expect(page.get_by_text("You can rate now")).to_be_visible(timeout=15_000)
+    let_clips_run(page)
+    expect(page.get_by_text("You can rate now")).to_be_visible()
     assert serious_findings(page) == []
     page.keyboard.type("52")
     page.keyboard.press("Backspace")
     page.keyboard.type("3")
     page.keyboard.press("Enter")
     expect(page.get_by_role("heading", name="Robot B")).to_be_visible()
-    expect(page.get_by_text("You can rate now")).to_be_visible(timeout=15_000)
+    let_clips_run(page)
+    expect(page.get_by_text("You can rate now")).to_be_visible()
     page.keyboard.type("12")
     page.keyboard.press("Enter")
     expect(page.get_by_role("heading", name="All robots are rated")).to_be_visible()
@@ -122,7 +125,7 @@ def test_a_rating_given_while_the_network_is_away_arrives_once_it_is_back(
     expect(page.get_by_text("Not saved yet. Trying again")).to_be_visible()
     assert invited.ratings() == []
     away = False
-    expect(page.get_by_role("heading", name="Robot B")).to_be_visible(timeout=15_000)
+    expect(page.get_by_role("heading", name="Robot B")).to_be_visible()
     assert invited.ratings() == [(1, 2, 5)]
 
 
@@ -149,7 +152,7 @@ def test_the_waiting_page_goes_on_by_itself_when_the_robots_are_ready(
     with invited.database.writing() as session:
         study = session.get_one(Study, invited.study.id)
         factories.make_robots(session, store, study, session.get_one(Participant, invited.participant.id))
-    expect(page.get_by_role("heading", name="Robot A")).to_be_visible(timeout=15_000)
+    expect(page.get_by_role("heading", name="Robot A")).to_be_visible()
 
 
 def test_operator_and_participant_follow_each_other_without_reloading(
@@ -166,7 +169,8 @@ def test_operator_and_participant_follow_each_other_without_reloading(
     expect(person.get_by_role("heading", name="Robot A is next")).to_be_visible()
     assert serious_findings(person) == serious_findings(operator) == []
     operator.get_by_role("button", name="Start").click()
-    expect(person.get_by_role("heading", name="Robot A is moving, please watch")).to_be_visible()
+    expect(person.get_by_role("heading", name="Robot A is moving. Please watch")).to_be_visible()
+    expect(operator.get_by_role("button", name="Repeat this trial")).to_be_visible()
     assert serious_findings(person) == serious_findings(operator) == []
     operator.get_by_label("Did something go wrong with the robot?").fill("it dropped the spoon")
     operator.get_by_role("button", name="Repeat this trial").click()

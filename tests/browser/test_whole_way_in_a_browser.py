@@ -174,7 +174,7 @@ def test_the_whole_way_with_the_keyboard_alone_and_back_to_the_panel(
     expect(page.get_by_label("Your completion code")).to_have_value("C1X7")
     press(page, "Copy")
     expect(page.get_by_text("Copied.")).to_be_visible()
-    page.wait_for_url("https://panel.example/done?cc=C1X7&pid=abc", timeout=15_000)
+    page.wait_for_url("https://panel.example/done?cc=C1X7&pid=abc")
 
     assert study.person().completed_at is not None
     own = urlsplit(study.address).netloc

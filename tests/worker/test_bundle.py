@@ -15,6 +15,7 @@ import numpy as np
 import onnxruntime
 import pytest
 
+from tests.waiting import PATIENCE_S
 from tests.worker import invented
 from worker.analysis.evaluation import evaluate
 from worker.ml import bundle, reward_training
@@ -76,7 +77,7 @@ def unzipped(written: bytes, tmp_path: Path) -> Path:
 def run(directory: Path, *arguments: str | Path) -> "subprocess.CompletedProcess[str]":
     """As somebody without this project would."""
     command = [sys.executable, "-I", "run_filter.py", *map(str, arguments)]
-    return subprocess.run(command, cwd=directory, capture_output=True, text=True, check=False, timeout=120)
+    return subprocess.run(command, cwd=directory, capture_output=True, text=True, check=False, timeout=PATIENCE_S)
 
 
 def test_the_same_contents_give_the_same_bytes(contents: BundleContents, written: bytes) -> None:

@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 from tqdm import tqdm
 
+from tests.waiting import PATIENCE_S
 from worker.compute import Compute, ComputeLost, Interrupted, Lane
 
 
@@ -97,7 +98,7 @@ def test_only_the_job_whose_process_died_is_lost(compute: Compute, tmp_path: Pat
     for thread in threads:
         thread.start()
     for thread in threads:
-        thread.join(timeout=60)
+        thread.join(timeout=PATIENCE_S)
     assert isinstance(outcomes[0], ComputeLost)
     assert outcomes[1] == 1
 
@@ -144,10 +145,10 @@ def test_a_compute_process_that_was_stopped_does_not_hold_up_the_end(tmp_path: P
     for pid in (idle, busy):
         os.kill(pid, signal.SIGSTOP)
     compute.close()
-    thread.join(timeout=60)
+    thread.join(timeout=PATIENCE_S)
     assert [type(error) for error in raised] == [Interrupted]
-    assert gone_within(idle, seconds=10)
-    assert gone_within(busy, seconds=10)
+    assert ends(idle)
+    assert ends(busy)
 
 
 def test_who_is_answering_does_not_wait_for_somebody_else_s_filter(tmp_path: Path) -> None:
@@ -162,7 +163,7 @@ def test_who_is_answering_does_not_wait_for_somebody_else_s_filter(tmp_path: Pat
     thread.start()
     assert compute.run(Lane.REWARDS, nothing, square, 3) == 9
     compute.close()
-    thread.join(timeout=60)
+    thread.join(timeout=PATIENCE_S)
     assert not thread.is_alive()
 
 
@@ -184,7 +185,7 @@ def test_stopping_interrupts_whoever_waits_with_nothing_that_could_be_recorded_a
 
     thread = threading.Thread(target=work)
     thread.start()
-    thread.join(timeout=60)
+    thread.join(timeout=PATIENCE_S)
     assert [type(error) for error in raised] == [Interrupted]
     assert not isinstance(raised[0], Exception)
 
@@ -205,7 +206,7 @@ def test_compute_processes_die_with_a_worker_that_is_killed() -> None:
         child = int(parent.stdout.readline())
         parent.kill()
         parent.wait()
-        assert gone_within(child, seconds=10)
+        assert ends(child)
 
 
 def test_processes_with_nothing_left_to_do_leave_without_a_word() -> None:
@@ -217,13 +218,15 @@ def test_processes_with_nothing_left_to_do_leave_without_a_word() -> None:
         "    compute.run(Lane.LEARNING, nothing, show_progress)\n"
         "    compute.close()\n"
     )
-    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True)
+    ended = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=PATIENCE_S, check=True
+    )
     assert ended.stderr == ""
 
 
-def gone_within(pid: int, seconds: float) -> bool:
+def ends(pid: int) -> bool:
     """Whether the process ends; a zombie whose parent has not asked counts as ended."""
-    for _ in range(int(seconds * 50)):
+    for _ in range(int(PATIENCE_S * 50)):
         try:
             status = Path(f"/proc/{pid}/stat").read_text()
         except FileNotFoundError:

@@ -14,6 +14,7 @@ import onnx
 import pytest
 import torch
 
+from tests.waiting import PATIENCE_S
 from tests.worker import invented
 from worker.ml import controller
 from worker.ml.action_filter import FilterWeights, build, state_of
@@ -130,7 +131,7 @@ def test_a_controller_runs_where_this_project_is_not_installed(models: dict[str,
     np.save(tmp_path / "mine.npy", SEEN[:5])
     for arguments in ([], ["--observations", "mine.npy", "--output", "out.npy"]):
         command = [sys.executable, "-I", "run_controller.py", *arguments]
-        ran = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=120)
+        ran = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=PATIENCE_S)
         assert ran.returncode == 0, ran.stdout + ran.stderr
         assert "Robot B of P07" in ran.stdout
     np.testing.assert_allclose(np.load(tmp_path / "out.npy"), Controller(models["studio"]).batch(SEEN[:5]), atol=1e-6)
@@ -142,7 +143,7 @@ def test_a_damaged_controller_says_so(models: dict[str, bytes], tmp_path: Path) 
     path = tmp_path / "controller.onnx"
     path.write_bytes(path.read_bytes()[:-1] + b"1")
     command = [sys.executable, "-I", "run_controller.py"]
-    ran = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=120)
+    ran = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=PATIENCE_S)
     assert ran.returncode == 1
     assert "controller.onnx is not the file that was exported" in ran.stderr
 

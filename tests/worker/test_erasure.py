@@ -16,6 +16,7 @@ from app.domain.studies import Participant, Study
 from app.services import retirement, withdrawal
 from app.settings import Settings
 from app.storage import ArtefactStore
+from tests.waiting import PATIENCE_S
 from tests.worker.conftest import the_workshop
 from worker import engine, erasure, records, workflows
 from worker.compute import Compute
@@ -25,7 +26,6 @@ from worker.workflows import Workshop, as_arguments
 from worker.workplace import Step, Workplace
 
 MARK = b"ERASE-ME-"
-PATIENCE_S = 20.0
 
 
 class Work:

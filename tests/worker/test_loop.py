@@ -19,6 +19,7 @@ from app.domain.models import Model, ModelKind, Run, RunKind, RunStatus
 from app.domain.preferences import LabelEvent
 from app.domain.studies import StudySettings
 from app.storage import ArtefactStore
+from tests.waiting import PATIENCE_S
 from worker import dataset
 from worker.ml import bundle
 from worker.ml.teachers import TASTES, Manner
@@ -27,7 +28,6 @@ from worker.rehearsal import Outcome, Rehearsal
 
 LABELS = 12
 SCENARIOS, BEHAVIOURS = 2, 4
-PATIENCE_S = 300.0
 
 pytestmark = pytest.mark.slow
 

@@ -21,14 +21,13 @@ from app.domain.models import Run, RunKind, RunStatus, WorkerPresence
 from app.domain.studies import Participant
 from app.settings import Settings
 from app.storage import ArtefactStore
+from tests.waiting import PATIENCE_S
 from tests.worker.conftest import the_workshop
 from worker import engine, reconcile, records, service, workflows
 from worker.compute import Compute
 from worker.records import Job
 from worker.workflows import Workshop, as_arguments
 from worker.workplace import Step, Workplace
-
-PATIENCE_S = 300.0
 
 Damage = Callable[[Path], None]
 

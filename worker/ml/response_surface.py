@@ -94,7 +94,7 @@ class ResponseSurface:
         config = stored_config(stored)
         if config.get("signals") != list(SIGNALS) or config.get("axes") != list(family.names):
             raise ValueError(
-                "This response surface was fitted for other signals or axes; run `python -m worker explore --task ...`."
+                "This response surface was fitted for other signals or axes; `python -m worker explore` fits another."
             )
         tensors = {name: array.astype(np.float64) for name, array in load(stored).items()}
         return cls(**tensors, axes=family.names)
