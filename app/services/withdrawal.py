@@ -112,6 +112,8 @@ def _rows_below(root_name: str, root_id: int) -> Iterator[tuple[Table, ColumnEle
             continue
         parents = [key for key in table.foreign_keys if key.column.table in found and key.column.table is not table]
         direct = [key for key in parents if key.column.table is root]
+        # The schema's own order is by chance, and a key that may be empty leads to some of the rows only.
+        parents.sort(key=lambda key: (bool(key.parent.nullable), key.parent.name))
         for key in direct or parents[:1]:
             found[table] = key.parent.in_(select(key.column).where(found[key.column.table]))
             yield table, found[table]

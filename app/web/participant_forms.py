@@ -7,7 +7,6 @@ from typing import Annotated
 
 from fastapi import APIRouter, Depends, Request
 from fastapi.responses import Response
-from starlette.datastructures import FormData
 
 from app.domain.protocol import LIKERT_POINTS, FormItem, Stage
 from app.domain.studies import Participant
@@ -23,8 +22,8 @@ router = APIRouter(prefix="/p")
 
 async def _typed(request: Request) -> Mapping[str, str]:
     """The fields as they were typed; which there are depends on the study."""
-    form: FormData = await request.form()
-    return {name: value for name, value in form.items() if isinstance(value, str)}
+    async with request.form() as form:  # files that somebody sends along are closed again
+        return {name: value for name, value in form.items() if isinstance(value, str)}
 
 
 Typed = Annotated[Mapping[str, str], Depends(_typed)]

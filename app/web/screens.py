@@ -29,7 +29,7 @@ Draw = Callable[[Session], Mapping[str, str]]
 Pieces = Sequence[str]
 """A part, cut where its rows begin."""
 
-_ROW = re.compile(r"(?=<(?:tr|li)\b[^>]*\bdata-row=)")
+_ROW = re.compile(r"(?=<[a-z]+\b[^>]*\bdata-row=)")
 
 
 class Screens:

@@ -13,7 +13,7 @@ from app.db import Database, now
 from app.domain.models import ModelKind, Report
 from app.domain.people import ApiToken, Experimenter, Role
 from app.domain.studies import Study
-from app.services import api_tokens, export_tables
+from app.services import api_tokens, export_tables, reports
 from app.storage import ArtefactStore
 from tests import factories
 from tests.finished_study import make_finished_study
@@ -149,9 +149,8 @@ def test_the_newest_report_and_its_figures(call: Call, database: Database, store
     with database.writing() as session:
         run = factories.make_run(session, study, kind="report")
         figures = {"ratings": {"svg": store.put(b"<svg/>")}}
-        session.add(
-            Report(study_id=study.id, run_id=run.id, basis="", contents={"blinded": False, "x": 1}, figures=figures)
-        )
+        contents = {"version": reports.VERSION, "blinded": False, "x": 1}
+        session.add(Report(study_id=study.id, run_id=run.id, basis="", contents=contents, figures=figures))
     report = call(f"/studies/{study.slug}/report").json()
     assert report["contents"]["x"] == 1
     assert (report["lock_hash"], report["deviations"]) == ("not locked", "none")

@@ -166,7 +166,7 @@ def test_the_first_robot_is_rated_while_the_rest_is_filmed(
     assert "1 of 6 ratings are safely stored" in look()
     with database.writing() as session:
         session.get_one(type(trials[0]), later[0][0]).film_id = later[0][1]
-    assert "Time 2 of 2 with this robot" in look()
+    assert "Round 2 of 2 with this robot" in look()
 
 
 def test_the_debrief_is_foretold_too(database: Database, study: Study, person: tuple[Participant, str]) -> None:

@@ -39,7 +39,7 @@ def everybody(database: Database) -> list[Participant]:
 
 def press(browser: TestClient, address: str) -> Answer:
     """Open the address and press the button on its page."""
-    action = re.search(r'<form[^>]+method="post"[^>]+action="([^"]+)"', browser.get(address).text)
+    action = re.search(r'<form class="onward"[^>]+action="([^"]+)"', browser.get(address).text)
     assert action is not None
     return browser.post(html.unescape(action[1]))
 

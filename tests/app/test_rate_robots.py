@@ -263,7 +263,13 @@ def test_while_the_robots_are_made_the_page_says_how_far_they_are_and_that_it_ma
     with database.writing() as session:
         factories.make_model(session, waiting.study, waiting.participant, ModelKind.FILTER, {})
         factories.make_run(
-            session, waiting.study, waiting.participant, kind=RunKind.METHOD, status=RunStatus.RUNNING, progress=0.5
+            session,
+            waiting.study,
+            waiting.participant,
+            kind=RunKind.METHOD,
+            status=RunStatus.RUNNING,
+            progress=0.5,
+            workflow_id=f"method/participant-{waiting.participant.id}/prefft/labels-10/answer-10",
         )
     page = waiting.look()
     assert "Training the robots" in page
@@ -280,10 +286,13 @@ def test_when_something_failed_the_waiting_page_says_so(begin: Callable[..., AtT
     assert "Something went wrong" in waiting.look()
 
 
-def test_a_film_whose_file_is_lost_is_waited_for(rating: AtTheRobots, store: ArtefactStore) -> None:
-    film = rating.trials[5].film
-    assert film is not None
-    store.delete(film.video_sha256)
+def test_a_film_whose_file_is_lost_is_waited_for_when_it_is_its_turn(rating: AtTheRobots, store: ArtefactStore) -> None:
+    last, first = rating.trials[5].film, rating.trials[0].film
+    assert first is not None
+    assert last is not None
+    store.delete(last.video_sha256)
+    assert "Robot A at work" in rating.look()
+    store.delete(first.video_sha256)
     assert "Your robots are being prepared" in rating.look()
 
 

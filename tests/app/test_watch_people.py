@@ -120,7 +120,7 @@ def test_a_useless_model_is_a_flag_and_what_rests_on_it_is_grey(
     assert "verdict-unproven" in page
     assert "verdict-better" not in page
     detail = experimenter.get("/studies/pilot/participants/P01").text
-    assert detail.count("not been shown to be better than guessing (1 of 7 preferences foreseen)") == 2
+    assert detail.count("not been shown to be better than guessing (1 of 7 preferences predicted correctly)") == 2
     assert 'class="card stack unproven"' in detail
 
 

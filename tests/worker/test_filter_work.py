@@ -9,14 +9,14 @@ from sqlalchemy import func, select
 from app.db import Database
 from app.domain.clips import Clip
 from app.domain.models import Model, ModelKind, RunKind
-from app.domain.preferences import Query, Response
+from app.domain.preferences import LabelEvent, Query, Response
 from app.domain.studies import Participant, Study
 from app.services import accuracy
 from app.storage import ArtefactStore
 from worker import records
 from worker.compute import Compute
 from worker.filter_work import NothingToLearnFrom, notes_on_foresight, train_filter
-from worker.outdated import is_outdated
+from worker.outdated import ending, filter_name, is_outdated
 from worker.records import Job
 from worker.workplace import Workplace
 
@@ -74,9 +74,11 @@ def answered(
 
 
 def outdated_at(place: Workplace, participant: Participant, milestone: int, *, begun: bool) -> bool:
-    name = f"filter/participant-{participant.id}/labels-{milestone}"
-    job = Job(name, RunKind.FILTER, participant.study_id, participant.id, milestone)
     with place.database.reading() as session:
+        settings = session.get_one(Study, participant.study_id).settings
+        last_answer = session.scalar(select(func.max(LabelEvent.id))) or 0
+        name = filter_name(participant.id, milestone, ending(settings, milestone, last_answer, None))
+        job = Job(name, RunKind.FILTER, participant.study_id, participant.id, milestone)
         return is_outdated(session, job, begun=begun)
 
 
