@@ -133,8 +133,8 @@ def make_run(session: Session, study: Study, participant: Participant | None = N
     """A run of the worker; a finished reward training unless told otherwise."""
     number = session.scalar(select(func.count(Run.id)))
     usual = {"kind": RunKind.REWARD, "status": RunStatus.SUCCEEDED, "label_count": 10, "seed": 1, "finished_at": now()}
+    usual["workflow_id"] = f"run/{number}"
     run = Run(
-        workflow_id=f"run/{number}",
         study_id=study.id,
         participant_id=participant.id if participant else None,
         **{**usual, **columns},
