@@ -85,16 +85,28 @@ class TestLooking:
     ) -> None:
         assert found(database, study, **wanted) == expected
 
-    def test_quick_means_before_half_of_the_clip_unless_it_was_seen_whole(
+    def test_quick_means_before_half_of_both_clips_was_played(
         self, database: Database, study: Study, queries: list[Query]
     ) -> None:
         with database.writing() as session:
             events = {each.query_id: each for each in session.scalars(select(LabelEvent))}
-            events[queries[0].id].response_time_ms = 999  # the clips last 2 s
-            events[queries[1].id].response_time_ms = 1000
-            events[queries[2].id].response_time_ms = 500
+            played = {0: (999, 2000), 1: (1000, 2000), 2: (0, 0), 3: (0, 0)}  # of 2 s
+            for place, (left_ms, right_ms) in played.items():
+                event = events[queries[place].id]
+                event.left_watched_ms, event.right_watched_ms, event.response_time_ms = left_ms, right_ms, 100
             events[queries[2].id].watched_whole = True
-            events[queries[3].id].response_time_ms = None
+            events[queries[3].id].scrub_count = 1
+        assert found(database, study, mark=Mark.QUICK) == [("P01", 1)]
+
+    def test_of_answers_before_playing_was_recorded_the_highest_speed_is_allowed_for(
+        self, database: Database, study: Study, queries: list[Query]
+    ) -> None:
+        with database.writing() as session:
+            events = {each.query_id: each for each in session.scalars(select(LabelEvent))}
+            for event in events.values():
+                event.left_watched_ms = event.right_watched_ms = event.response_time_ms = None
+            events[queries[0].id].response_time_ms = 499  # half of 2 s at twice the speed
+            events[queries[1].id].response_time_ms = 500
         assert found(database, study, mark=Mark.QUICK) == [("P01", 1)]
 
     @pytest.mark.parametrize(

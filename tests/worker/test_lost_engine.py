@@ -70,7 +70,7 @@ def job(participant: Participant) -> Job:
 def due(monkeypatch: pytest.MonkeyPatch, job: Job) -> Job:
     """The job is all that is ever missing, for as long as its run says so."""
 
-    def findings(session: object) -> Iterator[tuple[Job, int]]:
+    def findings(session: object, _lost: object = None) -> Iterator[tuple[Job, int]]:
         run = session.scalar(select(Run).where(Run.workflow_id == job.finding))  # type: ignore[attr-defined]
         seen = run and reconcile._Attempted(run.status, run.attempt, run.finished_at)
         attempt = reconcile._attempt_due(seen, now())
