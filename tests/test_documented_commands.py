@@ -19,6 +19,7 @@ import pytest
 from app.db import Database
 from app.services import accounts
 from app.settings import Settings
+from worker import laboratory
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -163,6 +164,8 @@ def run(program: str, arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> 
         runpy.run_path(str(file), run_name="__main__")
     except SystemExit as end:
         return int(end.code or 0)
+    finally:
+        laboratory.environment.cache_clear()  # programs close what they have used
     return 0
 
 

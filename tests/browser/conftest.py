@@ -129,12 +129,15 @@ def wait_ready(page: Page, answered: int) -> None:
     expect(page.locator("[data-phase=ready]")).to_be_visible()
 
 
+STYLES_ARE_THERE = "[...document.querySelectorAll('link[rel=stylesheet]')].every((link) => link.sheet)"
+
+
 def serious_findings(page: Page) -> list[str]:
     """What axe finds wrong in either theme for people who use assistive technology, once nothing moves any more.
 
     Whoever has just left a page first waits for something that only the next one has.
     """
-    page.wait_for_load_state()  # styles are there
+    page.wait_for_function(STYLES_ARE_THERE)
     found = []
     for scheme in ("light", "dark", None):
         page.emulate_media(color_scheme=scheme or "null")
