@@ -129,7 +129,10 @@ def wait_ready(page: Page, answered: int) -> None:
     expect(page.locator("[data-phase=ready]")).to_be_visible()
 
 
-STYLES_ARE_THERE = "[...document.querySelectorAll('link[rel=stylesheet]')].every((link) => link.sheet)"
+STYLES_ARE_THERE = """async () => {
+  const links = [...document.querySelectorAll("link[rel=stylesheet]")];
+  while (!links.every((link) => link.sheet)) await new Promise((wake) => setTimeout(wake, 50));
+}"""
 
 
 def serious_findings(page: Page) -> list[str]:
@@ -137,7 +140,7 @@ def serious_findings(page: Page) -> list[str]:
 
     Whoever has just left a page first waits for something that only the next one has.
     """
-    page.wait_for_function(STYLES_ARE_THERE)
+    page.evaluate(STYLES_ARE_THERE)  # not wait_for_function: the pages forbid what it evaluates
     found = []
     for scheme in ("light", "dark", None):
         page.emulate_media(color_scheme=scheme or "null")
