@@ -53,7 +53,7 @@ class RenderStyle:
 
 
 STYLES = {"sharp": RenderStyle(), "quick": RenderStyle(fps=15, width=640, height=480)}
-"""By the name of a study's clip quality. A quick clip takes less than half of a sharp one's time (docs/results/films.md)."""
+"""By the name of a study's clip quality. A quick clip takes less than half of a sharp one's time."""
 
 
 @dataclass(frozen=True)
