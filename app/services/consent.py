@@ -16,7 +16,8 @@ def fingerprint(text: str) -> str:
 
 
 def give(session: Session, participant: Participant, text: str, language: str) -> None:
-    """Store that this person agreed to this text, of the version the study uses now."""
+    """Store that this person agreed to this text, of the version the study uses now, and reads in this language."""
+    participant.language = language
     version = participant.study.settings.consent_version
     known = newest(session, participant)
     if has_consented(participant) and known is not None and (known.text, known.version) == (text, version):

@@ -49,7 +49,7 @@ def join_study(request: Request, token: Token, session: WritingSession, studio: 
     except PanelIdMissing:
         return _id_missing(request, study)
     joined.participant.study = study
-    language = languages.settle(request, joined.participant, languages.chosen_here(request))
+    language = languages.wording_of(request, joined.participant).language
     response = _first_page(request, studio.settings.base_url, joined)
     lifetime = timedelta(days=studio.settings.session_days)
     cookie = browser_sessions.open_for_participant(session, joined.participant, lifetime)

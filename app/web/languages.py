@@ -1,7 +1,7 @@
 """In which language somebody reads: what they chose, else what their browser asks for; kept to the end.
 
-A participant's language is in their row, so that it is the same on every device. The cookie is for pages that cannot
-tell who is asking: before joining, after withdrawing, and where something went wrong.
+From consent on a participant's language is in their row, so that it is the same on every device. The cookie is for
+pages that cannot tell: before consent, after withdrawing, and where something went wrong.
 """
 
 import re
@@ -17,7 +17,7 @@ from app.domain.protocol import Language
 from app.domain.studies import Participant
 from app.settings import Settings
 from app.web.deps import LANGUAGE_COOKIE, StudioDep, WritingSession, participant_or_nobody, set_cookie
-from app.web.wording import NAMES, Wording, preferred
+from app.web.wording import NAMES, Wording, preferred, wording_for
 
 router = APIRouter(prefix="/p")
 
@@ -44,27 +44,20 @@ def choose_language(
     return response
 
 
-def settle(request: Request, participant: Participant, asked: str = "") -> Language:
-    """Somebody has come in: from now on this is their language, until they choose another.
+def wording_of(request: Request, participant: Participant) -> Wording:
+    """The texts for this participant: in the language they chose or agreed in; before that in their browser's.
 
-    ``asked``: what is wanted more than what the browser asks for, such as a choice made before joining.
+    Looking settles nothing: a program that looks at links in mails has a language, too.
     """
-    if participant.language is None and participant.consented_at is not None:
-        participant.language = participant.study.settings.language  # who began with an earlier version read in this
-    if participant.language is None:
-        wanted = asked or request.headers.get("accept-language", "")
-        participant.language = preferred(wanted, participant.study.settings.offered_languages)
-    return Language(participant.language)
+    settings = participant.study.settings
+    if participant.language is None and participant.consented_at is None:
+        return wording_for(settings, of_browser(request, settings.offered_languages))
+    return wording_for(settings, participant.language)  # who began with an earlier version reads in the study's
 
 
 def of_browser(request: Request, offered: Sequence[Language] = tuple(Language)) -> Language:
     """The language for somebody of whom we know the browser only."""
-    return preferred(chosen_here(request) or request.headers.get("accept-language", ""), offered)
-
-
-def chosen_here(request: Request) -> str:
-    """The language last used in this browser; empty when there was none."""
-    return request.cookies.get(LANGUAGE_COOKIE, "")
+    return preferred(request.cookies.get(LANGUAGE_COOKIE) or request.headers.get("accept-language", ""), offered)
 
 
 def remember(response: Response, settings: Settings, language: Language) -> None:

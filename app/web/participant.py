@@ -76,9 +76,8 @@ def open_link(request: Request, token: Token, session: WritingSession, studio: S
         return go(request, "show_withdrawn")
     lifetime = timedelta(days=studio.settings.session_days)
     cookie = browser_sessions.open_for_participant(session, participant, lifetime)
-    language = languages.settle(request, participant)
     response = go(request, "show_next")  # there they are seen: whoever only looks at links is not the participant
     set_cookie(response, studio.settings, PARTICIPANT_COOKIE, cookie, lifetime)
-    languages.remember(response, studio.settings, language)
+    languages.remember(response, studio.settings, languages.wording_of(request, participant).language)
     response.headers["referrer-policy"] = "no-referrer"
     return response

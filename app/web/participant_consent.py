@@ -11,9 +11,10 @@ from app.domain.studies import Participant
 from app.services import consent, stages
 from app.web.consent_text import consent_text
 from app.web.deps import CurrentParticipant, WritingSession
+from app.web.languages import wording_of
 from app.web.participant_pages import go, participant_page
 from app.web.templating import moment
-from app.web.wording import Wording, wording_of
+from app.web.wording import Wording
 
 router = APIRouter(prefix="/p")
 
@@ -34,7 +35,7 @@ def give_consent(
     shown: Annotated[str, Form(max_length=64)],
 ) -> Response:
     """Store the agreement to the text that was on the screen; if it has changed meanwhile, show the new one."""
-    wording = wording_of(participant)
+    wording = wording_of(request, participant)
     text = consent_text(wording, participant).whole
     if shown != consent.fingerprint(text):
         return _consent_page(request, participant, changed=True)
@@ -46,7 +47,7 @@ def give_consent(
 def show_consent_copy(request: Request, participant: CurrentParticipant, session: WritingSession) -> Response:
     """The text to keep: as it was agreed to, or as it will be asked."""
     record = consent.newest(session, participant)
-    text = record.text if record else consent_text(wording_of(participant), participant).whole
+    text = record.text if record else consent_text(wording_of(request, participant), participant).whole
     context = {"record": record, "text": text, "language_of_text": record.language if record else None}
     return participant_page(request, "participant/consent_copy.html", participant, context)
 
@@ -55,7 +56,7 @@ def show_consent_copy(request: Request, participant: CurrentParticipant, session
 def save_consent_copy(request: Request, participant: CurrentParticipant, session: WritingSession) -> Response:
     """The same as a file."""
     record = consent.newest(session, participant)
-    wording = wording_of(participant)
+    wording = wording_of(request, participant)
     text = record.text if record else consent_text(wording, participant).whole
     lines = [participant.code, *([_agreed(wording, record)] if record else []), "", text, ""]
     name = f"{wording('consent-copy-file')}-{participant.code}.txt"
@@ -64,7 +65,7 @@ def save_consent_copy(request: Request, participant: CurrentParticipant, session
 
 
 def _consent_page(request: Request, participant: Participant, *, changed: bool) -> Response:
-    text = consent_text(wording_of(participant), participant)
+    text = consent_text(wording_of(request, participant), participant)
     context: dict[str, Any] = {"text": text, "shown": consent.fingerprint(text.whole), "changed": changed}
     return participant_page(request, "participant/consent.html", participant, context)
 

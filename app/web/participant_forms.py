@@ -13,9 +13,10 @@ from app.domain.studies import Participant
 from app.services import forms, stages
 from app.services.forms import MOST_CHARACTERS, Problem
 from app.web.deps import WritingSession
+from app.web.languages import wording_of
 from app.web.own_texts import choice_key
 from app.web.participant_pages import back_from, go, has_reached, participant_page
-from app.web.wording import Wording, wording_of
+from app.web.wording import Wording
 
 router = APIRouter(prefix="/p")
 
@@ -92,7 +93,7 @@ def _form(
     request: Request, participant: Participant, form: Stage, values: Mapping[str, str], wrong: Mapping[str, Problem]
 ) -> Response:
     settings = participant.study.settings
-    wording = wording_of(participant)
+    wording = wording_of(request, participant)
     fields = [_field(wording, item, values, wrong.get(item.name)) for item in forms.items_of(settings, form)]
     context = {
         "form": form.value,

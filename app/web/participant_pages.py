@@ -13,7 +13,6 @@ from app.services import stages
 from app.web import languages
 from app.web.deps import CurrentParticipant, NotYet, WritingSession
 from app.web.templating import page
-from app.web.wording import wording_of
 
 ADDRESSES = {
     Stage.CONSENT: "show_consent",
@@ -49,7 +48,7 @@ def participant_page(
         "study": participant.study,
         "settings": participant.study.settings,
         "participant": participant,
-        "wording": wording_of(participant),
+        "wording": languages.wording_of(request, participant),
         **languages.switch(request, participant.study.settings.offered_languages),
         "who": f"{participant.code}-{participant.created_at.timestamp():.0f}",
     }

@@ -19,8 +19,9 @@ from app.services.participant_events import EventKind
 from app.services.time_left import TimeLeft
 from app.web.deps import CurrentParticipant, RowId, Studio, StudioDep, WritingSession
 from app.web.error_pages import wants_json
+from app.web.languages import wording_of
 from app.web.participant_pages import go, participant_page
-from app.web.wording import Wording, wording_of
+from app.web.wording import Wording
 
 router = APIRouter(prefix="/p")
 
@@ -181,7 +182,7 @@ def _turn_for_script(
         "practising": practising,
         "answered": progress.practised if practising else progress.answered,
         "wanted": progress.practice_wanted if practising else progress.wanted,
-        "time_left": None if left is None else in_words(wording_of(participant), left),
+        "time_left": None if left is None else in_words(wording_of(request, participant), left),
         "pair": None if turn.query is None else vars(_pair(request, turn.query)),
         "following": [vars(_pair(request, query)) for query in turn.following],
         "undo_path": None

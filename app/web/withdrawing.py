@@ -11,7 +11,7 @@ from app.web import languages
 from app.web.deps import PARTICIPANT_COOKIE, CurrentParticipant, StudioDep, WritingSession
 from app.web.participant_pages import participant_page
 from app.web.templating import page
-from app.web.wording import Wording, wording_of
+from app.web.wording import Wording
 
 router = APIRouter(prefix="/p")
 
@@ -30,7 +30,7 @@ def withdraw(
     studio: StudioDep,
 ) -> Response:
     """Erase everything about this person; the bytes that a database keeps of what was erased go right afterwards."""
-    language = wording_of(participant).language
+    language = languages.wording_of(request, participant).language
     withdrawal.withdraw(session, studio.store, participant, actor=participant.code)
     address = request.app.url_path_for("show_withdrawn")
     response = RedirectResponse(address, HTTPStatus.SEE_OTHER)

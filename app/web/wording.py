@@ -16,7 +16,7 @@ from jinja2 import pass_context
 from jinja2.runtime import Context
 
 from app.domain.protocol import CONSENT_FACTS, Language
-from app.domain.studies import Participant, StudySettings
+from app.domain.studies import StudySettings
 
 log = logging.getLogger("app.wording")
 
@@ -82,12 +82,6 @@ class Wording:
             self._warned.add(key)
 
 
-def wording_of(participant: Participant) -> Wording:
-    """The texts for this participant: in the language they chose, else in the study's. The study is loaded."""
-    settings = participant.study.settings
-    return wording_for(settings, participant.language)
-
-
 def wording_for(settings: StudySettings, chosen: str | None = None) -> Wording:
     """The texts of a study in the language somebody chose, if it is offered, or in its own."""
     language = Language(chosen) if chosen in settings.offered_languages else settings.language
@@ -103,7 +97,7 @@ def preferred(accept_language: str, offered: Sequence[Language] = tuple(Language
 
 @pass_context
 def say(context: Context, key: str, /, **variables: Any) -> str:
-    """For templates: the text in the language of the page, which is that of its ``wording``, else its participant's.
+    """For templates: the text in the language of the page, which is that of its ``wording``, else English.
 
     Texts for scripts go into data attributes, with the name of a variable where its value is to come:
     ``data-count="{{ say("pair-count", answered="{answered}", wanted="{wanted}") }}"``.
@@ -168,10 +162,8 @@ def variables_of(node: ast.BaseNode) -> set[str]:
 
 
 def _of_page(context: Context) -> Wording:
-    wording, participant = context.get("wording"), context.get("participant")
-    if isinstance(wording, Wording):
-        return wording
-    return wording_of(participant) if isinstance(participant, Participant) else Wording(Language.ENGLISH)
+    wording = context.get("wording")
+    return wording if isinstance(wording, Wording) else Wording(Language.ENGLISH)
 
 
 def _own_words(language: Language, own: Mapping[str, str], study_language: Language) -> dict[str, str]:

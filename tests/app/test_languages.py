@@ -8,11 +8,11 @@ from fastapi.testclient import TestClient
 
 from app.db import Database
 from app.domain.protocol import Language
-from app.domain.studies import Participant, StudySettings
+from app.domain.studies import StudySettings
 from app.services import panel
 from app.web.wording import preferred, wording_for
 from tests import factories
-from tests.app.conftest import TakingPart
+from tests.app.conftest import TakingPart, agree
 
 GERMAN = {"Accept-Language": "de-AT,de;q=0.9,en;q=0.5"}
 
@@ -39,14 +39,28 @@ def test_the_browsers_language_is_spoken_from_the_first_page_on(invite: Callable
     assert language_of(client.get("/p/consent").text) == "de"
 
 
-def test_the_first_language_holds_on_another_device_whatever_that_asks_for(
+def test_a_program_that_looks_at_links_does_not_choose_the_language(
     invite: Callable[..., str], new_browser: Callable[[], TestClient]
 ) -> None:
     link = invite()
-    new_browser().get(link, headers=GERMAN)
-    other = new_browser()
-    other.get(link, headers={"Accept-Language": "en"})
-    assert language_of(other.get("/p/consent", headers={"Accept-Language": "en"}).text) == "de"
+    scanner, reader = new_browser(), new_browser()
+    scanner.headers["Accept-Language"] = "en"
+    assert scanner.get(scanner.get(link).headers["location"]).status_code < 400
+    reader.get(link, headers=GERMAN)
+    assert language_of(reader.get("/p/consent", headers=GERMAN).text) == "de"
+
+
+def test_the_language_of_consent_holds_on_another_device_whatever_that_asks_for(
+    invite: Callable[..., str], new_browser: Callable[[], TestClient]
+) -> None:
+    link = invite()
+    first, other = new_browser(), new_browser()
+    first.headers.update(GERMAN)
+    first.get(link)
+    agree(first)
+    other.headers["Accept-Language"] = "en"
+    other.get(link)
+    assert language_of(other.get("/p/withdraw").text) == "de"
 
 
 def test_who_began_before_languages_were_kept_goes_on_in_the_studys(
@@ -54,10 +68,10 @@ def test_who_began_before_languages_were_kept_goes_on_in_the_studys(
 ) -> None:
     with database.writing() as session:
         study = factories.make_study(session, language="de")
-        participant, token = factories.make_participant(session, study)
-    new_browser().get(f"/p/{token}", headers={"Accept-Language": "en"})
-    with database.reading() as session:
-        assert session.get_one(Participant, participant.id).language == "de"
+        _, token = factories.make_participant(session, study)
+    browser = new_browser()
+    browser.get(f"/p/{token}", headers={"Accept-Language": "en"})
+    assert language_of(browser.get("/p/withdraw").text) == "de"
 
 
 def test_a_language_the_study_does_not_offer_is_neither_spoken_nor_to_be_chosen(
