@@ -7,6 +7,7 @@ import pytest
 
 from worker.sim import arm_look, body_look, chair_look, head_look, human, limb_look, tool_look
 from worker.sim.arm import Tool
+from worker.sim.camera import Camera
 from worker.sim.colours import COMPLEXIONS, Palette, ramps
 from worker.sim.drinking import CUP, PELLETS, pellet_radius_m, resting_places_m
 from worker.sim.feeding import SPOON
@@ -15,7 +16,9 @@ from worker.sim.human import BODY_SHAPES, BROAD, BodyShape
 from worker.sim.jaco import JACO
 from worker.sim.meshes import Mesh, ball, curve, gradient, joined, openness, panel, surface, tube, without_hidden
 from worker.sim.scratching import SCRATCHER
+from worker.sim.shots import MACHINE_LIGHT
 from worker.sim.solids import Field, box, carve, cone, cylinder, ellipsoid, sphere, torus, union
+from worker.sim.stage import Paints, Stage
 from worker.sim.task_look import LOOKS
 from worker.trajectory import SKIN_TONES
 
@@ -42,6 +45,27 @@ def test_normals_point_away_from_the_inside() -> None:
     mesh = ball_mesh()
     outwards = (mesh.normals * mesh.vertices).sum(axis=1) / 0.1
     assert outwards.min() > 0.99
+
+
+def test_what_was_drawn_before_changes_no_pixel() -> None:
+    """The software renderer normalises normals in place whenever it draws, and some never settle by themselves."""
+    smooth = ball_mesh(0.006)
+    corners = smooth.faces.ravel()
+    rough = smooth.normals[corners] + np.random.default_rng(0).normal(0, 0.2, (len(corners), 3))
+    apart = np.arange(len(corners), dtype=np.int32).reshape(-1, 3)  # a normal of two faces is looked at twice
+    paints = Paints()
+    stage = Stage(paints)
+    stage.add({"ball": Mesh(smooth.vertices[corners], rough, smooth.paint[corners], apart)})
+    camera = Camera((0.0, -0.5, 0.1), (0.0, 0.0, 0.0), 30.0, 1200, 1200, 0.1, 2.0)
+    different = 0
+    for turn in np.linspace(0, 3, 10):
+        stage.place("ball", quaternion=(0.0, 0.0, np.sin(turn / 2), np.cos(turn / 2)))
+        one, other = (stage.draw(camera, None, 1200, 1200, MACHINE_LIGHT).rgb for _ in range(2))
+        assert np.ptp(one[:, 600]) > 50, "the ball is in sight, and lit from one side"
+        different += int(np.count_nonzero(one != other))
+    stage.close()
+    paints.close()
+    assert different == 0
 
 
 def test_every_edge_of_a_surface_is_shared_by_two_faces() -> None:

@@ -1,6 +1,7 @@
 """A client of the engine that only draws: meshes in, pixels out."""
 
 from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,6 +19,26 @@ class Drawing(NamedTuple):
     """(height, width, 4)"""
     depth: npt.NDArray[np.float32]
     """(height, width) in [0, 1], the normalised device depth"""
+
+
+_NUDGES = np.array(sorted(product((0, 1, -1), repeat=3), key=np.count_nonzero), np.float32)
+
+
+def lasting(normals: FloatArray) -> npt.NDArray[np.float32]:
+    """Unit normals (V, 3) that the software renderer leaves as they are; zeros, of vertices without faces, stay zeros.
+
+    It normalises them in place, in single precision, whenever it looks at one. Most unit vectors settle at once; one in
+    seven goes to and fro between two values for ever, and what is drawn would depend on what was drawn before. Here a
+    component is moved by a unit in its last place where need be.
+    """
+    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+    unit = np.asarray(normals / np.where(lengths == 0, 1, lengths), np.float32)
+    near = unit + _NUDGES[:, None] * np.spacing(unit)  # (27, V, 3)
+    x, y, z = np.moveaxis(near, 2, 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        normalised = near * (np.float32(1) / np.sqrt(x * x + y * y + z * z))[..., None]
+    stays = (normalised == near).all(axis=2)
+    return np.asarray(near[stays.argmax(axis=0), np.arange(len(unit))])
 
 
 class DrawingClient:
@@ -43,7 +64,7 @@ class DrawingClient:
         shape = pybullet.createVisualShape(
             pybullet.GEOM_MESH,
             vertices=vertices_m.tolist(),
-            normals=normals.tolist(),
+            normals=lasting(normals).tolist(),
             uvs=texture.tolist(),
             indices=faces.ravel().tolist(),
             rgbaColor=[1, 1, 1, 1],
