@@ -37,6 +37,7 @@ def add_filter(at: TakingPart, metrics: dict[str, Any]) -> Model:
 
 def test_while_nothing_is_there_it_says_so_and_holds_nobody_up(at_debrief: TakingPart) -> None:
     page = at_debrief.browser.get("/p/debrief").text
+    assert "This is your robot" not in page
     assert "still being made" in page
     assert "<video" not in page
     assert at_debrief.browser.post("/p/debrief").headers["location"] == "/p/next"
@@ -59,7 +60,7 @@ def test_before_and_after_are_shown_side_by_side_in_one_scenario(at_debrief: Tak
 def test_what_is_certain_is_said_in_plain_words_and_nothing_else(at_debrief: TakingPart) -> None:
     add_filter(at_debrief, factories.filter_metrics())
     page = at_debrief.browser.get("/p/debrief").text
-    assert "It moves more slowly (41\N{NO-BREAK SPACE}% less) and takes more time on its way to you." in page
+    assert "It moves more slowly (by 41\N{NO-BREAK SPACE}%) and takes more time on its way to you." in page
     assert "it presses less hard (63\N{NO-BREAK SPACE}% less)." in page
     assert "touches you" not in page, "its interval holds zero"
 

@@ -195,6 +195,15 @@ def test_what_was_learned_is_said_in_words_about_the_six_costs_whatever_the_mode
     assert "account for 50 %" in page
 
 
+def test_what_was_learned_is_a_sentence_with_units_as_they_are_written(
+    experimenter: TestClient, study: Study, participant: Participant, database: Database
+) -> None:
+    with database.writing() as session:
+        factories.make_model(session, study, participant, ModelKind.REWARD, factories.reward_metrics())
+    page = experimenter.get("/studies/pilot/participants/P01").text
+    assert "Dislikes spoon speed squared (m²/s²) and force at the mouth (N). Likes speed" in page
+
+
 def test_answers_to_either_side_are_counted_beside_the_pace(
     experimenter: TestClient, participant: Participant, database: Database, store: ArtefactStore
 ) -> None:
