@@ -268,7 +268,8 @@ class TestWatching:
         assert "<q>MemoryError: &lt;b&gt;no&lt;/b&gt; room</q>." in page
         falls.note(settings.data_dir, [falls.Falls("web", 1, since, "")])
         page = experimenter.get("/studies/pilot").text
-        assert "The web server has stopped once</strong>, 3 min ago.\n" in page
+        assert "The web server has stopped once</strong>, 3 min ago." in page
+        assert "last words" not in page
         falls.note(settings.data_dir, [])
         assert "has stopped" not in experimenter.get("/studies/pilot").text
 
