@@ -46,6 +46,8 @@ class Mark(StrEnum):
     """Prefers the obviously worse side of a catch pair."""
     QUICK = "quick"
     """Given before half of the clip can have been seen."""
+    WITHOUT_SCRIPT = "without_script"
+    """Sent by the plain form, for the page's script was not there."""
     EXCLUDED = "excluded"
 
 
@@ -208,6 +210,7 @@ def _marked(mark: Mark) -> ColumnElement[bool]:
         Mark.MISSED_CATCH: and_(Query.expected.is_not(None), LabelEvent.response.in_(_SIDES))
         & (LabelEvent.response != Query.expected),
         Mark.QUICK: _quick(),
+        Mark.WITHOUT_SCRIPT: LabelEvent.by_script.is_(False),
         Mark.EXCLUDED: is_excluded(),
     }
     return func.coalesce(conditions[mark], False)  # what is not known is not marked
