@@ -273,7 +273,7 @@ def test_while_the_robots_are_made_the_page_says_how_far_they_are_and_that_it_ma
         )
     page = waiting.look()
     assert "Training the robots" in page
-    assert "Robots trained: 2 of 3. Everything together: 50\N{NO-BREAK SPACE}%." in page
+    assert "Robots trained: 2 of 3. Overall progress: 50\N{NO-BREAK SPACE}%." in page
     with database.writing() as session:
         factories.make_model(session, waiting.study, waiting.participant, ModelKind.METHOD, {"method": "prefft"})
     assert "Filming the robots" in waiting.look()

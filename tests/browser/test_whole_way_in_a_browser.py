@@ -221,7 +221,7 @@ def test_in_german_from_the_welcome_to_the_withdrawal(open_study: Callable[..., 
     at(page, "consent")
     press(page, "Teilnahme widerrufen")
     at(page, "withdraw")
-    press(page, "Nein, alles behalten und zurück")
+    press(page, "Nein, alles behalten")
     at(page, "consent")
     press(page, "Teilnahme widerrufen")
     at(page, "withdraw")
