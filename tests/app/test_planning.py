@@ -154,6 +154,7 @@ def test_answers_excluded_after_locking_are_told_with_their_reasons_and_their_si
         (True, "The phone rang.", True, 1),
     ]
     assert "Answers excluded or taken in again after locking: 4, of which 1 after unblinding." in plan.in_words
+    assert "the page of results will tell" in experimenter.get(f"/studies/{study.slug}/answers/7").text
     assert "after locking: 4, of which 1 after unblinding" in experimenter.get(f"/studies/{study.slug}/lock").text
 
 
