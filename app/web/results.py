@@ -61,7 +61,7 @@ FIGURES = {
         "Each line is one person: their mean rating of each robot. Diamonds: mean over people, 95 % interval.",
     ),
     "learning_curves": (
-        "How well the models foresaw the answers",
+        "How well the models predicted the answers",
         "Every answer was predicted by a model that had not seen it; pairs drawn at random only.",
     ),
     "success_against_preference": (

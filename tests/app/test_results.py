@@ -77,7 +77,7 @@ def test_answers_excluded_after_locking_stand_beside_the_plan_with_their_reasons
         for query_id in session.scalars(select(Query.id).order_by(Query.id).limit(2)):
             excluding.exclude(session, there, query_id, "The <phone> rang.", "Ada")
     text = " ".join(results(experimenter, study).split())
-    side = ' <span class="tag">after unblinding</span>' if evaluated else ""
+    side = " after unblinding" if evaluated else ""
     assert f"2 answers of P01 excluded{side}: The &lt;phone&gt; rang." in text
     assert ("First rating" in text) is evaluated
 
