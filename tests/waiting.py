@@ -2,7 +2,11 @@
 
 import random
 import socket
+import threading
+import time
+from collections.abc import Callable
 from contextlib import suppress
+from pathlib import Path
 
 PATIENCE_S = 300.0
 FIXED_PORTS = range(20_000, 32_000)
@@ -16,3 +20,21 @@ def free_port() -> int:
         with socket.socket() as probe, suppress(OSError):
             probe.bind(("127.0.0.1", port))
             return port
+
+
+def until(condition: Callable[[], bool]) -> bool:
+    """Whether it became true in time."""
+    deadline = time.monotonic() + PATIENCE_S
+    while not condition():
+        if time.monotonic() > deadline:
+            return False
+        threading.Event().wait(0.05)
+    return True
+
+
+def gone(pid: int) -> bool:
+    """Whether the process has ended; one that nobody has asked for its exit code has."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] == "Z"
+    except FileNotFoundError:
+        return True

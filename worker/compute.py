@@ -249,7 +249,7 @@ def _as_bytes(error: BaseException) -> bytes:
     outcome = _Outcome(None, error)
     try:
         pickle.loads(pickle.dumps(outcome))  # noqa: S301  (some errors can be written down and not read)
-    except Exception:
+    except Exception:  # an error of any library, whose pickling may raise anything
         told = RuntimeError(f"{type(error).__name__}: {error}")
         told.add_note(traceback.format_exc())
         outcome = _Outcome(None, told)

@@ -1,7 +1,4 @@
-"""Every answer of a study, to look at and, with a reason, to leave out of learning and statistics.
-
-Nothing is deleted by that: the answer stays in every export with the reason beside it, and can be taken in again.
-"""
+"""Every answer of a study, to look at: narrowed by person, purpose, answer and what stands out about it."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,11 +12,9 @@ from app.domain.clips import Clip
 from app.domain.preferences import Exclusion, LabelEvent, Purpose, Query, Response, is_excluded
 from app.domain.studies import Participant, Study
 from app.errors import AppError
-from app.services import audit
 from app.services.consistency import FASTEST, TOO_FAST
 
 PAGE_SIZE = 25
-LONGEST_REASON = 500
 _SIDES = (Response.LEFT, Response.RIGHT)
 
 
@@ -27,12 +22,6 @@ class AnswerNotFound(AppError):
     """There is no such answer in this study. It may have been taken back; the list of answers shows what there is."""
 
     status = HTTPStatus.NOT_FOUND
-
-
-class ReasonMissing(AppError):
-    """Say why this answer is left out: the reason stands beside it in every export. Nothing was changed."""
-
-    status = HTTPStatus.UNPROCESSABLE_ENTITY
 
 
 class Mark(StrEnum):
@@ -46,6 +35,8 @@ class Mark(StrEnum):
     """Prefers the obviously worse side of a catch pair."""
     QUICK = "quick"
     """Given before half of the clip can have been seen."""
+    WITHOUT_SCRIPT = "without_script"
+    """Sent by the plain form, for the page's script was not there."""
     EXCLUDED = "excluded"
 
 
@@ -108,7 +99,7 @@ def find(session: Session, study: Study, wanted: Wanted) -> Found:
 
 def look(session: Session, study: Study, query_id: int, wanted: Wanted) -> Looked:
     """One answer. Raises AnswerNotFound."""
-    event = _counting_event(session, study, query_id)
+    event = counting_event(session, study, query_id)
     (given,) = _loaded(session, [event.id])
     events = select(LabelEvent).where(LabelEvent.query_id == query_id).order_by(LabelEvent.revision)
     words = select(Exclusion).where(Exclusion.label_event_id == event.id).order_by(Exclusion.id)
@@ -122,44 +113,18 @@ def look(session: Session, study: Study, query_id: int, wanted: Wanted) -> Looke
     )
 
 
-def exclude(session: Session, study: Study, query_id: int, reason: str, actor: str) -> None:
-    """Leave an answer out. Doing it again changes nothing. Raises AnswerNotFound and ReasonMissing."""
-    event = _counting_event(session, study, query_id)
-    if not reason.strip():
-        raise ReasonMissing
-    _say(session, study, event, excluded=True, reason=reason.strip()[:LONGEST_REASON], actor=actor)
-
-
-def include(session: Session, study: Study, query_id: int, actor: str) -> None:
-    """Take an answer in again. Doing it again changes nothing. Raises AnswerNotFound."""
-    _say(session, study, _counting_event(session, study, query_id), excluded=False, reason="", actor=actor)
-
-
-def count_excluded(session: Session, study: Study) -> int:
-    """How many answers of the study are left out."""
-    matching = _matching(study, Wanted(mark=Mark.EXCLUDED))
-    return session.scalar(select(func.count()).select_from(matching.subquery())) or 0
-
-
-def _say(session: Session, study: Study, event: LabelEvent, *, excluded: bool, reason: str, actor: str) -> None:
-    query = session.scalars(select(Query).where(Query.id == event.query_id).with_for_update()).one()  # one at a time
-    known = session.scalar(
-        select(Exclusion).where(Exclusion.label_event_id == event.id).order_by(Exclusion.id.desc()).limit(1)
-    )
-    if (known is not None and known.excluded) == excluded:
-        return
-    session.add(Exclusion(label_event_id=event.id, excluded=excluded, reason=reason, actor=actor))
-    code = session.get_one(Participant, query.participant_id).code
-    action = "answer excluded" if excluded else "answer taken in again"
-    audit.record(session, actor, action, f"{study.slug}/{code}/{query.ordinal}")
-
-
-def _counting_event(session: Session, study: Study, query_id: int) -> LabelEvent:
+def counting_event(session: Session, study: Study, query_id: int) -> LabelEvent:
+    """The answer that counts for a pair of the study. Raises AnswerNotFound."""
     matching = _matching(study, Wanted()).where(Query.id == query_id)
     found = session.execute(matching).first()
     if found is None:
         raise AnswerNotFound
     return session.get_one(LabelEvent, found.event_id)
+
+
+def counting_ids(study: Study) -> Select[int]:
+    """The ids of the events of all answers of the study that count."""
+    return _matching(study, Wanted()).with_only_columns(LabelEvent.id)
 
 
 def _matching(study: Study, wanted: Wanted) -> Select[int, int, int, int]:
@@ -208,6 +173,7 @@ def _marked(mark: Mark) -> ColumnElement[bool]:
         Mark.MISSED_CATCH: and_(Query.expected.is_not(None), LabelEvent.response.in_(_SIDES))
         & (LabelEvent.response != Query.expected),
         Mark.QUICK: _quick(),
+        Mark.WITHOUT_SCRIPT: LabelEvent.by_script.is_(False),
         Mark.EXCLUDED: is_excluded(),
     }
     return func.coalesce(conditions[mark], False)  # what is not known is not marked

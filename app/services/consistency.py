@@ -57,6 +57,8 @@ class Answer:
     """How long the longer clip lasts in real time."""
     seen: float | None = None
     """At most this share of the clip of which less was played; None when not measured."""
+    by_script: bool | None = None
+    """Whether the page's script sent it; None: it was not noted yet."""
 
     @property
     def chosen_clip_id(self) -> int | None:
@@ -111,6 +113,8 @@ class Consistency:
     left: Share | None
     """Share of left among answers that prefer a side; without bias its interval holds one half."""
     too_fast: Share | None
+    without_script: int
+    """Answers sent by the plain form: nobody saw to it that the clips had been played, or measured how."""
     longest_run: int
     slowing: Trend | None
     """Of response times, log-linear: below 0 is quicker with practice, well above 0 is tired."""
@@ -129,6 +133,7 @@ class Consistency:
             "catch_errors": self.catch_errors is not None and _no_slips(self.catch_errors),
             "side_bias": self.left is not None and _no_fair_coin(self.left),
             "too_fast": self.too_fast is not None and self.too_fast.scored >= FEWEST_TIMED and self.too_fast.low > 0.1,
+            "without_script": self.without_script > 0,
             "straight_line": self.longest_run >= LONG_RUN,
             "inconsistent": self.repeats.kappa is not None and self.repeats.kappa.high < 0.4,
             "slowing": self.slowing is not None and self.slowing.per_hundred.low > 25.0,
@@ -152,6 +157,7 @@ def answers_of(labels: Sequence[Label]) -> list[Answer]:
             response_time_ms=each.event.response_time_ms,
             clip_ms=max(each.query.left_clip.duration_ms, each.query.right_clip.duration_ms),
             seen=seen(each.event, each.query.left_clip.duration_ms, each.query.right_clip.duration_ms),
+            by_script=each.event.by_script,
         )
         for each in labels
     ]
@@ -189,6 +195,7 @@ def consistency(answers: Sequence[Answer]) -> Consistency:
         catch_errors=catch_errors(earnest),
         left=left_share(earnest),
         too_fast=too_fast(earnest),
+        without_script=sum(answer.by_script is False for answer in earnest),
         longest_run=longest_run(earnest),
         slowing=slowing(earnest),
         early_agreement=agreement(halves[0]),

@@ -6,9 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
-from typing import NamedTuple, TypeVar
 
-from sqlalchemy import ColumnElement, func, or_, select
+from sqlalchemy import func, select
 from sqlalchemy.orm import Session, joinedload
 
 from app.db import now
@@ -20,7 +19,7 @@ from app.domain.preferences import Exclusion, LabelEvent, Response, count_labels
 from app.domain.protocol import Stage
 from app.domain.studies import Awaited, Participant, Study
 from app.falls import Falls, noted
-from app.services import accuracy, damage, preparing, results, stages, watching
+from app.services import accuracy, damage, jobs, preparing, results, stages, watching
 from app.services.tallies import Tallies
 from app.storage import ArtefactStore
 
@@ -41,15 +40,6 @@ class Machine:
     damage: damage.Damage
     falls: Sequence[Falls]
     """Programs that have stopped by themselves of late."""
-
-
-@dataclass(frozen=True)
-class Job:
-    """A run that deserves a line: at work, about to be tried again, or failed and not made good since."""
-
-    run: Run
-    code: str | None
-    """Whom it is for; None: the whole study."""
 
 
 @dataclass(frozen=True)
@@ -113,7 +103,7 @@ class StudyOverview:
     pool: Pool
     rows: Sequence[ParticipantRow]
     stage_counts: Sequence[tuple[str, int]]
-    jobs: Sequence[Job]
+    jobs: Sequence[jobs.Job]
     """Failures first, then the newest first."""
     answers_today: int
     disk_use_bytes: int
@@ -177,13 +167,13 @@ def fingerprint(session: Session) -> str:
 def study_lines(session: Session, *, put_away: bool = False) -> Sequence[StudyLine]:
     """Every study that is at work, or every one that is put away; the newest first."""
     counted = session.execute(select(Rollout.study_id, func.count(Clip.id)).join(Clip).group_by(Rollout.study_id))
-    clips = {study_id: count for study_id, count in counted}  # noqa: C416  (a typed row is not a typed pair)
+    clips = dict(counted.all())
     everybody = select(Participant).where(Participant.is_preview.is_(False))
     people: dict[int, list[Participant]] = defaultdict(list)
     for participant in session.scalars(everybody):
         people[participant.study_id].append(participant)
     labels = count_labels(session, everybody.with_only_columns(Participant.id))
-    failed = Counter(run.study_id for run in _unmended(session))
+    failed = Counter(run.study_id for run in jobs.failures(session))
     lines = []
     kept = Study.put_away_at.is_not(None) if put_away else Study.put_away_at.is_(None)
     for study in session.scalars(select(Study).where(Study.deleted_at.is_(None), kept).order_by(Study.id.desc())):
@@ -224,7 +214,7 @@ def study_overview(session: Session, study: Study, tallies: Tallies | None = Non
         _pool(session, study),
         rows,
         watching.stage_counts({row.participant.id: row.stage for row in rows}),
-        _jobs(session, study),
+        jobs.of_study(session, study),
         watching.answers_today(session, study),
         watching.disk_use(session, study),
     )
@@ -254,7 +244,7 @@ def curve_of(session: Session, participant_id: int) -> accuracy.Curve:
 
 def _rows(session: Session, study: Study, people: Sequence[Participant], tallies: Tallies) -> Sequence[ParticipantRow]:
     ids = [person.id for person in people]
-    told, runs, wanted = tallies.of(session, ids), _noteworthy_runs(session, ids), study.settings.labels_per_participant
+    told, runs, wanted = tallies.of(session, ids), jobs.of_people(session, ids), study.settings.labels_per_participant
     where = watching.where_they_are(session, study.settings, people, {each: told[each].answered for each in ids})
     preparations = _preparations(session, ids)
     return [
@@ -293,94 +283,6 @@ def _versions(session: Session, participant: Participant) -> Sequence[results.Fi
     return [results.filter_version(model, bundle) for model, bundle in rows]
 
 
-class _Glance(NamedTuple):
-    """What it takes to know whether a run deserves a line. Of thousands, whole ones take their time to load."""
-
-    id: int
-    kind: str
-    workflow_id: str
-    status: str
-    study_id: int
-    participant_id: int | None
-
-
-def _glances(session: Session, *which: ColumnElement[bool]) -> Sequence[_Glance]:
-    """Runs in their order, from the oldest that has not succeeded: what came before has been settled."""
-    oldest = select(func.min(Run.id)).where(Run.status != RunStatus.SUCCEEDED, *which).scalar_subquery()
-    rows = session.execute(
-        select(Run.id, Run.kind, Run.workflow_id, Run.status, Run.study_id, Run.participant_id)
-        .where(Run.id >= oldest, *which)
-        .order_by(Run.id)
-    )
-    return [_Glance(*row) for row in rows]
-
-
-def _noteworthy_runs(session: Session, participant_ids: Sequence[int]) -> dict[int, Run]:
-    """Per participant the newest run at work; where none is, the newest failure that no later success has made good."""
-    by_person: dict[int, list[_Glance]] = defaultdict(list)
-    for run in _glances(session, Run.participant_id.in_(participant_ids)):
-        if run.participant_id is not None:
-            by_person[run.participant_id].append(run)
-    chosen = {person: _noteworthy(theirs) for person, theirs in by_person.items()}
-    whole = _whole(session, [run.id for run in chosen.values() if run is not None])
-    return {person: whole[run.id] for person, run in chosen.items() if run is not None}
-
-
-def _whole(session: Session, run_ids: Sequence[int]) -> dict[int, Run]:
-    return {run.id: run for run in session.scalars(select(Run).where(Run.id.in_(run_ids)))}
-
-
-_R = TypeVar("_R", Run, _Glance)
-
-
-def _noteworthy(runs: Sequence[_R]) -> _R | None:
-    """Of runs in their order: one at work, else a failure that still stands."""
-    working = [run for run in runs if run.status in (RunStatus.RUNNING, RunStatus.RETRY)]
-    if working:
-        return working[-1]
-    newest = {_work_of(run): run for run in runs}
-    return next((run for run in newest.values() if run.status == RunStatus.FAILED), None)
-
-
-def _present_runs(session: Session, *which: ColumnElement[bool]) -> Sequence[_Glance]:
-    """Runs for everybody still in a study, and for whole studies."""
-    of_others = select(Participant.id).where(
-        or_(Participant.is_preview.is_(True), Participant.withdrawn_at.is_not(None))
-    )
-    return _glances(session, or_(Run.participant_id.is_(None), Run.participant_id.not_in(of_others)), *which)
-
-
-def _unmended(session: Session, *which: ColumnElement[bool]) -> Sequence[_Glance]:
-    """Failures that no later success has made good."""
-    newest = {(_work_of(run), run.study_id, run.participant_id): run for run in _present_runs(session, *which)}
-    return [run for run in newest.values() if run.status == RunStatus.FAILED]
-
-
-def _jobs(session: Session, study: Study) -> Sequence[Job]:
-    """Of everybody still in the study, and of the study itself."""
-    mine = Run.study_id == study.id
-    at_work = _present_runs(session, mine, Run.status.in_((RunStatus.RUNNING, RunStatus.RETRY)))
-    ids = [
-        *(run.id for run in sorted(_unmended(session, mine), key=lambda run: -run.id)),
-        *(run.id for run in reversed(at_work)),
-    ]
-    runs = _whole(session, ids)
-    people = select(Participant).where(Participant.id.in_([run.participant_id for run in runs.values()]))
-    codes = {person.id: person.code for person in session.scalars(people)}
-    return [Job(runs[each], codes.get(runs[each].participant_id or 0)) for each in ids]
-
-
-def _work_of(run: Run | _Glance) -> str:
-    """What a later run of the same work makes good: of films and methods each has its own, and so has every export."""
-    if (
-        "/again-" in run.workflow_id
-    ):  # lost files made again, see worker.mending; the last number says when they were lost
-        return run.workflow_id.rpartition("-")[0]
-    if run.kind in (RunKind.METHOD, RunKind.FILMS):
-        return run.workflow_id.rpartition("/")[0]
-    return run.workflow_id if run.kind == RunKind.EXPORT else run.kind
-
-
 def _pool(session: Session, study: Study) -> Pool:
     clips = select(Clip).join(Rollout).where(Rollout.study_id == study.id)
     runs = session.scalars(
@@ -390,7 +292,7 @@ def _pool(session: Session, study: Study) -> Pool:
         made=session.scalar(select(func.count()).select_from(clips.subquery())) or 0,
         wanted=_clips_wanted(study),
         recent=session.scalars(clips.order_by(Clip.id.desc()).limit(RECENT_CLIPS)).all(),
-        run=_noteworthy(runs),
+        run=jobs.noteworthy(runs),
     )
 
 

@@ -206,7 +206,7 @@ def controllers_of(session: Session, participant_id: int) -> dict[str, Controlle
         .where(Assignment.participant_id == participant_id, Controller.participant_id == participant_id)
         .order_by(Assignment.letter)
     )
-    return {letter: controller for letter, controller in rows}  # noqa: C416  (a typed row is not a typed pair)
+    return dict(rows.all())
 
 
 def rated_count(session: Session, participant_id: int) -> int:

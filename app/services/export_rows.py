@@ -4,7 +4,7 @@ Every row comes with its key, by which keys ascend; ``window`` says which rows a
 """
 
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 from sqlalchemy import select
 from sqlalchemy.orm import Session, aliased, joinedload
@@ -18,6 +18,7 @@ from app.domain.studies import Deviation, Participant, Study
 from app.services import results, unblinding
 from app.services.paging import EVERYTHING, KeyedRows, Window
 
+_OfPerson = TypeVar("_OfPerson", ConsentRecord, ParticipantEvent, StageRecord)
 AT_ONCE = 200
 """Clips: there may be tens of thousands, and a page wants a hundred."""
 
@@ -34,6 +35,16 @@ def _present(session: Session, study: Study, window: Window) -> Iterator[tuple[P
     for person in everybody(session, study, window):
         if person.withdrawn_at is None:
             yield person, window.within(person.number)
+
+
+def _theirs(
+    session: Session, study: Study, window: Window, table: type[_OfPerson]
+) -> Iterator[tuple[Participant, _OfPerson]]:
+    """The wanted rows of a table whose rows belong to one person each, in the order in which they came."""
+    for person, wanted in _present(session, study, window):
+        rows = select(table).where(table.participant_id == person.id, wanted.beyond(table.id), wanted.known(table))
+        for row in session.scalars(rows.order_by(table.id)):
+            yield person, row
 
 
 def participants(session: Session, study: Study, window: Window = EVERYTHING) -> KeyedRows:
@@ -63,11 +74,8 @@ def _participant(study: Study, each: Participant) -> Sequence[Any]:
 
 
 def stages(session: Session, study: Study, window: Window = EVERYTHING) -> KeyedRows:
-    for person, wanted in _present(session, study, window):
-        theirs = select(StageRecord).where(StageRecord.participant_id == person.id)
-        theirs = theirs.where(wanted.beyond(StageRecord.id), wanted.known(StageRecord))
-        for each in session.scalars(theirs.order_by(StageRecord.id)):
-            yield (person.number, each.id), (person.code, each.stage, each.entered_at, each.finished_at)
+    for person, each in _theirs(session, study, window, StageRecord):
+        yield (person.number, each.id), (person.code, each.stage, each.entered_at, each.finished_at)
 
 
 def queries(session: Session, study: Study, window: Window = EVERYTHING) -> KeyedRows:
@@ -191,20 +199,13 @@ def forms(session: Session, study: Study, window: Window = EVERYTHING) -> KeyedR
 
 
 def consent(session: Session, study: Study, window: Window = EVERYTHING) -> KeyedRows:
-    for person, wanted in _present(session, study, window):
-        theirs = select(ConsentRecord).where(ConsentRecord.participant_id == person.id)
-        theirs = theirs.where(wanted.beyond(ConsentRecord.id), wanted.known(ConsentRecord))
-        for each in session.scalars(theirs.order_by(ConsentRecord.id)):
-            values = (person.code, each.version, each.language, each.agreed_at, each.text)
-            yield (person.number, each.id), values
+    for person, each in _theirs(session, study, window, ConsentRecord):
+        yield (person.number, each.id), (person.code, each.version, each.language, each.agreed_at, each.text)
 
 
 def events(session: Session, study: Study, window: Window = EVERYTHING) -> KeyedRows:
-    for person, wanted in _present(session, study, window):
-        theirs = select(ParticipantEvent).where(ParticipantEvent.participant_id == person.id)
-        theirs = theirs.where(wanted.beyond(ParticipantEvent.id), wanted.known(ParticipantEvent))
-        for each in session.scalars(theirs.order_by(ParticipantEvent.id)):
-            yield (person.number, each.id), (person.code, each.at, each.kind, each.detail)
+    for person, each in _theirs(session, study, window, ParticipantEvent):
+        yield (person.number, each.id), (person.code, each.at, each.kind, each.detail)
 
 
 def ratings(session: Session, study: Study, window: Window = EVERYTHING) -> KeyedRows:

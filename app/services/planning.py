@@ -15,7 +15,7 @@ from app.domain.evaluation import Rating, Trial
 from app.domain.preferences import LabelEvent, Purpose, Query
 from app.domain.protocol import PlannedTest
 from app.domain.studies import Deviation, Participant, Study
-from app.services import locking
+from app.services import excluding, locking
 
 TEST_NAMES: Mapping[str, str] = {
     PlannedTest.TWO_SAMPLE_T: "Two-sample t, as in the paper",
@@ -48,6 +48,18 @@ _IN_WORDS = {
 
 
 @dataclass(frozen=True)
+class LeftOut:
+    """Answers that were excluded after locking, or taken in again, for one reason and on one side of unblinding."""
+
+    excluded: bool
+    reason: str
+    """Empty for those taken in again."""
+    after_unblinding: bool
+    whose: Sequence[str]
+    """The code of the person for every answer."""
+
+
+@dataclass(frozen=True)
 class Plan:
     """The tests of a study, and the times that tell what they are worth."""
 
@@ -61,6 +73,7 @@ class Plan:
     first_rating_at: datetime | None
     unblinded_at: datetime | None
     deviations: Sequence[Deviation]
+    left_out: Sequence[LeftOut]
 
     @property
     def planned(self) -> Sequence[str]:
@@ -79,11 +92,19 @@ class Plan:
             parts.append(
                 f"Changes after locking: {len(self.deviations)}, of which {after} when there were ratings already."
             )
+        if self.left_out:
+            parts.append(self._left_out_in_words())
         return " ".join(parts)
 
     def seen_before(self, deviation: Deviation) -> bool:
         """Whether there were ratings when the study was changed."""
         return self.first_rating_at is not None and deviation.at >= self.first_rating_at
+
+    def _left_out_in_words(self) -> str:
+        count = sum(len(each.whose) for each in self.left_out)
+        after = sum(len(each.whose) for each in self.left_out if each.after_unblinding)
+        seen = f", of which {after} after unblinding" if self.unblinded_at is not None else ""
+        return f"Answers excluded or taken in again after locking: {count}{seen}."
 
 
 def plan_of(session: Session, study: Study) -> Plan:
@@ -104,7 +125,20 @@ def plan_of(session: Session, study: Study) -> Plan:
         first_rating_at=first_rating_at,
         unblinded_at=study.unblinded_at,
         deviations=locking.deviations(session, study),
+        left_out=_left_out(session, study),
     )
+
+
+def _left_out(session: Session, study: Study) -> Sequence[LeftOut]:
+    """Since the study was locked, the first first."""
+    if study.locked_at is None:
+        return []
+    whose: dict[tuple[bool, str, bool], list[str]] = {}
+    for each in excluding.changed_since(session, study, study.locked_at):
+        after_unblinding = study.unblinded_at is not None and each.word.at >= study.unblinded_at
+        same = (each.word.excluded, each.word.reason, after_unblinding)
+        whose.setdefault(same, []).append(each.participant.code)
+    return [LeftOut(*same, codes) for same, codes in whose.items()]
 
 
 def _standing(study: Study, first_answer_at: datetime | None, first_rating_at: datetime | None) -> Standing:

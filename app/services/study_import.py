@@ -19,7 +19,8 @@ from app.domain.studies import Participant, Study
 from app.errors import AppError
 from app.services import archive_reading, audit, enrolment, studies
 from app.services.archive import ArchiveInvalid, tables_of
-from app.services.archive_reading import REFERRED_BY_RUNS, Checked
+from app.services.archive_reading import Checked
+from app.services.archive_rows import REFERRED_BY_RUNS
 from app.services.withdrawal import in_use
 from app.storage import ArtefactStore
 
@@ -104,7 +105,7 @@ def bring_in(session: Session, store: ArtefactStore, unpacked: Unpacked, actor: 
             if not all(store.has(sha256) for sha256 in unpacked.checked.manifest.files):
                 raise ArchiveInvalid("A file was removed while the archive was read. Import it again.")
             return _insert(session, unpacked.checked, actor)
-    except Exception as error:
+    except Exception as error:  # whatever a stranger's rows break, the files that came with them go
         for sha256 in set(unpacked.put) - in_use(session, unpacked.put):
             store.delete(sha256)
         if isinstance(error, AppError):

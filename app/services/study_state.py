@@ -52,7 +52,7 @@ def standings(session: Session, lines: Sequence[StudyLine]) -> Mapping[int, Stan
         .where(present, StageRecord.stage == Stage.EVALUATION, StageRecord.finished_at.is_(None))
         .group_by(Participant.study_id)
     )
-    at_robots = {study_id: count for study_id, count in rating}  # noqa: C416  (a typed row is not a typed pair)
+    at_robots = dict(rating.all())
     return {
         line.study.id: _standing(line, *people.get(line.study.id, (0, 0)), at_robots.get(line.study.id, 0))
         for line in lines

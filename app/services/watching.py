@@ -101,7 +101,7 @@ def answers_given(session: Session, participant_ids: Sequence[int]) -> dict[int,
             *(Query.expected, Query.predicted_right, Query.strategy),
             *(left.duration_ms.label("left_ms"), right.duration_ms.label("right_ms")),
             *(LabelEvent.response, LabelEvent.response_time_ms, LabelEvent.created_at, LabelEvent.watched_whole),
-            *(LabelEvent.left_watched_ms, LabelEvent.right_watched_ms, LabelEvent.scrub_count),
+            *(LabelEvent.left_watched_ms, LabelEvent.right_watched_ms, LabelEvent.scrub_count, LabelEvent.by_script),
             is_excluded().label("excluded"),
         )
         .join(LabelEvent, LabelEvent.query_id == Query.id)
@@ -124,6 +124,7 @@ def answers_given(session: Session, participant_ids: Sequence[int]) -> dict[int,
             response_time_ms=row.response_time_ms,
             clip_ms=max(row.left_ms, row.right_ms),
             seen=seen(row, row.left_ms, row.right_ms),
+            by_script=row.by_script,
         )
         drawn_at_random = row.strategy == Strategy.UNIFORM
         given[row.participant_id].append(

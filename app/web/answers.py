@@ -9,7 +9,7 @@ from fastapi.responses import RedirectResponse, Response
 
 from app.domain.preferences import Purpose
 from app.domain.preferences import Response as Said
-from app.services import answers, export_rows, studies
+from app.services import answers, excluding, export_rows, studies
 from app.services.answers import Mark, Wanted
 from app.web.deps import ActingExperimenter, CurrentExperimenter, ReadingSession, RowId, Slug, WritingSession
 from app.web.templating import page
@@ -17,7 +17,7 @@ from app.web.templating import page
 router = APIRouter(prefix="/studies/{slug}/answers")
 
 NOTHING: Literal[""] = ""
-Reason = Annotated[str, Form(max_length=answers.LONGEST_REASON)]
+Reason = Annotated[str, Form(max_length=excluding.LONGEST_REASON)]
 
 
 def _wanted(
@@ -73,7 +73,7 @@ def show_answer(
         "looked": answers.look(session, study, query_id, wanted),
         "wanted": wanted,
         "query_string": query_string,
-        "longest_reason": answers.LONGEST_REASON,
+        "longest_reason": excluding.LONGEST_REASON,
     }
     return page(request, "experimenter/answer.html", context)
 
@@ -89,7 +89,7 @@ def exclude_answer(
     session: WritingSession,
 ) -> Response:
     """Leave the answer out of learning and statistics."""
-    answers.exclude(session, studies.find_study(session, slug), query_id, reason, experimenter.name)
+    excluding.exclude(session, studies.find_study(session, slug), query_id, reason, experimenter.name)
     return _back(request, slug, query_id, wanted)
 
 
@@ -103,7 +103,7 @@ def include_answer(
     session: WritingSession,
 ) -> Response:
     """Take the answer in again."""
-    answers.include(session, studies.find_study(session, slug), query_id, experimenter.name)
+    excluding.include(session, studies.find_study(session, slug), query_id, experimenter.name)
     return _back(request, slug, query_id, wanted)
 
 

@@ -39,7 +39,6 @@ from app.web.deps import Code, ReadingSession, RowId, Slug, Studio, StudioDep, W
 
 PREFIX = "/api/v1"
 LARGEST_PAGE = 1000
-TABLE_READ = "table read by the API"
 DESCRIPTION = """\
 Everything that the pages show and the exports hold, for programs.
 
@@ -164,9 +163,12 @@ def _study_line(study: Study) -> dict[str, Any]:
 
 
 @router.get("/studies/{slug}/participants", tags=["participants"])
-def list_participants(slug: Slug, _caller: Caller, session: ReadingSession) -> list[answers.ParticipantAnswer]:
+def list_participants(
+    slug: Slug, caller: Caller, session: ReadingSession, studio: StudioDep
+) -> list[answers.ParticipantAnswer]:
     """Everybody in the study, tombstones included."""
     study = studies.find_study(session, slug)
+    _note_reading(studio, session, caller, "participants", slug)
     provenance = exporting.provenance_of(session, study)
     rows = exporting.records(export_tables.BY_NAME["participants"], session, study, provenance)
     return [answers.ParticipantAnswer.model_validate(row) for row in rows]
@@ -189,9 +191,12 @@ def _personal_link(request: Request, token: str) -> str:
 
 
 @router.get("/studies/{slug}/participants/{code}/bundles", tags=["bundles"])
-def list_bundles(slug: Slug, code: Code, _caller: Caller, session: ReadingSession) -> list[answers.BundleAnswer]:
+def list_bundles(
+    slug: Slug, code: Code, caller: Caller, session: ReadingSession, studio: StudioDep
+) -> list[answers.BundleAnswer]:
     """Every published filter of a participant, the newest first."""
     person = enrolment.find_by_code(session, studies.find_study(session, slug), code)
+    _note_reading(studio, session, caller, "bundles", f"{slug}/{code}")
     rows = session.execute(
         select(Bundle, Model.label_count)
         .join(Model, Model.id == Bundle.model_id)
@@ -228,12 +233,13 @@ def download_bundle(
 
 
 @router.get("/studies/{slug}/report", tags=["reports"])
-def show_report(slug: Slug, _caller: Caller, session: ReadingSession) -> answers.ReportAnswer:
+def show_report(slug: Slug, caller: Caller, session: ReadingSession, studio: StudioDep) -> answers.ReportAnswer:
     """Statistics of the newest report, and where its figures are."""
     study = studies.find_study(session, slug)
     report = reports.newest(session, study)
     if report is None:
         raise NoReportYet
+    _note_reading(studio, session, caller, "report", slug)
     figures = {
         name: {kind: f"{PREFIX}/studies/{slug}/report/figures/{name}.{kind}" for kind in formats}
         for name, formats in report.figures.items()
@@ -312,7 +318,7 @@ def read_table(
     provenance = exporting.provenance_of(session, study)
     rows = exporting.keyed_records(wanted, session, study, provenance, window)
     found = list(islice(rows, limit + 1))
-    _note_reading(studio, session, caller, f"{slug}/{table}")
+    _note_reading(studio, session, caller, "table", f"{slug}/{table}")
     following = None
     if len(found) > limit:
         place = paging.cursor_of(whose, window, found[limit - 1][0])
@@ -320,11 +326,12 @@ def read_table(
     return answers.Page(table=table, rows=[row for _, row in found[:limit]], next=following)
 
 
-def _note_reading(studio: Studio, session: Session, caller: Experimenter, subject: str) -> None:
+def _note_reading(studio: Studio, session: Session, caller: Experimenter, what: str, subject: str) -> None:
     """Kept before anything is given away. Seldom enough that it need not wait for its turn in the event loop."""
-    if audit.is_worth_noting(session, caller.name, TABLE_READ, subject):
+    action = f"{what} read by the API"
+    if audit.is_worth_noting(session, caller.name, action, subject):
         with studio.database.writing() as writing:
-            audit.record(writing, caller.name, TABLE_READ, subject)
+            audit.record(writing, caller.name, action, subject)
 
 
 @router.get("/studies/{slug}/exports", tags=["exports"])

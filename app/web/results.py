@@ -12,9 +12,9 @@ from app.domain.people import Experimenter, Role
 from app.domain.studies import Study
 from app.errors import AppError
 from app.services import (
-    answers,
     audit,
     evaluating,
+    excluding,
     export_requests,
     export_tables,
     exporting,
@@ -61,7 +61,7 @@ FIGURES = {
         "Each line is one person: their mean rating of each robot. Diamonds: mean over people, 95 % interval.",
     ),
     "learning_curves": (
-        "How well the models foresaw the answers",
+        "How well the models predicted the answers",
         "Every answer was predicted by a model that had not seen it; pairs drawn at random only.",
     ),
     "success_against_preference": (
@@ -112,7 +112,7 @@ def results_context(session: Session, study: Study) -> dict[str, Any]:
         "tests": planning.TEST_NAMES,
         "plan": planning.plan_of(session, study),
         "forms": form_words.summaries(study, form_summaries.summaries_of(session, study)),
-        "excluded": answers.count_excluded(session, study),
+        "excluded": excluding.count(session, study),
         "figures": {name: FIGURES[name] for name in FIGURES if report is not None and name in report.figures},
     }
 

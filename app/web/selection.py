@@ -23,7 +23,7 @@ router = APIRouter(prefix="/studies/{slug}/selection")
 
 MOST = 1000
 _Code = Annotated[str, StringConstraints(pattern=r"^P[0-9]{2,8}$")]
-Codes = Annotated[list[_Code], Form(max_length=MOST)]
+Codes = Annotated[list[_Code], Form(default_factory=list, max_length=MOST)]
 
 
 class NobodyTicked(AppError):
@@ -45,7 +45,7 @@ def renew_links(
     experimenter: ActingExperimenter,
     session: WritingSession,
     studio: StudioDep,
-    code: Codes = [],  # noqa: B006  (never changed)
+    code: Codes,
 ) -> Response:
     """Replace the links of everybody who is ticked, and lead to the new ones; the old ones stop working."""
     study = studies.find_study(session, slug)
@@ -64,7 +64,7 @@ def download_bundles(
     experimenter: ActingExperimenter,
     session: WritingSession,
     studio: StudioDep,
-    code: Codes = [],  # noqa: B006  (never changed)
+    code: Codes,
 ) -> Response:
     """The newest bundle of everybody who is ticked and has one, as one zip file. Raises NoBundles."""
     study = studies.find_study(session, slug)

@@ -76,7 +76,7 @@ form-comments = Möchten Sie uns sonst noch etwas mitteilen?
 ## Anleitung
 
 instructions-title = So funktioniert es
-task-feeding = Ein Roboterarm reicht einer sitzenden Person mit einem Löffel Essen an. Jedes Paar zeigt dieselbe Situation in zwei Ausführungen: Der Roboter kann schneller oder langsamer sein, einen anderen Weg nehmen, den Löffel mehr oder weniger weit in den Mund führen oder etwas Essen verlieren. Stellen Sie sich vor, dass Sie selbst das Essen gereicht bekommen.
+task-feeding = Ein Roboterarm reicht einer sitzenden Person mit einem Löffel Essen an. Jedes Paar zeigt dieselbe Situation in zwei Ausführungen: Der Roboter kann schneller oder langsamer sein, einen anderen Weg nehmen, den Löffel mehr oder weniger weit in den Mund führen oder etwas Essen verlieren. Stellen Sie sich vor, dass Ihnen selbst das Essen angereicht wird.
 task-drinking = Ein Roboterarm bringt einer sitzenden Person einen Becher Wasser und neigt ihn, sodass sie trinken kann; das Wasser ist blau dargestellt. Jedes Paar zeigt dieselbe Situation in zwei Ausführungen: Der Roboter kann schneller oder langsamer sein, einen anderen Weg nehmen, vor dem Mund warten, mehr oder weniger auf einmal geben oder etwas verschütten. Stellen Sie sich vor, dass Sie selbst trinken.
 task-scratching = Ein Roboterarm kratzt eine juckende Stelle, den rötlichen Fleck am rechten Arm einer sitzenden Person. Jedes Paar zeigt dieselbe Situation in zwei Ausführungen: Der Roboter kann schneller oder langsamer sein, einen anderen Weg nehmen, vor der Berührung warten, stärker oder schwächer drücken, ruhiger oder flotter kratzen. Stellen Sie sich vor, dass es Ihr Arm ist.
 task-other = Ein Roboterarm hilft einer sitzenden Person. Jedes Paar zeigt dieselbe Situation in zwei Ausführungen. Stellen Sie sich vor, dass Ihnen selbst geholfen wird.
@@ -87,7 +87,7 @@ instructions-left = Links ist besser
 instructions-top = Oben: Der obere ist besser
 instructions-right = Rechts ist besser
 instructions-bottom = Unten: Der untere ist besser
-instructions-equal = Gleich gut: Für mich sind beide gleich gut
+instructions-equal = Gleich gut: Ich finde beide gleich gut
 instructions-skip = Weiß nicht: Ich konnte dieses Paar nicht beurteilen; es zählt nicht
 instructions-replay = Von vorn abspielen
 instructions-undo = Letzte Antwort zurücknehmen
@@ -101,41 +101,42 @@ instructions-practice = Mit der Übung beginnen
 ## Zum Schluss: der eigene Roboter
 
 debrief-title = Das ist Ihr Roboter
-debrief-lead = „Vorher“ ist der Roboter, wie ihn alle kennenlernen; „Ihr Roboter“ hat aus Ihren Antworten gelernt. Beide lösen dieselbe Aufgabe in derselben Situation, die für beide neu war.
+debrief-title-making = Ihr Roboter
+debrief-lead = „Vorher“ ist der Roboter, mit dem alle anfangen; „Ihr Roboter“ ist das, was Ihre Antworten aus ihm gemacht haben. Beide lösen dieselbe Aufgabe in derselben Situation, die für beide neu war.
 debrief-before = Vorher
 debrief-before-alt = Der Roboter, bevor er von Ihnen gelernt hat
 debrief-after = Ihr Roboter
 debrief-after-alt = Der Roboter, nachdem er von Ihnen gelernt hat
 debrief-making = Ihr Roboter entsteht gerade
 debrief-making-text = Er lernt aus Ihren Antworten und wird dann gefilmt. Das kann eine Weile dauern. Sie brauchen nicht zu warten: Gehen Sie weiter, und öffnen Sie Ihren Link später noch einmal, um ihn zu sehen.
-debrief-films-making = Die Filme entstehen gerade
+debrief-films-making = Die Videos entstehen gerade
 debrief-films-making-text = Ihr Roboter hat gelernt; nun wird er gefilmt. Sie brauchen nicht zu warten: Gehen Sie weiter, und öffnen Sie Ihren Link später noch einmal, um ihn zu sehen.
 debrief-learned = Was er von Ihnen gelernt hat
-debrief-learned-how = Verglichen mit dem Roboter vorher, über { $count } Situationen, die neu für ihn waren:
-debrief-learned-reference = Wir haben in { $count } Situationen, die für den Roboter neu waren, ausprobiert, was Ihre Antworten nahelegten. Nichts davon war sicher besser für Sie, ohne einen Nachteil zu haben. Ihr Roboter ist deshalb der, den alle kennenlernen: Beide Filme zeigen denselben Roboter.
-debrief-learned-nothing = Über { $count } Situationen, die neu für ihn waren, bewegt er sich ganz ähnlich wie der Roboter vorher. Entweder mochten Sie jenen, oder Ihre Antworten zogen in verschiedene Richtungen; beides ist in Ordnung.
-debrief-pace-quicker = Er bewegt sich schneller ({ $percent } % mehr) und ist eher bei Ihnen.
-debrief-pace-calmer = Er bewegt sich langsamer ({ $percent } % weniger) und lässt sich auf dem Weg zu Ihnen mehr Zeit.
-debrief-pace-less-motion = Er bewegt sich weniger ({ $percent } % weniger) und ist trotzdem eher bei Ihnen.
-debrief-pace-more-motion = Er bewegt sich mehr ({ $percent } % mehr) und braucht doch länger bis zu Ihnen.
-debrief-C_d-less = Er ist eher bei Ihnen.
+debrief-learned-how = Verglichen mit dem Roboter vorher, in { $count } Situationen, die neu für ihn waren:
+debrief-learned-reference = Wir haben in { $count } Situationen, die für den Roboter neu waren, ausprobiert, was Ihre Antworten nahelegten. Nichts davon war für Sie eindeutig besser, ohne auch einen Nachteil zu haben. Ihr Roboter ist deshalb der, mit dem alle anfangen: Beide Videos zeigen denselben Roboter.
+debrief-learned-nothing = In { $count } Situationen, die neu für ihn waren, bewegt er sich ganz ähnlich wie der Roboter vorher. Entweder gefiel Ihnen der schon, oder Ihre Antworten wiesen in verschiedene Richtungen; beides ist in Ordnung.
+debrief-pace-quicker = Er bewegt sich schneller (um { $percent } %) und ist früher bei Ihnen.
+debrief-pace-calmer = Er bewegt sich langsamer (um { $percent } %) und lässt sich auf dem Weg zu Ihnen mehr Zeit.
+debrief-pace-less-motion = Er bewegt sich weniger (um { $percent } %) und ist trotzdem früher bei Ihnen.
+debrief-pace-more-motion = Er bewegt sich mehr (um { $percent } %) und braucht doch länger bis zu Ihnen.
+debrief-C_d-less = Er ist früher bei Ihnen.
 debrief-C_d-more = Er lässt sich auf dem Weg zu Ihnen mehr Zeit.
 debrief-C_d-much = Er lässt sich auf dem Weg zu Ihnen viel mehr Zeit.
-debrief-C_v-less = Er bewegt sich langsamer ({ $percent } % weniger).
-debrief-C_v-more = Er bewegt sich schneller ({ $percent } % mehr).
+debrief-C_v-less = Er bewegt sich langsamer (um { $percent } %).
+debrief-C_v-more = Er bewegt sich schneller (um { $percent } %).
 debrief-C_v-much = Er bewegt sich viel schneller.
-debrief-C_f-less = Er berührt Sie weniger, wo er nicht soll ({ $percent } % weniger).
-debrief-C_f-more = Er berührt Sie mehr, wo er nicht soll ({ $percent } % mehr).
-debrief-C_f-much = Er berührt Sie viel mehr, wo er nicht soll.
-debrief-C_hf-less = Wo er Sie berühren soll, drückt er weniger stark ({ $percent } % weniger).
-debrief-C_hf-more = Wo er Sie berühren soll, drückt er stärker ({ $percent } % mehr).
+debrief-C_f-less = Er berührt Sie weniger, wo er es nicht soll (um { $percent } %).
+debrief-C_f-more = Er berührt Sie mehr, wo er es nicht soll (um { $percent } %).
+debrief-C_f-much = Er berührt Sie viel mehr, wo er es nicht soll.
+debrief-C_hf-less = Wo er Sie berühren soll, drückt er weniger stark (um { $percent } %).
+debrief-C_hf-more = Wo er Sie berühren soll, drückt er stärker (um { $percent } %).
 debrief-C_hf-much = Wo er Sie berühren soll, drückt er viel stärker.
-debrief-C_fd-less = Er verschüttet weniger auf Sie ({ $percent } % weniger).
-debrief-C_fd-more = Er verschüttet mehr auf Sie ({ $percent } % mehr).
+debrief-C_fd-less = Er verschüttet weniger auf Sie (um { $percent } %).
+debrief-C_fd-more = Er verschüttet mehr auf Sie (um { $percent } %).
 debrief-C_fd-much = Er verschüttet viel mehr auf Sie.
-debrief-C_fdv-less = Essen oder Trinken kommt langsamer in Ihren Mund ({ $percent } % weniger).
-debrief-C_fdv-more = Essen oder Trinken kommt schneller in Ihren Mund ({ $percent } % mehr).
-debrief-C_fdv-much = Essen oder Trinken kommt viel schneller in Ihren Mund.
+debrief-C_fdv-less = Essen oder Trinken gelangt langsamer in Ihren Mund (um { $percent } %).
+debrief-C_fdv-more = Essen oder Trinken gelangt schneller in Ihren Mund (um { $percent } %).
+debrief-C_fdv-much = Essen oder Trinken gelangt viel schneller in Ihren Mund.
 debrief-done = Abschließen
 
 ## Das Ende
@@ -162,7 +163,7 @@ finished-undo = Meine letzte Antwort zurücknehmen
 ## Widerruf
 
 withdraw-title = Teilnahme widerrufen
-withdraw-lead = Sie können jederzeit aufhören und brauchen keinen Grund zu nennen. Wenn Sie widerrufen, geschieht Folgendes:
+withdraw-lead = Sie können Ihre Teilnahme jederzeit widerrufen und brauchen keinen Grund zu nennen. Wenn Sie das tun, geschieht Folgendes:
 withdraw-body =
     - Alles, was Sie uns mitgeteilt haben, wird gelöscht: Ihre Antworten, Ihre Fragebögen, der Text Ihrer Einwilligung, Ihre Bewertungen.
     - Alles, was daraus entstanden ist, wird gelöscht: der Roboter, der von Ihnen gelernt hat, seine Videos und Dateien.
@@ -171,12 +172,12 @@ withdraw-body =
 withdraw-average = Die Roboter von Menschen, die nach Ihnen kamen, sind möglicherweise von einem Durchschnitt ausgegangen, zu dem Ihrer beigetragen hat. Auf Sie zurückführen lässt er sich nicht.
 withdraw-final = Das lässt sich nicht rückgängig machen, auch nicht von uns.
 withdraw-confirm = Alles über mich löschen
-withdraw-keep = Nein, alles behalten und zurück
+withdraw-keep = Nein, alles behalten
 withdrawn-title = Ihre Daten sind gelöscht
 withdrawn-lead = Sie haben Ihre Teilnahme widerrufen, und alles über Sie wurde gelöscht. Vielen Dank für Ihre Zeit.
-withdrawn-text = Die letzten Spuren auf unseren Rechnern verschwinden innerhalb von Minuten. Sie können diese Seite schließen; Ihr Link führt von jetzt an hierher.
+withdrawn-text = Die letzten Spuren auf unseren Rechnern verschwinden innerhalb weniger Minuten. Sie können diese Seite schließen; Ihr Link führt von jetzt an hierher.
 
-## Teilnahme über ein Panel oder eine offene Adresse
+## Teilnahme über ein Teilnahmeportal oder eine offene Adresse
 
 join-title = Herzlich willkommen
 join-start-lead = Sie sind eingeladen, an einer Studie teilzunehmen.
@@ -202,8 +203,8 @@ error-number = Fehler { $status }
 error-onward = Dorthin zurück, wo ich war
 error-link-needed = Wir können nicht erkennen, wer Sie sind. Bitte öffnen Sie Ihren persönlichen Link noch einmal: Sie machen genau dort weiter, wo Sie waren.
 error-link-not-valid = Dieser Link ist nicht gültig. Vielleicht wurde er durch einen neueren ersetzt; bitte fragen Sie die Person, die ihn Ihnen geschickt hat.
-error-joining-closed = Über diese Adresse kann man an keiner Studie (mehr) teilnehmen. Bitte fragen Sie die Personen, von denen Sie die Adresse haben.
-error-study-put-away = Diese Studie ist zurzeit geschlossen. Ihre bisherigen Antworten sind gespeichert. Bitte fragen Sie die Personen, die Sie eingeladen haben.
+error-joining-closed = Über diese Adresse ist zurzeit keine Teilnahme an einer Studie möglich. Bitte fragen Sie die Personen, von denen Sie die Adresse haben.
+error-study-put-away = Zurzeit kann niemand teilnehmen. Ihre bisherigen Antworten sind gespeichert. Bei Fragen wenden Sie sich bitte an die Personen, die Sie eingeladen haben.
 error-study-deleted = Diese Studie ist beendet, und alles über die Personen, die teilgenommen haben, wurde gelöscht. Sie können diese Seite schließen.
 error-not-yet = Vorher kommt noch etwas anderes. Sie werden dorthin weitergeleitet.
 error-query-not-found = Dieses Paar gehört nicht zu Ihren Paaren. Bitte machen Sie mit dem Paar weiter, das Ihnen gezeigt wird.
@@ -216,7 +217,7 @@ error-rated-already = Diesen Roboter haben Sie schon bewertet, und diese Bewertu
 error-correction-too-late = Nur die letzte Bewertung lässt sich ändern, und dies ist eine frühere.
 error-rating-misdirected = Diese Bewertung wurde schon zu einem anderen Roboter abgegeben. Bitte laden Sie die Seite neu und bewerten Sie noch einmal.
 error-foreign-form = Diese Anfrage kam von einer anderen Website und wurde abgelehnt. Bitte benutzen Sie die Seiten dieser Website.
-error-page-not-found = Unter dieser Adresse gibt es keine Seite.
+error-page-not-found = Unter dieser Adresse gibt es keine Seite. Wenn ein Link Sie hierher geführt hat, prüfen Sie bitte, ob er vollständig ist.
 error-not-understood = In diesem Formular fehlt etwas, oder etwas ist nicht gültig. Bitte gehen Sie zurück und prüfen Sie es.
 error-database-busy = Der Server ist beschäftigt oder noch nicht bereit. Es wurde nichts gespeichert; bitte versuchen Sie es gleich noch einmal.
 error-unforeseen = Das ist unser Fehler, und er wurde festgehalten. Bei diesem Schritt wurde nichts gespeichert; bitte versuchen Sie es noch einmal.
@@ -258,7 +259,7 @@ pair-now-answer = Jetzt können Sie antworten
 pair-saving = Wird gespeichert …
 pair-saving-earlier = Eine frühere Antwort wird gespeichert …
 pair-saved = Gespeichert. { $answered } von { $wanted }.
-pair-not-saved = Noch nicht gespeichert. Wird noch einmal versucht …
+pair-not-saved = Noch nicht gespeichert. Ein neuer Versuch läuft …
 pair-taken-back = Zurückgenommen. Bitte antworten Sie noch einmal.
 pair-unplayable = Diese Videos konnten nicht geladen werden.
 pair-broken-off = Diese Videos sind stehen geblieben. Sie können sie neu laden oder antworten, wenn Sie genug gesehen haben.
@@ -274,8 +275,8 @@ pair-why-other = Ein anderer Grund
 pair-why-none = Möchte ich nicht sagen
 pair-why-back = Zurück zum Paar
 waiting-heading = Ihr nächstes Paar wird vorbereitet
-waiting-text = Der Roboter nimmt gerade Videos auf. Diese Seite geht von selbst weiter; Sie brauchen nichts zu tun.
-waiting-answered = { $answered } von { $wanted } Antworten sind sicher gespeichert.
+waiting-text = Gerade werden neue Videos des Roboters aufgenommen. Danach geht es hier automatisch weiter; Sie brauchen nichts zu tun.
+waiting-answered = Sie haben bisher { $answered } von { $wanted } Antworten gegeben; alles ist sicher gespeichert.
 
 ## Übung (Vorsilbe practice-)
 
@@ -312,7 +313,7 @@ evaluation-minutes-left =
        *[other] Noch etwa { $minutes } Minuten.
     }
 wait-hours = Noch etwa { $hours } Stunden.
-wait-unknown = Wie lange es dauert, lässt sich noch nicht sagen: Mit diesen Einstellungen ist es das erste Mal.
+wait-unknown = Wie lange das dauert, lässt sich noch nicht sagen, denn es geschieht hier zum ersten Mal.
 wait-others-first = Es kann länger dauern, weil andere schon vor Ihnen warten.
 
 ## Bewertung (Vorsilbe evaluation-)
@@ -329,7 +330,7 @@ evaluation-repetition =
 evaluation-satisfaction = Wie zufrieden sind Sie insgesamt mit diesem Roboter?
 evaluation-satisfaction-low = überhaupt nicht zufrieden
 evaluation-satisfaction-high = völlig zufrieden
-evaluation-personalisation = Wie sehr wirkt sein Verhalten auf Sie persönlich zugeschnitten?
+evaluation-personalisation = Wie stark ist sein Verhalten Ihrem Eindruck nach auf Sie zugeschnitten?
 evaluation-personalisation-low = überhaupt nicht auf mich zugeschnitten
 evaluation-personalisation-high = völlig auf mich zugeschnitten
 evaluation-save = Speichern und weiter
@@ -342,7 +343,7 @@ evaluation-watch-first = Bitte sehen Sie ihn sich zuerst einmal bis zum Ende an
 evaluation-now-rate = Jetzt können Sie bewerten
 evaluation-keys = Tasten: zweimal 1 bis 5, dann die Eingabetaste. Die Rücktaste nimmt die letzte Eingabe zurück.
 evaluation-saving = Wird gespeichert …
-evaluation-not-saved = Noch nicht gespeichert. Wird noch einmal versucht …
+evaluation-not-saved = Noch nicht gespeichert. Ein neuer Versuch läuft …
 evaluation-refused = Das wurde nicht gespeichert, weil dieser Roboter nicht mehr an der Reihe ist. Die Seite wird neu geladen …
 evaluation-unplayable = Dieses Video konnte nicht geladen werden.
 evaluation-load-again = Neu laden
@@ -353,21 +354,21 @@ evaluation-position-value = { $seconds } von { $total } Sekunden
 evaluation-speed = Tempo
 evaluation-speed-value = { $rate }-faches Tempo
 evaluation-coming = Als Nächstes kommt Roboter { $letter }
-evaluation-coming-text = Er wird gleich gestartet. Dann geht es hier von selbst weiter.
-evaluation-moving = Roboter { $letter } bewegt sich, bitte schauen Sie zu
+evaluation-coming-text = Er wird gleich gestartet. Dann geht es hier automatisch weiter.
+evaluation-moving = Roboter { $letter } bewegt sich. Bitte schauen Sie zu.
 evaluation-moving-text = Sobald er fertig ist, werden Sie nach Ihrer Meinung gefragt.
 evaluation-waiting-title = Ihre Roboter werden vorbereitet
-evaluation-waiting-text = Sie lernen aus Ihren Antworten. Wenn sie fertig sind, sehen Sie jeden bei der Arbeit und bewerten ihn. Sie kennen sie nur unter Buchstaben.
+evaluation-waiting-text = Aus Ihren Antworten lernen gerade Roboter. Sobald sie bereit sind, sehen Sie mehrere Roboter bei der Arbeit und bewerten jeden davon. Bezeichnet sind sie nur mit Buchstaben: Roboter A, Roboter B und so weiter.
 evaluation-next-title = Der nächste Roboter wird vorbereitet
-evaluation-next-text = { $rated } von { $wanted } Bewertungen sind sicher gespeichert. Der nächste Film entsteht gerade; es geht von selbst weiter.
+evaluation-next-text = Sie haben bisher { $rated } von { $wanted } Bewertungen abgegeben; alles ist sicher gespeichert. Das nächste Video entsteht gerade. Danach geht es hier automatisch weiter.
 evaluation-waiting-progress = Wie weit Ihre Roboter sind
 evaluation-step-learning = Aus Ihren Antworten wird gelernt
 evaluation-step-training = Die Roboter werden trainiert
 evaluation-step-filming = Die Roboter werden gefilmt
 evaluation-step-packing = Die Roboter werden bereitgestellt
-evaluation-robots-ready = { $ready } von { $count } Robotern sind trainiert; { $percent } % der ganzen Arbeit sind getan.
-evaluation-may-close = Sie können diese Seite schließen: Ihre Antworten sind sicher gespeichert, und die Arbeit geht ohne Sie weiter. Ihr Link bringt Sie hierher zurück. Wenn Sie die Seite offen lassen, geht sie von selbst weiter.
-evaluation-trouble = Etwas ist schiefgegangen. Es wird noch einmal versucht, und die Person, von der Sie den Link haben, kann es sehen. Nichts von Ihnen ist verloren.
+evaluation-robots-ready = Fertig trainierte Roboter: { $ready } von { $count }. Gesamtfortschritt: { $percent } %.
+evaluation-may-close = Sie können diese Seite schließen: Ihre Antworten sind sicher gespeichert, und die Arbeit geht ohne Sie weiter. Ihr Link bringt Sie hierher zurück. Wenn Sie die Seite geöffnet lassen, geht es hier automatisch weiter.
+evaluation-trouble = Etwas ist schiefgegangen. Es wird noch einmal versucht, und die Person, von der Sie den Link haben, kann es sehen. Von Ihren Angaben ist nichts verloren gegangen.
 evaluation-done-title = Alle Roboter sind bewertet
 evaluation-done-text =
     { $count ->
@@ -375,6 +376,6 @@ evaluation-done-text =
        *[other] Ihre { $count } Bewertungen sind sicher gespeichert. Vielen Dank.
     }
 
-## Preview by an experimenter
+## Vorschau
 
 preview-mark = Vorschau: Nichts hiervon zählt

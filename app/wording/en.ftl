@@ -89,7 +89,7 @@ instructions-left = Left is better
 instructions-top = Top: the upper one is better
 instructions-right = Right is better
 instructions-bottom = Bottom: the lower one is better
-instructions-equal = Equal: both are equally good to me
+instructions-equal = Equal: I find both equally good
 instructions-skip = Can’t tell: I could not judge this pair; it does not count
 instructions-replay = Replay from the start
 instructions-undo = Take back the last answer
@@ -103,40 +103,41 @@ instructions-practice = Start with practice
 ## Debrief
 
 debrief-title = This is your robot
-debrief-lead = “Before” is the robot as everybody meets it, “Your robot” has learned from your answers. Both do the same task in the same situation, one that was new to both.
+debrief-title-making = Your robot
+debrief-lead = “Before” is the robot that everybody starts with; “Your robot” is what your answers have made of it. Both do the same task in the same situation, which was new to both.
 debrief-before = Before
 debrief-before-alt = The robot before it learned from you
 debrief-after = Your robot
 debrief-after-alt = The robot after it learned from you
 debrief-making = Your robot is still being made
 debrief-making-text = It is learning from your answers and will then be filmed. That can take a while. You need not wait: go on, and open your link again later to see it.
-debrief-films-making = The films are still being made
+debrief-films-making = The videos are still being made
 debrief-films-making-text = Your robot has learned; now it is being filmed. You need not wait: go on, and open your link again later to see it.
 debrief-learned = What it learned from you
-debrief-learned-how = Compared with the robot before, over { $count } situations it had not met:
-debrief-learned-reference = We tried what your answers suggested in { $count } situations that were new to the robot. Nothing there was surely better for you without a drawback, so your robot is the one that everybody meets: both films show the same robot.
-debrief-learned-nothing = Over { $count } situations it had not met, it moves much like the robot before. Either you liked that one, or your answers pulled in several directions; both are fine.
-debrief-pace-quicker = It moves more quickly ({ $percent } % more) and is with you sooner.
-debrief-pace-calmer = It moves more slowly ({ $percent } % less) and takes more time on its way to you.
-debrief-pace-less-motion = It moves less ({ $percent } % less) and is with you sooner all the same.
-debrief-pace-more-motion = It moves more ({ $percent } % more) and yet takes longer to be with you.
-debrief-C_d-less = It is with you sooner.
+debrief-learned-how = Compared with the robot before, in { $count } situations that were new to it:
+debrief-learned-reference = We tried out what your answers suggested in { $count } situations that were new to the robot. None of it was clearly better for you without a drawback, so your robot is the one that everybody starts with: both videos show the same robot.
+debrief-learned-nothing = In { $count } situations that were new to it, it moves much like the robot before. Either you liked that one, or your answers pointed in different directions; both are fine.
+debrief-pace-quicker = It moves more quickly (by { $percent } %) and reaches you sooner.
+debrief-pace-calmer = It moves more slowly (by { $percent } %) and takes more time on its way to you.
+debrief-pace-less-motion = It moves less (by { $percent } %) and reaches you sooner all the same.
+debrief-pace-more-motion = It moves more (by { $percent } %) and yet takes longer to reach you.
+debrief-C_d-less = It reaches you sooner.
 debrief-C_d-more = It takes more time on its way to you.
 debrief-C_d-much = It takes much more time on its way to you.
-debrief-C_v-less = It moves more slowly ({ $percent } % less).
-debrief-C_v-more = It moves more quickly ({ $percent } % more).
+debrief-C_v-less = It moves more slowly (by { $percent } %).
+debrief-C_v-more = It moves more quickly (by { $percent } %).
 debrief-C_v-much = It moves much more quickly.
-debrief-C_f-less = It touches you less where it should not ({ $percent } % less).
-debrief-C_f-more = It touches you more where it should not ({ $percent } % more).
+debrief-C_f-less = It touches you less where it should not (by { $percent } %).
+debrief-C_f-more = It touches you more where it should not (by { $percent } %).
 debrief-C_f-much = It touches you much more where it should not.
-debrief-C_hf-less = Where it is meant to touch you, it presses less hard ({ $percent } % less).
-debrief-C_hf-more = Where it is meant to touch you, it presses harder ({ $percent } % more).
+debrief-C_hf-less = Where it is meant to touch you, it presses less hard (by { $percent } %).
+debrief-C_hf-more = Where it is meant to touch you, it presses harder (by { $percent } %).
 debrief-C_hf-much = Where it is meant to touch you, it presses much harder.
-debrief-C_fd-less = It spills less on you ({ $percent } % less).
-debrief-C_fd-more = It spills more on you ({ $percent } % more).
+debrief-C_fd-less = It spills less on you (by { $percent } %).
+debrief-C_fd-more = It spills more on you (by { $percent } %).
 debrief-C_fd-much = It spills much more on you.
-debrief-C_fdv-less = Food or drink enters your mouth more slowly ({ $percent } % less).
-debrief-C_fdv-more = Food or drink enters your mouth more quickly ({ $percent } % more).
+debrief-C_fdv-less = Food or drink enters your mouth more slowly (by { $percent } %).
+debrief-C_fdv-more = Food or drink enters your mouth more quickly (by { $percent } %).
 debrief-C_fdv-much = Food or drink enters your mouth much more quickly.
 debrief-done = Finish
 
@@ -164,9 +165,9 @@ finished-undo = Take back my last answer
 ## Withdrawing
 
 withdraw-title = Withdraw from the study
-withdraw-lead = You may leave at any time and need not say why. If you do, this is what happens:
+withdraw-lead = You may withdraw at any time without saying why. If you do, this is what happens:
 withdraw-body =
-    - Everything you told us is erased: your answers, your forms, the text you agreed to, your ratings.
+    - Everything you told us is erased: your answers, your questionnaires, the text you agreed to, your ratings.
     - Everything made from it is erased: the robot that learned from you, its videos and its files.
     - All that remains is a note that { $code } took part and withdrew, and when. It says neither who you are nor what you told us.
     - Results that have already been published cannot be taken back.
@@ -182,8 +183,8 @@ withdrawn-text = The last traces on our computers will be gone within minutes. Y
 
 join-title = Welcome
 join-start-lead = You are invited to take part in a study.
-join-start-text = Press the button to come in. You will then read what taking part means and can decide; until you press it, nothing is stored.
-join-start = Come in
+join-start-text = Press the button to go on. You will then read what taking part means, and can decide. Nothing is stored until you press it.
+join-start = To the study
 join-missing-title = Something is missing in this address
 join-missing = We cannot tell who you are: the address should contain { $parameter }. Please open the study again from the page that offered it to you. If that does not help, contact the people who run that page.
 join-link-lead = This is your personal link. Keep it if you may want to go on later or on another device, and do not share it with anybody.
@@ -204,8 +205,8 @@ error-number = Error { $status }
 error-onward = Back to where I was
 error-link-needed = We cannot tell who you are. Please open your personal link once more: you will go on exactly where you were.
 error-link-not-valid = This link is not valid. It may have been replaced by a newer one; please ask the person who sent it to you.
-error-joining-closed = A study cannot be joined, or can no longer be joined, through this address. Please ask the people who gave it to you.
-error-study-put-away = This study is closed at the moment. What you have answered is kept. Please ask the people who invited you.
+error-joining-closed = This address does not lead to a study that can be joined now. Please ask the people who gave it to you.
+error-study-put-away = At the moment nobody can take part. Your answers so far are kept. If you have questions, please ask the people who invited you.
 error-study-deleted = This study is over, and everything about the people who took part has been erased. You can close this page.
 error-not-yet = Something else comes first. You are being taken there.
 error-query-not-found = This is not one of your pairs. Please go on with the pair you are shown.
@@ -218,7 +219,7 @@ error-rated-already = You have already rated this robot, and that rating counts.
 error-correction-too-late = Only the last rating can be changed, and this is an earlier one.
 error-rating-misdirected = This rating was already given to another robot. Please reload the page and rate again.
 error-foreign-form = This request came from another website and was refused. Please use the pages of this site.
-error-page-not-found = There is no page at this address.
+error-page-not-found = There is no page at this address. If a link brought you here, please check that it is complete.
 error-not-understood = Something on this form is missing or not valid. Please go back and check it.
 error-database-busy = The server is busy or not ready yet. Nothing was saved; please try again in a moment.
 error-unforeseen = This is our fault, and we have a record of it. Nothing was saved in this step; please try again.
@@ -276,8 +277,8 @@ pair-why-other = Another reason
 pair-why-none = I’d rather not say
 pair-why-back = Back to the pair
 waiting-heading = Your next pair is being prepared
-waiting-text = The robot is recording clips. This page goes on by itself; there is nothing you need to do.
-waiting-answered = { $answered } of { $wanted } answers are safely stored.
+waiting-text = New videos of the robot are being recorded. This page continues by itself; there is nothing you need to do.
+waiting-answered = You have given { $answered } of { $wanted } answers so far; everything is safely stored.
 
 ## Practice (prefix practice-)
 
@@ -314,8 +315,8 @@ evaluation-minutes-left =
        *[other] About { $minutes } minutes to go.
     }
 wait-hours = About { $hours } hours to go.
-wait-unknown = How long this takes is not known yet: it has not been done before with these settings.
-wait-others-first = It can take longer, because others have been waiting before you.
+wait-unknown = We cannot say yet how long this takes, because it has not been done here before.
+wait-others-first = It may take longer, because others were waiting before you.
 
 ## Evaluation (prefix evaluation-)
 
@@ -356,20 +357,20 @@ evaluation-speed = Speed
 evaluation-speed-value = { $rate } times normal speed
 evaluation-coming = Robot { $letter } is next
 evaluation-coming-text = It will be started in a moment. This page continues by itself.
-evaluation-moving = Robot { $letter } is moving, please watch
+evaluation-moving = Robot { $letter } is moving. Please watch.
 evaluation-moving-text = You will be asked about it as soon as it is done.
 evaluation-waiting-title = Your robots are being prepared
-evaluation-waiting-text = They are trained on your answers. When they are ready you will watch each of them at work and rate it. You will know them by letters only.
+evaluation-waiting-text = Robots are being trained on your answers. As soon as they are ready, you will watch several robots at work and rate each of them. You will know them only by letters: Robot A, Robot B and so on.
 evaluation-next-title = The next robot is being prepared
-evaluation-next-text = { $rated } of { $wanted } ratings are safely stored. The next film is in the making, and this page goes on by itself.
+evaluation-next-text = You have rated { $rated } of { $wanted } so far; everything is safely stored. The next video is being made. This page continues by itself.
 evaluation-waiting-progress = How far your robots are
 evaluation-step-learning = Learning from your answers
 evaluation-step-training = Training the robots
 evaluation-step-filming = Filming the robots
 evaluation-step-packing = Getting the robots ready
-evaluation-robots-ready = { $ready } of { $count } robots are trained; { $percent } % of everything is done.
-evaluation-may-close = You may close this page: your answers are safely stored, and the work goes on without you. Your link brings you back here. If you leave the page open, it goes on by itself.
-evaluation-trouble = Something went wrong. It is being tried again, and the person who sent you the link can see it. Nothing of yours is lost.
+evaluation-robots-ready = Robots trained: { $ready } of { $count }. Overall progress: { $percent } %.
+evaluation-may-close = You may close this page: your answers are safely stored, and the work continues without you. Your link brings you back here. If you leave the page open, it continues by itself.
+evaluation-trouble = Something went wrong. It will be tried again, and the person who sent you the link can see it. Nothing you have done is lost.
 evaluation-done-title = All robots are rated
 evaluation-done-text =
     { $count ->

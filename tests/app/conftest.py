@@ -1,18 +1,23 @@
-"""A participant in the middle of a study, as most tests of pages need one."""
+"""What most tests of pages need, a participant in the middle of a study; and another installation to bring studies."""
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from uuid import UUID, uuid4
 
 import pytest
+from fastapi import FastAPI
 from fastapi.testclient import TestClient
 from httpx2 import Response as Answer
 from sqlalchemy import select
 
-from app.db import Database
+from app.db import Base, Database
 from app.domain.preferences import LabelEvent, Query
 from app.domain.studies import Participant, Study
+from app.main import create_app
+from app.services import study_import
+from app.settings import Settings
 from app.storage import ArtefactStore
 from tests import factories
 
@@ -68,3 +73,25 @@ def taking_part(database: Database, store: ArtefactStore, new_browser: Callable[
     browser = new_browser()
     browser.get(f"/p/{token}")
     return TakingPart(browser, participant, token, study, queries, database)
+
+
+@pytest.fixture
+def elsewhere(tmp_path: Path) -> Iterator[FastAPI]:
+    """Another installation, which already holds something: ids there are others."""
+    application = create_app(Settings(_env_file=None, data_dir=tmp_path / "elsewhere", public_url=None))
+    (tmp_path / "elsewhere").mkdir()
+    there: Database = application.state.studio.database
+    Base.metadata.create_all(there.writer)
+    with there.writing() as session:
+        study = factories.make_study(session, "Something else")
+        person, _ = factories.make_participant(session, study)
+        factories.make_queries(session, application.state.studio.store, person, 3)
+    yield application
+    there.dispose()
+
+
+def bring(application: FastAPI, path: Path, seal_key: str = "") -> study_import.Imported:
+    """Import an archive there."""
+    studio = application.state.studio
+    with studio.database.writing() as session:
+        return study_import.read(session, studio.store, path, "experimenter", seal_key)

@@ -6,13 +6,14 @@ from typing import Any
 
 import pytest
 from fastapi import FastAPI
+from fastapi.routing import iter_route_contexts
 from fastapi.testclient import TestClient
-from sqlalchemy import select
+from sqlalchemy import func, select
 
 from app.db import Database, now
 from app.domain.models import ModelKind, Report
-from app.domain.people import ApiToken, Experimenter, Role
-from app.domain.studies import Study
+from app.domain.people import ApiToken, AuditEvent, Experimenter, Role
+from app.domain.studies import Participant, Study
 from app.services import api_tokens, export_tables, reports
 from app.storage import ArtefactStore
 from tests import factories
@@ -156,6 +157,38 @@ def test_the_newest_report_and_its_figures(call: Call, database: Database, store
     assert (report["lock_hash"], report["deviations"]) == ("not locked", "none")
     figure = call(report["figures"]["ratings"]["svg"].removeprefix("/api/v1"))
     assert (figure.content, figure.headers["content-type"]) == (b"<svg/>", "image/svg+xml")
+
+
+def test_whatever_tells_something_of_people_is_kept_with_who_read_it(
+    call: Call, studio_app: FastAPI, database: Database, store: ArtefactStore, study: Study
+) -> None:
+    """Every address of a study, those left out that tell of settings, of files that there are, or draw averages."""
+    with database.writing() as session:
+        person = session.scalars(select(Participant).where(Participant.study_id == study.id)).first()
+        assert person is not None
+        factories.make_bundle(session, store, factories.make_model(session, study, person, ModelKind.FILTER, {}))
+        run = factories.make_run(session, study, kind="report")
+        contents = {"version": reports.VERSION}
+        session.add(Report(study_id=study.id, run_id=run.id, basis="", contents=contents, figures={}))
+    impersonal = {"/studies/{slug}", "/studies/{slug}/tables", "/studies/{slug}/exports"}
+    files = ("/studies/{slug}/exports/{export_id}.zip", "/studies/{slug}/report/figures/{name}.{kind}")
+    asked = []
+    for route in iter_route_contexts(studio_app.state.api.routes):
+        path = getattr(route, "path", "")
+        if (
+            "GET" not in (getattr(route, "methods", None) or ())
+            or "{slug}" not in path
+            or path in {*impersonal, *files}
+        ):
+            continue
+        address = path.format(slug=study.slug, code="P01", version=1, table="labels")
+        with database.reading() as session:
+            before = session.scalar(select(func.count(AuditEvent.id)))
+        assert call(address).status_code == 200, address
+        with database.reading() as session:
+            assert session.scalar(select(func.count(AuditEvent.id))) == (before or 0) + 1, address
+        asked.append(path)
+    assert len(asked) == 5, asked
 
 
 def test_a_file_is_asked_for(call: Call, study: Study) -> None:

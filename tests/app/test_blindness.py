@@ -2,6 +2,7 @@
 
 import io
 import re
+import shutil
 import sys
 import zipfile
 from collections.abc import Callable, Iterator
@@ -82,6 +83,8 @@ def everything(
 ) -> Callable[[], Answers]:
     """Makes a report, and gathers every page, answer of the API, figure and file, all at the same moment."""
     _stop_the_clock(monkeypatch)
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage)  # pages say how much is free; others write meanwhile
     monkeypatch.setattr(figures, "DPI", 40)
     monkeypatch.setattr(preference_arrays, "arrays_of", lambda *_: None)  # nobody has moved in this study
 

@@ -34,7 +34,7 @@ def study(database: Database, store: ArtefactStore) -> Study:
             query.predicted_right = {2: 0.9, 3: 0.2}.get(place)
             factories.make_label(session, query, Response.LEFT, timedelta(minutes=9 - place), response_time_ms=3000)
         (other,) = factories.make_queries(session, store, second, 1)
-        factories.make_label(session, other, Response.EQUAL)
+        factories.make_label(session, other, Response.EQUAL, by_script=False)
     return study
 
 
@@ -77,6 +77,7 @@ class TestLooking:
             ({"response": Response.EQUAL}, [("P02", 1)]),
             ({"mark": Mark.MISPREDICTED}, [("P01", 3)]),
             ({"mark": Mark.QUICK}, []),
+            ({"mark": Mark.WITHOUT_SCRIPT}, [("P02", 1)]),
             ({"purpose": Purpose.CATCH}, []),
         ],
     )

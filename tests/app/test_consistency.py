@@ -214,3 +214,10 @@ def test_nothing_said_is_nothing_known() -> None:
 
 def test_the_balance_counts_every_kind_of_answer() -> None:
     assert of([answer(LEFT), answer(LEFT), answer(SKIP)]).balance == {LEFT: 2, RIGHT: 0, EQUAL: 0, SKIP: 1}
+
+
+def test_one_answer_without_the_pages_script_asks_for_a_look_and_practice_does_not() -> None:
+    practice = answer(purpose=Purpose.PRACTICE, by_script=False)
+    assert of([practice, answer(by_script=True), answer(by_script=None)]).flags == []
+    judged = of([answer(by_script=True), answer(by_script=False)])
+    assert (judged.without_script, judged.flags) == (1, ["without_script"])

@@ -37,6 +37,7 @@ def add_filter(at: TakingPart, metrics: dict[str, Any]) -> Model:
 
 def test_while_nothing_is_there_it_says_so_and_holds_nobody_up(at_debrief: TakingPart) -> None:
     page = at_debrief.browser.get("/p/debrief").text
+    assert "This is your robot" not in page
     assert "still being made" in page
     assert "<video" not in page
     assert at_debrief.browser.post("/p/debrief").headers["location"] == "/p/next"
@@ -59,23 +60,23 @@ def test_before_and_after_are_shown_side_by_side_in_one_scenario(at_debrief: Tak
 def test_what_is_certain_is_said_in_plain_words_and_nothing_else(at_debrief: TakingPart) -> None:
     add_filter(at_debrief, factories.filter_metrics())
     page = at_debrief.browser.get("/p/debrief").text
-    assert "It moves more slowly (41\N{NO-BREAK SPACE}% less) and takes more time on its way to you." in page
-    assert "it presses less hard (63\N{NO-BREAK SPACE}% less)." in page
+    assert "It moves more slowly (by 41\N{NO-BREAK SPACE}%) and takes more time on its way to you." in page
+    assert "it presses less hard (by 63\N{NO-BREAK SPACE}%)." in page
     assert "touches you" not in page, "its interval holds zero"
 
 
-PACE = re.compile(r"quick|slow|sooner|more time|longer|moves|schnell|langsam|eher|Zeit|länger|bewegt")
+PACE = re.compile(r"quick|slow|sooner|more time|longer|moves|schnell|langsam|früher|Zeit|länger|bewegt")
 MOUTH = re.compile(r"mouth|Mund")
 ABOUT = (
     PACE,
-    re.compile(r"where it should not|wo er nicht soll"),
+    re.compile(r"where it should not|wo er es nicht soll"),
     re.compile(r"presses|drückt"),
     re.compile(r"spill|verschüttet"),
     MOUTH,
 )
 """What a sentence can be about: the way to the person, touching on it, pressing at its end, spilling, the mouthful."""
 SAYS = {
-    "C_d": ("sooner|eher bei", "time on its way|longer|Zeit|länger"),
+    "C_d": ("sooner|früher bei", "time on its way|longer|Zeit|länger"),
     "C_v": ("slowly|moves less|langsamer|weniger", "quickly|moves more|schneller|mehr"),
 }
 """For the two costs that share sentences, how a decrease and an increase is said."""
@@ -133,7 +134,7 @@ def test_a_robot_that_learned_nothing_certain_is_not_made_more_of(at_debrief: Ta
 def test_a_robot_that_is_the_reference_is_called_that(at_debrief: TakingPart) -> None:
     add_filter(at_debrief, factories.filter_metrics() | {"uses_reference": True})
     page = at_debrief.browser.get("/p/debrief").text
-    assert "your robot is the one that everybody meets" in page
+    assert "your robot is the one that everybody starts with" in page
     assert "slowly" not in page
 
 

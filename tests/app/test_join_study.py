@@ -173,7 +173,7 @@ def test_an_address_that_was_closed_lets_nobody_in(
         panel.close_joining(session, session.scalars(select(Study)).one(), actor="pat")
     for answer in (client.get(address + "?PROLIFIC_PID=abc"), client.post(address + "?PROLIFIC_PID=abc")):
         assert answer.status_code == 404
-        assert "cannot be joined" in answer.text
+        assert "does not lead to a study that can be joined" in answer.text
 
 
 @pytest.mark.parametrize(

@@ -5,14 +5,14 @@ from datetime import datetime, timedelta
 
 import pytest
 from fastapi.testclient import TestClient
-from sqlalchemy import update
+from sqlalchemy import select, update
 
 from app.db import Database, now
 from app.domain.evaluation import Rating
-from app.domain.preferences import LabelEvent
+from app.domain.preferences import Exclusion, LabelEvent, Query
 from app.domain.protocol import PlannedTest
 from app.domain.studies import Deviation, Study, TaskName
-from app.services import exporting, locking, planning
+from app.services import excluding, exporting, locking, planning
 from app.services.planning import Plan, Standing
 from app.storage import ArtefactStore
 from tests import factories
@@ -120,6 +120,48 @@ def test_a_change_before_anything_was_rated_is_told_apart(database: Database, pl
             session.add(Deviation(study_id=study.id, at=at, actor="Ada", reason="So.", before={}, after={}))
     plan = plan_of(database, study)
     assert [plan.seen_before(each) for each in plan.deviations] == [False, True]
+
+
+def exclude(database: Database, study: Study, place: int, day: int, reason: str) -> None:
+    """Leave one of the answers out on that day; without a reason it is taken in again."""
+    with database.writing() as session:
+        here = session.get_one(Study, study.id)
+        query_id = session.scalars(select(Query.id).order_by(Query.id)).all()[place]
+        if reason:
+            excluding.exclude(session, here, query_id, reason, "Ada")
+        else:
+            excluding.include(session, here, query_id, "Ada")
+        session.flush()
+        session.scalars(select(Exclusion).order_by(Exclusion.id)).all()[-1].at = START + timedelta(days=day)
+
+
+def test_answers_excluded_after_locking_are_told_with_their_reasons_and_their_side_of_unblinding(
+    experimenter: TestClient, database: Database, planned: Planned
+) -> None:
+    study = planned(5)
+    exclude(database, study, 0, 4, "Was excluded before the lock.")
+    exclude(database, study, 1, 4, "Was in again at the end.")
+    exclude(database, study, 1, 6, "")
+    exclude(database, study, 2, 12, "The phone rang.")
+    exclude(database, study, 3, 13, "The phone rang.")
+    exclude(database, study, 4, 31, "The phone rang.")
+    exclude(database, study, 5, 14, "In and out again, as it was locked.")
+    exclude(database, study, 5, 15, "")
+    plan = plan_of(database, study)
+    assert [(each.excluded, each.reason, each.after_unblinding, len(each.whose)) for each in plan.left_out] == [
+        (False, "", False, 1),
+        (True, "The phone rang.", False, 2),
+        (True, "The phone rang.", True, 1),
+    ]
+    assert "Answers excluded or taken in again after locking: 4, of which 1 after unblinding." in plan.in_words
+    assert "the page of results will tell" in experimenter.get(f"/studies/{study.slug}/answers/7").text
+    assert "after locking: 4, of which 1 after unblinding" in experimenter.get(f"/studies/{study.slug}/lock").text
+
+
+def test_in_a_study_that_is_not_locked_an_exclusion_is_no_deviation(database: Database, planned: Planned) -> None:
+    study = planned(None)
+    exclude(database, study, 0, 12, "The phone rang.")
+    assert plan_of(database, study).left_out == []
 
 
 def test_provenance_of_an_export_lists_the_changes(database: Database, planned: Planned) -> None:

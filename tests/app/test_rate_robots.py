@@ -273,7 +273,7 @@ def test_while_the_robots_are_made_the_page_says_how_far_they_are_and_that_it_ma
         )
     page = waiting.look()
     assert "Training the robots" in page
-    assert "2 of 3 robots are trained; 50\N{NO-BREAK SPACE}% of everything is done" in page
+    assert "Robots trained: 2 of 3. Overall progress: 50\N{NO-BREAK SPACE}%." in page
     with database.writing() as session:
         factories.make_model(session, waiting.study, waiting.participant, ModelKind.METHOD, {"method": "prefft"})
     assert "Filming the robots" in waiting.look()
@@ -313,7 +313,7 @@ def test_a_physical_robot_is_rated_when_the_operator_says_that_it_is_done(
     assert "Robot A is next" in at.look()
     assert at.rate(at.trials[0]).status_code == 409
     experimenter.post(f"{desk}/trials/1/start")
-    assert "Robot A is moving, please watch" in at.look()
+    assert "Robot A is moving. Please watch." in at.look()
     assert at.rate(at.trials[0]).status_code == 409
     experimenter.post(f"{desk}/trials/1/done")
     assert "Please rate what the robot has just done" in at.look()

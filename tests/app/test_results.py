@@ -11,10 +11,10 @@ from sqlalchemy import select
 
 from app.db import Database, now
 from app.domain.models import Report, RunStatus
-from app.domain.preferences import Response
+from app.domain.preferences import Query, Response
 from app.domain.protocol import PlannedTest
 from app.domain.studies import Study, TaskName
-from app.services import dashboard, locking
+from app.services import dashboard, excluding, locking
 from app.storage import ArtefactStore
 from tests import factories
 from tests.finished_study import make_finished_study
@@ -63,6 +63,23 @@ def test_planned_tests_are_marked_and_all_others_are_exploratory(experimenter: T
     assert text.count('tag-planned">planned') == comparisons * scales
     assert text.count(">exploratory<") == comparisons * scales * (kinds - 1)
     assert "Planned tests were locked before the first answer." in text
+
+
+@pytest.mark.parametrize("evaluated", [True, False])
+def test_answers_excluded_after_locking_stand_beside_the_plan_with_their_reasons(
+    experimenter: TestClient, finished: Finished, database: Database, evaluated: bool
+) -> None:
+    study = finished(locked=True)
+    with database.writing() as session:
+        there = session.get_one(Study, study.id)
+        if not evaluated:
+            there.stored_settings = there.stored_settings | {"evaluation": None}
+        for query_id in session.scalars(select(Query.id).order_by(Query.id).limit(2)):
+            excluding.exclude(session, there, query_id, "The <phone> rang.", "Ada")
+    text = " ".join(results(experimenter, study).split())
+    side = " after unblinding" if evaluated else ""
+    assert f"2 answers of P01 excluded{side}: The &lt;phone&gt; rang." in text
+    assert ("First rating" in text) is evaluated
 
 
 def test_no_test_of_a_study_that_was_never_locked_is_called_planned(

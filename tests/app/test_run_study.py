@@ -264,8 +264,12 @@ class TestWatching:
         since = now() - timedelta(minutes=3)
         falls.note(settings.data_dir, [falls.Falls("worker", 4, since, "MemoryError: <b>no</b> room")])
         page = experimenter.get("/studies/pilot").text
-        assert "The worker has stopped 4 times</strong>, first 3 min ago" in page
-        assert "MemoryError: &lt;b&gt;no&lt;/b&gt; room" in page
+        assert "The worker has stopped 4 times</strong>, first 3 min ago. Its last words:" in page
+        assert "<q>MemoryError: &lt;b&gt;no&lt;/b&gt; room</q>." in page
+        falls.note(settings.data_dir, [falls.Falls("web", 1, since, "")])
+        page = experimenter.get("/studies/pilot").text
+        assert "The web server has stopped once</strong>, 3 min ago." in page
+        assert "last words" not in page
         falls.note(settings.data_dir, [])
         assert "has stopped" not in experimenter.get("/studies/pilot").text
 

@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from urllib.request import urlopen
@@ -15,7 +14,7 @@ from urllib.request import urlopen
 import pytest
 
 from app.falls import noted
-from tests.waiting import PATIENCE_S, free_port
+from tests.waiting import PATIENCE_S, free_port, gone, until
 
 Start = Callable[[], "Studio"]
 
@@ -79,15 +78,6 @@ def start(tmp_path: Path) -> Iterator[Start]:
             studio.stop(signal.SIGTERM)
 
 
-def within_patience(true: Callable[[], bool]) -> bool:
-    deadline = time.monotonic() + PATIENCE_S
-    while time.monotonic() < deadline:
-        if true():
-            return True
-        threading.Event().wait(0.05)
-    return False
-
-
 def answers(address: str) -> bool:
     try:
         with urlopen(f"{address}/login", timeout=5) as response:  # noqa: S310  (our own server)
@@ -96,17 +86,9 @@ def answers(address: str) -> bool:
         return False
 
 
-def gone(pid: int) -> bool:
-    try:
-        status = Path(f"/proc/{pid}/stat").read_text()
-    except FileNotFoundError:
-        return True
-    return status.rsplit(")", 1)[1].split()[0] == "Z"
-
-
 def test_the_first_start_prints_all_that_is_needed_and_ctrl_c_stops_both_programs(start: Start) -> None:
     studio = start()
-    assert within_patience(lambda: "worker-1 is ready" in studio.said and answers(studio.address))
+    assert until(lambda: "worker-1 is ready" in studio.said and answers(studio.address))
     link = re.search(r"Participant link\s+(\S+)", studio.said)
     assert link is not None
     assert link[1].startswith(f"{studio.address}/p/")
@@ -121,19 +103,19 @@ def test_the_first_start_prints_all_that_is_needed_and_ctrl_c_stops_both_program
 
 def test_a_second_start_makes_no_second_demo_study_and_no_new_password(start: Start) -> None:
     first = start()
-    assert within_patience(lambda: "Participant link" in first.said)
+    assert until(lambda: "Participant link" in first.said)
     first.stop()
     second = start()
-    assert within_patience(lambda: "nothing is lost" in second.said)
+    assert until(lambda: "nothing is lost" in second.said)
     assert "One-time password" not in second.said
     assert "/p/" not in second.said
 
 
 def test_a_worker_that_is_killed_is_started_again(start: Start) -> None:
     studio = start()
-    assert within_patience(lambda: "worker-1 is ready" in studio.said)
+    assert until(lambda: "worker-1 is ready" in studio.said)
     os.kill(studio.child("worker"), signal.SIGKILL)
-    assert within_patience(lambda: studio.said.count("worker-1 is ready") == 2)
+    assert until(lambda: studio.said.count("worker-1 is ready") == 2)
     assert "The worker stopped by itself (exit code -9); starting it again." in studio.said
 
 
@@ -143,44 +125,44 @@ def test_a_worker_that_keeps_falling_leaves_the_web_server_alone_and_is_tried_un
     with (tmp_path / "worker-1.lock").open("w") as held_by_another:
         fcntl.flock(held_by_another, fcntl.LOCK_EX)
         studio = start()
-        assert within_patience(lambda: "exit code 1, 3 times by now" in studio.said)
+        assert until(lambda: "exit code 1, 3 times by now" in studio.said)
         assert answers(studio.address)
-        assert within_patience(lambda: [falls.count >= 3 for falls in noted(tmp_path)] == [True])
+        assert until(lambda: [falls.count >= 3 for falls in noted(tmp_path)] == [True])
         (falls,) = noted(tmp_path)
         assert falls.program == "worker"
         assert "A worker of this name is already running" in falls.last_words
-    assert within_patience(lambda: "worker-1 is ready" in studio.said)
+    assert until(lambda: "worker-1 is ready" in studio.said)
     assert studio.stop() == 0
 
 
 def test_a_web_server_that_falls_is_started_again_and_the_worker_keeps_its_work(start: Start) -> None:
     studio = start()
-    assert within_patience(lambda: "worker-1 is ready" in studio.said and answers(studio.address))
+    assert until(lambda: "worker-1 is ready" in studio.said and answers(studio.address))
     worker, web = studio.child("worker"), studio.child("uvicorn")
     os.kill(web, signal.SIGKILL)
-    assert within_patience(lambda: "The web stopped by itself" in studio.said)
-    assert within_patience(lambda: answers(studio.address))
+    assert until(lambda: "The web stopped by itself" in studio.said)
+    assert until(lambda: answers(studio.address))
     assert studio.child("worker") == worker
 
 
 def test_a_damaged_file_of_the_engine_is_set_aside_and_the_studio_starts(start: Start, tmp_path: Path) -> None:
     (tmp_path / "engine.sqlite3").write_bytes(os.urandom(30_000))
     studio = start()
-    assert within_patience(lambda: "worker-1 is ready" in studio.said and answers(studio.address))
+    assert until(lambda: "worker-1 is ready" in studio.said and answers(studio.address))
     assert "the engine's file cannot be read (file is not a database); it is kept as" in studio.said
 
 
 def test_killing_the_supervisor_leaves_nothing_running(start: Start) -> None:
     studio = start()
-    assert within_patience(lambda: "worker-1 is ready" in studio.said and answers(studio.address))
+    assert until(lambda: "worker-1 is ready" in studio.said and answers(studio.address))
     programs = [studio.child("uvicorn"), studio.child("worker")]
     studio.stop(signal.SIGKILL)
-    assert within_patience(lambda: all(gone(pid) for pid in programs))
+    assert until(lambda: all(gone(pid) for pid in programs))
 
 
 def test_a_port_in_use_is_explained(start: Start) -> None:
     first = start()
-    assert within_patience(lambda: answers(first.address))
+    assert until(lambda: answers(first.address))
     second = start()
     assert second.ended() == 1
     assert "choose another: PORT=8001 make run" in second.said

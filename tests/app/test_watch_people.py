@@ -195,6 +195,15 @@ def test_what_was_learned_is_said_in_words_about_the_six_costs_whatever_the_mode
     assert "account for 50 %" in page
 
 
+def test_what_was_learned_is_a_sentence_with_units_as_they_are_written(
+    experimenter: TestClient, study: Study, participant: Participant, database: Database
+) -> None:
+    with database.writing() as session:
+        factories.make_model(session, study, participant, ModelKind.REWARD, factories.reward_metrics())
+    page = experimenter.get("/studies/pilot/participants/P01").text
+    assert "Dislikes spoon speed squared (m²/s²) and force at the mouth (N). Likes speed" in page
+
+
 def test_answers_to_either_side_are_counted_beside_the_pace(
     experimenter: TestClient, participant: Participant, database: Database, store: ArtefactStore
 ) -> None:
@@ -248,3 +257,17 @@ def test_somebody_erased_keeps_a_row_and_nothing_to_press(
     page = experimenter.get("/studies/pilot").text
     assert "erased" in page
     assert experimenter.get("/studies/pilot/participants/P01").status_code == 200
+
+
+def test_answers_by_the_plain_form_are_a_flag_that_leads_to_them(
+    experimenter: TestClient, participant: Participant, database: Database, store: ArtefactStore
+) -> None:
+    with database.writing() as session:
+        for query, by_script in zip(factories.make_queries(session, store, participant, 2), (True, False), strict=True):
+            factories.make_label(session, query, by_script=by_script)
+    page = experimenter.get("/studies/pilot/participants/P01").text
+    assert "how the clips were watched, and whether to the end, is not known" in page
+    assert "of 2 answers" in page
+    assert "without the page\N{RIGHT SINGLE QUOTATION MARK}s script</span>" in experimenter.get("/studies/pilot").text
+    marked = experimenter.get("/studies/pilot/answers?participant=P01&mark=without_script").text
+    assert "<strong>1</strong> answer" in marked

@@ -97,7 +97,7 @@ def test_numbers_are_written_as_the_language_writes_them() -> None:
         ("/p/next", {"Accept-Language": "de"}, "Bitte öffnen Sie Ihren Link noch einmal"),
         ("/p/" + "x" * 43, {"Accept-Language": "de-AT"}, "Dieser Link ist nicht gültig"),
         ("/p/nowhere", {"Cookie": "studio_language=de"}, "Seite nicht gefunden"),
-        ("/join/" + "x" * 30, {"Accept-Language": "de"}, "an keiner Studie (mehr) teilnehmen"),
+        ("/join/" + "x" * 30, {"Accept-Language": "de"}, "zurzeit keine Teilnahme an einer Studie möglich"),
         ("/p/next", {}, "Please open your link again"),
         ("/studies/none", {"Accept-Language": "de", "Accept": "application/json"}, "log in"),
     ],

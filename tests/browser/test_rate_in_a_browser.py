@@ -169,7 +169,7 @@ def test_operator_and_participant_follow_each_other_without_reloading(
     expect(person.get_by_role("heading", name="Robot A is next")).to_be_visible()
     assert serious_findings(person) == serious_findings(operator) == []
     operator.get_by_role("button", name="Start").click()
-    expect(person.get_by_role("heading", name="Robot A is moving, please watch")).to_be_visible()
+    expect(person.get_by_role("heading", name="Robot A is moving. Please watch.")).to_be_visible()
     expect(operator.get_by_role("button", name="Repeat this trial")).to_be_visible()
     assert serious_findings(person) == serious_findings(operator) == []
     operator.get_by_label("Did something go wrong with the robot?").fill("it dropped the spoon")

@@ -129,7 +129,7 @@ def test_the_whole_way_with_the_keyboard_alone_and_back_to_the_panel(
 
     page.goto(study.address + "?PROLIFIC_PID=abc")
     at(page, "join")
-    press(page, "Come in")
+    press(page, "To the study")
     at(page, "consent")
     press(page, "Save or print a copy")
     at(page, "consent-copy")
@@ -191,7 +191,7 @@ def test_whoever_wants_to_stay_is_not_taken_away(open_study: Callable[..., Open]
     study = open_study(return_url="https://panel.example/done")
     page = new_page()
     page.goto(study.address + "?PROLIFIC_PID=abc")
-    page.get_by_role("button", name="Come in").click()
+    page.get_by_role("button", name="To the study").click()
     page.wait_for_url("**/p/*")
     study.give_pairs()
     with study.database.writing() as session:
@@ -221,7 +221,7 @@ def test_in_german_from_the_welcome_to_the_withdrawal(open_study: Callable[..., 
     at(page, "consent")
     press(page, "Teilnahme widerrufen")
     at(page, "withdraw")
-    press(page, "Nein, alles behalten und zurück")
+    press(page, "Nein, alles behalten")
     at(page, "consent")
     press(page, "Teilnahme widerrufen")
     at(page, "withdraw")

@@ -3,8 +3,7 @@
 import base64
 import hashlib
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -16,7 +15,7 @@ from app.domain.studies import Participant, Study
 from app.services import retirement, withdrawal
 from app.settings import Settings
 from app.storage import ArtefactStore
-from tests.waiting import PATIENCE_S
+from tests.waiting import PATIENCE_S, until
 from tests.worker.conftest import the_workshop
 from worker import engine, erasure, records, workflows
 from worker.compute import Compute
@@ -86,17 +85,6 @@ def withdraw(database: Database, store: ArtefactStore, participant_id: int) -> N
 def erase(workshop: Workshop, settings: Settings, participant_id: int) -> bool:
     place, file = workshop.place, engine.file_of(settings)
     return erasure.erase_traces(place, participant_id, workshop.in_hand, workshop.stored, file).finished
-
-
-def until(condition: Callable[[], bool]) -> bool:
-    """Whether it became true in time."""
-    deadline = time.monotonic() + PATIENCE_S
-    pause = threading.Event()
-    while not condition():
-        if time.monotonic() > deadline:
-            return False
-        pause.wait(0.05)
-    return True
 
 
 def traces(folder: Path) -> list[str]:

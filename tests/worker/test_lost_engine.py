@@ -6,7 +6,6 @@ import os
 import shutil
 import sqlite3
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from datetime import timedelta
@@ -21,7 +20,7 @@ from app.domain.models import Run, RunKind, RunStatus, WorkerPresence
 from app.domain.studies import Participant
 from app.settings import Settings
 from app.storage import ArtefactStore
-from tests.waiting import PATIENCE_S
+from tests.waiting import PATIENCE_S, until
 from tests.worker.conftest import the_workshop
 from worker import engine, reconcile, records, service, workflows
 from worker.compute import Compute
@@ -106,16 +105,6 @@ def worker(settings: Settings, database: Database, store: ArtefactStore) -> Iter
 def status_of(database: Database, job: Job) -> str | None:
     with database.reading() as session:
         return session.scalar(select(Run.status).where(Run.workflow_id == job.finding))
-
-
-def until(condition: Callable[[], bool]) -> bool:
-    """Whether it became true in time."""
-    deadline = time.monotonic() + PATIENCE_S
-    while not condition():
-        if time.monotonic() > deadline:
-            return False
-        threading.Event().wait(0.05)
-    return True
 
 
 def lived(settings: Settings, database: Database, store: ArtefactStore) -> Path:

@@ -6,8 +6,7 @@ import sqlite3
 import subprocess
 import sys
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing, suppress
 from pathlib import Path
 
@@ -19,7 +18,7 @@ from app.domain.models import Run, RunStatus, WorkerPresence
 from app.domain.studies import StudySettings
 from app.services import studies
 from app.settings import Settings
-from tests.waiting import PATIENCE_S
+from tests.waiting import PATIENCE_S, gone, until
 
 AT_MOST_S = 60.0
 """Ten and what a busy machine adds. One that did not stop would film for minutes, or wait for as long as it is held."""
@@ -51,23 +50,6 @@ def descendants(pid: int) -> list[int]:
             if mine and "spawn_main" in stat.with_name("cmdline").read_text():
                 found.append(int(stat.parent.name))
     return found
-
-
-def gone(pid: int) -> bool:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] == "Z"
-    except FileNotFoundError:
-        return True
-
-
-def until(condition: Callable[[], bool]) -> bool:
-    """Whether it became true in time."""
-    deadline = time.monotonic() + PATIENCE_S
-    while not condition():
-        if time.monotonic() > deadline:
-            return False
-        threading.Event().wait(0.02)
-    return True
 
 
 def is_filming(database: Database) -> bool:

@@ -220,7 +220,7 @@ def learning_curves(contents: Mapping[str, Any]) -> Figure | None:
         axes.set_ylim(0, 101)
         axes.set_xlim(0, float(longest[-1]) * 1.02)
         axes.set_xlabel("Answers that preferred a side, on pairs drawn at random")
-        axes.set_ylabel(f"Foreseen of the last {contents['answers']['window']} (%)")
+        axes.set_ylabel(f"Predicted correctly of the last {contents['answers']['window']} (%)")
         axes.yaxis.grid(True, color=PALE, linewidth=0.6)
         axes.set_axisbelow(True)
     return figure

@@ -58,8 +58,4 @@ def make_report(tables: Tables) -> tuple[dict[str, Any], dict[str, dict[str, byt
 
 def _frame(tables: Tables, name: str) -> pd.DataFrame:
     frame = pd.DataFrame(getattr(tables, name), columns=tables.columns.get(name))
-    if frame.empty:
-        return frame
-    if name == "queries":
-        return frame[~frame["excluded"].astype(bool)]  # by an experimenter: nothing is concluded from those
-    return frame[frame["counts"].astype(bool)] if name == "ratings" else frame
+    return frame[frame["counts"].astype(bool)] if name == "ratings" and not frame.empty else frame
