@@ -1,9 +1,11 @@
 """Rehearsal: scripted participants walk through the real pages, from the personal link to the downloaded bundle.
 
+They are marked as scripted wherever they appear.
 They see what a browser without scripts sees, and answer as somebody of a given taste would, mistakes and indifference
 included. An experimenter locks the study before they come, and unblinds it when the last of them has rated.
 """
 
+import hashlib
 import json
 import time
 from collections.abc import Sequence
@@ -131,12 +133,15 @@ class Rehearsal:
     base_url: str
     pace_s: float = 0.0
     """how long a scripted participant thinks about a pair"""
+    name: str = "Rehearsal"
+    """of the study"""
 
     def run(self, task: str, tastes: Sequence[Taste], settings: StudySettings, manner: Manner, seed: int) -> Rehearsed:
         """One participant per taste, one after the other; the bundles are waited for and downloaded at the end."""
         with self.database.writing() as session:
-            study = studies.create_study(session, "Rehearsal", settings, seed=seed, task=TaskName(task))
-            enrolled = [enrolment.add_participant(session, study) for _ in tastes]
+            study = studies.create_study(session, self.name, settings, seed=seed, task=TaskName(task))
+            study.key_secret = hashlib.sha256(f"rehearsal/{seed}".encode()).hexdigest()  # nobody rates who could cheat
+            enrolled = [enrolment.add_participant(session, study, scripted_as=taste.name) for taste in tastes]
             password = accounts.create_first_experimenter(session)
         with Visitor(self.base_url, "/login") as experimenter:
             experimenter.log_in(accounts.FIRST_EXPERIMENTER, password or "")

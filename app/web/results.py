@@ -14,6 +14,7 @@ from app.errors import AppError
 from app.services import (
     answers,
     audit,
+    enrolment,
     evaluating,
     export_requests,
     export_tables,
@@ -113,6 +114,7 @@ def results_context(session: Session, study: Study) -> dict[str, Any]:
         "plan": planning.plan_of(session, study),
         "forms": form_words.summaries(study, form_summaries.summaries_of(session, study)),
         "excluded": answers.count_excluded(session, study),
+        "scripted": enrolment.count_scripted(session, study),
         "figures": {name: FIGURES[name] for name in FIGURES if report is not None and name in report.figures},
     }
 
@@ -171,6 +173,7 @@ def _exports_page(
         "blinded": unblinding.is_blinded(study),
         "tables": export_tables.TABLES,
         "provenance": exporting.provenance_of(session, study),
+        "scripted": enrolment.count_scripted(session, study),
         "may_export": roles.may(experimenter, Role.EXPERIMENTER),
         "seal_key": seal_key,
     }

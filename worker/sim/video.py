@@ -23,16 +23,18 @@ MOST_PIXELS, MOST_PICTURES = 4096 * 2304, 20_000
 """Of a video that somebody else has made."""
 
 
-def encode_mp4(frames: Iterable[Frame], width: int, height: int, fps: int) -> bytes:
+def encode_mp4(
+    frames: Iterable[Frame], width: int, height: int, fps: int, rate_factor: int = CONSTANT_RATE_FACTOR
+) -> bytes:
     """Encode RGB frames (height, width, 3). The same frames always give the same bytes."""
     with tempfile.TemporaryDirectory() as folder:
         # A real file: moving the index to the front makes the writer read its own output again.
         target = Path(folder) / "clip.mp4"
-        _write(target, frames, width, height, fps)
+        _write(target, frames, width, height, fps, rate_factor)
         return target.read_bytes()
 
 
-def _write(target: Path, frames: Iterable[Frame], width: int, height: int, fps: int) -> None:
+def _write(target: Path, frames: Iterable[Frame], width: int, height: int, fps: int, rate_factor: int) -> None:
     with av.open(str(target), "w", format="mp4", options={"movflags": "+faststart"}) as container:
         stream = container.add_stream("libx264", rate=fps)
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
@@ -41,7 +43,7 @@ def _write(target: Path, frames: Iterable[Frame], width: int, height: int, fps: 
         tags = "colorprim=smpte170m:transfer=smpte170m:colormatrix=smpte170m"
         stream.options = {
             "preset": PRESET,
-            "crf": str(CONSTANT_RATE_FACTOR),
+            "crf": str(rate_factor),
             "x264-params": f"chroma-qp-offset={CHROMA_OFFSET}:keyint={fps * 4}:{tags}",
         }
         for frame in frames:
