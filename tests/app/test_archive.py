@@ -115,6 +115,13 @@ def test_a_study_that_was_imported_exports_the_same(
             assert hashlib.sha256(there.store.read(sha256)).hexdigest() == sha256
 
 
+def test_a_file_that_was_not_here_before_is_no_lost_one(
+    elsewhere: FastAPI, packed: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    bring(elsewhere, packed)
+    assert caplog.messages == []
+
+
 @pytest.fixture
 def sealed(database: Database, store: ArtefactStore, study: Study, tmp_path: Path) -> Path:
     """The archive of the same study while it is blinded."""
