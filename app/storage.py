@@ -150,7 +150,7 @@ class ArtefactStore:
         return True
 
     def holds(self, sha256: str) -> bool:
-        """Whether there is a file of this name, whole or not. Unlike has() this looks for nothing that must be there."""
+        """Whether there is a file of this name, whole or not; unlike has() for files that need not be there."""
         return self.path(sha256).exists()
 
     def scrub(self, sha256: str) -> bool:
