@@ -24,21 +24,27 @@ NAME = "Demo: feeding, with scripted participants"
 TASK = "feeding"
 SEED = 1
 SETTINGS = StudySettings(
-    labels_per_participant=20,
+    labels_per_participant=24,
     retrain_every_labels=4,
     filter_milestones=(),
-    pool_scenarios=4,
-    behaviours_per_scenario=4,
+    pool_scenarios=3,
+    behaviours_per_scenario=5,
     clip_quality=ClipQuality.QUICK,
     strategy=Strategy.UNIFORM,
     practice_pairs=1,
     evaluation=EvaluationSettings(methods=(EvaluatedMethod.REFERENCE, EvaluatedMethod.PBARL), trials=1),
     debrief=True,
     planned_tests=(PlannedTest.PAIRED_T,),
-    consent_duration="About ten minutes.",
-    consent_payment="None.",
-    consent_ethics="None: this is a demonstration, not research.",
-    consent_contact="Whoever gave you the link.",
+    consent_duration="about ten minutes",
+    consent_payment="none",
+    consent_ethics="none: this is a demonstration, not research",
+    consent_contact="whoever gave you the link.",
+    wording={
+        "de:fact-duration": "etwa zehn Minuten",
+        "de:fact-payment": "keine",
+        "de:fact-ethics": "keines: Dies ist eine Vorführung, keine Forschung",
+        "de:fact-contact": "die Person, die Ihnen den Link gegeben hat.",
+    },
 )
 """Pairs are drawn at random, so that every prediction counts and few answers show whether a model has understood."""
 

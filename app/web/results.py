@@ -102,6 +102,7 @@ def results_context(session: Session, study: Study) -> dict[str, Any]:
         "report": report,
         "contents": report.contents if report else None,
         "outdated": report is None and reports.is_outdated(session, study),
+        "awaited": reports.is_awaited(session, study),
         "run": reports.run_in_hand(session, study),
         "blinded": unblinding.is_blinded(study),
         "evaluated": evaluating.settings_of(study) is not None,
