@@ -189,7 +189,8 @@ def _demo(session: Session, settings: Settings) -> tuple[str, Sequence[str]]:
         return demo.import_finished(session, ArtefactStore(settings.data_dir / "artefacts")), []
     except AppError as error:
         token = demo.make_empty(session, TaskName.FEEDING)
-        return token, ["", f"  {error} An empty one was made instead: its first clips take a few minutes."]
+        instead = "An empty demo study was made instead of the finished one; its first clips take a few minutes."
+        return token, ["", f"  {instead}", f"  {error}"]
 
 
 _COMMANDS: dict[str, Callable[[Settings], int]] = {

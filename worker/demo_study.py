@@ -54,7 +54,7 @@ def make(path: Path, directory: Path, seed: int = SEED) -> Rehearsed:
     with OwnStudio(directory) as studio:
         database = Database(studio.settings.sqlalchemy_url)
         store = ArtefactStore(directory / "artefacts")
-        rehearsal = Rehearsal(database, store, studio.settings.base_url, name=NAME, whole_pool=True)
+        rehearsal = Rehearsal(database, store, studio.settings.base_url, name=NAME, unhurried=True)
         rehearsed = rehearsal.run(TASK, list(PAPER_USERS.values()), SETTINGS, Manner(), seed)
         wait_until(PATIENCE_S, "still work to do", lambda: _has_everything(database))
         archive_study(database, store, path)

@@ -136,8 +136,9 @@ class Rehearsal:
     """how long a scripted participant thinks about a pair"""
     name: str = "Rehearsal"
     """of the study"""
-    whole_pool: bool = False
-    """whether everybody comes when all clips are there: who meets which pair then follows from the seed alone"""
+    unhurried: bool = False
+    """whether all clips are waited for, and for the model's prediction of every pair: however slow the machine, who
+    meets which pair then follows from the seed, and all that could be foreseen was"""
 
     def run(self, task: str, tastes: Sequence[Taste], settings: StudySettings, manner: Manner, seed: int) -> Rehearsed:
         """One participant per taste, one after the other; the bundles are waited for and downloaded at the end."""
@@ -149,7 +150,7 @@ class Rehearsal:
         with Visitor(self.base_url, "/login") as experimenter:
             experimenter.log_in(accounts.FIRST_EXPERIMENTER, password or "")
             conclusion.lock(experimenter, study)
-            if self.whole_pool:
+            if self.unhurried:
                 wait_until(PATIENCE_S, "no whole pool", lambda: self._pool_is_whole(study) or None)
             began = time.monotonic()
             outcomes, persons = [], []
@@ -219,7 +220,7 @@ class Rehearsal:
         with self.database.reading() as session:
             query = session.get_one(Query, query_id)
             learned = records.newest_model(session, outcome.participant_id, ModelKind.REWARD) is not None
-            expected = learned and query.purpose in LEARNED_FROM
+            expected = self.unhurried and learned and query.purpose in LEARNED_FROM
             return (not expected or query.predicted_by_model_id is not None) or None
 
     def _has_learned(self, outcome: Outcome) -> bool:

@@ -39,8 +39,10 @@ def add_participant(
 
 def count_scripted(session: Session, study: Study) -> int:
     """How many participants a program plays."""
-    played = select(func.count(Participant.id)).where(Participant.study_id == study.id)
-    return session.scalar(played.where(Participant.scripted_as.is_not(None))) or 0
+    present = select(func.count(Participant.id)).where(
+        Participant.study_id == study.id, Participant.withdrawn_at.is_(None)
+    )
+    return session.scalar(present.where(Participant.scripted_as.is_not(None))) or 0
 
 
 def add_preview(session: Session, study: Study, actor: str) -> tuple[Participant, str]:

@@ -41,7 +41,9 @@ def is_awaited(session: Session, study: Study) -> bool:
     answered = select(LabelEvent.id).join(Query).where(Query.participant_id.in_(people)).limit(1)
     run = run_in_hand(session, study)
     failed = run is not None and run.status == RunStatus.FAILED
-    return newest(session, study) is None and not failed and session.scalar(answered) is not None
+    if failed or study.put_away_at is not None or newest(session, study) is not None:
+        return False
+    return session.scalar(answered) is not None
 
 
 def figure(session: Session, store: ArtefactStore, study: Study, name: str, kind: str) -> bytes:

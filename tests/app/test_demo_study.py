@@ -155,7 +155,7 @@ def test_a_file_that_is_missing_or_damaged_does_not_keep_the_studio_from_startin
     greeting = first_start()
     assert "Participant link  http" in greeting
     assert said in greeting
-    assert "An empty one was made instead" in greeting
+    assert "An empty demo study was made instead" in greeting
     assert names() == ["Demo: feeding"]
     assert [path for path in (tmp_path / "data" / "artefacts").rglob("*") if path.is_file()] == []
 
