@@ -43,7 +43,7 @@ def visitor(database: Database, store: ArtefactStore) -> Participant:
     """Whose link is printed at the first start."""
     with database.writing() as session:
         demo.import_finished(session, store)
-        return session.scalars(select(Participant).order_by(Participant.id.desc())).first()
+        return session.scalars(select(Participant).order_by(Participant.id)).all()[-1]
 
 
 def test_nothing_is_made_again_but_the_report(visitor: Participant, database: Database) -> None:
