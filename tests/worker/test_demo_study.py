@@ -3,7 +3,10 @@
 A change after which this fails needs the archive anew: python -m worker demo-study.
 """
 
+import json
+import zipfile
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -16,7 +19,7 @@ from app.domain.preferences import Query
 from app.domain.studies import Participant, Study
 from app.services import demo
 from app.storage import ArtefactStore
-from worker import demo_study, querying, reconcile, records, report_work
+from worker import demo_study, export_work, querying, reconcile, records, report_work
 from worker.analysis import figures
 from worker.compute import Compute
 from worker.workplace import Workplace
@@ -91,3 +94,13 @@ def test_its_report_compares_the_methods(
         assert [each["participants"] for each in scale["means"]] == [3, 3]
     assert sum(each["foresight"] == "better" for each in contents["answers"]["participants"]) >= 2
     assert len(contents["change"]["participants"]) == 3
+
+
+def test_its_data_for_analysis_say_who_is_no_person(visitor: Participant, place: Workplace, tmp_path: Path) -> None:
+    path = tmp_path / "data.zip"
+    with place.database.reading() as session:
+        export_work.write_data(session, place, session.get_one(Study, visitor.study_id), path)
+    with zipfile.ZipFile(path) as data:
+        played = "P01 (neutral), P02 (cautious), P03 (impatient)"
+        assert f"These participants are no people: {played}." in data.read("README.md").decode()
+        assert json.loads(data.read("provenance.json"))["scripted"].keys() == {"P01", "P02", "P03"}
