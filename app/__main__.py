@@ -12,10 +12,10 @@ from sqlalchemy.orm import Session
 
 from app import upgrading
 from app.db import Database
-from app.domain.studies import USUAL_CLIP_STEPS, Study, StudySettings, TaskName
+from app.domain.studies import Study, TaskName
 from app.errors import EXPLAINED, AppError, in_words
 from app.programs import Programs, say
-from app.services import accounts, audit, damage, enrolment, export_tables, exporting, studies, study_import
+from app.services import accounts, audit, damage, demo, enrolment, export_tables, exporting, study_import
 from app.settings import Settings
 from app.storage import ArtefactStore, keep_private
 
@@ -114,13 +114,13 @@ def demo_study(settings: Settings, task: str) -> int:
     """Make a demo study of a task with one participant and print the personal link."""
     migrate(settings)
     with _database(settings).writing() as session:
-        link = _demo(session, settings, TaskName(task))
-    say(link)
+        token = demo.make_empty(session, TaskName(task))
+    say(f"{settings.base_url}/p/{token}")
     return 0
 
 
 def up(settings: Settings) -> int:
-    """Migrate, create the demo study on the first start, and run web server and worker until Ctrl-C."""
+    """Migrate, import the demo study on the first start, and run web server and worker until Ctrl-C."""
     _require_free_port(settings)
     migrate(settings)
     database = _database(settings)
@@ -176,18 +176,21 @@ def _first_start(session: Session, settings: Settings) -> str:
             f"  One-time password {password}  (you choose your own at the first login)",
         ]
     if session.scalar(select(func.count(Study.id))) == 0:
-        lines.append(f"  Participant link  {_demo(session, settings, TaskName.FEEDING)}")
+        token, remark = _demo(session, settings)
+        lines += [f"  Participant link  {settings.base_url}/p/{token}", *remark]
     else:
         lines.append("  Participant links are made on the dashboard, or with: make link")
     return "\n".join([*lines, "", "  Ctrl-C stops everything; nothing is lost.", ""])
 
 
-def _demo(session: Session, settings: Settings, task: TaskName) -> str:
-    """The personal link of a new demo study's participant."""
-    usual = StudySettings(clip_steps=USUAL_CLIP_STEPS[task])
-    study = studies.create_study(session, f"Demo: {task}", usual, task=task)
-    _, token = enrolment.add_participant(session, study)
-    return f"{settings.base_url}/p/{token}"
+def _demo(session: Session, settings: Settings) -> tuple[str, Sequence[str]]:
+    """The token of the participant's link in the demo study, and what is to be said of it."""
+    try:
+        return demo.import_finished(session, ArtefactStore(settings.data_dir / "artefacts")), []
+    except AppError as error:
+        token = demo.make_empty(session, TaskName.FEEDING)
+        instead = "An empty demo study was made instead of the finished one; its first clips take a few minutes."
+        return token, ["", f"  {instead}", f"  {error}"]
 
 
 _COMMANDS: dict[str, Callable[[Settings], int]] = {

@@ -149,6 +149,10 @@ class ArtefactStore:
             return False
         return True
 
+    def holds(self, sha256: str) -> bool:
+        """Whether there is a file of this name, whole or not; unlike has() for files that need not be there."""
+        return self.path(sha256).exists()
+
     def scrub(self, sha256: str) -> bool:
         """Like has(), but reads the whole file, whatever was known about it."""
         self._whole.pop(sha256, None)

@@ -70,6 +70,7 @@ RUN: dict[str, str | Elsewhere | OnlyParsed] = {
     ),
     "worker --help": "",
     "worker benchmark": Elsewhere("tests/worker/test_benchmark.py::test_the_command_can_only_report"),
+    "worker demo-study": OnlyParsed("takes minutes; what it made is looked at by tests/worker/test_demo_study.py"),
     "worker explore": OnlyParsed(SHIPPED + "tests/worker/test_exploration.py"),
     "worker foresee": OnlyParsed(SHIPPED + "tests/worker/test_signal_predictor.py"),
     "worker import-clips": Elsewhere("tests/worker/test_own_clips.py::test_the_documented_example_becomes_a_study"),

@@ -12,9 +12,20 @@ from typing import TypeAlias, get_args
 from app.db import Database
 from app.domain.protocol import EvaluationSettings
 from app.domain.studies import PAPER_PROTOCOL, ClipQuality, Method, RewardKind, Strategy, StudySettings
+from app.services import demo
 from app.settings import Settings
 from app.storage import ArtefactStore, keep_private
-from worker import benchmark, exploration, foresight, import_work, laboratory, pretraining, rehearsal, service
+from worker import (
+    benchmark,
+    demo_study,
+    exploration,
+    foresight,
+    import_work,
+    laboratory,
+    pretraining,
+    rehearsal,
+    service,
+)
 from worker.contest import INDIRECT_USERS, OPPOSED_USERS, PAPER_USERS
 from worker.ml import acquisition, reward_training
 from worker.ml.methods import METHODS
@@ -38,6 +49,7 @@ def parser() -> argparse.ArgumentParser:
     _add_training(commands)
     _add_benchmark(commands)
     _add_rehearsal(commands)
+    _add_demo_study(commands)
     return whole
 
 
@@ -226,6 +238,13 @@ def _add_rehearsal(commands: _Commands) -> None:
     rehearse.set_defaults(act=_rehearse)
 
 
+def _add_demo_study(commands: _Commands) -> None:
+    command = commands.add_parser("demo-study", help=demo_study.__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    command.add_argument("--output", type=Path, default=demo.ARCHIVE, help="the archive; default: what is shipped")
+    command.add_argument("--seed", type=int, default=demo_study.SEED)
+    command.set_defaults(act=_make_demo_study)
+
+
 def _add_task(command: argparse.ArgumentParser) -> None:
     command.add_argument("--task", choices=list(ENVIRONMENTS), default="feeding")
 
@@ -270,6 +289,14 @@ def _rehearse(options: argparse.Namespace) -> int:
         sys.stdout.write(rehearsal.summary(done) + "\n")
         if options.directory:
             sys.stdout.write(f"Figures, tables, bundles and numbers are in {directory / 'rehearsed'}\n")
+    return 0
+
+
+def _make_demo_study(options: argparse.Namespace) -> int:
+    with tempfile.TemporaryDirectory(prefix="demo-study-") as directory:
+        rehearsed = demo_study.make(options.output, Path(directory), options.seed)
+    sys.stdout.write(rehearsal.summary(rehearsed) + "\n")
+    sys.stdout.write(f"{options.output}: {options.output.stat().st_size / 1e6:.1f} MB\n")
     return 0
 
 

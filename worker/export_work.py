@@ -209,6 +209,7 @@ def _provenance(session: Session, study: Study, provenance: Provenance) -> dict[
             | {"before": each.before, "after": each.after}
             for each in deviations
         ],
+        "scripted": {each.code: each.scripted_as for each in export_rows.everybody(session, study) if each.scripted_as},
         "plan_in_words": planning.plan_of(session, study).in_words,
         "blinded": unblinding.is_blinded(study),
         "unblinded_at": study.unblinded_at.isoformat() if study.unblinded_at else None,
@@ -235,6 +236,7 @@ def _readme(
         version=provenance.software_version,
         moment=provenance.exported_at.isoformat(timespec="seconds"),
         blinded=blinded,
+        scripted=_scripted_in_words(about["scripted"]),
         plan=about["plan_in_words"],
         deviations="\n".join(listed) or "None.",
         missing="\n".join(lost) or "Nothing.",
@@ -243,11 +245,22 @@ def _readme(
     )
 
 
+def _scripted_in_words(scripted: Mapping[str, str]) -> str:
+    """A paragraph for whoever might take them for people; nothing when all are."""
+    if not scripted:
+        return ""
+    played = ", ".join(f"{code} ({user})" for code, user in scripted.items())
+    return (
+        f"\n**These participants are no people: {played}.** A program answered and rated for them"
+        " (`scripted_as` in the table `participants`).\n"
+    )
+
+
 _README = """\
 # {name} ({slug})
 
 Exported {moment} by PbARL Studio {version}. Lock hash of settings and plan: {lock}. {blinded}
-
+{scripted}
 | what | where |
 |---|---|
 | tables | `csv/`, `jsonl/`, `parquet/`: the same rows three times |

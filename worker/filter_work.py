@@ -110,7 +110,7 @@ def _publish(place: Workplace, run_id: int, job: Job, reward: str, draft: str) -
         version = records.next_version(session, job.participant)
         run = records.seen_labels(session, run_id)
         export = provenance_of(session, study)
-        notes = notes_on_foresight(dashboard.curve_of(session, job.participant))
+        notes = [*notes_on_script(participant), *notes_on_foresight(dashboard.curve_of(session, job.participant))]
     provenance = Provenance(
         study=study.name,
         participant=participant.code,
@@ -128,6 +128,13 @@ def _publish(place: Workplace, run_id: int, job: Job, reward: str, draft: str) -
     with place.database.writing() as session:
         saved = records.save_model(session, run_id, ModelKind.FILTER, model_artefact, finished.metrics)
         records.save_bundle(session, saved, version, bundle_artefact, len(finished.bundle))
+
+
+def notes_on_script(participant: Participant) -> Sequence[str]:
+    """What the model card has to say when nobody has answered."""
+    if participant.scripted_as is None:
+        return []
+    return [f"{participant.code} is no person: a program gave the answers of a user called {participant.scripted_as}."]
 
 
 def notes_on_foresight(curve: accuracy.Curve) -> Sequence[str]:

@@ -1,13 +1,16 @@
 """Rehearsal: scripted participants walk through the real pages, from the personal link to the downloaded bundle.
 
+They are marked as scripted wherever they appear.
 They see what a browser without scripts sees, and answer as somebody of a given taste would, mistakes and indifference
 included. An experimenter locks the study before they come, and unblinds it when the last of them has rated.
 """
 
+import hashlib
 import json
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +20,13 @@ from sqlalchemy.orm import Session
 from tqdm import tqdm
 
 from app.db import Database
-from app.domain.models import Bundle, Model, Run, RunKind, RunStatus
+from app.domain.models import Bundle, Model, ModelKind, Run, RunKind, RunStatus
 from app.domain.preferences import LEARNED_FROM, Query
 from app.domain.protocol import EvaluationMode
 from app.domain.studies import Study, StudySettings, TaskName
 from app.services import accounts, dashboard, enrolment, studies
 from app.storage import ArtefactStore
-from worker import conclusion
+from worker import conclusion, records
 from worker.conclusion import Conclusion
 from worker.ml.teachers import Manner, Taste
 from worker.own_studio import PATIENCE_S, wait_until
@@ -131,16 +134,24 @@ class Rehearsal:
     base_url: str
     pace_s: float = 0.0
     """how long a scripted participant thinks about a pair"""
+    name: str = "Rehearsal"
+    """of the study"""
+    unhurried: bool = False
+    """whether all clips are waited for, and for the model's prediction of every pair: however slow the machine, who
+    meets which pair then follows from the seed, and all that could be foreseen was"""
 
     def run(self, task: str, tastes: Sequence[Taste], settings: StudySettings, manner: Manner, seed: int) -> Rehearsed:
         """One participant per taste, one after the other; the bundles are waited for and downloaded at the end."""
         with self.database.writing() as session:
-            study = studies.create_study(session, "Rehearsal", settings, seed=seed, task=TaskName(task))
-            enrolled = [enrolment.add_participant(session, study) for _ in tastes]
+            study = studies.create_study(session, self.name, settings, seed=seed, task=TaskName(task))
+            study.key_secret = hashlib.sha256(f"rehearsal/{seed}".encode()).hexdigest()  # nobody rates who could cheat
+            enrolled = [enrolment.add_participant(session, study, scripted_as=taste.name) for taste in tastes]
             password = accounts.create_first_experimenter(session)
         with Visitor(self.base_url, "/login") as experimenter:
             experimenter.log_in(accounts.FIRST_EXPERIMENTER, password or "")
             conclusion.lock(experimenter, study)
+            if self.unhurried:
+                wait_until(PATIENCE_S, "no whole pool", lambda: self._pool_is_whole(study) or None)
             began = time.monotonic()
             outcomes, persons = [], []
             for (participant, token), taste in zip(enrolled, tastes, strict=True):
@@ -184,6 +195,7 @@ class Rehearsal:
         with tqdm(total=pairs, desc=f"{outcome.code} {outcome.taste.name}", unit="pair") as bar:
             for _ in range(pairs):
                 query_id = wait_until(PATIENCE_S, "no pair to label", visitor.query_id)
+                wait_until(PATIENCE_S, "no prediction", partial(self._was_predicted, outcome, query_id))
                 time.sleep(self.pace_s)
                 outcome.save_seconds.append(visitor.answer(person.answer(query_id)))
                 bar.update()
@@ -197,6 +209,19 @@ class Rehearsal:
     def _is_label(self, query_id: int) -> bool:
         with self.database.reading() as session:
             return session.get_one(Query, query_id).purpose in LEARNED_FROM
+
+    def _pool_is_whole(self, study: Study) -> bool:
+        with self.database.reading() as session:
+            pool = dashboard.study_overview(session, study).pool
+            return pool.made >= pool.wanted
+
+    def _was_predicted(self, outcome: Outcome, query_id: int) -> bool | None:
+        """A pair is predicted right after it was made; whoever answers at once would be earlier."""
+        with self.database.reading() as session:
+            query = session.get_one(Query, query_id)
+            learned = records.newest_model(session, outcome.participant_id, ModelKind.REWARD) is not None
+            expected = self.unhurried and learned and query.purpose in LEARNED_FROM
+            return (not expected or query.predicted_by_model_id is not None) or None
 
     def _has_learned(self, outcome: Outcome) -> bool:
         """People are slower than a retraining; whoever answers at once would never meet a model's prediction."""

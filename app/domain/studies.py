@@ -290,6 +290,8 @@ class Participant(Base):
     panel_parameters: Mapped[dict[str, Any] | None]
     is_preview: Mapped[bool] = mapped_column(default=False, server_default=false())
     """An experimenter looking at the study as a participant would: counted, exported and learned from nowhere."""
+    scripted_as: Mapped[str | None] = mapped_column(String(120))
+    """The user a program plays here, such as "cautious"; None: a person."""
     completed_at: Mapped[datetime | None]
     withdrawn_at: Mapped[datetime | None]
     """Everything else about the person is erased then; this row stays as the tombstone."""

@@ -93,6 +93,8 @@ class StudyLine:
     clips_wanted: int
     failed: int
     """Runs that failed and wait for somebody."""
+    scripted: int
+    """Participants whom a program plays."""
 
 
 @dataclass(frozen=True)
@@ -189,6 +191,7 @@ def study_lines(session: Session, *, put_away: bool = False) -> Sequence[StudyLi
                 clips=clips.get(study.id, 0),
                 clips_wanted=_clips_wanted(study),
                 failed=failed[study.id],
+                scripted=sum(person.scripted_as is not None for person in people[study.id]),
             )
         )
     return lines

@@ -25,9 +25,24 @@ class ParticipantNotFound(AppError):
     status = HTTPStatus.NOT_FOUND
 
 
-def add_participant(session: Session, study: Study, actor: str = audit.SYSTEM) -> tuple[Participant, str]:
-    """Add a person to the study. The token of the personal link is returned here and nowhere else: its hash is kept."""
-    return _add(session, study, actor, preview=False)
+def add_participant(
+    session: Session, study: Study, actor: str = audit.SYSTEM, scripted_as: str | None = None
+) -> tuple[Participant, str]:
+    """Add a person to the study. The token of the personal link is returned here and nowhere else: its hash is kept.
+
+    ``scripted_as``: the user whom a program is to play.
+    """
+    participant, token = _add(session, study, actor, preview=False)
+    participant.scripted_as = scripted_as
+    return participant, token
+
+
+def count_scripted(session: Session, study: Study) -> int:
+    """How many participants a program plays."""
+    present = select(func.count(Participant.id)).where(
+        Participant.study_id == study.id, Participant.withdrawn_at.is_(None)
+    )
+    return session.scalar(present.where(Participant.scripted_as.is_not(None))) or 0
 
 
 def add_preview(session: Session, study: Study, actor: str) -> tuple[Participant, str]:

@@ -55,7 +55,7 @@ def participants(session: Session, study: Study, window: Window = EVERYTHING) ->
 
 def _participant(study: Study, each: Participant) -> Sequence[Any]:
     if each.withdrawn_at is not None:
-        return (each.code, "withdrawn", *[None] * 9, each.withdrawn_at)
+        return (each.code, "withdrawn", *[None] * 9, each.withdrawn_at, each.scripted_as)
     status = "completed" if each.completed_at else "consented" if each.consented_at else "invited"
     return (
         each.code,
@@ -70,6 +70,7 @@ def _participant(study: Study, each: Participant) -> Sequence[Any]:
         each.last_seen_at,
         each.panel_id,
         None,
+        each.scripted_as,
     )
 
 

@@ -45,6 +45,9 @@ TABLES: Sequence[Table] = (
             Column("last_seen_at", W, "When their browser last asked for anything."),
             Column("panel_id", T, "Who this is at the recruitment panel, if they came through one. Personal."),
             Column("withdrawn_at", W, "When they withdrew; nothing else is kept of them."),
+            Column(
+                "scripted_as", T, "The user that a program plays: no person has answered or rated. Empty: a person."
+            ),
         ),
         export_rows.participants,
         (Participant,),

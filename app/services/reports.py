@@ -6,7 +6,8 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from app.domain.models import Report, Run, RunKind, RunStatus
-from app.domain.studies import Study
+from app.domain.preferences import LabelEvent, Query
+from app.domain.studies import Participant, Study
 from app.errors import AppError
 from app.storage import ArtefactStore
 
@@ -32,6 +33,17 @@ def is_outdated(session: Session, study: Study) -> bool:
     """Whether there is a report, but of an earlier version."""
     report = _last(session, study)
     return report is not None and not _is_current(report)
+
+
+def is_awaited(session: Session, study: Study) -> bool:
+    """Whether the first report, or the first of this version, is on its way: there are answers, and nothing failed."""
+    people = select(Participant.id).where(Participant.study_id == study.id, Participant.is_preview.is_(False))
+    answered = select(LabelEvent.id).join(Query).where(Query.participant_id.in_(people)).limit(1)
+    run = run_in_hand(session, study)
+    failed = run is not None and run.status == RunStatus.FAILED
+    if failed or study.put_away_at is not None or newest(session, study) is not None:
+        return False
+    return session.scalar(answered) is not None
 
 
 def figure(session: Session, store: ArtefactStore, study: Study, name: str, kind: str) -> bytes:

@@ -61,7 +61,7 @@ def unpack(store: ArtefactStore, source: Path | IO[bytes], seal_key: str = "") -
     shelf = _Shelf(store)
     with ExitStack() as kept:
         try:
-            reading = archive_reading.checked(source, shelf.workspace, seal_key, shelf.take, store.has)
+            reading = archive_reading.checked(source, shelf.workspace, seal_key, shelf.take, store.holds)
             checked = kept.enter_context(reading)
         except BaseException:
             shelf.clear()
@@ -79,7 +79,7 @@ class _Shelf:
 
     def take(self, sha256: str, pieces: Iterator[bytes]) -> None:
         """Store a file. One that is here already is written anew: it may have been damaged, and this one is not."""
-        known, digest = self._store.has(sha256), hashlib.sha256()
+        known, digest = self._store.holds(sha256), hashlib.sha256()
         with tempfile.TemporaryDirectory(dir=self.workspace, prefix="import-") as folder:
             path = Path(folder) / sha256
             with path.open("wb") as target:

@@ -35,7 +35,8 @@ ARTEFACT_COLUMNS: tuple[InstrumentedAttribute[Any], ...] = (
 """Every column that names a file of the artefact store. Report.figures does so too, inside its JSON."""
 
 KEPT_COLUMNS = frozenset(
-    {"id", "study_id", "number", "token_sha256", "seed", "created_at", "is_preview", "withdrawn_at", "erased_at"}
+    {"id", "study_id", "number", "token_sha256", "seed", "created_at", "is_preview", "scripted_as"}
+    | {"withdrawn_at", "erased_at"}
 )
 """Of the tombstone: what makes the code, and what lets the old link end at a page that says what happened."""
 _NOT_EMPTIED = frozenset({"created_at", "deleted_at", "erased_at"})

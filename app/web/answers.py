@@ -9,7 +9,7 @@ from fastapi.responses import RedirectResponse, Response
 
 from app.domain.preferences import Purpose
 from app.domain.preferences import Response as Said
-from app.services import answers, excluding, export_rows, studies
+from app.services import answers, enrolment, excluding, export_rows, studies
 from app.services.answers import Mark, Wanted
 from app.web.deps import ActingExperimenter, CurrentExperimenter, ReadingSession, RowId, Slug, WritingSession
 from app.web.templating import page
@@ -51,6 +51,7 @@ def show_answers(
         "responses": list(Said),
         "marks": list(Mark),
         "query_string": query_string,
+        "scripted": enrolment.count_scripted(session, study),
     }
     return page(request, "experimenter/answers.html", context)
 

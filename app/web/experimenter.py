@@ -189,6 +189,7 @@ def _study_context(session: Session, studio: Studio, slug: str, view: View) -> d
         "table": people_table(overview, view),
         "machine": dashboard.machine(session, studio.settings.data_dir),
         "sparkline": charts.sparkline,
+        "scripted": enrolment.count_scripted(session, study),
     }
 
 

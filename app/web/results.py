@@ -13,6 +13,7 @@ from app.domain.studies import Study
 from app.errors import AppError
 from app.services import (
     audit,
+    enrolment,
     evaluating,
     excluding,
     export_requests,
@@ -101,6 +102,7 @@ def results_context(session: Session, study: Study) -> dict[str, Any]:
         "report": report,
         "contents": report.contents if report else None,
         "outdated": report is None and reports.is_outdated(session, study),
+        "awaited": reports.is_awaited(session, study),
         "run": reports.run_in_hand(session, study),
         "blinded": unblinding.is_blinded(study),
         "evaluated": evaluating.settings_of(study) is not None,
@@ -113,6 +115,7 @@ def results_context(session: Session, study: Study) -> dict[str, Any]:
         "plan": planning.plan_of(session, study),
         "forms": form_words.summaries(study, form_summaries.summaries_of(session, study)),
         "excluded": excluding.count(session, study),
+        "scripted": enrolment.count_scripted(session, study),
         "figures": {name: FIGURES[name] for name in FIGURES if report is not None and name in report.figures},
     }
 
@@ -171,6 +174,7 @@ def _exports_page(
         "blinded": unblinding.is_blinded(study),
         "tables": export_tables.TABLES,
         "provenance": exporting.provenance_of(session, study),
+        "scripted": enrolment.count_scripted(session, study),
         "may_export": roles.may(experimenter, Role.EXPERIMENTER),
         "seal_key": seal_key,
     }

@@ -90,6 +90,13 @@ def test_a_study_that_was_imported_exports_the_same(
             assert hashlib.sha256(there.store.read(sha256)).hexdigest() == sha256
 
 
+def test_a_file_that_was_not_here_before_is_no_lost_one(
+    elsewhere: FastAPI, packed: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    bring(elsewhere, packed)
+    assert caplog.messages == []
+
+
 def _contents(path: Path) -> dict[str, bytes]:
     with zipfile.ZipFile(path) as file:
         return {name: file.read(name) for name in file.namelist()}

@@ -1,12 +1,13 @@
 """Results, exports and the API's documentation in a browser: for everybody, at every size, from this origin only."""
 
 import pytest
-from playwright.sync_api import Page
+from playwright.sync_api import Page, expect
 from sqlalchemy import select
 
 from app.db import Database
 from app.domain.models import Report
 from app.domain.people import Experimenter
+from app.domain.studies import Study
 from app.services import api_tokens
 from app.storage import ArtefactStore
 from tests import factories
@@ -22,16 +23,46 @@ SIZES = ((390, 844, "dark"), (1366, 768, "light"))
 
 
 @pytest.fixture
-def address_of_study(database: Database, store: ArtefactStore, address: str, monkeypatch: pytest.MonkeyPatch) -> str:
-    """A finished study with its report; the address of its pages."""
-    monkeypatch.setattr(figures, "DPI", 40)
+def study(database: Database, store: ArtefactStore) -> Study:
+    """A finished study without a report."""
     with database.writing() as session:
-        study = make_finished_study(session, store, people=5, labels=8)
+        return make_finished_study(session, store, people=5, labels=8)
+
+
+def report(database: Database, store: ArtefactStore, study: Study) -> None:
+    with database.writing() as session:
         contents, files = make_report(report_work.tables_of(session, study))
         stored = {name: {kind: store.put(file) for kind, file in each.items()} for name, each in files.items()}
         run = factories.make_run(session, study, kind="report")
         session.add(Report(study_id=study.id, run_id=run.id, basis="", contents=contents, figures=stored))
+
+
+@pytest.fixture
+def address_of_study(
+    database: Database, store: ArtefactStore, address: str, study: Study, monkeypatch: pytest.MonkeyPatch
+) -> str:
+    """The study with its report; the address of its pages."""
+    monkeypatch.setattr(figures, "DPI", 40)
+    report(database, store, study)
     return f"{address}/studies/{study.slug}"
+
+
+def test_the_page_shows_the_first_report_as_soon_as_it_is_there(
+    new_page: NewPage,
+    address: str,
+    study: Study,
+    experimenter_cookie: str,
+    database: Database,
+    store: ArtefactStore,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(figures, "DPI", 40)
+    page = new_page()
+    page.context.add_cookies([{"name": "studio_experimenter", "value": experimenter_cookie, "url": address}])
+    page.goto(f"{address}/studies/{study.slug}/results")
+    expect(page.get_by_role("heading", name="The report is being made")).to_be_visible()
+    report(database, store, study)
+    expect(page.get_by_role("heading", name="Ratings", exact=True)).to_be_visible()
 
 
 @pytest.mark.parametrize(("width", "height", "theme"), SIZES)

@@ -40,6 +40,7 @@ class RenderStyle:
     supersampling: Supersampling = ANTI_ALIASED
     inset: bool = True
     highlight_pressing: bool = True
+    rate_factor: int = video.CONSTANT_RATE_FACTOR
 
     @property
     def inset_size(self) -> tuple[int, int]:
@@ -52,8 +53,9 @@ class RenderStyle:
         return self.width / 640
 
 
-STYLES = {"sharp": RenderStyle(), "quick": RenderStyle(fps=15, width=640, height=480)}
-"""By the name of a study's clip quality. A quick clip takes less than half of a sharp one's time."""
+STYLES = {"sharp": RenderStyle(), "quick": RenderStyle(fps=15, width=640, height=480, rate_factor=30)}
+"""By the name of a study's clip quality. A quick clip takes less than half of a sharp one's time, and is small: at a
+rate factor of 30 a third smaller than at 26, while stills of both cannot be told apart."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +106,7 @@ class ClipRenderer:
         first = next(frames)
         count = frame_count(n_steps, style.fps)
         return RenderedClip(
-            video=video.encode_mp4(chain([first], frames), style.width, style.height, style.fps),
+            video=video.encode_mp4(chain([first], frames), style.width, style.height, style.fps, style.rate_factor),
             poster=video.encode_poster(first),
             width=style.width,
             height=style.height,
