@@ -1,10 +1,10 @@
 """Whether two installations compute the same bits from the same seeds: other Pythons, processors, builds of a library.
 
-    python -m tests.benchmarks.same_bits > here.txt
+    python -m tests.benchmarks.same_bits
 
-Prints a hash of everything that a study makes, for every task, in a few minutes; ``diff`` says what two installations
-make differently. Short trainings, so that differences are seen before they have grown; always in one thread. What was
-found is in docs/results/pythons.md.
+Prints a hash of everything that a study makes, for every task, in a few minutes; keep what two installations print,
+and ``diff`` says what they make differently. Trainings are short and in one thread. docs/results/pythons.md says what
+was found.
 """
 
 import argparse
@@ -35,7 +35,7 @@ from worker.sim.catalogue import ENVIRONMENTS
 from worker.sim.rollout import rollout
 from worker.trajectory import Trajectory
 
-LIBRARIES = ("numpy", "scipy", "torch", "onnxruntime", "pybullet", "av", "pillow")
+LIBRARIES = ("numpy", "scipy", "onnxruntime", "pybullet", "av", "pillow")
 SEED = 0
 SCENARIOS = range(5)
 OBSERVATIONS = 1000
@@ -56,11 +56,11 @@ TERMS = Terms(labels=20, smallest_pool=4, filter=FILTER, methods=MethodConfig(fi
 def main() -> None:
     """See the module."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("tasks", nargs="*", default=list(ENVIRONMENTS), help="all when none is named")
+    parser.add_argument("--tasks", nargs="+", choices=list(ENVIRONMENTS), default=list(ENVIRONMENTS))
     tasks = parser.parse_args().tasks
     torch.set_num_threads(1)
     used = ", ".join(f"{name} {version(name)}" for name in LIBRARIES)
-    sys.stdout.write(f"Python {platform.python_version()}, {used}\n")
+    sys.stdout.write(f"Python {platform.python_version()}, torch {torch.__version__}, {used}\n")
     for task in tasks:
         with tempfile.TemporaryDirectory() as work:
             for what, parts in made(task, Path(work)):
