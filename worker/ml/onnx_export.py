@@ -134,10 +134,10 @@ def _template(model: onnx.ModelProto, weights: Sequence[str]) -> onnx.ModelProto
         model.graph.initializer.remove(each)
         model.graph.input.append(onnx.helper.make_tensor_value_info(each.name, each.data_type, each.dims))
     with _Quiet():
-        smaller: onnx.ModelProto = onnxscript.optimizer.optimize(model)
+        smaller = _without_notes(onnxscript.optimizer.optimize(model))
     for each in [each for each in smaller.graph.input if each.name not in INPUTS]:
         smaller.graph.input.remove(each)
-    return _without_notes(smaller)
+    return smaller
 
 
 def _without_notes(model: onnx.ModelProto) -> onnx.ModelProto:
