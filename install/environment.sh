@@ -4,13 +4,29 @@
 set -euo pipefail
 venv=$1
 
-version() { "$1" -c 'import sys; print("%d.%d" % sys.version_info[:2])' 2>/dev/null || true; }
-fits() { case "$(version "$1")" in 3.11 | 3.12 | 3.13) true ;; *) false ;; esac }
-# The physics engine has wheels for 3.11; for newer ones it is compiled, with the headers of that Python.
-ready() {
-  [ "$(version "$1")" = 3.11 ] && "$1" -c 'import ensurepip' 2>/dev/null && return
-  "$1" -c 'import ensurepip, os, sysconfig as s; assert os.path.exists(s.get_path("include") + "/Python.h")' 2>/dev/null &&
-    command -v g++ >/dev/null
+# What keeps the studio from running on Python $1, one reason a line. There is a wheel of the physics engine for 3.11;
+# for newer ones it is compiled. On those the workflow engine asks SQLite for parts of a second.
+lacks() {
+  "$1" -c '
+import sys
+if not (3, 11) <= sys.version_info[:2] <= (3, 13):
+    print("is not Python 3.11, 3.12 or 3.13")
+    sys.exit()
+import importlib, os, shutil, sysconfig
+for module, package in (("ensurepip", "python3-venv"), ("sqlite3", "libsqlite3-dev before it is built")):
+    try:
+        importlib.import_module(module)
+    except ImportError:
+        print("lacks its module " + module + " (install " + package + ")")
+if sys.version_info[:2] > (3, 11):
+    if not os.path.exists(os.path.join(sysconfig.get_path("include"), "Python.h")):
+        print("lacks the headers that build the physics engine (install python3-dev)")
+    if not shutil.which("g++"):
+        print("needs g++, which builds the physics engine (install g++)")
+    sqlite3 = sys.modules.get("sqlite3")
+    if sqlite3 and sqlite3.sqlite_version_info < (3, 42):
+        print("needs SQLite 3.42 and has " + sqlite3.sqlite_version + " (Python 3.11 does without)")
+' 2>/dev/null || echo "does not start"
 }
 make_venv() {
   echo "Creating $venv with $("$1" --version) ..."
@@ -18,19 +34,19 @@ make_venv() {
 }
 
 if [ -n "${PYTHON:-}" ]; then
-  fits "$PYTHON" || { echo "PYTHON=$PYTHON is not a Python from 3.11 to 3.13."; exit 1; }
-  ready "$PYTHON" || { echo "$PYTHON lacks its venv module, or g++ and the headers that build the physics engine: install python3-venv, python3-dev and g++."; exit 1; }
+  reasons=$(lacks "$PYTHON")
+  [ -z "$reasons" ] || { sed "s|^|PYTHON=$PYTHON |; s|\$|.|" <<<"$reasons"; exit 1; }
   make_venv "$PYTHON"
   exit
 fi
 for name in python3.11 python3.12 python3.13 python3; do
-  if command -v "$name" >/dev/null && fits "$name" && ready "$name"; then
-    make_venv "$name"
-    exit
-  fi
+  command -v "$name" >/dev/null || continue
+  reasons=$(lacks "$name")
+  [ -n "$reasons" ] || { make_venv "$name"; exit; }
+  sed "s|^|$name |; s|\$|.|" <<<"$reasons"
 done
 
-echo "No Python 3.11 here, nor 3.12 or 3.13 with g++ and headers; fetching Python 3.11 with uv ..."
+echo "No Python fits as it is; fetching Python 3.11 with uv ..."
 fetch() { uv venv --quiet --seed --python 3.11 "$venv"; }
 if command -v uv >/dev/null; then
   fetch && exit

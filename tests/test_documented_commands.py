@@ -94,6 +94,7 @@ RUN: dict[str, str | Elsewhere | OnlyParsed] = {
     "replayed_waiting": REAL_TIME,
     "retraining": ROLLOUTS,
     "rounds": "1",
+    "same_bits": "--tasks feeding",
     "save_latency": "52 1",  # beyond the first break
     "sim_speed": "--resets 1 --episodes 1",
     "speed_cost_weight": "--scenarios 1",

@@ -106,6 +106,11 @@ def test_the_export_is_the_same_every_time(exported: bytes) -> None:
     assert to_onnx(module, SEEN, MEANS) == exported
 
 
+def test_the_export_tells_nothing_of_where_it_was_made(exported: bytes) -> None:
+    assert b".py" not in exported, "tracing notes the lines of code, with the folders of this machine"
+    assert b"+cpu" not in exported
+
+
 def test_two_tasks_of_the_same_sizes_are_exported_each_by_its_own_rules(exported: bytes) -> None:
     """A task that a lab adds may have as many axes and observations as another and still mean other things by them."""
     assert isinstance(FAMILY, ApproachModes)

@@ -1,6 +1,9 @@
 """Clips that every browser plays at once."""
 
 import io
+import os
+import subprocess
+import sys
 
 import av
 import numpy as np
@@ -50,6 +53,32 @@ def test_colours_survive(video: bytes) -> None:
 
 def test_the_same_frames_give_the_same_bytes(video: bytes) -> None:
     assert encode_mp4(frames(), 128, 96, 15) == video
+
+
+ENCODED = """
+import hashlib
+import numpy as np
+from worker.sim.video import encode_mp4
+
+ground = np.random.default_rng(0).integers(0, 256, (30, 40, 3), dtype=np.uint8).repeat(8, 0).repeat(8, 1)
+frames = [np.roll(ground, (2 * index, 3 * index), (0, 1)) for index in range(12)]
+print(hashlib.sha256(encode_mp4(frames, 320, 240, 15)).hexdigest())
+"""
+
+
+def test_the_same_frames_give_the_same_bytes_whatever_was_in_memory_before() -> None:
+    """Fast assembler of the encoder reads memory that nobody has written; the C library can fill it beforehand."""
+    hashes = {
+        subprocess.run(
+            [sys.executable, "-c", ENCODED],
+            env={**os.environ, "MALLOC_PERTURB_": filling},
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout
+        for filling in ("85", "170")
+    }
+    assert len(hashes) == 1
 
 
 def test_the_poster_is_a_jpeg_of_the_frame() -> None:

@@ -10,9 +10,11 @@ import numpy as np
 import numpy.typing as npt
 import onnx
 import onnx.numpy_helper
+import onnx_ir
 import onnxruntime
 import onnxscript.optimizer
 import torch
+from onnx_ir.passes.common import ClearMetadataAndDocStringPass
 
 from worker.ml.action_filter import ActionFilter
 
@@ -132,10 +134,17 @@ def _template(model: onnx.ModelProto, weights: Sequence[str]) -> onnx.ModelProto
         model.graph.initializer.remove(each)
         model.graph.input.append(onnx.helper.make_tensor_value_info(each.name, each.data_type, each.dims))
     with _Quiet():
-        smaller: onnx.ModelProto = onnxscript.optimizer.optimize(model)
+        smaller = _without_notes(onnxscript.optimizer.optimize(model))
     for each in [each for each in smaller.graph.input if each.name not in INPUTS]:
         smaller.graph.input.remove(each)
     return smaller
+
+
+def _without_notes(model: onnx.ModelProto) -> onnx.ModelProto:
+    """The same without what tracing notes: modules and lines of code, with the folders of whoever exports."""
+    noted = ClearMetadataAndDocStringPass()(onnx_ir.from_proto(model)).model
+    noted.producer_version = torch.__version__.partition("+")[0]
+    return onnx_ir.to_proto(noted)
 
 
 class _Quiet:
