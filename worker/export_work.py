@@ -251,7 +251,7 @@ def _scripted_in_words(scripted: Mapping[str, str]) -> str:
         return ""
     played = ", ".join(f"{code} ({user})" for code, user in scripted.items())
     return (
-        f"\n**These participants are no people: {played}.** A program answered and rated for them"
+        f"\n**These participants are not people: {played}.** A program answered and rated for them"
         " (`scripted_as` in the table `participants`).\n"
     )
 

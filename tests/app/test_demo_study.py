@@ -62,11 +62,11 @@ def test_the_visitor_may_come_in(minute_one: str, client: TestClient) -> None:
 
 
 @pytest.mark.parametrize("page", ["", "/results", "/answers", "/export"])
-def test_every_page_with_their_numbers_says_that_they_are_no_people(
+def test_every_page_with_their_numbers_says_that_they_are_not_people(
     minute_one: str, experimenter: TestClient, database: Database, page: str
 ) -> None:
     assert (
-        "3 scripted participants are no people" in experimenter.get(f"/studies/{the_study(database).slug}{page}").text
+        "3 scripted participants are not people" in experimenter.get(f"/studies/{the_study(database).slug}{page}").text
     )
 
 
@@ -85,7 +85,7 @@ def test_the_page_of_each_says_so_and_has_a_bundle_that_says_so_as_well(
     assert f"{person}/bundles/1.zip" in page
     with zipfile.ZipFile(io.BytesIO(experimenter.get(f"{person}/bundles/1.zip").content)) as bundle:
         (card,) = (name for name in bundle.namelist() if name.endswith("MODEL_CARD.md"))
-        assert "P02 is no person" in bundle.read(card).decode()
+        assert "a program gave the answers" in bundle.read(card).decode()
 
 
 def test_the_table_of_participants_says_who_plays_them(

@@ -102,5 +102,5 @@ def test_its_data_for_analysis_say_who_is_no_person(visitor: Participant, place:
         export_work.write_data(session, place, session.get_one(Study, visitor.study_id), path)
     with zipfile.ZipFile(path) as data:
         played = "P01 (neutral), P02 (cautious), P03 (impatient)"
-        assert f"These participants are no people: {played}." in data.read("README.md").decode()
+        assert f"These participants are not people: {played}." in data.read("README.md").decode()
         assert json.loads(data.read("provenance.json"))["scripted"].keys() == {"P01", "P02", "P03"}
