@@ -170,7 +170,7 @@ def test_ctrl_c_ends_the_compiler_too_and_leaves_no_files(tmp_path: Path) -> Non
     work = tmp_path / "work"
     work.mkdir()
     build = subprocess.Popen(
-        ["install/engine.sh", compiling(tmp_path, "exit 1")],
+        ["env", "--default-signal=INT", "install/engine.sh", compiling(tmp_path, "exit 1")],  # nohup ignores it
         cwd=ROOT,
         env={**os.environ, "TMPDIR": str(work)},
         start_new_session=True,
