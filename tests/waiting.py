@@ -1,6 +1,7 @@
 """How tests wait: for states, however slow the machine is; a deadline only ends a test that would wait for ever."""
 
 import random
+import signal
 import socket
 import threading
 import time
@@ -38,3 +39,8 @@ def gone(pid: int) -> bool:
         return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] == "Z"
     except FileNotFoundError:
         return True
+
+
+def hear_hangups() -> None:
+    """In a process that is about to become a program: even if the suite itself runs under nohup."""
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)

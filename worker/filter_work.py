@@ -134,7 +134,9 @@ def notes_on_script(participant: Participant) -> Sequence[str]:
     """What the model card has to say when nobody has answered."""
     if participant.scripted_as is None:
         return []
-    return [f"{participant.code} is not a person: a program gave the answers of a user called {participant.scripted_as}."]
+    return [
+        f"{participant.code} is not a person: a program gave the answers of a user called {participant.scripted_as}."
+    ]
 
 
 def notes_on_foresight(curve: accuracy.Curve) -> Sequence[str]:

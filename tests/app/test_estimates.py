@@ -91,7 +91,7 @@ def look(person: tuple[Participant, str], new_browser: Callable[[], TestClient])
 
 def test_what_was_never_done_here_is_said_to_be_unknown(look: Look) -> None:
     page = look()
-    assert "not known yet" in page
+    assert "cannot say yet how long this takes" in page
     assert "to go" not in page
 
 
@@ -163,7 +163,7 @@ def test_the_first_robot_is_rated_while_the_rest_is_filmed(
         uuid = "00000000-0000-0000-0000-000000000001"
         session.add(Rating(trial_id=trials[0].id, revision=1, satisfaction=4, personalisation=4, client_uuid=uuid))
     assert "The next robot is being prepared" in look()
-    assert "1 of 6 ratings are safely stored" in look()
+    assert "You have rated 1 of 6 so far" in look()
     with database.writing() as session:
         session.get_one(type(trials[0]), later[0][0]).film_id = later[0][1]
     assert "Round 2 of 2 with this robot" in look()

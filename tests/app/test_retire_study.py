@@ -56,7 +56,7 @@ class TestPuttingAway:
         browser.get(f"/p/{token}")
         answer = browser.get("/p/next")
         assert answer.status_code == 410
-        assert "closed at the moment" in answer.text
+        assert "At the moment nobody can take part" in answer.text
         assert 'href="/p/withdraw"' in answer.text
         assert browser.get("/p/withdraw").status_code == 200
         assert browser.get("/p/instructions").headers["location"] == "/p/next", "no page goes on"

@@ -39,7 +39,10 @@ def pages(database: Database, store: ArtefactStore, new_browser: Callable[[], Te
         assert answer.status_code < 500
         seen.extend([answer.text, str(answer.url), str(answer.headers)])
 
-    for address in (f"/join/{token}", f"/join/{token}?PROLIFIC_PID=abc", "/p/consent", "/p/consent/copy"):
+    for address in (f"/join/{token}", f"/join/{token}?PROLIFIC_PID=abc"):
+        see(address)
+    browser.post(f"/join/{token}?PROLIFIC_PID=abc")
+    for address in ("/p/consent", "/p/consent/copy"):
         see(address)
     agree(browser)
     for address in ("/p/consent/copy", "/p/consent/copy.txt", "/p/demographics"):

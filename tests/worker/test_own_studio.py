@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.waiting import PATIENCE_S, gone, until
+from tests.waiting import PATIENCE_S, gone, hear_hangups, until
 
 PROGRAM = """
 import sys
@@ -43,7 +43,7 @@ def programs_in(directory: Path) -> dict[str, int]:
 
 @pytest.fixture
 def command(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator["subprocess.Popen[bytes]"]:
-    process = subprocess.Popen(request.param(tmp_path), stdin=subprocess.PIPE)
+    process = subprocess.Popen(request.param(tmp_path), stdin=subprocess.PIPE, preexec_fn=hear_hangups)
     yield process
     process.kill()
     process.communicate()

@@ -18,7 +18,7 @@ from app.domain.models import Run, RunStatus, WorkerPresence
 from app.domain.studies import StudySettings
 from app.services import studies
 from app.settings import Settings
-from tests.waiting import PATIENCE_S, gone, until
+from tests.waiting import PATIENCE_S, gone, hear_hangups, until
 
 AT_MOST_S = 60.0
 """Ten and what a busy machine adds. One that did not stop would film for minutes, or wait for as long as it is held."""
@@ -33,7 +33,7 @@ def worker(settings: Settings, database: Database) -> Iterator[Worker]:
         studies.create_study(session, "Study", StudySettings(labels_per_participant=20, pool_scenarios=2))
     environment = {name: value for name, value in os.environ.items() if name != "DATABASE_URL"}
     environment.update(DATA_DIR=str(settings.data_dir), COMPUTE_PROCESSES="1")
-    process = subprocess.Popen([sys.executable, "-m", "worker", "run"], env=environment)
+    process = subprocess.Popen([sys.executable, "-m", "worker", "run"], env=environment, preexec_fn=hear_hangups)
     yield process
     for pid in (*descendants(process.pid), process.pid):
         if not gone(pid):
