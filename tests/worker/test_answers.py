@@ -4,6 +4,7 @@ import pandas as pd
 import pytest
 
 from worker.analysis.answers import answer_report, change_report
+from worker.analysis.statistics import rating_report
 
 
 def person(code: str, accuracy: float | None, asked: int = 0, same: int = 0) -> dict[str, object]:
@@ -21,6 +22,15 @@ def test_the_mean_over_people_has_their_t_interval() -> None:
     assert (pooled["people"], pooled["labels"], pooled["asked"], pooled["same"]) == (3, 40, 6, 5)
     assert pooled["mean_accuracy"] == pytest.approx(0.7)
     assert pooled["mean_high"] == pytest.approx(0.7 + 4.302653 * 0.1 / 3**0.5)
+
+
+def test_no_interval_goes_beyond_what_is_possible() -> None:
+    pooled = answer_report([person("P01", 0.65), person("P02", 0.89), person("P03", 0.84)], 30)["pooled"]
+    assert pooled["mean_low"] == pytest.approx(0.7933 - 4.302653 * 0.12662 / 3**0.5, abs=1e-3)
+    assert pooled["mean_high"] == 1
+    ratings = [{"participant": f"P0{n}", "method": "pbarl", "satisfaction": n, "personalisation": 5} for n in (1, 2, 5)]
+    means = rating_report(pd.DataFrame(ratings), ["pbarl"])["scales"]["satisfaction"]["means"]
+    assert [(each["low"], each["high"]) for each in means] == [(1, 5)]
 
 
 def test_nobody_and_nothing_are_no_error() -> None:

@@ -24,7 +24,7 @@ def answer_report(people: Sequence[Mapping[str, Any]], window: int) -> Result:
     ``window``: answers in the running accuracy of each.
     """
     shares = np.array([each["accuracy"]["accuracy"] for each in people if each["accuracy"]["accuracy"] is not None])
-    low, high = mean_interval(shares)
+    low, high = mean_interval(shares, possible=(0, 1))
     pooled = {
         "people": len(shares),
         "mean_accuracy": plain(shares.mean()) if len(shares) else None,

@@ -26,6 +26,7 @@ import numpy.typing as npt
 import pandas as pd
 from scipy import stats
 
+from app.domain.protocol import LIKERT_POINTS
 from worker.analysis.effect_sizes import d_z_interval, holm, rank_biserial, rank_biserial_interval
 from worker.analysis.hypothesis_tests import (
     FEWEST_PAIRED,
@@ -108,7 +109,7 @@ def _people(rows: pd.DataFrame, scale: str, by: str) -> list[Result]:
 def _mean_of(rows: pd.DataFrame, scale: str, group: str) -> Result:
     """Of one group: all ratings as the paper has them, and the mean over people with its 95 % interval."""
     values, people = _floats(rows[scale]), _floats(rows.groupby("participant")[scale].mean())
-    low, high = mean_interval(people)
+    low, high = mean_interval(people, possible=(1, LIKERT_POINTS))
     return {
         "group": group,
         "ratings": len(values),
@@ -121,12 +122,17 @@ def _mean_of(rows: pd.DataFrame, scale: str, group: str) -> Result:
     }
 
 
-def mean_interval(values: Floats) -> tuple[float | None, float | None]:
-    """The 95 % t interval of a mean; None for fewer than three values, which can hardly say how they scatter."""
+def mean_interval(
+    values: Floats, possible: tuple[float, float] = (-np.inf, np.inf)
+) -> tuple[float | None, float | None]:
+    """The 95 % t interval of a mean; None for fewer than three values, which can hardly say how they scatter.
+
+    ``possible``: the values that a mean can have; what lies beyond is cut off, which misses no true mean.
+    """
     if len(values) < FEWEST_PAIRED:
         return None, None
     margin = float(stats.t.ppf(0.975, len(values) - 1)) * float(values.std(ddof=1)) / len(values) ** 0.5
-    return plain(values.mean() - margin), plain(values.mean() + margin)
+    return plain(max(values.mean() - margin, possible[0])), plain(min(values.mean() + margin, possible[1]))
 
 
 def _tests(rows: pd.DataFrame, scale: str, by: str, first: str, second: str) -> dict[str, Result]:
