@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from worker.analysis.statistics import SCALES
+from worker.analysis.statistics import POINTS, SCALES
 
 DPI = 300
 INK, GREY, PALE = "#262626", "#8a8a8a", "#dddddd"
@@ -121,7 +121,7 @@ def _bars(axes: Axes, groups: Sequence[str], scale: Mapping[str, Any]) -> None:
     axes.tick_params(axis="x", length=0)
     axes.set_yticks(range(1, 6))
     axes.set_ylim(1, max(5.35, top))
-    axes.spines["left"].set_bounds(1, 5)
+    axes.spines["left"].set_bounds(*POINTS)
     axes.set_xlim(-0.6, len(groups) - 0.4)
 
 
@@ -161,7 +161,7 @@ def ratings_of_each_person(contents: Mapping[str, Any]) -> Figure | None:
             axes.set_xlim(-0.4, len(groups) - 0.6)
             axes.set_yticks(range(1, 6))
             axes.set_ylim(0.8, 5.2)
-            axes.spines["left"].set_bounds(1, 5)
+            axes.spines["left"].set_bounds(*POINTS)
             axes.set_title(scale.capitalize())
         figure.axes[0].set_ylabel("Mean rating of each person")
         _legend_of_means(figure.axes[1])

@@ -26,7 +26,6 @@ import numpy.typing as npt
 import pandas as pd
 from scipy import stats
 
-from app.domain.protocol import LIKERT_POINTS
 from worker.analysis.effect_sizes import d_z_interval, holm, rank_biserial, rank_biserial_interval
 from worker.analysis.hypothesis_tests import (
     FEWEST_PAIRED,
@@ -43,6 +42,8 @@ Floats = npt.NDArray[np.float64]
 Result = dict[str, Any]
 
 SCALES = ("satisfaction", "personalisation")
+POINTS = (1, 5)
+"""The lowest and the highest rating."""
 
 RECOMMENDED = "paired_t"
 MEASURED_ERROR_PERCENT: Sequence[Result] = (
@@ -109,7 +110,7 @@ def _people(rows: pd.DataFrame, scale: str, by: str) -> list[Result]:
 def _mean_of(rows: pd.DataFrame, scale: str, group: str) -> Result:
     """Of one group: all ratings as the paper has them, and the mean over people with its 95 % interval."""
     values, people = _floats(rows[scale]), _floats(rows.groupby("participant")[scale].mean())
-    low, high = mean_interval(people, possible=(1, LIKERT_POINTS))
+    low, high = mean_interval(people, possible=POINTS)
     return {
         "group": group,
         "ratings": len(values),
