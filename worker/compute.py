@@ -19,7 +19,7 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 from enum import StrEnum
 from multiprocessing.connection import Connection
 from multiprocessing.connection import wait as wait_for_any
-from typing import Any, NamedTuple, ParamSpec, TypeVar
+from typing import Any, NamedTuple, ParamSpec, Protocol, TypeVar
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -46,6 +46,26 @@ class Lane(StrEnum):
 
 
 _NICENESS = {Lane.CLIPS: 5, Lane.REWARDS: 5, Lane.LEARNING: 5, Lane.PATIENT: 15}
+
+
+class Computing(Protocol):
+    """What runs functions in compute processes: Compute itself, or a job's turn in it (worker.turns)."""
+
+    def run(
+        self, lane: Lane, beat: Callable[[], None], function: Callable[P, R], *args: P.args, **kwargs: P.kwargs
+    ) -> R:
+        """Call a top-level function in a process of the lane."""
+        ...
+
+    def run_all(
+        self, lane: Lane, beat: Callable[[], None], function: Callable[..., R], arguments: list[tuple[Any, ...]]
+    ) -> list[R]:
+        """Call the function once per tuple of arguments."""
+        ...
+
+    def is_needed_elsewhere(self, lane: Lane) -> bool:
+        """Whether somebody more urgent waits for the lane."""
+        ...
 
 
 class ComputeLost(RuntimeError):

@@ -21,7 +21,7 @@ import torch
 
 from app.domain.studies import usual_clip_steps
 from worker import laboratory, lessons
-from worker.exploration import surface_file
+from worker.laboratory import surface_file
 from worker.ml import acquisition, filter_problem, methods, reward_training
 from worker.ml.candidate_ranking import can_rank
 from worker.ml.filter_problem import FilterConfig, FilterProblem

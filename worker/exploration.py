@@ -44,11 +44,6 @@ JITTER = 0.08
 Floats = npt.NDArray[np.float64]
 
 
-def surface_file(task: str) -> Path:
-    """Where a task's response surface is kept; its record lies beside it."""
-    return laboratory.checkpoints(task) / "response_surface.safetensors"
-
-
 @dataclass(frozen=True)
 class Differences:
     """What modes changed, N rollouts each compared with the reference policy's in the same scenario."""
@@ -175,7 +170,7 @@ def _joined(blocks: Sequence[Block]) -> Differences:
 
 def _publish(task: Task, scenarios: int, found: Differences) -> dict[str, Any]:
     surface, successes = found.fit(task), found.successes
-    surface.save(surface_file(task.name))
+    surface.save(laboratory.surface_file(task.name))
     predicted, _ = surface.predict(found.modes)
     residual = ((found.signals - predicted) ** 2).mean(axis=0)
     spread = np.maximum((found.signals**2).mean(axis=0), 1e-12)
@@ -194,5 +189,5 @@ def _publish(task: Task, scenarios: int, found: Differences) -> dict[str, Any]:
         },
         "versions": {"python": platform.python_version(), "numpy": np.__version__},
     }
-    surface_file(task.name).with_suffix(".json").write_text(json.dumps(record, indent=2) + "\n")
+    laboratory.surface_file(task.name).with_suffix(".json").write_text(json.dumps(record, indent=2) + "\n")
     return record

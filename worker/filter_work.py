@@ -3,14 +3,14 @@
 from collections.abc import Sequence
 
 from app.domain.models import ModelKind
-from app.domain.studies import Method, Participant, RewardKind, Study
+from app.domain.studies import Method, Participant, RewardKind, Study, StudySettings
 from app.errors import AppError
 from app.services import accuracy, dashboard
 from app.services.exporting import provenance_of
 from worker import dataset, lessons, outdated, personalisation, records
 from worker.compute import Lane
 from worker.ml.bundle import Provenance
-from worker.ml.filter_problem import FilterDraft
+from worker.ml.filter_problem import FilterConfig, FilterDraft
 from worker.personalisation import Fitting
 from worker.records import Job
 from worker.workplace import Step, Workplace
@@ -155,6 +155,13 @@ def _draft(place: Workplace, artefact: str) -> FilterDraft:
     return personalisation.draft_from_bytes(place.store.read(artefact))
 
 
+def filter_config(settings: StudySettings) -> FilterConfig:
+    """What a study says about the fitting of its filters."""
+    return FilterConfig(
+        success_tolerance=settings.success_tolerance, evaluation_scenarios=settings.evaluation_scenarios
+    )
+
+
 def _fitting(place: Workplace, run_id: int, job: Job, reward: str) -> Fitting:
     with place.database.reading() as session:
         study = session.get_one(Study, job.study_id)
@@ -166,7 +173,7 @@ def _fitting(place: Workplace, run_id: int, job: Job, reward: str) -> Fitting:
         beat=place.beat(run_id),
         reward=place.store.read(reward),
         seed=seed,
-        settings=settings,
+        config=filter_config(settings),
         progress=lambda stage, share: place.report(run_id, stage, share),
         references=place.references,
     )

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from app.domain.studies import Participant, Study
 from worker import dataset, laboratory
-from worker.exploration import surface_file
+from worker.laboratory import surface_file
 from worker.ml.advice import expected_regret
 from worker.ml.response_surface import ResponseSurface
 from worker.ml.reward_models import RewardModel, StructuredReward, load_reward_model

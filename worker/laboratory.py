@@ -99,6 +99,11 @@ def checkpoints(name: str) -> Path:
     return CHECKPOINTS / environment_class(name).task.name
 
 
+def surface_file(task: str) -> Path:
+    """Where a task's response surface is kept; its record lies beside it."""
+    return checkpoints(task) / "response_surface.safetensors"
+
+
 def predictor_file(name: str) -> Path:
     """Where a task's predictor of signals is kept; its record lies beside it."""
     return checkpoints(name) / "signal_predictor.safetensors"

@@ -12,12 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from app.domain.studies import Method, StudySettings
 from worker import laboratory, lessons
 from worker.analysis.evaluation import evaluate
 from worker.analysis.proof import case_against
-from worker.compute import Lane
-from worker.exploration import surface_file
+from worker.compute import Computing, Lane
+from worker.laboratory import surface_file
 from worker.ml import bundle, filter_problem, mode_search, printed_filter, residual_learning
 from worker.ml.action_filter import FilterWeights
 from worker.ml.bundle import BundleContents, Provenance, Recording
@@ -25,7 +24,6 @@ from worker.ml.filter_problem import Act, FilterAct, FilterConfig, FilterDraft, 
 from worker.ml.response_surface import ResponseSurface
 from worker.ml.reward_models import load_reward_model
 from worker.trajectory import Trajectory
-from worker.turns import Computing
 
 CHUNK = 3
 """Scenarios per call of a compute process: small enough to spread evenly, large enough not to matter."""
@@ -56,7 +54,7 @@ class Fitting:
     beat: Callable[[], None]
     reward: bytes
     seed: int
-    settings: StudySettings
+    config: FilterConfig
     progress: Progress
     references: dict[tuple[str, range], list[Trajectory]]
     """rollouts of the frozen policy that other fittings have already made"""
@@ -65,7 +63,7 @@ class Fitting:
     def problem(self) -> FilterProblem:
         """What is to be fitted, in the words of the learning code."""
         task, policy = laboratory.task(self.task), laboratory.reference_policy(self.task)
-        return FilterProblem(task, policy, load_reward_model(self.reward), self.seed, _config(self.settings))
+        return FilterProblem(task, policy, load_reward_model(self.reward), self.seed, self.config)
 
     def find_mode(self, pool: Sequence[Trajectory]) -> FilterDraft:
         """The person's execution mode, as far as held-out scenarios allow it."""
@@ -115,7 +113,7 @@ class Fitting:
             "notes": [
                 *draft.notes,
                 *learned.get("foresight_notes", ()),
-                *_warnings(evaluation, self.settings.success_tolerance),
+                *_warnings(evaluation, self.config.success_tolerance),
             ],
             "trials": [asdict(trial) for trial in draft.trials],
             "seconds": {**draft.seconds, "evaluation": round(time.perf_counter() - started, 1)},
@@ -135,14 +133,14 @@ class Fitting:
         return Finished(draft.weights.to_bytes(), bundle.write(contents), metrics)
 
     def _evaluate(self, act: FilterAct) -> tuple[dict[str, Any], list[Trajectory]]:
-        scenarios = filter_problem.scenarios_for("evaluation", self.settings.evaluation_scenarios)
+        scenarios = filter_problem.scenarios_for("evaluation", self.config.evaluation_scenarios)
         filtered = self.collect(act, scenarios, 0.0, self.seed)
         reference, reward = self.reference(scenarios), self.problem.reward
         return evaluate(reference, filtered, reward.returns(reference), reward.returns(filtered)), filtered
 
     def _evaluate_reference(self) -> tuple[dict[str, Any], list[Trajectory]]:
         """What would be measured of a filter that changes nothing: simulations repeat themselves exactly."""
-        reference = self.reference(filter_problem.scenarios_for("evaluation", self.settings.evaluation_scenarios))
+        reference = self.reference(filter_problem.scenarios_for("evaluation", self.config.evaluation_scenarios))
         returns = self.problem.reward.returns(reference)
         return evaluate(reference, reference, returns, returns), list(reference)
 
@@ -165,19 +163,6 @@ class Fitting:
         if key not in self.references:
             self.references[key] = self.collect(laboratory.reference_policy(self.task).mean, scenarios, 0.0, 0)
         return self.references[key]
-
-
-def reference_blocks(task: str, settings: StudySettings) -> list[range]:
-    """The scenarios in which filters of such a study are compared with the reference policy."""
-    config = _config(settings)
-    gate = [config.gate_block(laboratory.task(task))] if settings.method is Method.STUDIO else []
-    return [*gate, filter_problem.scenarios_for("evaluation", config.evaluation_scenarios)]
-
-
-def _config(settings: StudySettings) -> FilterConfig:
-    return FilterConfig(
-        success_tolerance=settings.success_tolerance, evaluation_scenarios=settings.evaluation_scenarios
-    )
 
 
 def moves_nothing(weights: FilterWeights) -> bool:

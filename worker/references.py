@@ -2,11 +2,11 @@
 
 from app.domain.studies import Method, StudySettings
 from worker import laboratory, lessons
-from worker.compute import Lane
+from worker.compute import Computing, Lane
+from worker.filter_work import filter_config
 from worker.ml import filter_problem
-from worker.personalisation import CHUNK, reference_blocks
+from worker.personalisation import CHUNK
 from worker.trajectory import Trajectory
-from worker.turns import Computing
 
 
 def make_ready(
@@ -27,6 +27,13 @@ def make_ready(
             some = scenarios[len(made) : len(made) + CHUNK]
             made += compute.run(Lane.PATIENT, _no_beat, lessons.run_scenarios, task, act, some, 0.0, 0)
         references.setdefault(key, made)
+
+
+def reference_blocks(task: str, settings: StudySettings) -> list[range]:
+    """The scenarios in which filters of such a study are compared with the reference policy."""
+    config = filter_config(settings)
+    gate = [config.gate_block(laboratory.task(task))] if settings.method is Method.STUDIO else []
+    return [*gate, filter_problem.scenarios_for("evaluation", config.evaluation_scenarios)]
 
 
 def _no_beat() -> None:

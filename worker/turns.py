@@ -10,7 +10,7 @@ from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, ParamSpec, Protocol, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 from worker.compute import HEARTBEAT_S, Compute, Lane
 from worker.records import Job
@@ -21,26 +21,6 @@ R = TypeVar("R")
 
 AHEAD = 1
 """Tasks in a lane beside those at work, so that no process waits for its next."""
-
-
-class Computing(Protocol):
-    """What runs functions in compute processes; see worker.compute.Compute."""
-
-    def run(
-        self, lane: Lane, beat: Callable[[], None], function: Callable[P, R], *args: P.args, **kwargs: P.kwargs
-    ) -> R:
-        """Call a top-level function in a process of the lane."""
-        ...
-
-    def run_all(
-        self, lane: Lane, beat: Callable[[], None], function: Callable[..., R], arguments: list[tuple[Any, ...]]
-    ) -> list[R]:
-        """Call the function once per tuple of arguments."""
-        ...
-
-    def is_needed_elsewhere(self, lane: Lane) -> bool:
-        """Whether somebody more urgent waits for the lane."""
-        ...
 
 
 @dataclass

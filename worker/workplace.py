@@ -12,8 +12,8 @@ from sqlalchemy.exc import OperationalError
 from app.db import Database
 from app.storage import ArtefactStore, hash_of_file
 from worker import records
+from worker.compute import Computing
 from worker.trajectory import Trajectory
-from worker.turns import Computing
 
 
 class Step(Protocol):

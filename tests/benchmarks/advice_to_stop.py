@@ -16,7 +16,7 @@ import torch
 from tests.benchmarks.chosen_modes import FIRST_SEED, UnkeptBench, stake
 from worker import laboratory
 from worker.contest import PAPER_USERS, Cell, Terms
-from worker.exploration import surface_file
+from worker.laboratory import surface_file
 from worker.ml.advice import expected_regret
 from worker.ml.response_surface import ResponseSurface, best_mode
 from worker.ml.teachers import Taste

@@ -30,7 +30,7 @@ from tqdm import tqdm
 from worker import laboratory
 from worker.compute import Compute, Lane
 from worker.contest import Bench, Cell, Terms
-from worker.exploration import surface_file
+from worker.laboratory import surface_file
 from worker.ml import acquisition, bradley_terry, pooled_prior
 from worker.ml.response_surface import CAUTION, ResponseSurface, best_mode
 from worker.ml.reward_models import RewardModel

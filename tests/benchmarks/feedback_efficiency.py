@@ -31,7 +31,7 @@ from tests.benchmarks.chosen_modes import stake
 from tests.benchmarks.feedback_report import LINEAR, NAMED, Row
 from tests.benchmarks.pool_rollouts import Pool, pool_rollouts
 from worker import laboratory, lessons
-from worker.exploration import surface_file
+from worker.laboratory import surface_file
 from worker.ml import acquisition, calibration, reward_training
 from worker.ml.filter_problem import scenarios_for
 from worker.ml.pooled_prior import Prior

@@ -25,6 +25,7 @@ from worker import lessons
 from worker.compute import Compute, Lane
 from worker.contest import Bench, Cell, Terms
 from worker.ml.bundle import Provenance
+from worker.ml.filter_problem import FilterConfig
 from worker.ml.teachers import TASTES
 from worker.personalisation import Fitting
 from worker.references import make_ready
@@ -85,7 +86,7 @@ def _run(
     reward, _ = compute.run(Lane.REWARDS, _no_beat, lessons.fit_reward, task, "structured", *answers)
     mark()
     fitting = Fitting(
-        task, compute, _no_beat, reward, 0, StudySettings(), progress=lambda stage, share: None, references=references
+        task, compute, _no_beat, reward, 0, FilterConfig(), progress=lambda stage, share: None, references=references
     )
     draft = fitting.find_mode(bench.pool)
     mark()

@@ -12,7 +12,7 @@ FEEDING = laboratory.task("feeding")
 
 
 def sought(number: int, work: Path) -> list[Block]:
-    surface = ResponseSurface.load(exploration.surface_file("feeding"), FEEDING.modes)
+    surface = ResponseSurface.load(laboratory.surface_file("feeding"), FEEDING.modes)
     return exploration.sought_blocks(FEEDING, surface, number, work)
 
 

@@ -12,8 +12,7 @@ from app.storage import ArtefactStore
 from tests.worker import test_querying
 from worker import dataset, insight, querying
 from worker.compute import Compute
-from worker.exploration import surface_file
-from worker.laboratory import task
+from worker.laboratory import surface_file, task
 from worker.ml.advice import expected_regret
 from worker.ml.response_surface import ResponseSurface
 from worker.ml.reward_models import StructuredReward

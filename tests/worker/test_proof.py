@@ -9,14 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from app.domain.studies import StudySettings
 from worker import lessons
 from worker.analysis.proof import case_against
 from worker.compute import Compute
 from worker.ml import bundle
 from worker.ml.action_filter import FilterWeights
 from worker.ml.bundle import Provenance
-from worker.ml.filter_problem import Act, FilterDraft
+from worker.ml.filter_problem import Act, FilterConfig, FilterDraft
 from worker.ml.reward_models import StructuredReward
 from worker.personalisation import Finished, Fitting
 from worker.trajectory import SIGNALS, Trajectory
@@ -76,7 +75,7 @@ def finish(weights: FilterWeights, liked: Mapping[str, float]) -> Finished:
         beat=lambda: None,
         reward=StructuredReward(row).to_bytes(),
         seed=1,
-        settings=StudySettings(evaluation_scenarios=10),
+        config=FilterConfig(evaluation_scenarios=10),
         progress=lambda _stage, _share: None,
         references={},
     )

@@ -10,8 +10,9 @@ from app.db import Database
 from app.domain.studies import Method, StudySettings
 from app.storage import ArtefactStore
 from worker.compute import Compute
-from worker.personalisation import Fitting, reference_blocks
-from worker.references import make_ready
+from worker.filter_work import filter_config
+from worker.personalisation import Fitting
+from worker.references import make_ready, reference_blocks
 from worker.workplace import Workplace
 
 SETTINGS = StudySettings(evaluation_scenarios=10)
@@ -31,7 +32,7 @@ def fitting(place: Workplace) -> Fitting:
         beat=lambda: None,
         reward=b"",
         seed=7,
-        settings=SETTINGS,
+        config=filter_config(SETTINGS),
         progress=lambda stage, share: None,
         references=place.references,
     )

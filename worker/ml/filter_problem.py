@@ -82,7 +82,7 @@ class FilterConfig:
     kl_weight: float = 1e-3
     residual_shares: tuple[float, ...] = (1.0, 0.5)
     """tried in this order until one is acceptable and better than the mode alone"""
-    evaluation_scenarios: int = 200
+    evaluation_scenarios: int = 100
 
     def gate_block(self, task: Task) -> range:
         """Scenarios on which a setting is tried before it is accepted."""
