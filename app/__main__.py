@@ -14,8 +14,15 @@ from app import upgrading
 from app.db import Database
 from app.domain.studies import Study, TaskName
 from app.errors import EXPLAINED, AppError, in_words
+from app.paths import DOCS
 from app.programs import Programs, say
-from app.services import accounts, audit, damage, demo, enrolment, export_tables, exporting, study_import
+from app.services import audit
+from app.services.accounts import accounts
+from app.services.archives import demo_archive as demo
+from app.services.archives import study_import
+from app.services.exports import export_formats, export_tables
+from app.services.monitoring import damage
+from app.services.participants import enrolment
 from app.settings import Settings
 from app.storage import ArtefactStore, keep_private
 
@@ -77,8 +84,8 @@ def participant_link(settings: Settings) -> int:
 
 def dictionary(_settings: Settings) -> int:
     """Write the data dictionary of all exports to docs/protocol.md."""
-    path = Path(__file__).resolve().parents[1] / "docs" / "protocol.md"
-    path.write_text(exporting.dictionary_markdown(export_tables.TABLES))
+    path = DOCS / "protocol.md"
+    path.write_text(export_formats.dictionary_markdown(export_tables.TABLES))
     say(f"Wrote {path}")
     return 0
 

@@ -9,44 +9,37 @@ from fastapi.responses import PlainTextResponse, RedirectResponse
 from fastapi.staticfiles import StaticFiles
 
 from app.db import Database
+from app.paths import STATIC
 from app.settings import Settings
 from app.storage import ArtefactStore
-from app.web import (
+from app.web import media
+from app.web.api import pages, routes
+from app.web.error_pages import add_error_pages, error_page
+from app.web.experimenter import (
     accounts,
     answers,
-    api,
-    api_pages,
-    evaluation,
-    experimenter,
     help_page,
-    importing,
+    imports,
     invitations,
-    joining,
-    languages,
     live,
     login,
-    media,
     operator,
-    participant,
-    participant_consent,
-    participant_ending,
-    participant_forms,
-    participant_pairs,
     results,
-    retiring,
+    retirement,
     selection,
-    study_making,
+    studies,
+    study_settings,
     translations,
-    withdrawing,
 )
-from app.web.deps import Studio
-from app.web.error_pages import add_error_pages, error_page
-from app.web.guard import Guard
-from app.web.login_attempts import LoginAttempts
-from app.web.readiness import Readiness
-from app.web.screens import Screens
-from app.web.templating import ROOT, make_environment
-from app.web.turns import Turns
+from app.web.http.deps import Studio
+from app.web.http.rate_limit import LoginAttempts
+from app.web.http.readiness import Readiness
+from app.web.http.security import Guard
+from app.web.http.session_queue import Turns
+from app.web.http.shared_pages import Screens
+from app.web.participant import consent, entry, evaluation, finish, forms, joining, pairs, withdrawal
+from app.web.texts import languages
+from app.web.texts.templating import make_environment
 
 MAX_BODY_BYTES = 256 * 1024
 WRONG_TOKENS = 600
@@ -55,29 +48,29 @@ EXPERIMENTER_PARTS = (
     login,
     accounts,
     answers,
-    study_making,
+    study_settings,
     translations,
     invitations,
     selection,
-    retiring,
+    retirement,
     help_page,
-    experimenter,
+    studies,
     operator,
     results,
-    importing,
-    api_pages,
+    imports,
+    pages,
     media,
 )
 PARTICIPANT_PARTS = (
     joining,
     languages,
-    participant_consent,
-    participant_forms,
-    participant_pairs,
+    consent,
+    forms,
+    pairs,
     evaluation,
-    participant_ending,
-    withdrawing,
-    participant,
+    finish,
+    withdrawal,
+    entry,
 )
 """The last one comes last: it takes whatever address below /p/ is left for a personal link."""
 
@@ -115,9 +108,9 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     add_error_pages(app)
     for part in (*EXPERIMENTER_PARTS, *PARTICIPANT_PARTS):
         app.include_router(part.router)
-    app.state.api = api.create_api(studio, app.url_path_for, MAX_BODY_BYTES)
-    app.mount(api.PREFIX, app.state.api)
-    app.mount("/static", StaticFiles(directory=ROOT / "static"), name="static")
+    app.state.api = routes.create_api(studio, app.url_path_for, MAX_BODY_BYTES)
+    app.mount(routes.PREFIX, app.state.api)
+    app.mount("/static", StaticFiles(directory=STATIC), name="static")
 
     @app.get("/", name="show_start")
     def show_start() -> RedirectResponse:

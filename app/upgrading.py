@@ -17,6 +17,7 @@ from sqlalchemy.exc import DatabaseError, OperationalError
 
 from app.db import BUSY_TIMEOUT_S, file_of, now
 from app.errors import AppError, in_words
+from app.paths import MIGRATIONS
 from app.settings import Settings
 
 log = logging.getLogger(__name__)
@@ -89,7 +90,7 @@ def _draft(path: Path) -> Path:
 
 def _config(settings: Settings) -> Config:
     config = Config()
-    config.set_main_option("script_location", str(Path(__file__).resolve().parent.parent / "migrations"))
+    config.set_main_option("script_location", str(MIGRATIONS))
     config.set_main_option("sqlalchemy.url", settings.sqlalchemy_url.replace("%", "%%"))
     return config
 

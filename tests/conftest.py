@@ -23,7 +23,7 @@ import app.domain.studies  # noqa: F401  (all of them fill Base.metadata)
 from app.db import Base, Database
 from app.domain.people import Experimenter
 from app.main import create_app
-from app.services import accounts, browser_sessions
+from app.services.accounts import accounts, browser_sessions
 from app.settings import Settings
 from app.storage import ArtefactStore
 

@@ -21,7 +21,9 @@ from app.domain.models import Bundle, Model, ModelKind, Run, RunKind, RunStatus
 from app.domain.preferences import LabelEvent, Query, Response
 from app.domain.protocol import EvaluationMode, Stage
 from app.domain.studies import Participant, Study, StudySettings
-from app.services import enrolment, evaluating, stages, studies
+from app.services.evaluation import evaluation_plan
+from app.services.participants import enrolment, stages
+from app.services.studies import studies
 from app.storage import ArtefactStore
 
 FPS = 10
@@ -194,7 +196,7 @@ def make_film(
         participant_id=participant.id,
         method=method,
         model_id=model.id if model else None,
-        scenario=evaluating.comparison_scenarios(participant)[0] if scenario is None else scenario,
+        scenario=evaluation_plan.comparison_scenarios(participant)[0] if scenario is None else scenario,
         success=True,
         trajectory_sha256=store.put(f"trajectory of film {number}".encode()),
         video_sha256=store.put(video),
@@ -232,9 +234,9 @@ def make_robots(session: Session, store: ArtefactStore, study: Study, participan
     settings = study.settings.evaluation
     if settings is None:
         raise ValueError("This study evaluates nothing.")
-    evaluating.draw(session, study, participant)
-    methods = {each.letter: each.method for each in evaluating.assignments_of(session, participant.id)}
-    trials = evaluating.trials_of(session, participant.id)
+    evaluation_plan.draw(session, study, participant)
+    methods = {each.letter: each.method for each in evaluation_plan.assignments_of(session, participant.id)}
+    trials = evaluation_plan.trials_of(session, participant.id)
     if settings.mode is EvaluationMode.PHYSICAL:
         for method in methods.values():
             make_controller(session, store, participant, method)

@@ -14,7 +14,7 @@ from app.domain.participation import ConsentRecord, FormAnswer, ParticipantEvent
 from app.domain.preferences import Purpose, Query, Response
 from app.domain.protocol import EvaluationSettings
 from app.domain.studies import Participant, Study
-from app.services import evaluating
+from app.services.evaluation import evaluation_plan
 from app.storage import ArtefactStore
 from tests import factories
 
@@ -92,10 +92,10 @@ def _evaluate(session: Session, study: Study, person: Participant, random: Rando
 
 
 def _rate(session: Session, study: Study, person: Participant, random: Random) -> None:
-    evaluating.draw(session, study, person)
-    methods = {each.letter: each.method for each in evaluating.assignments_of(session, person.id)}
+    evaluation_plan.draw(session, study, person)
+    methods = {each.letter: each.method for each in evaluation_plan.assignments_of(session, person.id)}
     level = random.gauss(0, 0.5)
-    for trial in evaluating.trials_of(session, person.id):
+    for trial in evaluation_plan.trials_of(session, person.id):
         trial.shown_at = now()
         scores = [min(5, max(1, round(MEANS[methods[trial.letter]] + level + random.gauss(0, 0.7)))) for _ in range(2)]
         session.add(_rating(trial, 1, *scores))

@@ -17,9 +17,9 @@ from typing import Any, NoReturn
 import pytest
 
 from app.db import Database
-from app.services import accounts
+from app.services.accounts import accounts
 from app.settings import Settings
-from worker import laboratory
+from worker.compute import simulation
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -167,7 +167,7 @@ def run(program: str, arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> 
     except SystemExit as end:
         return int(end.code or 0)
     finally:
-        laboratory.environment.cache_clear()  # programs close what they have used
+        simulation.environment.cache_clear()  # programs close what they have used
     return 0
 
 

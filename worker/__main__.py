@@ -13,11 +13,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # Compute processes import this module again when they start. What they need they load themselves, and most of
     # what we need (torch, the engine) they do not.
     from app.errors import EXPLAINED, in_words
-    from worker import commands, stopping
+    from worker import cli, stop_signals
 
-    stopping.any_signal_is_ctrl_c()
+    stop_signals.any_signal_is_ctrl_c()
     try:
-        return commands.run(arguments)
+        return cli.run(arguments)
     except EXPLAINED as error:
         words = in_words(error)
         if words is None:

@@ -12,17 +12,11 @@ from starlette.exceptions import HTTPException
 
 from app.db import complaints
 from app.errors import AppError
-from app.web import languages
-from app.web.deps import (
-    EXPERIMENTER_COOKIE,
-    PARTICIPANT_COOKIE,
-    LoginNeeded,
-    NotYet,
-    PasswordChangeDue,
-)
-from app.web.guard import HEADERS
-from app.web.templating import page
-from app.web.wording import Wording
+from app.web.http.deps import EXPERIMENTER_COOKIE, PARTICIPANT_COOKIE, LoginNeeded, NotYet, PasswordChangeDue
+from app.web.http.security import HEADERS
+from app.web.texts import languages
+from app.web.texts.templating import page
+from app.web.texts.wording import Wording
 
 _TITLES = {
     HTTPStatus.UNAUTHORIZED: "Please log in",

@@ -12,9 +12,9 @@ from sqlalchemy.orm import Session
 from app.domain.clips import Clip, Rollout
 from app.domain.evaluation import Film
 from app.errors import AppError
-from app.services import browser_sessions
+from app.services.accounts import browser_sessions
 from app.storage import ArtefactStore
-from app.web.deps import EXPERIMENTER_COOKIE, PARTICIPANT_COOKIE, ReadingSession, Sha256, StudioDep
+from app.web.http.deps import EXPERIMENTER_COOKIE, PARTICIPANT_COOKIE, ReadingSession, Sha256, StudioDep
 
 router = APIRouter()
 

@@ -16,7 +16,7 @@ from app.db import Base, Database
 from app.domain.preferences import LabelEvent, Query
 from app.domain.studies import Participant, Study
 from app.main import create_app
-from app.services import study_import
+from app.services.archives import study_import
 from app.settings import Settings
 from app.storage import ArtefactStore
 from tests import factories

@@ -12,7 +12,7 @@ from sqlalchemy import func, select
 
 from app.db import Base, Database
 from app.domain.people import AuditEvent, Experimenter, Role
-from app.services import browser_sessions
+from app.services.accounts import browser_sessions
 from tests import factories
 from tests.conftest import PASSWORD
 

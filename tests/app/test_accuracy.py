@@ -5,8 +5,14 @@ from random import Random
 import pytest
 
 from app.domain.preferences import Response
-from app.services import accuracy
-from app.services.accuracy import Foresight, Predicted, curve, evidence_against_a_fair_coin, evidence_against_guessing
+from app.services.answers import accuracy
+from app.services.answers.accuracy import (
+    Foresight,
+    Predicted,
+    curve,
+    evidence_against_a_fair_coin,
+    evidence_against_guessing,
+)
 
 LEFT, RIGHT, EQUAL, SKIP = Response.LEFT, Response.RIGHT, Response.EQUAL, Response.SKIP
 

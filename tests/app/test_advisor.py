@@ -8,7 +8,7 @@ from sqlalchemy import select
 from app.db import Database
 from app.domain.models import Model, ModelKind
 from app.domain.people import AuditEvent
-from app.services import advisor
+from app.services.answers import stopping_advice
 from tests import factories
 
 
@@ -31,14 +31,14 @@ def models(regrets: Sequence[float | None]) -> list[Model]:
     ],
 )
 def test_three_small_regrets_in_a_row_are_enough(regrets: list[float | None], since: int | None) -> None:
-    advice = advisor.advice_of(models(regrets))
+    advice = stopping_advice.advice_of(models(regrets))
     assert advice is not None
     assert (advice.enough_since, advice.regret) == (since, regrets[-1])
 
 
 def test_nothing_is_said_of_models_without_a_regret() -> None:
-    assert advisor.advice_of(models([None, None])) is None
-    assert advisor.advice_of([]) is None
+    assert stopping_advice.advice_of(models([None, None])) is None
+    assert stopping_advice.advice_of([]) is None
 
 
 def test_it_is_noted_once(database: Database) -> None:
@@ -48,6 +48,6 @@ def test_it_is_noted_once(database: Database) -> None:
         for labels in (10, 20, 30, 40):
             metrics = {"advice": {"expected_regret": 0.05}}
             factories.make_model(session, study, participant, ModelKind.REWARD, metrics, labels=labels)
-            advisor.note(session, study, participant)
+            stopping_advice.note(session, study, participant)
         noted = session.scalars(select(AuditEvent.subject).where(AuditEvent.action.startswith("more answers"))).all()
     assert noted == ["pilot/P01 after 30 answers"]

@@ -14,7 +14,9 @@ from app.db import Database, now
 from app.domain.models import ModelKind, Report
 from app.domain.people import ApiToken, AuditEvent, Experimenter, Role
 from app.domain.studies import Participant, Study
-from app.services import api_tokens, export_tables, reports
+from app.services.accounts import api_tokens
+from app.services.exports import export_tables
+from app.services.runs import reports
 from app.storage import ArtefactStore
 from tests import factories
 from tests.finished_study import make_finished_study

@@ -20,7 +20,9 @@ from app.domain.participation import ConsentRecord, FormAnswer, ParticipantEvent
 from app.domain.people import AuditEvent, Experimenter
 from app.domain.preferences import LabelEvent, Query, Response
 from app.domain.studies import Deviation, Participant, Study
-from app.services import api_tokens, export_tables, withdrawal
+from app.services.accounts import api_tokens
+from app.services.exports import export_tables
+from app.services.participants import withdrawal
 from app.storage import ArtefactStore
 from tests import factories
 from tests.finished_study import make_finished_study

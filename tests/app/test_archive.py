@@ -20,15 +20,10 @@ from app.domain.models import Run, RunStatus
 from app.domain.participation import ConsentRecord, FormAnswer, ParticipantEvent
 from app.domain.preferences import Query
 from app.domain.studies import Deviation, Participant, Study
-from app.services import (
-    archive,
-    archive_reading,
-    enrolment,
-    export_tables,
-    exporting,
-    withdrawal,
-)
-from app.services.archive import ArchiveInvalid
+from app.services.archives import archive, archive_reading
+from app.services.archives.archive import ArchiveInvalid
+from app.services.exports import export_formats, export_tables
+from app.services.participants import enrolment, withdrawal
 from app.settings import Settings
 from app.storage import ArtefactStore
 from tests import factories
@@ -64,9 +59,9 @@ def exports(database: Database, slug: str) -> dict[str, str]:
     """Every table of the study as its CSV file."""
     with database.reading() as session:
         study = session.scalars(select(Study).where(Study.slug == slug)).one()
-        provenance = exporting.provenance_of(session, study, MOMENT)
+        provenance = export_formats.provenance_of(session, study, MOMENT)
         return {
-            table.name: "".join(exporting.csv_lines(table, session, study, provenance))
+            table.name: "".join(export_formats.csv_lines(table, session, study, provenance))
             for table in export_tables.TABLES
         }
 

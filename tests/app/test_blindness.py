@@ -22,15 +22,18 @@ from app.domain.evaluation import Assignment, Trial
 from app.domain.models import Model, Report
 from app.domain.people import Experimenter
 from app.domain.studies import Participant, Study
-from app.services import api_tokens, archive, evaluating, export_tables
+from app.services.accounts import api_tokens
+from app.services.archives import archive
+from app.services.evaluation import evaluation_plan
+from app.services.exports import export_tables
 from app.storage import ArtefactStore
 from tests import factories
 from tests.finished_study import make_finished_study
-from worker import export_work, preference_arrays, report_work
 from worker.analysis import figures
 from worker.analysis.report import make_report
-from worker.compute import Compute
-from worker.workplace import Workplace
+from worker.compute.pools import Compute
+from worker.jobs.publishing import export_files, preference_arrays, report_files
+from worker.jobs.runtime.context import Workplace
 
 WHEN = re.compile(
     rb"just now|\d+ (s|min|h|days) ago|\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d(\.\d+)?)?( UTC|Z|\+00:00)?|svg\?\d+"
@@ -51,8 +54,8 @@ def study(database: Database, store: ArtefactStore) -> Study:
     with database.writing() as session:
         study = make_finished_study(session, store, people=3, labels=6, unblinded=False)
         for person in session.scalars(select(Participant).where(Participant.study_id == study.id)):
-            methods = {each.letter: each.method for each in evaluating.assignments_of(session, person.id)}
-            for trial in evaluating.trials_of(session, person.id):
+            methods = {each.letter: each.method for each in evaluation_plan.assignments_of(session, person.id)}
+            for trial in evaluation_plan.trials_of(session, person.id):
                 method = methods[trial.letter]
                 trial.film = factories.make_film(session, store, person, method, scenario=trial.scenario)
             for method in ("reference", "pbarl"):
@@ -102,7 +105,7 @@ def everything(
             there = session.get_one(Study, study.id)
             place = Workplace(database, store, Compute(1))
             for name, write in (
-                ("data", lambda file: export_work.write_data(session, place, there, file)),
+                ("data", lambda file: export_files.write_data(session, place, there, file)),
                 ("archive", lambda file: archive.write(session, store, there, file)),
             ):
                 found |= _unpacked(name, write, tmp_path / "file.zip")
@@ -181,7 +184,7 @@ def _addresses(application: FastAPI, prefix: str, slug: str) -> Iterator[str]:
 
 
 def _report(session: Session, store: ArtefactStore, study: Study) -> None:
-    contents, files = make_report(report_work.tables_of(session, study))
+    contents, files = make_report(report_files.tables_of(session, study))
     stored = {name: {kind: store.put(file) for kind, file in each.items()} for name, each in files.items()}
     for older in session.scalars(select(Report)):
         older.contents, older.figures = contents, stored

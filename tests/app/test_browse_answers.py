@@ -14,8 +14,9 @@ from app.db import Database, now
 from app.domain.people import AuditEvent, Experimenter, Role
 from app.domain.preferences import Exclusion, LabelEvent, Purpose, Query, Response, current_answers, current_labels
 from app.domain.studies import Participant, Study
-from app.services import answers, dashboard
-from app.services.answers import Mark, Wanted
+from app.services.answers import answers
+from app.services.answers.answers import Mark, Wanted
+from app.services.monitoring import dashboard
 from app.storage import ArtefactStore
 from tests import factories
 

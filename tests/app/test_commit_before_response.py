@@ -48,7 +48,7 @@ def test_an_unforeseen_failure_is_a_page_and_changes_nothing(
     def break_down(*_arguments: object) -> None:
         raise RuntimeError("unforeseen")
 
-    monkeypatch.setattr("app.services.querying.next_turn", break_down)
+    monkeypatch.setattr("app.services.answers.next_query.next_turn", break_down)
     browser = TestClient(studio_app, raise_server_exceptions=False, cookies=dict(taking_part.browser.cookies))
     form = {"response": "left", "client_uuid": "8d1b2f5e-6a55-4b0e-9a55-0a4d8f6b1c11"}
     path = f"/p/queries/{taking_part.queries[0].id}/label"

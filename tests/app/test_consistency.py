@@ -7,8 +7,8 @@ import pytest
 
 from app.domain.clips import Clip
 from app.domain.preferences import Label, LabelEvent, Purpose, Query, Response
-from app.services import consistency
-from app.services.consistency import Answer, Consistency
+from app.services.answers import consistency
+from app.services.answers.consistency import Answer, Consistency
 
 LEFT, RIGHT, EQUAL, SKIP = Response.LEFT, Response.RIGHT, Response.EQUAL, Response.SKIP
 numbers = count(1)

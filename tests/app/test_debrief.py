@@ -12,9 +12,10 @@ from app.domain.participation import StageRecord
 from app.domain.preferences import Query
 from app.domain.protocol import Language, Stage
 from app.domain.studies import Participant, Study
-from app.services import debrief, results
+from app.services.participants import debrief
+from app.services.runs import model_metrics
 from app.storage import ArtefactStore
-from app.web.wording import Wording
+from app.web.texts.wording import Wording
 from tests import factories
 from tests.app.conftest import TakingPart
 
@@ -83,25 +84,27 @@ SAYS = {
 LEAST = debrief.NOTICED_PERCENT / 100
 
 
-def measured(sizes: Iterable[float]) -> list[results.Change]:
+def measured(sizes: Iterable[float]) -> list[model_metrics.Change]:
     """Changes of the six costs by these shares of what they were, all of them certain."""
     return [
-        results.Change("", symbol, False, 2.0, 2.0 * (1 + size), 2.0 * size, 1.9 * size, 2.1 * size)
-        for symbol, size in zip(results.COST_SYMBOLS, sizes, strict=True)
+        model_metrics.Change("", symbol, False, 2.0, 2.0 * (1 + size), 2.0 * size, 1.9 * size, 2.1 * size)
+        for symbol, size in zip(model_metrics.COST_SYMBOLS, sizes, strict=True)
     ]
 
 
 @pytest.mark.parametrize("language", Language)
 def test_no_two_sentences_contradict_each_other_whatever_was_measured(language: Language) -> None:
     say = Wording(language)
-    for sizes in itertools.product((-0.6, 0.03, 0.4, 3.0), repeat=len(results.COST_SYMBOLS)):
+    for sizes in itertools.product((-0.6, 0.03, 0.4, 3.0), repeat=len(model_metrics.COST_SYMBOLS)):
         lessons = debrief.lessons_of(measured(sizes))
         sentences = [say(f"debrief-{lesson.words}", percent=lesson.percent) for lesson in lessons]
         about_the_way = [each for each in sentences if PACE.search(each) and not MOUTH.search(each)]
         assert len(about_the_way) <= 1, about_the_way
         for topic in ABOUT[1:]:
             assert sum(bool(topic.search(each)) for each in sentences) <= 1, sentences
-        noticed = {symbol: size for symbol, size in zip(results.COST_SYMBOLS, sizes, strict=True) if abs(size) >= LEAST}
+        noticed = {
+            symbol: size for symbol, size in zip(model_metrics.COST_SYMBOLS, sizes, strict=True) if abs(size) >= LEAST
+        }
         said = len(noticed) - ({"C_d", "C_v"} <= noticed.keys())
         assert len(sentences) == said, "every noticeable change is said, and nothing else"
         for symbol, (less, more) in SAYS.items():

@@ -13,7 +13,7 @@ from app.__main__ import _first_start, main, migrate
 from app.db import Database
 from app.domain.clips import Clip
 from app.domain.studies import USUAL_CLIP_STEPS, Participant, Study, TaskName
-from app.services import demo
+from app.services.archives import demo_archive
 from app.settings import Settings
 from app.storage import ArtefactStore
 
@@ -25,7 +25,7 @@ MOST_BYTES = 6_000_000
 def minute_one(database: Database, store: ArtefactStore) -> str:
     """An empty studio right after its first start; the token of the participant's link."""
     with database.writing() as session:
-        return demo.import_finished(session, store)
+        return demo_archive.import_finished(session, store)
 
 
 def the_study(database: Database) -> Study:
@@ -34,7 +34,7 @@ def the_study(database: Database) -> Study:
 
 
 def test_the_archive_that_is_shipped_is_small() -> None:
-    assert demo.ARCHIVE.stat().st_size < MOST_BYTES
+    assert demo_archive.ARCHIVE.stat().st_size < MOST_BYTES
 
 
 def test_everybody_but_the_visitor_is_scripted_and_through(minute_one: str, database: Database) -> None:
@@ -149,9 +149,9 @@ def test_a_file_that_is_missing_or_damaged_does_not_keep_the_studio_from_startin
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     copy = tmp_path / "copy.zip"
-    copy.write_bytes(demo.ARCHIVE.read_bytes())
+    copy.write_bytes(demo_archive.ARCHIVE.read_bytes())
     broken(copy)
-    monkeypatch.setattr(demo, "ARCHIVE", copy)
+    monkeypatch.setattr(demo_archive, "ARCHIVE", copy)
     greeting = first_start()
     assert "Participant link  http" in greeting
     assert said in greeting

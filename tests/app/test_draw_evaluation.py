@@ -12,8 +12,8 @@ from app.db import Database
 from app.domain.evaluation import Assignment, Trial
 from app.domain.protocol import EvaluatedMethod, EvaluationSettings
 from app.domain.studies import Participant, Study
-from app.services import evaluating
-from app.services.evaluating import order_of_methods, williams_rows
+from app.services.evaluation import evaluation_plan
+from app.services.evaluation.evaluation_plan import order_of_methods, williams_rows
 from tests import factories
 
 SIZES = [2, 3, 4, 5]
@@ -75,9 +75,9 @@ def test_every_letter_is_met_in_one_block_of_trials_and_letters_follow_the_order
     database: Database, study: Study, participant: Participant
 ) -> None:
     with database.writing() as session:
-        evaluating.draw(session, study, participant)
-        trials = evaluating.trials_of(session, participant.id)
-        methods = {each.letter: each.method for each in evaluating.assignments_of(session, participant.id)}
+        evaluation_plan.draw(session, study, participant)
+        trials = evaluation_plan.trials_of(session, participant.id)
+        methods = {each.letter: each.method for each in evaluation_plan.assignments_of(session, participant.id)}
     assert [trial.letter for trial in trials] == list("AAABBBCCC")
     assert [trial.repetition for trial in trials] == [1, 2, 3] * 3
     assert list(methods.values()) == list(order_of_methods(study.key_secret, EvaluationSettings().methods, 1))
@@ -89,12 +89,14 @@ def test_all_methods_of_a_participant_meet_the_same_scenarios_and_other_particip
     with database.writing() as session:
         other, _ = factories.make_participant(session, study)
         for person in (participant, other):
-            evaluating.draw(session, study, person)
-        mine, others = ([each.scenario for each in evaluating.trials_of(session, p.id)] for p in (participant, other))
+            evaluation_plan.draw(session, study, person)
+        mine, others = (
+            [each.scenario for each in evaluation_plan.trials_of(session, p.id)] for p in (participant, other)
+        )
     assert mine[:3] == mine[3:6] == mine[6:]
     assert len(set(mine)) == 3
     assert not set(mine) & set(others)
-    assert set(mine) | set(others) <= set(evaluating.TRIAL_SCENARIOS)
+    assert set(mine) | set(others) <= set(evaluation_plan.TRIAL_SCENARIOS)
 
 
 def test_twenty_who_draw_at_once_draw_once(database: Database, study: Study, participant: Participant) -> None:
@@ -103,7 +105,7 @@ def test_twenty_who_draw_at_once_draw_once(database: Database, study: Study, par
     def draw(_number: int) -> None:
         barrier.wait()
         with database.writing() as session:
-            evaluating.draw(session, study, session.get_one(Participant, participant.id))
+            evaluation_plan.draw(session, study, session.get_one(Participant, participant.id))
 
     with ThreadPoolExecutor(20) as pool:
         list(pool.map(draw, range(20)))

@@ -13,7 +13,8 @@ from app.domain.evaluation import Rating
 from app.domain.models import Model, ModelKind, Run, RunKind, RunStatus
 from app.domain.protocol import EvaluatedMethod, EvaluationSettings
 from app.domain.studies import Awaited, Participant, Study
-from app.services import estimates, preparing
+from app.services.evaluation import robot_preparation
+from app.services.runs import estimates
 from app.storage import ArtefactStore
 from tests import factories
 
@@ -173,12 +174,12 @@ def test_the_debrief_is_foretold_too(database: Database, study: Study, person: t
     with database.reading() as session:
         participant = session.get_one(Participant, person[0].id)
         participant.study = session.get_one(Study, study.id)
-        assert preparing.until_debrief_s(session, participant) is None
+        assert robot_preparation.until_debrief_s(session, participant) is None
     somebody_before(database, study)
     with database.reading() as session:
         participant = session.get_one(Participant, person[0].id)
         participant.study = session.get_one(Study, study.id)
-        assert preparing.until_debrief_s(session, participant) == pytest.approx(84, abs=1)
+        assert robot_preparation.until_debrief_s(session, participant) == pytest.approx(84, abs=1)
 
 
 def test_the_dashboard_tells_when_somebody_can_go_on(

@@ -15,7 +15,9 @@ from app.db import Database, now
 from app.domain.models import Export
 from app.domain.people import AuditEvent, Experimenter, Role
 from app.domain.studies import Deviation, Participant, Study
-from app.services import csv_cells, export_tables, exporting, sealing, withdrawal
+from app.services.archives import sealing
+from app.services.exports import csv_cells, export_formats, export_tables
+from app.services.participants import withdrawal
 from app.storage import ArtefactStore
 from tests.finished_study import make_finished_study
 
@@ -54,7 +56,7 @@ def test_every_table_has_the_columns_of_its_dictionary_in_both_formats(
 
 @pytest.mark.parametrize("table", export_tables.TABLES, ids=lambda table: table.name)
 def test_values_are_of_the_kind_that_the_dictionary_says(
-    database: Database, study: Study, table: exporting.Table
+    database: Database, study: Study, table: export_formats.Table
 ) -> None:
     kinds: dict[str, tuple[type, ...]] = {
         "text": (str,),
@@ -65,21 +67,21 @@ def test_values_are_of_the_kind_that_the_dictionary_says(
         "json": (dict,),
     }
     with database.reading() as session:
-        provenance = exporting.provenance_of(session, study)
-        for row in exporting.records(table, session, study, provenance):
+        provenance = export_formats.provenance_of(session, study)
+        for row in export_formats.records(table, session, study, provenance):
             for column in table.all_columns:
                 value = row[column.name]
                 assert value is None or isinstance(value, kinds[column.kind.value]), (column.name, value)
 
 
 def test_the_dictionary_in_the_documentation_is_up_to_date() -> None:
-    assert (DOCS / "protocol.md").read_text() == exporting.dictionary_markdown(export_tables.TABLES), (
+    assert (DOCS / "protocol.md").read_text() == export_formats.dictionary_markdown(export_tables.TABLES), (
         "run: python -m app dictionary"
     )
 
 
 def test_every_column_says_what_it_means() -> None:
-    assert [row for row in exporting.dictionary(export_tables.TABLES) if len(row["meaning"]) < 4] == []
+    assert [row for row in export_formats.dictionary(export_tables.TABLES) if len(row["meaning"]) < 4] == []
 
 
 def test_formulas_that_participants_write_do_not_run_in_a_spreadsheet(
@@ -176,7 +178,7 @@ def test_every_row_says_whether_the_study_was_locked_and_how_it_deviated(
     (row, *_) = download("ratings")
     assert row["lock_hash"] == "ab" * 32
     assert row["deviations"].endswith(": too long")
-    assert row["software_version"] == exporting.software_version()
+    assert row["software_version"] == export_formats.software_version()
     assert download("deviations")[0]["reason"] == "too long"
 
 
@@ -187,7 +189,7 @@ def test_who_withdrew_is_a_tombstone_and_nothing_else(
         person = session.scalars(select(Participant).where(Participant.number == 1)).one()
         withdrawal.withdraw(session, store, person, "P01")
     tombstone = next(row for row in download("participants") if row["participant"] == "P01")
-    kept = {name for name, value in tombstone.items() if value} - {column.name for column in exporting.PROVENANCE}
+    kept = {name for name, value in tombstone.items() if value} - {column.name for column in export_formats.PROVENANCE}
     assert kept == {"participant", "status", "withdrawn_at"}
     for table in export_tables.TABLES:
         if table.name not in ("participants", "clips", "deviations"):

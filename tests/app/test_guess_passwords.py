@@ -20,10 +20,10 @@ from sqlalchemy import select
 from app.__main__ import web_server
 from app.db import Database
 from app.domain.people import BrowserSession, Experimenter
-from app.services import accounts, api_tokens, known_browsers
+from app.services.accounts import accounts, api_tokens, known_browsers
 from app.settings import Settings
-from app.web.hashing import Hashing
-from app.web.login_attempts import WINDOW_S, LoginAttempts
+from app.web.http.hashing import Hashing
+from app.web.http.rate_limit import WINDOW_S, LoginAttempts
 from tests.app.conftest import TakingPart
 from tests.waiting import PATIENCE_S, free_port
 
@@ -218,7 +218,7 @@ def test_a_password_that_was_replaced_while_it_was_checked_opens_nothing(
             accounts.reset_password(session, NAME)
         return found
 
-    monkeypatch.setattr("app.services.accounts.verify", verify_slowly)
+    monkeypatch.setattr("app.services.accounts.accounts.verify", verify_slowly)
     assert log_in(client, password).status_code == 401
     with database.reading() as session:
         assert session.scalars(select(BrowserSession)).all() == []

@@ -13,7 +13,7 @@ from sqlalchemy.exc import OperationalError
 from app import __main__ as commands
 from app.db import Database, complaints
 from app.main import create_app
-from app.services import health
+from app.services.monitoring import health
 from app.settings import Settings
 from tests.app.conftest import TakingPart
 
@@ -86,7 +86,7 @@ def test_strangers_learn_no_path_and_no_version(browser: TestClient, settings: S
 
 
 def test_however_many_ask_the_database_is_written_once(browser: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("app.web.readiness.KNOWN_FOR_S", 3600.0)
+    monkeypatch.setattr("app.web.http.readiness.KNOWN_FOR_S", 3600.0)
     commits: list[object] = []
     event.listen(database_of(browser).writer, "commit", commits.append)
     assert [browser.get("/health").status_code for _ in range(50)] == [200] * 50

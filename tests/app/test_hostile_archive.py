@@ -18,8 +18,9 @@ from sqlalchemy import func, select
 
 from app.db import Base, Database
 from app.domain.studies import Study
-from app.services import archive, archive_reading, locking, study_import, unpacking
-from app.services.archive import ArchiveInvalid
+from app.services.archives import archive, archive_reading, study_import, unpacking
+from app.services.archives.archive import ArchiveInvalid
+from app.services.studies import locking
 from app.storage import ArtefactStore
 from tests.finished_study import make_finished_study
 

@@ -13,7 +13,7 @@ from sqlalchemy import select
 
 from app.db import Database
 from app.domain.studies import Participant, Study
-from app.services import completion, panel
+from app.services.participants import completion, recruitment_panel
 from app.storage import ArtefactStore
 from tests import factories
 from tests.app.conftest import agree
@@ -27,7 +27,7 @@ def open_study(database: Database) -> Callable[..., str]:
     def make(**settings: str) -> str:
         with database.writing() as session:
             study = factories.make_study(session, **settings)
-            return f"/join/{panel.open_joining(session, study, actor='pat')}"
+            return f"/join/{recruitment_panel.open_joining(session, study, actor='pat')}"
 
     return make
 
@@ -118,10 +118,10 @@ class TestThroughAPanel:
         open_study()
         with database.writing() as session:
             study = session.scalars(select(Study)).one()
-            first = panel.join(session, study, {"PROLIFIC_PID": "abc"}).participant
+            first = recruitment_panel.join(session, study, {"PROLIFIC_PID": "abc"}).participant
             looks = iter([None, first])
-            monkeypatch.setattr(panel, "_known", lambda *_: next(looks))
-            assert panel.join(session, study, {"PROLIFIC_PID": "abc"}).participant is first
+            monkeypatch.setattr(recruitment_panel, "_known", lambda *_: next(looks))
+            assert recruitment_panel.join(session, study, {"PROLIFIC_PID": "abc"}).participant is first
         assert len(everybody(database)) == 1
 
     @pytest.mark.parametrize("query", ["", "?PROLIFIC_PID=", "?PROLIFIC_PID=%20", "?prolific_pid=abc"])
@@ -170,7 +170,7 @@ def test_an_address_that_was_closed_lets_nobody_in(
 ) -> None:
     address = open_study()
     with database.writing() as session:
-        panel.close_joining(session, session.scalars(select(Study)).one(), actor="pat")
+        recruitment_panel.close_joining(session, session.scalars(select(Study)).one(), actor="pat")
     for answer in (client.get(address + "?PROLIFIC_PID=abc"), client.post(address + "?PROLIFIC_PID=abc")):
         assert answer.status_code == 404
         assert "does not lead to a study that can be joined" in answer.text

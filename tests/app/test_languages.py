@@ -9,8 +9,8 @@ from fastapi.testclient import TestClient
 from app.db import Database
 from app.domain.protocol import Language
 from app.domain.studies import StudySettings
-from app.services import panel
-from app.web.wording import preferred, wording_for
+from app.services.participants import recruitment_panel
+from app.web.texts.wording import preferred, wording_for
 from tests import factories
 from tests.app.conftest import TakingPart, agree
 
@@ -128,7 +128,7 @@ def test_who_is_unknown_can_change_the_language_of_every_page(client: TestClient
 def test_what_was_chosen_before_joining_holds_after_it(database: Database, client: TestClient) -> None:
     with database.writing() as session:
         study = factories.make_study(session)
-        token = panel.open_joining(session, study, "someone")
+        token = recruitment_panel.open_joining(session, study, "someone")
     address = f"/join/{token}"
     page = client.get(address, headers=GERMAN).text  # without the panel's parameter
     assert language_of(page) == "de"

@@ -6,7 +6,7 @@ from sqlalchemy import select
 
 from app.db import Database
 from app.domain.studies import RewardKind, Strategy, Study
-from app.web.study_form import form_with_defaults
+from app.web.experimenter.study_form import form_with_defaults
 
 CHOICES = [
     *(("strategy", each.value) for each in Strategy),

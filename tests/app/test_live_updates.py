@@ -16,8 +16,9 @@ from sqlalchemy.orm import Session
 from app.db import Database
 from app.domain.people import BrowserSession, Experimenter, Role
 from app.domain.studies import Participant, Study
-from app.services import browser_sessions, dashboard
-from app.services.tallies import Tallies
+from app.services.accounts import browser_sessions
+from app.services.monitoring import dashboard
+from app.services.monitoring.tallies import Tallies
 from app.storage import ArtefactStore
 from tests import factories
 from tests.conftest import serving

@@ -10,7 +10,7 @@ from sqlalchemy import select, update
 from app.db import Base, Database, now
 from app.domain.people import AuditEvent, BrowserSession, Experimenter
 from app.main import create_app
-from app.services import accounts
+from app.services.accounts import accounts
 from app.settings import Settings
 from tests.app.conftest import TakingPart
 from tests.conftest import PASSWORD

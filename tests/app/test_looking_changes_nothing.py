@@ -17,7 +17,8 @@ from app.domain.people import Experimenter
 from app.domain.preferences import Query
 from app.domain.protocol import EvaluationSettings
 from app.domain.studies import Study
-from app.services import api_tokens, panel
+from app.services.accounts import api_tokens
+from app.services.participants import recruitment_panel
 from app.storage import ArtefactStore
 from tests import factories
 
@@ -119,7 +120,7 @@ def place(studio_app: FastAPI, database: Database, store: ArtefactStore, passwor
             "name": "ratings",
             "key": "x" * 20,
         }
-        join_token = panel.open_joining(session, study, "pat")
+        join_token = recruitment_panel.open_joining(session, study, "pat")
         token = api_tokens.create(session, session.scalars(select(Experimenter)).one(), "a notebook")[1]
     addresses = list(_addresses(studio_app, words, join_token, person_token))
     return Place(addresses, database, f"/p/{person_token}", f"/p/{rater_token}", token)

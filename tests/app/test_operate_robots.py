@@ -16,7 +16,8 @@ from app.domain.models import ModelKind
 from app.domain.people import AuditEvent
 from app.domain.protocol import EvaluationMode, EvaluationSettings
 from app.domain.studies import Participant, Study
-from app.services import export_tables, unblinding
+from app.services.evaluation import unblinding
+from app.services.exports import export_tables
 from app.storage import ArtefactStore
 from tests import factories
 

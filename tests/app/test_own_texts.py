@@ -12,9 +12,9 @@ from app.db import Database
 from app.domain.participation import ConsentRecord, FormAnswer
 from app.domain.protocol import FormItem, Language
 from app.domain.studies import Deviation, Study, StudySettings
-from app.services import locking
-from app.web.own_texts import missing_facts, missing_translations, own_texts, with_translations
-from app.web.wording import Wording, question_of, wording_for
+from app.services.studies import locking
+from app.web.texts.own_texts import missing_facts, missing_translations, own_texts, with_translations
+from app.web.texts.wording import Wording, question_of, wording_for
 from tests import factories
 from tests.app.conftest import agree
 

@@ -13,7 +13,7 @@ from app.domain.participation import ConsentRecord, FormAnswer, StageRecord
 from app.domain.preferences import Purpose, Query
 from app.domain.protocol import EvaluationSettings, FormItem, Stage
 from app.domain.studies import PAPER_PROTOCOL, Participant, Study, StudySettings
-from app.services import stages
+from app.services.participants import stages
 from app.storage import ArtefactStore
 from tests import factories
 from tests.app.conftest import agree

@@ -12,8 +12,10 @@ from app.domain.evaluation import Rating
 from app.domain.preferences import Exclusion, LabelEvent, Query
 from app.domain.protocol import PlannedTest
 from app.domain.studies import Deviation, Study, TaskName
-from app.services import excluding, exporting, locking, planning
-from app.services.planning import Plan, Standing
+from app.services.answers import exclusions
+from app.services.exports import export_formats
+from app.services.studies import locking, preregistration
+from app.services.studies.preregistration import Plan, Standing
 from app.storage import ArtefactStore
 from tests import factories
 from tests.finished_study import make_finished_study
@@ -44,7 +46,7 @@ def planned(database: Database, store: ArtefactStore) -> Planned:
 
 def plan_of(database: Database, study: Study) -> Plan:
     with database.reading() as session:
-        return planning.plan_of(session, session.get_one(Study, study.id))
+        return preregistration.plan_of(session, session.get_one(Study, study.id))
 
 
 @pytest.mark.parametrize(
@@ -128,9 +130,9 @@ def exclude(database: Database, study: Study, place: int, day: int, reason: str)
         here = session.get_one(Study, study.id)
         query_id = session.scalars(select(Query.id).order_by(Query.id)).all()[place]
         if reason:
-            excluding.exclude(session, here, query_id, reason, "Ada")
+            exclusions.exclude(session, here, query_id, reason, "Ada")
         else:
-            excluding.include(session, here, query_id, "Ada")
+            exclusions.include(session, here, query_id, "Ada")
         session.flush()
         session.scalars(select(Exclusion).order_by(Exclusion.id)).all()[-1].at = START + timedelta(days=day)
 
@@ -168,7 +170,9 @@ def test_provenance_of_an_export_lists_the_changes(database: Database, planned: 
     study = planned(5)
     with database.writing() as session:
         session.add(Deviation(study_id=study.id, actor="Ada", reason="Fewer people came.", before={}, after={}))
-        assert "Fewer people came." in exporting.provenance_of(session, session.get_one(Study, study.id)).deviations
+        assert (
+            "Fewer people came." in export_formats.provenance_of(session, session.get_one(Study, study.id)).deviations
+        )
 
 
 def test_whoever_locks_after_the_first_rating_is_told_what_that_is_worth(

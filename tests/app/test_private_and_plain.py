@@ -14,7 +14,7 @@ from app.errors import AppError, in_words
 from app.settings import Settings
 from app.storage import ArtefactStore, keep_private
 from worker import __main__ as worker
-from worker import engine
+from worker.jobs.runtime import engine
 
 APP = [["migrate"], ["reset-password"], ["link"], ["demo"], ["import-study", "study.zip"], ["up"]]
 

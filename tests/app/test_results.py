@@ -14,13 +14,15 @@ from app.domain.models import Report, RunStatus
 from app.domain.preferences import Query, Response
 from app.domain.protocol import PlannedTest
 from app.domain.studies import Study, TaskName
-from app.services import dashboard, excluding, locking
+from app.services.answers import exclusions
+from app.services.monitoring import dashboard
+from app.services.studies import locking
 from app.storage import ArtefactStore
 from tests import factories
 from tests.finished_study import make_finished_study
-from worker import report_work
 from worker.analysis.report import make_report
 from worker.analysis.statistics import MEASURED_ERROR_PERCENT
+from worker.jobs.publishing import report_files
 
 Finished = Callable[..., Study]
 
@@ -36,7 +38,7 @@ def finished(database: Database, store: ArtefactStore, monkeypatch: pytest.Monke
             if locked:
                 locking.lock(session, study, study.slug, "Ada")
                 study.locked_at = now() - timedelta(days=1)
-            contents, _ = make_report(report_work.tables_of(session, study))
+            contents, _ = make_report(report_files.tables_of(session, study))
             run = factories.make_run(session, study, kind="report")
             figures: dict[str, Any] = {"ratings": {"svg": store.put(b"<svg/>"), "png": store.put(b"png")}}
             session.add(Report(study_id=study.id, run_id=run.id, basis="", contents=contents, figures=figures))
@@ -75,7 +77,7 @@ def test_answers_excluded_after_locking_stand_beside_the_plan_with_their_reasons
         if not evaluated:
             there.stored_settings = there.stored_settings | {"evaluation": None}
         for query_id in session.scalars(select(Query.id).order_by(Query.id).limit(2)):
-            excluding.exclude(session, there, query_id, "The <phone> rang.", "Ada")
+            exclusions.exclude(session, there, query_id, "The <phone> rang.", "Ada")
     text = " ".join(results(experimenter, study).split())
     side = " after unblinding" if evaluated else ""
     assert f"2 answers of P01 excluded{side}: The &lt;phone&gt; rang." in text

@@ -13,8 +13,9 @@ from app.domain.participation import StageRecord
 from app.domain.people import AuditEvent, Experimenter, Role
 from app.domain.protocol import EvaluationSettings, Stage
 from app.domain.studies import PAPER_PROTOCOL, Participant, Study
-from app.services import dashboard, enrolment, study_state, withdrawal
-from app.services.study_state import State
+from app.services.monitoring import dashboard, study_state
+from app.services.monitoring.study_state import State
+from app.services.participants import enrolment, withdrawal
 from app.storage import ArtefactStore
 from tests import factories
 from tests.app.study_pages import controls, typed

@@ -14,7 +14,7 @@ from app.domain.models import ModelKind, Run, RunKind, RunStatus, WorkerPresence
 from app.domain.people import AuditEvent
 from app.domain.preferences import Response
 from app.domain.studies import Participant, Study
-from app.services import enrolment
+from app.services.participants import enrolment
 from app.settings import Settings
 from app.storage import ArtefactStore
 from tests import factories
@@ -283,7 +283,7 @@ class TestWatching:
     def test_a_full_disk_is_noticed(
         self, experimenter: TestClient, study: Study, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr("app.services.dashboard.DISK_LOW_BYTES", 2**62)
+        monkeypatch.setattr("app.services.monitoring.dashboard.DISK_LOW_BYTES", 2**62)
         assert "disk is nearly full" in experimenter.get("/studies/pilot").text
 
     @pytest.mark.parametrize(

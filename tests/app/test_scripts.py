@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from app.web.templating import ROOT, imports_of
+from app.paths import ROOT
+from app.web.texts.templating import imports_of
 
 SCRIPTS = sorted((ROOT / "static").glob("*.js"))
 

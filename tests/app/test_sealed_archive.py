@@ -12,8 +12,9 @@ from fastapi import FastAPI
 
 from app.db import Database
 from app.domain.studies import Study
-from app.services import archive, sealing, unblinding
-from app.services.archive import ArchiveInvalid
+from app.services.archives import archive, sealing
+from app.services.archives.archive import ArchiveInvalid
+from app.services.evaluation import unblinding
 from app.storage import ArtefactStore
 from tests import factories
 from tests.app.conftest import bring

@@ -12,7 +12,7 @@ from app.db import Database
 from app.domain.clips import Clip
 from app.domain.studies import Deviation, Study
 from app.storage import ArtefactStore
-from app.web.turns import READERS
+from app.web.http.session_queue import READERS
 from tests import factories
 from tests.waiting import PATIENCE_S
 

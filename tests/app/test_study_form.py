@@ -11,10 +11,10 @@ from sqlalchemy import select
 from app.db import Database
 from app.domain.protocol import EvaluatedMethod, EvaluationMode, PlannedTest
 from app.domain.studies import PAPER_PROTOCOL, PREVIEW_NUMBERS, Deviation, Participant, Study, StudySettings
-from app.services import locking
+from app.services.studies import locking
 from app.storage import ArtefactStore
-from app.web.form_lines import items_of, lines_of, lines_of_texts, texts_of
-from app.web.study_form import StudyForm
+from app.web.experimenter.form_lines import items_of, lines_of, lines_of_texts, texts_of
+from app.web.experimenter.study_form import StudyForm
 from tests import factories
 from tests.app.study_pages import typed
 

@@ -17,7 +17,8 @@ from app.domain.people import AuditEvent
 from app.domain.preferences import Response
 from app.domain.protocol import FormItem
 from app.domain.studies import Participant, Study
-from app.services import form_summaries, withdrawal
+from app.services.monitoring import form_summaries
+from app.services.participants import withdrawal
 from app.storage import ArtefactStore
 from tests import factories
 

@@ -10,8 +10,9 @@ from app.db import Database
 from app.domain.models import ModelKind
 from app.domain.preferences import Query, Response
 from app.domain.studies import Participant, Study
-from app.services import dashboard, withdrawal
-from app.services.tallies import Tallies
+from app.services.monitoring import dashboard
+from app.services.monitoring.tallies import Tallies
+from app.services.participants import withdrawal
 from app.storage import ArtefactStore
 from tests import factories
 

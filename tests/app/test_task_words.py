@@ -8,7 +8,7 @@ from fastapi.testclient import TestClient
 from app.db import Database
 from app.domain.models import ModelKind, RunKind, RunStatus
 from app.domain.studies import Study, StudySettings, TaskName
-from app.services import studies
+from app.services.studies import studies
 from tests import factories
 from tests.app.conftest import agree
 

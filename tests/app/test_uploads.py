@@ -13,9 +13,9 @@ from sqlalchemy import select
 from app.db import Database
 from app.domain.people import Experimenter, Role
 from app.domain.studies import Study
-from app.services import archive
+from app.services.archives import archive
 from app.storage import ArtefactStore
-from app.web import importing
+from app.web.experimenter import imports
 from tests import factories
 from tests.waiting import PATIENCE_S
 
@@ -84,7 +84,7 @@ def test_nothing_is_read_from_another_site(address: str, experimenter_cookie: st
 def test_nothing_is_read_that_has_no_room(
     address: str, experimenter_cookie: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(importing, "MOST_OF_THE_DISK", 0.0)
+    monkeypatch.setattr(imports, "MOST_OF_THE_DISK", 0.0)
     with announced(address, experimenter_cookie) as connection:
         assert status_of(connection) == 413
         assert "Free some space" in rest_of(connection)
@@ -113,7 +113,7 @@ def test_an_upload_that_was_broken_off_leaves_its_place_to_the_next(
 def test_an_upload_that_stalls_is_given_up(
     address: str, experimenter_cookie: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(importing, "PATIENCE_S", 0.05)
+    monkeypatch.setattr(imports, "PATIENCE_S", 0.05)
     with announced(address, experimenter_cookie) as connection:
         assert status_of(connection) == 100
         assert "stopped in the middle" in rest_of(connection)

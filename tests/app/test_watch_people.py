@@ -12,7 +12,7 @@ from app.domain.participation import StageRecord
 from app.domain.preferences import Purpose, Response
 from app.domain.protocol import Stage
 from app.domain.studies import Participant, Study
-from app.services import dashboard, watching
+from app.services.monitoring import dashboard, participant_status
 from app.storage import ArtefactStore
 from tests import factories
 
@@ -75,7 +75,9 @@ def test_the_pace_leaves_breaks_out(participant: Participant, database: Database
         for query, ago_s in zip(factories.make_queries(session, store, participant, 6), moments, strict=True):
             factories.make_label(session, query, ago=timedelta(seconds=ago_s))
     with database.reading() as session:
-        pace_s = watching.judged(watching.answers_given(session, [participant.id])[participant.id], []).pace_s
+        pace_s = participant_status.judged(
+            participant_status.answers_given(session, [participant.id])[participant.id], []
+        ).pace_s
     assert pace_s == pytest.approx(10.0, abs=0.5)
 
 

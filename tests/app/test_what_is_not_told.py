@@ -8,7 +8,7 @@ from fastapi.testclient import TestClient
 from app.db import Database
 from app.domain.protocol import PAPER_DEMOGRAPHICS, USUAL_QUESTIONNAIRE, EvaluationSettings
 from app.domain.studies import Participant
-from app.services import panel
+from app.services.participants import recruitment_panel
 from app.storage import ArtefactStore
 from tests import factories
 from tests.app.conftest import agree
@@ -30,7 +30,7 @@ def pages(database: Database, store: ArtefactStore, new_browser: Callable[[], Te
             return_url="https://panel.example/?code={code}",
             evaluation=EvaluationSettings(trials=1),
         )
-        token = panel.open_joining(session, study, "someone")
+        token = recruitment_panel.open_joining(session, study, "someone")
     browser = new_browser()
     seen: list[str] = []
 

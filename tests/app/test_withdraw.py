@@ -16,7 +16,7 @@ from app.domain.participation import ConsentRecord, FormAnswer, ParticipantEvent
 from app.domain.people import AuditEvent
 from app.domain.preferences import Exclusion, LabelEvent
 from app.domain.studies import Participant, Study
-from app.services import withdrawal
+from app.services.participants import withdrawal
 from app.settings import Settings
 from app.storage import ArtefactStore
 from tests import factories

@@ -10,9 +10,9 @@ from fluent.syntax import ast
 
 from app.domain.protocol import Language
 from app.domain.studies import StudySettings
-from app.web import wording
-from app.web.templating import ROOT
-from app.web.wording import Wording, built_in_texts, variables_of, wording_for
+from app.paths import ROOT, WORDING
+from app.web.texts import wording
+from app.web.texts.wording import Wording, built_in_texts, variables_of, wording_for
 
 TEMPLATES = sorted((ROOT / "templates" / "participant").glob("*.html"))
 NAMES_FOR_CODE = r"{% block (page|page_data|body_class|sheet_class|width) %}.*?{% endblock %}"
@@ -30,7 +30,7 @@ def test_every_language_has_the_same_messages_with_the_same_variables() -> None:
 
 @pytest.mark.parametrize("language", Language)
 def test_no_message_is_broken_or_there_twice(language: Language) -> None:
-    text = (wording.FOLDER / f"{language}.ftl").read_text(encoding="utf-8")
+    text = (WORDING / f"{language}.ftl").read_text(encoding="utf-8")
     body = wording._resource(language).body
     assert [entry for entry in body if isinstance(entry, ast.Junk)] == []
     keys = re.findall(r"^([a-zA-Z][a-zA-Z0-9_-]*) =", text, re.MULTILINE)

@@ -3,8 +3,8 @@
 import pytest
 
 from app.domain.studies import LONGEST_CLIP_STEPS, USUAL_CLIP_STEPS, TaskName
-from app.web.task_words import words_of
-from worker.sim.catalogue import ENVIRONMENTS
+from app.web.texts.task_words import words_of
+from worker.tasks.registry import ENVIRONMENTS
 from worker.trajectory import COSTS, SIGNALS
 
 

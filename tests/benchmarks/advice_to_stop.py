@@ -2,7 +2,7 @@
 
     python -m tests.benchmarks.advice_to_stop
 
-The paper's users answer with one label seed that no table uses. Expected: worker.ml.advice, in standard deviations of
+The paper's users answer with one label seed that no table uses. Expected: worker.ml.stopping, in standard deviations of
 predicted return over all modes. True: how much less than the best mode the picked one gains on the response surface,
 in % of what the user minds and likes under the reference policy. Minutes.
 """
@@ -14,15 +14,15 @@ from pathlib import Path
 import torch
 
 from tests.benchmarks.chosen_modes import FIRST_SEED, UnkeptBench, stake
-from worker import laboratory
-from worker.contest import PAPER_USERS, Cell, Terms
-from worker.laboratory import surface_file
-from worker.ml.advice import expected_regret
-from worker.ml.response_surface import ResponseSurface, best_mode
+from worker.compute import simulation
+from worker.compute.simulation import surface_file
+from worker.experiments.benchmark_cell import PAPER_USERS, Cell, Terms
+from worker.experiments.rollout_cache import Shelf
+from worker.ml.filters.response_surface import ResponseSurface, best_mode
+from worker.ml.stopping import expected_regret
 from worker.ml.teachers import Taste
-from worker.shelf import Shelf
-from worker.sim.catalogue import ENVIRONMENTS
 from worker.sim.costs import signal_weights
+from worker.tasks.registry import ENVIRONMENTS
 
 COUNTS = (20, 40, 60, 80, 100, 120, 150, 200)
 WORK = Path("data/benchmark/rollouts")
@@ -42,7 +42,7 @@ def main() -> None:
 
 def _regrets(name: str, taste: Taste) -> list[str]:
     """Expected / true, for each number of answers."""
-    task = laboratory.task(name)
+    task = simulation.task(name)
     surface = ResponseSurface.load(surface_file(name), task.modes)
     wish, unit = signal_weights(task, taste.omega, taste.per_signal), stake(task, taste) / 100
     most = float(surface.predict(best_mode(surface, wish, 0))[0] @ wish)

@@ -20,7 +20,7 @@ from app.__main__ import migrate
 from app.domain.people import Experimenter
 from app.domain.preferences import LabelEvent, Query
 from app.main import create_app
-from app.services import accounts, api_tokens
+from app.services.accounts import accounts, api_tokens
 from app.settings import Settings
 from tests import factories
 

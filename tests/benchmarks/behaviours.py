@@ -16,13 +16,13 @@ import numpy as np
 import numpy.typing as npt
 from tqdm import tqdm
 
-from worker import laboratory
+from worker.compute import simulation
 from worker.ml.acquisition import matched_pairs
 from worker.ml.teachers import OMEGA, OPPOSED, User
-from worker.sim.catalogue import ENVIRONMENTS
 from worker.sim.costs import CostForm, preference_rewards
 from worker.sim.rollout import rollout
-from worker.tasks import Task
+from worker.task import Task
+from worker.tasks.registry import ENVIRONMENTS
 from worker.trajectory import SIGNALS, Trajectory
 
 FIRST_SCENARIO = 10_700_000
@@ -41,7 +41,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, nargs="+", default=[60, 100], help="control steps shown, from the start")
     options = parser.parse_args()
     for name in options.task:
-        task, pool = laboratory.task(name), _pool(name, options.scenarios)
+        task, pool = simulation.task(name), _pool(name, options.scenarios)
         sys.stdout.write(f"## {task.title}\n\n{_successes(name, pool)}\n\n{_axes(name, options.axis_scenarios)}\n\n")
         found = [_agreements(task, pool, steps) for steps in options.steps]
         sys.stdout.write("| prefer the same clip | " + " | ".join(f"first {steps / 10:g} s" for steps in options.steps))
@@ -53,9 +53,9 @@ def main() -> None:
 
 def _pool(name: str, scenarios: int) -> list[Trajectory]:
     return [
-        rollout(laboratory.environment(name), laboratory.act_as(name, behaviour), scenario)
+        rollout(simulation.environment(name), simulation.act_as(name, behaviour), scenario)
         for scenario in tqdm(range(FIRST_SCENARIO, FIRST_SCENARIO + scenarios), desc=name)
-        for behaviour in laboratory.behaviours(name, scenario, PER_SCENARIO)
+        for behaviour in simulation.behaviours(name, scenario, PER_SCENARIO)
     ]
 
 
@@ -63,7 +63,7 @@ def _successes(name: str, pool: list[Trajectory]) -> str:
     """Success of the pool, and of each kind of behaviour in it."""
     kinds: dict[str, list[bool]] = {}
     for index, trajectory in enumerate(pool):
-        behaviour = laboratory.behaviours(name, trajectory.scenario, PER_SCENARIO)[index % PER_SCENARIO]
+        behaviour = simulation.behaviours(name, trajectory.scenario, PER_SCENARIO)[index % PER_SCENARIO]
         kind = next((each for each in ("checkpoint", "temperature", "disturbance") if getattr(behaviour, each)), "mode")
         kinds.setdefault(kind, []).append(trajectory.success)
     parts = (f"{kind} {100 * np.mean(each):.0f} % of {len(each)}" for kind, each in sorted(kinds.items()))
@@ -73,7 +73,7 @@ def _successes(name: str, pool: list[Trajectory]) -> str:
 
 def _axes(name: str, scenarios: int) -> str:
     """What each end of each mode axis does, over a few scenarios."""
-    family, environment = laboratory.task(name).modes, laboratory.environment(name)
+    family, environment = simulation.task(name).modes, simulation.environment(name)
     lines = [
         "| mode | success | arrives, s | speed near, m/s | force at target, N | largest force, N | sideways, cm |",
         "|---|---|---|---|---|---|---|",
@@ -81,7 +81,7 @@ def _axes(name: str, scenarios: int) -> str:
     ends: list[tuple[str, Mapping[str, float]]] = [("reference", {})]
     ends += [(f"{axis.name} {end:+g}", {axis.name: end}) for axis in family.axes for end in (axis.low, axis.high)]
     for label, mode in ends:
-        act = laboratory.act_in_mode(name, family.vector(mode))
+        act = simulation.act_in_mode(name, family.vector(mode))
         made = [rollout(environment, act, FIRST_SCENARIO + 5000 + each) for each in range(scenarios)]
         lines.append(f"| {label} | " + " | ".join(_figures(made)) + " |")
     return "\n".join(lines)

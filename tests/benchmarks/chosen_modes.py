@@ -27,18 +27,19 @@ import numpy.typing as npt
 import torch
 from tqdm import tqdm
 
-from worker import laboratory
-from worker.compute import Compute, Lane
-from worker.contest import Bench, Cell, Terms
-from worker.laboratory import surface_file
-from worker.ml import acquisition, bradley_terry, pooled_prior
-from worker.ml.response_surface import CAUTION, ResponseSurface, best_mode
-from worker.ml.reward_models import RewardModel
+from worker.compute import simulation
+from worker.compute.pools import Compute, Lane
+from worker.compute.simulation import surface_file
+from worker.experiments.benchmark_cell import Bench, Cell, Terms
+from worker.experiments.rollout_cache import Shelf
+from worker.ml import acquisition
+from worker.ml.filters.response_surface import CAUTION, ResponseSurface, best_mode
+from worker.ml.rewards import bradley_terry, pooled_prior
+from worker.ml.rewards.reward_models import RewardModel
 from worker.ml.teachers import TASTES, Manner, Taste, User
-from worker.shelf import Shelf
-from worker.sim.catalogue import ENVIRONMENTS
 from worker.sim.costs import signal_weights, stakes
-from worker.tasks import Task
+from worker.task import Task
+from worker.tasks.registry import ENVIRONMENTS
 
 Floats = npt.NDArray[np.float64]
 
@@ -108,7 +109,7 @@ def answer(question: Question, work: Path) -> dict[str, Any]:
     """Regrets (U,) in %, by how much the own mode beats the best of the others' for each user, predicted success."""
     torch.set_num_threads(1)
     pooled_prior.DEVIATION, bradley_terry.LAPSES = question.choice.deviation, question.choice.lapses
-    task = laboratory.task(question.task)
+    task = simulation.task(question.task)
     surface = ResponseSurface.load(surface_file(task.name), task.modes)
     wishes = np.array([signal_weights(task, TASTES[user].omega, TASTES[user].per_signal) for user in USERS])
     unit = np.array([stake(task, TASTES[user]) for user in USERS]) / 100
@@ -132,7 +133,7 @@ def answer(question: Question, work: Path) -> dict[str, Any]:
 
 def stake(task: Task, taste: Taste) -> float:
     """What somebody minds and likes in an episode of the reference policy, in the mean."""
-    reference = laboratory.reference_rollouts(task.name)
+    reference = simulation.reference_rollouts(task.name)
     costs, signals = (
         np.mean([getattr(each, what).sum(axis=0) for each in reference], axis=0) for what in ("costs", "signals")
     )

@@ -16,9 +16,9 @@ import numpy as np
 from PIL import Image
 
 from tests.benchmarks.films import films
-from worker.sim.catalogue import ENVIRONMENTS
 from worker.sim.human import BODY_SHAPES
-from worker.sim.render import ClipRenderer
+from worker.sim.render.clip import ClipRenderer
+from worker.tasks.registry import ENVIRONMENTS
 from worker.trajectory import BODIES, SKIN_TONES, Trajectory
 
 FRAMES = 5

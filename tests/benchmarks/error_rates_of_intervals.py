@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from app.domain.preferences import Purpose, Response
-from app.services import accuracy, consistency
-from app.services.consistency import Answer
+from app.services.answers import accuracy, consistency
+from app.services.answers.consistency import Answer
 from worker.analysis.agreement import wilson_interval
 from worker.analysis.effect_sizes import d_z_interval, rank_biserial, rank_biserial_interval
 from worker.analysis.evaluation import mean_change, success_change

@@ -30,18 +30,19 @@ from tests.benchmarks import feedback_report
 from tests.benchmarks.chosen_modes import stake
 from tests.benchmarks.feedback_report import LINEAR, NAMED, Row
 from tests.benchmarks.pool_rollouts import Pool, pool_rollouts
-from worker import laboratory, lessons
-from worker.laboratory import surface_file
-from worker.ml import acquisition, calibration, reward_training
-from worker.ml.filter_problem import scenarios_for
-from worker.ml.pooled_prior import Prior
-from worker.ml.response_surface import ResponseSurface, best_mode
-from worker.ml.reward_models import RewardModel
-from worker.ml.reward_training import SignalScale
+from worker.compute import learning, simulation
+from worker.compute.simulation import surface_file
+from worker.ml import acquisition
+from worker.ml.filters.filter_problem import scenarios_for
+from worker.ml.filters.gate import signal_changes, successes
+from worker.ml.filters.response_surface import ResponseSurface, best_mode
+from worker.ml.rewards import calibration, reward_training
+from worker.ml.rewards.pooled_prior import Prior
+from worker.ml.rewards.reward_models import RewardModel
+from worker.ml.rewards.reward_training import SignalScale
 from worker.ml.teachers import TASTES, Manner, ScriptedTeacher, Taste, User, random_taste
-from worker.ml.trials import signal_changes, successes
-from worker.sim.catalogue import ENVIRONMENTS
 from worker.sim.costs import preference_rewards, signal_weights
+from worker.tasks.registry import ENVIRONMENTS
 from worker.trajectory import Array, Trajectory
 
 Floats = npt.NDArray[np.float64]
@@ -113,7 +114,7 @@ class Bench:
     """Pools and users of one task."""
 
     def __init__(self, task: str, pool_scenarios: int, most_labels: int) -> None:
-        self.task, self.most_labels = laboratory.task(task), most_labels
+        self.task, self.most_labels = simulation.task(task), most_labels
         steps = 100 if task == "drinking" else 60
         self.pool = pool_rollouts(task, POOL_FIRST, pool_scenarios, steps)
         self.unseen = pool_rollouts(task, UNSEEN_FIRST, UNSEEN_SCENARIOS, steps)
@@ -178,7 +179,7 @@ class Bench:
             chain.seed,
             scale=self.scale,
             prior=prior,
-            predictor=laboratory.signal_predictor(self.task.name) if chain.model == "predicted" else None,
+            predictor=simulation.signal_predictor(self.task.name) if chain.model == "predicted" else None,
         )
 
     def _row(self, chain: Chain, count: int, fitted: reward_training.FitResult) -> Measured:
@@ -223,16 +224,16 @@ class Bench:
         """The same in unseen scenarios."""
         name, reference = self.task.name, self.driven_reference
         scenarios = [each.scenario for each in reference]
-        filtered = lessons.run_scenarios(name, laboratory.act_in_mode(name, mode), scenarios, 0.0, 0)
+        filtered = learning.run_scenarios(name, simulation.act_in_mode(name, mode), scenarios, 0.0, 0)
         change = signal_changes(reference, filtered).mean(axis=0) @ self._true_weights(user)
         return self._percent(user, float(change)), 100 * float((successes(filtered) - successes(reference)).mean())
 
     @cached_property
     def driven_reference(self) -> list[Trajectory]:
         """The reference policy in the scenarios in which modes are driven."""
-        policy = laboratory.reference_policy(self.task.name)
+        policy = simulation.reference_policy(self.task.name)
         scenarios = scenarios_for("evaluation", DRIVEN_SCENARIOS)
-        return lessons.run_scenarios(self.task.name, policy.mean, scenarios, 0.0, 0)
+        return learning.run_scenarios(self.task.name, policy.mean, scenarios, 0.0, 0)
 
     def _percent(self, user: str, change: float) -> float:
         return 100 * change / stake(self.task, _taste(user))

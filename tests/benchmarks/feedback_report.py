@@ -17,7 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from worker.analysis.figures import LINE_COLOURS, MARKERS, STYLE, rendered
-from worker.sim.catalogue import ENVIRONMENTS
+from worker.tasks.registry import ENVIRONMENTS
 
 Row = dict[str, Any]
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 
-from worker import laboratory
+from worker.compute import simulation
 from worker.sim.rollout import rollout
 from worker.trajectory import Trajectory
 
@@ -12,5 +12,5 @@ FIRST_SCENARIO = 7_000
 def films(task: str, count: int, first: int = FIRST_SCENARIO) -> Iterator[Trajectory]:
     """The first behaviour of each of so many scenarios."""
     for scenario in range(first, first + count):
-        behaviour = laboratory.behaviours(task, scenario, 1)[0]
-        yield rollout(laboratory.environment(task), laboratory.act_as(task, behaviour), scenario)
+        behaviour = simulation.behaviours(task, scenario, 1)[0]
+        yield rollout(simulation.environment(task), simulation.act_as(task, behaviour), scenario)

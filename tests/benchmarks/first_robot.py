@@ -20,12 +20,14 @@ from app.domain.evaluation import Film, Trial
 from app.domain.models import Run, RunKind, RunStatus
 from app.domain.protocol import EvaluationSettings
 from app.domain.studies import PAPER_PROTOCOL, StudySettings
-from app.services import enrolment, evaluating, studies
+from app.services.evaluation import evaluation_plan
+from app.services.participants import enrolment
+from app.services.studies import studies
 from app.storage import ArtefactStore
 from worker.ml.teachers import TASTES, Manner
-from worker.own_studio import OwnStudio, wait_until
-from worker.scripted_person import ScriptedPerson
-from worker.visitor import Visitor
+from worker.rehearsal.browser import Visitor
+from worker.rehearsal.participant_steps import ScriptedPerson
+from worker.rehearsal.server import OwnStudio, wait_until
 
 LABELS, TRIALS = 12, 1
 PACE_S = 2.0
@@ -106,10 +108,10 @@ def _debriefed(database: Database, participant_id: int) -> bool:
     with database.reading() as session:
         films = session.scalars(
             select(Film.id).where(
-                Film.participant_id == participant_id, Film.scenario.in_(evaluating.COMPARISON_SCENARIOS)
+                Film.participant_id == participant_id, Film.scenario.in_(evaluation_plan.COMPARISON_SCENARIOS)
             )
         ).all()
-    return len(films) >= 2 * evaluating.COMPARED
+    return len(films) >= 2 * evaluation_plan.COMPARED
 
 
 def _report_runs(database: Database, participant_id: int) -> None:

@@ -31,7 +31,7 @@ from app.domain.models import ModelKind
 from app.domain.people import Experimenter
 from app.domain.preferences import LabelEvent, Query
 from app.domain.studies import Study
-from app.services import browser_sessions
+from app.services.accounts import browser_sessions
 from app.settings import Settings
 from app.storage import ArtefactStore
 from tests import factories

@@ -15,11 +15,11 @@ import numpy as np
 import numpy.typing as npt
 from tqdm import tqdm
 
-from worker import laboratory
+from worker.compute import simulation
 from worker.ml.acquisition import matched_pairs
-from worker.ml.segments import SegmentPairs
-from worker.sim.catalogue import ENVIRONMENTS
+from worker.ml.rewards.segments import SegmentPairs
 from worker.sim.rollout import rollout
+from worker.tasks.registry import ENVIRONMENTS
 
 Array = npt.NDArray[np.float32]
 Indices = npt.NDArray[np.int64]
@@ -90,9 +90,9 @@ def _block(task: str, first: int, scenarios: int, directory: Path) -> Pool:
 
 def _roll(task: str, first: int, scenarios: int) -> Pool:
     made = [
-        rollout(laboratory.environment(task), laboratory.act_as(task, behaviour), scenario)
+        rollout(simulation.environment(task), simulation.act_as(task, behaviour), scenario)
         for scenario in range(first, first + scenarios)
-        for behaviour in laboratory.behaviours(task, scenario, PER_SCENARIO)
+        for behaviour in simulation.behaviours(task, scenario, PER_SCENARIO)
     ]
     return Pool(
         np.stack([each.signals for each in made]),
@@ -105,9 +105,9 @@ def _roll(task: str, first: int, scenarios: int) -> Pool:
 
 def _fingerprint(task: str) -> str:
     """Changes with the policy and with the modes that are drawn; a change of the physics needs an empty folder."""
-    weights = laboratory.reference_policy(task).weights
+    weights = simulation.reference_policy(task).weights
     policy = b"".join(np.ascontiguousarray(weights[name]).tobytes() for name in sorted(weights))
-    drawn = repr([laboratory.behaviours(task, scenario, PER_SCENARIO) for scenario in range(3)])
+    drawn = repr([simulation.behaviours(task, scenario, PER_SCENARIO) for scenario in range(3)])
     return hashlib.sha256(policy + drawn.encode()).hexdigest()[:12]
 
 
@@ -119,7 +119,7 @@ def main() -> None:
     parser.add_argument("--scenarios", type=int, required=True)
     parser.add_argument("--directory", type=Path, default=DIRECTORY, help="where they are kept")
     options = parser.parse_args()
-    steps = laboratory.task(options.task).episode_steps
+    steps = simulation.task(options.task).episode_steps
     pool_rollouts(options.task, options.first, options.scenarios, steps, options.directory)
 
 

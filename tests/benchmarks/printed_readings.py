@@ -19,16 +19,16 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from worker import lessons
 from worker.analysis.evaluation import success_change
-from worker.contest import PAPER_USERS, Bench, Cell, Terms
-from worker.ml.filter_problem import act_of, scenarios_for
-from worker.ml.pbarl_printed import BETAS, OTHER_TASKS_BETAS, PrintedConfig
-from worker.ml.printed_filter import fit_printed
-from worker.ml.trials import successes
-from worker.shelf import Shelf
-from worker.sim.catalogue import ENVIRONMENTS
+from worker.compute import learning
+from worker.experiments.benchmark_cell import PAPER_USERS, Bench, Cell, Terms
+from worker.experiments.rollout_cache import Shelf
+from worker.ml.filters.filter_problem import act_of, scenarios_for
+from worker.ml.filters.gate import successes
+from worker.ml.filters.pbarl_printed import BETAS, OTHER_TASKS_BETAS, PrintedConfig
+from worker.ml.filters.printed_filter import fit_printed
 from worker.sim.costs import preference_rewards, stakes
+from worker.tasks.registry import ENVIRONMENTS
 from worker.trajectory import Trajectory
 
 LOSSES = ("rec", "pref", "kl", "dyn")
@@ -97,7 +97,7 @@ def _measured(task: str, name: str, options: argparse.Namespace) -> dict[str, An
     draft = fit_printed(problem, shelf.reference(scenarios_for("residual", setting.config.printed_rollouts)), config)
     act = act_of(problem.task.modes, problem.policy, draft.weights)
     scenarios = scenarios_for("evaluation", options.scenarios)
-    before, after = shelf.reference(scenarios), lessons.run_scenarios(task, act, scenarios, 0.0, 0)
+    before, after = shelf.reference(scenarios), learning.run_scenarios(task, act, scenarios, 0.0, 0)
     success = success_change(successes(before), successes(after))
     return {
         "task": task,

@@ -16,8 +16,8 @@ from collections.abc import Callable
 from functools import partial
 
 from tests.benchmarks.films import films
-from worker.sim.catalogue import ENVIRONMENTS
-from worker.sim.render import STYLES, ClipRenderer
+from worker.sim.render.clip import STYLES, ClipRenderer
+from worker.tasks.registry import ENVIRONMENTS
 from worker.trajectory import Trajectory
 
 

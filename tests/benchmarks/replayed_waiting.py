@@ -29,14 +29,18 @@ from app.domain.clips import Rollout
 from app.domain.models import ModelKind, Run, RunKind, RunStatus
 from app.domain.protocol import EvaluationSettings
 from app.domain.studies import PAPER_PROTOCOL, Participant, Study, StudySettings
-from app.services import studies
+from app.services.studies import studies
 from app.settings import Settings
 from app.storage import ArtefactStore
 from tests import factories
-from worker import laboratory, lessons, records, references, service, workflows
-from worker.compute import Lane
-from worker.records import Job
-from worker.workplace import Step, Workplace
+from worker.compute import learning as lessons
+from worker.compute import simulation
+from worker.compute.pools import Lane
+from worker.jobs import service, workflows
+from worker.jobs.learning import reference_rollouts
+from worker.jobs.runtime import records
+from worker.jobs.runtime.context import Step, Workplace
+from worker.jobs.runtime.records import Job
 
 LABELS, TRIALS, BEHAVIOURS = 12, 3, 6
 SLICE_S = 0.1
@@ -121,7 +125,7 @@ def serve() -> None:
             RunKind.REPORT: quick,
         }
     )
-    for module, name in ((laboratory, "warm_up"), (lessons, "warm_up"), (references, "make_ready")):
+    for module, name in ((simulation, "warm_up"), (lessons, "warm_up"), (reference_rollouts, "make_ready")):
         setattr(module, name, nothing)
     service.run(Settings())
 
@@ -186,12 +190,12 @@ class Lab:
         return run is not None and (run.status == RunStatus.SUCCEEDED or (ORDERED and run.progress > 0))
 
     def _foretold(self, person: Participant) -> int | None:
-        from app.services import preparing  # not in older trees
+        from app.services.evaluation import robot_preparation  # not in older trees
 
         with self.database.reading() as session:
             whole = session.get_one(Participant, person.id)
             whole.study = session.get_one(Study, whole.study_id)
-            return preparing.preparation(session, whole).seconds_left
+            return robot_preparation.preparation(session, whole).seconds_left
 
 
 def main() -> None:

@@ -21,16 +21,16 @@ import numpy as np
 from tqdm import tqdm
 
 from app.domain.studies import StudySettings
-from worker import lessons
-from worker.compute import Compute, Lane
-from worker.contest import Bench, Cell, Terms
-from worker.ml.bundle import Provenance
-from worker.ml.filter_problem import FilterConfig
+from worker.compute import learning
+from worker.compute.filter_fitting import Fitting
+from worker.compute.pools import Compute, Lane
+from worker.experiments.benchmark_cell import Bench, Cell, Terms
+from worker.experiments.rollout_cache import Shelf
+from worker.jobs.learning.reference_rollouts import make_ready
+from worker.ml.export.bundle import Provenance
+from worker.ml.filters.filter_problem import FilterConfig
 from worker.ml.teachers import TASTES
-from worker.personalisation import Fitting
-from worker.references import make_ready
-from worker.shelf import Shelf
-from worker.sim.catalogue import ENVIRONMENTS
+from worker.tasks.registry import ENVIRONMENTS
 from worker.trajectory import Trajectory
 
 STAGES = ("reward", "mode", "residual", "gates", "evaluation_and_bundle")
@@ -61,7 +61,7 @@ def _measured(task: str, user: str, options: argparse.Namespace) -> list[dict[st
     try:
         started = time.perf_counter()
         for lane in (Lane.REWARDS, Lane.LEARNING):
-            compute.warm_up(lane, partial(lessons.warm_up, task))
+            compute.warm_up(lane, partial(learning.warm_up, task))
         make_ready(compute, references, task, StudySettings())
         ahead = round(time.perf_counter() - started, 1)
         runs = [{**_run(task, user, bench, compute, references), "made_ready": ahead} for _ in range(2)]
@@ -83,7 +83,7 @@ def _run(
         marks.append(time.perf_counter())
 
     answers = (bench.labelled, bench.targets.astype(np.float32), bench.scale, 0)
-    reward, _ = compute.run(Lane.REWARDS, _no_beat, lessons.fit_reward, task, "structured", *answers)
+    reward, _ = compute.run(Lane.REWARDS, _no_beat, learning.fit_reward, task, "structured", *answers)
     mark()
     fitting = Fitting(
         task, compute, _no_beat, reward, 0, FilterConfig(), progress=lambda stage, share: None, references=references

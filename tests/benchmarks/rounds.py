@@ -22,7 +22,9 @@ from app.domain.studies import PAPER_PROTOCOL, Participant
 from app.settings import Settings
 from app.storage import ArtefactStore
 from tests import factories
-from worker import erasure, reconcile, records
+from worker.jobs import reconcile
+from worker.jobs.runtime import records
+from worker.jobs.upkeep import erasure
 
 CLIPS = 24
 REPEATS = 20

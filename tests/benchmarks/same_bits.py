@@ -22,17 +22,19 @@ from typing import get_args
 import numpy as np
 import torch
 
-from worker import laboratory
-from worker.contest import Bench, Cell, Terms
-from worker.ml import methods, reward_training, studio_filter
-from worker.ml.filter_problem import FilterConfig, act_of
-from worker.ml.methods import MethodConfig
-from worker.ml.preference_rl import PolicyAct
-from worker.ml.prefft import FineTuning
+from worker.compute import simulation
+from worker.experiments.benchmark_cell import Bench, Cell, Terms
+from worker.experiments.rollout_cache import Shelf
+from worker.ml.filters import pbarl
+from worker.ml.filters.filter_problem import FilterConfig, act_of
+from worker.ml.methods import registry
+from worker.ml.methods.preference_rl import PolicyAct
+from worker.ml.methods.prefft import FineTuning
+from worker.ml.methods.registry import MethodConfig
+from worker.ml.rewards import reward_training
 from worker.ml.teachers import TASTES, User
-from worker.shelf import Shelf
-from worker.sim.catalogue import ENVIRONMENTS
 from worker.sim.rollout import rollout
+from worker.tasks.registry import ENVIRONMENTS
 from worker.trajectory import Trajectory
 
 LIBRARIES = ("numpy", "scipy", "onnxruntime", "pybullet", "av", "pillow")
@@ -70,7 +72,7 @@ def main() -> None:
 
 def made(task: str, work: Path) -> Iterator[tuple[str, Iterable[bytes]]]:
     """What is compared, and its bytes."""
-    env, policy = laboratory.environment(task), laboratory.reference_policy(task)
+    env, policy = simulation.environment(task), simulation.reference_policy(task)
     rng = np.random.default_rng(SEED)
     yield (
         "physics under drawn actions",
@@ -81,13 +83,13 @@ def made(task: str, work: Path) -> Iterator[tuple[str, Iterable[bytes]]]:
         ),
     )
     seen = (policy.offset + rng.standard_normal((OBSERVATIONS, len(policy.offset)))).astype(np.float32)
-    frozen = [policy, *(laboratory.reference_policy(task, early) for early in laboratory.early_policies(task))]
+    frozen = [policy, *(simulation.reference_policy(task, early) for early in simulation.early_policies(task))]
     yield "actions of the frozen policies", (each.mean(seen).tobytes() for each in frozen)
 
     bench = Bench(Cell(task, TASTES[User.CAUTIOUS], "pbarl", SEED), TERMS, Shelf(task, work / "rollouts"), work)
     yield "behaviours of a pool", (part for each in bench.pool for part in arrays_of(each))
     yield "stored trajectories", (stored(each) for each in bench.pool)
-    filmed, renderer = bench.pool[0], laboratory.renderer("sharp")
+    filmed, renderer = bench.pool[0], simulation.renderer("sharp")
     yield "pictures", (picture.tobytes() for picture in renderer.pictures(filmed, 0, FILMED_STEPS))
     clip = renderer.render_clip(filmed, 0, FILMED_STEPS)
     yield "clip", [clip.video]
@@ -103,10 +105,10 @@ def learned(bench: Bench) -> Iterator[tuple[str, Iterable[bytes]]]:
     """What is learned with rollouts."""
     setting = bench.setting()
     gate = setting.reference(FILTER.gate_block(bench.task))
-    draft = studio_filter.fit_studio(setting.problem, setting.surface(), setting.pool, gate, setting.collect)
+    draft = pbarl.fit_studio(setting.problem, setting.surface(), setting.pool, gate, setting.collect)
     yield "filter", [draft.weights.to_bytes()]
     yield "filter.onnx", [act_of(bench.task.modes, setting.problem.policy, draft.weights).exported.stored]
-    tuned = methods.fit("prefft", setting).act
+    tuned = registry.fit("prefft", setting).act
     assert isinstance(tuned, PolicyAct)
     yield "fine-tuned policy", (array.tobytes() for _, array in sorted(tuned.policy.weights.items()))
 

@@ -19,10 +19,10 @@ from pathlib import Path
 import numpy as np
 
 import worker
-from worker.ml.policies import GaussianPolicy
+from worker.ml.policies.gaussian import GaussianPolicy
 from worker.sim.assistive import AssistiveEnv
-from worker.sim.catalogue import ENVIRONMENTS
-from worker.sim.drinking import DrinkingEnv
+from worker.tasks.drinking.environment import DrinkingEnv
+from worker.tasks.registry import ENVIRONMENTS
 
 BENCHMARK_STEPS_PER_S = {"feeding": 160.0, "drinking": 21.0, "scratching": 268.0}
 """Medians measured on a comparable core (facts sheet of Assistive Gym v1.0); Drinking with 64 pellets."""

@@ -11,10 +11,10 @@ import sys
 
 import numpy as np
 
-from worker import laboratory
-from worker.sim.catalogue import ENVIRONMENTS
+from worker.compute import simulation
 from worker.sim.costs import BASE_WEIGHTS, cost_items
 from worker.sim.rollout import Act, rollout
+from worker.tasks.registry import ENVIRONMENTS
 from worker.trajectory import COSTS
 
 FACTORS = (0.8, 0.9, 1.0, 1.1, 1.2)
@@ -28,13 +28,13 @@ def main() -> None:
     parser.add_argument("--scenarios", type=int, default=200)
     options = parser.parse_args()
     task, scenarios = options.task, range(FIRST_SCENARIO, FIRST_SCENARIO + options.scenarios)
-    env = laboratory.environment(task)
+    env = simulation.environment(task)
     sums = np.zeros((len(FACTORS), len(COSTS)))
     for row, factor in enumerate(FACTORS):
         successes = 0
         for scenario in scenarios:
             episode = rollout(env, scaled(task, factor), scenario)
-            items = cost_items(laboratory.task(task), episode.costs, episode.signals, "calibrated").sum(0)
+            items = cost_items(simulation.task(task), episode.costs, episode.signals, "calibrated").sum(0)
             sums[row] += items / len(scenarios)
             successes += episode.success
         printed = "  ".join(f"{name} {value:7.3f}" for name, value in zip(COSTS, sums[row], strict=True))
@@ -52,12 +52,12 @@ def main() -> None:
 
 def scaled(task: str, factor: float) -> Act:
     """The reference policy, faster or slower where its speed is a cost."""
-    described = laboratory.task(task)
+    described = simulation.task(task)
     if described.speed_counts_near:
-        policy = laboratory.reference_policy(task)
+        policy = simulation.reference_policy(task)
         return lambda seen: factor * policy.mean(seen)
     mode = described.modes.vector({"speed_far": float(np.log(factor)), "speed_near": float(np.log(factor))})
-    return laboratory.act_in_mode(task, np.array(mode))
+    return simulation.act_in_mode(task, np.array(mode))
 
 
 if __name__ == "__main__":

@@ -13,8 +13,8 @@ import numpy.typing as npt
 
 from worker.sim.arm import tool_jacobian
 from worker.sim.assistive import ARM, AssistiveEnv
-from worker.sim.catalogue import ENVIRONMENTS
 from worker.sim.seated_person import PERSON
+from worker.tasks.registry import ENVIRONMENTS
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -11,7 +11,7 @@ from app.db import Database
 from app.domain.models import ModelKind, RunStatus
 from app.domain.preferences import Response
 from app.domain.studies import Study
-from app.services import enrolment
+from app.services.participants import enrolment
 from app.storage import ArtefactStore
 from tests import factories
 from tests.browser.conftest import PATIENCE_MS

@@ -8,14 +8,14 @@ from app.db import Database
 from app.domain.models import Report
 from app.domain.people import Experimenter
 from app.domain.studies import Study
-from app.services import api_tokens
+from app.services.accounts import api_tokens
 from app.storage import ArtefactStore
 from tests import factories
 from tests.browser.conftest import NewPage, serious_findings
 from tests.finished_study import make_finished_study
-from worker import report_work
 from worker.analysis import figures
 from worker.analysis.report import make_report
+from worker.jobs.publishing import report_files
 
 pytestmark = pytest.mark.browser
 
@@ -31,7 +31,7 @@ def study(database: Database, store: ArtefactStore) -> Study:
 
 def report(database: Database, store: ArtefactStore, study: Study) -> None:
     with database.writing() as session:
-        contents, files = make_report(report_work.tables_of(session, study))
+        contents, files = make_report(report_files.tables_of(session, study))
         stored = {name: {kind: store.put(file) for kind, file in each.items()} for name, each in files.items()}
         run = factories.make_run(session, study, kind="report")
         session.add(Report(study_id=study.id, run_id=run.id, basis="", contents=contents, figures=stored))

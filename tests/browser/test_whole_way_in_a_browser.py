@@ -15,7 +15,7 @@ from app.domain.models import ModelKind
 from app.domain.participation import FormAnswer
 from app.domain.protocol import PAPER_DEMOGRAPHICS, USUAL_QUESTIONNAIRE, EvaluationSettings
 from app.domain.studies import Participant, Study
-from app.services import panel
+from app.services.participants import recruitment_panel
 from app.storage import ArtefactStore
 from tests import factories
 from tests.browser.conftest import NewPage, serious_findings, wait_ready
@@ -78,7 +78,7 @@ def open_study(database: Database, store: ArtefactStore, address: str) -> Callab
                 answer_after_first_play=False,
                 **settings,
             )
-            token = panel.open_joining(session, study, actor="pat")
+            token = recruitment_panel.open_joining(session, study, actor="pat")
         return Open(f"{address}/join/{token}", study, database, store)
 
     return make

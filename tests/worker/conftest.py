@@ -18,11 +18,11 @@ from app.domain.preferences import LabelEvent, Query, Response
 from app.domain.studies import Participant, Study, StudySettings
 from app.settings import Settings
 from app.storage import ArtefactStore
-from worker.compute import Compute
+from worker.compute.pools import Compute
+from worker.jobs.runtime.context import Workplace
+from worker.jobs.runtime.lanes import Turns
+from worker.jobs.workflows import Workshop
 from worker.trajectory import COSTS, SIGNALS, Trajectory
-from worker.turns import Turns
-from worker.workflows import Workshop
-from worker.workplace import Workplace
 
 STEPS = 20
 

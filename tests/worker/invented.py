@@ -6,11 +6,11 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
-from worker.ml import dense
-from worker.ml.policies import GaussianPolicy
-from worker.ml.segments import SegmentPairs
-from worker.ml.signal_predictor import SignalPredictor
-from worker.sim.feeding import FEEDING
+from worker.ml import dense_network
+from worker.ml.policies.gaussian import GaussianPolicy
+from worker.ml.rewards.segments import SegmentPairs
+from worker.ml.rewards.signal_predictor import SignalPredictor
+from worker.tasks.feeding.environment import FEEDING
 from worker.trajectory import COSTS, SIGNALS, Trajectory
 
 TASK = FEEDING
@@ -83,7 +83,9 @@ def predictor(seed: int = 0, hidden: int = 8) -> SignalPredictor:
         for array in (rng.standard_normal((fan_in, fan_out)) / fan_in**0.5, rng.standard_normal((1, fan_out)))
     ]
     zeros, ones = np.zeros(D + A, np.float32), np.ones(D + A, np.float32)
-    return SignalPredictor(dense.of_parameters(drawn), zeros, ones, zeros[:S], ones[:S], np.full(S, 9.0, np.float32))
+    return SignalPredictor(
+        dense_network.of_parameters(drawn), zeros, ones, zeros[:S], ones[:S], np.full(S, 9.0, np.float32)
+    )
 
 
 def pairs(count: int, rng: np.random.Generator, steps: int = 20) -> SegmentPairs:

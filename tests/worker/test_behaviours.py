@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from worker import laboratory
-from worker.behaviours import DIFFERENT_ENOUGH, Behaviour, draw_behaviours
-from worker.sim.catalogue import ENVIRONMENTS
+from worker.compute import simulation
+from worker.compute.behaviours import DIFFERENT_ENOUGH, Behaviour, draw_behaviours
+from worker.tasks.registry import ENVIRONMENTS
 from worker.trajectory import Trajectory
 
 EARLY = ["success_40", "success_70"]
@@ -20,14 +20,14 @@ def name(request: pytest.FixtureRequest) -> str:
 
 
 def test_the_same_scenario_has_the_same_behaviours_and_another_one_others(name: str) -> None:
-    first = laboratory.behaviours(name, 11, 4)
-    assert first == laboratory.behaviours(name, 11, 4)
-    assert first != laboratory.behaviours(name, 12, 4)
+    first = simulation.behaviours(name, 11, 4)
+    assert first == simulation.behaviours(name, 11, 4)
+    assert first != simulation.behaviours(name, 12, 4)
     assert len({str(each.described()) for each in first}) == 4
 
 
 def test_every_kind_of_behaviour_occurs_and_plain_modes_are_the_rule(name: str) -> None:
-    task = laboratory.task(name)
+    task = simulation.task(name)
     drawn = [each for scenario in range(150) for each in draw_behaviours(task, scenario, 4, EARLY)]
     plain = [each for each in drawn if not (each.temperature or each.disturbance or each.checkpoint)]
     assert 0.73 < len(plain) / len(drawn) < 0.87
@@ -37,17 +37,17 @@ def test_every_kind_of_behaviour_occurs_and_plain_modes_are_the_rule(name: str) 
 
 
 def test_behaviours_of_one_scenario_differ_on_some_axis_by_almost_half_its_range(name: str) -> None:
-    family = laboratory.task(name).modes
+    family = simulation.task(name).modes
     width = np.array([axis.high - axis.low for axis in family.axes])
     for scenario in range(30):
-        drawn = draw_behaviours(laboratory.task(name), scenario, 4, EARLY)
+        drawn = draw_behaviours(simulation.task(name), scenario, 4, EARLY)
         modes = [np.array(family.vector(each.mode)) for each in drawn]
         for index, mode in enumerate(modes):
             assert all((np.abs(mode - other) / width).max() >= DIFFERENT_ENOUGH for other in modes[:index])
 
 
 def test_many_behaviours_on_few_axes_stand_closer_but_are_found() -> None:
-    task = laboratory.task("feeding")
+    task = simulation.task("feeding")
     narrow = replace(task, modes=replace(task.modes, axes=task.modes.axes[:1]))
     assert len({each.mode["speed_far"] for each in draw_behaviours(narrow, 3, 8)}) == 8
 
@@ -57,10 +57,10 @@ def test_many_behaviours_on_few_axes_stand_closer_but_are_found() -> None:
     [Behaviour(temperature=1.5, seed=(1, 2)), Behaviour({"speed_far": -0.4}, disturbance=0.2, seed=(1, 2))],
 )
 def test_chance_in_a_behaviour_comes_from_its_seed_alone(behaviour: Behaviour) -> None:
-    observation = laboratory.environment("feeding").reset(seed=3)[0]
+    observation = simulation.environment("feeding").reset(seed=3)[0]
 
     def actions() -> np.ndarray:
-        act = laboratory.act_as("feeding", behaviour)
+        act = simulation.act_as("feeding", behaviour)
         return np.array([act(observation) for _ in range(5)])
 
     np.testing.assert_array_equal(actions(), actions())
@@ -68,10 +68,10 @@ def test_chance_in_a_behaviour_comes_from_its_seed_alone(behaviour: Behaviour) -
 
 
 def test_an_early_policy_acts_differently_from_the_finished_one() -> None:
-    observation = laboratory.environment("feeding").reset(seed=3)[0]
+    observation = simulation.environment("feeding").reset(seed=3)[0]
     early, finished = (
-        laboratory.act_as("feeding", Behaviour(checkpoint=each))(observation)
-        for each in (laboratory.early_policies("feeding")[0], "")
+        simulation.act_as("feeding", Behaviour(checkpoint=each))(observation)
+        for each in (simulation.early_policies("feeding")[0], "")
     )
     assert np.abs(early - finished).max() > 0.02
 
@@ -79,5 +79,5 @@ def test_an_early_policy_acts_differently_from_the_finished_one() -> None:
 def test_what_is_stored_with_a_rollout_says_how_it_was_made() -> None:
     behaviour = Behaviour({"speed_far": -0.4, "press": 0.0}, disturbance=0.2, seed=(7, 1))
     assert behaviour.described() == {"mode": {"speed_far": -0.4, "press": 0.0}, "disturbance": 0.2, "seed": (7, 1)}
-    recorded = laboratory.record_clip("feeding", "quick", 7, behaviour, 0, 15)
+    recorded = simulation.record_clip("feeding", "quick", 7, behaviour, 0, 15)
     assert Trajectory.load(io.BytesIO(recorded.trajectory)).task == "feeding"

@@ -6,11 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from worker import benchmark, commands, contest
-from worker.benchmark import PROFILES, Selection, with_options
-from worker.contest import OPPOSED_USERS, PAPER_USERS, Cell, Terms
-from worker.ml.filter_problem import FilterConfig
-from worker.ml.methods import METHODS
+from worker import cli
+from worker.experiments import benchmark, benchmark_cell
+from worker.experiments.benchmark import PROFILES, Selection, with_options
+from worker.experiments.benchmark_cell import OPPOSED_USERS, PAPER_USERS, Cell, Terms
+from worker.ml.filters.filter_problem import FilterConfig
+from worker.ml.methods.registry import METHODS
 from worker.ml.teachers import Taste
 
 SHY = Taste("shy", (1.0, 3.0, 2.0, 2.0, 1.0, 1.0))
@@ -27,7 +28,7 @@ def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
     directory = tmp_path_factory.mktemp("benchmark")
     for method in ("reference", "pbarl"):
         for taste in (PAPER_USERS["cautious"], SHY):
-            contest.run_cell(Cell("feeding", taste, method, 0), TINY, directory)
+            benchmark_cell.run_cell(Cell("feeding", taste, method, 0), TINY, directory)
     return directory
 
 
@@ -56,7 +57,7 @@ def test_the_tables_are_written_from_whatever_is_finished(work: Path, tmp_path: 
     assert len(matrix) == 4
     page = (tmp_path / "table1.md").read_text()
     assert "shy (1, 3, 2, 2, 1, 1)" in page
-    assert f"as a hash: {contest.code_mark()} (4 runs)." in page
+    assert f"as a hash: {benchmark_cell.code_mark()} (4 runs)." in page
     assert (tmp_path / "pareto-feeding.svg").read_text().startswith("<svg")
     assert len(rows(tmp_path / "costs.csv")) == 4
 
@@ -75,7 +76,7 @@ def test_cells_of_other_terms_are_not_mixed_in(work: Path, tmp_path: Path) -> No
 
 def test_a_cell_run_again_gives_the_same_numbers(work: Path, tmp_path: Path) -> None:
     report(work, tmp_path / "before")
-    contest.run_cell(Cell("feeding", SHY, "pbarl", 0), TINY, work)
+    benchmark_cell.run_cell(Cell("feeding", SHY, "pbarl", 0), TINY, work)
     report(work, tmp_path / "after")
     assert (tmp_path / "before" / "table1.csv").read_text() == (tmp_path / "after" / "table1.csv").read_text()
 
@@ -113,19 +114,19 @@ def test_the_quick_profile_does_everything_a_little() -> None:
 
 
 def test_users_are_named_or_given_by_their_weights() -> None:
-    assert commands._taste("slow") == OPPOSED_USERS["slow"]
-    assert commands._taste("shy=1,3,2,2,1,1") == SHY
-    level = commands._taste("level=1,1,1,1,1,1,tilt_rad:0.3")
+    assert cli._taste("slow") == OPPOSED_USERS["slow"]
+    assert cli._taste("shy=1,3,2,2,1,1") == SHY
+    level = cli._taste("level=1,1,1,1,1,1,tilt_rad:0.3")
     assert (level.omega, level.per_signal) == ((1.0,) * 6, {"tilt_rad": 0.3})
     unknown_signal = "shy=1,1,1,1,1,1,noise:1"
     for wrong in ("nobody", "shy=1,2", "neutral=1,1,1,1,1,1", "a/b=1,1,1,1,1,1", "shy=a,1,1,1,1,1", unknown_signal):
         with pytest.raises(Exception, match="is none of"):
-            commands._taste(wrong)
+            cli._taste(wrong)
 
 
 def test_the_command_can_only_report(tmp_path: Path) -> None:
     arguments = ["benchmark", "--profile", "quick", "--report-only", "--work-directory", str(tmp_path)]
-    assert commands.run(arguments) == 0
+    assert cli.run(arguments) == 0
     assert not (tmp_path / "quick").exists()
 
 
@@ -134,5 +135,5 @@ def test_users_who_cannot_err_in_that_way_are_refused_in_words(
     wrong: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit):
-        commands.parser().parse_args(["benchmark", *wrong])
+        cli.parser().parse_args(["benchmark", *wrong])
     assert "number" in capsys.readouterr().err

@@ -18,14 +18,15 @@ import pytest
 from tests.waiting import PATIENCE_S
 from tests.worker import invented
 from worker.analysis.evaluation import evaluate
-from worker.ml import bundle, reward_training
-from worker.ml.action_filter import FilterWeights, build
-from worker.ml.bundle import BundleContents, BundleDamaged, Provenance, Recording
-from worker.ml.model_card import model_card
-from worker.ml.onnx_export import to_onnx
-from worker.ml.policies import GaussianPolicy
-from worker.ml.policy_onnx import policy_to_onnx
-from worker.ml.reward_models import StructuredReward, load_reward_model
+from worker.ml.export import bundle
+from worker.ml.export.bundle import BundleContents, BundleDamaged, Provenance, Recording
+from worker.ml.export.model_card import model_card
+from worker.ml.filters.filter_module import FilterWeights, build
+from worker.ml.filters.filter_onnx import to_onnx
+from worker.ml.policies.gaussian import GaussianPolicy
+from worker.ml.policies.policy_onnx import policy_to_onnx
+from worker.ml.rewards import reward_training
+from worker.ml.rewards.reward_models import StructuredReward, load_reward_model
 from worker.trajectory import SIGNALS
 
 POLICY = invented.small_policy()
@@ -181,7 +182,7 @@ def test_the_bundle_runs_on_its_own_and_confirms_itself(unzipped: Path) -> None:
 def test_the_script_needs_only_numpy_and_onnxruntime() -> None:
     code = (
         "import sys, runpy; sys.argv=['run_filter.py', '--help']\n"
-        "try: runpy.run_path('worker/ml/run_filter.py', run_name='__main__')\n"
+        "try: runpy.run_path('worker/ml/export/run_filter.py', run_name='__main__')\n"
         "except SystemExit: pass\n"
         "print([name for name in ('torch', 'safetensors', 'onnx', 'worker', 'app') if name in sys.modules])"
     )

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from tests.worker import invented
-from worker.ml.calibration import HeldOut, expected_calibration_error, fit_temperature, report
-from worker.ml.network_training import MlpTraining
-from worker.ml.reward_training import fit
+from worker.ml.rewards.calibration import HeldOut, expected_calibration_error, fit_temperature, report
+from worker.ml.rewards.network_training import MlpTraining
+from worker.ml.rewards.reward_training import fit
 from worker.trajectory import SIGNALS
 
 

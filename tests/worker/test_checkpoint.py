@@ -9,10 +9,11 @@ import pytest
 
 from tests.worker import invented
 from tests.worker.test_methods import POLICY, REWARD, World
-from worker.ml import checkpoint, preference_rl, prefft
-from worker.ml.checkpoint import Abandoned, Checkpoint, Paused
-from worker.ml.policies import GaussianPolicy
-from worker.ml.prefft import FineTuning
+from worker.ml.methods import preference_rl, prefft
+from worker.ml.methods.prefft import FineTuning
+from worker.ml.policies import checkpoint
+from worker.ml.policies.checkpoint import Abandoned, Checkpoint, Paused
+from worker.ml.policies.gaussian import GaussianPolicy
 
 CONFIG = FineTuning(steps=480, warm_up_steps=120, critic_first_updates=20, cloning_steps=50, tie_weight=1.0)
 DIES_AT = 300

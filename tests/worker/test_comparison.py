@@ -15,7 +15,7 @@ from worker.analysis.evaluation import success_change
 from worker.analysis.pareto import pareto_svg
 from worker.analysis.published import TABLE_1, published
 from worker.analysis.table_files import to_csv, to_markdown
-from worker.ml.methods import METHODS
+from worker.ml.methods.registry import METHODS
 
 USERS = ("neutral", "cautious", "impatient")
 N = 40

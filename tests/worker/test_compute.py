@@ -15,7 +15,7 @@ import pytest
 from tqdm import tqdm
 
 from tests.waiting import PATIENCE_S
-from worker.compute import Compute, ComputeLost, Interrupted, Lane
+from worker.compute.pools import Compute, ComputeLost, Interrupted, Lane
 
 
 def nothing() -> None:
@@ -194,7 +194,7 @@ def test_compute_processes_die_with_a_worker_that_is_killed() -> None:
     program = (
         "import os, sys\n"
         "from tests.worker.test_compute import nothing, own_pid\n"
-        "from worker.compute import Compute, Lane\n"
+        "from worker.compute.pools import Compute, Lane\n"
         "if __name__ == '__main__':\n"
         "    print(Compute(1).run(Lane.LEARNING, nothing, own_pid), flush=True)\n"
         "    sys.stdin.read()\n"
@@ -212,7 +212,7 @@ def test_compute_processes_die_with_a_worker_that_is_killed() -> None:
 def test_processes_with_nothing_left_to_do_leave_without_a_word() -> None:
     program = (
         "from tests.worker.test_compute import nothing, show_progress\n"
-        "from worker.compute import Compute, Lane\n"
+        "from worker.compute.pools import Compute, Lane\n"
         "if __name__ == '__main__':\n"
         "    compute = Compute(1)\n"
         "    compute.run(Lane.LEARNING, nothing, show_progress)\n"

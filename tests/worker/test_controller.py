@@ -16,16 +16,16 @@ import torch
 
 from tests.waiting import PATIENCE_S
 from tests.worker import invented
-from worker.ml import controller
-from worker.ml.action_filter import FilterWeights, build, state_of
-from worker.ml.adapter import ResidualAdapter
-from worker.ml.best_of_n import BestOfN
-from worker.ml.controller import Blinded
-from worker.ml.filter_problem import Act, act_of
-from worker.ml.pbarl_printed import PrintedEncoder
-from worker.ml.policy_module import FrozenPolicy
-from worker.ml.preference_rl import PolicyAct
-from worker.ml.run_controller import Controller
+from worker.ml.export import blinded_controller
+from worker.ml.export.blinded_controller import Blinded
+from worker.ml.export.run_controller import Controller
+from worker.ml.filters.action_encoder import ResidualAdapter
+from worker.ml.filters.filter_module import FilterWeights, build, state_of
+from worker.ml.filters.filter_problem import Act, act_of
+from worker.ml.filters.pbarl_printed import PrintedEncoder
+from worker.ml.methods.best_of_n import BestOfN
+from worker.ml.methods.preference_rl import PolicyAct
+from worker.ml.policies.torch_module import FrozenPolicy
 
 POLICY = invented.small_policy()
 FROZEN = FrozenPolicy(POLICY.weights)
@@ -58,16 +58,16 @@ ACTS: dict[str, Act] = {
 
 @pytest.fixture(scope="module")
 def models() -> dict[str, bytes]:
-    return {name: controller.of_act(act, SEEN) for name, act in ACTS.items()}
+    return {name: blinded_controller.of_act(act, SEEN) for name, act in ACTS.items()}
 
 
 def zipped(model: bytes, letter: str = "B") -> bytes:
-    return controller.write(Blinded(invented.TASK, "feeding-at-home", "P07", letter, model, SEEN))
+    return blinded_controller.write(Blinded(invented.TASK, "feeding-at-home", "P07", letter, model, SEEN))
 
 
 @pytest.mark.parametrize("weights", [studio_weights(), printed_weights()], ids=["studio", "printed"])
 def test_a_filter_and_its_policy_in_one_file_act_as_torch_does(weights: FilterWeights) -> None:
-    stored = controller.of_act(act_of(invented.TASK.modes, POLICY, weights), SEEN)
+    stored = blinded_controller.of_act(act_of(invented.TASK.modes, POLICY, weights), SEEN)
     with torch.no_grad():
         seen = torch.from_numpy(SEEN)
         expected = build(invented.TASK.modes, POLICY, weights)(seen, FROZEN(seen)[0]).numpy()
@@ -149,11 +149,11 @@ def test_a_damaged_controller_says_so(models: dict[str, bytes], tmp_path: Path) 
 
 
 def test_the_same_contents_give_the_same_bytes(models: dict[str, bytes]) -> None:
-    assert controller.of_act(ACTS["printed"], SEEN) == models["printed"]
+    assert blinded_controller.of_act(ACTS["printed"], SEEN) == models["printed"]
     digests = {hashlib.sha256(zipped(models["printed"])).hexdigest() for _ in range(2)}
     assert len(digests) == 1
 
 
 def test_what_is_neither_policy_nor_filter_is_refused() -> None:
-    with pytest.raises(controller.NotExportable, match="BestOfN"):
-        controller.of_act(BestOfN.__new__(BestOfN), SEEN)
+    with pytest.raises(blinded_controller.NotExportable, match="BestOfN"):
+        blinded_controller.of_act(BestOfN.__new__(BestOfN), SEEN)

@@ -12,7 +12,7 @@ from app.domain.preferences import Exclusion, LabelEvent, Query, Response
 from app.domain.studies import Participant
 from app.storage import ArtefactStore
 from tests.worker.conftest import STEPS, make_trajectory
-from worker import dataset
+from worker.jobs.learning import dataset
 
 AddClips = Callable[..., list[Clip]]
 Answer = Callable[[Clip, Clip, Response], Query]

@@ -17,12 +17,16 @@ from app.domain.evaluation import Film
 from app.domain.models import Report, RunKind
 from app.domain.preferences import Query
 from app.domain.studies import Participant, Study
-from app.services import demo
+from app.services.archives import demo_archive
 from app.storage import ArtefactStore
-from worker import demo_study, export_work, querying, reconcile, records, report_work
 from worker.analysis import figures
-from worker.compute import Compute
-from worker.workplace import Workplace
+from worker.compute.pools import Compute
+from worker.jobs import reconcile
+from worker.jobs.learning import query_selection
+from worker.jobs.publishing import export_files, report_files
+from worker.jobs.runtime import records
+from worker.jobs.runtime.context import Workplace
+from worker.rehearsal import demo_study
 
 
 class Here(Compute):
@@ -45,7 +49,7 @@ def place(database: Database, store: ArtefactStore) -> Workplace:
 def visitor(database: Database, store: ArtefactStore) -> Participant:
     """Whose link is printed at the first start."""
     with database.writing() as session:
-        demo.import_finished(session, store)
+        demo_archive.import_finished(session, store)
         return session.scalars(select(Participant).order_by(Participant.id)).all()[-1]
 
 
@@ -61,7 +65,7 @@ def test_its_settings_are_those_with_which_it_would_be_made_now(visitor: Partici
 
 
 def test_the_visitor_has_pairs_as_soon_as_the_worker_runs(visitor: Participant, place: Workplace) -> None:
-    querying.refill_queries(place, visitor.id)
+    query_selection.refill_queries(place, visitor.id)
     with place.database.reading() as session:
         queries = session.scalars(select(Query).where(Query.participant_id == visitor.id)).all()
     assert queries
@@ -82,10 +86,10 @@ def test_its_report_compares_the_methods(
 ) -> None:
     monkeypatch.setattr(figures, "DPI", 30)
     with place.database.reading() as session:
-        (job,) = report_work.due(session, session.get_one(Study, visitor.study_id))
+        (job,) = report_files.due(session, session.get_one(Study, visitor.study_id))
     with place.database.writing() as session:
         run_id = records.begin_run(session, job, seed=1)
-    report_work.make(place, job, run_id, lambda _name, function, *arguments: function(*arguments))
+    report_files.make(place, job, run_id, lambda _name, function, *arguments: function(*arguments))
     with place.database.reading() as session:
         contents = session.scalars(select(Report)).one().contents
     assert not contents["blinded"]
@@ -99,7 +103,7 @@ def test_its_report_compares_the_methods(
 def test_its_data_for_analysis_say_who_is_no_person(visitor: Participant, place: Workplace, tmp_path: Path) -> None:
     path = tmp_path / "data.zip"
     with place.database.reading() as session:
-        export_work.write_data(session, place, session.get_one(Study, visitor.study_id), path)
+        export_files.write_data(session, place, session.get_one(Study, visitor.study_id), path)
     with zipfile.ZipFile(path) as data:
         played = "P01 (neutral), P02 (cautious), P03 (impatient)"
         assert f"These participants are not people: {played}." in data.read("README.md").decode()

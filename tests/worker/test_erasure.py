@@ -12,17 +12,20 @@ from dbos import DBOS, SetWorkflowID
 from app.db import Database, now
 from app.domain.models import ModelKind, RunKind
 from app.domain.studies import Participant, Study
-from app.services import retirement, withdrawal
+from app.services.participants import withdrawal
+from app.services.studies import retirement
 from app.settings import Settings
 from app.storage import ArtefactStore
 from tests.waiting import PATIENCE_S, until
 from tests.worker.conftest import the_workshop
-from worker import engine, erasure, records, workflows
-from worker.compute import Compute
-from worker.reconcile import findings, short_of_queries
-from worker.records import Job
-from worker.workflows import Workshop, as_arguments
-from worker.workplace import Step, Workplace
+from worker.compute.pools import Compute
+from worker.jobs import workflows
+from worker.jobs.reconcile import findings, short_of_queries
+from worker.jobs.runtime import engine, records
+from worker.jobs.runtime.context import Step, Workplace
+from worker.jobs.runtime.records import Job
+from worker.jobs.upkeep import erasure
+from worker.jobs.workflows import Workshop, as_arguments
 
 MARK = b"ERASE-ME-"
 

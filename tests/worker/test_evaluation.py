@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from statsmodels.stats.proportion import proportion_confint
 
-from app.services import accuracy
+from app.services.answers import accuracy
 from tests.worker import invented
 from worker.analysis.agreement import wilson_interval
 from worker.analysis.evaluation import evaluate, mean_change, success_change

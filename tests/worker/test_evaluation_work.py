@@ -19,18 +19,20 @@ from app.domain.models import Model, ModelKind, Run, RunKind, RunStatus
 from app.domain.preferences import Query, Response
 from app.domain.protocol import EvaluatedMethod, EvaluationMode, EvaluationSettings
 from app.domain.studies import Participant, Study
-from app.services import evaluating
+from app.services.evaluation import evaluation_plan
 from app.storage import ArtefactStore
-from worker import reconcile, records
-from worker.compute import Compute, Lane
-from worker.film_work import make_films
-from worker.method_work import train_method
-from worker.ml import filter_problem, prefft
-from worker.ml.action_filter import FilterWeights
-from worker.ml.reward_models import StructuredReward
-from worker.records import Job
+from worker.compute.pools import Compute, Lane
+from worker.jobs import reconcile
+from worker.jobs.clips.evaluation_films import make_films
+from worker.jobs.learning.baselines import train_method
+from worker.jobs.runtime import records
+from worker.jobs.runtime.context import Workplace
+from worker.jobs.runtime.records import Job
+from worker.ml.filters import filter_problem
+from worker.ml.filters.filter_module import FilterWeights
+from worker.ml.methods import prefft
+from worker.ml.rewards.reward_models import StructuredReward
 from worker.trajectory import SIGNALS
-from worker.workplace import Workplace
 
 LABELS = 10
 
@@ -135,18 +137,18 @@ def test_after_the_last_label_every_method_is_trained_evaluated_and_filmed(
 
     with database.reading() as session:
         films = session.scalars(select(Film)).all()
-        trials = evaluating.trials_of(session, participant.id)
-        methods = {each.letter: each.method for each in evaluating.assignments_of(session, participant.id)}
+        trials = evaluation_plan.trials_of(session, participant.id)
+        methods = {each.letter: each.method for each in evaluation_plan.assignments_of(session, participant.id)}
     assert len(films) == 3 + 4
     assert all(place.store.has(film.video_sha256) and place.store.has(film.trajectory_sha256) for film in films)
     assert [trial.film is not None and trial.film.method for trial in trials] == [
         methods[trial.letter] for trial in trials
     ]
-    compared = [(film.method, film.scenario) for film in films if film.scenario in evaluating.COMPARISON_SCENARIOS]
+    compared = [(film.method, film.scenario) for film in films if film.scenario in evaluation_plan.COMPARISON_SCENARIOS]
     assert sorted(compared) == sorted(
         (method, scenario)
         for method in ("reference", "pbarl")
-        for scenario in evaluating.comparison_scenarios(participant)
+        for scenario in evaluation_plan.comparison_scenarios(participant)
     )
     trajectories = {film.trajectory_sha256 for film in films}
     assert len(trajectories) == len(films), "every method acts differently"
@@ -166,7 +168,7 @@ def test_for_a_physical_robot_every_letter_gets_a_controller(
     ]
     done(place, controllers, make_films)
     with database.reading() as session:
-        packed = evaluating.controllers_of(session, participant.id)
+        packed = evaluation_plan.controllers_of(session, participant.id)
     assert list(packed) == ["A", "B"]
     for letter, controller in packed.items():
         with zipfile.ZipFile(io.BytesIO(place.store.read(controller.artefact_sha256))) as archive:
@@ -230,7 +232,7 @@ def test_repeats_and_catch_pairs_after_the_last_label_ask_for_nothing_new(
 
 
 def test_scenarios_of_trials_and_comparisons_are_used_by_nothing_else() -> None:
-    ours = [evaluating.TRIAL_SCENARIOS, evaluating.COMPARISON_SCENARIOS]
+    ours = [evaluation_plan.TRIAL_SCENARIOS, evaluation_plan.COMPARISON_SCENARIOS]
     others = [range(first, first + 1_000_000) for first in filter_problem.SCENARIO_BLOCKS.values()]
     pool = range(reconcile.scenario_seed(0, 0), reconcile.scenario_seed(89_999, 999))
     spans = sorted([*ours, *others, pool], key=lambda span: span.start)

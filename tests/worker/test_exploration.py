@@ -4,16 +4,17 @@ from pathlib import Path
 
 import numpy as np
 
-from worker import exploration, laboratory
-from worker.exploration import BLOCK, MODES_PER_SCENARIO, Block
-from worker.ml.response_surface import ResponseSurface
+from worker.compute import simulation
+from worker.experiments import fit_response_surface
+from worker.experiments.fit_response_surface import BLOCK, MODES_PER_SCENARIO, Block
+from worker.ml.filters.response_surface import ResponseSurface
 
-FEEDING = laboratory.task("feeding")
+FEEDING = simulation.task("feeding")
 
 
 def sought(number: int, work: Path) -> list[Block]:
-    surface = ResponseSurface.load(laboratory.surface_file("feeding"), FEEDING.modes)
-    return exploration.sought_blocks(FEEDING, surface, number, work)
+    surface = ResponseSurface.load(simulation.surface_file("feeding"), FEEDING.modes)
+    return fit_response_surface.sought_blocks(FEEDING, surface, number, work)
 
 
 def test_modes_that_people_want_lie_at_the_edges_where_random_modes_are_rare(tmp_path: Path) -> None:

@@ -24,13 +24,16 @@ from app.domain.clips import Clip, Rollout
 from app.domain.models import Export
 from app.domain.preferences import Query, Response
 from app.domain.studies import Participant, Study
-from app.services import export_requests, export_tables
-from app.services.export_requests import ExportKind
+from app.services.exports import export_requests, export_tables
+from app.services.exports.export_requests import ExportKind
 from app.storage import ArtefactStore
-from worker import dataset, export_work, reconcile, records
-from worker.compute import Compute
+from worker.compute.pools import Compute
+from worker.jobs import reconcile
+from worker.jobs.learning import dataset
+from worker.jobs.publishing import export_files
+from worker.jobs.runtime import records
+from worker.jobs.runtime.context import Workplace
 from worker.trajectory import SIGNALS
-from worker.workplace import Workplace
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 AddClips = Callable[..., list[Clip]]
@@ -57,15 +60,15 @@ def make_export(place: Workplace, study: Study, kind: ExportKind = ExportKind.DA
     with place.database.writing() as session:
         export_requests.request(session, session.get_one(Study, study.id), kind, "experimenter")
     with place.database.reading() as session:
-        (job,) = export_work.due(session, session.get_one(Study, study.id))
+        (job,) = export_files.due(session, session.get_one(Study, study.id))
         assert job.finding in {each.finding for each, _ in reconcile.findings(session)}
     with place.database.writing() as session:
         run_id = records.begin_run(session, job, seed=1)
-    export_work.make(place, job, run_id, lambda _name, function, *arguments: function(*arguments))
+    export_files.make(place, job, run_id, lambda _name, function, *arguments: function(*arguments))
     with place.database.reading() as session:
         export = session.scalars(select(Export).order_by(Export.id.desc())).first()
         assert export is not None
-        assert export_work.due(session, session.get_one(Study, study.id)) == []
+        assert export_files.due(session, session.get_one(Study, study.id)) == []
     assert export.artefact_sha256 is not None
     return zipfile.ZipFile(io.BytesIO(place.store.read(export.artefact_sha256)))
 
@@ -102,9 +105,9 @@ def test_an_export_that_somebody_withdraws_from_while_it_is_made_is_made_again_w
     pairs: list[tuple[Clip, Clip]],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    from app.services import withdrawal
+    from app.services.participants import withdrawal
 
-    write, held = export_work.write_data, list[str]()
+    write, held = export_files.write_data, list[str]()
 
     def withdrawing(session: Session, place: Workplace, study: Study, path: Path) -> Any:
         missing = write(session, place, study, path)
@@ -114,7 +117,7 @@ def test_an_export_that_somebody_withdraws_from_while_it_is_made_is_made_again_w
             withdrawal.withdraw(another, place.store, another.get_one(Participant, participant.id), "P01")
         return missing
 
-    monkeypatch.setattr(export_work, "write_data", withdrawing)
+    monkeypatch.setattr(export_files, "write_data", withdrawing)
     made = make_export(place, study)
     assert ["P01," in each for each in held] == [True, False], "made twice"
     assert "withdrawn" in made.read("csv/participants.csv").decode()

@@ -9,10 +9,10 @@ import pytest
 import torch
 
 from tests.worker import invented
-from worker.ml.action_filter import FilterWeights, build, state_of
-from worker.ml.adapter import REACH, ResidualAdapter
-from worker.ml.onnx_export import ExportDiffers, OnnxFilter, largest_difference, to_onnx
-from worker.ml.policy_module import FrozenPolicy
+from worker.ml.filters.action_encoder import REACH, ResidualAdapter
+from worker.ml.filters.filter_module import FilterWeights, build, state_of
+from worker.ml.filters.filter_onnx import ExportDiffers, OnnxFilter, largest_difference, to_onnx
+from worker.ml.policies.torch_module import FrozenPolicy
 from worker.modes import ApproachModes
 
 POLICY = invented.small_policy()
@@ -132,7 +132,7 @@ def test_filters_of_several_tasks_can_be_exported_at_once() -> None:
 
 
 def test_an_export_that_differs_is_not_published(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("worker.ml.onnx_export.LARGEST_DIFFERENCE", -1.0)
+    monkeypatch.setattr("worker.ml.filters.filter_onnx.LARGEST_DIFFERENCE", -1.0)
     with pytest.raises(ExportDiffers, match="largest difference"):
         to_onnx(build(FAMILY, POLICY, FilterWeights(mode=MODE)), SEEN, MEANS)
 

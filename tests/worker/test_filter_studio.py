@@ -9,12 +9,12 @@ import pytest
 import torch
 
 from tests.worker import invented
-from worker.ml import filter_problem, mode_search, residual_learning, response_surface, studio_filter
-from worker.ml.action_filter import FilterWeights
-from worker.ml.filter_problem import FilterConfig, FilterDraft, FilterProblem, act_of, noisy
-from worker.ml.residual_learning import learn_round
-from worker.ml.response_surface import ResponseSurface
-from worker.ml.reward_models import StructuredReward
+from worker.ml.filters import filter_problem, mode_search, pbarl, residual, response_surface
+from worker.ml.filters.filter_module import FilterWeights
+from worker.ml.filters.filter_problem import FilterConfig, FilterDraft, FilterProblem, act_of, noisy
+from worker.ml.filters.residual import learn_round
+from worker.ml.filters.response_surface import ResponseSurface
+from worker.ml.rewards.reward_models import StructuredReward
 from worker.trajectory import SIGNALS, Trajectory
 
 POLICY = invented.small_policy()
@@ -109,7 +109,7 @@ def test_the_whole_fit_moves_the_robot_where_the_person_wants_it(
     torch.set_num_threads(1)
     told: list[tuple[str, float]] = []
     world = World()
-    draft = studio_filter.fit_studio(
+    draft = pbarl.fit_studio(
         problem(weight, reference),
         surface,
         [],
@@ -183,7 +183,7 @@ def test_a_residual_that_does_not_help_is_left_out_and_said_so(reference: list[T
     wrong = learn_round(
         problem(1.0, reference), FilterDraft(FilterWeights()), [World().collect(POLICY.mean, range(6), 0.3, 0)]
     )
-    gated = residual_learning.gate_residual(problem(-1.0, reference), wrong, reference, World().collect)
+    gated = residual.gate_residual(problem(-1.0, reference), wrong, reference, World().collect)
     assert gated.weights.residual_share == 0.0
     assert "residual" in gated.notes[0]
 
@@ -224,7 +224,7 @@ def test_a_round_that_made_it_worse_is_taken_back_and_the_next_step_is_half_as_b
         return replace(draft, weights=fast if len(rounds) == 1 else draft.weights)
 
     dislikes_speed = problem(-1.0, reference, residual_rounds=3, preference_weight=1.0)
-    found = residual_learning.train_residual(
+    found = residual.train_residual(
         dislikes_speed, FilterDraft(slow), World().collect, lambda stage, share: None, careless
     )
     assert came_from == [slow, slow, slow]

@@ -11,14 +11,14 @@ from app.domain.clips import Clip
 from app.domain.models import Model, ModelKind, RunKind
 from app.domain.preferences import LabelEvent, Query, Response
 from app.domain.studies import Participant, Study
-from app.services import accuracy
+from app.services.answers import accuracy
 from app.storage import ArtefactStore
-from worker import records
-from worker.compute import Compute
-from worker.filter_work import NothingToLearnFrom, notes_on_foresight, train_filter
-from worker.outdated import ending, filter_name, is_outdated
-from worker.records import Job
-from worker.workplace import Workplace
+from worker.compute.pools import Compute
+from worker.jobs.learning.filters import NothingToLearnFrom, notes_on_foresight, train_filter
+from worker.jobs.runtime import records
+from worker.jobs.runtime.context import Workplace
+from worker.jobs.runtime.due_work import ending, filter_name, is_outdated
+from worker.jobs.runtime.records import Job
 
 
 @pytest.fixture

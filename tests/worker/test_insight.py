@@ -10,14 +10,14 @@ from app.domain.clips import Clip
 from app.domain.studies import Participant, Strategy
 from app.storage import ArtefactStore
 from tests.worker import test_querying
-from worker import dataset, insight, querying
-from worker.compute import Compute
-from worker.laboratory import surface_file, task
-from worker.ml.advice import expected_regret
-from worker.ml.response_surface import ResponseSurface
-from worker.ml.reward_models import StructuredReward
+from worker.compute.pools import Compute
+from worker.compute.simulation import surface_file, task
+from worker.jobs.learning import dataset, query_selection, reward_metrics
+from worker.jobs.runtime.context import Workplace
+from worker.ml.filters.response_surface import ResponseSurface
+from worker.ml.rewards.reward_models import StructuredReward
+from worker.ml.stopping import expected_regret
 from worker.trajectory import COSTS, SIGNALS
-from worker.workplace import Workplace
 
 AddClips = Callable[..., list[Clip]]
 
@@ -33,7 +33,7 @@ def test_clips_are_ranked_by_what_the_model_likes(
     add_clips(1)
     add_clips(2)
     likes_one_signal = StructuredReward(np.tile(np.eye(len(SIGNALS))[2], (8, 1)))
-    ranking = insight.insight(place, participant.id, likes_one_signal.to_bytes())["ranking"]
+    ranking = reward_metrics.insight(place, participant.id, likes_one_signal.to_bytes())["ranking"]
     with place.database.reading() as session:
         clips = dataset.pool_clips(session, participant.study_id)
         sums = {
@@ -49,7 +49,7 @@ def test_clips_are_ranked_by_what_the_model_likes(
 def test_what_a_model_thinks_of_the_six_costs_is_found_whatever_it_was_learned_from(rng: np.random.Generator) -> None:
     costs = rng.standard_normal((60, 6)) * (1.0, 10.0, 0.1, 5.0, 1.0, 0.0)
     wishes = np.array([0.0, -0.3, 0.0, -0.2, 0.0, 0.0]) + 0.02 * rng.standard_normal((6, 6))
-    found = insight.weights_of_costs(costs, wishes @ costs.T)
+    found = reward_metrics.weights_of_costs(costs, wishes @ costs.T)
     weights = found["weights"]
     assert list(weights) == ["C_d", "C_v", "C_f", "C_hf", "C_fd"], "the last one is the same in all clips"
     assert [name for name, each in weights.items() if each["high"] < 0] == ["C_v", "C_hf"]
@@ -59,7 +59,7 @@ def test_what_a_model_thinks_of_the_six_costs_is_found_whatever_it_was_learned_f
 
 def test_a_model_that_wants_something_else_explains_little_by_the_costs(rng: np.random.Generator) -> None:
     costs, returns = rng.standard_normal((200, 6)), rng.standard_normal((8, 200))
-    found = insight.weights_of_costs(costs, returns)
+    found = reward_metrics.weights_of_costs(costs, returns)
     assert found["explained"] < 0.2
     assert np.mean([each["low"] < 0 < each["high"] for each in found["weights"].values()]) > 0.6
 
@@ -69,13 +69,15 @@ def test_a_model_says_what_it_thinks_of_the_costs_of_the_studys_clips(
 ) -> None:
     fears_spilling = StructuredReward(np.tile(-np.eye(len(SIGNALS))[SIGNALS.index("spilled_on_person")], (8, 1)))
     add_clips(1)
-    assert "costs" not in insight.insight(place, participant.id, fears_spilling.to_bytes()), "too few clips to tell"
+    assert "costs" not in reward_metrics.insight(place, participant.id, fears_spilling.to_bytes()), (
+        "too few clips to tell"
+    )
     for scenario in (2, 3, 4, 5):
         add_clips(scenario)
     with place.database.reading() as session:
         clips = dataset.pool_clips(session, participant.study_id)
-        assert len(clips) >= insight.FEWEST_CLIPS
-    found = insight.insight(place, participant.id, fears_spilling.to_bytes())["costs"]
+        assert len(clips) >= reward_metrics.FEWEST_CLIPS
+    found = reward_metrics.insight(place, participant.id, fears_spilling.to_bytes())["costs"]
     assert list(found["weights"]) == list(COSTS)
     assert 0.0 <= found["explained"] <= 1.0
 
@@ -109,7 +111,7 @@ def test_a_share_of_the_pairs_is_drawn_at_random_and_stored_as_such(
     test_querying.settle_on(place, Strategy.CONTESTED)
     for scenario in (1, 2, 3, 4):
         add_clips(scenario)
-    querying.refill_queries(place, participant.id)
+    query_selection.refill_queries(place, participant.id)
     queries = test_querying.queries_of(place.database, participant)
     uniform = [query for query in queries if query.strategy == Strategy.UNIFORM]
     chosen = [query for query in queries if query.strategy == Strategy.CONTESTED]

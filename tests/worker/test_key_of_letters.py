@@ -19,14 +19,17 @@ from app.domain.models import ModelKind, Run, RunKind
 from app.domain.preferences import Query, Response
 from app.domain.protocol import EvaluationMode, EvaluationSettings
 from app.domain.studies import Participant, Study
-from app.services import archive, evaluating, locking, unblinding
+from app.services.archives import archive
+from app.services.evaluation import evaluation_plan, unblinding
+from app.services.studies import locking
 from app.storage import ArtefactStore
 from tests import factories
 from tests.worker.test_evaluation_work import AtHand, done, due, learn, settle
-from worker import export_work, film_work
-from worker.film_work import make_films
-from worker.records import Job
-from worker.workplace import Workplace
+from worker.jobs.clips import evaluation_films
+from worker.jobs.clips.evaluation_films import make_films
+from worker.jobs.publishing import export_files
+from worker.jobs.runtime.context import Workplace
+from worker.jobs.runtime.records import Job
 
 METHODS = ("reference", "pbarl")
 MOMENT = re.compile(rb"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(\.\d+)?(\+00:00)?")
@@ -59,7 +62,9 @@ def all_said(add_clips: Callable[[int], list[Clip]], answer: Callable[[Clip, Cli
 def _keys() -> tuple[str, str]:
     """Two secrets that give the first participant other letters."""
     methods = EvaluationSettings(methods=METHODS).methods
-    by_order = {tuple(evaluating.order_of_methods(f"{each:064x}", methods, 1)): f"{each:064x}" for each in range(20)}
+    by_order = {
+        tuple(evaluation_plan.order_of_methods(f"{each:064x}", methods, 1)): f"{each:064x}" for each in range(20)
+    }
     one, other = by_order.values()
     return one, other
 
@@ -94,7 +99,7 @@ def _prepared_under(
         here = session.get_one(Study, study.id)
         assert unblinding.is_blinded(here)
         archive.write(session, place.store, here, folder / "study.zip")
-        export_work.write_data(session, place, here, folder / "data.zip")
+        export_files.write_data(session, place, here, folder / "data.zip")
         left = {
             "films": _rows(session.scalars(select(Film).order_by(Film.method)).all()),
             "controllers": _rows(session.scalars(select(Controller).order_by(Controller.method)).all()),
@@ -102,7 +107,7 @@ def _prepared_under(
             "archive": _from_outside(folder / "study.zip"),
             "data": _inside(folder / "data.zip"),
         }
-        letters = {each.letter: each.method for each in evaluating.assignments_of(session, participant.id)}
+        letters = {each.letter: each.method for each in evaluation_plan.assignments_of(session, participant.id)}
     return left, letters
 
 
@@ -128,7 +133,7 @@ def _inside(path: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.usefixtures("all_said")
-@pytest.mark.parametrize("what", [film_work.TRIALS, film_work.CONTROLLERS])
+@pytest.mark.parametrize("what", [evaluation_films.TRIALS, evaluation_films.CONTROLLERS])
 def test_the_order_in_which_robots_are_made_tells_no_method(
     place: Told, database: Database, study: Study, participant: Participant, what: str
 ) -> None:
@@ -144,13 +149,13 @@ def test_the_order_in_which_robots_are_made_tells_no_method(
             for table in (Trial, Assignment):
                 session.execute(delete(table))
             session.get_one(Study, study.id).key_secret = f"{number:064x}"
-        made = [method for method, *_ in film_work._plan(place, job, what)]
+        made = [method for method, *_ in evaluation_films._plan(place, job, what)]
         with database.reading() as session:
-            letters = {each.method: each.letter for each in evaluating.assignments_of(session, participant.id)}
+            letters = {each.method: each.letter for each in evaluation_plan.assignments_of(session, participant.id)}
         by_method.add(tuple(made))
         by_letter.add("".join(letters[method] for method in made))
     assert len(by_method) > 3
-    assert by_letter == {"ABC"} if what == film_work.TRIALS else len(by_letter) > 3
+    assert by_letter == {"ABC"} if what == evaluation_films.TRIALS else len(by_letter) > 3
 
 
 def test_the_seed_that_everybody_sees_does_not_tell_the_letters(database: Database, study: Study) -> None:
@@ -158,8 +163,8 @@ def test_the_seed_that_everybody_sees_does_not_tell_the_letters(database: Databa
     with database.writing() as session:
         stored = session.get_one(Study, study.id)
         stored.key_secret = "f" * 64
-        drawn = [evaluating.order_of_methods(stored.key_secret, methods, number) for number in range(1, 13)]
-        from_seed = [evaluating.order_of_methods(str(stored.seed), methods, number) for number in range(1, 13)]
+        drawn = [evaluation_plan.order_of_methods(stored.key_secret, methods, number) for number in range(1, 13)]
+        from_seed = [evaluation_plan.order_of_methods(str(stored.seed), methods, number) for number in range(1, 13)]
         assert drawn != from_seed
         locked = json.dumps(locking.document(stored))
     assert "f" * 64 not in locked

@@ -20,11 +20,11 @@ from app.domain.preferences import LabelEvent
 from app.domain.studies import StudySettings
 from app.storage import ArtefactStore
 from tests.waiting import PATIENCE_S
-from worker import dataset
-from worker.ml import bundle
+from worker.jobs.learning import dataset
+from worker.ml.export import bundle
 from worker.ml.teachers import TASTES, Manner
-from worker.own_studio import OwnStudio
-from worker.rehearsal import Outcome, Rehearsal
+from worker.rehearsal.rehearsal import Outcome, Rehearsal
+from worker.rehearsal.server import OwnStudio
 
 LABELS = 12
 SCENARIOS, BEHAVIOURS = 2, 4

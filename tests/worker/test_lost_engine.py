@@ -22,11 +22,12 @@ from app.settings import Settings
 from app.storage import ArtefactStore
 from tests.waiting import PATIENCE_S, until
 from tests.worker.conftest import the_workshop
-from worker import engine, reconcile, records, service, workflows
-from worker.compute import Compute
-from worker.records import Job
-from worker.workflows import Workshop, as_arguments
-from worker.workplace import Step, Workplace
+from worker.compute.pools import Compute
+from worker.jobs import reconcile, service, workflows
+from worker.jobs.runtime import engine, records
+from worker.jobs.runtime.context import Step, Workplace
+from worker.jobs.runtime.records import Job
+from worker.jobs.workflows import Workshop, as_arguments
 
 Damage = Callable[[Path], None]
 

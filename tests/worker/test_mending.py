@@ -17,13 +17,16 @@ from app.domain.studies import Participant, Study
 from app.storage import ArtefactStore
 from tests import factories
 from tests.worker.test_evaluation_work import AtHand, at_once
-from worker import laboratory, mending, reconcile, records
-from worker.clip_work import build_clips
-from worker.film_work import make_films
-from worker.mending import FilmLost, NotTheSameAgain
-from worker.records import Job
+from worker.compute import simulation
+from worker.jobs import reconcile
+from worker.jobs.clips import repairs
+from worker.jobs.clips.evaluation_films import make_films
+from worker.jobs.clips.pool_clips import build_clips
+from worker.jobs.clips.repairs import FilmLost, NotTheSameAgain
+from worker.jobs.runtime import records
+from worker.jobs.runtime.context import Workplace
+from worker.jobs.runtime.records import Job
 from worker.trajectory import Trajectory
-from worker.workplace import Workplace
 
 
 @pytest.fixture
@@ -35,7 +38,7 @@ def place(database: Database, store: ArtefactStore) -> Workplace:
 def clips(place: Workplace, study: Study) -> list[Clip]:
     """Of one scenario, really simulated and filmed."""
     job = next(job for job in due(place) if job.kind == RunKind.CLIPS)
-    assert not mending.is_about(job)
+    assert not repairs.is_about(job)
     work(place, job)
     with place.database.reading() as session:
         return list(session.scalars(select(Clip).order_by(Clip.id)))
@@ -49,7 +52,7 @@ def due(place: Workplace) -> list[Job]:
 
 def to_mend(place: Workplace) -> list[Job]:
     """What of that is about lost files."""
-    return [job for job in due(place) if mending.is_about(job)]
+    return [job for job in due(place) if repairs.is_about(job)]
 
 
 def work(place: Workplace, job: Job) -> None:
@@ -122,12 +125,12 @@ def test_another_recording_takes_its_place_only_where_nobody_has_answered(
     before = trajectory_of(place, clips[0])
     damage(place.store.path(before))
     assert not place.store.has(before)
-    simulate = laboratory.record_clip
+    simulate = simulation.record_clip
 
-    def differently(name: str, quality: str, scenario: int, *shot: Any) -> laboratory.RecordedClip:
+    def differently(name: str, quality: str, scenario: int, *shot: Any) -> simulation.RecordedClip:
         return simulate(name, quality, scenario + 1, *shot)
 
-    monkeypatch.setattr(laboratory, "record_clip", differently)
+    monkeypatch.setattr(simulation, "record_clip", differently)
     (job,) = to_mend(place)
     if answered:
         with pytest.raises(NotTheSameAgain, match="backup"):

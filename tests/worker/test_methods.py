@@ -11,15 +11,16 @@ import pytest
 import torch
 
 from tests.worker import invented
-from worker.ml import filter_problem, methods, pbrl_hri, preference_rl, prefft, response_surface
-from worker.ml.action_filter import load_state
-from worker.ml.best_of_n import BestOfN, fit_best_of_n
-from worker.ml.filter_problem import FilterConfig, FilterProblem, noisy
-from worker.ml.methods import METHODS, MethodConfig, Setting
-from worker.ml.pbrl_hri import FromScratch
-from worker.ml.prefft import FineTuning
-from worker.ml.reward_models import MlpReward, StructuredReward
-from worker.ml.value import ActionValue
+from worker.ml.filters import filter_problem, response_surface
+from worker.ml.filters.filter_module import load_state
+from worker.ml.filters.filter_problem import FilterConfig, FilterProblem, noisy
+from worker.ml.filters.fitted_q import ActionValue
+from worker.ml.methods import pbrl_hri, preference_rl, prefft, registry
+from worker.ml.methods.best_of_n import BestOfN, fit_best_of_n
+from worker.ml.methods.pbrl_hri import FromScratch
+from worker.ml.methods.prefft import FineTuning
+from worker.ml.methods.registry import METHODS, MethodConfig, Setting
+from worker.ml.rewards.reward_models import MlpReward, StructuredReward
 from worker.trajectory import SIGNALS, Trajectory
 
 POLICY = invented.small_policy()
@@ -109,13 +110,13 @@ def setting(action_reward: MlpReward) -> Setting:
 @pytest.mark.parametrize("name", METHODS)
 def test_every_method_gives_an_act_that_travels_and_is_the_same_again(name: str, setting: Setting) -> None:
     seen = invented.observations(3, np.random.default_rng(0))
-    fitted = methods.fit(name, setting)
+    fitted = registry.fit(name, setting)
     actions = np.array([fitted.act(each) for each in seen])
     assert actions.shape == (3, 7)
     assert np.abs(actions).max() <= 1.0
     travelled = pickle.loads(pickle.dumps(fitted.act))  # noqa: S301
     np.testing.assert_array_equal([travelled(each) for each in seen], actions)
-    again = methods.fit(name, setting)
+    again = registry.fit(name, setting)
     np.testing.assert_array_equal([again.act(each) for each in seen], actions)
     assert (again.environment_steps, again.labels) == (fitted.environment_steps, fitted.labels)
 
@@ -133,7 +134,7 @@ def test_every_method_gives_an_act_that_travels_and_is_the_same_again(name: str,
 def test_every_environment_step_a_method_asks_for_is_counted(
     name: str, steps: int, labels: int, setting: Setting
 ) -> None:
-    fitted = methods.fit(name, setting)
+    fitted = registry.fit(name, setting)
     assert (fitted.environment_steps, fitted.labels) == (steps, labels)
 
 
@@ -236,4 +237,4 @@ def test_best_of_n_chooses_what_is_liked_among_what_the_policy_would_do(best_of:
 
 def test_an_unknown_method_is_refused(setting: Setting) -> None:
     with pytest.raises(KeyError):
-        methods.fit("magic", setting)
+        registry.fit("magic", setting)

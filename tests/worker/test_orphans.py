@@ -12,9 +12,9 @@ from app.domain.models import ModelKind
 from app.domain.studies import Participant, Study
 from app.storage import ArtefactStore
 from tests import factories
-from worker import orphans
-from worker.compute import Compute
-from worker.workplace import Workplace
+from worker.compute.pools import Compute
+from worker.jobs.runtime.context import Workplace
+from worker.jobs.upkeep import unused_files
 
 TWO_DAYS_S = 2 * 24 * 3600
 
@@ -44,10 +44,10 @@ def test_old_files_that_nobody_refers_to_go_and_all_others_stay(place: Workplace
         study = session.get_one(Study, participant.study_id)
         model = factories.make_model(session, study, participant, ModelKind.REWARD, factories.reward_metrics())
         model.artefact_sha256 = used = stored(place, b"a model")
-    assert orphans.clear_away(place, {promised}) == 1
+    assert unused_files.clear_away(place, {promised}) == 1
     assert not place.store.has(lost)
     assert all(place.store.has(each) for each in (promised, wanted_again, fresh, used))
-    assert orphans.clear_away(place, {promised}) == 0
+    assert unused_files.clear_away(place, {promised}) == 0
 
 
 def test_what_was_never_written_to_its_end_goes_as_well(place: Workplace) -> None:
@@ -56,5 +56,5 @@ def test_what_was_never_written_to_its_end_goes_as_well(place: Workplace) -> Non
     for path in (old, young):
         path.write_bytes(b"half")
     age(old)
-    orphans.clear_away(place, ())
+    unused_files.clear_away(place, ())
     assert (old.exists(), young.exists()) == (False, True)

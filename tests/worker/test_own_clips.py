@@ -18,17 +18,20 @@ from app.domain.clips import Clip, Rollout
 from app.domain.models import Model, ModelKind, RunKind
 from app.domain.preferences import Query, Response
 from app.domain.studies import Participant, Study
-from app.services import enrolment
+from app.services.participants import enrolment
 from app.storage import ArtefactStore
 from tests import factories
-from worker import dataset, preference_arrays, querying, reconcile, records
-from worker.compute import Compute
-from worker.import_work import ClipsInvalid, import_clips
-from worker.ml.reward_models import StructuredReward, load_reward_model
-from worker.records import Job
-from worker.reward_work import train_reward
-from worker.sim.video import encode_mp4, playable
-from worker.workplace import Workplace
+from worker.compute.pools import Compute
+from worker.jobs import reconcile
+from worker.jobs.clips.import_clips import ClipsInvalid, import_clips
+from worker.jobs.learning import dataset, query_selection
+from worker.jobs.learning.reward_models import train_reward
+from worker.jobs.publishing import preference_arrays
+from worker.jobs.runtime import records
+from worker.jobs.runtime.context import Workplace
+from worker.jobs.runtime.records import Job
+from worker.ml.rewards.reward_models import StructuredReward, load_reward_model
+from worker.sim.render.video import encode_mp4, playable
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 WAYS = ("slow_far", "slow_near", "fast_far", "fast_near")
@@ -130,7 +133,7 @@ def _answer_everything(place: Workplace, own: Study) -> int:
         participant, _ = enrolment.add_participant(session, own)
         person = participant.id
     for _ in range(3):
-        querying.refill_queries(place, person)
+        query_selection.refill_queries(place, person)
         with place.database.writing() as session:
             for query in records.unanswered(session, person, *dataset.CLIPS_AND_ROLLOUTS):
                 left, right = (
@@ -299,7 +302,7 @@ def test_a_long_video_is_looked_at_picture_by_picture() -> None:
 def test_pairs_whose_videos_are_lost_make_room_for_others(place: Workplace, own: Study) -> None:
     with place.database.writing() as session:
         participant, _ = enrolment.add_participant(session, own)
-    querying.refill_queries(place, participant.id)
+    query_selection.refill_queries(place, participant.id)
 
     def waiting() -> list[Query]:
         with place.database.reading() as session:
@@ -314,13 +317,13 @@ def test_pairs_whose_videos_are_lost_make_room_for_others(place: Workplace, own:
     with place.database.reading() as session:
         assert reconcile.with_lost_queries(session, place.store.lost()) != []
         assert list(reconcile.findings(session, place.store.lost())) == [], "nobody can film another lab's robot again"
-    querying.refill_queries(place, participant.id)
+    query_selection.refill_queries(place, participant.id)
     after = waiting()
     showing = [query.id for query in after if lost.id in (query.left_clip_id, query.right_clip_id)]
     assert showing == [before[0].id], "the one in front of the participant may still be answered"
     with place.database.writing() as session:
         session.get_one(Query, before[0].id).served_at = now() - records.LIES_OPEN
-    querying.refill_queries(place, participant.id)
+    query_selection.refill_queries(place, participant.id)
     with place.database.reading() as session:
         shown = [clip for clip in dataset.pool_clips(session, own.id) if clip.id != lost.id]
         left_over = {frozenset((left.id, right.id)) for left, right in dataset.matched_pairs(shown)}

@@ -8,8 +8,8 @@ import pytest
 from app.domain.preferences import Purpose
 from app.domain.studies import StudySettings
 from tests.worker import invented
-from worker import pair_plan
-from worker.ml.segments import SegmentPairs, Stretch
+from worker.jobs.learning import query_plan
+from worker.ml.rewards.segments import SegmentPairs, Stretch
 from worker.trajectory import SIGNALS, Array
 
 WHOLE_STUDY = StudySettings(practice_pairs=2, introduction_pairs=10, repeated_pairs=20, catch_pairs=5)
@@ -28,7 +28,7 @@ def stretch(*, success: bool, delivered: bool, spilled: float = 0.0, shown: int 
 
 
 def test_every_pair_that_was_asked_for_is_in_the_plan() -> None:
-    plan = pair_plan.plan(WHOLE_STUDY, seed=4)
+    plan = query_plan.plan(WHOLE_STUDY, seed=4)
     assert [slot.ordinal for slot in plan] == list(range(1, 2 + WHOLE_STUDY.question_count + 1))
     counts = Counter(slot.purpose for slot in plan)
     assert counts == {
@@ -41,14 +41,14 @@ def test_every_pair_that_was_asked_for_is_in_the_plan() -> None:
 
 
 def test_practice_comes_first_and_whole_trajectories_before_clips() -> None:
-    purposes = [slot.purpose for slot in pair_plan.plan(WHOLE_STUDY, seed=4)]
+    purposes = [slot.purpose for slot in query_plan.plan(WHOLE_STUDY, seed=4)]
     assert purposes[:12] == [Purpose.PRACTICE] * 2 + [Purpose.INTRODUCTION] * 10
     assert not {Purpose.PRACTICE, Purpose.INTRODUCTION} & set(purposes[12:])
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_repeats_ask_different_earlier_labels_again_when_nobody_remembers(seed: int) -> None:
-    plan = pair_plan.plan(WHOLE_STUDY, seed)
+    plan = query_plan.plan(WHOLE_STUDY, seed)
     repeats = [slot for slot in plan if slot.purpose is Purpose.REPEAT]
     asked = [slot.repeats_ordinal or 0 for slot in repeats]
     assert len(set(asked)) == len(asked)
@@ -59,13 +59,13 @@ def test_repeats_ask_different_earlier_labels_again_when_nobody_remembers(seed: 
 
 def test_repeats_and_catch_pairs_are_spread_over_the_study() -> None:
     for purpose in (Purpose.REPEAT, Purpose.CATCH):
-        places = [slot.ordinal for slot in pair_plan.plan(WHOLE_STUDY, seed=4) if slot.purpose is purpose]
+        places = [slot.ordinal for slot in query_plan.plan(WHOLE_STUDY, seed=4) if slot.purpose is purpose]
         assert max(places) - min(places) > 80
 
 
 def test_the_plan_follows_from_the_seed_alone() -> None:
-    assert pair_plan.plan(WHOLE_STUDY, 4) == pair_plan.plan(WHOLE_STUDY.model_copy(), 4)
-    assert pair_plan.plan(WHOLE_STUDY, 4) != pair_plan.plan(WHOLE_STUDY, 5)
+    assert query_plan.plan(WHOLE_STUDY, 4) == query_plan.plan(WHOLE_STUDY.model_copy(), 4)
+    assert query_plan.plan(WHOLE_STUDY, 4) != query_plan.plan(WHOLE_STUDY, 5)
 
 
 @pytest.mark.parametrize(
@@ -77,7 +77,7 @@ def test_the_plan_follows_from_the_seed_alone() -> None:
     ],
 )
 def test_even_a_study_too_short_for_its_repeats_has_a_plan(settings: StudySettings) -> None:
-    plan = pair_plan.plan(settings, 1)
+    plan = query_plan.plan(settings, 1)
     assert len(plan) == settings.question_count
     for slot in plan:
         assert (slot.repeats_ordinal is not None) == (slot.purpose is Purpose.REPEAT)
@@ -86,8 +86,8 @@ def test_even_a_study_too_short_for_its_repeats_has_a_plan(settings: StudySettin
 
 def test_a_run_that_fails_beside_a_clean_success_has_an_obvious_answer() -> None:
     clean, failed = stretch(success=True, delivered=True), stretch(success=False, delivered=False)
-    assert pair_plan.obvious_answer(clean, failed) == "left"
-    assert pair_plan.obvious_answer(failed, clean) == "right"
+    assert query_plan.obvious_answer(clean, failed) == "left"
+    assert query_plan.obvious_answer(failed, clean) == "right"
 
 
 @pytest.mark.parametrize(
@@ -98,7 +98,7 @@ def test_a_run_that_fails_beside_a_clean_success_has_an_obvious_answer() -> None
     ],
 )
 def test_two_runs_that_end_well_are_a_matter_of_taste(other: Stretch) -> None:
-    assert pair_plan.obvious_answer(stretch(success=True, delivered=True), other) is None
+    assert query_plan.obvious_answer(stretch(success=True, delivered=True), other) is None
 
 
 @pytest.mark.parametrize(
@@ -109,11 +109,11 @@ def test_two_runs_that_end_well_are_a_matter_of_taste(other: Stretch) -> None:
     ],
 )
 def test_only_a_success_that_is_clean_and_seen_is_obviously_better(messy: Stretch) -> None:
-    assert pair_plan.obvious_answer(messy, stretch(success=False, delivered=False)) is None
+    assert query_plan.obvious_answer(messy, stretch(success=False, delivered=False)) is None
 
 
 def test_practice_shows_the_pairs_that_differ_most() -> None:
     rng = np.random.default_rng(3)
     alike = invented.trajectory(rng)
     pairs = [(alike, alike)] * 19 + [(alike, invented.trajectory(rng))]
-    assert pair_plan.very_different(SegmentPairs.cut(pairs))[0] == 19
+    assert query_plan.very_different(SegmentPairs.cut(pairs))[0] == 19

@@ -15,11 +15,13 @@ from app.domain.preferences import LabelEvent, Purpose, Query, Response
 from app.domain.studies import LONGEST_CLIP_STEPS, Participant, Study, TaskName
 from app.storage import ArtefactStore
 from tests.worker.conftest import STEPS, make_trajectory
-from worker import dataset, pair_plan, querying, reconcile, records, reward_work
-from worker.compute import Compute
-from worker.records import Job
+from worker.compute.pools import Compute
+from worker.jobs import reconcile
+from worker.jobs.learning import dataset, query_plan, query_selection, reward_models
+from worker.jobs.runtime import records
+from worker.jobs.runtime.context import Workplace
+from worker.jobs.runtime.records import Job
 from worker.trajectory import SIGNALS
-from worker.workplace import Workplace
 
 WHOLE = LONGEST_CLIP_STEPS[TaskName.FEEDING]
 ENDS = ("undelivered", "spilled_on_person", "high_force_n")
@@ -80,7 +82,7 @@ def queries_of(place: Workplace, participant: Participant) -> Sequence[Query]:
 def answer_all(place: Workplace, participant: Participant, response: Response = Response.LEFT) -> None:
     """Refill and answer until nothing more is asked."""
     for _ in range(10):
-        querying.refill_queries(place, participant.id)
+        query_selection.refill_queries(place, participant.id)
         with place.database.writing() as session:
             waiting = records.unanswered(session, participant.id)
             for query in waiting:
@@ -97,7 +99,7 @@ def test_the_queries_follow_the_plan_to_its_end(
     fill_pool(place, study)
     answer_all(place, participant)
     with place.database.reading() as session:
-        plan = pair_plan.plan(session.get_one(Study, study.id).settings, participant.seed)
+        plan = query_plan.plan(session.get_one(Study, study.id).settings, participant.seed)
     queries = queries_of(place, participant)
     assert [(query.ordinal, query.purpose) for query in queries] == [(slot.ordinal, slot.purpose) for slot in plan]
 
@@ -120,7 +122,7 @@ def test_while_whole_episodes_are_being_filmed_nobody_is_sent_ahead(
     settle(practice_pairs=1, introduction_pairs=5)
     for scenario in range(4):
         add_clips(scenario)
-    querying.refill_queries(place, participant.id)
+    query_selection.refill_queries(place, participant.id)
     assert [query.purpose for query in queries_of(place, participant)] == [Purpose.PRACTICE]
 
 
@@ -131,7 +133,7 @@ def test_a_repeat_asks_the_same_clips_again_on_the_sides_the_plan_says(
     fill_pool(place, study)
     answer_all(place, participant)
     with place.database.reading() as session:
-        plan = pair_plan.plan(session.get_one(Study, study.id).settings, participant.seed)
+        plan = query_plan.plan(session.get_one(Study, study.id).settings, participant.seed)
     by_ordinal = {query.ordinal: query for query in queries_of(place, participant)}
     repeats = [slot for slot in plan if slot.purpose is Purpose.REPEAT]
     assert len(repeats) == 4
@@ -165,14 +167,14 @@ def test_a_pool_without_an_obvious_pair_gives_repeats_instead_and_a_note(
     settle(catch_pairs=3)
     for scenario in range(4):
         add_runs(place, study, scenario, (True, True, True, True))
-    with caplog.at_level(logging.WARNING, logger="worker.querying"):
+    with caplog.at_level(logging.WARNING, logger="worker.jobs.learning.query_selection"):
         answer_all(place, participant)
-    instead = [query for query in queries_of(place, participant) if query.strategy == querying.NO_OBVIOUS_PAIR]
+    instead = [query for query in queries_of(place, participant) if query.strategy == query_selection.NO_OBVIOUS_PAIR]
     assert {(query.purpose, query.expected) for query in instead} == {(Purpose.REPEAT, None)}
     assert len(instead) == 3
     assert "no pair with an obvious answer" in caplog.text
     with place.database.reading() as session:
-        (note,) = reward_work.notes_on_pairs(session, participant.id)
+        (note,) = reward_models.notes_on_pairs(session, participant.id)
     assert note.startswith("3 catch pairs could not be had")
 
 
@@ -182,19 +184,19 @@ def test_a_catch_pair_waits_for_the_pool_to_grow_and_nobody_waits_for_it(
     settle(catch_pairs=3)
     for scenario in range(3):
         add_runs(place, study, scenario, (True, True, True, True))
-    querying.refill_queries(place, participant.id)
+    query_selection.refill_queries(place, participant.id)
     with place.database.writing() as session:
         waiting = records.unanswered(session, participant.id)
         for query in waiting[:-1]:
             session.add(LabelEvent(query_id=query.id, revision=1, response="left", client_uuid=f"{query.id}"))
-        plan = pair_plan.plan(session.get_one(Study, study.id).settings, participant.seed)
-    querying.refill_queries(place, participant.id)
+        plan = query_plan.plan(session.get_one(Study, study.id).settings, participant.seed)
+    query_selection.refill_queries(place, participant.id)
     caught = [slot.ordinal for slot in plan if slot.purpose is Purpose.CATCH]
     made = [query.ordinal for query in queries_of(place, participant)]
     assert caught[0] not in made
     assert max(made) > caught[0]
     add_runs(place, study, 3, (True, True, False, False))
-    querying.refill_queries(place, participant.id)
+    query_selection.refill_queries(place, participant.id)
     purposes = {query.ordinal: query.purpose for query in queries_of(place, participant)}
     assert purposes[caught[0]] == Purpose.CATCH
 
@@ -223,7 +225,7 @@ def test_models_are_due_by_labels_alone(
 ) -> None:
     settle(practice_pairs=2, introduction_pairs=2, repeated_pairs=4, catch_pairs=2)
     fill_pool(place, study)
-    querying.refill_queries(place, participant.id)
+    query_selection.refill_queries(place, participant.id)
     with place.database.writing() as session:
         waiting = records.unanswered(session, participant.id)
         for query in waiting[:11]:  # two of them practice
@@ -239,12 +241,12 @@ def test_only_labels_are_predicted(
 
     settle(practice_pairs=1, introduction_pairs=3, repeated_pairs=4, catch_pairs=2)
     fill_pool(place, study)
-    querying.refill_queries(place, participant.id)
+    query_selection.refill_queries(place, participant.id)
     with place.database.writing() as session:
         for query in records.unanswered(session, participant.id):
             session.add(LabelEvent(query_id=query.id, revision=1, response="right", client_uuid=f"{query.id}"))
     model_id = save_reward_model(place, participant)
-    querying.refill_queries(place, participant.id)
+    query_selection.refill_queries(place, participant.id)
     later = queries_of(place, participant)[12:]
     assert Purpose.REPEAT in {query.purpose for query in later}
     for query in later:
@@ -256,13 +258,13 @@ def test_a_newer_model_chooses_other_pairs_but_leaves_the_plan_as_it_is(
 ) -> None:
     settle(practice_pairs=1, introduction_pairs=2, repeated_pairs=4)
     fill_pool(place, study)
-    querying.refill_queries(place, participant.id)
+    query_selection.refill_queries(place, participant.id)
     before = [(query.ordinal, query.purpose) for query in queries_of(place, participant)]
     with place.database.writing() as session:
         records.drop_unseen_queries(session, participant.id, keep=3)
     kept = [query.ordinal for query in queries_of(place, participant)]
     assert kept == [1, 2, 3]
-    querying.refill_queries(place, participant.id)
+    query_selection.refill_queries(place, participant.id)
     assert [(query.ordinal, query.purpose) for query in queries_of(place, participant)] == before
 
 
@@ -280,8 +282,9 @@ def test_as_many_scenarios_are_filmed_whole_as_the_introduction_needs(
 def test_whole_episodes_are_filmed_of_the_rollouts_that_are_there(
     place: Workplace, study: Study, settle: Callable[..., None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from worker import clip_work, laboratory
-    from worker.sim.render import RenderedClip
+    from worker.compute import simulation
+    from worker.jobs.clips import pool_clips
+    from worker.sim.render.clip import RenderedClip
 
     settle(introduction_pairs=1)
     scenario = reconcile.scenario_seed(study.seed, 0)
@@ -295,14 +298,14 @@ def test_whole_episodes_are_filmed_of_the_rollouts_that_are_there(
         filmed.append((trajectory, first_step, step_count))
         return RenderedClip(b"video", b"poster", 640, 480, 15, step_count, 100 * step_count)
 
-    monkeypatch.setattr(laboratory, "film_again", film)
+    monkeypatch.setattr(simulation, "film_again", film)
     monkeypatch.setattr(
         place.compute, "run_all", lambda _lane, _beat, function, shots: [function(*shot) for shot in shots]
     )
     job = Job(f"clips/study-{study.id}/whole-{scenario}", RunKind.CLIPS, study.id)
     with place.database.writing() as session:
         run_id = records.begin_run(session, job, 0)
-    clip_work.build_clips(place, job, run_id, lambda _name, function, *arguments: function(*arguments))
+    pool_clips.build_clips(place, job, run_id, lambda _name, function, *arguments: function(*arguments))
     with place.database.reading() as session:
         rollouts = session.scalars(select(Rollout).order_by(Rollout.behaviour)).all()
         whole = session.scalars(select(Clip).where(Clip.step_count == WHOLE).order_by(Clip.id)).all()

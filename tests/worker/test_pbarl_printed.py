@@ -8,14 +8,14 @@ import torch
 from torch import Tensor
 
 from tests.worker import invented
-from worker.ml import pbarl_printed
-from worker.ml.action_filter import build
-from worker.ml.filter_problem import FilterProblem
-from worker.ml.network_training import MlpTraining, TransformerTraining
-from worker.ml.pbarl_printed import PrintedConfig, PrintedEncoder, reconstruction_loss
-from worker.ml.printed_filter import fit_printed
-from worker.ml.reward_models import StructuredReward
-from worker.ml.reward_training import fit
+from worker.ml.filters import pbarl_printed
+from worker.ml.filters.filter_module import build
+from worker.ml.filters.filter_problem import FilterProblem
+from worker.ml.filters.pbarl_printed import PrintedConfig, PrintedEncoder, reconstruction_loss
+from worker.ml.filters.printed_filter import fit_printed
+from worker.ml.rewards.network_training import MlpTraining, TransformerTraining
+from worker.ml.rewards.reward_models import StructuredReward
+from worker.ml.rewards.reward_training import fit
 from worker.trajectory import SIGNALS
 
 POLICY = invented.small_policy()

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from worker import personalisation
-from worker.ml.action_filter import FilterWeights
-from worker.ml.filter_problem import FilterDraft, Trial
+from worker.compute import filter_fitting
+from worker.ml.filters.filter_module import FilterWeights
+from worker.ml.filters.filter_problem import FilterDraft, Trial
 
 
 def test_a_draft_comes_back_as_it_was_stored() -> None:
@@ -16,7 +16,7 @@ def test_a_draft_comes_back_as_it_was_stored() -> None:
     )
     trial = Trial(gate=0.7, residual_share=0.0, preference=0.4, success_change=-0.01, p95_force_n=2.0)
     draft = FilterDraft(weights, {"value": np.ones(3, np.float32)}, (trial,), ("a note",), {"mode": 1.5})
-    again = personalisation.draft_from_bytes(personalisation.draft_to_bytes(draft))
+    again = filter_fitting.draft_from_bytes(filter_fitting.draft_to_bytes(draft))
     assert again.weights.mode == draft.weights.mode
     assert (again.weights.gate, again.trials, again.notes, again.seconds) == (
         draft.weights.gate,
@@ -30,6 +30,6 @@ def test_a_draft_comes_back_as_it_was_stored() -> None:
 
 @pytest.mark.parametrize(("delta", "warned"), [(-0.10, True), (-0.035, False), (0.01, False)])
 def test_a_filter_that_costs_more_success_than_allowed_warns_against_its_use(delta: float, warned: bool) -> None:
-    warnings = personalisation._warnings({"success": {"delta": delta}}, tolerance=0.035)
+    warnings = filter_fitting._warnings({"success": {"delta": delta}}, tolerance=0.035)
     assert bool(warnings) == warned
     assert all("Do not run this filter on a person" in warning for warning in warnings)

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import worker
-from worker.ml.policies import ACTION_STD_FLOOR, GaussianPolicy
+from worker.ml.policies.gaussian import ACTION_STD_FLOOR, GaussianPolicy
 
 CHECKPOINT = Path(worker.__file__).parent / "checkpoints" / "feeding" / "policy.safetensors"
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from tests.worker import invented
-from worker.ml.pooled_prior import Prior, prior_of
-from worker.ml.reward_models import StructuredReward
-from worker.ml.reward_training import SignalScale, fit, posterior
+from worker.ml.rewards.pooled_prior import Prior, prior_of
+from worker.ml.rewards.reward_models import StructuredReward
+from worker.ml.rewards.reward_training import SignalScale, fit, posterior
 from worker.trajectory import SIGNALS
 
 SIZE = len(SIGNALS)

@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from worker import lessons
 from worker.analysis.proof import case_against
-from worker.compute import Compute
-from worker.ml import bundle
-from worker.ml.action_filter import FilterWeights
-from worker.ml.bundle import Provenance
-from worker.ml.filter_problem import Act, FilterConfig, FilterDraft
-from worker.ml.reward_models import StructuredReward
-from worker.personalisation import Finished, Fitting
+from worker.compute import learning
+from worker.compute.filter_fitting import Finished, Fitting
+from worker.compute.pools import Compute
+from worker.ml.export import bundle
+from worker.ml.export.bundle import Provenance
+from worker.ml.filters.filter_module import FilterWeights
+from worker.ml.filters.filter_problem import Act, FilterConfig, FilterDraft
+from worker.ml.rewards.reward_models import StructuredReward
 from worker.trajectory import SIGNALS, Trajectory
 
 
@@ -61,7 +61,7 @@ class HereAndNow(Fitting):
     """Rolls out in this process."""
 
     def collect(self, act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
-        return lessons.run_scenarios(self.task, act, scenarios, noise, seed)
+        return learning.run_scenarios(self.task, act, scenarios, noise, seed)
 
 
 def finish(weights: FilterWeights, liked: Mapping[str, float]) -> Finished:

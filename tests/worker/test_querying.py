@@ -15,12 +15,14 @@ from app.domain.models import ModelKind, Run
 from app.domain.preferences import Query, Response
 from app.domain.studies import Participant, Strategy, Study
 from app.storage import ArtefactStore
-from worker import dataset, querying, records, reward_work
-from worker.compute import Compute
-from worker.ml import acquisition, reward_training
-from worker.ml.reward_models import StructuredReward
+from worker.compute.pools import Compute
+from worker.jobs.learning import dataset, query_selection, reward_models
+from worker.jobs.runtime import records
+from worker.jobs.runtime.context import Workplace
+from worker.ml import acquisition
+from worker.ml.rewards import reward_training
+from worker.ml.rewards.reward_models import StructuredReward
 from worker.trajectory import SIGNALS
-from worker.workplace import Workplace
 
 AddClips = Callable[..., list[Clip]]
 Answer = Callable[[Clip, Clip, Response], Query]
@@ -44,7 +46,7 @@ def test_no_pair_comes_twice_on_whichever_side(place: Workplace, participant: Pa
     for scenario in (1, 2, 3):
         add_clips(scenario)
     for _ in range(3):
-        querying.refill_queries(place, participant.id)
+        query_selection.refill_queries(place, participant.id)
     queries = queries_of(place.database, participant)
     pairs = Counter(frozenset((query.left_clip_id, query.right_clip_id)) for query in queries)
     assert len(queries) == records.QUERIES_AHEAD
@@ -58,11 +60,11 @@ def test_the_same_study_gives_a_participant_the_same_pairs(
 ) -> None:
     for scenario in (1, 2, 3):
         add_clips(scenario)
-    querying.refill_queries(place, participant.id)
+    query_selection.refill_queries(place, participant.id)
     first = [(query.left_clip_id, query.right_clip_id) for query in queries_of(place.database, participant)]
     with place.database.writing() as session:
         records.drop_unseen_queries(session, participant.id, keep=0)
-    querying.refill_queries(place, participant.id)
+    query_selection.refill_queries(place, participant.id)
     assert [(query.left_clip_id, query.right_clip_id) for query in queries_of(place.database, participant)] == first
 
 
@@ -112,7 +114,7 @@ def test_waiting_queries_are_predicted_by_the_newest_model(
     for left, right in ((0, 1), (1, 2), (2, 3)):
         answer(clips[left], clips[right], Response.RIGHT)
     model_id = save_reward_model(place, participant)
-    querying.refill_queries(place, participant.id)
+    query_selection.refill_queries(place, participant.id)
     waiting = queries_of(place.database, participant)[3:]
     assert waiting
     assert {query.predicted_by_model_id for query in waiting} == {model_id}
@@ -127,12 +129,12 @@ def test_a_strategy_needs_a_model_and_until_then_pairs_are_random(
     clips = add_clips(1) + add_clips(2) + add_clips(3)
     for left, right in ((0, 1), (1, 2), (2, 3)):
         answer(clips[left], clips[right], Response.RIGHT)
-    querying.refill_queries(place, participant.id)
+    query_selection.refill_queries(place, participant.id)
     assert {query.strategy for query in queries_of(place.database, participant)[3:]} == {"uniform"}
     with place.database.writing() as session:
         records.drop_unseen_queries(session, participant.id, keep=0)
     save_reward_model(place, participant)
-    querying.refill_queries(place, participant.id)
+    query_selection.refill_queries(place, participant.id)
     chosen = queries_of(place.database, participant)[3:]
     assert {query.strategy for query in chosen} == {strategy, "uniform"}, "a share is always drawn at random"
     assert len({query.propensity for query in chosen[:1]} | {1 / 15}) == 2, "not every pair was equally likely"
@@ -144,7 +146,7 @@ def test_contested_pairs_are_found_with_the_paper_s_users_before_others_have_ans
     settle_on(place, Strategy.CONTESTED)
     add_clips(1)
     add_clips(2)
-    querying.refill_queries(place, participant.id)
+    query_selection.refill_queries(place, participant.id)
     queries = queries_of(place.database, participant)
     assert {query.strategy for query in queries} == {Strategy.CONTESTED, "uniform"}
     assert all(query.propensity >= 0.5 / 12 for query in queries), "half of the chance is spread over all pairs"
@@ -165,7 +167,7 @@ def test_contested_pairs_are_those_other_participants_disagree_about(
 
     disagreement = acquisition.contested
     monkeypatch.setattr(acquisition, "contested", contested)
-    querying.refill_queries(place, participant.id)
+    query_selection.refill_queries(place, participant.id)
     differences = differences_of_pairs(place, participant)
     assert np.argsort(seen[0]).tolist() == np.argsort(differences).tolist()
 
@@ -186,7 +188,7 @@ def test_contested_pairs_are_not_asked_where_this_person_s_own_model_is_sure(
         return choose(*arguments, **named)
 
     monkeypatch.setattr(acquisition, "choose", chosen)
-    querying.refill_queries(place, participant.id)
+    query_selection.refill_queries(place, participant.id)
     differs = differences_of_pairs(place, participant) > 0.0
     assert differs.any()
     assert scores[0][differs].max() < 1e-6
@@ -202,14 +204,14 @@ def test_a_pooled_prior_is_of_those_who_joined_before_and_have_answered_everythi
     with place.database.reading() as session:
         study = session.scalars(select(Study)).one()
         newcomers = [session.get_one(Participant, each) for each in (participant.id, finished, last)]
-        earlier = [reward_work.earlier_models(session, each, study) for each in newcomers]
+        earlier = [reward_models.earlier_models(session, each, study) for each in newcomers]
     assert [[model.participant_id for model in each] for each in earlier] == [[], [], [finished]]
 
 
 def two_who_disagree_about_the_first_signal(place: Workplace, participant: Participant) -> None:
     """Add two other participants who want the opposite of each other."""
     for number, sign in ((2, 1.0), (3, -1.0)):
-        somebody_else(place, participant, number, sign * FIRST_SIGNAL, querying.OTHERS_LABELS)
+        somebody_else(place, participant, number, sign * FIRST_SIGNAL, query_selection.OTHERS_LABELS)
 
 
 def differences_of_pairs(place: Workplace, participant: Participant) -> npt.NDArray[np.float64]:

@@ -13,7 +13,8 @@ from app.domain.models import Run, RunKind, RunStatus
 from app.domain.preferences import Exclusion, LabelEvent, Query, Response
 from app.domain.protocol import EvaluationSettings
 from app.domain.studies import Participant, Study, StudySettings
-from worker import outdated, reconcile, records
+from worker.jobs import reconcile
+from worker.jobs.runtime import due_work, records
 
 AddClips = Callable[..., list[Clip]]
 Answer = Callable[[Clip, Clip, Response], Query]
@@ -142,7 +143,7 @@ def test_a_failed_run_is_tried_again_a_few_times_and_then_only_when_somebody_ask
 
 def test_milestones_that_were_passed_in_the_meantime_are_skipped() -> None:
     settings = StudySettings(filter_milestones=(50, 100))
-    assert [outdated.filter_due(settings, count) for count in (49, 50, 99, 130, 199, 200)] == [
+    assert [due_work.filter_due(settings, count) for count in (49, 50, 99, 130, 199, 200)] == [
         0,
         50,
         50,
@@ -154,7 +155,7 @@ def test_milestones_that_were_passed_in_the_meantime_are_skipped() -> None:
 
 def test_the_end_is_a_retraining_even_when_the_cadence_does_not_divide_it() -> None:
     settings = StudySettings(labels_per_participant=25, retrain_every_labels=10)
-    assert [outdated.reward_due(settings, count) for count in (9, 10, 24, 25)] == [0, 10, 20, 25]
+    assert [due_work.reward_due(settings, count) for count in (9, 10, 24, 25)] == [0, 10, 20, 25]
 
 
 def test_queries_are_made_ahead_but_never_more_than_planned(
@@ -168,7 +169,7 @@ def test_queries_are_made_ahead_but_never_more_than_planned(
 
 
 def test_pool_scenarios_never_meet_the_ones_filters_are_evaluated_on() -> None:
-    from worker.ml.filter_problem import SCENARIO_BLOCKS
+    from worker.ml.filters.filter_problem import SCENARIO_BLOCKS
 
     assert max(SCENARIO_BLOCKS.values()) + 1_000_000 <= reconcile.scenario_seed(0, 0)
 

@@ -9,11 +9,11 @@ import pytest
 from app.db import Database
 from app.domain.studies import Method, StudySettings
 from app.storage import ArtefactStore
-from worker.compute import Compute
-from worker.filter_work import filter_config
-from worker.personalisation import Fitting
-from worker.references import make_ready, reference_blocks
-from worker.workplace import Workplace
+from worker.compute.filter_fitting import Fitting
+from worker.compute.pools import Compute
+from worker.jobs.learning.filters import filter_config
+from worker.jobs.learning.reference_rollouts import make_ready, reference_blocks
+from worker.jobs.runtime.context import Workplace
 
 SETTINGS = StudySettings(evaluation_scenarios=10)
 

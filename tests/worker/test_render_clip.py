@@ -8,22 +8,22 @@ import numpy.typing as npt
 import pytest
 
 from tests.worker.waving import itching_trajectory, pouring_trajectory, waving_trajectory
-from worker.sim import layers
 from worker.sim.arm import Tool
-from worker.sim.camera import scene_camera
-from worker.sim.catalogue import ENVIRONMENTS
-from worker.sim.close_up import close_up
-from worker.sim.feeding import SPOON, FeedingEnv
 from worker.sim.geometry import Shape, rotation_of
-from worker.sim.highlight import Highlight
 from worker.sim.human import BROAD, RIGHT
 from worker.sim.jaco import JACO
-from worker.sim.motion import clip_motion
-from worker.sim.render import INSET_MARGIN_PX, STYLES, ClipRenderer
-from worker.sim.scratching import SCRATCHER, ScratchingEnv
-from worker.sim.shots import Shot
-from worker.sim.stage import Stage
-from worker.sim.task_look import LOOKS
+from worker.sim.render import compositing
+from worker.sim.render.camera import scene_camera
+from worker.sim.render.clip import INSET_MARGIN_PX, STYLES, ClipRenderer
+from worker.sim.render.close_up import close_up
+from worker.sim.render.highlight import Highlight
+from worker.sim.render.interpolation import clip_motion
+from worker.sim.render.passes import Shot
+from worker.sim.render.stage import Stage
+from worker.sim.render.task_look import LOOKS
+from worker.tasks.feeding.environment import SPOON, FeedingEnv
+from worker.tasks.registry import ENVIRONMENTS
+from worker.tasks.scratching.environment import SCRATCHER, ScratchingEnv
 from worker.trajectory import Trajectory
 
 Picture = npt.NDArray[np.uint8]
@@ -159,13 +159,13 @@ def test_two_skin_tones_differ_in_the_face_only_and_share_the_still_picture(
 ) -> None:
     light = film(renderer, waving_trajectory(1, skin_tone=0))[0]
     drawn: list[int] = []
-    still = layers.View.still
+    still = compositing.View.still
 
-    def noted(view: layers.View, stage: Stage) -> Shot:
+    def noted(view: compositing.View, stage: Stage) -> Shot:
         drawn.append(view.width)
         return still(view, stage)
 
-    monkeypatch.setattr(layers.View, "still", noted)
+    monkeypatch.setattr(compositing.View, "still", noted)
     dark = film(renderer, waving_trajectory(1, skin_tone=5))[0]
     assert drawn == [renderer.style.inset_size[0]]
     trajectory = waving_trajectory(1)

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from tests.worker.waving import MOUNT, itching_trajectory, waving_trajectory
-from worker.sim.camera import lamp, scene_camera
-from worker.sim.feeding import SPOON
 from worker.sim.human import BROAD, LEFT, RIGHT
 from worker.sim.jaco import JACO
-from worker.sim.motion import Motion, clip_motion, quaternions, smoothly
-from worker.sim.rectangles import GRID_PX, cover, on_grid
-from worker.sim.task_look import FEEDING_LOOK, LOOKS, task_look
+from worker.sim.render.camera import lamp, scene_camera
+from worker.sim.render.interpolation import Motion, clip_motion, quaternions, smoothly
+from worker.sim.render.rectangles import GRID_PX, cover, on_grid
+from worker.sim.render.task_look import FEEDING_LOOK, LOOKS, task_look
+from worker.tasks.feeding.environment import SPOON
 from worker.trajectory import Trajectory
 
 MOUTH_M = np.array(BROAD.neck_pivot_m) + BROAD.mouth_from_neck_m

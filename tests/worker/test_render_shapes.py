@@ -5,21 +5,33 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from worker.sim import arm_look, body_look, chair_look, head_look, human, limb_look, tool_look
+from worker.sim import human
 from worker.sim.arm import Tool
-from worker.sim.camera import Camera
-from worker.sim.colours import COMPLEXIONS, Palette, ramps
-from worker.sim.drinking import CUP, PELLETS, pellet_radius_m, resting_places_m
-from worker.sim.feeding import SPOON
 from worker.sim.geometry import Shape
 from worker.sim.human import BODY_SHAPES, BROAD, BodyShape
 from worker.sim.jaco import JACO
-from worker.sim.meshes import Mesh, ball, curve, gradient, joined, openness, panel, surface, tube, without_hidden
-from worker.sim.scratching import SCRATCHER
-from worker.sim.shots import MACHINE_LIGHT
-from worker.sim.solids import Field, box, carve, cone, cylinder, ellipsoid, sphere, torus, union
-from worker.sim.stage import Paints, Stage
-from worker.sim.task_look import LOOKS
+from worker.sim.render.camera import Camera
+from worker.sim.render.meshes import arm_mesh, body_mesh, chair_mesh, head_mesh, limb_mesh, tool_mesh
+from worker.sim.render.meshes.colours import COMPLEXIONS, Palette, ramps
+from worker.sim.render.meshes.distance_fields import Field, box, carve, cone, cylinder, ellipsoid, sphere, torus, union
+from worker.sim.render.meshes.mesh import (
+    Mesh,
+    ball,
+    curve,
+    gradient,
+    joined,
+    openness,
+    panel,
+    surface,
+    tube,
+    without_hidden,
+)
+from worker.sim.render.passes import MACHINE_LIGHT
+from worker.sim.render.stage import Paints, Stage
+from worker.sim.render.task_look import LOOKS
+from worker.tasks.drinking.environment import CUP, PELLETS, pellet_radius_m, resting_places_m
+from worker.tasks.feeding.environment import SPOON
+from worker.tasks.scratching.environment import SCRATCHER
 from worker.trajectory import SKIN_TONES
 
 BALL = sphere((0.0, 0.0, 0.0), 0.1)
@@ -154,28 +166,28 @@ def test_full_light_is_not_wrapped_around_to_darkness() -> None:
 
 
 def test_the_mouth_is_open_wide_enough_for_the_spoon_and_no_wider_for_a_cup_or_nothing() -> None:
-    middle, features = head_look.MOUTH, head_look.FEATURES["broad"]
+    middle, features = head_mesh.MOUTH, head_mesh.FEATURES["broad"]
     bowl_edges = middle + np.array([[0.019, -0.005, 0.0], [-0.019, -0.005, 0.0], [0, 0.02, 0.008], [0, 0.02, -0.004]])
-    assert (head_look.face(features, LOOKS["feeding"].mouth)(bowl_edges) > 0).all()
+    assert (head_mesh.face(features, LOOKS["feeding"].mouth)(bowl_edges) > 0).all()
     below_the_rim = middle + np.array([[0.0, 0.0, -0.009]])
-    assert (head_look.face(features, LOOKS["drinking"].mouth)(below_the_rim) < 0).all()
-    assert (head_look.face(features, LOOKS["scratching"].mouth)(middle + np.array([[0.0, 0.004, 0.004]])) < 0).all()
+    assert (head_mesh.face(features, LOOKS["drinking"].mouth)(below_the_rim) < 0).all()
+    assert (head_mesh.face(features, LOOKS["scratching"].mouth)(middle + np.array([[0.0, 0.004, 0.004]])) < 0).all()
 
 
 def test_the_cup_is_cut_out_for_the_nose_and_whole_where_it_is_drunk_from() -> None:
-    for mesh in (tool_look.cup(arm_look.Detail(Palette())), tool_look.cup_glass(arm_look.Detail(Palette()))):
-        x, y, z = (mesh.vertices - tool_look.CUP_CENTRE_M).T
+    for mesh in (tool_mesh.cup(arm_mesh.Detail(Palette())), tool_mesh.cup_glass(arm_mesh.Detail(Palette()))):
+        x, y, z = (mesh.vertices - tool_mesh.CUP_CENTRE_M).T
         angle = np.arctan2(np.abs(y), x)
         assert z[angle < 0.5].max() == pytest.approx(0.0, abs=0.004)
-        assert z[angle > 2.9].max() == pytest.approx(-tool_look.NOSE_CUT_M, abs=0.004)
+        assert z[angle > 2.9].max() == pytest.approx(-tool_mesh.NOSE_CUT_M, abs=0.004)
 
 
 def test_water_in_a_level_cup_stays_below_the_cut() -> None:
-    assert resting_places_m(PELLETS)[:, 2].max() + pellet_radius_m(PELLETS) < -tool_look.NOSE_CUT_M + 0.002
+    assert resting_places_m(PELLETS)[:, 2].max() + pellet_radius_m(PELLETS) < -tool_mesh.NOSE_CUT_M + 0.002
 
 
 def test_the_mirror_image_of_a_mesh_still_faces_outwards() -> None:
-    arm = limb_look.arm_meshes(BROAD, Palette(), "shirt", BALL)
+    arm = limb_mesh.arm_meshes(BROAD, Palette(), "shirt", BALL)
     assert volume(arm["right_forearm"]) == pytest.approx(volume(arm["left_forearm"]))
     assert volume(arm["right_forearm"]) > 0
 
@@ -197,7 +209,7 @@ def test_faces_hidden_inside_another_solid_are_left_out_and_the_others_kept() ->
 def test_arms_lie_on_the_armrests_and_not_in_them(body: BodyShape) -> None:
     _, elbow, wrist, _ = human.arm_points_m(body, np.radians([0.0, 0.0, 0.0, 90.0]), human.LEFT)
     underside = (elbow + wrist) / 2 - [0.0, 0.0, body.forearm_radius_m]
-    gap = float(chair_look.chair(body)(underside[None])[0])
+    gap = float(chair_mesh.chair(body)(underside[None])[0])
     assert -0.002 < gap < 0.02
 
 
@@ -205,7 +217,7 @@ def test_arms_lie_on_the_armrests_and_not_in_them(body: BodyShape) -> None:
 @pytest.mark.parametrize("side", [human.RIGHT, human.LEFT])
 def test_drawn_arms_have_the_thickness_that_the_simulation_feels(body: BodyShape, side: int) -> None:
     name = ("right", "left")[side]
-    meshes = limb_look.arm_meshes(body, Palette(), "shirt", body_look.trunk(body))
+    meshes = limb_mesh.arm_meshes(body, Palette(), "shirt", body_mesh.trunk(body))
     bare = meshes[f"{name}_upper_arm"].vertices
     bare = bare[(bare[:, 2] < -0.62 * body.upper_arm_length_m) & (bare[:, 2] > -0.92 * body.upper_arm_length_m)]
     forearm = meshes[f"{name}_forearm"].vertices
@@ -216,15 +228,15 @@ def test_drawn_arms_have_the_thickness_that_the_simulation_feels(body: BodyShape
 
 @pytest.mark.parametrize("body", BODY_SHAPES.values(), ids=lambda body: body.name)
 def test_the_drawn_mouth_is_where_the_simulation_feeds(body: BodyShape) -> None:
-    drawn = head_look.MOUTH * body.head_scale
+    drawn = head_mesh.MOUTH * body.head_scale
     assert drawn == pytest.approx(np.array(body.mouth_from_neck_m), abs=0.001)
 
 
 @pytest.mark.parametrize("tool", [SPOON, CUP, SCRATCHER], ids=lambda tool: tool.name)
 def test_known_tools_have_a_designed_look_as_large_as_what_the_simulation_moves(tool: Tool) -> None:
-    detail = arm_look.Detail(Palette())
-    drawn = tool_look.tool_look(tool).solid(detail).vertices
-    felt = tool_look.plain(detail, tool.shapes).vertices
+    detail = arm_mesh.Detail(Palette())
+    drawn = tool_mesh.tool_look(tool).solid(detail).vertices
+    felt = tool_mesh.plain(detail, tool.shapes).vertices
     # The spoon's handle is drawn longer, for the hand to hold.
     assert drawn.min(axis=0) == pytest.approx(felt.min(axis=0), abs=0.065)
     assert drawn.max(axis=0) == pytest.approx(felt.max(axis=0), abs=0.013)
@@ -233,20 +245,20 @@ def test_known_tools_have_a_designed_look_as_large_as_what_the_simulation_moves(
 def test_a_tool_nobody_designed_is_drawn_from_its_collision_shapes() -> None:
     shapes = (Shape.box((0, 0, 0), (0.02, 0.04, 0.06)), Shape("capsule", 0.01, 0.1), Shape("sphere", 0.02))
     comb = Tool("comb", (0, 0, 0), (0, 0, 0), shapes, 0.1)
-    mesh = tool_look.tool_look(comb).solid(arm_look.Detail(Palette()))
+    mesh = tool_mesh.tool_look(comb).solid(arm_mesh.Detail(Palette()))
     assert mesh.vertices.max(axis=0) == pytest.approx([0.02, 0.02, 0.06], abs=0.002)
     assert volume(mesh) > 0
 
 
 def test_a_robot_nobody_designed_is_drawn_from_its_links() -> None:
-    links = arm_look.arm_meshes(arm_look.Detail(Palette()), replace(JACO, name="other"), arm_look.Grip(0.004))
+    links = arm_mesh.arm_meshes(arm_mesh.Detail(Palette()), replace(JACO, name="other"), arm_mesh.Grip(0.004))
     assert list(links) == [joint.link for joint in JACO.joints]
     assert all(volume(mesh) > 0 for mesh in links.values())
 
 
 def test_the_fingers_touch_the_handle_without_cutting_through_it() -> None:
-    detail = arm_look.Detail(Palette())
-    handle = tool_look.spoon(detail).vertices
+    detail = arm_mesh.Detail(Palette())
+    handle = tool_mesh.spoon(detail).vertices
     grip = handle[(handle[:, 0] > -0.155) & (handle[:, 0] < -0.105)]
     lowest_above, highest_below = _finger_gap(detail)
     assert lowest_above >= grip[:, 2].max() - 0.004
@@ -254,10 +266,10 @@ def test_the_fingers_touch_the_handle_without_cutting_through_it() -> None:
     assert lowest_above - highest_below < 0.016
 
 
-def _finger_gap(detail: arm_look.Detail) -> tuple[float, float]:
+def _finger_gap(detail: arm_mesh.Detail) -> tuple[float, float]:
     """Heights of the fingertips above and of the thumb below the handle, in the spoon's frame."""
-    grip = tool_look.tool_look(SPOON).grip
-    hand = arm_look.arm_meshes(detail, JACO, grip)["link_7"].vertices
+    grip = tool_mesh.tool_look(SPOON).grip
+    hand = arm_mesh.arm_meshes(detail, JACO, grip)["link_7"].vertices
     up = -hand[:, 1]  # the spoon's z axis is link 7's -y axis
     tips = (hand[:, 2] < -0.155) & (hand[:, 2] > -0.165)
     return float(up[tips & (up > 0)].min()), float(up[tips & (up < 0)].max())
@@ -265,7 +277,7 @@ def _finger_gap(detail: arm_look.Detail) -> tuple[float, float]:
 
 @pytest.mark.parametrize("body", BODY_SHAPES.values(), ids=lambda body: body.name)
 def test_the_same_code_always_makes_the_same_head(body: BodyShape) -> None:
-    first, second = (head_look.head_mesh(body, head_look.EATING, Palette()) for _ in range(2))
+    first, second = (head_mesh.head_mesh(body, head_mesh.EATING, Palette()) for _ in range(2))
     assert (first.vertices == second.vertices).all()
     assert (first.faces == second.faces).all()
     assert np.isfinite(first.vertices).all()

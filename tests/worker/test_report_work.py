@@ -14,15 +14,18 @@ from app.db import Database, now
 from app.domain.models import Report, Run, RunKind, RunStatus
 from app.domain.preferences import Exclusion, LabelEvent, Query
 from app.domain.studies import Participant, Study
-from app.services import export_tables, exporting, withdrawal
+from app.services.exports import export_formats, export_tables
+from app.services.participants import withdrawal
 from app.storage import ArtefactStore
 from tests import factories
 from tests.finished_study import make_finished_study
-from worker import reconcile, records, report_work
 from worker.analysis import figures
-from worker.compute import Compute
-from worker.records import Job
-from worker.workplace import Workplace
+from worker.compute.pools import Compute
+from worker.jobs import reconcile
+from worker.jobs.publishing import report_files
+from worker.jobs.runtime import records
+from worker.jobs.runtime.context import Workplace
+from worker.jobs.runtime.records import Job
 
 
 class Here(Compute):
@@ -54,7 +57,7 @@ def finished(database: Database, store: ArtefactStore) -> Study:
 
 def due(place: Workplace, study: Study) -> list[Job]:
     with place.database.reading() as session:
-        return report_work.due(session, session.get_one(Study, study.id))
+        return report_files.due(session, session.get_one(Study, study.id))
 
 
 def make_report(place: Workplace, study: Study) -> Report:
@@ -62,7 +65,7 @@ def make_report(place: Workplace, study: Study) -> Report:
     (job,) = due(place, study)
     with place.database.writing() as session:
         run_id = records.begin_run(session, job, seed=1)
-    report_work.make(place, job, run_id, lambda _name, function, *arguments: function(*arguments))
+    report_files.make(place, job, run_id, lambda _name, function, *arguments: function(*arguments))
     with place.database.writing() as session:
         records.finish_run(session, run_id)
         return session.scalars(select(Report)).one()
@@ -97,7 +100,7 @@ def test_a_new_rating_makes_a_new_report_but_not_at_once(place: Workplace, finis
     with place.database.writing() as session:
         factories.make_rated_trials(session, session.scalars(select(Participant)).first(), 1)  # type: ignore[arg-type]
     assert due(place, finished) == []
-    age(place, report_work.AT_MOST_EVERY)
+    age(place, report_files.AT_MOST_EVERY)
     second = make_report(place, finished)
     assert (second.id, second.basis) != (first.id, first.basis)
     with place.database.reading() as session:
@@ -122,11 +125,11 @@ def test_on_a_busy_machine_reports_do_not_keep_people_s_models_waiting(place: Wo
         session.get_one(Study, finished.id).unblinded_at = now() - timedelta(days=1)
         factories.make_rated_trials(session, session.scalars(select(Participant)).first(), 1)  # type: ignore[arg-type]
     slow, very_slow = timedelta(seconds=9), timedelta(minutes=9)
-    age(place, report_work.REST * slow - timedelta(seconds=1), slow)
+    age(place, report_files.REST * slow - timedelta(seconds=1), slow)
     assert due(place, finished) == []
-    age(place, report_work.REST * slow, slow)
+    age(place, report_files.REST * slow, slow)
     assert len(due(place, finished)) == 1
-    age(place, report_work.LONGEST_REST, very_slow)
+    age(place, report_files.LONGEST_REST, very_slow)
     assert len(due(place, finished)) == 1, "somebody wants to see the end of it"
 
 
@@ -182,7 +185,7 @@ def test_somebody_who_withdraws_while_a_report_is_made_is_in_no_report(place: Wo
             return function(*args, **kwargs)
 
     other = Workplace(place.database, place.store, Meanwhile())
-    stored = report_work._make(other, finished.id, run_id)
+    stored = report_files._make(other, finished.id, run_id)
     with place.database.reading() as session:
         assert session.scalars(select(Report)).all() == []
     assert not any(place.store.has(sha256) for sha256 in stored)
@@ -192,8 +195,8 @@ def test_numbers_of_the_report_are_those_of_the_exported_csv(place: Workplace, f
     report = make_report(place, finished)
     with place.database.reading() as session:
         study = session.get_one(Study, finished.id)
-        provenance = exporting.provenance_of(session, study)
-        lines = exporting.csv_lines(export_tables.BY_NAME["ratings"], session, study, provenance)
+        provenance = export_formats.provenance_of(session, study)
+        lines = export_formats.csv_lines(export_tables.BY_NAME["ratings"], session, study, provenance)
         table = pd.read_csv(io.StringIO("".join(lines)))
     table = table[table.counts]
     assert len(table) == 5 * 9

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from worker.ml.response_surface import ResponseSurface, best_mode, fit, monomials
-from worker.sim.feeding import FEEDING
+from worker.ml.filters.response_surface import ResponseSurface, best_mode, fit, monomials
+from worker.tasks.feeding.environment import FEEDING
 from worker.trajectory import SIGNALS
 
 FAMILY = FEEDING.modes

@@ -7,12 +7,12 @@ import pytest
 import torch
 
 from tests.worker import invented
-from worker.ml import bradley_terry, reward_training
-from worker.ml.network_training import MlpTraining, TransformerTraining
-from worker.ml.pooled_prior import DEVIATION
-from worker.ml.reward_models import CLIP, RewardModel, StructuredReward, load_reward_model, stored_config
-from worker.ml.reward_training import SignalScale, fit, posterior
-from worker.ml.segments import SegmentPairs
+from worker.ml.rewards import bradley_terry, reward_training
+from worker.ml.rewards.network_training import MlpTraining, TransformerTraining
+from worker.ml.rewards.pooled_prior import DEVIATION
+from worker.ml.rewards.reward_models import CLIP, RewardModel, StructuredReward, load_reward_model, stored_config
+from worker.ml.rewards.reward_training import SignalScale, fit, posterior
+from worker.ml.rewards.segments import SegmentPairs
 from worker.trajectory import SIGNALS
 
 KINDS: tuple[reward_training.Kind, ...] = ("structured", "predicted", "mlp", "preference_transformer")

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import torch
 
-from worker.ml import reference_training, sac
-from worker.ml.policies import GaussianPolicy
+from worker.ml.policies import pretraining, sac
+from worker.ml.policies.gaussian import GaussianPolicy
 from worker.spaces import Field, Space
 
 
@@ -59,11 +59,11 @@ CONFIG = sac.SacConfig(
 
 
 def test_it_learns_to_reach_and_writes_policy_and_record(tmp_path: Path) -> None:
-    record = reference_training.pretrain(Reach, CONFIG, tmp_path, command="test")
+    record = pretraining.pretrain(Reach, CONFIG, tmp_path, command="test")
     policy = GaussianPolicy.load(tmp_path / "policy.safetensors")
-    untrained = reference_training.evaluate(Reach(), lambda _: np.zeros(2, np.float32), 0, 50)
+    untrained = pretraining.evaluate(Reach(), lambda _: np.zeros(2, np.float32), 0, 50)
     assert untrained["success"] < 0.2
-    assert reference_training.evaluate(Reach(), policy.mean, 0, 50)["success"] > 0.9
+    assert pretraining.evaluate(Reach(), policy.mean, 0, 50)["success"] > 0.9
     assert record["test_mean_action"]["success"] > 0.9
     assert json.loads((tmp_path / "training.json").read_text())["steps"] == 3000
 
@@ -80,9 +80,9 @@ def test_a_killed_training_resumes_where_it_last_saved(tmp_path: Path) -> None:
             raise Killed
 
     with pytest.raises(Killed):
-        reference_training.pretrain(Reach, config, tmp_path, kill_at_1000)
+        pretraining.pretrain(Reach, config, tmp_path, kill_at_1000)
     seen: list[int] = []
-    record = reference_training.pretrain(Reach, config, tmp_path, lambda steps, figures: seen.append(steps))
+    record = pretraining.pretrain(Reach, config, tmp_path, lambda steps, figures: seen.append(steps))
     assert seen[0] > 800
     assert record["steps"] == 1200
     assert [point["steps"] for point in record["curve"]][-2:] == [800, 1200]

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from tests.worker import invented
-from worker.ml import reward_training
-from worker.ml.network_training import MlpTraining, TransformerTraining
-from worker.ml.reward_models import RewardModel
-from worker.ml.segments import SegmentPairs, Stretch
+from worker.ml.rewards import reward_training
+from worker.ml.rewards.network_training import MlpTraining, TransformerTraining
+from worker.ml.rewards.reward_models import RewardModel
+from worker.ml.rewards.segments import SegmentPairs, Stretch
 from worker.trajectory import Trajectory
 
 SHORT, LONG = 20, 33

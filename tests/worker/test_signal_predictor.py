@@ -9,18 +9,19 @@ import pytest
 import torch
 
 from tests.worker import invented
-from worker import foresight, laboratory, lessons
-from worker.ml import reward_training, signal_learning
-from worker.ml.candidate_ranking import ranker_at
-from worker.ml.predicted_reward import PredictedReward
-from worker.ml.reward_models import StructuredReward, load_reward_model
-from worker.ml.reward_training import SignalScale
-from worker.ml.segments import SegmentPairs
-from worker.ml.signal_learning import PredictorTraining
-from worker.ml.signal_predictor import UNSENSED, SignalPredictor
-from worker.shelf import Shelf
-from worker.sim.catalogue import ENVIRONMENTS
+from worker.compute import learning, simulation
+from worker.experiments import train_signal_predictor
+from worker.experiments.rollout_cache import Shelf
+from worker.ml.rewards import reward_training, signal_training
+from worker.ml.rewards.action_ranking import ranker_at
+from worker.ml.rewards.predicted_reward import PredictedReward
+from worker.ml.rewards.reward_models import StructuredReward, load_reward_model
+from worker.ml.rewards.reward_training import SignalScale
+from worker.ml.rewards.segments import SegmentPairs
+from worker.ml.rewards.signal_predictor import UNSENSED, SignalPredictor
+from worker.ml.rewards.signal_training import PredictorTraining
 from worker.sim.rollout import rollout
+from worker.tasks.registry import ENVIRONMENTS
 from worker.trajectory import SIGNALS, Trajectory
 
 QUICK = PredictorTraining(hidden=16, steps=60, batch=64, learning_rate=1e-2)
@@ -41,14 +42,14 @@ def episodes(task: str, count: int) -> list[Trajectory]:
     """Behaviours as in a pool of clips, in scenarios that the predictor has never seen."""
     found = []
     for scenario in range(260_000, 260_000 + count):
-        for behaviour in laboratory.behaviours(task, scenario, 3):
-            found.append(rollout(laboratory.environment(task), laboratory.act_as(task, behaviour), scenario))
+        for behaviour in simulation.behaviours(task, scenario, 3):
+            found.append(rollout(simulation.environment(task), simulation.act_as(task, behaviour), scenario))
     return found
 
 
 @pytest.mark.parametrize("task", ENVIRONMENTS)
 def test_what_ships_foresees_the_signals_of_clips_it_has_not_seen(task: str) -> None:
-    found = signal_learning.explained(laboratory.signal_predictor(task), episodes(task, 4), steps=60)
+    found = signal_training.explained(simulation.signal_predictor(task), episodes(task, 4), steps=60)
     assert found["distance_m"]["clip"] > 0.9
     assert found["speed_squared_m2_s2"]["clip"] > 0.8
     assert found["force_at_target_n" if task != "drinking" else "undelivered"]["clip"] > 0.5
@@ -58,8 +59,8 @@ def test_it_learns_a_signal_that_follows_from_the_action_and_is_the_same_every_t
     rng = np.random.default_rng(0)
     rollouts = [invented.trajectory(rng) for _ in range(200)]
     training = PredictorTraining(hidden=32, steps=500, batch=128, learning_rate=1e-2)
-    first, again, other = (signal_learning.fit(rollouts, seed, training) for seed in (0, 0, 1))
-    share = signal_learning.explained(first, [invented.trajectory(rng) for _ in range(20)], 10)
+    first, again, other = (signal_training.fit(rollouts, seed, training) for seed in (0, 0, 1))
+    share = signal_training.explained(first, [invented.trajectory(rng) for _ in range(20)], 10)
     assert share["speed_m_s"]["step"] > 0.9  # invented speeds are the first joint's action
     assert share["force_at_target_n"]["step"] < 0.2  # invented forces are noise
     assert np.array_equal(first.layers[0][0], again.layers[0][0])
@@ -69,7 +70,7 @@ def test_it_learns_a_signal_that_follows_from_the_action_and_is_the_same_every_t
 def test_a_constant_signal_is_foreseen_as_that_constant() -> None:
     rng = np.random.default_rng(0)
     signals = np.full((20, len(SIGNALS)), 3.0)
-    foreseen = signal_learning.fit([invented.trajectory(rng, signals=signals) for _ in range(4)], 0, QUICK)
+    foreseen = signal_training.fit([invented.trajectory(rng, signals=signals) for _ in range(4)], 0, QUICK)
     episode = invented.trajectory(rng)
     np.testing.assert_allclose(foreseen.predict(episode.observations[:-1], episode.actions).mean(axis=0), 3.0, atol=0.3)
 
@@ -140,10 +141,10 @@ def test_a_model_without_a_predictor_is_refused_in_words() -> None:
 def test_a_task_whose_signals_cannot_be_foreseen_says_what_to_do(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(laboratory, "CHECKPOINTS", tmp_path)
-    laboratory.signal_predictor.cache_clear()
-    with pytest.raises(laboratory.NoPredictor, match="python -m worker foresee --task drinking"):
-        laboratory.signal_predictor("drinking")
+    monkeypatch.setattr(simulation, "CHECKPOINTS", tmp_path)
+    simulation.signal_predictor.cache_clear()
+    with pytest.raises(simulation.NoPredictor, match="python -m worker foresee --task drinking"):
+        simulation.signal_predictor("drinking")
 
 
 def test_a_study_s_reward_model_is_fitted_without_sensors() -> None:
@@ -152,7 +153,7 @@ def test_a_study_s_reward_model_is_fitted_without_sensors() -> None:
     couples = [(rollouts[3 * at], rollouts[3 * at + 1]) for at in range(4)]
     shown = SegmentPairs.cut(couples, 0, 60)
     answers: npt.NDArray[np.float32] = rng.integers(0, 2, len(shown)).astype(np.float32)
-    stored, metrics = lessons.fit_reward("feeding", "predicted", shown, answers, SignalScale.of(shown), 0)
+    stored, metrics = learning.fit_reward("feeding", "predicted", shown, answers, SignalScale.of(shown), 0)
     model = load_reward_model(stored)
     assert isinstance(model, PredictedReward)
     assert metrics["kind"] == "predicted"
@@ -161,12 +162,14 @@ def test_a_study_s_reward_model_is_fitted_without_sensors() -> None:
 
 def test_the_command_keeps_its_rollouts_and_says_how_well_signals_are_foreseen(tmp_path: Path) -> None:
     target = tmp_path / "predictor.safetensors"
-    record = foresight.foresee("feeding", tmp_path, 1, scenarios=2, tested=1, training=QUICK, target=target)
+    record = train_signal_predictor.foresee(
+        "feeding", tmp_path, 1, scenarios=2, tested=1, training=QUICK, target=target
+    )
     assert json.loads(target.with_suffix(".json").read_text()) == record
     assert record["explained_share"]["distance_m"]["step"] > 0.3
     kept = list(Shelf("feeding", tmp_path).directory.glob("behaviour-*.npz"))
     made = {path: path.stat().st_mtime_ns for path in kept}
-    again = foresight.foresee("feeding", tmp_path, 1, scenarios=2, tested=1, training=QUICK, target=target)
+    again = train_signal_predictor.foresee("feeding", tmp_path, 1, scenarios=2, tested=1, training=QUICK, target=target)
     assert again == record
     assert {path: path.stat().st_mtime_ns for path in kept} == made
     assert len(kept) == 18

@@ -8,9 +8,11 @@ import pytest
 import torch
 
 import worker
-from worker.ml.policies import GaussianPolicy
+from worker.ml.policies.gaussian import GaussianPolicy
 from worker.sim.assistive import ACTION_UNIT_RAD
-from worker.sim.drinking import (
+from worker.sim.jaco import JACO
+from worker.tasks.drinking.demonstrator import ScriptedPouring
+from worker.tasks.drinking.environment import (
     CUP,
     CUP_BASE_RADIUS_M,
     CUP_HEIGHT_M,
@@ -20,9 +22,7 @@ from worker.sim.drinking import (
     DrinkingEnv,
     pellet_radius_m,
 )
-from worker.sim.jaco import JACO
-from worker.sim.scripted_drinking import ScriptedPouring
-from worker.sim.water import Cup
+from worker.tasks.drinking.water import Cup
 
 REFERENCE_POLICY = Path(worker.__file__).parent / "checkpoints" / "drinking" / "policy.safetensors"
 STILL = np.zeros(7, np.float32)

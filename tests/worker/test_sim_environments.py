@@ -14,14 +14,14 @@ from stable_baselines3.common.env_checker import check_env as check_env_for_sb3
 
 import worker
 import worker.sim
-from worker.ml.policies import GaussianPolicy
+from worker.ml.policies.gaussian import GaussianPolicy
 from worker.sim import human
 from worker.sim.arm import start_postures
 from worker.sim.assistive import ARM, AssistiveEnv
 from worker.sim.bullet import Bullet
-from worker.sim.catalogue import ENVIRONMENTS
 from worker.sim.geometry import rotation_of
 from worker.sim.seated_person import PERSON, add_person
+from worker.tasks.registry import ENVIRONMENTS
 from worker.trajectory import BODIES, SIGNALS
 
 CHECKPOINTS = Path(worker.__file__).parent / "checkpoints"

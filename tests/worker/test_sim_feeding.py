@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 import worker
-from worker.ml.policies import GaussianPolicy
+from worker.ml.policies.gaussian import GaussianPolicy
 from worker.sim.bullet import Bullet
-from worker.sim.feeding import FEEDING, SPOON, START, FeedingEnv
-from worker.sim.food import BALLS
 from worker.sim.geometry import rotation_of
 from worker.sim.jaco import JACO
+from worker.tasks.feeding.environment import FEEDING, SPOON, START, FeedingEnv
+from worker.tasks.feeding.food import BALLS
 
 EPISODE_STEPS = FEEDING.episode_steps
 REFERENCE_POLICY = Path(worker.__file__).parent / "checkpoints" / "feeding" / "policy.safetensors"

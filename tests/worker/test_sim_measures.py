@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from worker.sim.costs import base_weights, cost_items, preference_rewards, signal_weights, stakes
-from worker.sim.feeding import FEEDING
 from worker.sim.measures import Outcome, StepMeasures, TaskReward
-from worker.sim.scratching import SCRATCHING
+from worker.tasks.feeding.environment import FEEDING
+from worker.tasks.scratching.environment import SCRATCHING
 from worker.trajectory import COSTS, SIGNALS
 
 STILL = StepMeasures(

@@ -8,15 +8,22 @@ import numpy as np
 import pytest
 
 import worker
-from worker.ml.policies import GaussianPolicy
+from worker.ml.policies.gaussian import GaussianPolicy
 from worker.sim import human
 from worker.sim.bullet import Bullet
 from worker.sim.geometry import rotation_of
 from worker.sim.human import BODY_SHAPES, RIGHT, Person, draw_person
 from worker.sim.measures import HIGH_FORCE_N
-from worker.sim.scratching import BARE_SKIN, SCRATCHING, STROKES_NEEDED, TIP_RADIUS_M, Scratch, ScratchingEnv
 from worker.sim.seated_person import PERSON
-from worker.sim.yielding_arm import FOREARM, UPPER_ARM, YieldingArm
+from worker.tasks.scratching.environment import (
+    BARE_SKIN,
+    SCRATCHING,
+    STROKES_NEEDED,
+    TIP_RADIUS_M,
+    Scratch,
+    ScratchingEnv,
+)
+from worker.tasks.scratching.yielding_arm import FOREARM, UPPER_ARM, YieldingArm
 
 REFERENCE_POLICY = Path(worker.__file__).parent / "checkpoints" / "scratching" / "policy.safetensors"
 

@@ -12,10 +12,10 @@ from sqlalchemy.orm import Session
 from app.db import Database, now
 from app.domain.models import RunKind
 from app.domain.studies import Awaited, Participant, Study
-from worker.compute import Compute, Lane
-from worker.records import Job
-from worker.turns import Turns
-from worker.urgency import Gate, Level, Urgency, WhoWaits
+from worker.compute.pools import Compute, Lane
+from worker.jobs.runtime.lanes import Turns
+from worker.jobs.runtime.records import Job
+from worker.jobs.runtime.urgency import Gate, Level, Urgency, WhoWaits
 
 
 def add_study(session: Session, slug: str, study: Study) -> Study:

@@ -11,7 +11,7 @@ import numpy.typing as npt
 import pytest
 from PIL import Image
 
-from worker.sim.video import encode_mp4, encode_poster
+from worker.sim.render.video import encode_mp4, encode_poster
 
 
 def frames(count: int = 12) -> list[npt.NDArray[np.uint8]]:

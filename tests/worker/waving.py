@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 
 from worker.sim.arm import FloatArray, Tool, transform
-from worker.sim.drinking import CUP
-from worker.sim.feeding import SPOON
 from worker.sim.human import ARM_JOINTS, BODY_SHAPES, RIGHT, arm_points_m
 from worker.sim.jaco import JACO
+from worker.tasks.drinking.environment import CUP
+from worker.tasks.feeding.environment import SPOON
 from worker.trajectory import COSTS, SIGNALS, Array, Trajectory
 
 POSTURE_RAD = np.array([-3.01, 3.73, 0.0, 4.89, 1.43, 1.76, 0.41])

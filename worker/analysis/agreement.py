@@ -1,4 +1,4 @@
-"""The interval of a proportion. The web server has the same without numpy (app.services.accuracy); a test compares."""
+"""The Wilson interval of a proportion. The web server has the same without numpy (app.services.answers.accuracy)."""
 
 import numpy as np
 

@@ -1,7 +1,7 @@
 """What the answers of a study say together, and what its filters change.
 
-The figures of one person come as the dashboard has them (app/services/answer_figures.py), what filters change as the
-table ``evaluations.csv`` that is exported. Layouts are with each function; unknown is None.
+The figures of one person come as the dashboard has them (app.services.answers.answer_figures), what filters change as
+the table ``evaluations.csv`` that is exported. Layouts are with each function; unknown is None.
 """
 
 from collections.abc import Mapping, Sequence

@@ -1,8 +1,8 @@
 """One report: tables in, contents and figures out. The one function that the worker's processes run.
 
 Contents (stored as Report.contents): ``version``, ``blinded``, ``plan`` (standing, planned tests, in_words: see
-app.services.planning), ``ratings`` (see statistics), ``answers`` and ``change`` (see answers). Figures by name, each as
-SVG and PNG (see figures).
+app.services.studies.preregistration), ``ratings`` (see statistics), ``answers`` and ``change`` (see answers).
+Figures by name, each as SVG and PNG (see figures).
 """
 
 from collections.abc import Mapping, Sequence
@@ -24,7 +24,7 @@ class Tables:
     """codes of everybody who takes part and has not withdrawn"""
     ratings: Sequence[Row]
     answers: Sequence[Row]
-    """a row per participant, see app.services.answer_figures"""
+    """a row per participant, see app.services.answers.answer_figures"""
     evaluations: Sequence[Row]
     groups: Sequence[str]
     """methods in their order, or letters while blinded; empty in a study without evaluation"""
@@ -33,7 +33,7 @@ class Tables:
     window: int = 30
     """answers in the running accuracy"""
     version: int = 0
-    """of the contents, see app.services.reports"""
+    """of the contents, see app.services.runs.reports"""
     columns: dict[str, Sequence[str]] = field(default_factory=dict)
     """of each table by name: an empty table has no rows to read them from"""
 

@@ -22,7 +22,7 @@ from worker.sim.jaco import JACO
 from worker.sim.measures import Outcome, StepMeasures, TaskReward
 from worker.sim.seated_person import HEAD, PERSON, add_person
 from worker.spaces import CONTROL_STEP_S, JOINT_ACTION, Space
-from worker.tasks import Task
+from worker.task import Task
 from worker.trajectory import BODIES
 
 Array = npt.NDArray[np.float32]

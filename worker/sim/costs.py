@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from worker.tasks import Task
+from worker.task import Task
 from worker.trajectory import COSTS, SIGNALS
 
 Array = npt.NDArray[np.float32]

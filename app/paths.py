@@ -1,0 +1,11 @@
+"""Where the files lie that the program brings along."""
+
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = ROOT / "docs"
+MIGRATIONS = ROOT / "migrations"
+STATIC = ROOT / "static"
+TEMPLATES = ROOT / "templates"
+WORDING = ROOT / "app" / "wording"
+DEMO_STUDY = ROOT / "app" / "demo" / "feeding.zip"

@@ -1,0 +1,41 @@
+"""The demo study: what somebody who has just installed the studio finds in it."""
+
+from sqlalchemy.orm import Session
+
+from app.domain.studies import USUAL_CLIP_STEPS, StudySettings, TaskName
+from app.errors import AppError
+from app.paths import DEMO_STUDY
+from app.services import audit
+from app.services.archives import study_import
+from app.services.archives.archive import ArchiveInvalid
+from app.services.participants import enrolment
+from app.services.studies import studies
+from app.storage import ArtefactStore
+
+ARCHIVE = DEMO_STUDY
+"""A finished study of scripted participants; ``python -m worker demo-study`` makes it anew."""
+
+
+class DemoMissing(AppError):
+    """The demo study that ships with the studio is not there."""
+
+
+def import_finished(session: Session, store: ArtefactStore) -> str:
+    """Import the archive that ships with the studio and add a participant, whose token is returned.
+
+    Raises DemoMissing and ArchiveInvalid; nothing is changed then.
+    """
+    if not ARCHIVE.is_file():
+        raise DemoMissing
+    try:
+        study = study_import.read(session, store, ARCHIVE, audit.SYSTEM).study
+    except OSError as error:
+        raise ArchiveInvalid(f"The demo study cannot be imported: {error.strerror}.") from error
+    return enrolment.add_participant(session, study)[1]
+
+
+def make_empty(session: Session, task: TaskName) -> str:
+    """Make a study of the task, whose clips have yet to be made, with one participant, whose token is returned."""
+    usual = StudySettings(clip_steps=USUAL_CLIP_STEPS[task])
+    study = studies.create_study(session, f"Demo: {task}", usual, task=task)
+    return enrolment.add_participant(session, study)[1]

@@ -1,0 +1,226 @@
+"""The blinded evaluation: which method hides behind which letter, in which order, and what is to be shown now.
+
+How it is drawn. As in the paper every method is met in one block of trials (three by default), and the order of the
+blocks varies. The orders are the rows of a Williams design: over one cycle of participants (2, 4, 6 or 10 of them for
+2, 4, 3 or 5 methods) every method comes equally often at every place and equally often right after every other one.
+Which row a participant gets follows from their number: each cycle goes through all rows once, in an order drawn from
+the study's secret, which nobody sees before unblinding; the seed, which everybody sees, tells nothing about it. Letters
+are given in the order of appearance (the first block is Robot A), so a letter says when a method was met and nothing
+else. The scenarios are the same for all methods of a participant, one per repetition, and different for other
+participants.
+
+Everything follows from the secret and the seeds, so that drawing twice is drawing once. The hash of the secret is part
+of what is locked, and the secret is shown after unblinding: whoever has both can draw the letters again.
+"""
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+from sqlalchemy import func, or_, select
+from sqlalchemy.orm import Session, joinedload
+
+from app.db import now
+from app.domain.evaluation import Assignment, Controller, Film, Rating, Trial
+from app.domain.protocol import EvaluatedMethod, EvaluationMode, EvaluationSettings
+from app.domain.studies import Participant, Study
+from app.storage import ArtefactStore
+
+LETTERS = "ABCDE"
+TRAINED = (EvaluatedMethod.PREFFT, EvaluatedMethod.PREFFT_ANCHORED, EvaluatedMethod.PBARL_PRINTED)
+"""Methods that are trained for the evaluation alone; the reference is there, and pbarl is the participant's filter."""
+
+TRIAL_SCENARIOS = range(6_000_000, 6_800_000)
+"""Scenarios of trials; nothing else uses them (worker.ml.filters.filter_problem.SCENARIO_BLOCKS has the others)."""
+COMPARISON_SCENARIOS = range(6_800_000, 6_900_000)
+"""Scenarios in which somebody's robot is shown before and after."""
+COMPARED = 2
+"""Scenarios of the before and after."""
+_MOST_TRIALS = 20
+
+
+class State(StrEnum):
+    """What a participant does now."""
+
+    PREPARING = "preparing"
+    """The robots are not ready yet."""
+    WATCHING = "watching"
+    """Video: a film to watch and rate."""
+    COMING = "coming"
+    """Physical: the operator has not started the robot yet."""
+    MOVING = "moving"
+    """Physical: the robot moves."""
+    RATING = "rating"
+    """Physical: the robot has moved, and is to be rated."""
+    FINISHED = "finished"
+
+
+@dataclass(frozen=True)
+class Turn:
+    """What a participant of the evaluation is to be shown now."""
+
+    state: State
+    rated: int
+    wanted: int
+    trial: Trial | None
+    """Its film loaded. None while the robots are prepared, and at the end."""
+    correctable: Trial | None
+    """The trial rated last, whose rating can still be changed."""
+
+
+def settings_of(study: Study) -> EvaluationSettings | None:
+    """What is evaluated; None in studies without, and in those whose clips were made elsewhere."""
+    return study.settings.evaluation if study.material is None else None
+
+
+def williams_rows(count: int) -> Sequence[tuple[int, ...]]:
+    """Orders of ``count`` treatments in which each comes equally often at each place and after each other one.
+
+    Williams (1949), Australian Journal of Scientific Research A 2, 149-168: one square for an even number, two mirrored
+    ones for an odd number.
+    """
+    first = [(place + 1) // 2 if place % 2 else (count - place // 2) % count for place in range(count)]
+    square = [tuple((each + shift) % count for each in first) for shift in range(count)]
+    return square if count % 2 == 0 else [*square, *(row[::-1] for row in square)]
+
+
+def order_of_methods(secret: str, methods: Sequence[EvaluatedMethod], number: int) -> Sequence[EvaluatedMethod]:
+    """The order in which the participant of this number meets the methods."""
+    drawn = sorted(methods, key=lambda method: mark(secret, "method", method))
+    rows = williams_rows(len(methods))
+    cycle, place = divmod(number - 1, len(rows))
+    row = sorted(rows, key=lambda each: mark(secret, "row", cycle, *each))[place]
+    return [drawn[index] for index in row]
+
+
+def draw(session: Session, study: Study, participant: Participant) -> None:
+    """Draw the participant's letters and trials; drawing again changes nothing."""
+    settings = settings_of(study)
+    if settings is None or participant.withdrawn_at is not None:
+        return
+    session.scalar(select(Participant.id).where(Participant.id == participant.id).with_for_update())  # one at a time
+    if session.scalar(select(Assignment.id).where(Assignment.participant_id == participant.id).limit(1)) is not None:
+        return
+    methods = order_of_methods(study.key_secret, settings.methods, participant.number)
+    for block, (letter, method) in enumerate(zip(LETTERS, methods, strict=False)):
+        session.add(Assignment(participant_id=participant.id, letter=letter, method=method))
+        for repetition in range(1, settings.trials + 1):
+            trial = Trial(
+                participant_id=participant.id,
+                ordinal=block * settings.trials + repetition,
+                letter=letter,
+                repetition=repetition,
+                scenario=trial_scenario(participant, repetition),
+            )
+            session.add(trial)
+    session.flush()
+
+
+def trial_scenario(participant: Participant, repetition: int) -> int:
+    """The scenario of one repetition, whatever the method."""
+    places = len(TRIAL_SCENARIOS) // _MOST_TRIALS
+    return TRIAL_SCENARIOS.start + participant.seed % places * _MOST_TRIALS + repetition - 1
+
+
+def comparison_scenarios(participant: Participant) -> Sequence[int]:
+    """The scenarios in which the participant's robot is shown before and after."""
+    first = COMPARISON_SCENARIOS.start + participant.seed % (len(COMPARISON_SCENARIOS) // COMPARED) * COMPARED
+    return range(first, first + COMPARED)
+
+
+def trials_of(session: Session, participant_id: int) -> Sequence[Trial]:
+    """The participant's trials in their order, films loaded."""
+    theirs = select(Trial).where(Trial.participant_id == participant_id).order_by(Trial.ordinal)
+    return session.scalars(theirs.options(joinedload(Trial.film))).all()
+
+
+def assignments_of(session: Session, participant_id: int) -> Sequence[Assignment]:
+    """Which letter hides which method, by letter."""
+    theirs = select(Assignment).where(Assignment.participant_id == participant_id)
+    return session.scalars(theirs.order_by(Assignment.letter)).all()
+
+
+def begun(session: Session, study: Study) -> set[int]:
+    """Ids of participants to whom a robot has been shown."""
+    shown = select(Trial.participant_id).join(Participant, Participant.id == Trial.participant_id)
+    seen = or_(Trial.shown_at.is_not(None), Trial.started_at.is_not(None))
+    return set(session.scalars(shown.where(Participant.study_id == study.id, seen)))
+
+
+def ratings_of(session: Session, participant_id: int) -> dict[int, Rating]:
+    """The rating that counts of each rated trial, by the trial's id."""
+    theirs = select(Rating).join(Trial).where(Trial.participant_id == participant_id).order_by(Rating.revision)
+    return {rating.trial_id: rating for rating in session.scalars(theirs)}
+
+
+def next_turn(session: Session, store: ArtefactStore, participant: Participant) -> Turn:
+    """What the participant is to be shown; the study is loaded. Marks a film as shown."""
+    draw(session, participant.study, participant)
+    trials, ratings = trials_of(session, participant.id), ratings_of(session, participant.id)
+    rated = [trial for trial in trials if trial.id in ratings]
+    open_trials = [trial for trial in trials if trial.id not in ratings]
+    last = rated[-1] if rated else None
+    if trials and not open_trials:
+        return Turn(State.FINISHED, len(rated), len(trials), None, last)
+    state = _state(session, store, participant, trials)
+    if state is State.PREPARING:
+        return Turn(state, len(rated), len(trials), None, last)
+    trial = open_trials[0]
+    if state is State.WATCHING and trial.shown_at is None:
+        trial.shown_at = now()
+    return Turn(state, len(rated), len(trials), trial, last)
+
+
+def _state(session: Session, store: ArtefactStore, participant: Participant, trials: Sequence[Trial]) -> State:
+    settings = settings_of(participant.study)
+    ratings = ratings_of(session, participant.id)
+    trial = next((each for each in trials if each.id not in ratings), None)
+    if settings is None or trial is None or not is_ready(session, store, settings, participant.id, trial):
+        return State.PREPARING
+    if settings.mode is EvaluationMode.VIDEO:
+        return State.WATCHING
+    if trial.finished_at is not None:
+        return State.RATING
+    return State.COMING if trial.started_at is None else State.MOVING
+
+
+def is_ready(
+    session: Session,
+    store: ArtefactStore,
+    settings: EvaluationSettings,
+    participant_id: int,
+    trial: Trial,
+) -> bool:
+    """Whether the trial's robot can be shown: its film is there (others may still be made), or all controllers."""
+    if settings.mode is EvaluationMode.PHYSICAL:
+        return len(controllers_of(session, participant_id)) >= len(settings.methods)
+    return trial.film is not None and store.has(trial.film.video_sha256)
+
+
+def controllers_of(session: Session, participant_id: int) -> dict[str, Controller]:
+    """The participant's controllers, by the letter of their method."""
+    rows = session.execute(
+        select(Assignment.letter, Controller)
+        .join(Controller, Controller.method == Assignment.method)
+        .where(Assignment.participant_id == participant_id, Controller.participant_id == participant_id)
+        .order_by(Assignment.letter)
+    )
+    return dict(rows.all())
+
+
+def rated_count(session: Session, participant_id: int) -> int:
+    """How many trials the participant has rated."""
+    rated = select(func.count(func.distinct(Rating.trial_id))).join(Trial)
+    return session.scalar(rated.where(Trial.participant_id == participant_id)) or 0
+
+
+def film_of(session: Session, participant_id: int, method: str, scenario: int, model_id: int | None) -> Film | None:
+    """A film that has been made already."""
+    theirs = select(Film).where(Film.participant_id == participant_id, Film.method == method, Film.scenario == scenario)
+    return session.scalar(theirs.where(Film.model_id == model_id if model_id is not None else Film.model_id.is_(None)))
+
+
+def mark(secret: str, *parts: object) -> str:
+    """Sorts in an order that looks random and is the same on every machine."""
+    return hashlib.sha256(f"{secret}/evaluation/{'/'.join(map(str, parts))}".encode()).hexdigest()

@@ -1,0 +1,340 @@
+"""The rows of an export's tables: what is read from the database, in the order of the columns in export_tables.
+
+Every row comes with its key, by which keys ascend; ``window`` says which rows are wanted (see paging).
+"""
+
+from collections.abc import Iterator, Sequence
+from typing import Any, TypeVar
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session, aliased, joinedload
+
+from app.domain.clips import Clip, Rollout
+from app.domain.evaluation import Rating, Trial
+from app.domain.models import Bundle, Model, ModelKind
+from app.domain.participation import ConsentRecord, FormAnswer, ParticipantEvent, StageRecord
+from app.domain.preferences import LEARNED_FROM, Exclusion, LabelEvent, Query
+from app.domain.studies import Deviation, Participant, Study
+from app.services.evaluation import unblinding
+from app.services.exports.paging import EVERYTHING, KeyedRows, Window
+from app.services.runs import model_metrics
+
+_OfPerson = TypeVar("_OfPerson", ConsentRecord, ParticipantEvent, StageRecord)
+AT_ONCE = 200
+"""Clips: there may be tens of thousands, and a page wants a hundred."""
+
+
+def everybody(session: Session, study: Study, window: Window = EVERYTHING) -> Sequence[Participant]:
+    """Everybody in the study by number, tombstones included; previews are nobody."""
+    people = select(Participant).where(Participant.study_id == study.id, Participant.is_preview.is_(False))
+    people = people.where(window.reaches(Participant.number), window.known(Participant))
+    return session.scalars(people.order_by(Participant.number)).all()
+
+
+def _present(session: Session, study: Study, window: Window) -> Iterator[tuple[Participant, Window]]:
+    """Everybody who has not withdrawn, each with what is wanted of their rows; their number begins their keys."""
+    for person in everybody(session, study, window):
+        if person.withdrawn_at is None:
+            yield person, window.within(person.number)
+
+
+def _theirs(
+    session: Session, study: Study, window: Window, table: type[_OfPerson]
+) -> Iterator[tuple[Participant, _OfPerson]]:
+    """The wanted rows of a table whose rows belong to one person each, in the order in which they came."""
+    for person, wanted in _present(session, study, window):
+        rows = select(table).where(table.participant_id == person.id, wanted.beyond(table.id), wanted.known(table))
+        for row in session.scalars(rows.order_by(table.id)):
+            yield person, row
+
+
+def participants(session: Session, study: Study, window: Window = EVERYTHING) -> KeyedRows:
+    for each in everybody(session, study, window):
+        if (each.number,) > window.after:
+            yield (each.number,), _participant(study, each)
+
+
+def _participant(study: Study, each: Participant) -> Sequence[Any]:
+    if each.withdrawn_at is not None:
+        return (each.code, "withdrawn", *[None] * 9, each.withdrawn_at, each.scripted_as)
+    status = "completed" if each.completed_at else "consented" if each.consented_at else "invited"
+    return (
+        each.code,
+        status,
+        each.seed,
+        each.language or study.settings.language.value,
+        each.created_at,
+        each.consented_at,
+        each.consent_version,
+        each.instructed_at,
+        each.completed_at,
+        each.last_seen_at,
+        each.panel_id,
+        None,
+        each.scripted_as,
+    )
+
+
+def stages(session: Session, study: Study, window: Window = EVERYTHING) -> KeyedRows:
+    for person, each in _theirs(session, study, window, StageRecord):
+        yield (person.number, each.id), (person.code, each.stage, each.entered_at, each.finished_at)
+
+
+def queries(session: Session, study: Study, window: Window = EVERYTHING) -> KeyedRows:
+    for person, wanted in _present(session, study, window):
+        shown = select(Query).where(Query.participant_id == person.id, wanted.known(Query)).order_by(Query.ordinal)
+        clips = (joinedload(side).joinedload(Clip.rollout) for side in (Query.left_clip, Query.right_clip))
+        queries = {query.id: query for query in session.scalars(shown.options(*clips))}
+        answers, exclusions = _last_events(session, person, wanted), _exclusions(session, person, wanted)
+        theirs = select(Model.id, Model.label_count).where(Model.participant_id == person.id)
+        seen = dict(session.execute(theirs).all())
+        for query in queries.values():
+            if (query.ordinal,) > wanted.after:
+                answer = answers.get(query.id)
+                values = _query(query, queries, answer, seen.get(query.predicted_by_model_id or 0))
+                learned = _learned_from(query, answer, exclusions.get(answer.id) if answer is not None else None)
+                yield (person.number, query.ordinal), (person.code, *values, *learned)
+
+
+def _last_events(session: Session, person: Participant, wanted: Window) -> dict[int, LabelEvent]:
+    events = select(LabelEvent).join(Query).where(Query.participant_id == person.id, wanted.known(LabelEvent))
+    return {event.query_id: event for event in session.scalars(events.order_by(LabelEvent.revision))}
+
+
+def _exclusions(session: Session, person: Participant, wanted: Window) -> dict[int, Exclusion]:
+    """The newest word about every answer that is left out, by the answer's id."""
+    words = select(Exclusion).join(LabelEvent).join(Query)
+    words = words.where(Query.participant_id == person.id, wanted.known(Exclusion))
+    newest = {word.label_event_id: word for word in session.scalars(words.order_by(Exclusion.id))}
+    return {event_id: word for event_id, word in newest.items() if word.excluded}
+
+
+def _query(query: Query, queries: dict[int, Query], last: LabelEvent | None, model_labels: int | None) -> Sequence[Any]:
+    earlier = queries.get(query.repeats_query_id or 0)
+    left, right = query.left_clip, query.right_clip
+    answer = last if last is not None and last.response is not None else None
+    return (
+        query.ordinal,
+        query.purpose,
+        earlier.ordinal if earlier else None,
+        earlier.left_clip_id != query.left_clip_id if earlier else None,
+        query.expected,
+        left.rollout.scenario,
+        left.rollout.behaviour,
+        right.rollout.scenario,
+        right.rollout.behaviour,
+        left.step_count,
+        right.step_count,
+        left.video_sha256,
+        right.video_sha256,
+        query.strategy,
+        query.propensity,
+        query.predicted_right,
+        model_labels,
+        query.served_at,
+        answer.response if answer else None,
+        answer.reason if answer else None,
+        answer.response_time_ms if answer else None,
+        answer.created_at if answer else None,
+        last.revision if last else 0,
+    )
+
+
+def _learned_from(query: Query, last: LabelEvent | None, exclusion: Exclusion | None) -> Sequence[Any]:
+    """Whether the answer is a label, whether it is excluded, and why."""
+    answered = last is not None and last.response is not None
+    excluded = answered and exclusion is not None
+    reason = exclusion.reason if excluded and exclusion is not None else None
+    return answered and not excluded and query.purpose in LEARNED_FROM, excluded, reason
+
+
+def labels(session: Session, study: Study, window: Window = EVERYTHING) -> KeyedRows:
+    for person, wanted in _present(session, study, window):
+        newest = {event.id for event in _last_events(session, person, wanted).values()}
+        exclusions = _exclusions(session, person, wanted)
+        rows = session.execute(
+            select(Query, LabelEvent)
+            .join(LabelEvent, LabelEvent.query_id == Query.id)
+            .where(Query.participant_id == person.id)
+            .where(wanted.beyond(LabelEvent.id), wanted.known(LabelEvent))
+            .order_by(LabelEvent.id)
+        )
+        for query, event in rows:
+            yield (
+                (person.number, event.id),
+                (
+                    person.code,
+                    query.ordinal,
+                    query.purpose,
+                    event.revision,
+                    event.response,
+                    event.id not in newest,
+                    event.reason,
+                    event.response_time_ms,
+                    event.replay_count,
+                    event.scrub_count,
+                    event.playback_rate,
+                    event.watched_whole,
+                    event.left_watched_ms,
+                    event.right_watched_ms,
+                    event.play_error_count,
+                    event.stall_count,
+                    event.stalled_ms,
+                    event.largest_drift_ms,
+                    event.by_script,
+                    event.created_at,
+                    event.id in exclusions,
+                ),
+            )
+
+
+def forms(session: Session, study: Study, window: Window = EVERYTHING) -> KeyedRows:
+    for person, wanted in _present(session, study, window):
+        theirs = select(FormAnswer).where(FormAnswer.participant_id == person.id, wanted.known(FormAnswer))
+        answers = session.scalars(theirs.order_by(FormAnswer.id)).all()
+        newest = {(each.form, each.item): each.id for each in answers}
+        for each in answers:
+            superseded = newest[each.form, each.item] != each.id
+            if (each.id,) > wanted.after:
+                values = (person.code, each.form, each.item, each.value, superseded, each.created_at)
+                yield (person.number, each.id), values
+
+
+def consent(session: Session, study: Study, window: Window = EVERYTHING) -> KeyedRows:
+    for person, each in _theirs(session, study, window, ConsentRecord):
+        yield (person.number, each.id), (person.code, each.version, each.language, each.agreed_at, each.text)
+
+
+def events(session: Session, study: Study, window: Window = EVERYTHING) -> KeyedRows:
+    for person, each in _theirs(session, study, window, ParticipantEvent):
+        yield (person.number, each.id), (person.code, each.at, each.kind, each.detail)
+
+
+def ratings(session: Session, study: Study, window: Window = EVERYTHING) -> KeyedRows:
+    blinded = unblinding.is_blinded(study)
+    methods = {} if blinded else unblinding.methods_by_letter(session, study)
+    for person, wanted in _present(session, study, window):
+        rows = session.execute(
+            select(Trial, Rating)
+            .outerjoin(Rating, (Rating.trial_id == Trial.id) & wanted.known(Rating))
+            .where(Trial.participant_id == person.id, wanted.known(Trial))
+            .options(joinedload(Trial.film))
+            .order_by(Trial.ordinal, Rating.revision)
+        ).all()
+        newest = {trial.id: rating.revision for trial, rating in rows if rating is not None}
+        for trial, rating in rows:
+            key = trial.ordinal, rating.revision if rating else 0
+            if key <= wanted.after:
+                continue
+            yield (
+                (person.number, *key),
+                (
+                    person.code,
+                    trial.letter,
+                    methods.get((person.id, trial.letter)),
+                    trial.repetition,
+                    trial.ordinal,
+                    trial.scenario,
+                    rating.satisfaction if rating else None,
+                    rating.personalisation if rating else None,
+                    rating is not None and newest[trial.id] == rating.revision,
+                    rating.revision if rating else None,
+                    rating.response_time_ms if rating else None,
+                    rating.by_script if rating else None,
+                    rating.created_at if rating else None,
+                    trial.shown_at,
+                    trial.started_at,
+                    trial.finished_at,
+                    trial.film.success if trial.film is not None and not blinded else None,
+                ),
+            )
+
+
+def models(session: Session, study: Study, window: Window = EVERYTHING) -> KeyedRows:
+    """While the study is blinded, without the hashes of methods: those are files of letters as well."""
+    blinded = unblinding.is_blinded(study)
+    for person, wanted in _present(session, study, window):
+        theirs = select(Model).where(Model.participant_id == person.id, wanted.beyond(Model.id), wanted.known(Model))
+        for each in session.scalars(theirs.order_by(Model.id)):
+            yield (
+                (person.number, each.id),
+                (
+                    person.code,
+                    each.kind,
+                    each.label_count,
+                    each.label_hash,
+                    each.seed,
+                    None if blinded and each.kind == ModelKind.METHOD else each.artefact_sha256,
+                    each.created_at,
+                    each.metrics,
+                ),
+            )
+
+
+def evaluations(session: Session, study: Study, window: Window = EVERYTHING) -> KeyedRows:
+    for person, wanted in _present(session, study, window):
+        rows = session.execute(
+            select(Model, Bundle)
+            .outerjoin(Bundle, Bundle.model_id == Model.id)
+            .where(Model.participant_id == person.id, Model.kind == ModelKind.FILTER, wanted.known(Model))
+            .order_by(Model.label_count, Model.id)
+        ).all()
+        for place, (model, bundle) in enumerate(rows, 1):
+            measured = model_metrics.filter_version(model, bundle)
+            named = [("success", measured.success), ("preference", measured.preference)]
+            named += [(cost.symbol, cost) for cost in measured.costs]
+            for number, (name, change) in enumerate(named):
+                key = model.label_count, model.id, number
+                if change is not None and key > wanted.after:
+                    yield (
+                        (person.number, *key),
+                        (
+                            person.code,
+                            measured.label_count,
+                            place == len(rows),
+                            measured.bundle_version,
+                            measured.scenarios,
+                            name,
+                            change.reference,
+                            change.filtered,
+                            change.delta,
+                            change.low,
+                            change.high,
+                        ),
+                    )
+
+
+def clips(session: Session, study: Study, window: Window = EVERYTHING) -> KeyedRows:
+    rollout = aliased(Rollout)
+    place = (rollout.scenario, rollout.behaviour, Clip.first_step, Clip.step_count, Clip.id)
+    rows = session.execute(
+        select(Clip, rollout)
+        .join(rollout, Clip.rollout_id == rollout.id)
+        .where(rollout.study_id == study.id, window.beyond(*place), window.known(Clip))
+        .order_by(*place)
+        .execution_options(yield_per=AT_ONCE)
+    )
+    for clip, run in rows:
+        yield (
+            (run.scenario, run.behaviour, clip.first_step, clip.step_count, clip.id),
+            (
+                clip.video_sha256,
+                run.scenario,
+                run.behaviour,
+                run.mode,
+                run.success,
+                clip.first_step,
+                clip.step_count,
+                clip.duration_ms,
+                clip.fps,
+                run.trajectory_sha256,
+            ),
+        )
+
+
+def deviations(session: Session, study: Study, window: Window = EVERYTHING) -> KeyedRows:
+    known = select(Deviation).where(
+        Deviation.study_id == study.id, window.beyond(Deviation.id), window.known(Deviation)
+    )
+    for each in session.scalars(known.order_by(Deviation.id)):
+        yield (each.id,), (each.at, each.actor, each.reason, each.before, each.after)

@@ -1,0 +1,300 @@
+"""The tables of an export and what every column means; export_rows reads what stands in them."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from app.domain.clips import Clip
+from app.domain.evaluation import Rating, Trial
+from app.domain.models import Model, ModelKind
+from app.domain.participation import ConsentRecord, FormAnswer, ParticipantEvent, StageRecord
+from app.domain.preferences import LabelEvent, Purpose, Query, Response, SkipReason
+from app.domain.protocol import EvaluatedMethod, Stage
+from app.domain.studies import Deviation, Participant
+from app.services.exports import export_rows
+from app.services.exports.export_formats import Column, Kind, Table
+
+PARTICIPANT = Column("participant", Kind.TEXT, "Code of the participant.", allowed="P01, P02, ...")
+ORDINAL = Column("ordinal", Kind.INTEGER, "Place of the pair in this participant's order.", allowed="from 1")
+SHA256 = "64 hexadecimal digits"
+WITHOUT_SCRIPT = (
+    "Whether the page's script sent it. False: a browser without script, where nothing is measured and nothing "
+    "waits until the clips were seen. Empty: taken back, or from a version that did not note it."
+)
+
+
+def _words(values: type[Any]) -> str:
+    return ", ".join(value.value for value in values)
+
+
+T, I, N, B, W, J = Kind.TEXT, Kind.INTEGER, Kind.NUMBER, Kind.BOOLEAN, Kind.TIME, Kind.JSON  # noqa: E741
+
+TABLES: Sequence[Table] = (
+    Table(
+        "participants",
+        "One row per participant, tombstones of those who withdrew included.",
+        (
+            PARTICIPANT,
+            Column("status", T, "How far they are.", allowed="invited, consented, completed, withdrawn"),
+            Column("seed", I, "Everything drawn for this person follows from it."),
+            Column("language", T, "Of the pages.", allowed="en, de"),
+            Column("invited_at", W, "When the personal link was made."),
+            Column("consented_at", W, "When they agreed."),
+            Column("consent_version", T, "To which text."),
+            Column("instructed_at", W, "When they had read the instructions."),
+            Column("completed_at", W, "When they had finished everything."),
+            Column("last_seen_at", W, "When their browser last asked for anything."),
+            Column("panel_id", T, "Who this is at the recruitment panel, if they came through one. Personal."),
+            Column("withdrawn_at", W, "When they withdrew; nothing else is kept of them."),
+            Column(
+                "scripted_as", T, "The user that a program plays: no person has answered or rated. Empty: a person."
+            ),
+        ),
+        export_rows.participants,
+        (Participant,),
+    ),
+    Table(
+        "stages",
+        "When everybody came into each stage and was through with it.",
+        (
+            PARTICIPANT,
+            Column("stage", T, "Part of the way.", allowed=_words(Stage)),
+            Column("entered_at", W, "When it was first shown."),
+            Column(
+                "finished_at", W, "When it was done; empty where that is counted instead (practice, pairs, evaluation)."
+            ),
+        ),
+        export_rows.stages,
+        (StageRecord,),
+    ),
+    Table(
+        "queries",
+        "One row per pair that was made for a participant, with the answer that counts.",
+        (
+            PARTICIPANT,
+            ORDINAL,
+            Column(
+                "purpose", T, "Why it is shown; only introduction and preference are learned from.", "", _words(Purpose)
+            ),
+            Column("repeats_ordinal", I, "Of a repeat: the ordinal of the pair that it asks again."),
+            Column("sides_swapped", B, "Of a repeat: whether the clips have changed sides."),
+            Column("expected", T, "Of a catch pair: the obvious answer.", allowed="left, right"),
+            Column(
+                "left_scenario", I, "Situation of the left clip; with the behaviour it names the clip (table clips)."
+            ),
+            Column("left_behaviour", I, "Way of doing the task on the left."),
+            Column("right_scenario", I, "Situation of the right clip; usually the same."),
+            Column("right_behaviour", I, "Way of doing the task on the right."),
+            Column("left_steps", I, "Length of the left clip.", "control steps"),
+            Column("right_steps", I, "Length of the right clip.", "control steps"),
+            Column("left_video_sha256", T, "The video that was shown on the left.", allowed=SHA256),
+            Column("right_video_sha256", T, "The video that was shown on the right.", allowed=SHA256),
+            Column("strategy", T, "How the pair was chosen."),
+            Column("propensity", N, "Probability with which it was chosen among the candidates.", allowed="0 to 1"),
+            Column(
+                "predicted_right",
+                N,
+                "P(right preferred) by the newest model that had not seen this pair's answer; empty without one.",
+                allowed="0 to 1",
+            ),
+            Column("predicted_from_labels", I, "How many answers that model had learned from."),
+            Column("served_at", W, "When it was first shown."),
+            Column(
+                "response", T, "The answer that counts; empty: not answered, or taken back.", allowed=_words(Response)
+            ),
+            Column("reason", T, "Why they could not tell (skip).", allowed=_words(SkipReason)),
+            Column("response_time_ms", I, "From the first frame of both videos to the answer.", "ms"),
+            Column("answered_at", W, "When that answer reached the server."),
+            Column("revisions", I, "Answers and undos of this pair; table labels has them all."),
+            Column("is_label", B, "Whether the answer is learned from."),
+            Column("excluded", B, "Whether an experimenter has left the answer out of learning and statistics."),
+            Column("exclusion_reason", T, "Why, in their words."),
+        ),
+        export_rows.queries,
+        (Query, LabelEvent),
+    ),
+    Table(
+        "labels",
+        "Every answer and every undo as it came in, those that no longer count included.",
+        (
+            PARTICIPANT,
+            ORDINAL,
+            Column("purpose", T, "Of the pair.", allowed=_words(Purpose)),
+            Column("revision", I, "First, second, ... word about this pair.", allowed="from 1"),
+            Column("response", T, "What was said; empty: the answer before was taken back.", allowed=_words(Response)),
+            Column("superseded", B, "Whether a later word about this pair counts instead."),
+            Column("reason", T, "Why they could not tell (skip).", allowed=_words(SkipReason)),
+            Column("response_time_ms", I, "From the first frame of both videos to the answer.", "ms"),
+            Column("replay_count", I, "How often the clips were started again."),
+            Column("scrub_count", I, "How often somebody moved through the clips by hand."),
+            Column("playback_rate", N, "Speed at the moment of the answer; 1 is real time.", allowed="0.25 to 2"),
+            Column("watched_whole", B, "Whether both clips had been seen from beginning to end."),
+            Column("left_watched_ms", I, "How much of the left clip had been played, in its own time.", "ms"),
+            Column("right_watched_ms", I, "How much of the right clip had been played, in its own time.", "ms"),
+            Column("play_error_count", I, "Clips that could not be loaded or played."),
+            Column("stall_count", I, "How often a clip had to wait for the network."),
+            Column("stalled_ms", I, "How long altogether.", "ms"),
+            Column(
+                "largest_drift_ms",
+                I,
+                "How far the two clips were apart at worst, before they were brought together.",
+                "ms",
+            ),
+            Column("by_script", B, WITHOUT_SCRIPT),
+            Column("created_at", W, "When it reached the server."),
+            Column("excluded", B, "Whether an experimenter has left this answer out of learning and statistics."),
+        ),
+        export_rows.labels,
+        (LabelEvent,),
+    ),
+    Table(
+        "forms",
+        "Answers to demographics and questionnaire. The study's settings have the questions.",
+        (
+            PARTICIPANT,
+            Column("form", T, "Which form.", allowed="demographics, questionnaire"),
+            Column("item", T, "Name of the question."),
+            Column("value", T, "What was entered (likert: 1 to 5); empty: left out on purpose."),
+            Column("superseded", B, "Whether a later answer to the same question counts instead."),
+            Column("created_at", W, "When it reached the server."),
+        ),
+        export_rows.forms,
+        (FormAnswer,),
+    ),
+    Table(
+        "consent",
+        "What exactly everybody agreed to.",
+        (
+            PARTICIPANT,
+            Column("version", T, "Version of the text."),
+            Column("language", T, "Of the text.", allowed="en, de"),
+            Column("agreed_at", W, "When they agreed."),
+            Column("text", T, "The text, word for word."),
+        ),
+        export_rows.consent,
+        (ConsentRecord,),
+    ),
+    Table(
+        "events",
+        "What happened on the way besides answers: breaks, hidden pages, clips that would not play.",
+        (
+            PARTICIPANT,
+            Column("at", W, "When."),
+            Column("kind", T, "What; app/services/participant_events.py says what each means."),
+            Column("detail", J, "Numbers that belong to it."),
+        ),
+        export_rows.events,
+        (ParticipantEvent,),
+    ),
+    Table(
+        "ratings",
+        "Every trial of the blinded evaluation with what was said about it; a corrected rating has a row per revision.",
+        (
+            PARTICIPANT,
+            Column(
+                "letter",
+                T,
+                "Under which the participant met the method; letters go by the order of meeting.",
+                "",
+                "A to E",
+            ),
+            Column(
+                "method", T, "Which method it was; empty until the study is unblinded.", allowed=_words(EvaluatedMethod)
+            ),
+            Column("repetition", I, "Which trial of this method.", allowed="from 1"),
+            Column("order", I, "Place of the trial among all of this participant.", allowed="from 1"),
+            Column("scenario", I, "Situation; the same for all methods of a participant and repetition."),
+            Column("satisfaction", I, "Overall satisfaction.", allowed="1 to 5; empty: not rated"),
+            Column("personalisation", I, "How personalised the robot seemed.", allowed="1 to 5; empty: not rated"),
+            Column("counts", B, "Whether this rating counts: false for a corrected one, and where there is none."),
+            Column("revision", I, "First, second, ... rating of this trial.", allowed="from 1"),
+            Column("response_time_ms", I, "From showing the scales to sending.", "ms"),
+            Column("by_script", B, WITHOUT_SCRIPT),
+            Column("rated_at", W, "When it reached the server."),
+            Column("shown_at", W, "Video: when the film was first shown."),
+            Column("started_at", W, "Physical: when the operator started the robot."),
+            Column("finished_at", W, "Physical: when the operator said that it was done."),
+            Column("success", B, "Video: whether the robot succeeded; empty until the study is unblinded."),
+        ),
+        export_rows.ratings,
+        (Trial, Rating),
+    ),
+    Table(
+        "models",
+        "Every model that was trained for a participant.",
+        (
+            PARTICIPANT,
+            Column("kind", T, "What it is.", allowed=_words(ModelKind)),
+            Column(
+                "label_count",
+                I,
+                "Answers given by then, those without a preference and excluded ones included.",
+            ),
+            Column("label_hash", T, "Fingerprint of these answers.", allowed=SHA256),
+            Column("seed", I, "Of the training."),
+            Column(
+                "artefact_sha256", T, "The stored file; of methods unknown while the study is blinded.", allowed=SHA256
+            ),
+            Column("created_at", W, "When it was ready."),
+            Column("metrics", J, "What was measured while training."),
+        ),
+        export_rows.models,
+        (Model,),
+    ),
+    Table(
+        "evaluations",
+        "What each filter changes on unseen simulated scenarios, against the reference policy; one row per measure.",
+        (
+            PARTICIPANT,
+            Column("label_count", I, "Answers the filter has learned from."),
+            Column("newest", B, "Whether it is the participant's newest filter."),
+            Column("bundle_version", I, "Of the published bundle, if there is one."),
+            Column("scenarios", I, "Unseen scenarios it was measured on."),
+            Column(
+                "measure",
+                T,
+                "success: share of scenarios. preference: learned return, in standard deviations of the reference's. "
+                "C_*: the paper's costs, summed per episode.",
+                allowed="success, preference, C_d, C_v, C_f, C_hf, C_fd, C_fdv",
+            ),
+            Column("reference", N, "Mean with the reference policy; empty for preference."),
+            Column("filtered", N, "Mean with the filter; empty for preference."),
+            Column("delta", N, "Mean difference, filtered minus reference, paired by scenario."),
+            Column("low", N, "Lower end of the 95 % interval of the difference."),
+            Column("high", N, "Upper end."),
+        ),
+        export_rows.evaluations,
+        (Model,),
+    ),
+    Table(
+        "clips",
+        "The pool of clips that pairs are made of.",
+        (
+            Column("video_sha256", T, "The video.", allowed=SHA256),
+            Column("scenario", I, "Situation: its seed, or the number given when clips were imported."),
+            Column("behaviour", I, "Way of doing the task in this situation.", allowed="from 0"),
+            Column("mode", J, "What the behaviour is."),
+            Column("success", B, "Whether the whole trajectory succeeded."),
+            Column("first_step", I, "First control step that is shown."),
+            Column("step_count", I, "How many are shown.", "control steps"),
+            Column("duration_ms", I, "Length of the video.", "ms"),
+            Column("fps", I, "Frames per second.", "1/s"),
+            Column("trajectory_sha256", T, "The stored trajectory.", allowed=SHA256),
+        ),
+        export_rows.clips,
+        (Clip,),
+    ),
+    Table(
+        "deviations",
+        "Changes to the study after it was locked.",
+        (
+            Column("at", W, "When."),
+            Column("actor", T, "Whose account."),
+            Column("reason", T, "Why, in their words."),
+            Column("before", J, "What was changed, as it was."),
+            Column("after", J, "And as it is since."),
+        ),
+        export_rows.deviations,
+        (Deviation,),
+    ),
+)
+BY_NAME = {table.name: table for table in TABLES}

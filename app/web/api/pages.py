@@ -1,0 +1,63 @@
+"""Pages about the API: its documentation, and the tokens of an account."""
+
+import json
+from http import HTTPStatus
+from typing import Annotated
+
+from fastapi import APIRouter, Form, Request
+from fastapi.responses import RedirectResponse, Response
+
+from app.services.accounts import api_tokens
+from app.web.api import openapi, routes
+from app.web.http.deps import CurrentExperimenter, OwnAccount, ReadingSession, RowId, WritingSession
+from app.web.texts.templating import page
+
+router = APIRouter()
+
+
+@router.get("/api/docs", name="show_api")
+def show_api(request: Request) -> Response:
+    """Everything that the API offers, on one page that loads nothing from anywhere else."""
+    document = request.app.state.api.openapi()
+    operations = openapi.described(document, routes.PREFIX)
+    for operation in operations:
+        for side in ("takes", "gives"):
+            example = operation[side]
+            operation[side] = None if example is None else json.dumps(example, indent=2, ensure_ascii=False)
+    context = {
+        "document": document,
+        "paragraphs": document["info"]["description"].strip().split("\n\n"),
+        "tags": list(dict.fromkeys(operation["tag"] for operation in operations)),
+        "operations": operations,
+        "base": str(request.base_url).rstrip("/"),
+        "prefix": routes.PREFIX,
+    }
+    return page(request, "api_docs.html", context)
+
+
+@router.get("/tokens", name="show_tokens")
+def show_tokens(request: Request, experimenter: CurrentExperimenter, session: ReadingSession) -> Response:
+    """The tokens of this account."""
+    tokens = api_tokens.of_experimenter(session, experimenter)
+    return page(request, "experimenter/tokens.html", {"experimenter": experimenter, "tokens": tokens, "made": None})
+
+
+@router.post("/tokens", name="create_token")
+def create_token(
+    request: Request,
+    name: Annotated[str, Form(min_length=1, max_length=api_tokens.LONGEST_NAME)],
+    experimenter: OwnAccount,
+    session: WritingSession,
+) -> Response:
+    """Make a token and show it, this one time; there is nothing to come back to, so this is the page itself."""
+    token, text = api_tokens.create(session, experimenter, name)
+    tokens = api_tokens.of_experimenter(session, experimenter)
+    context = {"experimenter": experimenter, "tokens": tokens, "made": (token, text)}
+    return page(request, "experimenter/tokens.html", context)
+
+
+@router.post("/tokens/{token_id}/revoke", name="revoke_token")
+def revoke_token(request: Request, token_id: RowId, experimenter: OwnAccount, session: WritingSession) -> Response:
+    """Make a token worthless."""
+    api_tokens.revoke(session, experimenter, token_id)
+    return RedirectResponse(request.app.url_path_for("show_tokens"), HTTPStatus.SEE_OTHER)

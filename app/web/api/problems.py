@@ -1,0 +1,86 @@
+"""Errors of the API as problem details (RFC 9457): in words what happened and what to do."""
+
+from collections.abc import Mapping
+from http import HTTPStatus
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse, Response
+from sqlalchemy.exc import OperationalError
+from starlette.exceptions import HTTPException
+
+from app.db import complaints
+from app.errors import AppError
+from app.web.http.security import HEADERS
+
+_REPLACED = {"offset": "offset is gone, because answers between two pages would shift it: follow next instead."}
+
+
+class ParameterUnknown(AppError):
+    """This address does not know one of the parameters."""
+
+    status = HTTPStatus.UNPROCESSABLE_ENTITY
+
+
+async def only_known_parameters(request: Request) -> None:
+    """A parameter that is ignored is an answer to another question than the one that was asked.
+
+    Raises ParameterUnknown, which names those that are known.
+    """
+    documented = request.app.openapi()["paths"][request.scope["route"].path][request.method.lower()]
+    known = [each["name"] for each in documented.get("parameters", ()) if each["in"] == "query"]
+    unknown = sorted(set(request.query_params) - set(known))
+    if unknown:
+        named = ", ".join(name[:40] for name in unknown[:5])
+        replaced = [_REPLACED[name] for name in unknown if name in _REPLACED]
+        words = f"It knows {', '.join(known)}." if known else "It takes none after the question mark."
+        raise ParameterUnknown(" ".join([f"This address does not know: {named}.", words, *replaced]))
+
+
+def add_problems(api: FastAPI) -> None:
+    """Have every error of this application answered so."""
+
+    @api.exception_handler(AppError)
+    def ours(_request: Request, error: AppError) -> Response:
+        return problem(error.status, error.message)
+
+    @api.exception_handler(HTTPException)
+    def of_the_framework(_request: Request, error: HTTPException) -> Response:
+        words = {
+            HTTPStatus.NOT_FOUND: "There is nothing at this address. /api/docs lists what there is.",
+            HTTPStatus.METHOD_NOT_ALLOWED: "This address cannot be used in that way. /api/docs says how.",
+            HTTPStatus.REQUEST_ENTITY_TOO_LARGE: "That was more than we accept at once.",
+        }
+        status = HTTPStatus(error.status_code)
+        return problem(status, words.get(status, "This request could not be understood."), error.headers)
+
+    @api.exception_handler(RequestValidationError)
+    def not_valid(_request: Request, error: RequestValidationError) -> Response:
+        wrong = [
+            f"{'.'.join(str(part) for part in each['loc'][1:]) or 'body'}: {each['msg']}" for each in error.errors()
+        ]
+        status = HTTPStatus.UNPROCESSABLE_ENTITY
+        if any(each["loc"][0] == "path" for each in error.errors()):
+            status = HTTPStatus.NOT_FOUND
+        return problem(status, f"Not valid: {'; '.join(wrong)}.")
+
+    @api.exception_handler(OperationalError)
+    def database_busy(_request: Request, error: OperationalError) -> Response:
+        complaints.error("the database did not answer: %s", error.orig)
+        message = "The database is busy or not ready. Nothing was saved; please try again in a moment."
+        return problem(HTTPStatus.SERVICE_UNAVAILABLE, message, {"retry-after": "2"})
+
+    @api.exception_handler(Exception)
+    def unforeseen(_request: Request, _error: Exception) -> Response:
+        message = "This is our fault, and it is in the log. Nothing was saved by this step; please try again."
+        return problem(HTTPStatus.INTERNAL_SERVER_ERROR, message, HEADERS)
+
+
+def problem(status: HTTPStatus, detail: str, headers: Mapping[str, str] | None = None) -> Response:
+    """Problem details, RFC 9457."""
+    content = {"title": status.phrase, "status": int(status), "detail": detail}
+    answer = JSONResponse(content, status, media_type="application/problem+json")
+    answer.headers.update(headers or {})
+    if status is HTTPStatus.UNAUTHORIZED:
+        answer.headers["www-authenticate"] = "Bearer"
+    return answer

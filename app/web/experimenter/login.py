@@ -1,0 +1,141 @@
+"""Logging in and out, and choosing a password."""
+
+from datetime import timedelta
+from http import HTTPStatus
+from typing import Annotated
+
+from fastapi import APIRouter, Form, Request
+from fastapi.concurrency import run_in_threadpool
+from fastapi.responses import RedirectResponse, Response
+from sqlalchemy.orm import Session
+
+from app.domain.people import Experimenter
+from app.errors import AppError
+from app.services import audit
+from app.services.accounts import accounts, browser_sessions, known_browsers
+from app.web.http.deps import (
+    EXPERIMENTER_COOKIE,
+    KNOWN_BROWSER_COOKIE,
+    LoggedInBriefly,
+    Studio,
+    StudioDep,
+    WritingSession,
+    set_cookie,
+)
+from app.web.texts.templating import page
+
+router = APIRouter()
+
+_Password = Annotated[str, Form(max_length=accounts.MAX_PASSWORD_LENGTH)]
+
+
+class TooManyAttempts(AppError):
+    """Too many attempts. Please wait a minute, then try again."""
+
+    status = HTTPStatus.TOO_MANY_REQUESTS
+
+
+@router.get("/login", name="show_login")
+def show_login(request: Request, next: str = "") -> Response:
+    """The form."""
+    return page(request, "experimenter/login.html", {"next": _inside(next), "name": "", "error": None})
+
+
+@router.post("/login", name="log_in")
+async def log_in(
+    request: Request,
+    studio: StudioDep,
+    name: Annotated[str, Form(max_length=80)],
+    password: _Password,
+    next: Annotated[str, Form(max_length=300)] = "",
+) -> Response:
+    """Check the password while holding neither a turn nor a thread that others need, then open a session."""
+    try:
+        experimenter = await _verified(request, studio, name, password)
+        return await _enter(request, studio, experimenter, _inside(next), "logged in")
+    except (accounts.WrongNameOrPassword, TooManyAttempts) as error:
+        context = {"next": _inside(next), "name": name, "error": error.message}
+        status = error.status if isinstance(error, TooManyAttempts) else HTTPStatus.UNAUTHORIZED
+        return page(request, "experimenter/login.html", context, status)
+
+
+@router.post("/logout", name="log_out")
+def log_out(request: Request, session: WritingSession) -> Response:
+    """End this login for good: the cookie is worthless afterwards."""
+    browser_sessions.close(session, request.cookies.get(EXPERIMENTER_COOKIE, ""))
+    response = RedirectResponse(request.app.url_path_for("show_login"), HTTPStatus.SEE_OTHER)
+    response.delete_cookie(EXPERIMENTER_COOKIE)
+    return response
+
+
+@router.get("/password", name="show_password")
+def show_password(request: Request, experimenter: LoggedInBriefly) -> Response:
+    """The form to choose a password."""
+    return page(request, "experimenter/password.html", {"experimenter": experimenter, "error": None})
+
+
+@router.post("/password", name="change_password")
+async def change_password(
+    request: Request,
+    studio: StudioDep,
+    experimenter: LoggedInBriefly,
+    current: _Password,
+    new: _Password,
+    again: _Password,
+) -> Response:
+    """Change the password; every other login of this account ends."""
+    try:
+        _count_attempt(request, studio, experimenter.name, browser=f"logged in/{experimenter.id}")
+        if new != again:
+            raise accounts.PasswordUnacceptable("The two new passwords differ. Please type the same one twice.")
+        password_hash = await studio.hashing_for_known.run(accounts.hash_of_new, experimenter, current=current, new=new)
+    except (accounts.WrongNameOrPassword, accounts.PasswordUnacceptable, TooManyAttempts) as error:
+        status = error.status if isinstance(error, TooManyAttempts) else HTTPStatus.UNPROCESSABLE_ENTITY
+        context = {"experimenter": experimenter, "error": error.message}
+        return page(request, "experimenter/password.html", context, status)
+    async with studio.turns.writing() as session:
+        changed = await run_in_threadpool(accounts.set_password, session, experimenter, password_hash)
+    return await _enter(request, studio, changed, _inside(""), "logged in with the new password")
+
+
+async def _verified(request: Request, studio: Studio, name: str, password: str) -> Experimenter:
+    """Raises WrongNameOrPassword and TooManyAttempts."""
+    async with studio.turns.reading() as session:
+        account = await run_in_threadpool(accounts.by_name, session, name)
+    browser = known_browsers.name_in(request.cookies.get(KNOWN_BROWSER_COOKIE, ""), account)
+    _count_attempt(request, studio, name, browser)
+    hashing = studio.hashing if browser is None else studio.hashing_for_known
+    return await hashing.run(accounts.verify, account, password)
+
+
+def _count_attempt(request: Request, studio: Studio, account: str, browser: str | None) -> None:
+    address = request.client.host if request.client else "unknown"
+    if not studio.login_attempts.allow(address, account, browser):
+        raise TooManyAttempts
+
+
+async def _enter(request: Request, studio: Studio, experimenter: Experimenter, target: str, act: str) -> Response:
+    """Raises WrongNameOrPassword when the password was replaced while it was being checked."""
+    lifetime = timedelta(hours=studio.settings.login_hours)
+    async with studio.turns.writing() as session:
+        cookie = await run_in_threadpool(_open_session, session, experimenter, lifetime, act)
+    response = RedirectResponse(target or request.app.url_path_for("show_studies"), HTTPStatus.SEE_OTHER)
+    set_cookie(response, studio.settings, EXPERIMENTER_COOKIE, cookie, lifetime)
+    mark = known_browsers.new_mark(experimenter)
+    set_cookie(response, studio.settings, KNOWN_BROWSER_COOKIE, mark, known_browsers.LIFETIME)
+    return response
+
+
+def _open_session(session: Session, experimenter: Experimenter, lifetime: timedelta, act: str) -> str:
+    stored = session.get(Experimenter, experimenter.id)
+    if stored is None or stored.password_hash != experimenter.password_hash:
+        raise accounts.WrongNameOrPassword
+    cookie = browser_sessions.open_for_experimenter(session, stored, lifetime)
+    audit.record(session, stored.name, act, stored.name)
+    return cookie
+
+
+def _inside(target: str) -> str:
+    """The page to go on to, if it is one of the experimenter's own; a login must not lead to other sites."""
+    inside = target.startswith("/studies") and target.isprintable() and target.isascii() and "\\" not in target
+    return target if inside else ""

@@ -1,0 +1,265 @@
+"""Results: what the newest report says, its figures, and the data as files."""
+
+from collections.abc import Iterator, Mapping
+from http import HTTPStatus
+from typing import Annotated, Any, Literal
+
+from fastapi import APIRouter, Path, Request
+from fastapi.responses import FileResponse, RedirectResponse, Response, StreamingResponse
+from sqlalchemy.orm import Session
+
+from app.domain.people import Experimenter, Role
+from app.domain.studies import Study
+from app.errors import AppError
+from app.services import audit
+from app.services.accounts import roles
+from app.services.answers import exclusions
+from app.services.archives import sealing
+from app.services.evaluation import evaluation_plan, unblinding
+from app.services.exports import export_formats, export_requests, export_tables
+from app.services.exports.export_requests import ExportKind
+from app.services.monitoring import form_summaries
+from app.services.participants import enrolment
+from app.services.runs import reports
+from app.services.studies import locking, preregistration, studies
+from app.web.experimenter import form_words
+from app.web.http.deps import (
+    ActingExperimenter,
+    CurrentExperimenter,
+    ReadingSession,
+    RowId,
+    Slug,
+    StudioDep,
+    WritingSession,
+)
+from app.web.http.spooling import spooled
+from app.web.texts import task_words
+from app.web.texts.templating import page
+
+router = APIRouter(prefix="/studies/{slug}")
+
+TableName = Annotated[str, Path(pattern=r"^[a-z]{1,40}$")]
+FileKind = Literal["csv", "jsonl"]
+MEDIA_TYPES = {"csv": "text/csv; charset=utf-8", "jsonl": "application/x-ndjson"}
+LINES_AT_ONCE = 200
+METHOD_NAMES = {
+    "reference": "Pre-trained policy",
+    "prefft": "PrefFT",
+    "prefft_anchored": "PrefFT, anchored",
+    "pbarl": "PbARL",
+    "pbarl_printed": "PbARL as printed",
+}
+FIGURES = {
+    "ratings": ("Mean ratings, as in the paper", ""),
+    "ratings_of_each_person": (
+        "The same ratings, person by person",
+        "Each line is one person: their mean rating of each robot. Diamonds: mean over people, 95 % interval.",
+    ),
+    "learning_curves": (
+        "How well the models predicted the answers",
+        "Every answer was predicted by a model that had not seen it; pairs drawn at random only.",
+    ),
+    "success_against_preference": (
+        "What the filters change",
+        "One point per person with 95 % intervals: right is more preferred, up is more often successful. Hollow: the "
+        "model that says so has not been shown to be better than guessing.",
+    ),
+    "cost_changes": (
+        "The paper\N{RIGHT SINGLE QUOTATION MARK}s costs",
+        "One circle per person; costs that the reference does not have are left out.",
+    ),
+}
+
+
+class TableNotFound(AppError):
+    """There is no table of this name. The page of exports lists them all."""
+
+    status = HTTPStatus.NOT_FOUND
+
+
+@router.get("/results", name="show_results")
+def show_results(
+    request: Request, slug: Slug, experimenter: CurrentExperimenter, session: ReadingSession, studio: StudioDep
+) -> Response:
+    """Tables, tests and figures of the newest report."""
+    study = studies.find_study(session, slug)
+    context = results_context(session, study) | {"experimenter": experimenter}
+    return page(request, "experimenter/results.html", context)
+
+
+def results_context(session: Session, study: Study) -> dict[str, Any]:
+    """What the page shows."""
+    report = reports.newest(session, study)
+    return {
+        "study": study,
+        "settings": study.settings,
+        "report": report,
+        "contents": report.contents if report else None,
+        "outdated": report is None and reports.is_outdated(session, study),
+        "awaited": reports.is_awaited(session, study),
+        "run": reports.run_in_hand(session, study),
+        "blinded": unblinding.is_blinded(study),
+        "evaluated": evaluation_plan.settings_of(study) is not None,
+        "words": task_words.words_of(study.task),
+        "name_of": _name_of,
+        "p_value": _p_value,
+        "two_decimals": _two_decimals,
+        "statistic": _statistic,
+        "tests": preregistration.TEST_NAMES,
+        "plan": preregistration.plan_of(session, study),
+        "forms": form_words.summaries(study, form_summaries.summaries_of(session, study)),
+        "excluded": exclusions.count(session, study),
+        "scripted": enrolment.count_scripted(session, study),
+        "figures": {name: FIGURES[name] for name in FIGURES if report is not None and name in report.figures},
+    }
+
+
+@router.get("/results/figures/{name}.{kind}", name="show_figure")
+def show_figure(
+    slug: Slug,
+    name: Annotated[str, Path(pattern=r"^[a-z_]{1,60}$")],
+    kind: Literal["svg", "png"],
+    _experimenter: CurrentExperimenter,
+    session: ReadingSession,
+    studio: StudioDep,
+) -> Response:
+    """One figure of the newest report."""
+    study = studies.find_study(session, slug)
+    content = reports.figure(session, studio.store, study, name, kind)
+    # An SVG file styles itself; opened by itself it must not be able to do anything else.
+    policy = "default-src 'none'; style-src 'unsafe-inline'; sandbox"
+    headers = {"content-security-policy": policy, "content-disposition": f'inline; filename="{slug}-{name}.{kind}"'}
+    return Response(content, media_type=reports.FORMATS[kind], headers=headers)
+
+
+@router.get("/export", name="show_exports")
+def show_exports(
+    request: Request, slug: Slug, experimenter: CurrentExperimenter, session: ReadingSession, studio: StudioDep
+) -> Response:
+    """Every table, the whole as one file, and the archive."""
+    return _exports_page(request, studies.find_study(session, slug), experimenter, session)
+
+
+@router.get("/export/seal-key", include_in_schema=False)
+def forget_seal_key(request: Request, slug: Slug) -> Response:
+    """The page of exports, for whoever loads the page with the key again."""
+    return RedirectResponse(request.app.url_path_for("show_exports", slug=slug), HTTPStatus.SEE_OTHER)
+
+
+@router.post("/export/seal-key", name="show_seal_key")
+def show_seal_key(request: Request, slug: Slug, experimenter: ActingExperimenter, session: WritingSession) -> Response:
+    """The key of this study's sealed archives; who has asked for it is kept."""
+    roles.require(experimenter, Role.EXPERIMENTER)
+    study = studies.find_study(session, slug)
+    audit.record(session, experimenter.name, "seal key shown", slug)
+    return _exports_page(request, study, experimenter, session, sealing.key_of(study))
+
+
+def _exports_page(
+    request: Request, study: Study, experimenter: Experimenter, session: Session, seal_key: str | None = None
+) -> Response:
+    exports = [(export, export_requests.run_of(session, export)) for export in export_requests.of_study(session, study)]
+    context = {
+        "study": study,
+        "experimenter": experimenter,
+        "deviations": len(locking.deviations(session, study)),
+        "waiting": any(export.finished_at is None for export, _ in exports),
+        "exports": exports,
+        "blinded": unblinding.is_blinded(study),
+        "tables": export_tables.TABLES,
+        "provenance": export_formats.provenance_of(session, study),
+        "scripted": enrolment.count_scripted(session, study),
+        "may_export": roles.may(experimenter, Role.EXPERIMENTER),
+        "seal_key": seal_key,
+    }
+    return page(request, "experimenter/export.html", context)
+
+
+@router.post("/export/files/{kind}", name="request_export")
+def request_export(
+    request: Request, slug: Slug, kind: ExportKind, experimenter: ActingExperimenter, session: WritingSession
+) -> Response:
+    """Ask the worker for a file."""
+    roles.require(experimenter, Role.EXPERIMENTER)
+    export_requests.request(session, studies.find_study(session, slug), kind, experimenter.name)
+    return RedirectResponse(request.app.url_path_for("show_exports", slug=slug), HTTPStatus.SEE_OTHER)
+
+
+@router.get("/export/files/{export_id}.zip", name="download_export")
+def download_export(
+    slug: Slug, export_id: RowId, experimenter: ActingExperimenter, session: WritingSession, studio: StudioDep
+) -> Response:
+    """A finished file."""
+    roles.require(experimenter, Role.EXPERIMENTER)
+    study = studies.find_study(session, slug)
+    export = export_requests.find(session, studio.store, study, export_id)
+    audit.record(session, experimenter.name, f"{export.kind} export downloaded", f"{slug}/{export_id}")
+    filename = f"{slug}-{export.kind}-{export.requested_at:%Y%m%dT%H%M}.zip"
+    path = studio.store.path(export.artefact_sha256 or "")
+    return FileResponse(path, media_type="application/zip", filename=filename)
+
+
+@router.get("/export/{table}.{kind}", name="download_table")
+def download_table(
+    slug: Slug,
+    table: TableName,
+    kind: FileKind,
+    experimenter: ActingExperimenter,
+    session: WritingSession,
+    studio: StudioDep,
+) -> Response:
+    """One table, as the database is now."""
+    roles.require(experimenter, Role.EXPERIMENTER)
+    study = studies.find_study(session, slug)
+    if table not in export_tables.BY_NAME:
+        raise TableNotFound
+    audit.record(session, experimenter.name, "table exported", f"{slug}/{table}.{kind}")
+    provenance = export_formats.provenance_of(session, study)
+    lock = "not-locked" if study.lock_hash is None else study.lock_hash[:8]
+    name = f"{slug}-{table}-{lock}-{provenance.exported_at:%Y%m%dT%H%M%S}.{kind}"
+    headers = {"content-disposition": f'attachment; filename="{name}"'}
+    write = export_formats.csv_lines if kind == "csv" else export_formats.json_lines
+
+    def lines(later: Session) -> Iterator[str]:
+        """The request's own session is over by the time anything is sent."""
+        found = studies.find_study(later, slug)
+        return _handfuls(write(export_tables.BY_NAME[table], later, found, provenance))
+
+    return StreamingResponse(spooled(studio.turns, lines), media_type=MEDIA_TYPES[kind], headers=headers)
+
+
+def _handfuls(lines: Iterator[str]) -> Iterator[str]:
+    waiting: list[str] = []
+    for line in lines:
+        waiting.append(line)
+        if len(waiting) == LINES_AT_ONCE:
+            yield "".join(waiting)
+            waiting = []
+    yield "".join(waiting)
+
+
+def _name_of(group: str) -> str:
+    """What a method, or a letter, is called."""
+    return METHOD_NAMES.get(group, f"Robot {group}")
+
+
+def _p_value(result: Mapping[str, Any], key: str = "p") -> str:
+    """A p value as papers print it."""
+    value = result.get(key)
+    if value is None:
+        return "\N{EN DASH}"
+    return "< .001" if value < 0.001 else f"{value:.3f}".removeprefix("0")
+
+
+def _two_decimals(value: float) -> str:
+    """A difference or an effect size as papers print it."""
+    return _plain(value, sign="+") if round(value, 2) else "0.00"
+
+
+def _statistic(value: float) -> str:
+    """A test statistic as papers print it."""
+    return _plain(value, sign="-") if round(value, 2) else "0.00"
+
+
+def _plain(value: float, sign: str) -> str:
+    return f"{value:{sign}.2f}".replace("-", "\N{MINUS SIGN}")

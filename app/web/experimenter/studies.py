@@ -1,0 +1,223 @@
+"""The experimenter's pages: studies, one study, one participant. Each is whole without script."""
+
+from collections import Counter
+from collections.abc import AsyncIterator, Mapping
+from http import HTTPStatus
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Depends, Request
+from fastapi.responses import FileResponse, RedirectResponse, Response
+from fastapi.sse import EventSourceResponse, ServerSentEvent
+from jinja2 import Environment
+from sqlalchemy.orm import Session
+
+from app.services import audit
+from app.services.monitoring import dashboard, form_summaries, study_state
+from app.services.participants import debrief, enrolment
+from app.services.runs import publishing
+from app.services.studies import studies
+from app.web.experimenter import charts, form_words, live
+from app.web.experimenter.participants_table import View, WantedView, people_table
+from app.web.http.deps import (
+    ActingExperimenter,
+    Code,
+    CurrentExperimenter,
+    ReadingSession,
+    RowId,
+    Slug,
+    Studio,
+    StudioDep,
+    WritingSession,
+    experimenter_asking,
+)
+from app.web.texts import task_words
+from app.web.texts.templating import page
+
+router = APIRouter(prefix="/studies")
+
+LIST_PARTS = ("machine", "study_list")
+STUDY_PARTS = ("machine", "jobs", "pool", "participants")
+PARTICIPANT_PARTS = (
+    "machine",
+    "participant_summary",
+    "trust",
+    "accuracy",
+    "participant_forms",
+    "weights",
+    "liked",
+    "filters",
+    "runs",
+)
+
+
+def _may_stream(request: Request, studio: StudioDep) -> None:
+    """Checks the login before a stream begins, and holds no session while it lasts."""
+    with studio.database.reading() as session:
+        experimenter_asking(request, session)
+
+
+MayStream = Annotated[None, Depends(_may_stream)]
+
+
+@router.get("", name="show_studies")
+def show_studies(
+    request: Request,
+    experimenter: CurrentExperimenter,
+    session: ReadingSession,
+    studio: StudioDep,
+    put_away: bool = False,
+) -> Response:
+    """Every study that is at work, or those that are put away."""
+    context = _list_context(session, studio, put_away) | {"experimenter": experimenter, "parts": LIST_PARTS}
+    return page(request, "experimenter/studies.html", context)
+
+
+@router.get("/live", name="stream_studies", response_class=EventSourceResponse)
+async def stream_studies(
+    request: Request, studio: StudioDep, _allowed: MayStream, put_away: bool = False
+) -> AsyncIterator[ServerSentEvent]:
+    """The list of studies as it changes."""
+    templates = request.app.state.templates  # and nothing else of the request: what is drawn is for all who look
+
+    def draw(session: Session) -> Mapping[str, str]:
+        return _draw(templates, LIST_PARTS, _list_context(session, studio, put_away))
+
+    async for event in live.redrawn_parts(request, studio, draw):
+        yield event
+
+
+@router.get("/{slug}", name="show_study")
+def show_study(
+    request: Request,
+    slug: Slug,
+    view: WantedView,
+    experimenter: CurrentExperimenter,
+    session: ReadingSession,
+    studio: StudioDep,
+) -> Response:
+    """One study: its pool and everybody in it."""
+    context = _study_context(session, studio, slug, view) | {"experimenter": experimenter, "parts": STUDY_PARTS}
+    return page(request, "experimenter/study.html", context)
+
+
+@router.get("/{slug}/live", name="stream_study", response_class=EventSourceResponse)
+async def stream_study(
+    request: Request, slug: Slug, view: WantedView, studio: StudioDep, _allowed: MayStream
+) -> AsyncIterator[ServerSentEvent]:
+    """One study as it changes, in the view that the page was asked for."""
+    templates = request.app.state.templates  # and nothing else of the request: what is drawn is for all who look
+
+    def draw(session: Session) -> Mapping[str, str]:
+        return _draw(templates, STUDY_PARTS, _study_context(session, studio, slug, view))
+
+    async for event in live.redrawn_parts(request, studio, draw):
+        yield event
+
+
+@router.post("/{slug}/runs/{run_id}/retry", name="retry_run")
+def retry_run(
+    request: Request, slug: Slug, run_id: RowId, experimenter: ActingExperimenter, session: WritingSession
+) -> Response:
+    """Ask for another attempt at a failed run."""
+    study = studies.find_study(session, slug)
+    publishing.retry_run(session, study, run_id, experimenter.name)
+    return _see(request, "show_study", slug=slug)
+
+
+@router.get("/{slug}/participants/{code}", name="show_participant")
+def show_participant(
+    request: Request,
+    slug: Slug,
+    code: Code,
+    experimenter: CurrentExperimenter,
+    session: ReadingSession,
+    studio: StudioDep,
+) -> Response:
+    """One participant: what they said, what was learned, and what it changes."""
+    context = _participant_context(session, studio, slug, code)
+    context |= {"experimenter": experimenter, "parts": PARTICIPANT_PARTS}
+    return page(request, "experimenter/participant.html", context)
+
+
+@router.get("/{slug}/participants/{code}/live", name="stream_participant", response_class=EventSourceResponse)
+async def stream_participant(
+    request: Request, slug: Slug, code: Code, studio: StudioDep, _allowed: MayStream
+) -> AsyncIterator[ServerSentEvent]:
+    """One participant as it changes."""
+    templates = request.app.state.templates  # and nothing else of the request: what is drawn is for all who look
+
+    def draw(session: Session) -> Mapping[str, str]:
+        return _draw(templates, PARTICIPANT_PARTS, _participant_context(session, studio, slug, code))
+
+    async for event in live.redrawn_parts(request, studio, draw):
+        yield event
+
+
+@router.get("/{slug}/participants/{code}/bundles/{version}.zip", name="download_bundle")
+def download_bundle(
+    slug: Slug,
+    code: Code,
+    version: RowId,
+    experimenter: ActingExperimenter,
+    session: WritingSession,
+    studio: StudioDep,
+) -> Response:
+    """The participant's filter as a zip file that runs without this project."""
+    study = studies.find_study(session, slug)
+    participant = enrolment.find_by_code(session, study, code)
+    bundle = publishing.find_bundle(session, studio.store, participant, version)
+    audit.record(session, experimenter.name, "bundle downloaded", f"{slug}/{code}/{version}")
+    filename = f"{slug}-{code}-v{version}.zip"
+    return FileResponse(studio.store.path(bundle.artefact_sha256), media_type="application/zip", filename=filename)
+
+
+def _list_context(session: Session, studio: Studio, put_away: bool) -> dict[str, Any]:
+    lines = dashboard.study_lines(session, put_away=put_away)
+    names = Counter(line.study.name.casefold() for line in lines)
+    return {
+        "machine": dashboard.machine(session, studio.settings.data_dir),
+        "lines": lines,
+        "standings": study_state.standings(session, lines),
+        "twice": {line.study.id for line in lines if names[line.study.name.casefold()] > 1},
+        "put_away": put_away,
+        "put_away_count": studies.count_put_away(session),
+    }
+
+
+def _study_context(session: Session, studio: Studio, slug: str, view: View) -> dict[str, Any]:
+    study = studies.find_study(session, slug)
+    overview = dashboard.study_overview(session, study, studio.tallies)
+    return {
+        "study": study,
+        "settings": study.settings,
+        "overview": overview,
+        "table": people_table(overview, view),
+        "machine": dashboard.machine(session, studio.settings.data_dir),
+        "sparkline": charts.sparkline,
+        "scripted": enrolment.count_scripted(session, study),
+    }
+
+
+def _participant_context(session: Session, studio: Studio, slug: str, code: str) -> dict[str, Any]:
+    study = studies.find_study(session, slug)
+    participant = enrolment.find_by_code(session, study, code)
+    detail = dashboard.participant_detail(session, study, participant, studio.tallies)
+    return {
+        "study": study,
+        "settings": study.settings,
+        "detail": detail,
+        "films": debrief.before_and_after(session, participant),
+        "machine": dashboard.machine(session, studio.settings.data_dir),
+        "chart": charts.accuracy_chart(detail.row.curve, study.settings.labels_per_participant),
+        "interval": charts.interval,
+        "words": task_words.words_of(study.task),
+        "forms": form_words.sheets(study, form_summaries.sheets_of(session, study, participant)),
+    }
+
+
+def _draw(templates: Environment, parts: tuple[str, ...], context: Mapping[str, Any]) -> Mapping[str, str]:
+    return {name: templates.get_template(f"experimenter/_{name}.html").render(context) for name in parts}
+
+
+def _see(request: Request, name: str, **parameters: str) -> RedirectResponse:
+    return RedirectResponse(request.app.url_path_for(name, **parameters), HTTPStatus.SEE_OTHER)

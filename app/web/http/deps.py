@@ -1,0 +1,212 @@
+"""What a route may ask for: settings, sessions on the database, and the person who is asking."""
+
+from collections.abc import AsyncIterator, Mapping
+from dataclasses import dataclass, field
+from datetime import timedelta
+from http import HTTPStatus
+from threading import Event
+from typing import Annotated
+
+from fastapi import Depends, Path, Request, Response
+from fastapi.concurrency import run_in_threadpool
+from sqlalchemy.orm import Session
+
+from app.db import Database
+from app.domain.people import Experimenter, Role
+from app.domain.studies import Participant
+from app.errors import AppError
+from app.services.accounts import browser_sessions, roles
+from app.services.monitoring.tallies import Tallies
+from app.settings import Settings
+from app.storage import ArtefactStore
+from app.web.http.hashing import Hashing
+from app.web.http.import_limit import ImportDesk
+from app.web.http.new_links import LinkDesk
+from app.web.http.rate_limit import LoginAttempts
+from app.web.http.session_queue import Turns
+from app.web.http.shared_pages import Screens
+
+PARTICIPANT_COOKIE = "studio_participant"
+EXPERIMENTER_COOKIE = "studio_experimenter"
+KNOWN_BROWSER_COOKIE = "studio_known_browser"
+LANGUAGE_COOKIE = "studio_language"
+"""The language of the pages in this browser, for those that cannot tell who is asking."""
+
+
+class LinkNeeded(AppError):
+    """We cannot tell who you are. Please open your personal link again: you go on exactly where you were."""
+
+    status = HTTPStatus.UNAUTHORIZED
+
+
+class NotYet(AppError):
+    """Something else comes first. You are taken there."""
+
+    status = HTTPStatus.CONFLICT
+
+
+class LoginNeeded(AppError):
+    """Please log in."""
+
+    status = HTTPStatus.UNAUTHORIZED
+
+
+class PasswordChangeDue(AppError):
+    """Please choose a password of your own first."""
+
+    status = HTTPStatus.FORBIDDEN
+
+
+@dataclass(frozen=True)
+class Studio:
+    """The parts that every request shares."""
+
+    settings: Settings
+    database: Database
+    store: ArtefactStore
+    turns: Turns
+    login_attempts: LoginAttempts
+    screens: Screens
+    token_attempts: LoginAttempts
+    """Of their own: a program with an old token must not lock out the people who log in from the same address."""
+    hashing: Hashing = field(default_factory=Hashing)
+    hashing_for_known: Hashing = field(default_factory=Hashing)
+    """For people whose browser is known or who are logged in: they do not queue behind strangers who guess."""
+    link_desk: LinkDesk = field(default_factory=LinkDesk)
+    imports: ImportDesk = field(default_factory=ImportDesk)
+    tallies: Tallies = field(default_factory=Tallies)
+    closing: Event = field(default_factory=Event)
+    """Set when the server is asked to stop, so that open event streams end by themselves."""
+
+
+async def studio_of(request: Request) -> Studio:
+    """The parts as create_app made them. Async, because a plain function would take a thread for this."""
+    studio: Studio = request.app.state.studio
+    return studio
+
+
+StudioDep = Annotated[Studio, Depends(studio_of)]
+
+
+async def _reading_session(studio: StudioDep) -> AsyncIterator[Session]:
+    async with studio.turns.reading() as session:
+        yield session
+
+
+async def _writing_session(studio: StudioDep) -> AsyncIterator[Session]:
+    async with studio.turns.writing() as session:
+        yield session
+
+
+# scope="function": the transaction ends before the response leaves. With the default scope a commit that fails
+# would come after a response that says "saved".
+ReadingSession = Annotated[Session, Depends(_reading_session, scope="function")]
+WritingSession = Annotated[Session, Depends(_writing_session, scope="function")]
+
+
+def participant_or_nobody(request: Request, session: Session) -> Participant | None:
+    """The participant whose browser this is, study loaded."""
+    cookie = request.cookies.get(PARTICIPANT_COOKIE)
+    participant = browser_sessions.participant_of(session, cookie) if cookie else None
+    return None if participant is None or participant.withdrawn_at is not None else participant
+
+
+def participant_asking(request: Request, session: Session) -> Participant:
+    """The participant whose browser this is, study loaded. Raises LinkNeeded."""
+    participant = participant_or_nobody(request, session)
+    if participant is None:
+        raise LinkNeeded
+    return participant
+
+
+def experimenter_asking(request: Request, session: Session) -> Experimenter:
+    """The experimenter who is logged in, password changed. Raises LoginNeeded and PasswordChangeDue."""
+    experimenter = experimenter_logged_in(request, session)
+    if experimenter.must_change_password:
+        raise PasswordChangeDue
+    return experimenter
+
+
+def experimenter_logged_in(request: Request, session: Session) -> Experimenter:
+    """The experimenter who is logged in, perhaps with a one-time password. Raises LoginNeeded."""
+    cookie = request.cookies.get(EXPERIMENTER_COOKIE)
+    experimenter = browser_sessions.experimenter_of(session, cookie) if cookie else None
+    if experimenter is None:
+        raise LoginNeeded
+    return experimenter
+
+
+def _participant(request: Request, session: WritingSession) -> Participant:
+    return participant_asking(request, session)
+
+
+def _experimenter(request: Request, session: ReadingSession) -> Experimenter:
+    return experimenter_asking(request, session)
+
+
+def _owner(request: Request, session: ReadingSession) -> Experimenter:
+    experimenter = experimenter_asking(request, session)
+    roles.require(experimenter, Role.OWNER)
+    return experimenter
+
+
+async def _owner_briefly(request: Request, studio: StudioDep) -> Experimenter:
+    async with studio.turns.reading() as session:
+        return await run_in_threadpool(_owner, request, session)
+
+
+async def _logged_in_briefly(request: Request, studio: StudioDep) -> Experimenter:
+    async with studio.turns.reading() as session:
+        return await run_in_threadpool(experimenter_logged_in, request, session)
+
+
+def _acting_experimenter(request: Request, session: WritingSession) -> Experimenter:
+    experimenter = experimenter_asking(request, session)
+    roles.require(experimenter, Role.EXPERIMENTER)
+    return experimenter
+
+
+def _own_account(request: Request, session: WritingSession) -> Experimenter:
+    return experimenter_asking(request, session)
+
+
+CurrentParticipant = Annotated[Participant, Depends(_participant, scope="function")]
+"""In the request's writing session: whatever a participant does leaves a trace, if only that they were here."""
+CurrentExperimenter = Annotated[Experimenter, Depends(_experimenter, scope="function")]
+"""Whoever is logged in, readers included: for looking."""
+ActingExperimenter = Annotated[Experimenter, Depends(_acting_experimenter, scope="function")]
+"""In the request's writing session; at least an experimenter: for whatever changes something or leaves the studio."""
+CurrentOwner = Annotated[Experimenter, Depends(_owner, scope="function")]
+OwnerBriefly = Annotated[Experimenter, Depends(_owner_briefly)]
+"""Like CurrentOwner, and no turn is held when the route begins: for what hashes a password."""
+LoggedInBriefly = Annotated[Experimenter, Depends(_logged_in_briefly)]
+"""Whoever is logged in, a one-time password is enough; no turn is held either."""
+OwnAccount = Annotated[Experimenter, Depends(_own_account, scope="function")]
+"""In the request's writing session, whatever their role: for what concerns nobody but themselves."""
+
+
+async def _typed(request: Request) -> Mapping[str, str]:
+    async with request.form() as form:  # files that somebody sends along are closed again
+        return {name: value for name, value in form.items() if isinstance(value, str)}
+
+
+Typed = Annotated[Mapping[str, str], Depends(_typed)]
+"""A form's fields as they were typed, where which there are depends on the study."""
+RowId = Annotated[int, Path(ge=1, le=2**31 - 1)]
+Slug = Annotated[str, Path(pattern=r"^[a-z0-9-]{1,80}$")]
+Code = Annotated[str, Path(pattern=r"^P[0-9]{2,8}$")]
+Sha256 = Annotated[str, Path(pattern=r"^[0-9a-f]{64}$")]
+Token = Annotated[str, Path(pattern=r"^[A-Za-z0-9_-]{20,100}$")]
+
+
+def set_cookie(response: Response, settings: Settings, name: str, cookie: str, lifetime: timedelta) -> None:
+    """Set a cookie that is out of reach of scripts and not sent along by other sites' forms."""
+    response.set_cookie(
+        name,
+        cookie,
+        max_age=int(lifetime.total_seconds()),
+        httponly=True,
+        samesite="lax",
+        secure=settings.secure_cookies,
+        path="/",
+    )

@@ -1,0 +1,158 @@
+"""The participant's blinded evaluation: watch a robot known by a letter, rate it, go on."""
+
+from http import HTTPStatus
+from typing import Annotated, Any
+from uuid import UUID, uuid4
+
+from fastapi import APIRouter, Form, Request
+from fastapi.responses import JSONResponse, RedirectResponse, Response
+from pydantic import BaseModel, BeforeValidator, Field
+
+from app.domain.evaluation import Film, Rating, Trial
+from app.domain.protocol import LIKERT_POINTS, Stage
+from app.domain.studies import Awaited, Participant
+from app.services.answers import next_query
+from app.services.evaluation import evaluation_plan, ratings, robot_preparation
+from app.services.evaluation.evaluation_plan import State, Turn
+from app.web.error_pages import wants_json
+from app.web.http.deps import NotYet, RowId, StudioDep, WritingSession
+from app.web.participant.pages import go, has_reached, is_in, participant_page
+
+router = APIRouter(prefix="/p/evaluation")
+
+_DAY_MS = 24 * 3600 * 1000
+_Points = Annotated[int, Field(ge=1, le=LIKERT_POINTS)]
+_Milliseconds = Annotated[int | None, BeforeValidator(lambda value: value or None), Field(ge=0, le=_DAY_MS)]
+
+InEvaluation = Annotated[Participant, is_in(Stage.EVALUATION)]
+AtEvaluation = Annotated[Participant, has_reached(Stage.EVALUATION)]
+
+_TEMPLATES = {
+    State.PREPARING: "participant/evaluation_waiting.html",
+    State.COMING: "participant/evaluation_robot.html",
+    State.MOVING: "participant/evaluation_robot.html",
+    State.WATCHING: "participant/evaluation.html",
+    State.RATING: "participant/evaluation_rating.html",
+}
+
+
+class RatingForm(BaseModel):
+    """One rating. What the browser could not measure comes empty."""
+
+    satisfaction: _Points
+    personalisation: _Points
+    client_uuid: UUID
+    corrects: Annotated[int, Field(ge=0, le=10_000)] = 0
+    response_time_ms: _Milliseconds = None
+
+
+@router.get("", name="show_evaluation")
+def show_evaluation(
+    request: Request, participant: InEvaluation, session: WritingSession, studio: StudioDep
+) -> Response:
+    """The robot to watch and rate now, or how far the robots are."""
+    next_query.seen(participant)
+    turn = evaluation_plan.next_turn(session, studio.store, participant)
+    next_query.waits(participant, Awaited.ROBOTS if turn.state is State.PREPARING else None)
+    if wants_json(request):
+        return JSONResponse(_for_script(request, turn))
+    if turn.trial is None:
+        context: dict[str, Any] = {"turn": turn, "preparation": robot_preparation.preparation(session, participant)}
+        return participant_page(request, _TEMPLATES[State.PREPARING], participant, context)
+    return _trial_page(request, participant, turn, turn.trial, None, _TEMPLATES[turn.state])
+
+
+@router.get("/done", name="show_evaluation_done")
+def show_evaluation_done(
+    request: Request, participant: AtEvaluation, session: WritingSession, studio: StudioDep
+) -> Response:
+    """Everything is rated; the last rating can still be changed."""
+    turn = evaluation_plan.next_turn(session, studio.store, participant)
+    if turn.state is not State.FINISHED:
+        raise NotYet
+    return participant_page(request, "participant/evaluation_done.html", participant, {"turn": turn})
+
+
+@router.get("/trials/{trial_id}", name="show_last_rating")
+def show_last_rating(
+    request: Request, trial_id: RowId, participant: AtEvaluation, session: WritingSession, studio: StudioDep
+) -> Response:
+    """The rating given last, to be changed."""
+    trial, rated = ratings.find_rated(session, participant, trial_id)
+    turn = evaluation_plan.next_turn(session, studio.store, participant)
+    trials = {each.id: each for each in evaluation_plan.trials_of(session, participant.id)}
+    template = _TEMPLATES[State.WATCHING if trials[trial.id].film else State.RATING]
+    return _trial_page(request, participant, turn, trials[trial.id], rated, template)
+
+
+@router.post("/trials/{trial_id}/rating", name="rate_trial")
+def rate_trial(
+    request: Request,
+    trial_id: RowId,
+    form: Annotated[RatingForm, Form()],
+    participant: AtEvaluation,
+    session: WritingSession,
+    studio: StudioDep,
+) -> Response:
+    """Store the rating; the transaction is committed before this response leaves."""
+    if participant.completed_at is not None:
+        raise ratings.CorrectionTooLate
+    score = ratings.Score(form.satisfaction, form.personalisation)
+    ratings.rate(
+        session,
+        participant,
+        trial_id,
+        score,
+        form.client_uuid,
+        corrects=form.corrects,
+        response_time_ms=form.response_time_ms,
+        by_script=wants_json(request),
+    )
+    next_query.seen(participant)
+    turn = evaluation_plan.next_turn(session, studio.store, participant)
+    name = "show_evaluation_done" if turn.state is State.FINISHED else "show_evaluation"
+    if wants_json(request):
+        return JSONResponse({**_for_script(request, turn), "next_path": request.app.url_path_for(name)})
+    return RedirectResponse(request.app.url_path_for(name), HTTPStatus.SEE_OTHER)
+
+
+@router.get("/next", name="leave_evaluation")
+def leave_evaluation(request: Request, participant: AtEvaluation) -> Response:
+    """On to what comes after the evaluation."""
+    return go(request, "show_next")
+
+
+def _trial_page(
+    request: Request, participant: Participant, turn: Turn, trial: Trial, rated: Rating | None, template: str
+) -> Response:
+    settings = evaluation_plan.settings_of(participant.study)
+    context = {
+        "turn": turn,
+        "trial": trial,
+        "trials_each": settings.trials if settings else 0,
+        "rated": rated,
+        "film": None if trial.film is None else _film(request, trial.film),
+        "client_uuid": uuid4(),
+        "points": range(1, LIKERT_POINTS + 1),
+    }
+    return participant_page(request, template, participant, context)
+
+
+def _film(request: Request, film: Film) -> dict[str, Any]:
+    """What the page needs of a film, and nothing that tells its method."""
+    return {
+        "video": request.app.url_path_for("show_video", sha256=film.video_sha256),
+        "poster": request.app.url_path_for("show_poster", sha256=film.poster_sha256),
+        "width": film.width,
+        "height": film.height,
+        "fps": film.fps,
+    }
+
+
+def _for_script(request: Request, turn: Turn) -> dict[str, Any]:
+    return {
+        "state": turn.state,
+        "trial": None if turn.trial is None else turn.trial.ordinal,
+        "rated": turn.rated,
+        "wanted": turn.wanted,
+    }

@@ -1,0 +1,219 @@
+"""From a reward model to a published filter, stage by stage, with the rollouts spread over the compute processes.
+
+Between two stages everything is in one stored draft, so that a worker killed in the middle loses one stage at most.
+"""
+
+import io
+import json
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from worker.analysis.evaluation import evaluate
+from worker.analysis.proof import case_against
+from worker.compute import learning, simulation
+from worker.compute.pools import Computing, Lane
+from worker.compute.simulation import surface_file
+from worker.ml.export import bundle
+from worker.ml.export.bundle import BundleContents, Provenance, Recording
+from worker.ml.filters import filter_problem, mode_search, printed_filter, residual
+from worker.ml.filters.filter_module import FilterWeights
+from worker.ml.filters.filter_problem import Act, FilterAct, FilterConfig, FilterDraft, FilterProblem, Progress, Trial
+from worker.ml.filters.response_surface import ResponseSurface
+from worker.ml.rewards.reward_models import load_reward_model
+from worker.trajectory import Trajectory
+
+CHUNK = 3
+"""Scenarios per call of a compute process: small enough to spread evenly, large enough not to matter."""
+
+
+PRINTED_ROLLOUTS = 100
+"""Episodes of the frozen policy whose transitions the printed method is trained on."""
+
+RECORDED_EPISODES = 2
+"""How much of the evaluation goes into the bundle for checking the filter elsewhere."""
+
+
+@dataclass(frozen=True)
+class Finished:
+    """A filter ready to be published."""
+
+    filter_weights: bytes
+    bundle: bytes
+    metrics: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Fitting:
+    """One filter in the making."""
+
+    task: str
+    compute: Computing
+    beat: Callable[[], None]
+    reward: bytes
+    seed: int
+    config: FilterConfig
+    progress: Progress
+    references: dict[tuple[str, range], list[Trajectory]]
+    """rollouts of the frozen policy that other fittings have already made"""
+
+    @property
+    def problem(self) -> FilterProblem:
+        """What is to be fitted, in the words of the learning code."""
+        task, policy = simulation.task(self.task), simulation.reference_policy(self.task)
+        return FilterProblem(task, policy, load_reward_model(self.reward), self.seed, self.config)
+
+    def find_mode(self, pool: Sequence[Trajectory]) -> FilterDraft:
+        """The person's execution mode, as far as held-out scenarios allow it."""
+        surface = ResponseSurface.load(surface_file(self.task), self.problem.task.modes)
+        reference = self._gate_reference()
+        return mode_search.find_mode(self.problem, surface, pool, reference, self.collect, self.progress)
+
+    def train_residual(self, draft: FilterDraft) -> FilterDraft:
+        """The residual action encoder around the mode."""
+        return residual.train_residual(self.problem, draft, self.collect, self.progress, self._learn)
+
+    def gate_residual(self, draft: FilterDraft) -> FilterDraft:
+        """As much of the residual as held-out scenarios allow."""
+        reference = self._gate_reference()
+        return residual.gate_residual(self.problem, draft, reference, self.collect, self.progress)
+
+    def fit_printed(self) -> FilterDraft:
+        """The paper's PbARL as printed, on transitions of the frozen policy. Not gated: it is what it is."""
+        transitions = self.reference(filter_problem.scenarios_for("residual", PRINTED_ROLLOUTS))
+        self.progress("training the printed action encoder", 0.1)
+        return self.compute.run(Lane.LEARNING, self.beat, printed_filter.fit_printed, self.problem, transitions)
+
+    def finish(self, draft: FilterDraft, provenance: Provenance, learned: Mapping[str, Any]) -> Finished:
+        """Export, drive through unseen scenarios, pack. A studio's filter that does not meet the burden of proof
+        (worker.analysis.proof) is replaced by the reference.
+
+        ``learned``: the reward model's metrics and what to say of its foresight (``foresight_notes``), for the card.
+        """
+        started = time.perf_counter()
+        self.progress("driving the filter through unseen scenarios", 0.88)
+        act = filter_problem.act_of(self.problem.task.modes, self.problem.policy, draft.weights)
+        evaluation, filtered = self._evaluate(act)
+        against = case_against(evaluation) if draft.weights.method == "studio" else ()
+        rejected: dict[str, Any] = {}
+        if against:
+            rejected = {"evaluation": evaluation, "mode": dict(draft.weights.mode), **_strengths(draft.weights)}
+            draft = as_reference(draft, evaluation["preference"], against)
+            act = filter_problem.act_of(self.problem.task.modes, self.problem.policy, draft.weights)
+            evaluation, filtered = self._evaluate_reference()
+        metrics: dict[str, Any] = {
+            "evaluation": evaluation,
+            "uses_reference": moves_nothing(draft.weights),
+            "rejected": rejected,
+            **_strengths(draft.weights),
+            "mode": dict(draft.weights.mode),
+            "method": draft.weights.method,
+            "notes": [
+                *draft.notes,
+                *learned.get("foresight_notes", ()),
+                *_warnings(evaluation, self.config.success_tolerance),
+            ],
+            "trials": [asdict(trial) for trial in draft.trials],
+            "seconds": {**draft.seconds, "evaluation": round(time.perf_counter() - started, 1)},
+            "weights": learned.get("weights"),
+            "costs": learned.get("costs"),
+        }
+        contents = BundleContents(
+            task=self.problem.task,
+            filter_onnx=act.exported.stored,
+            weights=draft.weights,
+            reward=self.problem.reward,
+            policy=self.problem.policy,
+            recording=Recording.of(filtered[:RECORDED_EPISODES]),
+            metrics=metrics,
+            provenance=provenance,
+        )
+        return Finished(draft.weights.to_bytes(), bundle.write(contents), metrics)
+
+    def _evaluate(self, act: FilterAct) -> tuple[dict[str, Any], list[Trajectory]]:
+        scenarios = filter_problem.scenarios_for("evaluation", self.config.evaluation_scenarios)
+        filtered = self.collect(act, scenarios, 0.0, self.seed)
+        reference, reward = self.reference(scenarios), self.problem.reward
+        return evaluate(reference, filtered, reward.returns(reference), reward.returns(filtered)), filtered
+
+    def _evaluate_reference(self) -> tuple[dict[str, Any], list[Trajectory]]:
+        """What would be measured of a filter that changes nothing: simulations repeat themselves exactly."""
+        reference = self.reference(filter_problem.scenarios_for("evaluation", self.config.evaluation_scenarios))
+        returns = self.problem.reward.returns(reference)
+        return evaluate(reference, reference, returns, returns), list(reference)
+
+    def collect(self, act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
+        """One rollout per scenario, in order; the same whatever the number of processes."""
+        chunks = [list(scenarios[first : first + CHUNK]) for first in range(0, len(scenarios), CHUNK)]
+        arguments = [(self.task, act, chunk, noise, seed) for chunk in chunks]
+        parts = self.compute.run_all(Lane.LEARNING, self.beat, learning.run_scenarios, arguments)
+        return [trajectory for part in parts for trajectory in part]
+
+    def _learn(self, problem: FilterProblem, draft: FilterDraft, rounds: Sequence[Sequence[Trajectory]]) -> FilterDraft:
+        return self.compute.run(Lane.LEARNING, self.beat, residual.learn_round, problem, draft, rounds)
+
+    def _gate_reference(self) -> Sequence[Trajectory]:
+        return self.reference(self.problem.config.gate_block(self.problem.task))
+
+    def reference(self, scenarios: range) -> Sequence[Trajectory]:
+        """The frozen policy's rollouts: the same for everybody, so they are made once per worker."""
+        key = (self.task, scenarios)
+        if key not in self.references:
+            self.references[key] = self.collect(simulation.reference_policy(self.task).mean, scenarios, 0.0, 0)
+        return self.references[key]
+
+
+def moves_nothing(weights: FilterWeights) -> bool:
+    """Whether the filter leaves the reference policy as it is."""
+    without_residual = not weights.encoder or weights.residual_share == 0.0
+    off = without_residual and not any(weights.mode.values())
+    return weights.gate == 0.0 or (weights.method == "studio" and off)
+
+
+def as_reference(draft: FilterDraft, preference: Mapping[str, float], against: Sequence[str]) -> FilterDraft:
+    """A filter that changes nothing in place of one that did not meet the burden of proof, and why."""
+    note = (
+        "The reference policy is used as it is. The filter that was trained had no sure gain on unseen scenarios "
+        f"(learned preference {preference['delta']:+.2f} [{preference['low']:+.2f}, {preference['high']:+.2f}] sd), "
+        f"and a price: {'; '.join(against)}."
+    )
+    return replace(draft, weights=FilterWeights(gate=0.0), notes=(*draft.notes, note))
+
+
+def _strengths(weights: FilterWeights) -> dict[str, float]:
+    return {"gate": weights.gate, "residual_share": weights.residual_share if weights.encoder else 0.0}
+
+
+def _warnings(evaluation: dict[str, Any], tolerance: float) -> list[str]:
+    """What must not be overlooked: the printed method is not gated, and a gate can be wrong on other scenarios."""
+    delta = evaluation["success"]["delta"]
+    if delta >= -tolerance:
+        return []
+    return [
+        f"Success fell by {-100 * delta:.0f} points on unseen scenarios, more than the study's tolerance of "
+        f"{100 * tolerance:.1f}. Do not run this filter on a person."
+    ]
+
+
+def draft_to_bytes(draft: FilterDraft) -> bytes:
+    """A draft as one .npz file of plain arrays."""
+    record = {"trials": [asdict(trial) for trial in draft.trials], "notes": draft.notes, "seconds": dict(draft.seconds)}
+    arrays: dict[str, Any] = {f"value/{name}": array for name, array in draft.value.items()}
+    arrays["weights"] = np.frombuffer(draft.weights.to_bytes(), np.uint8)
+    arrays["record"] = np.array(json.dumps(record))
+    target = io.BytesIO()
+    np.savez(target, **arrays)
+    return target.getvalue()
+
+
+def draft_from_bytes(stored: bytes) -> FilterDraft:
+    """Read what draft_to_bytes() wrote."""
+    with np.load(io.BytesIO(stored), allow_pickle=False) as arrays:
+        record = json.loads(str(arrays["record"]))
+        value = {name.removeprefix("value/"): arrays[name] for name in arrays.files if name.startswith("value/")}
+        weights = FilterWeights.from_bytes(arrays["weights"].tobytes())
+    trials = tuple(Trial(**each) for each in record["trials"])
+    return FilterDraft(weights, value, trials, tuple(record["notes"]), record["seconds"])

@@ -1,0 +1,80 @@
+"""What the learning processes do: fit reward models, ask them, and drive filters through scenarios."""
+
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any, cast, get_args
+
+import numpy as np
+import numpy.typing as npt
+
+from worker.compute.simulation import environment, reference_policy, reference_rollouts, signal_predictor
+from worker.ml.filters.filter_problem import Act, noisy
+from worker.ml.rewards import reward_training
+from worker.ml.rewards.pooled_prior import prior_of
+from worker.ml.rewards.reward_models import RewardModel, load_reward_model
+from worker.ml.rewards.reward_training import SignalScale
+from worker.ml.rewards.segments import SegmentPairs
+from worker.sim.rollout import rollout
+from worker.trajectory import SIGNALS, Array, Trajectory
+
+
+def warm_up(task: str) -> None:
+    """Make the rollouts that a task's reward models are normalised over: the first retraining is then a quick one."""
+    reference_rollouts(task)
+
+
+def run_scenarios(task: str, act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
+    """One rollout per scenario, with Gaussian noise of this deviation on every action."""
+    return [
+        rollout(environment(task), noisy(act, noise, seed, scenario), scenario, reference_policy(task).mean)
+        for scenario in scenarios
+    ]
+
+
+def fit_reward(
+    task: str,
+    kind: str,
+    pairs: SegmentPairs,
+    targets: Array,
+    scale: SignalScale,
+    seed: int,
+    earlier: Sequence[bytes] = (),
+    recorded_signals: Sequence[str] | None = None,
+) -> tuple[bytes, dict[str, Any]]:
+    """The stored reward model and its metrics.
+
+    ``scale``: what the signals are like in the study's pool; ``earlier``: models of others for
+    a pooled prior; ``recorded_signals``: what the signals are called when the clips were recorded elsewhere. Then there
+    is no reference policy to normalise over, and what the person was shown takes its place.
+    Raises ValueError for a kind there is not, and laboratory.NoPredictor where the task's signals cannot be foreseen.
+    """
+    if kind not in get_args(reward_training.Kind):
+        raise ValueError(f"There is no reward model of the kind {kind!r}.")
+    prior = prior_of([_model(each) for each in earlier], scale.spread)
+    fitted = reward_training.fit(
+        pairs,
+        targets,
+        cast(reward_training.Kind, kind),
+        seed,
+        scale=scale,
+        reference=reference_rollouts(task) if recorded_signals is None else (),
+        prior=prior,
+        signal_names=SIGNALS if recorded_signals is None else recorded_signals,
+        predictor=signal_predictor(task) if kind == "predicted" else None,
+    )
+    return fitted.model.to_bytes(), {**fitted.metrics, "pooled_from": len(earlier)}
+
+
+def probability_right(stored_model: bytes, pairs: SegmentPairs) -> list[float]:
+    """P(right preferred) of each pair, the mean over the ensemble."""
+    return [float(value) for value in _model(stored_model).probability_right(pairs)]
+
+
+def member_probabilities(stored_model: bytes, pairs: SegmentPairs) -> npt.NDArray[np.float64]:
+    """P(right preferred) of each pair under every member, (E, N)."""
+    return _model(stored_model).member_probabilities(pairs)
+
+
+@lru_cache(maxsize=16)
+def _model(stored: bytes) -> RewardModel:
+    return load_reward_model(stored)

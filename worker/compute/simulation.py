@@ -1,0 +1,204 @@
+"""Where simulation meets learning: what the compute processes do, with no database in sight.
+
+Every function takes and returns plain arrays and bytes, so that it can run in another process, in a command, or in a
+notebook. Environments and renderers are kept from call to call: building them costs more than using them. Nothing here
+loads torch, so that the processes that film start quickly and stay small. Tasks go by their names.
+"""
+
+import io
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache, lru_cache
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+import worker
+from worker.compute.behaviours import Behaviour, SlowWaves, draw_behaviours
+from worker.ml.policies.gaussian import GaussianPolicy
+from worker.ml.rewards.signal_predictor import SignalPredictor
+from worker.sim.assistive import AssistiveEnv
+from worker.sim.render.clip import STYLES, ClipRenderer, RenderedClip
+from worker.sim.render.scene import Scene
+from worker.sim.rollout import rollout
+from worker.task import Task
+from worker.tasks.registry import ENVIRONMENTS
+from worker.trajectory import Array, Trajectory
+
+CHECKPOINTS = Path(worker.__file__).resolve().parent / "checkpoints"
+
+REFERENCE_SCENARIOS = 2_000_000_000
+"""First of the scenarios over which reward models are normalised."""
+REFERENCE_COUNT = 40
+
+Act = Callable[[Array], Array]
+"""observation (D,) -> action (7,)"""
+
+
+class UnknownTask(ValueError):
+    """This installation cannot simulate the task."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(f"There is no task named {name!r}; this installation knows {', '.join(ENVIRONMENTS)}.")
+
+
+class NoPredictor(ValueError):
+    """Nothing was trained that foresees the task's signals."""
+
+    def __init__(self, task: str) -> None:
+        super().__init__(f"The signals of {task} cannot be foreseen yet: run python -m worker foresee --task {task}.")
+
+
+@dataclass(frozen=True)
+class RecordedClip:
+    """One rollout of the pool and its video."""
+
+    trajectory: bytes
+    success: bool
+    clip: RenderedClip
+
+
+def warm_up() -> None:
+    """Import and build what making clips needs, so that the first clip comes quickly."""
+    environment("feeding")
+    renderer("sharp")
+
+
+def environment_class(name: str) -> type[AssistiveEnv]:
+    """The environment of a task. Raises UnknownTask."""
+    if name not in ENVIRONMENTS:
+        raise UnknownTask(name)
+    return ENVIRONMENTS[name]
+
+
+def task(name: str) -> Task:
+    """The description of a task. Raises UnknownTask."""
+    return environment_class(name).task
+
+
+@cache
+def environment(name: str) -> AssistiveEnv:
+    """This process' environment of a task."""
+    return environment_class(name)()
+
+
+@cache
+def renderer(quality: str) -> ClipRenderer:
+    """This process' renderer of clips in a quality."""
+    return ClipRenderer(STYLES[quality], scene=_scene())
+
+
+@cache
+def _scene() -> Scene:
+    """Meshes and drawing clients, which take most of a renderer's memory: one set for every quality."""
+    return Scene()
+
+
+def checkpoints(name: str) -> Path:
+    """The folder with the task's trained policy and response surface."""
+    return CHECKPOINTS / environment_class(name).task.name
+
+
+def surface_file(task: str) -> Path:
+    """Where a task's response surface is kept; its record lies beside it."""
+    return checkpoints(task) / "response_surface.safetensors"
+
+
+def predictor_file(name: str) -> Path:
+    """Where a task's predictor of signals is kept; its record lies beside it."""
+    return checkpoints(name) / "signal_predictor.safetensors"
+
+
+@cache
+def signal_predictor(name: str) -> SignalPredictor:
+    """What foresees a task's signals from state and action. Raises NoPredictor for a task that has none."""
+    if not predictor_file(name).exists():
+        raise NoPredictor(name)
+    return SignalPredictor.load(predictor_file(name))
+
+
+@cache
+def reference_policy(name: str, early: str = "") -> GaussianPolicy:
+    """The frozen policy of a task that ships with the studio, or one from an early stage of its training."""
+    return GaussianPolicy.load(checkpoints(name) / (f"early/{early}.safetensors" if early else "policy.safetensors"))
+
+
+def early_policies(name: str) -> list[str]:
+    """Names of the early policies that ship with a task."""
+    return sorted(path.stem for path in (checkpoints(name) / "early").glob("*.safetensors"))
+
+
+def behaviours(name: str, scenario: int, count: int) -> list[Behaviour]:
+    """The ways in which a pool executes a scenario of a task."""
+    return draw_behaviours(task(name), scenario, count, early_policies(name))
+
+
+def act_in_mode(name: str, mode: npt.ArrayLike) -> Act:
+    """The frozen policy executed in a mode (A,)."""
+    return _in_mode(task(name), reference_policy(name).mean, np.asarray(mode, np.float32))
+
+
+def act_as(name: str, behaviour: Behaviour) -> Act:
+    """The behaviour as a policy for one episode."""
+    policy = reference_policy(name, behaviour.checkpoint)
+    rng = np.random.default_rng(behaviour.seed)
+    base: Act = policy.mean
+    if behaviour.temperature:
+
+        def base(observation: Array) -> Array:
+            return policy.sample(observation, rng, behaviour.temperature)
+
+    family = task(name).modes
+    moved = _in_mode(task(name), base, np.array(family.vector(behaviour.mode), np.float32))
+    if not behaviour.disturbance:
+        return moved
+    waves = SlowWaves(behaviour.disturbance, rng)
+    return lambda observation: moved(observation) + waves()
+
+
+def _in_mode(of: Task, base: Act, mode: Array) -> Act:
+    def act(observation: Array) -> Array:
+        action: Array = of.modes.speed_factor(observation, mode) * base(of.modes.perceived(observation, mode))
+        return action
+
+    return act
+
+
+def record_clip(
+    name: str, quality: str, scenario: int, behaviour: Behaviour, first_step: int, step_count: int
+) -> RecordedClip:
+    """Run the scenario in some behaviour and render the stretch of it that participants will see."""
+    trajectory = rollout(environment(name), act_as(name, behaviour), scenario, reference_policy(name).mean)
+    target = io.BytesIO()
+    trajectory.save(target)
+    return RecordedClip(
+        target.getvalue(), trajectory.success, renderer(quality).render_clip(trajectory, first_step, step_count)
+    )
+
+
+def film(name: str, quality: str, controller: bytes, scenario: int) -> RecordedClip:
+    """Run a whole episode as a controller (see worker.ml.export.blinded_controller) acts, and render all of it."""
+    from worker.ml.export.run_controller import (
+        Controller,  # processes that never film controllers do without its runtime
+    )
+
+    trajectory = rollout(environment(name), Controller(controller), scenario, reference_policy(name).mean)
+    target = io.BytesIO()
+    trajectory.save(target)
+    clip = renderer(quality).render_clip(trajectory, 0, len(trajectory))
+    return RecordedClip(target.getvalue(), trajectory.success, clip)
+
+
+def film_again(quality: str, trajectory: bytes, first_step: int, step_count: int) -> RenderedClip:
+    """Another stretch of a rollout that was recorded before."""
+    return renderer(quality).render_clip(Trajectory.load(io.BytesIO(trajectory)), first_step, step_count)
+
+
+@lru_cache(maxsize=4)
+def reference_rollouts(
+    name: str, first: int = REFERENCE_SCENARIOS, count: int = REFERENCE_COUNT
+) -> tuple[Trajectory, ...]:
+    """Rollouts of the frozen policy's mean action in consecutive scenarios."""
+    policy = reference_policy(name)
+    return tuple(rollout(environment(name), policy.mean, scenario) for scenario in range(first, first + count))

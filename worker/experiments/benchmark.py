@@ -1,0 +1,359 @@
+"""Methods x tasks x users x seeds on unseen scenarios: ``python -m worker benchmark`` (the paper's Table I and more).
+
+Every finished cell is a file; what is missing is run, spread over processes, and after every few cells all tables are
+written anew from the cells there are. An interrupted run goes on where it was, and nothing is ever run twice.
+"""
+
+import json
+import platform
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from worker.analysis.comparison import Cells, Row, Run, cost_rows, personalisation_rows, pooled, table_rows
+from worker.analysis.pareto import pareto_svg
+from worker.analysis.table_files import METHOD, to_csv, to_markdown
+from worker.compute import simulation
+from worker.compute.pools import Compute, Lane
+from worker.experiments import benchmark_cell
+from worker.experiments.benchmark_cell import INDIRECT_USERS, OPPOSED_USERS, PAPER_USERS, Cell, Terms
+from worker.experiments.rollout_cache import Shelf, policy_mark
+from worker.ml.filters.filter_problem import FilterConfig
+from worker.ml.methods.pbrl_hri import FromScratch
+from worker.ml.methods.prefft import FineTuning
+from worker.ml.methods.registry import METHODS, MethodConfig
+from worker.ml.teachers import Manner, Taste, random_taste
+from worker.sim.costs import preference_rewards, stakes
+from worker.tasks.registry import ENVIRONMENTS
+
+INTERRUPTED = 130
+"""Exit code after Ctrl-C, as shells have it."""
+REPORT_EVERY_S = 20.0
+SHELF_CHUNK = 10
+CLOSE_POINTS = 0.2
+"""The second picture leaves out methods that lose more success than this."""
+
+PROFILES = {
+    "full": Terms(),
+    "quick": Terms(
+        labels=40,
+        scenarios=20,
+        smallest_pool=8,
+        filter=FilterConfig(
+            mode_attempts=2,
+            gates=(0.5,),
+            gate_scenarios=12,
+            residual_rounds=1,
+            residual_rollouts=12,
+            value_steps=200,
+            adapter_steps=60,
+        ),
+        methods=MethodConfig(
+            printed_steps=150,
+            printed_rollouts=12,
+            fine_tuning=FineTuning(steps=2_400, warm_up_steps=800, critic_first_updates=100, cloning_steps=300),
+            from_scratch=FromScratch(steps=2_400, random_steps=800),
+            value_rollouts=12,
+            value_steps=200,
+        ),
+    ),
+}
+"""How much of everything; quick is for seeing it work and for tests, its numbers mean nothing."""
+
+
+@dataclass(frozen=True)
+class Selection:
+    """What is to be run; the tables also show what was run earlier under the same terms."""
+
+    methods: Sequence[str] = tuple(METHODS)
+    tasks: Sequence[str] = tuple(ENVIRONMENTS)
+    tastes: Sequence[Taste] = tuple(PAPER_USERS.values())
+    seeds: int = 1
+
+    def cells(self) -> list[Cell]:
+        """Seed by seed, method by method, the reference policy first: what is there early is already a table."""
+        names = sorted({*self.methods, "reference"}, key=list(METHODS).index)
+        return [
+            Cell(task, taste, method, seed)
+            for seed in range(self.seeds)
+            for method in names
+            for task in self.tasks
+            for taste in self.tastes
+        ]
+
+
+def population(count: int) -> list[Taste]:
+    """Users drawn at random, always the same ones."""
+    return [random_taste(f"person-{number}", np.random.default_rng([number, 11])) for number in range(count)]
+
+
+def benchmark(
+    selection: Selection, terms: Terms, work: Path, output: Path, processes: int, command: str, run: bool = True
+) -> int:
+    """Run what is missing (unless ``run`` is False) and write the tables; returns the exit code.
+
+    1: a cell failed, and its reason is on the standard error; all others were run. 130: interrupted.
+    """
+    missing = [cell for cell in selection.cells() if not cell.path(terms, work).exists()]
+    failures: list[str] = []
+    code = 0
+
+    def report() -> None:
+        _report(terms, work, output, command)
+
+    if run and missing:
+        compute = Compute(processes)
+        try:
+            _fill_shelves(compute, processes, missing, terms, work)
+            failures = _run_cells(compute, processes, missing, terms, work, report)
+        except KeyboardInterrupt:
+            sys.stderr.write("Interrupted. The same command goes on from here.\n")
+            code = INTERRUPTED
+        finally:
+            compute.close()
+    report()
+    for failure in failures:
+        sys.stderr.write(failure + "\n")
+    return code or (1 if failures else 0)
+
+
+# -- running -----------------------------------------------------------------------------------------------------------
+
+
+def _fill_shelves(compute: Compute, processes: int, missing: Sequence[Cell], terms: Terms, work: Path) -> None:
+    """Rollouts that all cells of a task share, first and in parallel."""
+    jobs = []
+    for task in dict.fromkeys(cell.task for cell in missing):
+        gate = terms.filter.gate_block(simulation.task(task))
+        jobs += [(task, work, "behaviours", chunk) for chunk in _chunks(terms.pool)]
+        unseen = [terms.unseen(seed) for seed in dict.fromkeys(cell.seed for cell in missing)]
+        jobs += [(task, work, "reference", chunk) for part in (*unseen, gate) for chunk in _chunks(part)]
+    _in_parallel(compute, processes, "shared rollouts", fill_shelf, jobs)
+
+
+def fill_shelf(task: str, work: Path, what: str, scenarios: Sequence[int]) -> None:
+    """Make what is missing of a stretch of shared rollouts."""
+    shelf = Shelf(task, work / "rollouts")
+    if what == "behaviours":
+        shelf.behaviours(scenarios)
+    else:
+        shelf.reference(scenarios)
+
+
+def _run_cells(
+    compute: Compute, processes: int, missing: Sequence[Cell], terms: Terms, work: Path, report: Any
+) -> list[str]:
+    return _in_parallel(
+        compute, processes, "cells", benchmark_cell.run_cell, [(cell, terms, work) for cell in missing], report
+    )
+
+
+def _in_parallel(
+    compute: Compute, processes: int, what: str, function: Any, jobs: Sequence[tuple[Any, ...]], report: Any = None
+) -> list[str]:
+    """One job per free process; returns what went wrong, job by job, and goes on with the others."""
+    failures, reported = [], time.monotonic()
+    # One waiting thread per process: Compute waits for all jobs of a call, and cells take from a second to an hour.
+    with ThreadPoolExecutor(processes) as threads, tqdm(total=len(jobs), unit=what.split()[-1], desc=what) as bar:
+        waiting: dict[Future[Any], tuple[Any, ...]] = {
+            threads.submit(compute.run, Lane.LEARNING, _no_beat, function, *job): job for job in jobs
+        }
+        try:
+            while waiting:
+                for future in wait(waiting, return_when=FIRST_COMPLETED).done:
+                    job = waiting.pop(future)
+                    bar.update(1)
+                    error = future.exception()
+                    if error is not None:
+                        failures.append(f"{job[0]}: {type(error).__name__}: {error}")
+                if report and time.monotonic() - reported > REPORT_EVERY_S:
+                    report()
+                    reported = time.monotonic()
+        except BaseException:
+            compute.close()
+            threads.shutdown(wait=False, cancel_futures=True)
+            raise
+    return failures
+
+
+def _no_beat() -> None:
+    """Nobody watches this process."""
+
+
+def _chunks(scenarios: range) -> list[range]:
+    return [scenarios[first : first + SHELF_CHUNK] for first in range(0, len(scenarios), SHELF_CHUNK)]
+
+
+# -- reporting ---------------------------------------------------------------------------------------------------------
+
+
+def _report(terms: Terms, work: Path, output: Path, command: str) -> None:
+    """All files, from the cells there are."""
+    found = list(_finished(terms, work))
+    tastes = {taste.name: taste for _, _, taste in found}
+    runs = [_run(record, arrays, terms, tastes) for record, arrays, _ in found]
+    cells = pooled(sorted(runs, key=_order))
+    if not cells:
+        return
+    output.mkdir(parents=True, exist_ok=True)
+    groups = _groups(list(tastes))
+    _replace(output / "table1.csv", to_csv(table_rows(cells)))
+    _replace(output / "costs.csv", to_csv(cost_rows(cells)))
+    _replace(output / "personalisation.csv", to_csv(personalisation_rows(cells, METHOD, groups)))
+    _replace(output / "table1.md", to_markdown(cells, groups, _header(terms, cells, tastes, command, _states(found))))
+    for task, all_rows in _by_task(table_rows(cells)):
+        rows = compared(all_rows)
+        _replace(output / f"pareto-{task}.svg", pareto_svg(task, rows, list(METHODS)))
+        close = [row for row in rows if row["success_delta"] >= -CLOSE_POINTS]
+        _replace(output / f"pareto-{task}-close.svg", pareto_svg(task, close, list(METHODS)))
+
+
+def _finished(terms: Terms, work: Path) -> Iterator[tuple[dict[str, Any], dict[str, Any], Taste]]:
+    """Every cell under these terms that was run with the present policies."""
+    present = {
+        f"{task}-{policy_mark(task)}"
+        for task in ENVIRONMENTS
+        if (simulation.checkpoints(task) / "policy.safetensors").exists()
+    }
+    for path in sorted(terms.directory(work).glob("*/*/*.npz")):
+        if path.parts[-3] not in present or path.name.startswith("."):
+            continue
+        with np.load(path, allow_pickle=False) as stored:
+            arrays = {name: stored[name] for name in stored.files}
+        record = json.loads(str(arrays.pop("record")))
+        taste = Taste(record["taste"]["name"], tuple(record["taste"]["omega"]), record["taste"]["per_signal"])
+        yield record, arrays, taste
+
+
+def _run(record: dict[str, Any], arrays: dict[str, Any], terms: Terms, tastes: dict[str, Taste]) -> Run:
+    """r^H is linear in the measured sums, so every user can judge every run."""
+    task = simulation.task(record["task"])
+    true, at_stake = (
+        {
+            name: of(task, arrays["costs"], arrays["signals"], taste.omega, terms.form, taste.per_signal)
+            for name, taste in tastes.items()
+        }
+        for of in (preference_rewards, stakes)
+    )
+    return Run(
+        record["task"],
+        record["taste"]["name"],
+        record["method"],
+        record["seed"],
+        record["labels"],
+        arrays["success"],
+        arrays["learned"],
+        true,
+        at_stake,
+        arrays["costs"],
+        record["spent"],
+        tuple(record["notes"]),
+    )
+
+
+def _order(run: Run) -> tuple[int, int, int, str]:
+    users = [*PAPER_USERS, *OPPOSED_USERS, *INDIRECT_USERS]
+    user = users.index(run.user) if run.user in users else len(users)
+    return list(ENVIRONMENTS).index(run.task), user, list(METHODS).index(run.method), run.user
+
+
+def _groups(users: Sequence[str]) -> list[list[str]]:
+    """The paper's users among themselves, so those who truly differ, those no mode is made for, and all others."""
+    known = [list(PAPER_USERS), list(OPPOSED_USERS), list(INDIRECT_USERS)]
+    others = [user for user in users if not any(user in group for group in known)]
+    return [*known, others]
+
+
+def compared(rows: Sequence[Row]) -> Sequence[Row]:
+    """Of one task's rows those of users for whom several methods were run; all when there is no such user.
+
+    A picture of a single method beside the reference policy compares nothing.
+    """
+    counts = Counter(row["user"] for row in rows)
+    return [row for row in rows if counts[row["user"]] > 2] or rows
+
+
+def _by_task(rows: Sequence[Row]) -> list[tuple[str, list[Row]]]:
+    tasks = dict.fromkeys(row["task"] for row in rows)
+    return [(task, [row for row in rows if row["task"] == task]) for task in tasks]
+
+
+def _header(terms: Terms, cells: Cells, tastes: dict[str, Taste], command: str, states: str) -> str:
+    seeds = sorted({run.seed for cell in cells.values() for run in cell.runs})
+    versions = f"Python {platform.python_version()}, NumPy {np.__version__}, torch {torch.__version__}"
+    marks = ", ".join(f"{task} {policy_mark(task)}" for task in dict.fromkeys(task for task, _, _ in cells))
+    weights = "; ".join(
+        f"{taste.name} ({', '.join(f'{value:g}' for value in taste.omega)}"
+        + "".join(f", {signal} {value:g}" for signal, value in taste.per_signal.items())
+        + ")"
+        for taste in tastes.values()
+    )
+    methods = terms.methods
+    lines = [
+        f"    {command}",
+        "",
+        f"{len(cells)} cells of task, user and method are finished; seeds {', '.join(map(str, seeds))}.",
+        f"{terms.labels} scripted labels per user and seed ({_spoken(terms.manner)}) on",
+        f"{len(terms.pool)} scenarios, pairs chosen by `{terms.rule}`, reward model `{terms.reward}`, costs in the",
+        f"`{terms.form}` form.",
+        f"Every method is driven through {terms.scenarios} scenarios per seed, from {terms.unseen(0).start} on: no",
+        "clip, surface, gate or training uses them; how settings were chosen is in docs/method.md, section 6.",
+        f"Environment steps: PrefFT {methods.fine_tuning.steps}, PbRL-HRI {methods.from_scratch.steps};",
+        f"gradient steps of printed PbARL {methods.printed_steps}. Weights of the users: {weights}.",
+        f"{versions}. Frozen policies: {marks}.",
+        states,
+    ]
+    return "\n".join(lines)
+
+
+def _states(found: Sequence[tuple[dict[str, Any], dict[str, Any], Taste]]) -> str:
+    """Cells do not run again when the code changes, so the page says how many states of it they are from."""
+    counts = Counter(record.get("code", "not recorded") for record, _, _ in found)
+    told = ", ".join(f"{state} ({count} runs)" for state, count in counts.most_common())
+    return f"State of worker/ml, worker/sim and worker/experiments/benchmark_cell.py, as a hash: {told}."
+
+
+def _spoken(manner: Manner) -> str:
+    told = [f"{100 * manner.mistakes:g} % mistakes", f'{100 * manner.equal_share:g} % "equal"']
+    if manner.rationality is not None:
+        told.append(f"rationality {manner.rationality:g}")
+    return ", ".join(told)
+
+
+def _replace(path: Path, text: str) -> None:
+    partial = path.with_name(f".{path.name}")
+    partial.write_text(text)
+    partial.replace(path)
+
+
+def with_options(
+    terms: Terms,
+    *,
+    prefft_steps: int | None = None,
+    pbrl_steps: int | None = None,
+    printed_steps: int | None = None,
+    rationality: float | None = None,
+    mistakes: float | None = None,
+    **values: Any,
+) -> Terms:
+    """A profile with what was said on the command line; None leaves a value as it is."""
+    chosen = terms.methods
+    if prefft_steps is not None:
+        chosen = replace(chosen, fine_tuning=replace(chosen.fine_tuning, steps=prefft_steps))
+    if pbrl_steps is not None:
+        chosen = replace(chosen, from_scratch=replace(chosen.from_scratch, steps=pbrl_steps))
+    if printed_steps is not None:
+        chosen = replace(chosen, printed_steps=printed_steps)
+    errs = {"rationality": rationality, "mistakes": mistakes}
+    manner = replace(terms.manner, **{name: value for name, value in errs.items() if value is not None})
+    given = {name: value for name, value in values.items() if value is not None}
+    return replace(terms, methods=chosen, manner=manner, **given)

@@ -1,0 +1,193 @@
+"""Explores once, for everybody, what a task's execution modes change: ``python -m worker explore --task feeding``.
+
+Every scenario is executed by the reference policy and in several modes; the differences are fitted by a response
+surface, which ships with the studio. First the modes are drawn at random; then, for some rounds, they are the ones that
+people drawn from a population would be given by the surface so far. What is best for somebody lies at the edges of the
+space of modes, where random modes are rare and a regression promises most.
+
+Finished blocks are kept, so an interrupted exploration goes on where it was.
+"""
+
+import json
+import platform
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from tqdm import tqdm
+
+from worker.compute import simulation
+from worker.compute.pools import Compute, Lane
+from worker.ml.filters import response_surface
+from worker.ml.filters.response_surface import ResponseSurface, best_mode
+from worker.ml.teachers import random_taste
+from worker.sim.costs import signal_weights
+from worker.sim.rollout import rollout
+from worker.task import Task
+from worker.trajectory import SIGNALS
+
+FIRST_SCENARIO = 100_000
+SCENARIOS = 300
+"""executed in random modes"""
+SOUGHT_FIRST = 150_000
+SOUGHT_SCENARIOS = 60
+"""executed, in every later round, in modes that somebody would want"""
+ROUNDS = 3
+MODES_PER_SCENARIO = 12
+BLOCK = 10
+JITTER = 0.08
+"""Standard deviation around a mode that somebody wants, as a share of every axis' range."""
+
+Floats = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Differences:
+    """What modes changed, N rollouts each compared with the reference policy's in the same scenario."""
+
+    modes: Floats
+    """(N, A)"""
+    signals: Floats
+    """(N, S) of the episode's summed signals"""
+    success: Floats
+    """(N,) in {-1, 0, 1}"""
+    reference_success: Floats
+    """(scenarios,)"""
+
+    def fit(self, task: Task) -> ResponseSurface:
+        """A surface of all of them."""
+        return response_surface.fit(task.modes, self.modes, self.signals, self.successes)
+
+    @property
+    def successes(self) -> Floats:
+        """(N,) in {0, 1}"""
+        return self.reference_success.repeat(MODES_PER_SCENARIO) + self.success
+
+
+@dataclass(frozen=True)
+class Block:
+    """BLOCK scenarios in a row, each executed in its own modes."""
+
+    task: str
+    first: int
+    modes: Floats
+    """(BLOCK, MODES_PER_SCENARIO, A)"""
+    file: Path
+
+    def is_there(self) -> bool:
+        """Whether it was run, in these modes."""
+        if not self.file.exists():
+            return False
+        with np.load(self.file, allow_pickle=False) as stored:
+            return np.array_equal(stored["modes"], self.modes.reshape(-1, self.modes.shape[-1]))
+
+
+def explore(task: str, work_directory: Path, processes: int, scenarios: int = SCENARIOS) -> dict[str, Any]:
+    """Run what is missing, fit the response surface, write it and its record; returns the record."""
+    work_directory.mkdir(parents=True, exist_ok=True)
+    described = simulation.task(task)
+    blocks = [
+        Block(task, first, _random_modes(described, first), work_directory / f"differences-{first}.npz")
+        for first in range(FIRST_SCENARIO, FIRST_SCENARIO + scenarios, BLOCK)
+    ]
+    compute = Compute(processes)
+    try:
+        _run(compute, processes, blocks, "random modes")
+        for number in range(ROUNDS):
+            surface = _joined(blocks).fit(described)
+            sought = sought_blocks(described, surface, number, work_directory)
+            _run(compute, processes, sought, f"modes that people want, round {number + 1}")
+            blocks += sought
+    finally:
+        compute.close()
+    return _publish(described, scenarios, _joined(blocks))
+
+
+def compare_block(block: Block) -> None:
+    """Differences of one block of scenarios, written to a file that is either complete or absent."""
+    policy, environment = simulation.reference_policy(block.task), simulation.environment(block.task)
+    signals, success, reference_success = [], [], []
+    for scenario, modes in zip(range(block.first, block.first + BLOCK), block.modes, strict=True):
+        reference = rollout(environment, policy.mean, scenario)
+        reference_success.append(reference.success)
+        for mode in modes:
+            changed = rollout(environment, simulation.act_in_mode(block.task, mode), scenario)
+            signals.append(
+                changed.signals.sum(axis=0, dtype=np.float64) - reference.signals.sum(axis=0, dtype=np.float64)
+            )
+            success.append(float(changed.success) - float(reference.success))
+    partial = block.file.with_suffix(".partial.npz")
+    flat = block.modes.reshape(-1, block.modes.shape[-1])
+    np.savez(partial, modes=flat, signals=signals, success=success, reference_success=reference_success)
+    partial.replace(block.file)
+
+
+def _random_modes(task: Task, first: int) -> Floats:
+    return np.array(
+        [
+            task.modes.sample(MODES_PER_SCENARIO, np.random.default_rng([scenario, 2]))
+            for scenario in range(first, first + BLOCK)
+        ]
+    )
+
+
+def sought_blocks(task: Task, surface: ResponseSurface, number: int, work_directory: Path) -> list[Block]:
+    """Every scenario is executed in the modes of as many people, and near them."""
+    count = SOUGHT_SCENARIOS // BLOCK
+    per_block = BLOCK * MODES_PER_SCENARIO
+    rng = np.random.default_rng([number, 3])
+    people = [random_taste("somebody", rng) for _ in range(per_block)]
+    wanted = np.array(
+        [best_mode(surface, signal_weights(task, each.omega, per_signal=each.per_signal), number) for each in people]
+    )
+    width = surface.high - surface.low
+    blocks = []
+    for index in range(count):
+        first = SOUGHT_FIRST + 1000 * number + BLOCK * index
+        around = wanted[rng.permutation(per_block)] + JITTER * width * rng.standard_normal(wanted.shape)
+        modes = np.clip(around, surface.low, surface.high).reshape(BLOCK, MODES_PER_SCENARIO, -1)
+        blocks.append(Block(task.name, first, modes, work_directory / f"sought-{first}.npz"))
+    return blocks
+
+
+def _run(compute: Compute, processes: int, blocks: Sequence[Block], what: str) -> None:
+    missing = [block for block in blocks if not block.is_there()]
+    with tqdm(total=len(blocks), initial=len(blocks) - len(missing), unit="block", desc=what) as bar:
+        for first in range(0, len(missing), processes):
+            batch = missing[first : first + processes]
+            compute.run_all(Lane.LEARNING, lambda: None, compare_block, [(block,) for block in batch])
+            bar.update(len(batch))
+
+
+def _joined(blocks: Sequence[Block]) -> Differences:
+    loaded = [np.load(block.file, allow_pickle=False) for block in blocks]
+    names = ("modes", "signals", "success", "reference_success")
+    return Differences(*(np.concatenate([each[name] for each in loaded]).astype(np.float64) for name in names))
+
+
+def _publish(task: Task, scenarios: int, found: Differences) -> dict[str, Any]:
+    surface, successes = found.fit(task), found.successes
+    surface.save(simulation.surface_file(task.name))
+    predicted, _ = surface.predict(found.modes)
+    residual = ((found.signals - predicted) ** 2).mean(axis=0)
+    spread = np.maximum((found.signals**2).mean(axis=0), 1e-12)
+    record = {
+        "command": f"python -m worker explore --task {task.name} --scenarios {scenarios}",
+        "scenarios": [FIRST_SCENARIO, FIRST_SCENARIO + scenarios - 1],
+        "sought": {"rounds": ROUNDS, "scenarios_per_round": SOUGHT_SCENARIOS, "jitter": JITTER},
+        "modes_per_scenario": MODES_PER_SCENARIO,
+        "axes": {axis.name: [axis.low, axis.high] for axis in task.modes.axes},
+        "reference_success": float(found.reference_success.mean()),
+        "mode_success": float(successes.mean()),
+        "explained_share": {
+            name: round(float(1 - residual[column] / spread[column]), 3)
+            for column, name in enumerate(SIGNALS)
+            if spread[column] > 1e-9
+        },
+        "versions": {"python": platform.python_version(), "numpy": np.__version__},
+    }
+    simulation.surface_file(task.name).with_suffix(".json").write_text(json.dumps(record, indent=2) + "\n")
+    return record

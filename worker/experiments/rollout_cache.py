@@ -1,0 +1,70 @@
+"""Rollouts that many fits need, kept on disk: one file per rollout, complete or absent, made by whoever comes first."""
+
+import hashlib
+import os
+from collections.abc import Sequence
+from functools import lru_cache
+from pathlib import Path
+
+from worker.compute import simulation
+from worker.compute.behaviours import Behaviour
+from worker.sim.rollout import rollout
+from worker.trajectory import Trajectory
+
+BEHAVIOURS_PER_SCENARIO = 6
+"""As in a study (StudySettings.behaviours_per_scenario)."""
+
+
+class Shelf:
+    """The rollouts of one task and one frozen policy."""
+
+    def __init__(self, task: str, directory: Path) -> None:
+        self.task = task
+        self.directory = directory / f"{task}-{policy_mark(task)}"
+        self.directory.mkdir(parents=True, exist_ok=True)
+
+    def reference(self, scenarios: Sequence[int]) -> list[Trajectory]:
+        """The frozen policy's deterministic action in these scenarios."""
+        return [self._reference(scenario) for scenario in scenarios]
+
+    def behaviours(self, scenarios: Sequence[int]) -> list[Trajectory]:
+        """Several behaviours of each scenario, as a pool of clips has them."""
+        return [each for scenario in scenarios for each in self._behaviours(scenario)]
+
+    def _reference(self, scenario: int) -> Trajectory:
+        path = self.directory / f"reference-{scenario}.npz"
+        if path.exists():
+            return _load(path)
+        policy = simulation.reference_policy(self.task)
+        return _kept(rollout(simulation.environment(self.task), policy.mean, scenario), path)
+
+    def _behaviours(self, scenario: int) -> list[Trajectory]:
+        drawn = simulation.behaviours(self.task, scenario, BEHAVIOURS_PER_SCENARIO)
+        return [self._behaviour(scenario, index, behaviour) for index, behaviour in enumerate(drawn)]
+
+    def _behaviour(self, scenario: int, index: int, behaviour: Behaviour) -> Trajectory:
+        path = self.directory / f"behaviour-{scenario}-{index}.npz"
+        if path.exists():
+            return _load(path)
+        act, reference = simulation.act_as(self.task, behaviour), simulation.reference_policy(self.task).mean
+        return _kept(rollout(simulation.environment(self.task), act, scenario, reference), path)
+
+
+def policy_mark(task: str) -> str:
+    """Eight characters that change with the task's frozen policy and with anything its description says."""
+    mark = hashlib.sha256(repr(simulation.task(task)).encode())
+    for name, array in sorted(simulation.reference_policy(task).weights.items()):
+        mark.update(name.encode() + array.tobytes())
+    return mark.hexdigest()[:8]
+
+
+@lru_cache(maxsize=2_000)
+def _load(path: Path) -> Trajectory:
+    return Trajectory.load(path)
+
+
+def _kept(trajectory: Trajectory, path: Path) -> Trajectory:
+    partial = path.with_name(f".{path.stem}-{os.getpid()}.npz")
+    trajectory.save(partial)
+    partial.replace(path)
+    return trajectory

@@ -1,0 +1,218 @@
+"""What an evaluation shows: films of the robots in scenarios that nothing else uses, or controllers for a real one.
+
+Three kinds of runs: ``before-after`` (the participant's robot beside the reference, for debriefing and experimenters),
+``trials`` (everything that is rated in video mode), ``controllers`` (one file per letter in physical mode).
+"""
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from app.domain.evaluation import Controller, Film, Trial
+from app.domain.models import Model, ModelKind, RunKind
+from app.domain.protocol import EvaluatedMethod, EvaluationMode
+from app.domain.studies import Participant, Study
+from app.services.evaluation import evaluation_plan
+from worker.compute import baseline_fitting, simulation
+from worker.compute.pools import Lane
+from worker.compute.simulation import RecordedClip
+from worker.jobs.clips import repairs
+from worker.jobs.learning import baselines
+from worker.jobs.learning.filters import NothingToLearnFrom
+from worker.jobs.runtime import due_work, records
+from worker.jobs.runtime.context import Step, Workplace
+from worker.jobs.runtime.records import Job
+
+AT_A_TIME = 2
+"""Films between two marks of progress."""
+BEFORE_AFTER, TRIALS, CONTROLLERS = "before-after", "trials", "controllers"
+
+
+@dataclass(frozen=True)
+class Robot:
+    """One method as it is shown to one participant."""
+
+    method: str
+    model_id: int | None
+    controller: bytes
+
+
+def due(
+    study: Study, participant_id: int, ending: str, succeeded: Collection[str], robots_shown: bool = False
+) -> list[Job]:
+    """What is to be filmed or packed for somebody whose last filter is there. ``ending``: labels and last answer.
+
+    ``robots_shown``: they have begun to rate, so that what they rate stays.
+    """
+    wanted = [BEFORE_AFTER] if study.material is None else []
+    settings = None if robots_shown else evaluation_plan.settings_of(study)
+    if settings and baselines.all_trained(study, participant_id, ending, succeeded):
+        wanted.append(TRIALS if settings.mode is EvaluationMode.VIDEO else CONTROLLERS)
+    labels = study.settings.labels_per_participant
+    return [
+        Job(f"films/participant-{participant_id}/{what}/{ending}", RunKind.FILMS, study.id, participant_id, labels)
+        for what in reversed(wanted)  # the debrief comes last
+    ]
+
+
+def make_films(place: Workplace, job: Job, run_id: int, step: Step) -> None:
+    """Make what the job names; a killed worker loses two films at most."""
+    if repairs.is_about(job):
+        repairs.make_again(place, job, run_id, step)
+        return
+    what = job.finding.split("/")[2]
+    shots = step("plan", _plan, place, job, what)
+    for first in range(0, len(shots), AT_A_TIME):
+        if step(f"is-outdated-{first}", _is_outdated, place, job):
+            return
+        place.report(run_id, f"{_DOING[what]} {first + 1} of {len(shots)}", first / len(shots))
+        some = shots[first : first + AT_A_TIME]
+        step(f"shots-{first}", _pack if what == CONTROLLERS else _film, place, run_id, job, some)
+
+
+_DOING = {BEFORE_AFTER: "filming before and after,", TRIALS: "filming robot", CONTROLLERS: "packing robot"}
+
+
+def _is_outdated(place: Workplace, job: Job) -> bool:
+    with place.database.reading() as session:
+        return due_work.is_outdated(session, job)
+
+
+def _plan(place: Workplace, job: Job, what: str) -> list[list[Any]]:
+    """[method, model, scenario] of every film in the order of showing, or [method, model, letter] of every controller.
+
+    Draws the evaluation if need be. Whoever has begun to watch sees the models they began with to the end. Controllers
+    come in an order of their own: which was made when then tells nothing of the key.
+    """
+    with place.database.writing() as session:
+        study, participant = session.get_one(Study, job.study_id), session.get_one(Participant, job.participant)
+        if what == BEFORE_AFTER:
+            methods = (EvaluatedMethod.REFERENCE.value, EvaluatedMethod.PBARL.value)
+            return [
+                [method, _newest_model(session, participant.id, method), scenario]
+                for scenario in evaluation_plan.comparison_scenarios(participant)
+                for method in methods
+            ]
+        evaluation_plan.draw(session, study, participant)
+        letters = {each.letter: each.method for each in evaluation_plan.assignments_of(session, participant.id)}
+        trials = evaluation_plan.trials_of(session, participant.id)
+        models = {method: _newest_model(session, participant.id, method) for method in letters.values()}
+        models |= {trial.film.method: trial.film.model_id for trial in trials if trial.shown_at and trial.film}
+        if what == CONTROLLERS:
+            shots = [[method, models[method], letter] for letter, method in letters.items()]
+            return sorted(shots, key=lambda shot: evaluation_plan.mark(study.key_secret, "made", participant.id, *shot))
+        return [[letters[each.letter], models[letters[each.letter]], each.scenario] for each in trials]
+
+
+def _newest_model(session: Session, participant_id: int, method: str) -> int | None:
+    """None: the reference. Raises NothingToLearnFrom when nothing was ever trained."""
+    if method == EvaluatedMethod.REFERENCE:
+        return None
+    if method == EvaluatedMethod.PBARL:
+        own = records.newest_model(session, participant_id, ModelKind.FILTER)
+        found = None if own is None else own.id
+    else:
+        rival = baselines.newest(session, participant_id, method)
+        found = None if rival is None else rival[0]
+    if found is None:
+        raise NothingToLearnFrom
+    return found
+
+
+def _film(place: Workplace, run_id: int, job: Job, shots: list[list[Any]]) -> None:
+    task = _task(place, job)
+    wanted = dict.fromkeys((method, model_id) for method, model_id, _ in shots)
+    robots = {method: _robot(place, run_id, task, method, model_id) for method, model_id in wanted}
+    with place.database.reading() as session:
+        quality = session.get_one(Study, job.study_id).settings.clip_quality.value
+        missing = [
+            (robots[method], scenario)
+            for method, model_id, scenario in shots
+            if evaluation_plan.film_of(session, job.participant, method, scenario, model_id) is None
+        ]
+    arguments = [(task, quality, robot.controller, scenario) for robot, scenario in missing]
+    recorded = place.compute.run_all(Lane.CLIPS, place.beat(run_id), simulation.film, arguments)
+    files = [_stored(place, each) for each in recorded]
+    with place.database.writing() as session:
+        for (robot, scenario), columns in zip(missing, files, strict=True):
+            _save(session, job.participant, robot, scenario, columns)
+        for method, model_id, scenario in shots:
+            _show(session, job.participant, method, scenario, model_id)
+
+
+def _stored(place: Workplace, recorded: RecordedClip) -> dict[str, Any]:
+    return {
+        "success": recorded.success,
+        "trajectory_sha256": place.store.put(recorded.trajectory),
+        **repairs.stored(place, recorded.clip),
+    }
+
+
+def _save(session: Session, participant_id: int, robot: Robot, scenario: int, columns: dict[str, Any]) -> None:
+    """Record a film; doing it twice changes nothing."""
+    if evaluation_plan.film_of(session, participant_id, robot.method, scenario, robot.model_id) is None:
+        film = Film(participant_id=participant_id, method=robot.method, model_id=robot.model_id, scenario=scenario)
+        for name, value in columns.items():
+            setattr(film, name, value)
+        session.add(film)
+        session.flush()
+
+
+def _show(session: Session, participant_id: int, method: str, scenario: int, model_id: int | None) -> None:
+    """Give the film to the trial it was made for, unless that has been watched, or another model of the method has."""
+    trials = evaluation_plan.trials_of(session, participant_id)
+    film = evaluation_plan.film_of(session, participant_id, method, scenario, model_id)
+    watched = [trial.film for trial in trials if trial.shown_at is not None and trial.film is not None]
+    if film is None or any(each.method == method and each.model_id != model_id for each in watched):
+        return
+    letters = {each.method: each.letter for each in evaluation_plan.assignments_of(session, participant_id)}
+    for trial in trials:
+        if trial.letter == letters.get(method) and trial.scenario == scenario and trial.shown_at is None:
+            trial.film_id = film.id
+
+
+def _pack(place: Workplace, run_id: int, job: Job, shots: list[list[Any]]) -> None:
+    task = _task(place, job)
+    with place.database.reading() as session:
+        slug, code = session.get_one(Study, job.study_id).slug, session.get_one(Participant, job.participant).code
+    for method, model_id, letter in shots:
+        robot = _robot(place, run_id, task, method, model_id)
+        packed = baseline_fitting.packed(task, slug, code, letter, robot.controller)
+        artefact = place.store.put(packed)
+        with place.database.writing() as session:
+            _keep_controller(session, job.participant, robot, artefact, len(packed))
+
+
+def _keep_controller(session: Session, participant_id: int, robot: Robot, artefact: str, byte_count: int) -> None:
+    """Record a controller; a newer one replaces it until the robot has been started."""
+    theirs = select(Controller).where(Controller.participant_id == participant_id, Controller.method == robot.method)
+    known = session.scalar(theirs)
+    begun = select(Trial.id).where(Trial.participant_id == participant_id, Trial.started_at.is_not(None)).limit(1)
+    if known is None:
+        known = Controller(participant_id=participant_id, method=robot.method)
+        session.add(known)
+    elif session.scalar(begun) is not None:
+        return
+    known.model_id, known.artefact_sha256, known.byte_count = robot.model_id, artefact, byte_count
+
+
+def _robot(place: Workplace, run_id: int, task: str, method: str, model_id: int | None) -> Robot:
+    """A model of the method as a controller."""
+    beat = place.beat(run_id)
+    if model_id is None:
+        return Robot(
+            method, None, place.compute.run(Lane.LEARNING, beat, baseline_fitting.controller_of_reference, task)
+        )
+    with place.database.reading() as session:
+        stored = place.store.read(session.get_one(Model, model_id).artefact_sha256)
+    if method == EvaluatedMethod.PBARL:
+        stored = place.compute.run(Lane.LEARNING, beat, baseline_fitting.controller_of_filter, task, stored)
+    return Robot(method, model_id, stored)
+
+
+def _task(place: Workplace, job: Job) -> str:
+    with place.database.reading() as session:
+        return session.get_one(Study, job.study_id).task

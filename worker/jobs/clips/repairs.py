@@ -1,0 +1,150 @@
+"""Clips and films whose stored files were lost: made again from what is left, under the same rows.
+
+People may have answered what they saw. So a video is made again of the very trajectory it showed, and a trajectory that
+comes out differently (another machine, another version) takes the place of the old one only where nobody has answered.
+"""
+
+import hashlib
+import io
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from sqlalchemy import or_, select
+from sqlalchemy.orm import Session
+
+from app.domain.clips import Clip, Rollout
+from app.domain.evaluation import Film
+from app.domain.models import RunKind
+from app.domain.preferences import LabelEvent, Query
+from app.domain.studies import Participant, Study
+from app.errors import AppError
+from worker.compute import simulation
+from worker.compute.pools import Lane
+from worker.jobs.runtime.context import Step, Workplace
+from worker.jobs.runtime.records import Job
+from worker.sim.render.clip import RenderedClip
+from worker.trajectory import Trajectory
+
+AGAIN = "again"
+"""In the name of a finding: files of a rollout or film were lost at that moment."""
+
+
+class NotTheSameAgain(AppError):
+    """A recording that people have answered about is lost, and making it again gave another, so nothing was changed.
+    Restore the file from a backup of the data directory, then run: python -m app scrub
+    """
+
+
+class FilmLost(AppError):
+    """The recording of a film is lost. Restore it from a backup of the data directory, then run: python -m app scrub"""
+
+
+def due(session: Session, study: Study, lost: Mapping[str, int]) -> list[Job]:
+    """What is to be made again. ``lost``: as ArtefactStore.lost() gives it."""
+    if study.material is not None or not lost:
+        return []  # videos of other robots come from outside
+    recorded, filmed = Rollout.trajectory_sha256, (Clip.video_sha256, Clip.poster_sha256)
+    pool = select(Rollout.id, recorded, *filmed).outerjoin(Clip, Clip.rollout_id == Rollout.id)
+    pool = pool.where(Rollout.study_id == study.id, or_(*(each.in_(lost) for each in (recorded, *filmed))))
+    rendered = (Film.video_sha256, Film.poster_sha256)
+    films = select(Film.id, Film.participant_id, *rendered).join(Participant, Participant.id == Film.participant_id)
+    films = films.where(Participant.study_id == study.id, Participant.withdrawn_at.is_(None))
+    films = films.where(or_(*(each.in_(lost) for each in rendered)))
+    stamps: dict[int, int] = {}  # the same file may be lost twice, and work of one name is done once
+    for rollout, *hashes in session.execute(pool):
+        stamps[rollout] = max(stamps.get(rollout, 0), *(lost.get(sha256, 0) for sha256 in hashes))
+    jobs = [
+        Job(f"clips/study-{study.id}/{AGAIN}-{rollout}-{stamp}", RunKind.CLIPS, study.id)
+        for rollout, stamp in stamps.items()
+    ]
+    for film, person, *hashes in session.execute(films):
+        stamp = max(lost.get(sha256, 0) for sha256 in hashes)
+        name = f"films/participant-{person}/{AGAIN}-{film}-{stamp}"
+        jobs.append(Job(name, RunKind.FILMS, study.id, person))
+    return jobs
+
+
+def is_about(job: Job) -> bool:
+    """Whether the job makes something again."""
+    return job.finding.rsplit("/", 1)[1].startswith(f"{AGAIN}-")
+
+
+def make_again(place: Workplace, job: Job, run_id: int, step: Step) -> None:
+    """Make the lost files of the rollout or film that the job names. Raises NotTheSameAgain and FilmLost."""
+    number = int(job.finding.rsplit("/", 1)[1].split("-")[1])
+    place.report(run_id, "making lost files again", 0.0)
+    step(AGAIN, _film_again if job.kind == RunKind.FILMS else _clips_again, place, run_id, number)
+
+
+def stored(place: Workplace, clip: RenderedClip) -> dict[str, Any]:
+    """The columns of a clip or film that are about its video, once its files are stored."""
+    return {
+        "video_sha256": place.store.put(clip.video),
+        "poster_sha256": place.store.put(clip.poster),
+        "width": clip.width,
+        "height": clip.height,
+        "fps": clip.fps,
+        "duration_ms": clip.duration_ms,
+        "byte_count": len(clip.video),
+    }
+
+
+def _clips_again(place: Workplace, run_id: int, rollout_id: int) -> None:
+    with place.database.reading() as session:
+        rollout = session.get_one(Rollout, rollout_id)
+        clips = session.scalars(select(Clip).where(Clip.rollout_id == rollout_id)).all()
+        may_differ = not _answered(session, clips)
+        study = session.get_one(Study, rollout.study_id)
+        task, settings, quality = study.task, study.settings, study.settings.clip_quality.value
+    whole = place.store.has(rollout.trajectory_sha256)
+    if whole:
+        trajectory = place.store.read(rollout.trajectory_sha256)
+    else:
+        drawn = simulation.behaviours(task, rollout.scenario, settings.behaviours_per_scenario)[rollout.behaviour]
+        shot = (task, quality, rollout.scenario, drawn, 0, settings.clip_steps)
+        trajectory = place.compute.run(Lane.CLIPS, place.beat(run_id), simulation.record_clip, *shot).trajectory
+    sha256 = hashlib.sha256(trajectory).hexdigest()
+    if sha256 != rollout.trajectory_sha256 and not may_differ:
+        raise NotTheSameAgain
+    lost = [clip for clip in clips if sha256 != rollout.trajectory_sha256 or not _is_whole(place, clip)]
+    shots = [(quality, trajectory, clip.first_step, clip.step_count) for clip in lost]
+    filmed = place.compute.run_all(Lane.CLIPS, place.beat(run_id), simulation.film_again, shots)
+    place.store.put(trajectory)
+    columns = [stored(place, each) for each in filmed]
+    success = Trajectory.load(io.BytesIO(trajectory)).success
+    with place.database.writing() as session:
+        again = session.get_one(Rollout, rollout_id)
+        again.trajectory_sha256, again.success = sha256, success
+        for clip, each in zip(lost, columns, strict=True):
+            _change(session.get_one(Clip, clip.id), each)
+
+
+def _film_again(place: Workplace, run_id: int, film_id: int) -> None:
+    with place.database.reading() as session:
+        film = session.get_one(Film, film_id)
+        study = session.get_one(Study, session.get_one(Participant, film.participant_id).study_id)
+        quality = study.settings.clip_quality.value
+    if not place.store.has(film.trajectory_sha256):
+        raise FilmLost
+    trajectory = place.store.read(film.trajectory_sha256)
+    steps = len(Trajectory.load(io.BytesIO(trajectory)))
+    filmed = place.compute.run(Lane.CLIPS, place.beat(run_id), simulation.film_again, quality, trajectory, 0, steps)
+    columns = stored(place, filmed)
+    with place.database.writing() as session:
+        _change(session.get_one(Film, film_id), columns)
+
+
+def _change(row: Clip | Film, columns: Mapping[str, Any]) -> None:
+    for name, value in columns.items():
+        setattr(row, name, value)
+
+
+def _is_whole(place: Workplace, clip: Clip) -> bool:
+    return place.store.has(clip.video_sha256) and place.store.has(clip.poster_sha256)
+
+
+def _answered(session: Session, clips: Sequence[Clip]) -> bool:
+    """Whether anybody has ever said anything about one of these clips."""
+    ids = [clip.id for clip in clips]
+    about = select(LabelEvent.id).join(Query).where(or_(Query.left_clip_id.in_(ids), Query.right_clip_id.in_(ids)))
+    return session.scalar(about.limit(1)) is not None

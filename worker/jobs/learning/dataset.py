@@ -1,0 +1,164 @@
+"""From rows to arrays: what was shown and said, as the learning code wants it.
+
+``target_of`` is the one place where a response becomes a number.
+"""
+
+import hashlib
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from sqlalchemy import select
+from sqlalchemy.orm import Session, contains_eager, joinedload
+
+from app.domain.clips import Clip, Rollout
+from app.domain.preferences import Label, Query, Response, count_labels, current_labels
+from app.domain.studies import Participant, Study
+from app.errors import AppError
+from app.storage import ArtefactStore
+from worker.ml import acquisition
+from worker.ml.rewards.reward_training import SignalScale
+from worker.ml.rewards.segments import SegmentPairs, Stretch
+from worker.trajectory import SIGNALS, Array, OutdatedTrajectory, Recorded, Recording, Trajectory
+
+
+class RecordedByAnOlderVersion(AppError):
+    """This study's clips were recorded by an older version in another simulation. Make a new study to go on."""
+
+
+IMPORTED = "imported"
+"""In a rollout's mode: it was recorded elsewhere, and this says where it came from."""
+
+_TARGETS = {Response.LEFT: 0.0, Response.EQUAL: 0.5, Response.RIGHT: 1.0, Response.SKIP: None}
+
+
+def target_of(response: Response) -> float | None:
+    """The paper's y: P(right preferred), left being sigma^0 and right sigma^1. "Can't tell" says nothing: None."""
+    return _TARGETS[response]
+
+
+CLIPS_AND_ROLLOUTS = (
+    joinedload(Query.left_clip).joinedload(Clip.rollout),
+    joinedload(Query.right_clip).joinedload(Clip.rollout),
+)
+
+
+@dataclass(frozen=True)
+class Preferences:
+    """Everything one participant has said that a reward model may learn from."""
+
+    pairs: SegmentPairs | None
+    """None while nothing with a target has been said."""
+    targets: Array
+    """(N,) in {0, 1/2, 1}"""
+    label_count: int
+    """How many labels were given, those without a target and those that were excluded included."""
+    label_hash: str
+
+
+def label_hash(labels: Sequence[Label]) -> str:
+    """A fingerprint of who was shown what and said what: the same labels give the same hash on any machine."""
+    lines = [
+        f"{each.query.ordinal} {each.query.left_clip.video_sha256} {each.query.right_clip.video_sha256} {each.response}"
+        for each in labels
+    ]
+    return hashlib.sha256("\n".join(lines).encode()).hexdigest()
+
+
+def labels_with_clips(session: Session, participant_id: int) -> Sequence[Label]:
+    """The participant's current labels that are not excluded, each with its clips and their rollouts loaded."""
+    return current_labels(session, participant_id, *CLIPS_AND_ROLLOUTS)
+
+
+def load_preferences(session: Session, store: ArtefactStore, participant_id: int) -> Preferences:
+    """The participant's labels as arrays; pairs without a target, and excluded ones, are left out."""
+    given = count_labels(session, select(Participant.id).where(Participant.id == participant_id))
+    labels = labels_with_clips(session, participant_id)
+    said = [(label, target) for label in labels if (target := target_of(label.response)) is not None]
+    return Preferences(
+        pairs=segment_pairs(store, [(each.query.left_clip, each.query.right_clip) for each, _ in said])
+        if said
+        else None,
+        targets=np.array([target for _, target in said], np.float32),
+        label_count=given.get(participant_id, 0),
+        label_hash=label_hash(labels),
+    )
+
+
+def segment_pairs(store: ArtefactStore, pairs: Sequence[tuple[Clip, Clip]]) -> SegmentPairs:
+    """The segments shown by one or more pairs of clips, left first; whole trajectories may be among them."""
+    return SegmentPairs.of([(stretch(store, left), stretch(store, right)) for left, right in pairs])
+
+
+def stretch(store: ArtefactStore, clip: Clip) -> Stretch:
+    """What a clip shows, simulated here or recorded elsewhere."""
+    trajectory = _recorded(store, clip.rollout.trajectory_sha256, IMPORTED in clip.rollout.mode)
+    return Stretch(trajectory, clip.first_step, clip.step_count)
+
+
+def pool_clips(session: Session, study_id: int) -> Sequence[Clip]:
+    """Every clip of the study's pool with its rollout; of imported clips all, whatever their length."""
+    study = session.get_one(Study, study_id)
+    return _clips(session, study, study.settings.clip_steps)
+
+
+def whole_clips(session: Session, study_id: int) -> Sequence[Clip]:
+    """Clips of whole episodes with their rollouts; of imported clips all."""
+    study = session.get_one(Study, study_id)
+    return _clips(session, study, study.whole_clip_steps)
+
+
+def _clips(session: Session, study: Study, step_count: int | None) -> Sequence[Clip]:
+    of_study = select(Clip).join(Rollout).where(Rollout.study_id == study.id)
+    if study.material is None:
+        of_study = of_study.where(Clip.step_count == step_count)
+    return session.scalars(of_study.order_by(Clip.id).options(contains_eager(Clip.rollout))).all()
+
+
+def matched_pairs(clips: Sequence[Clip]) -> list[tuple[Clip, Clip]]:
+    """Every pair of clips of the same scenario, with their rollouts loaded."""
+    rows = acquisition.matched_pairs([clip.rollout.scenario for clip in clips])
+    return [(clips[first], clips[second]) for first, second in rows]
+
+
+def signal_scale(session: Session, store: ArtefactStore, study_id: int) -> SignalScale:
+    """What the signals are like in the study's pool: in the clips that can be asked about, and in their episodes."""
+    clips = pool_clips(session, study_id)
+    episodes = [stretch(store, clip).trajectory for clip in clips]
+    means = [each.signals.mean(axis=0, dtype=np.float64) for each in episodes]
+    return SignalScale.of(segment_pairs(store, matched_pairs(clips)), means)
+
+
+def shown(store: ArtefactStore, clip: Clip) -> Trajectory:
+    """The whole simulated trajectory that a clip shows a stretch of."""
+    return _trajectory(store.root, clip.rollout.trajectory_sha256)
+
+
+def signal_names(study: Study) -> Sequence[str]:
+    """Names, with units, of the columns of signals in the study's trajectories."""
+    return SIGNALS if study.material is None else [each["name"] for each in study.material["signals"]]
+
+
+def stored_trajectory(store: ArtefactStore, sha256: str) -> Trajectory:
+    """A trajectory by the hash of its file."""
+    return _trajectory(store.root, sha256)
+
+
+def _recorded(store: ArtefactStore, sha256: str, imported: bool) -> Recorded:
+    return (_recording if imported else _trajectory)(store.root, sha256)
+
+
+@lru_cache(maxsize=1024)
+def _recording(root: Path, sha256: str) -> Recording:
+    return Recording.load(io.BytesIO(ArtefactStore(root).read(sha256)))
+
+
+@lru_cache(maxsize=1024)
+def _trajectory(root: Path, sha256: str) -> Trajectory:
+    try:
+        return Trajectory.load(io.BytesIO(ArtefactStore(root).read(sha256)))
+    except OutdatedTrajectory as error:
+        raise RecordedByAnOlderVersion from error

@@ -1,0 +1,182 @@
+"""Filters: from the participant's reward model to an evaluated, published bundle."""
+
+from collections.abc import Sequence
+
+from app.domain.models import ModelKind
+from app.domain.studies import Method, Participant, RewardKind, Study, StudySettings
+from app.errors import AppError
+from app.services.answers import accuracy
+from app.services.exports.export_formats import provenance_of
+from app.services.monitoring import dashboard
+from worker.compute import filter_fitting, learning
+from worker.compute.filter_fitting import Fitting
+from worker.compute.pools import Lane
+from worker.jobs.learning import dataset
+from worker.jobs.runtime import due_work, records
+from worker.jobs.runtime.context import Step, Workplace
+from worker.jobs.runtime.records import Job
+from worker.ml.export.bundle import Provenance
+from worker.ml.filters.filter_problem import FilterConfig, FilterDraft
+
+STAGES = {Method.STUDIO: ("mode", "residual", "gate"), Method.PRINTED: ("printed",)}
+
+
+class NothingToLearnFrom(AppError):
+    """Every answer so far was "can't tell", so there is no reward model and no filter can be trained."""
+
+
+def train_filter(place: Workplace, job: Job, run_id: int, step: Step) -> None:
+    """Train, evaluate and publish; every stage is a step, so that a killed worker loses one stage at most.
+
+    Nothing is made of a filter that is outdated before it is begun, and none is gone on with once its person has given
+    the last answer, for then they wait for the last one.
+    """
+    if step("is-outdated", _is_outdated, place, job, False):
+        return
+    reward = step("reward", _choose_reward, place, run_id, job)
+    if not reward:
+        return
+    with place.database.reading() as session:
+        settings = session.get_one(Study, job.study_id).settings
+    draft = ""
+    for stage in STAGES[settings.method]:
+        if step(f"is-outdated-before-{stage}", _is_outdated, place, job, True):
+            return
+        draft = step(stage, _stage, place, run_id, job, reward, draft, stage)
+    step("publish", _publish, place, run_id, job, reward, draft)
+
+
+def _is_outdated(place: Workplace, job: Job, begun: bool) -> bool:
+    with place.database.reading() as session:
+        return due_work.is_outdated(session, job, begun=begun)
+
+
+def _choose_reward(place: Workplace, run_id: int, job: Job) -> str:
+    """The artefact of the reward model to follow: the newest. The printed method needs one on states and actions.
+
+    Empty when the newest filter has already seen the same labels: somebody who answers faster than filters are trained
+    passes several milestones at once.
+    """
+    with place.database.writing() as session:
+        study = session.get_one(Study, job.study_id)
+        task, settings = study.task, study.settings
+        model = records.newest_model(session, job.participant, ModelKind.REWARD)
+        if model is None:
+            raise NothingToLearnFrom
+        records.set_labels(session, run_id, model.label_count, model.label_hash)
+        newest = records.newest_model(session, job.participant, ModelKind.FILTER)
+        if newest is not None and newest.label_hash == model.label_hash:
+            return ""
+    if settings.method is Method.STUDIO or settings.reward_kind is not RewardKind.STRUCTURED:
+        return model.artefact_sha256
+    place.report(run_id, "learning a reward model on states and actions", 0.05)
+    with place.database.reading() as session:
+        preferences = dataset.load_preferences(session, place.store, job.participant)
+        scale = dataset.signal_scale(session, place.store, job.study_id)
+    if preferences.pairs is None:
+        raise NothingToLearnFrom
+    stored, _ = place.compute.run(
+        Lane.LEARNING,
+        place.beat(run_id),
+        learning.fit_reward,
+        task,
+        RewardKind.MLP.value,
+        preferences.pairs,
+        preferences.targets,
+        scale,
+        model.seed,
+    )
+    return place.store.put(stored)
+
+
+def _stage(place: Workplace, run_id: int, job: Job, reward: str, draft: str, stage: str) -> str:
+    """One stage of the fit: the artefact of a draft in, the artefact of a better one out."""
+    fitting = _fitting(place, run_id, job, reward)
+    if stage in {"mode", "printed"}:
+        with place.database.reading() as session:
+            clips = dataset.pool_clips(session, job.study_id)
+        pool = [dataset.shown(place.store, clip) for clip in clips]
+        result = fitting.find_mode(pool) if stage == "mode" else fitting.fit_printed()
+    else:
+        before = _draft(place, draft)
+        result = fitting.train_residual(before) if stage == "residual" else fitting.gate_residual(before)
+    return place.store.put(filter_fitting.draft_to_bytes(result))
+
+
+def _publish(place: Workplace, run_id: int, job: Job, reward: str, draft: str) -> None:
+    """Evaluate on unseen scenarios, write the bundle, and only then let anybody see it."""
+    fitting = _fitting(place, run_id, job, reward)
+    with place.database.reading() as session:
+        participant = session.get_one(Participant, job.participant)
+        study = session.get_one(Study, job.study_id)
+        model = records.newest_model(session, job.participant, ModelKind.REWARD)
+        version = records.next_version(session, job.participant)
+        run = records.seen_labels(session, run_id)
+        export = provenance_of(session, study)
+        notes = [*notes_on_script(participant), *notes_on_foresight(dashboard.curve_of(session, job.participant))]
+    provenance = Provenance(
+        study=study.name,
+        participant=participant.code,
+        version=version,
+        label_count=run.label_count,
+        label_hash=run.label_hash,
+        seed=participant.seed,
+        created_at=run.started_at.isoformat(timespec="seconds"),
+        lock_hash=export.lock_hash,
+        deviations=export.deviations,
+    )
+    learned = {**(model.metrics if model else {}), "foresight_notes": notes}
+    finished = fitting.finish(_draft(place, draft), provenance, learned)
+    model_artefact, bundle_artefact = place.store.put(finished.filter_weights), place.store.put(finished.bundle)
+    with place.database.writing() as session:
+        saved = records.save_model(session, run_id, ModelKind.FILTER, model_artefact, finished.metrics)
+        records.save_bundle(session, saved, version, bundle_artefact, len(finished.bundle))
+
+
+def notes_on_script(participant: Participant) -> Sequence[str]:
+    """What the model card has to say when nobody has answered."""
+    if participant.scripted_as is None:
+        return []
+    return [
+        f"{participant.code} is not a person: a program gave the answers of a user called {participant.scripted_as}."
+    ]
+
+
+def notes_on_foresight(curve: accuracy.Curve) -> Sequence[str]:
+    """What the model card has to say about a reward model that nobody may rely on yet."""
+    if curve.proven:
+        return []
+    foreseen = f"{curve.overall.correct:g} of {curve.overall.scored}" if curve.overall else "none"
+    return [
+        "The reward model behind this filter has not been shown to be better than guessing: before they were given it"
+        f" foresaw {foreseen} of this person's preferences on pairs drawn at random. What it says about the person, the"
+        " learned preference included, may mean nothing."
+    ]
+
+
+def _draft(place: Workplace, artefact: str) -> FilterDraft:
+    return filter_fitting.draft_from_bytes(place.store.read(artefact))
+
+
+def filter_config(settings: StudySettings) -> FilterConfig:
+    """What a study says about the fitting of its filters."""
+    return FilterConfig(
+        success_tolerance=settings.success_tolerance, evaluation_scenarios=settings.evaluation_scenarios
+    )
+
+
+def _fitting(place: Workplace, run_id: int, job: Job, reward: str) -> Fitting:
+    with place.database.reading() as session:
+        study = session.get_one(Study, job.study_id)
+        task, settings = study.task, study.settings
+        seed = session.get_one(Participant, job.participant).seed
+    return Fitting(
+        task=task,
+        compute=place.compute,
+        beat=place.beat(run_id),
+        reward=place.store.read(reward),
+        seed=seed,
+        config=filter_config(settings),
+        progress=lambda stage, share: place.report(run_id, stage, share),
+        references=place.references,
+    )

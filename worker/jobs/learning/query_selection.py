@@ -1,0 +1,282 @@
+"""What each participant is asked next, and what the newest model expects them to say."""
+
+import logging
+from collections.abc import Collection, Sequence
+from typing import Any
+
+import numpy as np
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from app.domain.clips import Clip
+from app.domain.models import ModelKind
+from app.domain.preferences import LEARNED_FROM, Purpose, Query
+from app.domain.studies import Participant, Strategy, Study
+from worker.compute import learning, simulation
+from worker.jobs.learning import dataset, query_plan
+from worker.jobs.learning.query_plan import Slot
+from worker.jobs.runtime import records
+from worker.jobs.runtime.context import Workplace
+from worker.ml import acquisition
+from worker.ml.teachers import OMEGA, User
+from worker.sim.costs import preference_rewards
+from worker.task import Task
+
+log = logging.getLogger("worker.jobs.learning.query_selection")
+
+PRACTICE, REPEAT, OBVIOUS, NO_OBVIOUS_PAIR = "practice", "repeat", "obvious", "no_obvious_pair"
+"""How pairs that are no labels were chosen; the last: a repeat in the place of a catch pair that could not be had."""
+
+_CHOSEN_LATER = (Purpose.PREFERENCE, Purpose.REPEAT)
+
+OTHERS_LABELS = 20
+"""So many answers a participant has given before their model speaks for them to others."""
+MOST_OTHERS = 12
+"""More people cost time and hardly change on which pairs people differ."""
+
+
+def refill_queries(place: Workplace, participant_id: int) -> None:
+    """Make the queries the participant will meet next. Safe to call at any time, by any number of workers.
+
+    Places are filled in their order: where one must wait, for clips to be filmed, the later ones wait as well. Pairs of
+    a study of own clips that cannot be shown any more make room for others; clips of ours are made again.
+    """
+    lost = place.store.lost()
+    with place.database.reading() as session:
+        participant = session.get_one(Participant, participant_id)
+        study = session.get_one(Study, participant.study_id)
+    if lost and study.material is not None:
+        with place.database.writing() as session:
+            records.drop_lost_queries(session, participant_id, lost)
+    with place.database.reading() as session:
+        free = records.free_ordinals(session, participant_id, study.settings)
+        if not free:
+            return
+        slots = query_plan.plan(study.settings, participant.seed)
+        rows = _Choosing(place, session, participant, study, lost).rows([slots[ordinal - 1] for ordinal in free])
+    if not rows:
+        return
+    with place.database.writing() as session:
+        records.save_queries(session, participant_id, rows)
+    predict_waiting(place, participant_id)
+
+
+def predict_waiting(place: Workplace, participant_id: int) -> None:
+    """Write the newest model's prediction to every query that has never been answered: honest by construction.
+
+    Only to labels: a repeat was answered before, a catch pair is no question of taste, practice is none at all.
+    """
+    with place.database.reading() as session:
+        model = records.newest_model(session, participant_id, ModelKind.REWARD)
+        waiting = records.unanswered(session, participant_id, *dataset.CLIPS_AND_ROLLOUTS)
+        queries = [query for query in waiting if query.purpose in LEARNED_FROM]
+        if model is None or all(query.predicted_by_model_id == model.id for query in queries):
+            return
+        pairs = dataset.segment_pairs(place.store, [(query.left_clip, query.right_clip) for query in queries])
+        ids = [query.id for query in queries]
+    probabilities = learning.probability_right(place.store.read(model.artefact_sha256), pairs)
+    with place.database.writing() as session:
+        records.save_predictions(session, model.id, dict(zip(ids, probabilities, strict=True)))
+
+
+def _scores(
+    place: Workplace, session: Session, participant: Participant, pairs: list[tuple[Clip, Clip]], strategy: Strategy
+) -> acquisition.Floats | None:
+    """How much every candidate is worth asking; None when the choice is to be uniform."""
+    if strategy is Strategy.UNIFORM:
+        return None
+    members = None
+    model = records.newest_model(session, participant.id, ModelKind.REWARD)
+    if model is not None:
+        segments = dataset.segment_pairs(place.store, pairs)
+        members = learning.member_probabilities(place.store.read(model.artefact_sha256), segments)
+    if strategy is Strategy.CONTESTED:
+        return acquisition.contested(_answers_of_others(place, session, participant, pairs), members)
+    return None if members is None else acquisition.score(strategy.value, members)
+
+
+def _answers_of_others(
+    place: Workplace, session: Session, participant: Participant, pairs: list[tuple[Clip, Clip]]
+) -> acquisition.Floats:
+    """(U, M) what other people would say about each pair: participants, or the paper's users while there are few."""
+    others = records.models_of_others(session, participant.id, ModelKind.REWARD, OTHERS_LABELS, MOST_OTHERS)
+    if len(others) >= 2:
+        segments = dataset.segment_pairs(place.store, pairs)
+        said = [learning.probability_right(place.store.read(model.artefact_sha256), segments) for model in others]
+        return np.array(said, np.float64)
+    task = simulation.task(session.get_one(Study, participant.study_id).task)
+    returns = {clip.id: _stand_ins(place, task, clip) for pair in pairs for clip in pair}
+    return acquisition.expected_answers(np.array([returns[right.id] - returns[left.id] for left, right in pairs]).T)
+
+
+def _stand_ins(place: Workplace, task: Task, clip: Clip) -> acquisition.Floats:
+    """(3,) what the paper's users would feel about what a clip shows, by their own costs."""
+    shown, steps = dataset.shown(place.store, clip), slice(clip.first_step, clip.first_step + clip.step_count)
+    costs, signals = shown.costs[steps], shown.signals[steps]
+    return np.array([preference_rewards(task, costs, signals, OMEGA[user]).sum() for user in User])
+
+
+class _Choosing:
+    """Gives places of a participant's plan their clips. No pair of clips is chosen twice, on whichever side."""
+
+    def __init__(
+        self, place: Workplace, session: Session, participant: Participant, study: Study, lost: Collection[str]
+    ) -> None:
+        self._lost = lost
+        self._place, self._session, self._participant, self._study = place, session, participant, study
+        asked = select(Query).where(Query.participant_id == participant.id)
+        self._sides = {query.ordinal: (query.left_clip_id, query.right_clip_id) for query in session.scalars(asked)}
+        self._used = {frozenset(sides) for sides in self._sides.values()}
+        self._clips = self._shown(dataset.pool_clips(session, study.id))
+
+    def rows(self, slots: Sequence[Slot]) -> list[dict[str, Any]]:
+        """As many of these places as can be filled now, as columns of queries."""
+        own = {slot.ordinal: self._own(slot) for slot in slots if slot.purpose not in _CHOSEN_LATER}
+        preferences = iter(self._preferences([slot.ordinal for slot in slots if slot.purpose is Purpose.PREFERENCE]))
+        rows = []
+        for slot in slots:
+            if slot.purpose is Purpose.PREFERENCE:
+                row = next(preferences, None)
+            elif slot.purpose is Purpose.REPEAT:
+                row = self._again(self._askable(slot), slot.swapped, REPEAT)
+            else:
+                row = own[slot.ordinal]
+            if row is None and slot.purpose is Purpose.CATCH:
+                continue  # made as soon as the pool has one
+            if row is None:
+                break
+            rows.append({"purpose": slot.purpose, "ordinal": slot.ordinal, **row})
+            self._sides[slot.ordinal] = row["left_clip_id"], row["right_clip_id"]
+        return rows
+
+    def _own(self, slot: Slot) -> dict[str, Any] | None:
+        """Practice, introduction and catch pairs: few candidates, so they choose before the labels on clips do."""
+        rng = np.random.default_rng([self._participant.seed, slot.ordinal])
+        if slot.purpose is Purpose.PRACTICE:
+            row = self._practice(rng)
+        else:
+            row = self._catch(slot, rng) if slot.purpose is Purpose.CATCH else self._introduction(rng)
+        if row is not None:
+            self._used.add(frozenset((row["left_clip_id"], row["right_clip_id"])))
+        return row
+
+    def _preferences(self, ordinals: list[int]) -> list[dict[str, Any]]:
+        """Chosen together, so that the sides are balanced."""
+        pairs = self._unused(self._clips) if ordinals else []
+        if not pairs:
+            return []
+        settings, participant = self._study.settings, self._participant
+        scores = _scores(self._place, self._session, participant, pairs, settings.strategy)
+        choice = acquisition.choose(
+            len(ordinals),
+            len(pairs),
+            np.random.default_rng([participant.seed, ordinals[0]]),
+            rule="uniform" if scores is None else settings.strategy.value,
+            scores=scores,
+            random_share=settings.random_share,
+        )
+        drawn = zip(choice.indices, choice.swapped, choice.propensities, choice.at_random, strict=True)
+        return [
+            _columns(
+                pairs[index], bool(swapped), Strategy.UNIFORM if at_random else settings.strategy, float(propensity)
+            )
+            for index, swapped, propensity, at_random in drawn
+        ]
+
+    def _introduction(self, rng: np.random.Generator) -> dict[str, Any] | None:
+        """A pair of whole trajectories."""
+        return self._one_of(
+            self._unused(self._shown(dataset.whole_clips(self._session, self._study.id))), Strategy.UNIFORM, rng
+        )
+
+    def _practice(self, rng: np.random.Generator) -> dict[str, Any] | None:
+        """Two very different clips: the keys are to be learned, not to be pondered over."""
+        pairs = self._unused(self._clips)
+        if not pairs:
+            return None
+        rows = query_plan.very_different(dataset.segment_pairs(self._place.store, pairs))
+        return self._one_of([pairs[row] for row in rows], PRACTICE, rng)
+
+    def _catch(self, slot: Slot, rng: np.random.Generator) -> dict[str, Any] | None:
+        """A pair with an obvious answer; where the pool has none, an earlier pair again: nothing is invented.
+
+        While the pool is growing the place stays free, unless there is nothing else to go on with.
+        """
+        store = self._place.store
+        candidates = [
+            (pair, answer)
+            for pair in self._unused(self._clips)
+            if (answer := query_plan.obvious_answer(*(dataset.stretch(store, clip) for clip in pair))) is not None
+        ]
+        if not candidates and self._may_yet_come():
+            return None
+        if not candidates:
+            log.warning("participant %d: no pair with an obvious answer in the pool", self._participant.id)
+            asked = self._labels_before(slot.ordinal)
+            return self._again(asked[int(rng.integers(len(asked)))] if asked else None, False, NO_OBVIOUS_PAIR)
+        pair, answer = candidates[int(rng.integers(len(candidates)))]
+        swapped = bool(rng.integers(2))
+        expected = answer if not swapped else {"left": "right", "right": "left"}[answer]
+        return _columns(pair, swapped, OBVIOUS, 1.0 / len(candidates)) | {"expected": expected}
+
+    def _may_yet_come(self) -> bool:
+        settings = self._study.settings
+        wanted = settings.pool_scenarios * settings.behaviours_per_scenario
+        growing = self._study.material is None and len(self._clips) < wanted
+        return growing and bool(records.unanswered(self._session, self._participant.id))
+
+    def _labels_before(self, ordinal: int) -> list[int]:
+        """Places of earlier labels on clips that no repeat has asked again, the newest few left out where possible."""
+        slots = query_plan.plan(self._study.settings, self._participant.seed)
+        again = {slot.repeats_ordinal for slot in slots}
+        known = [slot for slot in slots[: ordinal - 1] if slot.ordinal in self._sides]
+        labels = [slot.ordinal for slot in known if slot.purpose is Purpose.PREFERENCE]
+        fresh = [each for each in labels if each not in again and ordinal - each >= query_plan.REPEAT_DISTANCE]
+        return fresh or labels[:1]
+
+    def _askable(self, slot: Slot) -> int | None:
+        """The place of the pair that is to be asked again; of another one if that cannot be shown any more."""
+        if not self._lost:
+            return slot.repeats_ordinal
+        known = {clip.id for clip in self._clips}
+        places = (slot.repeats_ordinal, *self._labels_before(slot.ordinal))
+        return next((place for place in places if place in self._sides and known.issuperset(self._sides[place])), None)
+
+    def _again(self, ordinal: int | None, swapped: bool, strategy: str) -> dict[str, Any] | None:
+        if ordinal is None or ordinal not in self._sides:
+            return None
+        left, right = reversed(self._sides[ordinal]) if swapped else self._sides[ordinal]
+        return {
+            "left_clip_id": left,
+            "right_clip_id": right,
+            "purpose": Purpose.REPEAT,
+            "repeats_ordinal": ordinal,
+            "strategy": strategy,
+            "propensity": 1.0,
+        }
+
+    def _one_of(
+        self, pairs: Sequence[tuple[Clip, Clip]], strategy: str, rng: np.random.Generator
+    ) -> dict[str, Any] | None:
+        if not pairs:
+            return None
+        index, swapped = int(rng.integers(len(pairs))), bool(rng.integers(2))
+        return _columns(pairs[index], swapped, strategy, 1.0 / len(pairs))
+
+    def _shown(self, clips: Sequence[Clip]) -> list[Clip]:
+        """Those of the clips that can be shown."""
+        return [clip for clip in clips if clip.video_sha256 not in self._lost and clip.poster_sha256 not in self._lost]
+
+    def _unused(self, clips: Sequence[Clip]) -> list[tuple[Clip, Clip]]:
+        """Pairs of clips of one scenario that this participant has not been given yet."""
+        return [pair for pair in dataset.matched_pairs(clips) if frozenset(clip.id for clip in pair) not in self._used]
+
+
+def _columns(pair: tuple[Clip, Clip], swapped: bool, strategy: str, propensity: float) -> dict[str, Any]:
+    left, right = reversed(pair) if swapped else pair
+    return {
+        "left_clip_id": left.id,
+        "right_clip_id": right.id,
+        "strategy": strategy,
+        "propensity": propensity,
+    }

@@ -1,0 +1,282 @@
+"""Files that somebody has asked for: the whole data of a study as one zip, or an archive for another installation."""
+
+import json
+import tempfile
+import zipfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as parquet
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from app.db import now
+from app.domain.models import Export, RunKind
+from app.domain.studies import Deviation, Participant, Study
+from app.paths import DOCS
+from app.services.archives import archive, archive_reading, sealing
+from app.services.evaluation import unblinding
+from app.services.exports import export_formats, export_requests, export_rows, export_tables
+from app.services.exports.csv_cells import json_text
+from app.services.exports.export_formats import Kind, Provenance, Table
+from app.services.exports.export_requests import ExportKind
+from app.services.runs import reports
+from app.services.studies import preregistration
+from app.storage import ArtefactMissing
+from worker.jobs.publishing import preference_arrays
+from worker.jobs.runtime.context import Step, Workplace
+from worker.jobs.runtime.records import Job
+
+Missing = Mapping[str, Sequence[str]]
+"""Hashes of stored files that could not be had, by what they are."""
+
+_ARROW = {
+    Kind.TEXT: pa.string(),
+    Kind.INTEGER: pa.int64(),
+    Kind.NUMBER: pa.float64(),
+    Kind.BOOLEAN: pa.bool_(),
+    Kind.TIME: pa.timestamp("ms", "UTC"),
+    Kind.JSON: pa.string(),
+}
+
+
+def due(session: Session, study: Study) -> list[Job]:
+    """Files that were asked for and are not there."""
+    waiting = select(Export).where(Export.study_id == study.id, Export.finished_at.is_(None)).order_by(Export.id)
+    return [Job(export_requests.finding(each), RunKind.EXPORT, study.id) for each in session.scalars(waiting)]
+
+
+def make(place: Workplace, job: Job, run_id: int, step: Step) -> None:
+    """Make the file that the finding names."""
+    step("make", _make, place, int(job.finding.rpartition("-")[2]), run_id)
+
+
+def _make(place: Workplace, export_id: int, run_id: int) -> str:
+    """The artefact's hash. When somebody withdraws meanwhile, the file is thrown away and made again without them."""
+    while (sha256 := _made(place, export_id, run_id)) is None:
+        place.report(run_id, "writing the file again, because somebody has withdrawn", 0.1)
+    return sha256
+
+
+def _made(place: Workplace, export_id: int, run_id: int) -> str | None:
+    """The artefact's hash; None when somebody withdrew while it was made."""
+    with place.database.reading() as session:
+        export = session.get_one(Export, export_id)
+        study_id, kind = export.study_id, ExportKind(export.kind)
+        gone = _gone(session, study_id)
+    with _workspace(place) as folder:
+        path = folder / "export.zip"
+        place.report(run_id, "writing the file", 0.1)
+        with place.database.reading() as session:
+            write = write_data if kind is ExportKind.DATA else _write_archive
+            missing = write(session, place, session.get_one(Study, study_id), path)
+        byte_count, sha256 = path.stat().st_size, place.store.take(path)
+    with place.database.writing() as session:
+        if _gone(session, study_id) != gone:
+            place.store.delete(sha256)
+            return None
+        export = session.get_one(Export, export_id)
+        export.artefact_sha256, export.byte_count, export.finished_at = sha256, byte_count, now()
+        export.missing = dict(missing) or None
+    return sha256
+
+
+def _write_archive(session: Session, place: Workplace, study: Study, path: Path) -> Missing:
+    """Written, and read back as another installation would: nobody is to find out when it is needed."""
+    missing = archive.write(session, place.store, study, path)
+    archive_reading.verify(path, path.parent, sealing.key_of(study))
+    return missing
+
+
+@contextmanager
+def _workspace(place: Workplace) -> Iterator[Path]:
+    """A folder on the disk of the store, gone afterwards whatever happens."""
+    base = place.store.unfinished(0).parent
+    base.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=base, prefix="export-") as folder:
+        yield Path(folder)
+
+
+def _gone(session: Session, study_id: int) -> Sequence[int]:
+    people = select(Participant.id).where(Participant.study_id == study_id, Participant.withdrawn_at.is_not(None))
+    return session.scalars(people.order_by(Participant.id)).all()
+
+
+def write_data(session: Session, place: Workplace, study: Study, path: Path) -> Missing:
+    """Tables in three formats, their dictionary, the report with its figures, and preference pairs as arrays.
+
+    A stored file that is missing or damaged is left out, and said to be.
+    """
+    provenance, missing = export_formats.provenance_of(session, study), dict[str, list[str]]()
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as target:
+        for table in export_tables.TABLES:
+            _write_table(target, session, study, table, provenance)
+        target.writestr("dictionary.csv", export_formats.dictionary_csv(export_tables.TABLES))
+        target.writestr("dictionary.md", export_formats.dictionary_markdown(export_tables.TABLES))
+        pictures = _write_report(target, session, place, study, missing)
+        people = _write_pairs(target, session, place, study, missing)
+        about = _provenance(session, study, provenance) | {"missing": missing}
+        target.writestr("provenance.json", _json(about))
+        target.writestr("README.md", _readme(study, provenance, about, pictures, people))
+    return missing
+
+
+def _write_table(target: zipfile.ZipFile, session: Session, study: Study, table: Table, provenance: Provenance) -> None:
+    for kind, write in (("csv", export_formats.csv_lines), ("jsonl", export_formats.json_lines)):
+        with target.open(f"{kind}/{table.name}.{kind}", "w") as stream:
+            for line in write(table, session, study, provenance):
+                stream.write(line.encode())
+    with target.open(f"parquet/{table.name}.parquet", "w") as stream:
+        parquet.write_table(arrow_table(table, session, study, provenance), stream)
+
+
+def arrow_table(table: Table, session: Session, study: Study, provenance: Provenance) -> pa.Table:
+    """The table with typed columns; json columns are text, and meanings are kept with the columns."""
+    columns = table.all_columns
+    rows = [(*values, *provenance.values) for values in table.rows(session, study)]
+    arrays = [
+        pa.array([_arrow_value(column.kind, row[place]) for row in rows], _ARROW[column.kind])
+        for place, column in enumerate(columns)
+    ]
+    fields = [
+        pa.field(column.name, _ARROW[column.kind], metadata={"meaning": column.meaning, "unit": column.unit})
+        for column in columns
+    ]
+    return pa.Table.from_arrays(arrays, schema=pa.schema(fields))
+
+
+def _arrow_value(kind: Kind, value: Any) -> Any:
+    return json_text(value) if kind is Kind.JSON and value is not None else value
+
+
+def _write_report(
+    target: zipfile.ZipFile, session: Session, place: Workplace, study: Study, missing: dict[str, list[str]]
+) -> list[str]:
+    report = reports.newest(session, study)
+    if report is None:
+        return []
+    target.writestr("report/report.json", _json({"made_at": report.created_at.isoformat(), **report.contents}))
+    for name, formats in sorted(report.figures.items()):
+        for kind, sha256 in formats.items():
+            try:
+                target.writestr(f"report/{name}.{kind}", place.store.read(sha256))
+            except ArtefactMissing:
+                missing.setdefault("figures of the report", []).append(sha256)
+    return sorted(report.figures)
+
+
+def _write_pairs(
+    target: zipfile.ZipFile, session: Session, place: Workplace, study: Study, missing: dict[str, list[str]]
+) -> list[str]:
+    written = []
+    for person in export_rows.everybody(session, study):
+        lost = set[str]()
+        arrays = preference_arrays.arrays_of(session, place.store, study, person, lost)
+        if lost:
+            missing[f"recordings: pairs of {person.code} that show them are not in its arrays"] = sorted(lost)
+        if arrays is not None:
+            target.writestr(f"pairs/{person.code}.npz", arrays)
+            written.append(person.code)
+    if (DOCS / "arrays.md").exists():
+        target.writestr("pairs/README.md", (DOCS / "arrays.md").read_text())
+    return written
+
+
+def _provenance(session: Session, study: Study, provenance: Provenance) -> dict[str, Any]:
+    """Everything that says what this study was and what these files are."""
+    deviations = session.scalars(select(Deviation).where(Deviation.study_id == study.id).order_by(Deviation.id))
+    return {
+        "study": study.slug,
+        "name": study.name,
+        "task": study.task,
+        "seed": study.seed,
+        "settings": study.stored_settings,
+        "lock_hash": provenance.lock_hash,
+        "locked_at": study.locked_at.isoformat() if study.locked_at else None,
+        "lock_document": study.lock_document,
+        "deviations": [
+            {"at": each.at.isoformat(), "actor": each.actor, "reason": each.reason}
+            | {"before": each.before, "after": each.after}
+            for each in deviations
+        ],
+        "scripted": {each.code: each.scripted_as for each in export_rows.everybody(session, study) if each.scripted_as},
+        "plan_in_words": preregistration.plan_of(session, study).in_words,
+        "blinded": unblinding.is_blinded(study),
+        "unblinded_at": study.unblinded_at.isoformat() if study.unblinded_at else None,
+        "evaluation_key": study.key_secret if study.unblinded_at else None,
+        "software_version": provenance.software_version,
+        "exported_at": provenance.exported_at.isoformat(),
+    }
+
+
+def _readme(
+    study: Study, provenance: Provenance, about: dict[str, Any], pictures: Sequence[str], people: Sequence[str]
+) -> str:
+    listed = [f"* {each['at']}, {each['actor']}: {' '.join(each['reason'].split())}" for each in about["deviations"]]
+    lost = [f"* {what}: {', '.join(hashes)}" for what, hashes in about["missing"].items()]
+    blinded = (
+        "The study is blinded: letters stand for methods, and no file here says which is which."
+        if unblinding.is_blinded(study)
+        else "The study is not blinded (any more)."
+    )
+    return _README.format(
+        name=study.name,
+        slug=study.slug,
+        lock=provenance.lock_hash,
+        version=provenance.software_version,
+        moment=provenance.exported_at.isoformat(timespec="seconds"),
+        blinded=blinded,
+        scripted=_scripted_in_words(about["scripted"]),
+        plan=about["plan_in_words"],
+        deviations="\n".join(listed) or "None.",
+        missing="\n".join(lost) or "Nothing.",
+        figures=", ".join(pictures) or "none yet",
+        people=", ".join(people) or "nobody yet",
+    )
+
+
+def _scripted_in_words(scripted: Mapping[str, str]) -> str:
+    """A paragraph for whoever might take them for people; nothing when all are."""
+    if not scripted:
+        return ""
+    played = ", ".join(f"{code} ({user})" for code, user in scripted.items())
+    return (
+        f"\n**These participants are not people: {played}.** A program answered and rated for them"
+        " (`scripted_as` in the table `participants`).\n"
+    )
+
+
+_README = """\
+# {name} ({slug})
+
+Exported {moment} by PbARL Studio {version}. Lock hash of settings and plan: {lock}. {blinded}
+{scripted}
+| what | where |
+|---|---|
+| tables | `csv/`, `jsonl/`, `parquet/`: the same rows three times |
+| what every column means | `dictionary.csv`, `dictionary.md` |
+| settings, seed, lock, deviations | `provenance.json` |
+| statistics and figures ({figures}) | `report/` |
+| preference pairs as arrays ({people}) | `pairs/`, explained in `pairs/README.md` |
+
+Open the tables with `pandas.read_parquet("parquet/ratings.parquet")` or, in R, `arrow::read_parquet` or `read.csv`.
+Participants who withdrew are tombstones in `participants`, and nothing of them is anywhere else.
+
+## What was planned
+{plan}
+
+## Deviations from the locked plan
+{deviations}
+
+## Missing
+Stored files that were missing or damaged when this was made, by their hashes; a backup of the data directory has them.
+
+{missing}
+"""
+
+
+def _json(value: Any) -> str:
+    return json.dumps(value, indent=2, ensure_ascii=False) + "\n"

@@ -1,0 +1,211 @@
+"""What is missing or stale, asked of the database again and again: the answer is always the whole truth.
+
+Nothing here is remembered between two rounds, so a lost message, a killed worker or a second worker cannot leave
+anything undone or do it twice: each finding has one name, and work is started under that name at most once.
+"""
+
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from datetime import datetime, timedelta
+from typing import NamedTuple
+
+from sqlalchemy import func, or_, select
+from sqlalchemy.orm import Session
+
+from app.db import now
+from app.domain.clips import Clip, Rollout
+from app.domain.models import Run, RunKind, RunStatus
+from app.domain.preferences import LabelEvent, Query, count_labels
+from app.domain.studies import Participant, Study
+from app.services.evaluation import evaluation_plan
+from worker.jobs.clips import evaluation_films, repairs
+from worker.jobs.clips.pool_clips import WHOLE
+from worker.jobs.learning import baselines
+from worker.jobs.publishing import export_files, report_files
+from worker.jobs.runtime.due_work import (
+    ending,
+    filter_due,
+    filter_name,
+    last_answers,
+    last_exclusions,
+    present_ids,
+    reward_due,
+)
+from worker.jobs.runtime.records import ATTEMPTS, LEASE, Job, next_queries
+
+CLIPS_AHEAD = 2
+"""Scenarios per study in the making at a time: enough to keep busy, few enough that studies share fairly."""
+
+RETRY_AFTER = timedelta(seconds=10)
+_AT_WORK = (Study.deleted_at.is_(None), Study.put_away_at.is_(None))
+
+
+class _Attempted(NamedTuple):
+    """What is to be known of a run here. Whole ones take their time to load, and there are thousands of them."""
+
+    status: str
+    attempt: int
+    finished_at: datetime | None
+
+
+def findings(session: Session, lost: Mapping[str, int] | None = None) -> Iterator[tuple[Job, int]]:
+    """Every run that should exist and does not, or must be tried again, with the number of its attempt.
+
+    ``lost``: stored files that are to be made again, as ArtefactStore.lost() gives them.
+    """
+    known = session.execute(select(Run.workflow_id, Run.status, Run.attempt, Run.finished_at))
+    runs = {name: _Attempted(status, attempt, finished) for name, status, attempt, finished in known}
+    filters = select(Run.participant_id).where(Run.kind == RunKind.FILTER, Run.status == RunStatus.RUNNING)
+    being_filtered = set(session.scalars(filters.where(Run.heartbeat_at >= now() - LEASE)))
+    succeeded = {name for name, run in runs.items() if run.status == RunStatus.SUCCEEDED}
+    for study in session.scalars(select(Study).where(Study.deleted_at.is_(None)).order_by(Study.id)).all():
+        if study.put_away_at is not None:
+            jobs: Iterable[Job] = export_files.due(session, study)  # somebody has asked for those
+        else:
+            jobs = (*repairs.due(session, study, lost or {}), *_all_due(session, study, succeeded))
+        for job in jobs:
+            attempt = _attempt_due(runs.get(job.finding), now())
+            one_at_a_time = job.kind == RunKind.FILTER and job.participant_id in being_filtered
+            if attempt is not None and not one_at_a_time:
+                yield job, attempt
+
+
+def _all_due(session: Session, study: Study, succeeded: Collection[str]) -> Iterator[Job]:
+    yield from _missing_clips(session, study)
+    yield from _stale_models(session, study, succeeded)
+    yield from report_files.due(session, study)
+    yield from export_files.due(session, study)
+
+
+def abandoned(session: Session, in_hand: Collection[str]) -> list[tuple[Job, int]]:
+    """Runs that some worker began and of which nothing has been heard since, with the number of the attempt.
+
+    ``in_hand``: findings that this worker is busy with itself; a machine under load may be late with a sign of life.
+    """
+    lost = select(Run).where(Run.status == RunStatus.RUNNING, Run.heartbeat_at < now() - LEASE)
+    return [(job_of(run), run.attempt) for run in session.scalars(lost) if run.workflow_id not in in_hand]
+
+
+def job_of(run: Run) -> Job:
+    """What the run was begun for."""
+    return Job(run.workflow_id, RunKind(run.kind), run.study_id, run.participant_id, run.label_count, run.label_hash)
+
+
+def workflow_name(finding: str, attempt: int) -> str:
+    """The engine's name for one attempt at a finding."""
+    return f"{finding}#{attempt}"
+
+
+def studies_with_answers(session: Session) -> list[Study]:
+    """The simulated studies in which somebody has answered: their first retraining is not far."""
+    answered = select(Participant.study_id).join(Query).join(LabelEvent)
+    found = session.scalars(select(Study).where(Study.id.in_(answered), *_AT_WORK).order_by(Study.id))
+    return [study for study in found if study.material is None]
+
+
+def short_of_queries(session: Session) -> list[int]:
+    """Participants who could soon run out of queries."""
+    return [
+        participant_id
+        for study in session.scalars(select(Study).where(*_AT_WORK)).all()
+        for participant_id in _without_all_queries(session, study)
+        if next_queries(session, participant_id, study.settings)[1] > 0
+    ]
+
+
+def with_lost_queries(session: Session, lost: Collection[str]) -> list[int]:
+    """Participants who wait for pairs that cannot be shown, nor their clips be made again: videos from outside."""
+    if not lost:
+        return []
+    studies = [study.id for study in session.scalars(select(Study)).all() if study.material is not None]
+    of_lost = select(Clip.id).where(or_(Clip.video_sha256.in_(lost), Clip.poster_sha256.in_(lost)))
+    answered = select(LabelEvent.id).where(LabelEvent.query_id == Query.id).exists()
+    waiting = select(Query.participant_id).join(Participant, Participant.id == Query.participant_id)
+    waiting = waiting.where(Participant.study_id.in_(studies), ~answered)
+    return list(session.scalars(waiting.where(or_(Query.left_clip_id.in_(of_lost), Query.right_clip_id.in_(of_lost)))))
+
+
+def _without_all_queries(session: Session, study: Study) -> list[int]:
+    """Everybody who has not yet been given all their queries: in a study that is over, nobody."""
+    settings = study.settings
+    counted = present_ids(study).outerjoin(Query).group_by(Participant.id)
+    short = counted.having(func.count(Query.id) < settings.practice_pairs + settings.question_count)
+    return list(session.scalars(short.order_by(Participant.id)))
+
+
+def _attempt_due(run: _Attempted | None, moment: datetime) -> int | None:
+    if run is None:
+        return 1
+    if run.status == RunStatus.RETRY:
+        return run.attempt
+    failed_since = moment - (run.finished_at or moment)
+    pause = RETRY_AFTER * max(1, run.attempt - 1)
+    if run.status == RunStatus.FAILED and run.attempt <= ATTEMPTS and failed_since > pause:
+        return run.attempt
+    return None
+
+
+def _missing_clips(session: Session, study: Study) -> list[Job]:
+    """Clips of every scenario; of the first ones also whole episodes, as soon as they were rolled out."""
+    if study.material is not None:
+        return []  # brought along by the study
+    settings, jobs = study.settings, []
+    clips = _clips_by_scenario(session, study, settings.clip_steps)
+    whole = _clips_by_scenario(session, study, study.whole_clip_steps)
+    for index in range(settings.pool_scenarios):
+        seed = scenario_seed(study.seed, index)
+        if clips.get(seed, 0) < settings.behaviours_per_scenario:
+            jobs.append(Job(f"clips/study-{study.id}/scenario-{seed}", RunKind.CLIPS, study.id))
+        elif index < settings.introduction_scenarios and whole.get(seed, 0) < settings.behaviours_per_scenario:
+            jobs.append(Job(f"clips/study-{study.id}/{WHOLE}-{seed}", RunKind.CLIPS, study.id))
+    return jobs[:CLIPS_AHEAD]
+
+
+def _clips_by_scenario(session: Session, study: Study, step_count: int | None) -> dict[int, int]:
+    """How many clips of this length there are of each scenario."""
+    counted = (
+        select(Rollout.scenario, func.count(Clip.id))
+        .join(Clip)
+        .where(Rollout.study_id == study.id, Clip.step_count == step_count)
+        .group_by(Rollout.scenario)
+    )
+    return dict(session.execute(counted).all())
+
+
+def scenario_seed(study_seed: int, index: int) -> int:
+    """The scenario at one place of a study's pool; far from those that filters are trained and evaluated on."""
+    return 10_000_000 + study_seed % 90_000 * 1_000 + index
+
+
+def _stale_models(session: Session, study: Study, succeeded: Collection[str]) -> list[Job]:
+    jobs, settings = [], study.settings
+    answers, exclusions = last_answers(session, present_ids(study)), last_exclusions(session, present_ids(study))
+    begun = evaluation_plan.begun(session, study)
+    for participant_id, count in sorted(count_labels(session, present_ids(study)).items()):
+        suffix = ending(settings, count, answers[participant_id], exclusions.get(participant_id))
+        reward = reward_due(settings, count)
+        if reward:
+            name = f"reward/participant-{participant_id}/labels-{reward}{suffix}"
+            jobs.append(Job(name, RunKind.REWARD, study.id, participant_id, reward))
+            milestone = filter_due(settings, count)
+            if milestone and name in succeeded and study.material is None:  # no simulator, no filter
+                name = filter_name(participant_id, milestone, suffix)
+                jobs.append(Job(name, RunKind.FILTER, study.id, participant_id, milestone))
+        if count >= settings.labels_per_participant and study.material is None:
+            robots_shown = participant_id in begun
+            jobs += _missing_from_evaluation(study, participant_id, f"labels-{reward}{suffix}", succeeded, robots_shown)
+    return jobs
+
+
+def _missing_from_evaluation(
+    study: Study, participant_id: int, ending: str, succeeded: Collection[str], robots_shown: bool
+) -> list[Job]:
+    """What is to be trained, filmed or packed for somebody who has given all labels.
+
+    Whoever has been shown robots rates those: other ones, learned without an excluded answer, would be for nobody.
+    """
+    if f"reward/participant-{participant_id}/{ending}" not in succeeded:
+        return []
+    jobs = [] if robots_shown else baselines.due(study, participant_id, ending)
+    if f"filter/participant-{participant_id}/{ending}" in succeeded:
+        jobs += evaluation_films.due(study, participant_id, ending, succeeded, robots_shown)
+    return jobs

@@ -1,0 +1,174 @@
+"""Whose work comes first: that of whoever waits, and the longer somebody waits the sooner.
+
+Known from the database alone (Participant.waiting_for, waiting_since, last_seen_at), so every worker knows it.
+"""
+
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
+from enum import IntEnum
+from typing import NamedTuple
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from app.db import now
+from app.domain.models import RunKind
+from app.domain.studies import Awaited, Participant, Study
+from worker.jobs.runtime.records import Job
+
+PRESENT_WITHIN = timedelta(seconds=90)
+"""Waiting pages look again every few seconds, browsers let hidden ones do so once a minute."""
+ASKED_WITHIN = timedelta(minutes=10)
+"""So long after unblinding a report is what an experimenter waits for."""
+_BEGINNING = datetime(1970, 1, 1, tzinfo=UTC)
+
+
+class Level(IntEnum):
+    """Why something is done, the most urgent first."""
+
+    WAITING = 0
+    """A participant looks at a waiting page for it right now."""
+    ANSWERING = 1
+    """A participant is here and will soon need it."""
+    ASKED = 2
+    """An experimenter has asked for it."""
+    DUE = 3
+    """A participant needs it who is not here."""
+    POOL = 4
+    """Clips of a study with participants."""
+    UNOPENED = 5
+    """Clips of a study that has none."""
+    UNREAD = 6
+    """A report that nobody has asked for."""
+
+
+class Urgency(NamedTuple):
+    """Smaller is sooner: the level, since when somebody waits or was seen, and what one person needs first."""
+
+    level: Level
+    since: datetime
+    step: int
+
+
+_STEPS = {RunKind.REWARD: 0, RunKind.FILTER: 1, RunKind.METHOD: 1, RunKind.FILMS: 2}
+_LAST_STEP = 3
+
+
+@dataclass(frozen=True)
+class _Person:
+    study_id: int
+    seen_at: datetime | None
+    awaited: str | None
+    waiting_since: datetime | None
+    present: bool
+
+
+@dataclass(frozen=True)
+class WhoWaits:
+    """Everybody as they were at one moment."""
+
+    people: Mapping[int, _Person] = field(default_factory=dict)
+    just_unblinded: frozenset[int] = frozenset()
+
+    @classmethod
+    def look(cls, session: Session) -> "WhoWaits":
+        """As the database has it now."""
+        moment = now()
+        columns = (
+            Participant.id,
+            Participant.study_id,
+            Participant.last_seen_at,
+            Participant.waiting_for,
+            Participant.waiting_since,
+        )
+        rows = session.execute(select(*columns).where(Participant.withdrawn_at.is_(None)))
+        people = {
+            row.id: _Person(
+                row.study_id,
+                row.last_seen_at,
+                row.waiting_for,
+                row.waiting_since,
+                present=row.last_seen_at is not None and moment - row.last_seen_at <= PRESENT_WITHIN,
+            )
+            for row in rows
+        }
+        unblinded = session.scalars(select(Study.id).where(Study.unblinded_at > moment - ASKED_WITHIN))
+        return cls(people, frozenset(unblinded))
+
+    def urgency(self, job: Job) -> Urgency:
+        """How soon the job is to be done."""
+        if job.kind == RunKind.EXPORT or (job.kind == RunKind.REPORT and job.study_id in self.just_unblinded):
+            return Urgency(Level.ASKED, _BEGINNING, 0)
+        if job.kind == RunKind.REPORT:
+            return Urgency(Level.UNREAD, _BEGINNING, 0)
+        person = None if job.participant_id is None else self.people.get(job.participant_id)
+        return self._of_study(job.study_id) if person is None else _of_person(person, job)
+
+    def _of_study(self, study_id: int) -> Urgency:
+        """Of its clips, for which those wait who compare."""
+        people = [each for each in self.people.values() if each.study_id == study_id]
+        if not people:
+            return Urgency(Level.UNOPENED, _BEGINNING, 0)
+        comparing = [each for each in people if each.present and each.awaited in (None, Awaited.PAIR)]
+        waiting = [each.waiting_since for each in comparing if each.awaited and each.waiting_since]
+        if waiting:
+            return Urgency(Level.WAITING, min(waiting), 0)
+        return Urgency(Level.ANSWERING if comparing else Level.POOL, _BEGINNING, 0)
+
+
+def _of_person(person: _Person, job: Job) -> Urgency:
+    before_after = job.kind == RunKind.FILMS and "/before-after/" in job.finding
+    step = _LAST_STEP if before_after else _STEPS.get(RunKind(job.kind), _LAST_STEP)
+    if not person.present:
+        return Urgency(Level.DUE, person.seen_at or _BEGINNING, step)
+    needed_for_it = not before_after or person.awaited == Awaited.DEBRIEF
+    if person.awaited and person.waiting_since and needed_for_it:
+        return Urgency(Level.WAITING, person.waiting_since, step)
+    return Urgency(Level.ANSWERING, person.waiting_since or person.seen_at or _BEGINNING, step)
+
+
+class Gate:
+    """Lets so many in at a time, the most urgent first; asked anew whenever one leaves, for urgency changes.
+
+    ``holds_back``: whether nobody of this level is to be let in at present, although there is room.
+    """
+
+    LOOK_S = 1.0
+
+    def __init__(self, places: int, holds_back: Callable[[Level], bool] = lambda _level: False) -> None:
+        self._free, self._holds_back = places, holds_back
+        self._waiting: dict[int, Callable[[], Urgency]] = {}
+        self._number = 0
+        self._changed = threading.Condition()
+
+    @contextmanager
+    def passed(self, urgency: Callable[[], Urgency]) -> Iterator[None]:
+        """Waits for a place, which is given back at the end."""
+        with self._changed:
+            self._number += 1
+            mine = self._number
+            self._waiting[mine] = urgency
+            while not self._is_next(mine):
+                self._changed.wait(self.LOOK_S)
+            del self._waiting[mine]
+            self._free -= 1
+            self._changed.notify_all()
+        try:
+            yield
+        finally:
+            with self._changed:
+                self._free += 1
+                self._changed.notify_all()
+
+    def is_awaited_above(self, level: Level) -> bool:
+        """Whether somebody waits here who is more urgent than this level."""
+        with self._changed:
+            return any(urgency().level < level for urgency in self._waiting.values())
+
+    def _is_next(self, mine: int) -> bool:
+        ranks = {number: urgency() for number, urgency in self._waiting.items()}
+        admissible = [(rank, number) for number, rank in ranks.items() if not self._holds_back(rank.level)]
+        return self._free > 0 and bool(admissible) and min(admissible)[1] == mine

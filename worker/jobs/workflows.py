@@ -1,0 +1,141 @@
+"""The durable workflow behind every run: load (transaction) -> compute (no transaction) -> save (transaction).
+
+The engine remembers which steps of a workflow are finished. A worker that is killed resumes at the first unfinished
+one; every step may therefore run twice, and leaves the same rows and files when it does.
+"""
+
+import errno
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+from typing import Any
+
+from dbos import DBOS, DBOSConfiguredInstance
+from sqlalchemy.exc import OperationalError
+from sqlalchemy.orm import Session
+
+from app.domain.models import RunKind
+from app.domain.studies import Participant, Study
+from app.errors import AppError
+from worker.jobs.clips.evaluation_films import make_films
+from worker.jobs.clips.pool_clips import build_clips
+from worker.jobs.learning.baselines import train_method
+from worker.jobs.learning.filters import train_filter
+from worker.jobs.learning.reward_models import train_reward
+from worker.jobs.publishing import export_files, report_files
+from worker.jobs.runtime import records
+from worker.jobs.runtime.context import Step, Workplace
+from worker.jobs.runtime.lanes import Turns
+from worker.jobs.runtime.records import Job
+
+log = logging.getLogger("worker")
+
+FALLS_ALLOWED = 5
+"""How often a worker may fall in the middle of an attempt before that has failed."""
+
+_BODIES: dict[RunKind, Callable[[Workplace, Job, int, Step], None]] = {
+    RunKind.CLIPS: build_clips,
+    RunKind.REWARD: train_reward,
+    RunKind.FILTER: train_filter,
+    RunKind.METHOD: train_method,
+    RunKind.FILMS: make_films,
+    RunKind.REPORT: report_files.make,
+    RunKind.EXPORT: export_files.make,
+}
+
+
+class ParticipantWithdrew(AppError):
+    """The participant has withdrawn, or the study was deleted, so there is nothing to be done."""
+
+
+@DBOS.dbos_class()
+class Workshop(DBOSConfiguredInstance):
+    """Does jobs at one workplace."""
+
+    def __init__(self, place: Workplace, turns: Turns) -> None:
+        super().__init__("workshop")
+        self.place, self.turns = place, turns
+        self.in_hand: set[str] = set()
+        """findings that this process is working on"""
+        self.stored: dict[str, set[str]] = {}
+        """artefacts of work that has not succeeded yet, by finding: nothing else may know of them"""
+
+    @DBOS.workflow(max_recovery_attempts=FALLS_ALLOWED)
+    def work(self, arguments: dict[str, Any]) -> None:
+        """Do one job; what goes wrong is kept with the run and in the log, never raised."""
+        job = Job(**arguments)
+        self.in_hand.add(job.finding)
+        started = time.monotonic()
+        try:
+            run_id = _step("begin", self._begin, arguments)
+            if run_id is None:
+                return
+            place = self.place.noting(self.stored.setdefault(job.finding, set())).computing(self.turns.of(job))
+            _BODIES[RunKind(job.kind)](place, job, run_id, _step)
+            _step("finish", self._finish, run_id)
+            self.stored.pop(job.finding, None)
+            log.info("%s done in %.1f s", job.finding, time.monotonic() - started)
+        except AppError as refusal:  # foreseen, and already in words for people
+            log.warning("%s: %s", job.finding, refusal.message)
+            _step("fail", self._fail, job.finding, refusal.message)
+        except Exception as error:  # the worker's edge: one failed job must not stop the others
+            if self._is_pointless(job):
+                log.info("%s is abandoned: the participant has withdrawn, or the study was deleted", job.finding)
+                return
+            log.exception("%s failed", job.finding)
+            _step("fail", self._fail, job.finding, f"{type(error).__name__}: {error}", not _is_the_machine_s(error))
+        finally:
+            self.in_hand.discard(job.finding)
+
+    def _is_pointless(self, job: Job) -> bool:
+        with self.place.database.reading() as session:
+            return _has_withdrawn(session, job)
+
+    def _begin(self, arguments: dict[str, Any]) -> int | None:
+        """The run's id; None when there is nothing to be done, because an earlier life of this job has finished it."""
+        job = Job(**arguments)
+        with self.place.database.writing() as session:
+            if _has_withdrawn(session, job):
+                raise ParticipantWithdrew
+            if records.has_succeeded(session, job.finding):
+                return None
+            return records.begin_run(session, job, _seed(session, job))
+
+    def _finish(self, run_id: int) -> None:
+        with self.place.database.writing() as session:
+            records.finish_run(session, run_id)
+
+    def _fail(self, finding: str, error: str, counts: bool = True) -> None:
+        with self.place.database.writing() as session:
+            records.fail_run(session, finding, error, counts)
+
+
+def _step(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
+    return DBOS.run_step({"name": name}, function, *arguments)
+
+
+def _is_the_machine_s(error: Exception) -> bool:
+    """Whether the same work would succeed once there is space again, or the database can be reached."""
+    if isinstance(error, OSError):
+        return error.errno in {errno.ENOSPC, errno.EDQUOT, errno.EROFS}
+    return isinstance(error, OperationalError)
+
+
+def _has_withdrawn(session: Session, job: Job) -> bool:
+    if session.get_one(Study, job.study_id).deleted_at is not None:
+        return True
+    return job.participant_id is not None and (
+        session.get_one(Participant, job.participant_id).withdrawn_at is not None
+    )
+
+
+def _seed(session: Session, job: Job) -> int:
+    if job.participant_id is None:
+        return session.get_one(Study, job.study_id).seed
+    return session.get_one(Participant, job.participant_id).seed
+
+
+def as_arguments(job: Job) -> dict[str, Any]:
+    """The job as plain values, which is what the engine stores."""
+    return {name: str(value) if name == "kind" else value for name, value in asdict(job).items()}

@@ -1,0 +1,242 @@
+"""The published form of a personal filter: one zip file that says what it is and proves that it is undamaged.
+
+The same contents give the same bytes: fixed timestamps, sorted names, nothing of the machine it was written on.
+"""
+
+import hashlib
+import io
+import json
+import platform
+import zipfile
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import numpy.typing as npt
+from safetensors.numpy import save
+
+from worker.ml.export import run_filter
+from worker.ml.export.model_card import model_card
+from worker.ml.filters.filter_module import FilterWeights
+from worker.ml.filters.filter_onnx import INPUTS, OUTPUT, OnnxFilter
+from worker.ml.policies.gaussian import GaussianPolicy
+from worker.ml.policies.policy_onnx import policy_to_onnx
+from worker.ml.rewards.reward_models import CLIP, RewardModel
+from worker.spaces import CONTROL_STEP_S, JOINT_ACTION, Space
+from worker.task import Task
+from worker.trajectory import SIGNALS, Trajectory
+
+Array = npt.NDArray[np.float32]
+
+SCHEMA_VERSION = 1
+MANIFEST = "manifest.json"
+LARGEST_BYTES = 256 << 20
+"""Of all files of a bundle together; those written so far have a hundredth of it."""
+_TIMESTAMP = (1980, 1, 1, 0, 0, 0)
+_LIBRARIES = ("numpy", "onnx", "onnxruntime", "onnxscript", "safetensors", "torch")
+
+
+class BundleDamaged(ValueError):
+    """The bundle is not what was exported. Download it again."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Inputs of the filter during N control steps, for checking it elsewhere."""
+
+    observations: Array
+    """(N, D)"""
+    policy_means: Array
+    """(N, 7)"""
+
+    @classmethod
+    def of(cls, trajectories: Sequence[Trajectory]) -> Self:
+        """Every step of these rollouts."""
+        return cls(
+            np.concatenate([each.observations[: len(each)] for each in trajectories]).astype(np.float32),
+            np.concatenate([each.reference_actions for each in trajectories]).astype(np.float32),
+        )
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """Where a filter comes from. Plain values; ``participant`` is a pseudonym such as P07."""
+
+    study: str
+    participant: str
+    version: int
+    label_count: int
+    label_hash: str
+    seed: int
+    created_at: str
+    """ISO 8601, UTC"""
+    lock_hash: str
+    deviations: str
+    """fingerprint of the locked settings and plan, and what was changed afterwards, in words as in every export"""
+
+
+@dataclass(frozen=True)
+class BundleContents:
+    """Everything that is published."""
+
+    task: Task
+    filter_onnx: bytes
+    weights: FilterWeights
+    reward: RewardModel
+    policy: GaussianPolicy
+    recording: Recording
+    metrics: Mapping[str, Any]
+    """Model.metrics of the filter; evaluation, notes and the reward model's weights are published"""
+    provenance: Provenance
+
+
+def write(contents: BundleContents) -> bytes:
+    """The zip file."""
+    exported = OnnxFilter(contents.filter_onnx)
+    recording = contents.recording
+    files = {
+        "filter.onnx": contents.filter_onnx,
+        "policy.onnx": policy_to_onnx(contents.policy),
+        "reward_model.safetensors": contents.reward.to_bytes(),
+        "action_encoder.safetensors": contents.weights.to_bytes(),
+        "run_filter.py": Path(run_filter.__file__).read_bytes(),
+        "recorded/observations.npy": _npy(recording.observations),
+        "recorded/policy_means.npy": _npy(recording.policy_means),
+        "recorded/actions.npy": _npy(exported.batch(recording.observations, recording.policy_means)),
+    }
+    manifest = _manifest(contents)
+    files["MODEL_CARD.md"] = model_card(manifest).encode()
+    manifest["files"] = {
+        name: {"bytes": len(stored), "sha256": _sha256(stored)} for name, stored in sorted(files.items())
+    }
+    files[MANIFEST] = (json.dumps(manifest, indent=2, sort_keys=True, allow_nan=False) + "\n").encode()
+    return _zipped(files)
+
+
+def verify(stored: bytes) -> dict[str, Any]:
+    """The manifest of an undamaged bundle. Raises BundleDamaged when a file is missing, changed or was never listed."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(stored)) as archive:
+            if sum(each.file_size for each in archive.infolist()) > LARGEST_BYTES:
+                raise BundleDamaged(f"{BundleDamaged.__doc__} It would unpack to far more than a bundle holds.")
+            files = {name: archive.read(name) for name in archive.namelist()}
+        manifest: dict[str, Any] = json.loads(files.pop(MANIFEST))
+        listed: dict[str, dict[str, Any]] = manifest["files"]
+    except (zipfile.BadZipFile, KeyError, ValueError) as error:
+        raise BundleDamaged(f"{BundleDamaged.__doc__} ({error})") from error
+    changed = [
+        name
+        for name, expected in listed.items()
+        if name not in files or len(files[name]) != expected["bytes"] or _sha256(files[name]) != expected["sha256"]
+    ]
+    unlisted = sorted(set(files) - set(listed))
+    if changed or unlisted:
+        raise BundleDamaged(f"{BundleDamaged.__doc__} Affected: {', '.join(sorted(changed) + unlisted)}.")
+    return manifest
+
+
+def _manifest(contents: BundleContents) -> dict[str, Any]:
+    """Everything but the list of files."""
+    provenance, weights = contents.provenance, contents.weights
+    return {
+        "schema_version": SCHEMA_VERSION,
+        "task": contents.task.name,
+        "study": provenance.study,
+        "lock_hash": provenance.lock_hash,
+        "deviations": provenance.deviations,
+        "participant": provenance.participant,
+        "version": provenance.version,
+        "created_at": provenance.created_at,
+        "labels": {"count": provenance.label_count, "sha256": provenance.label_hash},
+        "seed": provenance.seed,
+        "control_rate_hz": round(1.0 / CONTROL_STEP_S, 6),
+        "observation": described_space(contents.task.observation),
+        "action": described_space(JOINT_ACTION),
+        "onnx": _onnx_interface(contents.filter_onnx, contents.task.observation.size),
+        "normalisation": {
+            "inside_filter": True,
+            "observation_offset": contents.policy.offset.tolist(),
+            "observation_scale": contents.policy.scale.tolist(),
+            "reward_offset": contents.reward.normalisation.offset,
+            "reward_scale": contents.reward.normalisation.scale,
+            "reward_clip": CLIP,
+        },
+        "policy": {
+            "file": "policy.onnx",
+            "weights_sha256": _sha256(save(contents.policy.weights)),
+            "action_limit": contents.policy.action_limit,
+        },
+        "method": weights.method,
+        "mode": dict(weights.mode),
+        "mode_axes": [asdict(axis) for axis in contents.task.modes.axes],
+        "gate": weights.gate,
+        "residual_share": weights.residual_share if weights.encoder else 0.0,
+        "reward_kind": contents.reward.kind,
+        "signals": list(SIGNALS),
+        "uses_reference_policy": bool(contents.metrics.get("uses_reference")),
+        "learned_weights": contents.metrics.get("weights"),
+        "learned_costs": contents.metrics.get("costs"),
+        "evaluation": contents.metrics.get("evaluation"),
+        "notes": list(contents.metrics.get("notes", ())),
+        "versions": {
+            "python": platform.python_version(),
+            "pbarl-studio": version("pbarl-studio"),
+            **{name: version(name) for name in _LIBRARIES},
+        },
+    }
+
+
+def described_space(space: Space) -> dict[str, Any]:
+    """Name, place, unit, range and meaning of every number of a space."""
+    fields = [
+        {
+            "name": field.name,
+            "first": place.start,
+            "size": field.size,
+            "unit": field.unit,
+            "low": field.low,
+            "high": field.high,
+            "meaning": field.meaning,
+        }
+        for field, place in space.slices()
+    ]
+    return {"size": space.size, "fields": fields}
+
+
+def _onnx_interface(stored: bytes, observation_size: int) -> dict[str, Any]:
+    sizes = {INPUTS[0]: observation_size, INPUTS[1]: JOINT_ACTION.size, OUTPUT: JOINT_ACTION.size}
+
+    def described(name: str) -> dict[str, Any]:
+        return {"name": name, "type": "float32", "shape": ["batch", sizes[name]]}
+
+    return {
+        "file": "filter.onnx",
+        "opset": OnnxFilter(stored).opset,
+        "inputs": [described(name) for name in INPUTS],
+        "outputs": [described(OUTPUT)],
+    }
+
+
+def _npy(array: Array) -> bytes:
+    target = io.BytesIO()
+    np.save(target, np.ascontiguousarray(array, np.float32), allow_pickle=False)
+    return target.getvalue()
+
+
+def _sha256(stored: bytes) -> str:
+    return hashlib.sha256(stored).hexdigest()
+
+
+def _zipped(files: Mapping[str, bytes]) -> bytes:
+    target = io.BytesIO()
+    with zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name in sorted(files):
+            entry = zipfile.ZipInfo(name, _TIMESTAMP)
+            entry.compress_type = zipfile.ZIP_DEFLATED
+            entry.create_system = 3  # Unix, wherever it is written
+            entry.external_attr = 0o644 << 16
+            archive.writestr(entry, files[name])
+    return target.getvalue()

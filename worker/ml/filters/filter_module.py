@@ -1,0 +1,162 @@
+"""The action filter as a torch module: what runs after the frozen policy, and what is exported.
+
+action = policy_mean + gate * (transform(observation, policy_mean) - policy_mean). With gate 0 the policy is untouched.
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal, Self
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from safetensors.numpy import load, save
+from torch import Tensor, nn
+
+from worker.ml.filters.action_encoder import ResidualAdapter
+from worker.ml.filters.pbarl_printed import PrintedEncoder
+from worker.ml.policies.gaussian import GaussianPolicy
+from worker.ml.policies.torch_module import FrozenPolicy
+from worker.ml.rewards.reward_models import stored_config
+from worker.modes import ModeFamily
+
+Array = npt.NDArray[np.float32]
+Method = Literal["studio", "printed"]
+
+
+@dataclass(frozen=True)
+class FilterWeights:
+    """Everything personal about a filter as plain arrays: travels between processes, is stored, builds the module."""
+
+    method: Method = "studio"
+    mode: Mapping[str, float] = field(default_factory=dict)
+    """the person's mode by the names of its axes; an axis that is not named is 0"""
+    gate: float = 1.0
+    residual_share: float = 1.0
+    """share of the encoder's residual that is used; 0 means the mode alone"""
+    encoder: Mapping[str, Array] = field(default_factory=dict)
+    """state of ResidualAdapter or PrintedEncoder; empty: none was trained"""
+
+    def changed(self, **values: Any) -> Self:
+        """The same with some values replaced."""
+        return replace(self, **values)
+
+    def to_bytes(self) -> bytes:
+        """One safetensors file."""
+        config = {
+            "gate": self.gate,
+            "kind": "action encoder",
+            "method": self.method,
+            "mode": dict(self.mode),
+            "residual_share": self.residual_share,
+        }
+        tensors = {name: np.ascontiguousarray(array) for name, array in self.encoder.items()}
+        return save(tensors, metadata={"config": json.dumps(config, sort_keys=True)})
+
+    @classmethod
+    def from_bytes(cls, stored: bytes) -> Self:
+        """Read what to_bytes() wrote."""
+        config = stored_config(stored)
+        return cls(config["method"], config["mode"], config["gate"], config["residual_share"], load(stored))
+
+
+class ModeTransform(nn.Module):
+    """The person's execution mode around the frozen policy, and the residual adapter around that."""
+
+    mode: Tensor
+    residual_share: Tensor
+
+    def __init__(
+        self,
+        family: ModeFamily,
+        policy: FrozenPolicy,
+        mode: Mapping[str, float],
+        adapter: ResidualAdapter | None,
+        residual_share: float,
+    ) -> None:
+        super().__init__()
+        self.family = family
+        self.policy = policy
+        self.adapter = adapter
+        self.register_buffer("mode", torch.tensor(family.vector(mode), dtype=torch.float32))
+        self.register_buffer("residual_share", torch.tensor(residual_share, dtype=torch.float32))
+
+    def base(self, observation: Tensor) -> tuple[Tensor, Tensor]:
+        """The mode's action and the policy's deviation where the mode looks, (B, 7) each."""
+        action, log_std = self.policy(self.family.perceived(observation, self.mode, torch))
+        quicker = self.family.speed_factor(observation, self.mode, torch) * action
+        return quicker.clamp(-1.0, 1.0), self.policy.action_std(action, log_std)
+
+    def forward(self, observation: Tensor, policy_mean: Tensor) -> Tensor:
+        """(B, D), (B, 7) -> (B, 7). The policy is asked where the mode looks; policy_mean is not needed."""
+        action, deviation = self.base(observation)
+        if self.adapter is None:
+            return action
+        moved: Tensor = self.adapter(observation, action, deviation)
+        return action + self.residual_share * (moved - action)
+
+
+class PrintedTransform(nn.Module):
+    """The paper's encoder after the policy: encode (s, policy_mean), decode."""
+
+    def __init__(self, encoder: PrintedEncoder) -> None:
+        super().__init__()
+        self.encoder = encoder
+
+    def forward(self, observation: Tensor, policy_mean: Tensor) -> Tensor:
+        """(B, D), (B, 7) -> (B, 7)"""
+        action: Tensor = self.encoder(observation, policy_mean)
+        return action
+
+
+class ActionFilter(nn.Module):
+    """observation (B, D), policy_mean (B, 7) -> action (B, 7) in [-1, 1]. Deterministic."""
+
+    gate: Tensor
+
+    def __init__(self, transform: nn.Module, gate: float) -> None:
+        super().__init__()
+        self.transform = transform
+        self.register_buffer("gate", torch.tensor(gate, dtype=torch.float32))
+
+    @property
+    def structure(self) -> object:
+        """What decides about the computation besides the weights and their shapes; can be hashed."""
+        return getattr(self.transform, "family", type(self.transform))
+
+    def forward(self, observation: Tensor, policy_mean: Tensor) -> Tensor:
+        """See the class."""
+        change = self.transform(observation, policy_mean) - policy_mean
+        action: Tensor = (policy_mean + self.gate * change).clamp(-1.0, 1.0)
+        return action
+
+
+def build(family: ModeFamily, policy: GaussianPolicy, weights: FilterWeights) -> ActionFilter:
+    """The module for these weights around this policy, in evaluation mode, on the CPU.
+
+    Raises ValueError when the weights name an axis that the task's family of modes does not have.
+    """
+    frozen = FrozenPolicy(policy.weights)
+    transform: nn.Module
+    if weights.method == "printed":
+        encoder = PrintedEncoder(frozen.offset, frozen.scale)
+        load_state(encoder, weights.encoder)
+        transform = PrintedTransform(encoder)
+    else:
+        adapter = None
+        if weights.encoder and weights.residual_share > 0.0:
+            adapter = ResidualAdapter(frozen.offset, frozen.scale)
+            load_state(adapter, weights.encoder)
+        transform = ModeTransform(family, frozen, weights.mode, adapter, weights.residual_share)
+    return ActionFilter(transform, weights.gate).eval().requires_grad_(False)
+
+
+def state_of(module: nn.Module) -> dict[str, Array]:
+    """A module's state as arrays."""
+    return {name: tensor.detach().numpy().astype(np.float32) for name, tensor in module.state_dict().items()}
+
+
+def load_state(module: nn.Module, state: Mapping[str, Array]) -> None:
+    """Put arrays back into a module."""
+    module.load_state_dict({name: torch.from_numpy(np.array(array)) for name, array in state.items()})

@@ -1,0 +1,53 @@
+"""Trying a filter on held-out scenarios, and what makes it acceptable: better for the person, task and forces kept."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from worker.ml.filters.filter_problem import Act, Collect, FilterProblem, Trial
+from worker.trajectory import Trajectory
+
+Floats = npt.NDArray[np.float64]
+
+
+def try_on(
+    problem: FilterProblem,
+    act: Act,
+    gate: float,
+    residual_share: float,
+    reference: Sequence[Trajectory],
+    collect: Collect,
+) -> tuple[Trial, Sequence[Trajectory]]:
+    """What came of it in the scenarios of ``reference``, and the rollouts."""
+    scenarios = [each.scenario for each in reference]
+    filtered = collect(act, scenarios, 0.0, problem.seed)
+    before, after = problem.reward.returns(reference), problem.reward.returns(filtered)
+    unit = max(float(before.std()), 1e-9)
+    success = float((successes(filtered) - successes(reference)).mean())
+    trial = Trial(gate, residual_share, float((after - before).mean()) / unit, success, _p95_force_n(filtered))
+    return trial, filtered
+
+
+def signal_changes(reference: Sequence[Trajectory], filtered: Sequence[Trajectory]) -> Floats:
+    """(N, S) of the summed signals, scenario by scenario."""
+    pairs = zip(reference, filtered, strict=True)
+    return np.array(
+        [after.signals.sum(axis=0, dtype=np.float64) - before.signals.sum(axis=0) for before, after in pairs]
+    )
+
+
+def successes(trajectories: Sequence[Trajectory]) -> Floats:
+    """(N,) in {0, 1}"""
+    return np.array([float(each.success) for each in trajectories])
+
+
+def acceptable(problem: FilterProblem, trial: Trial, reference: Sequence[Trajectory]) -> bool:
+    """Whether it raises the learned return and keeps the task and the forces within the tolerances."""
+    config = problem.config
+    gentle = trial.p95_force_n <= max(config.force_limit_n, _p95_force_n(reference))
+    return trial.preference > 0.0 and trial.success_change >= -config.success_tolerance and gentle
+
+
+def _p95_force_n(trajectories: Sequence[Trajectory]) -> float:
+    return float(np.quantile([each.contact_force_n.max() for each in trajectories], 0.95))

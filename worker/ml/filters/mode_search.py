@@ -1,0 +1,78 @@
+"""The first stage of the studio's filter: a person's execution mode, from the response surface and a few trials."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+
+from worker.ml.filters.filter_module import FilterWeights
+from worker.ml.filters.filter_problem import Collect, FilterAct, FilterDraft, FilterProblem, Progress, Trial, act_of
+from worker.ml.filters.gate import acceptable, signal_changes, successes, try_on
+from worker.ml.filters.response_surface import CAUTION, ResponseSurface, best_mode
+from worker.trajectory import Trajectory
+
+Floats = npt.NDArray[np.float64]
+
+
+def find_mode(
+    problem: FilterProblem,
+    surface: ResponseSurface,
+    pool: Sequence[Trajectory],
+    reference: Sequence[Trajectory],
+    collect: Collect,
+    progress: Progress = lambda stage, share: None,
+) -> FilterDraft:
+    """The mode with the best learned return of those tried that keep the task and its forces.
+
+    The best predicted mode lies where the surface knows least, and is the one whose success and return are most likely
+    overestimated. It is therefore tried on the held-out scenarios of ``reference``, the surface learns from the trial,
+    and the search goes on from there, more careful about success with every trial that was not acceptable. When no
+    attempt is acceptable the last mode is weakened; at worst it is off.
+    ``pool``: rollouts of many modes, used only when the reward is not linear in the signals.
+    """
+    started = time.perf_counter()
+    wishes = problem.reward.signal_weights(pool)
+    tried: list[tuple[Trial, Floats]] = []
+    accepted: list[tuple[Trial, Floats]] = []
+    for attempt in range(problem.config.mode_attempts):
+        if len(accepted) == problem.config.modes_to_choose_from:
+            break
+        progress("searching the person's way of doing the task", 0.1 * attempt)
+        rejected = len(tried) - len(accepted)
+        mode = best_mode(surface, wishes, problem.seed, success_caution=CAUTION * (1 + rejected))
+        if not mode.any() or any(np.array_equal(mode, earlier) for _, earlier in tried):
+            break
+        progress(f"checking mode {attempt + 1} on held-out scenarios", 0.03 + 0.1 * attempt)
+        trial, driven = try_on(problem, _act_in(problem, mode), 1.0, 0.0, reference, collect)
+        tried.append((trial, mode))
+        if acceptable(problem, trial, reference):
+            accepted.append((trial, mode))
+        surface = surface.with_observed(mode, signal_changes(reference, driven), successes(driven))
+    if not tried:
+        return _without_mode("The labels do not yet say clearly what to change; the mode is off.", [], started)
+    for gate in problem.config.gates if not accepted else ():
+        progress(f"checking the mode at {gate:.0%} on held-out scenarios", 0.32)
+        act = replace(_act_in(problem, tried[-1][1]), gate=gate)
+        weakened = try_on(problem, act, gate, 0.0, reference, collect)[0], tried[-1][1]
+        tried.append(weakened)
+        if acceptable(problem, weakened[0], reference):
+            accepted = [weakened]
+            break
+    trials = [trial for trial, _ in tried]
+    if not accepted:
+        note = "No mode was better while keeping the task and the forces; the mode is off."
+        return _without_mode(note, trials, started)
+    chosen, mode = max(accepted, key=lambda each: each[0].preference)
+    weights = FilterWeights(mode=problem.task.modes.named(mode), gate=chosen.gate)
+    ordered = (*(trial for trial in trials if trial is not chosen), chosen)
+    return FilterDraft(weights, trials=ordered).timed("mode", started)
+
+
+def _act_in(problem: FilterProblem, mode: Floats) -> FilterAct:
+    return act_of(problem.task.modes, problem.policy, FilterWeights(mode=problem.task.modes.named(mode)))
+
+
+def _without_mode(note: str, trials: Sequence[Trial], started: float) -> FilterDraft:
+    return FilterDraft(FilterWeights(), trials=tuple(trials), notes=(note,)).timed("mode", started)

@@ -1,0 +1,26 @@
+"""The studio's filter, stage by stage: a person's execution mode, gated, and a residual adapter around it, gated again.
+
+Every stage takes a draft and returns a better one.
+"""
+
+from collections.abc import Sequence
+
+from worker.ml.filters.filter_problem import Collect, FilterDraft, FilterProblem, Progress
+from worker.ml.filters.mode_search import find_mode
+from worker.ml.filters.residual import gate_residual, train_residual
+from worker.ml.filters.response_surface import ResponseSurface
+from worker.trajectory import Trajectory
+
+
+def fit_studio(
+    problem: FilterProblem,
+    surface: ResponseSurface,
+    pool: Sequence[Trajectory],
+    reference: Sequence[Trajectory],
+    collect: Collect,
+    progress: Progress = lambda stage, share: None,
+) -> FilterDraft:
+    """All stages in a row. ``reference``: rollouts of the reference policy on the problem's gate scenarios."""
+    draft = find_mode(problem, surface, pool, reference, collect, progress)
+    draft = train_residual(problem, draft, collect, progress)
+    return gate_residual(problem, draft, reference, collect, progress)

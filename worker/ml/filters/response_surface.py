@@ -1,0 +1,194 @@
+"""What each execution mode changes, for everybody: a small regression fitted once from rollouts of random modes.
+
+It predicts how the summed signals of an episode and its chance of success differ from the reference policy's in the
+same scenario. Given a person's weights on the signals, their best mode is then found without any further rollout.
+"""
+
+import json
+from dataclasses import dataclass, replace
+from itertools import combinations_with_replacement
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+import numpy.typing as npt
+from safetensors.numpy import load, save
+from scipy.special import expit, logit
+
+from worker.ml.rewards.reward_models import stored_config
+from worker.modes import ModeFamily
+from worker.trajectory import SIGNALS
+
+Floats = npt.NDArray[np.float64]
+
+RIDGE = 1.0
+OUTLIER_SHARE = 0.005
+"""Share at either end of every column that is cut to the quantile: a few crashes must not bend the surface."""
+
+SUCCESS_TOLERANCE = 0.015
+SUCCESS_PENALTY = 20.0
+"""Standard deviations of predicted return per unit of success lost beyond the tolerance."""
+DRAWS = 20_000
+CAUTION = 1.0
+"""Standard deviations that are subtracted from a mode's predicted return (over the reward model's members) and from its
+predicted log odds of success: the best of many is the one that is most likely overestimated."""
+REFERENCE_PRECISION = 0.1
+"""Of the prior of the reference policy's log odds of success: it is known from data alone."""
+NEWTON_STEPS = 15
+LONGEST_STEP = 3.0
+
+
+@dataclass(frozen=True)
+class ResponseSurface:
+    """psi(mode) @ coefficients: change of the summed signals; sigmoid([1, psi(mode)] @ log_odds): chance of success."""
+
+    coefficients: Floats
+    """(M, S)"""
+    gram: Floats
+    """(M, M) of the rollouts behind the coefficients, ridge included: how sure they are in which direction"""
+    log_odds: Floats
+    """(1 + M,) of success; the first belongs to the reference policy"""
+    precision: Floats
+    """(1 + M, 1 + M) of the log odds (Laplace approximation of their posterior)"""
+    low: Floats
+    """(A,) range of the modes it was fitted on"""
+    high: Floats
+    axes: tuple[str, ...]
+
+    def predict(self, modes: npt.ArrayLike, caution: float = 0.0) -> tuple[Floats, Floats]:
+        """(..., A) -> changes of the summed signals (..., S) and of the chance of success (...).
+
+        With ``caution`` the log odds of success are taken so many of their standard deviations lower.
+        """
+        features = monomials(np.asarray(modes, np.float64))
+        doubt = np.linalg.inv(self.precision)[1:, 1:]
+        deviation = np.sqrt(np.maximum(((features @ doubt) * features).sum(axis=-1), 0.0))
+        change = features @ self.log_odds[1:] - caution * deviation
+        return features @ self.coefficients, expit(self.log_odds[0] + change) - expit(self.log_odds[0])
+
+    def with_observed(self, mode: Floats, signal_deltas: Floats, successes: Floats) -> Self:
+        """The surface after N more rollouts of one mode (A,): as if it had been fitted with them.
+
+        signal_deltas (N, S) and successes (N,) as in fit(). Nearby modes are predicted anew, too; others hardly.
+        """
+        features = monomials(mode)
+        gram = self.gram + len(signal_deltas) * np.outer(features, features)
+        moments = self.gram @ self.coefficients + np.outer(features, signal_deltas.sum(axis=0))
+        repeated = np.repeat(_with_one(features[None]), len(successes), axis=0)
+        log_odds, precision = _logistic(repeated, successes, self.log_odds, self.precision)
+        coefficients = np.asarray(np.linalg.solve(gram, moments), np.float64)
+        return replace(self, coefficients=coefficients, gram=gram, log_odds=log_odds, precision=precision)
+
+    def to_bytes(self) -> bytes:
+        """One safetensors file."""
+        config = {"axes": list(self.axes), "kind": "response surface", "signals": list(SIGNALS)}
+        names = ("coefficients", "gram", "log_odds", "precision", "low", "high")
+        return save(
+            {name: np.ascontiguousarray(getattr(self, name), np.float32) for name in names},
+            metadata={"config": json.dumps(config, sort_keys=True)},
+        )
+
+    @classmethod
+    def from_bytes(cls, stored: bytes, family: ModeFamily) -> Self:
+        """Read what to_bytes() wrote. Raises ValueError when it was fitted for other signals or axes than today's."""
+        config = stored_config(stored)
+        if config.get("signals") != list(SIGNALS) or config.get("axes") != list(family.names):
+            raise ValueError(
+                "This response surface was fitted for other signals or axes; `python -m worker explore` fits another."
+            )
+        tensors = {name: array.astype(np.float64) for name, array in load(stored).items()}
+        return cls(**tensors, axes=family.names)
+
+    def save(self, path: Path) -> None:
+        """Write to_bytes() to a file."""
+        path.write_bytes(self.to_bytes())
+
+    @classmethod
+    def load(cls, path: Path, family: ModeFamily) -> Self:
+        """Read a file written by save()."""
+        return cls.from_bytes(path.read_bytes(), family)
+
+
+def monomials(modes: Floats) -> Floats:
+    """(..., A) -> (..., M): first order, second order with cross terms, pure third order. No constant: 0 maps to 0."""
+    columns = [modes[..., axis] for axis in range(modes.shape[-1])]
+    products = [first * second for first, second in combinations_with_replacement(columns, 2)]
+    return np.stack([*columns, *products, *(column**3 for column in columns)], axis=-1)
+
+
+def fit(family: ModeFamily, modes: Floats, signal_deltas: Floats, successes: Floats) -> ResponseSurface:
+    """Ridge regression of the signals and logistic regression of success, from N paired rollouts.
+
+    modes (N, A); signal_deltas (N, S): summed signals of the rollout with this mode minus those of the reference
+    rollout of the same scenario; successes (N,): 1 or 0.
+    """
+    low, high = np.quantile(signal_deltas, [OUTLIER_SHARE, 1 - OUTLIER_SHARE], axis=0)
+    features = monomials(np.asarray(modes, np.float64))
+    gram = features.T @ features + RIDGE * np.eye(features.shape[1])
+    unsure = np.diag([REFERENCE_PRECISION, *np.full(features.shape[1], RIDGE)])
+    usual = np.array([logit(np.clip(np.mean(successes), 0.01, 0.99)), *np.zeros(features.shape[1])])
+    log_odds, precision = _logistic(_with_one(features), np.asarray(successes, np.float64), usual, unsure)
+    return ResponseSurface(
+        np.asarray(np.linalg.solve(gram, features.T @ np.clip(signal_deltas, low, high)), np.float64),
+        gram,
+        log_odds,
+        precision,
+        np.array([axis.low for axis in family.axes]),
+        np.array([axis.high for axis in family.axes]),
+        family.names,
+    )
+
+
+def _with_one(features: Floats) -> Floats:
+    return np.concatenate([np.ones((len(features), 1)), features], axis=1)
+
+
+def _logistic(features: Floats, successes: Floats, mean: Floats, precision: Floats) -> tuple[Floats, Floats]:
+    """Mode and precision of the posterior of log odds (P,) with the prior N(mean, precision^-1), by Newton's method."""
+    weights = mean
+    for _ in range(NEWTON_STEPS):
+        chance = expit(features @ weights)
+        gradient = features.T @ (chance - successes) + precision @ (weights - mean)
+        hessian = features.T @ (features * (chance * (1.0 - chance))[:, None]) + precision
+        step = np.linalg.solve(hessian, gradient)
+        weights = weights - step * min(1.0, LONGEST_STEP / max(float(np.linalg.norm(step)), 1e-12))
+    chance = expit(features @ weights)
+    return weights, features.T @ (features * (chance * (1.0 - chance))[:, None]) + precision
+
+
+def best_mode(
+    surface: ResponseSurface,
+    weights: Floats,
+    seed: int,
+    *,
+    tolerance: float = SUCCESS_TOLERANCE,
+    penalty: float = SUCCESS_PENALTY,
+    caution: float = CAUTION,
+    success_caution: float = CAUTION,
+) -> Floats:
+    """(A,) the mode with the best predicted return for these weights on the signals, (S,) or (E, S) for E members.
+
+    With members the return counts as their mean less ``caution`` of their standard deviations: what few labels leave
+    open is then not gambled on (docs/method.md has what this gains). The chance of success is taken ``success_caution``
+    of its standard deviations lower. Random search with two local refinements; the mode 0 is always among the
+    candidates and wins ties, so that somebody for whom nothing is better keeps the reference policy.
+    """
+    rng = np.random.default_rng(seed)
+    width = surface.high - surface.low
+    members = np.atleast_2d(weights)
+    reference = np.zeros((1, len(width)))
+    candidates = np.concatenate([reference, rng.uniform(surface.low, surface.high, (DRAWS, len(width)))])
+    unit = max(float((surface.predict(candidates)[0] @ members.mean(axis=0)).std()), 1e-9)
+
+    def value(modes: Floats) -> Floats:
+        signals, success = surface.predict(modes, success_caution)
+        returns = signals @ members.T / unit
+        worth: Floats = returns.mean(axis=-1) - caution * returns.std(axis=-1)
+        return worth - penalty * np.maximum(-success - tolerance, 0.0)
+
+    for spread in (0.2, 0.05):
+        best = candidates[np.argsort(value(candidates))[-40:]]
+        around = np.repeat(best, 100, axis=0) + spread * width * rng.standard_normal((4000, len(width)))
+        candidates = np.concatenate([reference, best, np.clip(around, surface.low, surface.high)])
+    winner: Floats = candidates[np.argmax(value(candidates))]
+    return winner

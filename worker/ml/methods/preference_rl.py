@@ -1,0 +1,149 @@
+"""Reinforcement learning on a learned reward: what PrefFT and PbRL-HRI share. The learner is that of sac.
+
+Environments report the measured ``signals`` of every step in their info; their own reward is ignored. An episode is
+rewarded when it is over, as a whole, so that the reward model may be one that remembers what came before.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import gymnasium
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from worker.ml.policies.checkpoint import Checkpoint, Paused
+from worker.ml.policies.gaussian import GaussianPolicy
+from worker.ml.policies.sac import Learner, Replay, SacConfig
+from worker.ml.rewards.reward_models import RewardModel
+from worker.trajectory import SIGNALS
+
+Array = npt.NDArray[np.float32]
+Env = gymnasium.Env[Any, Any]
+MakeEnv = Callable[[], Env]
+EpisodeReward = Callable[[Array, Array, Array], npt.NDArray[np.floating]]
+"""signals (T, S), observations (T, D), actions (T, 7) of one whole episode -> rewards (T,)"""
+FirstActions = Callable[[Array], Array]
+"""observations (N, D) -> actions (N, 7) before the actor takes over"""
+
+TRAINING_SCENARIOS = 1_000_000
+"""Episodes are random scenarios below this number; nothing is evaluated there."""
+_LONGEST_EPISODE = 1_000
+
+
+@dataclass(frozen=True)
+class PolicyAct:
+    """A policy's deterministic action as a rollout's callable."""
+
+    policy: GaussianPolicy
+
+    def __call__(self, observation: Array) -> Array:
+        """(D,) -> (7,)"""
+        return self.policy.mean(observation)
+
+
+def learned(reward: RewardModel) -> EpisodeReward:
+    """The mean over the members, normalised and clipped."""
+    return lambda signals, observations, actions: reward.episode_rewards(signals, observations, actions).mean(axis=0)
+
+
+@dataclass
+class _Episode:
+    """What has happened since an environment's last reset."""
+
+    states: list[Array] = field(default_factory=list)
+    actions: list[Array] = field(default_factory=list)
+    signals: list[list[float]] = field(default_factory=list)
+
+
+class PreferenceRl:
+    """Several environments, the replay, and a learner once there is one. Draws torch's global random numbers."""
+
+    def __init__(self, make_env: MakeEnv, reward: EpisodeReward, config: SacConfig) -> None:
+        self.config, self.reward = config, reward
+        self.rng = np.random.default_rng([config.seed, 6])
+        self.envs = [make_env() for _ in range(config.environments)]
+        self.actions = int(np.prod(self.envs[0].action_space.shape or ()))
+        capacity = max(config.total_steps + config.environments, _LONGEST_EPISODE * config.environments)
+        self.replay = Replay(capacity, config.observation.size, self.actions)
+        self.states = np.stack([self._reset(env) for env in self.envs])
+        self.episodes = [_Episode([state]) for state in self.states]
+        self.steps = 0
+
+    def warm_up(self, first: FirstActions) -> Array:
+        """Make ``random_steps`` steps, or at least one episode, without learning; returns those states, (N, D)."""
+        while self.steps < self.config.random_steps or not self.replay.count:
+            self._step(first(self.states))
+        finished: Array = self.replay.rows[: self.replay.count, : self.config.observation.size].numpy()
+        return finished
+
+    def learn(self, learner: Learner, checkpoint: Checkpoint | None = None) -> None:
+        """The rest of the steps: first the critics alone, on the warm-up's episodes, then everything."""
+        config = self.config
+        for _ in range(0 if learner.updates else config.critic_first_updates):
+            learner.update(self.replay, actor=False)
+        owed = 0.0
+        while self.steps < config.total_steps:
+            if checkpoint:
+                self._keep_state(learner, checkpoint)
+            with torch.no_grad():
+                actions: Array = learner.actor.sample(torch.from_numpy(self.states))[0].numpy()
+            self._step(actions)
+            learner.set_learning_rate(self.steps / config.total_steps)
+            owed += config.updates_per_step * len(self.envs)
+            while owed >= 1:
+                learner.update(self.replay)
+                owed -= 1
+
+    def restore(self, learner: Learner, tensors: dict[str, Tensor], counts: dict[str, Any]) -> None:
+        """Go on from a checkpoint of learn(); the episodes that were in flight then begin anew."""
+        self.replay.count, self.steps = len(tensors["replay"]), counts["steps"]
+        self.replay.rows[: self.replay.count] = tensors["replay"]
+        learner.load_state(tensors, counts["updates"])
+        torch.set_rng_state(tensors["torch_rng"])
+        self.rng.bit_generator.state = counts["rng"]
+
+    def _keep_state(self, learner: Learner, checkpoint: Checkpoint) -> None:
+        checkpoint.note(self.steps / self.config.total_steps)
+        if checkpoint.is_due or checkpoint.pause_is_asked:
+            rows = self.replay.rows[: self.replay.count]
+            tensors = {**learner.state(), "replay": rows, "torch_rng": torch.get_rng_state()}
+            rng = self.rng.bit_generator.state
+            counts = {"steps": self.steps, "updates": learner.updates, "rng": rng}
+            checkpoint.write(tensors, {**counts, "target_entropy": learner.config.target_entropy})
+        if checkpoint.pause_is_asked:
+            raise Paused(Paused.__doc__)
+
+    def close(self) -> None:
+        """Free the environments."""
+        for env in self.envs:
+            env.close()
+
+    def _step(self, actions: Array) -> None:
+        """One step in every environment."""
+        for index, (env, action) in enumerate(zip(self.envs, actions, strict=True)):
+            state, _, terminated, truncated, info = env.step(action)
+            episode = self.episodes[index]
+            episode.states.append(state)
+            episode.actions.append(action)
+            episode.signals.append([info["signals"][name] for name in SIGNALS])
+            if terminated or truncated:
+                self._keep(episode, terminated)
+                state = self._reset(env)
+                self.episodes[index] = _Episode([state])
+            self.states[index] = state
+        self.steps += len(self.envs)
+
+    def _keep(self, episode: _Episode, terminated: bool) -> None:
+        """Reward a finished episode and put it into the replay."""
+        states, actions = np.array(episode.states, np.float32), np.array(episode.actions, np.float32)
+        rewards = self.reward(np.array(episode.signals, np.float32), states[:-1], actions)
+        goes_on = np.ones(len(actions), np.float32)
+        goes_on[-1] = not terminated  # a time limit is not an end: what would have followed still counts
+        self.replay.add(states[:-1], actions, np.asarray(rewards, np.float32), goes_on, states[1:])
+
+    def _reset(self, env: Env) -> Array:
+        state: Array = env.reset(seed=int(self.rng.integers(TRAINING_SCENARIOS)))[0]
+        return state

@@ -1,0 +1,217 @@
+"""Every method of the comparison behind one interface: fit(name, setting) gives a policy to run and what it cost.
+
+Labels are those the reward model was trained on. Environment steps are all that the method asked for on top of them,
+trials on held-out scenarios included. What is made once for everybody (the pool of clips, the response surface of the
+modes, the frozen policy) counts for nobody.
+"""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
+
+import gymnasium
+import numpy as np
+import numpy.typing as npt
+
+from worker.ml.filters import filter_problem, pbarl
+from worker.ml.filters.filter_problem import Act, Collect, FilterDraft, FilterProblem
+from worker.ml.filters.pbarl_printed import BETAS, OTHER_TASKS_BETAS, PrintedConfig
+from worker.ml.filters.printed_filter import fit_printed
+from worker.ml.filters.response_surface import ResponseSurface
+from worker.ml.methods import pbrl_hri, prefft
+from worker.ml.methods.best_of_n import fit_best_of_n
+from worker.ml.methods.pbrl_hri import FromScratch
+from worker.ml.methods.preference_rl import Env, MakeEnv, PolicyAct, learned
+from worker.ml.methods.prefft import TIED, FineTuning
+from worker.ml.policies.checkpoint import Checkpoint
+from worker.ml.rewards.reward_models import RewardModel
+from worker.trajectory import Trajectory
+
+Array = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class MethodConfig:
+    """How much each method may do; what the studio's filter may do is in the problem's FilterConfig."""
+
+    printed_steps: int = 3_000
+    """the paper: 1.5e7"""
+    printed_rollouts: int = 100
+    fine_tuning: FineTuning = field(default_factory=FineTuning)
+    from_scratch: FromScratch = field(default_factory=FromScratch)
+    candidates: int = 10
+    """n of best_of_n"""
+    value_rollouts: int = 150
+    value_noise: float = 0.25
+    value_steps: int = 3_000
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One user's task, given to every method alike."""
+
+    problem: FilterProblem
+    """with the reward model that everybody is judged by"""
+    labels: int
+    pool: Sequence[Trajectory]
+    """rollouts of many behaviours"""
+    surface: Callable[[], ResponseSurface]
+    action_reward: Callable[[], RewardModel]
+    """a model of the same labels that can score actions which were never executed"""
+    reference: Callable[[range], Sequence[Trajectory]]
+    """rollouts of the frozen policy's deterministic action in these scenarios"""
+    collect: Collect
+    make_env: MakeEnv
+    config: MethodConfig = MethodConfig()
+    checkpoint: Checkpoint | None = None
+    """where a training that takes minutes keeps what a restart needs, and says how far it is"""
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A method's result. ``act`` is deterministic and can be sent to another process."""
+
+    act: Act
+    labels: int
+    environment_steps: int
+    cpu_s: float
+    """of this process, simulation included"""
+    notes: tuple[str, ...]
+
+
+FitMethod = Callable[[Setting], tuple[Act, tuple[str, ...]]]
+
+
+def fit(name: str, setting: Setting) -> Fitted:
+    """Fit the method of this name in METHODS; raises KeyError for another."""
+    method, meter, started = METHODS[name], _Meter(), time.process_time()
+    act, notes = method(meter.on(setting))
+    labels = 0 if name == "reference" else setting.labels
+    return Fitted(act, labels, meter.steps, round(time.process_time() - started, 2), notes)
+
+
+# -- the methods -------------------------------------------------------------------------------------------------------
+
+
+def fit_reference(setting: Setting) -> tuple[Act, tuple[str, ...]]:
+    """The frozen policy: nothing is learned."""
+    return PolicyAct(setting.problem.policy), ()
+
+
+def fit_pbarl(setting: Setting) -> tuple[Act, tuple[str, ...]]:
+    """The studio's default: mode, gate, residual encoder, gate."""
+    problem = setting.problem
+    gate = setting.reference(problem.config.gate_block(problem.task))
+    draft = pbarl.fit_studio(problem, setting.surface(), setting.pool, gate, setting.collect)
+    weights = draft.weights
+    mode = ", ".join(f"{axis} {value:+.2f}" for axis, value in weights.mode.items()) or "off"
+    share = weights.residual_share if weights.encoder else 0.0
+    return _exported(problem, draft), (*draft.notes, f"Mode: {mode}; gate {weights.gate:g}; residual {share:g}.")
+
+
+def fit_as_printed(setting: Setting, list_length: int) -> tuple[Act, tuple[str, ...]]:
+    """The paper's objective with a list of n actions; no gate, as the paper has none."""
+    problem = replace(setting.problem, reward=setting.action_reward())
+    rollouts = setting.reference(filter_problem.scenarios_for("residual", setting.config.printed_rollouts))
+    config = PrintedConfig(
+        list_length=list_length,
+        betas=BETAS.get(problem.task.name, OTHER_TASKS_BETAS),
+        steps=setting.config.printed_steps,
+    )
+    checkpoint = setting.checkpoint
+    draft = fit_printed(problem, rollouts, config, lambda stage, share: checkpoint.note(share) if checkpoint else None)
+    return _exported(problem, draft), draft.notes
+
+
+def fit_prefft(setting: Setting, tie_weight: float) -> tuple[Act, tuple[str, ...]]:
+    """SAC goes on from the frozen policy on the learned reward."""
+    problem, config = setting.problem, replace(setting.config.fine_tuning, tie_weight=tie_weight)
+    policy = prefft.fine_tune(
+        setting.make_env,
+        problem.policy,
+        learned(problem.reward),
+        problem.task.observation,
+        config,
+        problem.seed,
+        setting.checkpoint,
+    )
+    return PolicyAct(policy), (f"SAC for {config.steps} steps; tie {tie_weight:g}.",)
+
+
+def fit_pbrl_hri(setting: Setting) -> tuple[Act, tuple[str, ...]]:
+    """SAC from scratch on the distance and the learned reward."""
+    problem, config = setting.problem, setting.config.from_scratch
+    reference = setting.reference(problem.config.gate_block(problem.task))
+    reward = pbrl_hri.sketchy(reference, learned(problem.reward))
+    policy = pbrl_hri.train(setting.make_env, problem.policy, reward, problem.task.observation, config, problem.seed)
+    return PolicyAct(policy), (f"SAC from scratch for {config.steps} steps.",)
+
+
+def fit_best_of(setting: Setting) -> tuple[Act, tuple[str, ...]]:
+    """The most valuable of n samples in every step."""
+    problem, config = setting.problem, setting.config
+    scenarios = filter_problem.scenarios_for("residual", config.value_rollouts)
+    rollouts = setting.collect(PolicyAct(problem.policy), scenarios, config.value_noise, problem.seed)
+    act = fit_best_of_n(problem.policy, problem.reward, rollouts, config.candidates, config.value_steps, problem.seed)
+    return act, (f"n = {config.candidates} samples and the mean, ranked by value.",)
+
+
+METHODS: Mapping[str, FitMethod] = {
+    "reference": fit_reference,
+    "pbarl": fit_pbarl,
+    "pbarl_printed": partial(fit_as_printed, list_length=10),
+    "pbarl_n1": partial(fit_as_printed, list_length=1),
+    "pbarl_n20": partial(fit_as_printed, list_length=20),
+    "prefft": partial(fit_prefft, tie_weight=0.0),
+    "prefft_anchored": partial(fit_prefft, tie_weight=TIED),
+    "pbrl_hri": fit_pbrl_hri,
+    "best_of_n": fit_best_of,
+}
+
+
+# -- inside ------------------------------------------------------------------------------------------------------------
+
+
+def _exported(problem: FilterProblem, draft: FilterDraft) -> Act:
+    """What is evaluated is what would be shipped: the ONNX file."""
+    return filter_problem.act_of(problem.task.modes, problem.policy, draft.weights)
+
+
+class _Meter:
+    """Counts the environment steps behind everything that a setting offers."""
+
+    def __init__(self) -> None:
+        self.steps = 0
+
+    def on(self, setting: Setting) -> Setting:
+        """The same setting, measured."""
+
+        def collect(act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
+            return self._counted(setting.collect(act, scenarios, noise, seed))
+
+        def reference(scenarios: range) -> list[Trajectory]:
+            return self._counted(setting.reference(scenarios))
+
+        def make_env() -> Env:
+            return _Metered(setting.make_env(), self)
+
+        return replace(setting, collect=collect, reference=reference, make_env=make_env)
+
+    def _counted(self, trajectories: Sequence[Trajectory]) -> list[Trajectory]:
+        self.steps += sum(len(each) for each in trajectories)
+        return list(trajectories)
+
+
+class _Metered(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """An environment whose steps are counted."""
+
+    def __init__(self, env: Env, meter: _Meter) -> None:
+        super().__init__(env)
+        self._meter = meter
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """See gymnasium.Env."""
+        self._meter.steps += 1
+        return self.env.step(action)

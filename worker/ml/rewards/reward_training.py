@@ -1,0 +1,255 @@
+"""Fitting a reward model to labelled pairs. Deterministic: the same pairs, targets and seed give the same model."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import minimize
+
+from worker.ml.rewards import calibration
+from worker.ml.rewards.bradley_terry import probability_of_answer, probability_right, slope_of_answer
+from worker.ml.rewards.calibration import HeldOut
+from worker.ml.rewards.network_training import MlpTraining, TransformerTraining, fit_mlp, fit_transformer
+from worker.ml.rewards.pooled_prior import Prior
+from worker.ml.rewards.predicted_reward import PredictedReward
+from worker.ml.rewards.reward_models import Normalisation, RewardModel, StructuredReward
+from worker.ml.rewards.segments import SegmentPairs
+from worker.ml.rewards.signal_predictor import SignalPredictor
+from worker.trajectory import SIGNALS, Trajectory
+
+Floats = npt.NDArray[np.float64]
+Kind = Literal["structured", "predicted", "mlp", "preference_transformer"]
+
+MEMBERS = 8
+LARGEST_GRADIENT = 1e-6
+"""At what counts as the posterior's mode."""
+CALIBRATION_FOLDS = 5
+OUTLIER_SHARE = 0.01
+"""Of the mean signals at either end: the single wildest clip does not say what is usual."""
+UNDONE = "undelivered"
+NEVER_WANTED = (UNDONE, "spilled", "spilled_on_person", "high_force_n", "force_away_n", "action_change_squared")
+"""Signals that nobody wants more of. Their weights are never positive: that the task gets done takes longer than a
+clip, and slow clips, which show less of it done, must not be read as a wish that it is not done. What is rare in clips
+or about the same in all, like jerks and touches in passing, would else be liked by chance, and then sought."""
+_PINNED = 1e6
+"""Prior precision of a weight that is held at 0."""
+_SMALLEST_SPREAD = 1e-6
+
+
+@dataclass(frozen=True)
+class FitResult:
+    """A reward model and what is worth knowing about it, as plain values for a JSON column."""
+
+    model: RewardModel
+    metrics: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class SignalScale:
+    """What the signals are like in the clips of a pool."""
+
+    spread: Floats
+    """(S,) root mean square of the summed differences of a pair; a column that never differs has 1"""
+    least_per_step: Floats
+    most_per_step: Floats
+    """(S,) the smallest and the largest mean of each signal over the steps of one clip or episode, outliers excepted"""
+
+    @classmethod
+    def of(cls, pairs: SegmentPairs, episode_means: npt.ArrayLike = ()) -> "SignalScale":
+        """From pairs like those that are asked, and the mean signals of whole episodes like those behind them, (N, S).
+
+        Both count as shown: an episode goes on after its clip, most often with less motion.
+        """
+        shown = pairs.shown[..., None]
+        width = pairs.signals.shape[-1]
+        means = pairs.signals.mean(axis=2, dtype=np.float64, where=shown).reshape(-1, width)
+        bounds = [_usual(each) for each in (means, np.reshape(episode_means, (-1, width))) if len(each)]
+        least, most = np.min([low for low, _ in bounds], axis=0), np.max([high for _, high in bounds], axis=0)
+        return cls(_spread_of(pairs.signal_differences()), least, most)
+
+
+def _usual(means: Floats) -> tuple[Floats, Floats]:
+    low, high = np.quantile(means, [OUTLIER_SHARE, 1.0 - OUTLIER_SHARE], axis=0)
+    return low, high
+
+
+def fit(
+    pairs: SegmentPairs,
+    targets: npt.ArrayLike,
+    kind: Kind,
+    seed: int,
+    *,
+    scale: SignalScale | None = None,
+    reference: Sequence[Trajectory] = (),
+    prior: Prior | None = None,
+    mlp: MlpTraining | None = None,
+    transformer: TransformerTraining | None = None,
+    signal_names: Sequence[str] = SIGNALS,
+    predictor: SignalPredictor | None = None,
+) -> FitResult:
+    """Fit an ensemble to N pairs and their targets P(right preferred) in {0, 1/2, 1}.
+
+    ``scale``: of the signals in the pool the pairs come from; from the labelled pairs themselves when missing, which
+    is shaky below about 30 labels.
+    ``reference``: rollouts of the reference policy to normalise over; the labelled segments when missing.
+    ``prior``: of the structured kind's weights, Prior.standard() when missing.
+    ``signal_names``: what the columns of the pairs' signals are called.
+    ``predictor``: of the signals, which the kind "predicted" needs.
+    Raises ValueError for targets outside {0, 1/2, 1}, a count that differs from the pairs', or a missing predictor.
+    """
+    started = time.perf_counter()
+    answers = _checked(pairs, targets)
+    metrics: dict[str, Any] = {"kind": kind, "trained_on": len(pairs), "seed": seed}
+    known = prior or Prior.standard(len(signal_names))
+    model: RewardModel
+    if kind == "structured":
+        model, found = _fit_structured(pairs, answers, seed, scale or SignalScale.of(pairs), known, signal_names)
+    elif kind == "predicted":
+        if predictor is None:
+            raise ValueError("The kind 'predicted' needs a predictor of the signals.")
+        foreseen = predictor.completed(pairs.signals, pairs.observations, pairs.actions).astype(np.float32)
+        completed = replace(pairs, signals=foreseen)
+        wider = _wider(scale or SignalScale.of(completed), completed)
+        linear, found = _fit_structured(completed, answers, seed, wider, known, signal_names)
+        model = PredictedReward.with_predictor(linear, predictor)
+    elif kind == "mlp":
+        model, found = fit_mlp(pairs, answers, seed, mlp or MlpTraining())
+    else:
+        model, found = fit_transformer(pairs, answers, seed, transformer or TransformerTraining())
+    held_out: HeldOut = found.pop("held_out")
+    temperature = calibration.fit_temperature(held_out)
+    undone = signal_names.index(UNDONE) if UNDONE in signal_names else None
+    model = replace(model, temperature=temperature, undone_column=undone)
+    model = model.normalised_over(reference) if reference else _normalised_over_segments(model, pairs)
+    metrics.update(found, calibration=calibration.report(held_out, temperature))
+    metrics["training_accuracy"] = _accuracy(model, pairs, answers)
+    metrics["fit_seconds"] = round(time.perf_counter() - started, 4)
+    return FitResult(model, metrics)
+
+
+def _wider(measured: SignalScale, foreseen: SegmentPairs) -> SignalScale:
+    """What hardly ever differs in a pool may be foreseen to differ: errors must not be blown up to standard size."""
+    differences = np.sqrt((foreseen.signal_differences() ** 2).mean(axis=0))
+    return replace(measured, spread=np.maximum(measured.spread, differences))
+
+
+def _spread_of(differences: Floats) -> Floats:
+    spread = np.sqrt((differences**2).mean(axis=0))
+    return np.where(spread > _SMALLEST_SPREAD, spread, 1.0)
+
+
+def _checked(pairs: SegmentPairs, targets: npt.ArrayLike) -> Floats:
+    answers = np.asarray(targets, np.float64)
+    if answers.shape != (len(pairs),):
+        raise ValueError(f"{len(pairs)} pairs need as many targets, got shape {answers.shape}.")
+    if not np.isin(answers, (0.0, 0.5, 1.0)).all():
+        raise ValueError("Targets must be 0, 1/2 or 1; leave out answers of the kind 'can't tell'.")
+    return answers
+
+
+def _accuracy(model: RewardModel, pairs: SegmentPairs, answers: Floats) -> float | None:
+    decided = answers != 0.5
+    if not decided.any():
+        return None
+    right = model.probability_right(pairs)
+    hits = np.where(right == 0.5, 0.5, (right > 0.5) == (answers > 0.5))  # no opinion: half right
+    return float(hits[decided].mean())
+
+
+def _normalised_over_segments(model: RewardModel, pairs: SegmentPairs) -> RewardModel:
+    raw = model.raw_rewards(pairs.signals, pairs.observations, pairs.actions)
+    return replace(model, normalisation=Normalisation.over(raw[:, pairs.shown]))
+
+
+# -- structured: Bayesian logistic regression --------------------------------------------------------------------------
+
+
+def _fit_structured(
+    pairs: SegmentPairs, answers: Floats, seed: int, scale: SignalScale, prior: Prior, signal_names: Sequence[str]
+) -> tuple[StructuredReward, dict[str, Any]]:
+    features = pairs.signal_differences() / scale.spread
+    costs = [column for column, name in enumerate(signal_names) if name in NEVER_WANTED]
+    mean, covariance = posterior(features, answers, prior, costs)
+    members = _antithetic(mean, covariance, np.random.default_rng(seed)) / scale.spread
+    deviation = 1.96 * np.sqrt(np.diag(covariance))
+    weights = {
+        name: {"mean": float(value), "low": float(value - margin), "high": float(value + margin)}
+        for name, value, margin in zip(signal_names, mean, deviation, strict=True)
+    }
+    return StructuredReward(members, least_per_step=scale.least_per_step, most_per_step=scale.most_per_step), {
+        "weights": weights,
+        "weights_unit": "log odds per standard deviation of a pair",
+        "held_out": _held_out(features, answers, seed, prior, costs),
+    }
+
+
+def _held_out(features: Floats, answers: Floats, seed: int, prior: Prior, costs: Sequence[int]) -> HeldOut:
+    """Log odds of every pair under members fitted without its fold."""
+    rng = np.random.default_rng(seed)
+    fold = rng.permutation(len(answers)) % CALIBRATION_FOLDS
+    logits = np.zeros((MEMBERS, len(answers)))
+    for each in range(min(CALIBRATION_FOLDS, len(answers))):
+        inside = fold == each
+        mean, covariance = posterior(features[~inside], answers[~inside], prior, costs)
+        logits[:, inside] = _antithetic(mean, covariance, rng) @ features[inside].T
+    return HeldOut(logits, answers, allows_for_lapses=True)
+
+
+def posterior(
+    features: Floats, answers: Floats, prior: Prior | None = None, costs: Sequence[int] = ()
+) -> tuple[Floats, Floats]:
+    """Laplace approximation of p(w | labels): its mean (S,) and covariance (S, S). Prior.standard() when missing.
+
+    features (N, S) standardised differences right minus left; answers (N,) in {0, 1/2, 1}; ``costs``: columns whose
+    mean weight must not be positive. Those that would be are held at 0, and the others fitted anew.
+    """
+    known = prior or Prior.standard(features.shape[1])
+    pinned: set[int] = set()
+    while True:
+        weights, covariance = _laplace(features, answers, known, sorted(pinned))
+        wrong = {column for column in costs if weights[column] > 0.0} - pinned
+        if not wrong:
+            return weights, covariance
+        pinned |= wrong
+
+
+def _laplace(features: Floats, answers: Floats, prior: Prior, pinned: Sequence[int]) -> tuple[Floats, Floats]:
+    """The mode by a trust region, which overshoots neither on separable data nor where somebody may have slipped."""
+    precision, mean = np.asarray(np.linalg.inv(prior.covariance), np.float64), prior.mean.copy()
+    precision[pinned, pinned] += _PINNED
+    mean[pinned] = 0.0
+
+    def loss(weights: Floats) -> tuple[float, Floats]:
+        said = probability_of_answer(probability_right(features @ weights))
+        surprise = -(answers * np.log(said) + (1.0 - answers) * np.log(1.0 - said)).sum()
+        pull = precision @ (weights - mean)
+        gradient = _gradient_and_information(features, answers, weights)[0]
+        return float(surprise + 0.5 * pull @ (weights - mean)), gradient + pull
+
+    def curvature(weights: Floats) -> Floats:
+        return _gradient_and_information(features, answers, weights)[1] + precision
+
+    found = minimize(loss, mean, jac=True, hess=curvature, method="trust-exact", options={"gtol": LARGEST_GRADIENT})
+    weights: Floats = found.x
+    weights[pinned] = 0.0
+    return weights, np.asarray(np.linalg.inv(curvature(weights)), np.float64)
+
+
+def _gradient_and_information(features: Floats, answers: Floats, weights: Floats) -> tuple[Floats, Floats]:
+    """Of the summed right form of Eq. (2) for people who sometimes answer at random: (S,) and Fisher's (S, S)."""
+    preferred = probability_right(features @ weights)
+    said, slope = probability_of_answer(preferred), slope_of_answer(preferred)
+    variance = said * (1.0 - said)
+    gradient: Floats = features.T @ ((said - answers) * slope / variance)
+    information: Floats = features.T @ (features * (slope**2 / variance)[:, None])
+    return gradient, information
+
+
+def _antithetic(mean: Floats, covariance: Floats, rng: np.random.Generator) -> Floats:
+    """(E, S) posterior samples in mirrored pairs: their mean is the posterior's mean exactly."""
+    half = rng.standard_normal((MEMBERS // 2, len(mean))) @ np.linalg.cholesky(covariance).T
+    samples: Floats = mean + np.concatenate([half, -half])
+    return samples

@@ -1,0 +1,37 @@
+"""Whether more labels would still change what a person's robot does: the expected regret of stopping now.
+
+The members of a reward model are what the person may want, as far as the labels say. Each would have its own best way
+of doing the task; the filter is given one for all of them. How much worse that one is for the average member than the
+member's own best is what perfect knowledge of the person could still gain. More labels bring the members together and
+the regret to zero; a regret that is small already is not worth anybody's time.
+"""
+
+import numpy as np
+import numpy.typing as npt
+
+from worker.ml.filters.response_surface import CAUTION, SUCCESS_PENALTY, SUCCESS_TOLERANCE, ResponseSurface
+
+Floats = npt.NDArray[np.float64]
+
+CANDIDATES = 4_000
+"""Modes that are tried, the same for every member and at every retraining."""
+
+
+def expected_regret(surface: ResponseSurface, members: Floats) -> float:
+    """What knowing the person for certain could gain, in standard deviations of predicted return over all modes.
+
+    ``members`` (E, S): the weights of the reward model's members per unit of each signal. The mode for all is chosen
+    as response_surface.best_mode does, with caution; the one for each member by that member alone. Every member's
+    return counts in its own standard deviations: a member that is sure of little must not count for little.
+    """
+    rng = np.random.default_rng(0)
+    drawn = rng.uniform(surface.low, surface.high, (CANDIDATES, len(surface.low)))
+    modes = np.concatenate([np.zeros((1, drawn.shape[1])), drawn])
+    signals, success = surface.predict(modes, CAUTION)
+    lost = SUCCESS_PENALTY * np.maximum(-success - SUCCESS_TOLERANCE, 0.0)
+    returns = signals @ members.T  # (modes, E)
+    unit = max(float((signals @ members.mean(axis=0)).std()), 1e-9)
+    for_all = (returns.mean(axis=1) - CAUTION * returns.std(axis=1)) / unit - lost
+    chosen = int(np.argmax(for_all))
+    own = returns / np.maximum(returns.std(axis=0), 1e-9) - lost[:, None]
+    return float((own.max(axis=0) - own[chosen]).mean())

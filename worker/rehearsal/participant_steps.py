@@ -1,0 +1,139 @@
+"""A scripted participant of a rehearsal: knows what really happened in each clip, and answers and rates by taste.
+
+What a robot "really" did they look up in the database, which a person does by watching.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from sqlalchemy import select
+from sqlalchemy.orm import Session, joinedload
+
+from app.db import Database
+from app.domain.clips import Clip
+from app.domain.evaluation import Trial
+from app.domain.models import ModelKind
+from app.domain.preferences import Query
+from app.domain.studies import Study
+from app.storage import ArtefactStore
+from worker.compute import simulation
+from worker.jobs.learning import dataset
+from worker.jobs.runtime import records
+from worker.ml.rewards.reward_models import RewardModel, load_reward_model
+from worker.ml.scripted_ratings import RatingManner, ScriptedRater
+from worker.ml.teachers import Manner, ScriptedTeacher, Taste, segment_returns
+from worker.sim.costs import preference_rewards
+from worker.trajectory import Trajectory
+
+CALIBRATION_PAIRS = 200
+Floats = npt.NDArray[np.float64]
+Rows = npt.NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class Rated:
+    """What was said about one trial, and what is true about it."""
+
+    method: str
+    satisfaction: int
+    personalisation: int
+    true_share: float
+    """Share of the pool's episodes that suit this user less than the one shown."""
+    success: bool
+
+
+@dataclass(frozen=True)
+class Insight:
+    """How often a participant's reward model names the clip that truly suits them better, over the study's pool."""
+
+    same_scenario: float
+    """Pairs of one scenario: most of them were asked, with mistakes."""
+    other_scenarios: float
+    """Pairs of different scenarios, none of which was ever asked."""
+
+
+class ScriptedPerson:
+    """A user of one taste in one study."""
+
+    def __init__(
+        self, database: Database, store: ArtefactStore, study: Study, taste: Taste, manner: Manner, seed: int
+    ) -> None:
+        self._database, self._store, self._study_id = database, store, study.id
+        self._task = simulation.task(study.task)
+        self._taste, self._manner = taste, manner
+        self._rng = np.random.default_rng(seed)
+        self._teacher: ScriptedTeacher | None = None
+        self._rater: ScriptedRater | None = None
+
+    def answer(self, query_id: int) -> str:
+        """What this user says about the query."""
+        with self._database.reading() as session:
+            query = session.scalars(
+                select(Query).where(Query.id == query_id).options(*dataset.CLIPS_AND_ROLLOUTS)
+            ).one()
+            left, right = (self._rewards(clip) for clip in (query.left_clip, query.right_clip))
+            if self._teacher is None:
+                self._teacher = self._calibrated(session)
+        return self._teacher.answer(left, right, self._rng)
+
+    def rate(self, trial_id: int) -> Rated:
+        """What this user says about the robot of a trial, and which method it really was."""
+        with self._database.reading() as session:
+            trial = session.scalars(select(Trial).where(Trial.id == trial_id).options(joinedload(Trial.film))).one()
+            if trial.film is None:
+                raise ValueError(f"Trial {trial_id} has no film.")
+            watched = dataset.stored_trajectory(self._store, trial.film.trajectory_sha256)
+            if self._rater is None:
+                episodes = [dataset.shown(self._store, clip) for clip in dataset.pool_clips(session, self._study_id)]
+                seen = np.array([self._true_rewards(each).sum() for each in episodes])
+                self._rater = ScriptedRater(seen, RatingManner(), self._rng)
+        value = float(self._true_rewards(watched).sum())
+        given = self._rater.rate(value, watched.success)
+        return Rated(trial.film.method, *given, self._rater.share(value), bool(watched.success))
+
+    def insight(self, participant_id: int) -> Insight | None:
+        """What the newest reward model of this participant has understood; None while there is none."""
+        with self._database.reading() as session:
+            newest = records.newest_model(session, participant_id, ModelKind.REWARD)
+            clips = dataset.pool_clips(session, self._study_id)
+            if newest is None:
+                return None
+            model = load_reward_model(self._store.read(newest.artefact_sha256))
+        scenarios = np.array([clip.rollout.scenario for clip in clips])
+        first, second = np.triu_indices(len(clips), 1)
+        better = self._second_is_better(model, clips, first, second)
+        same = scenarios[first] == scenarios[second]
+        return Insight(_share(better[same]), _share(better[~same]))
+
+    def _second_is_better(
+        self, model: RewardModel, clips: Sequence[Clip], first: Rows, second: Rows
+    ) -> npt.NDArray[np.bool_]:
+        """(N, 2): whether the second clip of each pair is better, in truth and to the model."""
+        values = np.array([segment_returns(self._rewards(clip), self._manner.myopia) for clip in clips])
+        pairs = [(clips[left], clips[right]) for left, right in zip(first, second, strict=True)]
+        foreseen = model.probability_right(dataset.segment_pairs(self._store, pairs))
+        return np.stack([values[second] > values[first], foreseen > 0.5], axis=1)
+
+    def _calibrated(self, session: Session) -> ScriptedTeacher:
+        pairs = dataset.matched_pairs(dataset.pool_clips(session, self._study_id))
+        rewards = [[self._rewards(clip) for clip in pair] for pair in pairs[:CALIBRATION_PAIRS]]
+        return ScriptedTeacher.calibrated(self._manner, np.array(rewards))
+
+    def _rewards(self, clip: Clip) -> Floats:
+        steps = slice(clip.first_step, clip.first_step + clip.step_count)
+        return self._true_rewards(dataset.shown(self._store, clip))[steps]
+
+    def _true_rewards(self, shown: Trajectory) -> Floats:
+        """r^H of every step."""
+        taste = self._taste
+        rewards = preference_rewards(
+            self._task, shown.costs, shown.signals, taste.omega, "calibrated", taste.per_signal
+        )
+        return np.asarray(rewards, np.float64)
+
+
+def _share(judged: npt.NDArray[np.bool_]) -> float:
+    """Of (N, 2) judgements, how many agree; not a number when there are none."""
+    return float((judged[:, 0] == judged[:, 1]).mean()) if len(judged) else float("nan")
