@@ -73,7 +73,7 @@ def nothing(*_arguments: Any) -> None:
 
 
 def clips(place: Workplace, job: Job, run_id: int, step: Step) -> None:
-    scenario = int(job.finding.rsplit("-", 1)[1])
+    scenario = job.number
     for first in range(0, BEHAVIOURS, 2):
         place.report(run_id, "filming", first / BEHAVIOURS)
         place.compute.run_all(Lane.CLIPS, place.beat(run_id), busy, [(CLIP_S,)] * 2)
@@ -103,7 +103,7 @@ def learning(lane: Lane, stages: tuple[tuple[int, int, float], ...]) -> Callable
 
 
 def films(place: Workplace, job: Job, run_id: int, step: Step) -> None:
-    count = 3 * TRIALS if "/trials/" in job.finding else 4
+    count = 3 * TRIALS if job.about.subject == "trials" else 4
     for first in range(0, count, 2):
         place.report(run_id, "filming", first / count)
         place.compute.run_all(Lane.CLIPS, place.beat(run_id), busy, [(FILM_S,)] * min(2, count - first))

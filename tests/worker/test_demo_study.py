@@ -55,7 +55,7 @@ def visitor(database: Database, store: ArtefactStore) -> Participant:
 
 def test_nothing_is_made_again_but_the_report(visitor: Participant, database: Database) -> None:
     with database.reading() as session:
-        assert {job.kind for job, _ in reconcile.findings(session)} == {RunKind.REPORT}
+        assert {job.kind for job, _ in reconcile.due(session)} == {RunKind.REPORT}
 
 
 def test_its_settings_are_those_with_which_it_would_be_made_now(visitor: Participant, database: Database) -> None:

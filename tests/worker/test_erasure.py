@@ -18,16 +18,17 @@ from app.settings import Settings
 from app.storage import ArtefactStore
 from tests.waiting import PATIENCE_S, until
 from tests.worker.conftest import the_workshop
+from tests.worker.invented import job_of
 from worker.compute.pools import Compute
 from worker.jobs import workflows
-from worker.jobs.reconcile import findings, short_of_queries
+from worker.jobs.reconcile import due, short_of_queries
 from worker.jobs.runtime import engine, records
 from worker.jobs.runtime.context import Step, Workplace
-from worker.jobs.runtime.records import Job
+from worker.jobs.runtime.records import Job, as_arguments
 from worker.jobs.upkeep import erasure
-from worker.jobs.workflows import Workshop, as_arguments
+from worker.jobs.workflows import Workshop
 
-MARK = b"ERASE-ME-"
+MARK = b"erase-me"
 
 
 class Work:
@@ -72,11 +73,11 @@ def workshop(settings: Settings, database: Database, store: ArtefactStore) -> It
 
 @pytest.fixture
 def job(participant: Participant) -> Job:
-    return Job(f"filter/participant-{participant.id}/{MARK.decode()}", RunKind.FILTER, 1, participant.id, 10)
+    return job_of(f"filter/participant-{participant.id}/{MARK.decode()}/labels-10", 1)
 
 
 def start(workshop: Workshop, job: Job) -> None:
-    with SetWorkflowID(f"{job.finding}#1"):
+    with SetWorkflowID(f"{job.key}#1"):
         DBOS.enqueue_workflow(RunKind.FILTER, workshop.work, as_arguments(job))
 
 
@@ -176,11 +177,11 @@ def test_what_the_worker_keeps_of_others_stays(
         other = Participant(study_id=participant.study_id, number=99, token_sha256="o" * 64, seed=1)
         session.add(other)
     work.may_go_on.set()
-    start(workshop, Job("filter/of-another", RunKind.FILTER, participant.study_id, other.id, 10))
+    start(workshop, job_of(f"filter/participant-{other.id}/labels-10", participant.study_id))
     assert until(lambda: [each.status for each in DBOS.list_workflows()] == ["SUCCESS"])
     withdraw(place.database, place.store, participant.id)
     assert until(lambda: erase(workshop, settings, participant.id))
-    assert [each.workflow_id for each in DBOS.list_workflows()] == ["filter/of-another#1"]
+    assert [each.workflow_id for each in DBOS.list_workflows()] == [f"filter/participant-{other.id}/labels-10#1"]
     assert len(traces(settings.data_dir)) == 3, "the other's draft, model, and row"
 
 
@@ -219,7 +220,7 @@ def test_work_for_a_deleted_study_does_nothing(
     place = workshop.place
     with place.database.writing() as session:
         session.get_one(Study, participant.study_id).deleted_at = now()
-    start(workshop, Job("filter/of-the-study", RunKind.FILTER, participant.study_id))
+    start(workshop, job_of(f"filter/study-{participant.study_id}", participant.study_id))
     assert until(lambda: [each.status for each in DBOS.list_workflows()] == ["SUCCESS"])
     assert not work.waits.is_set()
 
@@ -230,4 +231,4 @@ def test_nothing_is_due_for_somebody_who_has_withdrawn(
     withdraw(database, store, participant.id)
     with database.reading() as session:
         assert participant.id not in short_of_queries(session)
-        assert participant.id not in {job.participant_id for job, _ in findings(session)}
+        assert participant.id not in {job.participant_id for job, _ in due(session)}

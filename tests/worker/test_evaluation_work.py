@@ -83,7 +83,7 @@ def all_said(add_clips: Callable[[int], list[Clip]], answer: Callable[[Clip, Cli
 
 def due(database: Database, *kinds: RunKind) -> list[Job]:
     with database.reading() as session:
-        return [job for job, _ in reconcile.findings(session) if job.kind in kinds]
+        return [job for job, _ in reconcile.due(session) if job.kind in kinds]
 
 
 def done(place: Workplace, job: Job, work: Callable[..., None] | None = None) -> int:
@@ -110,7 +110,7 @@ def learn(place: Workplace) -> None:
 
 
 def names(jobs: list[Job]) -> list[str]:
-    return ["/".join(job.finding.split("/")[:3]) for job in jobs]
+    return ["/".join(job.key.split("/")[:3]) for job in jobs]
 
 
 @pytest.mark.slow
@@ -222,13 +222,13 @@ def test_repeats_and_catch_pairs_after_the_last_label_ask_for_nothing_new(
     place: Workplace, database: Database, study: Study, answer: Callable[[Clip, Clip, Response], Query]
 ) -> None:
     settle(database, study)
-    before = names(due(database, RunKind.REWARD)), due(database, RunKind.REWARD)[0].finding
+    before = names(due(database, RunKind.REWARD)), due(database, RunKind.REWARD)[0].key
     with database.reading() as session:
         clips = session.scalars(select(Clip)).all()
     query = answer(clips[0], clips[1], Response.LEFT)
     with database.writing() as session:
         session.get_one(Query, query.id).purpose = "repeat"
-    assert (names(due(database, RunKind.REWARD)), due(database, RunKind.REWARD)[0].finding) == before
+    assert (names(due(database, RunKind.REWARD)), due(database, RunKind.REWARD)[0].key) == before
 
 
 def test_scenarios_of_trials_and_comparisons_are_used_by_nothing_else() -> None:
@@ -252,7 +252,7 @@ def test_a_controller_is_not_exchanged_once_the_robot_has_moved(
         session.scalars(select(Trial)).first().started_at = study.created_at  # type: ignore[union-attr]
         model = session.scalars(select(Model).where(Model.kind == ModelKind.FILTER)).one()
         model.artefact_sha256 = place.store.put(FilterWeights(mode={"speed_far": 0.9}).to_bytes())
-        session.scalars(select(Run).where(Run.workflow_id == job.finding)).one().status = RunStatus.RETRY
+        session.scalars(select(Run).where(Run.workflow_id == job.key)).one().status = RunStatus.RETRY
     done(place, job, make_films)
     with database.reading() as session:
         assert {each.method: each.artefact_sha256 for each in session.scalars(select(Controller))} == kept

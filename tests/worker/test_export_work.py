@@ -61,7 +61,7 @@ def make_export(place: Workplace, study: Study, kind: ExportKind = ExportKind.DA
         export_requests.request(session, session.get_one(Study, study.id), kind, "experimenter")
     with place.database.reading() as session:
         (job,) = export_files.due(session, session.get_one(Study, study.id))
-        assert job.finding in {each.finding for each, _ in reconcile.findings(session)}
+        assert job.key in {each.key for each, _ in reconcile.due(session)}
     with place.database.writing() as session:
         run_id = records.begin_run(session, job, seed=1)
     export_files.make(place, job, run_id, lambda _name, function, *arguments: function(*arguments))

@@ -10,6 +10,7 @@ from app.db import Database
 from app.domain.clips import Clip
 from app.domain.models import Model, ModelKind, RunKind
 from app.domain.preferences import LabelEvent, Query, Response
+from app.domain.run_keys import RunKey
 from app.domain.studies import Participant, Study
 from app.services.answers import accuracy
 from app.storage import ArtefactStore
@@ -17,7 +18,7 @@ from worker.compute.pools import Compute
 from worker.jobs.learning.filters import NothingToLearnFrom, notes_on_foresight, train_filter
 from worker.jobs.runtime import records
 from worker.jobs.runtime.context import Workplace
-from worker.jobs.runtime.due_work import ending, filter_name, is_outdated
+from worker.jobs.runtime.due_work import answers_known, is_outdated
 from worker.jobs.runtime.records import Job
 
 
@@ -31,14 +32,14 @@ def at_once(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
     return function(*arguments)
 
 
-def begin(place: Workplace, participant: Participant, kind: RunKind, name: str) -> tuple[Job, int]:
-    job = Job(name, kind, participant.study_id, participant.id, 10)
+def begin(place: Workplace, participant: Participant, kind: RunKind, answers: str = "") -> tuple[Job, int]:
+    job = Job(RunKey(kind, participant_id=participant.id, labels=10, answers=answers), participant.study_id)
     with place.database.writing() as session:
         return job, records.begin_run(session, job, seed=1)
 
 
 def save_model(place: Workplace, participant: Participant, kind: ModelKind, label_hash: str) -> None:
-    _, run_id = begin(place, participant, RunKind(kind.value), f"{kind}/{label_hash}")
+    _, run_id = begin(place, participant, RunKind(kind.value), label_hash)
     with place.database.writing() as session:
         records.set_labels(session, run_id, 10, label_hash)
         records.save_model(session, run_id, kind, "0" * 64, {})
@@ -77,9 +78,9 @@ def outdated_at(place: Workplace, participant: Participant, milestone: int, *, b
     with place.database.reading() as session:
         settings = session.get_one(Study, participant.study_id).settings
         last_answer = session.scalar(select(func.max(LabelEvent.id))) or 0
-        name = filter_name(participant.id, milestone, ending(settings, milestone, last_answer, None))
-        job = Job(name, RunKind.FILTER, participant.study_id, participant.id, milestone)
-        return is_outdated(session, job, begun=begun)
+        known = answers_known(settings, milestone, last_answer, None)
+        key = RunKey(RunKind.FILTER, participant_id=participant.id, labels=milestone, answers=known)
+        return is_outdated(session, Job(key, participant.study_id), begun=begun)
 
 
 def test_of_two_milestones_that_were_passed_only_the_newer_filter_is_trained(
@@ -91,7 +92,7 @@ def test_of_two_milestones_that_were_passed_only_the_newer_filter_is_trained(
     with place.database.writing() as session:
         study = session.get_one(Study, participant.study_id)
         study.stored_settings = {**study.stored_settings, "filter_milestones": [10, 15]}
-    job, run_id = begin(place, participant, RunKind.FILTER, f"filter/participant-{participant.id}/labels-10")
+    job, run_id = begin(place, participant, RunKind.FILTER)
     train_filter(place, job, run_id, at_once)
     assert count_filters(place) == 0, "the one of 15 is due"
     assert not outdated_at(place, participant, 10, begun=True), "one that has begun is finished while they answer"

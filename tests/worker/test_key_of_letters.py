@@ -18,18 +18,19 @@ from app.domain.evaluation import Assignment, Controller, Film, Trial
 from app.domain.models import ModelKind, Run, RunKind
 from app.domain.preferences import Query, Response
 from app.domain.protocol import EvaluationMode, EvaluationSettings
+from app.domain.run_keys import CONTROLLERS, TRIALS
 from app.domain.studies import Participant, Study
 from app.services.archives import archive
 from app.services.evaluation import evaluation_plan, unblinding
 from app.services.studies import locking
 from app.storage import ArtefactStore
 from tests import factories
+from tests.worker.invented import job_of
 from tests.worker.test_evaluation_work import AtHand, done, due, learn, settle
 from worker.jobs.clips import evaluation_films
 from worker.jobs.clips.evaluation_films import make_films
 from worker.jobs.publishing import export_files
 from worker.jobs.runtime.context import Workplace
-from worker.jobs.runtime.records import Job
 
 METHODS = ("reference", "pbarl")
 MOMENT = re.compile(rb"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(\.\d+)?(\+00:00)?")
@@ -133,7 +134,7 @@ def _inside(path: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.usefixtures("all_said")
-@pytest.mark.parametrize("what", [evaluation_films.TRIALS, evaluation_films.CONTROLLERS])
+@pytest.mark.parametrize("what", [TRIALS, CONTROLLERS])
 def test_the_order_in_which_robots_are_made_tells_no_method(
     place: Told, database: Database, study: Study, participant: Participant, what: str
 ) -> None:
@@ -142,7 +143,7 @@ def test_the_order_in_which_robots_are_made_tells_no_method(
     with database.writing() as session:
         factories.make_model(session, study, participant, ModelKind.FILTER, factories.filter_metrics())
         factories.make_model(session, study, participant, ModelKind.METHOD, {"method": "prefft"})
-    job = Job(f"films/participant-1/{what}/x", RunKind.FILMS, study.id, participant.id)
+    job = job_of(f"films/participant-{participant.id}/{what}/labels-10", study.id)
     by_method, by_letter = set(), set()
     for number in range(20):
         with database.writing() as session:
@@ -155,7 +156,7 @@ def test_the_order_in_which_robots_are_made_tells_no_method(
         by_method.add(tuple(made))
         by_letter.add("".join(letters[method] for method in made))
     assert len(by_method) > 3
-    assert by_letter == {"ABC"} if what == evaluation_films.TRIALS else len(by_letter) > 3
+    assert by_letter == {"ABC"} if what == TRIALS else len(by_letter) > 3
 
 
 def test_the_seed_that_everybody_sees_does_not_tell_the_letters(database: Database, study: Study) -> None:

@@ -22,12 +22,13 @@ from app.settings import Settings
 from app.storage import ArtefactStore
 from tests.waiting import PATIENCE_S, until
 from tests.worker.conftest import the_workshop
+from tests.worker.invented import job_of
 from worker.compute.pools import Compute
 from worker.jobs import reconcile, service, workflows
 from worker.jobs.runtime import engine, records
 from worker.jobs.runtime.context import Step, Workplace
-from worker.jobs.runtime.records import Job
-from worker.jobs.workflows import Workshop, as_arguments
+from worker.jobs.runtime.records import Job, as_arguments
+from worker.jobs.workflows import Workshop
 
 Damage = Callable[[Path], None]
 
@@ -43,7 +44,7 @@ class Work:
         self.fails: list[Exception] = []
 
     def __call__(self, place: Workplace, job: Job, run_id: int, step: Step) -> None:
-        step("prepare", self.prepared.append, job.finding)
+        step("prepare", self.prepared.append, job.key)
         step("save", self._save, job)
 
     def _save(self, job: Job) -> None:
@@ -51,7 +52,7 @@ class Work:
         assert self.may_finish.wait(PATIENCE_S)
         if self.fails:
             raise self.fails.pop(0)
-        self.finished.append(job.finding)
+        self.finished.append(job.key)
 
 
 @pytest.fixture
@@ -63,21 +64,21 @@ def work(monkeypatch: pytest.MonkeyPatch) -> Work:
 
 @pytest.fixture
 def job(participant: Participant) -> Job:
-    return Job(f"filter/participant-{participant.id}/labels-10", RunKind.FILTER, 1, participant.id, 10)
+    return job_of(f"filter/participant-{participant.id}/labels-10", 1)
 
 
 @pytest.fixture
 def due(monkeypatch: pytest.MonkeyPatch, job: Job) -> Job:
     """The job is all that is ever missing, for as long as its run says so."""
 
-    def findings(session: object, _lost: object = None) -> Iterator[tuple[Job, int]]:
-        run = session.scalar(select(Run).where(Run.workflow_id == job.finding))  # type: ignore[attr-defined]
+    def found(session: object, _lost: object = None) -> Iterator[tuple[Job, int]]:
+        run = session.scalar(select(Run).where(Run.workflow_id == job.key))  # type: ignore[attr-defined]
         seen = run and reconcile._Attempted(run.status, run.attempt, run.finished_at)
         attempt = reconcile._attempt_due(seen, now())
         if attempt is not None:
             yield job, attempt
 
-    monkeypatch.setattr(reconcile, "findings", findings)
+    monkeypatch.setattr(reconcile, "due", found)
     monkeypatch.setattr(reconcile, "short_of_queries", lambda _session: [])
     monkeypatch.setattr(reconcile, "RETRY_AFTER", timedelta(seconds=0.2))
     monkeypatch.setattr(service, "LOOK_AGAIN_S", 0.2)
@@ -105,7 +106,7 @@ def worker(settings: Settings, database: Database, store: ArtefactStore) -> Iter
 
 def status_of(database: Database, job: Job) -> str | None:
     with database.reading() as session:
-        return session.scalar(select(Run.status).where(Run.workflow_id == job.finding))
+        return session.scalar(select(Run.status).where(Run.workflow_id == job.key))
 
 
 def lived(settings: Settings, database: Database, store: ArtefactStore) -> Path:
@@ -215,7 +216,7 @@ def test_work_goes_on_whatever_has_happened_to_the_engine_s_file(
         shutil.copy(path, damaged)
     with worker(settings, database, store):
         assert until(lambda: status_of(database, due) == RunStatus.SUCCEEDED)
-    assert work.finished == [due.finding]
+    assert work.finished == [due.key]
     if damaged.exists():
         kept = [aside.read_bytes() for aside in path.parent.glob("engine.sqlite3.set-aside-*")]
         assert kept == [damaged.read_bytes()], "what could not be used is kept"
@@ -242,7 +243,7 @@ def test_a_database_older_than_the_engine_s_file_gets_its_work_done_again(
     shutil.copy(tmp_path / "backup", settings.data_dir / "studio.sqlite3")
     with worker(settings, database, store):
         assert until(lambda: status_of(database, due) == RunStatus.SUCCEEDED)
-    assert work.prepared == work.finished == [due.finding] * 2
+    assert work.prepared == work.finished == [due.key] * 2
 
 
 def test_an_engine_s_file_older_than_the_database_does_nothing_twice(
@@ -262,7 +263,7 @@ def test_an_engine_s_file_older_than_the_database_does_nothing_twice(
     with worker(settings, database, store):
         seen = last_seen(database)
         assert until(lambda: last_seen(database) != seen)
-    assert work.finished == [due.finding]
+    assert work.finished == [due.key]
     assert len(list(path.parent.glob("engine.sqlite3.set-aside-*"))) == 1
 
 
@@ -272,8 +273,8 @@ def test_work_that_the_engine_takes_for_done_is_done_when_the_database_does_not_
     with worker(settings, database, store):
         assert until(lambda: status_of(database, due) == RunStatus.SUCCEEDED)
         with database.writing() as session:
-            session.delete(session.scalars(select(Run).where(Run.workflow_id == due.finding)).one())
-        assert until(lambda: work.finished == [due.finding] * 2)
+            session.delete(session.scalars(select(Run).where(Run.workflow_id == due.key)).one())
+        assert until(lambda: work.finished == [due.key] * 2)
 
 
 def test_work_that_fills_the_disk_is_tried_until_there_is_space(
@@ -282,10 +283,10 @@ def test_work_that_fills_the_disk_is_tried_until_there_is_space(
     full = OSError(errno.ENOSPC, "No space left on device")
     work.fails = [full] * (2 * records.ATTEMPTS)
     with worker(settings, database, store):
-        assert until(lambda: work.finished == [due.finding])
+        assert until(lambda: work.finished == [due.key])
         assert until(lambda: status_of(database, due) == RunStatus.SUCCEEDED)
     with database.reading() as session:
-        assert session.scalars(select(Run.attempt).where(Run.workflow_id == due.finding)).one() == 1
+        assert session.scalars(select(Run.attempt).where(Run.workflow_id == due.key)).one() == 1
 
 
 def test_a_sign_of_life_that_cannot_be_written_does_not_end_the_work(
@@ -303,7 +304,7 @@ def test_work_in_the_middle_of_which_the_worker_falls_again_and_again_counts_as_
 ) -> None:
     path = lived(settings, database, store)
     engine.launch(settings)
-    with SetWorkflowID(f"{due.finding}#1"):
+    with SetWorkflowID(f"{due.key}#1"):
         DBOS.enqueue_workflow("a queue of nobody", the_workshop().work, as_arguments(due))
     DBOS.destroy()
     with closing(sqlite3.connect(path)) as connection:

@@ -47,7 +47,7 @@ def clips(place: Workplace, study: Study) -> list[Clip]:
 def due(place: Workplace) -> list[Job]:
     """What the worker would begin now."""
     with place.database.reading() as session:
-        return [job for job, _ in reconcile.findings(session, place.store.lost())]
+        return [job for job, _ in reconcile.due(session, place.store.lost())]
 
 
 def to_mend(place: Workplace) -> list[Job]:

@@ -100,7 +100,7 @@ def test_the_same_as_a_zip_file(place: Workplace, folder: Path) -> None:
 
 def test_nothing_is_simulated_for_it(place: Workplace, own: Study) -> None:
     with place.database.reading() as session:
-        assert list(reconcile.findings(session)) == []
+        assert list(reconcile.due(session)) == []
 
 
 def test_people_are_asked_and_a_reward_model_learns_what_they_want_in_the_labs_own_signals(
@@ -108,7 +108,7 @@ def test_people_are_asked_and_a_reward_model_learns_what_they_want_in_the_labs_o
 ) -> None:
     person = _answer_everything(place, own)
     with place.database.reading() as session:
-        due = [job for job, _ in reconcile.findings(session) if job.kind is RunKind.REWARD]
+        due = [job for job, _ in reconcile.due(session) if job.kind is RunKind.REWARD]
         assert len(due) == 1
     _train(place, due[0])
     with place.database.reading() as session:
@@ -119,11 +119,11 @@ def test_people_are_asked_and_a_reward_model_learns_what_they_want_in_the_labs_o
     assert isinstance(learned, StructuredReward)
     assert learned.weights.shape[1] == 2
     with place.database.writing() as session:
-        factories.make_run(session, own, session.get_one(Participant, person)).workflow_id = due[0].finding + "/x"
+        factories.make_run(session, own, session.get_one(Participant, person)).workflow_id = due[0].key + "/x"
         run = session.scalars(select(Model.run_id)).one()
         records.finish_run(session, run)
     with place.database.reading() as session:
-        kinds = {job.kind for job, _ in reconcile.findings(session)}
+        kinds = {job.kind for job, _ in reconcile.due(session)}
     assert kinds <= {RunKind.REPORT}, "no filter, no method, no film: there is no simulator to make them in"
 
 
@@ -316,7 +316,7 @@ def test_pairs_whose_videos_are_lost_make_room_for_others(place: Workplace, own:
     assert not place.store.has(lost.video_sha256)
     with place.database.reading() as session:
         assert reconcile.with_lost_queries(session, place.store.lost()) != []
-        assert list(reconcile.findings(session, place.store.lost())) == [], "nobody can film another lab's robot again"
+        assert list(reconcile.due(session, place.store.lost())) == [], "nobody can film another lab's robot again"
     query_selection.refill_queries(place, participant.id)
     after = waiting()
     showing = [query.id for query in after if lost.id in (query.left_clip_id, query.right_clip_id)]

@@ -15,12 +15,12 @@ from app.domain.preferences import LabelEvent, Purpose, Query, Response
 from app.domain.studies import LONGEST_CLIP_STEPS, Participant, Study, TaskName
 from app.storage import ArtefactStore
 from tests.worker.conftest import STEPS, make_trajectory
+from tests.worker.invented import job_of
 from worker.compute.pools import Compute
 from worker.jobs import reconcile
 from worker.jobs.learning import dataset, query_plan, query_selection, reward_models
 from worker.jobs.runtime import records
 from worker.jobs.runtime.context import Workplace
-from worker.jobs.runtime.records import Job
 from worker.trajectory import SIGNALS
 
 WHOLE = LONGEST_CLIP_STEPS[TaskName.FEEDING]
@@ -231,7 +231,7 @@ def test_models_are_due_by_labels_alone(
         for query in waiting[:11]:  # two of them practice
             session.add(LabelEvent(query_id=query.id, revision=1, response="left", client_uuid=f"{query.id}"))
     with place.database.reading() as session:
-        assert RunKind.REWARD not in {job.kind for job, _ in reconcile.findings(session)}
+        assert RunKind.REWARD not in {job.kind for job, _ in reconcile.due(session)}
 
 
 def test_only_labels_are_predicted(
@@ -275,7 +275,7 @@ def test_as_many_scenarios_are_filmed_whole_as_the_introduction_needs(
     for index in range(4):
         add_clips(reconcile.scenario_seed(study.seed, index))
     with place.database.reading() as session:
-        found = {job.finding for job, _ in reconcile.findings(session)}
+        found = {job.key for job, _ in reconcile.due(session)}
     assert found == {f"clips/study-1/whole-{reconcile.scenario_seed(study.seed, index)}" for index in range(2)}
 
 
@@ -302,7 +302,7 @@ def test_whole_episodes_are_filmed_of_the_rollouts_that_are_there(
     monkeypatch.setattr(
         place.compute, "run_all", lambda _lane, _beat, function, shots: [function(*shot) for shot in shots]
     )
-    job = Job(f"clips/study-{study.id}/whole-{scenario}", RunKind.CLIPS, study.id)
+    job = job_of(f"clips/study-{study.id}/whole-{scenario}", study.id)
     with place.database.writing() as session:
         run_id = records.begin_run(session, job, 0)
     pool_clips.build_clips(place, job, run_id, lambda _name, function, *arguments: function(*arguments))

@@ -89,7 +89,7 @@ def test_reports_are_found_by_the_reconciler_and_only_while_something_is_newer(
     place: Workplace, finished: Study
 ) -> None:
     with place.database.reading() as session:
-        assert RunKind.REPORT in {job.kind for job, _ in reconcile.findings(session)}
+        assert RunKind.REPORT in {job.kind for job, _ in reconcile.due(session)}
     make_report(place, finished)
     age(place, timedelta(hours=1))
     assert due(place, finished) == []

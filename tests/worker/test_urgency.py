@@ -10,8 +10,8 @@ import pytest
 from sqlalchemy.orm import Session
 
 from app.db import Database, now
-from app.domain.models import RunKind
 from app.domain.studies import Awaited, Participant, Study
+from tests.worker.invented import job_of
 from worker.compute.pools import Compute, Lane
 from worker.jobs.runtime.lanes import Turns
 from worker.jobs.runtime.records import Job
@@ -41,12 +41,11 @@ def add_person(session: Session, study: Study, awaited: Awaited | None = None, *
 
 
 def films(person: Participant, what: str = "trials") -> Job:
-    finding = f"films/participant-{person.id}/{what}/labels-20/answer-9"
-    return Job(finding, RunKind.FILMS, person.study_id, person.id, 20)
+    return job_of(f"films/participant-{person.id}/{what}/labels-20/answer-9", person.study_id)
 
 
 def clips(study: Study) -> Job:
-    return Job(f"clips/study-{study.id}/scenario-1", RunKind.CLIPS, study.id)
+    return job_of(f"clips/study-{study.id}/scenario-1", study.id)
 
 
 def level(database: Database, job: Job) -> Level:
@@ -62,8 +61,8 @@ def test_work_is_ordered_by_who_waits_and_how_long_and_not_by_study(database: Da
         longer = add_person(session, busy, Awaited.ROBOTS, seen=20, waiting=500)
         answering = add_person(session, third, seen=5)
         unopened = add_study(session, "unopened", study)
-    report = Job("report/study-1/basis-0", RunKind.REPORT, idle.id)
-    asked = Job("export/study-1/1", RunKind.EXPORT, idle.id)
+    report = job_of("report/study-1/basis-0", idle.id)
+    asked = job_of("export/study-1/data-1", idle.id)
     wanted = [films(longer), films(later), films(answering), asked, films(gone), clips(idle), clips(unopened), report]
     with database.reading() as session:
         waits = WhoWaits.look(session)
@@ -74,7 +73,7 @@ def test_work_is_ordered_by_who_waits_and_how_long_and_not_by_study(database: Da
 def test_of_one_person_what_the_first_robot_needs_comes_before_the_debrief(database: Database, study: Study) -> None:
     with database.writing() as session:
         person = add_person(session, study, Awaited.ROBOTS, seen=1, waiting=60)
-    learning = Job("filter/x", RunKind.FILTER, study.id, person.id, 20)
+    learning = job_of(f"filter/participant-{person.id}/labels-20", study.id)
     wanted = [learning, films(person), films(person, "before-after")]
     with database.reading() as session:
         waits = WhoWaits.look(session)
@@ -109,7 +108,7 @@ def test_clips_are_as_urgent_as_whoever_needs_pairs_of_them(
 
 
 def test_a_report_is_asked_for_once_the_study_is_unblinded(database: Database, study: Study) -> None:
-    report = Job("report/study-1/basis-0", RunKind.REPORT, study.id)
+    report = job_of("report/study-1/basis-0", study.id)
     assert level(database, report) is Level.UNREAD
     with database.writing() as session:
         session.get_one(Study, study.id).unblinded_at = now()

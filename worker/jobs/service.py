@@ -27,10 +27,10 @@ from worker.jobs.learning import query_selection, reference_rollouts
 from worker.jobs.runtime import engine, records
 from worker.jobs.runtime.context import Workplace
 from worker.jobs.runtime.lanes import Turns
-from worker.jobs.runtime.records import Job
+from worker.jobs.runtime.records import Job, as_arguments
 from worker.jobs.runtime.urgency import Level, WhoWaits
 from worker.jobs.upkeep import erasure, unused_files
-from worker.jobs.workflows import Workshop, as_arguments
+from worker.jobs.workflows import Workshop
 from worker.stop_signals import Stop
 
 log = logging.getLogger("worker")
@@ -152,7 +152,7 @@ class _Rounds:
         turns = self._workshop.turns
         with self._place.database.reading() as session:
             lost_files = self._place.store.lost()
-            due = list(reconcile.findings(session, lost_files))
+            due = list(reconcile.due(session, lost_files))
             hungry = {*reconcile.short_of_queries(session), *reconcile.with_lost_queries(session, lost_files)}
             lost = reconcile.abandoned(session, self._workshop.in_hand)
             answered = reconcile.studies_with_answers(session)
@@ -166,7 +166,7 @@ class _Rounds:
         for study_id in deleted:
             self._erase(erasure.erase_traces_of_study, study_id)
         for job, attempt in lost:
-            self._take_over(job, reconcile.workflow_name(job.finding, attempt))
+            self._take_over(job, reconcile.workflow_name(job.key, attempt))
         for study in answered:
             if study.id not in self._prepared:
                 self._prepared.add(study.id)
@@ -201,13 +201,13 @@ class _Rounds:
 
         What the engine was told and has not begun is still due, and counts, unless it seems to have forgotten it.
         """
-        begun = Counter(finding.partition("/")[0] for finding in self._workshop.in_hand)
+        begun = Counter(key.partition("/")[0] for key in self._workshop.in_hand)
         for job, attempt in sorted(due, key=lambda each: self._workshop.turns.who_waits.urgency(each[0])):
             level = self._workshop.turns.who_waits.urgency(job).level
             places = engine.QUEUES[job.kind] + (engine.RESERVE if level <= Level.ANSWERING else 0)
-            if job.finding in self._workshop.in_hand or begun[job.kind] >= places:
+            if job.key in self._workshop.in_hand or begun[job.kind] >= places:
                 continue
-            name = reconcile.workflow_name(job.finding, attempt)
+            name = reconcile.workflow_name(job.key, attempt)
             self._start(job, name)
             begun[job.kind] += time.monotonic() - self._told_at.setdefault(name, time.monotonic()) < BEGINS_WITHIN_S
 
@@ -216,7 +216,7 @@ class _Rounds:
         if time.monotonic() - self._started.get(name, -math.inf) < LOOK_AGAIN_S:
             return
         self._started[name] = time.monotonic()
-        if job.finding not in self._workshop.in_hand and not engine.is_at_it(name):
+        if job.key not in self._workshop.in_hand and not engine.is_at_it(name):
             self._go_on(job, name)
 
     def _take_over(self, job: Job, name: str) -> None:
@@ -230,7 +230,7 @@ class _Rounds:
         if engine.gave_up(name):
             log.warning("%s: %s", name, KeepsFelling().message)
             with self._place.database.writing() as session:
-                records.fail_run(session, job.finding, KeepsFelling().message)
+                records.fail_run(session, job.key, KeepsFelling().message)
             return
         log.warning("%s was left behind; taking it over", name)
         self._go_on(job, name)

@@ -5,7 +5,7 @@ Three kinds of runs: ``before-after`` (the participant's robot beside the refere
 """
 
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from sqlalchemy import select
@@ -14,6 +14,7 @@ from sqlalchemy.orm import Session
 from app.domain.evaluation import Controller, Film, Trial
 from app.domain.models import Model, ModelKind, RunKind
 from app.domain.protocol import EvaluatedMethod, EvaluationMode
+from app.domain.run_keys import BEFORE_AFTER, CONTROLLERS, TRIALS, RunKey
 from app.domain.studies import Participant, Study
 from app.services.evaluation import evaluation_plan
 from worker.compute import baseline_fitting, simulation
@@ -28,7 +29,6 @@ from worker.jobs.runtime.records import Job
 
 AT_A_TIME = 2
 """Films between two marks of progress."""
-BEFORE_AFTER, TRIALS, CONTROLLERS = "before-after", "trials", "controllers"
 
 
 @dataclass(frozen=True)
@@ -40,20 +40,17 @@ class Robot:
     controller: bytes
 
 
-def due(
-    study: Study, participant_id: int, ending: str, succeeded: Collection[str], robots_shown: bool = False
-) -> list[Job]:
-    """What is to be filmed or packed for somebody whose last filter is there. ``ending``: labels and last answer.
+def due(study: Study, reward: RunKey, succeeded: Collection[str], robots_shown: bool = False) -> list[Job]:
+    """What is to be filmed or packed for somebody whose last filter is there. ``reward``: their last model's.
 
     ``robots_shown``: they have begun to rate, so that what they rate stays.
     """
     wanted = [BEFORE_AFTER] if study.material is None else []
     settings = None if robots_shown else evaluation_plan.settings_of(study)
-    if settings and baselines.all_trained(study, participant_id, ending, succeeded):
+    if settings and baselines.all_trained(study, reward, succeeded):
         wanted.append(TRIALS if settings.mode is EvaluationMode.VIDEO else CONTROLLERS)
-    labels = study.settings.labels_per_participant
     return [
-        Job(f"films/participant-{participant_id}/{what}/{ending}", RunKind.FILMS, study.id, participant_id, labels)
+        Job(replace(reward, kind=RunKind.FILMS, subject=what), study.id)
         for what in reversed(wanted)  # the debrief comes last
     ]
 
@@ -63,7 +60,7 @@ def make_films(place: Workplace, job: Job, run_id: int, step: Step) -> None:
     if repairs.is_about(job):
         repairs.make_again(place, job, run_id, step)
         return
-    what = job.finding.split("/")[2]
+    what = job.about.subject
     shots = step("plan", _plan, place, job, what)
     for first in range(0, len(shots), AT_A_TIME):
         if step(f"is-outdated-{first}", _is_outdated, place, job):

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from app.domain.run_keys import WHOLE
 from app.domain.studies import Study
 from worker.compute import simulation
 from worker.compute.pools import Lane
@@ -11,8 +12,6 @@ from worker.jobs.runtime.context import Step, Workplace
 from worker.jobs.runtime.records import Job
 from worker.sim.render.clip import RenderedClip
 
-WHOLE = "whole"
-"""In the name of a finding: whole episodes of the scenario's rollouts are missing, for the introduction."""
 AT_A_TIME = 2
 """Two clips already make a pair that can be labelled."""
 
@@ -22,14 +21,13 @@ def build_clips(place: Workplace, job: Job, run_id: int, step: Step) -> None:
     if repairs.is_about(job):
         repairs.make_again(place, job, run_id, step)
         return
-    what, number = job.finding.rsplit("/", 1)[1].rsplit("-", 1)
-    film = _film_whole if what == WHOLE else _film
+    film = _film_whole if job.about.subject == WHOLE else _film
     with place.database.reading() as session:
         count = session.get_one(Study, job.study_id).settings.behaviours_per_scenario
     for first in range(0, count, AT_A_TIME):
         which = list(range(first, min(first + AT_A_TIME, count)))
         place.report(run_id, f"filming behaviours {which[0] + 1} to {which[-1] + 1} of {count}", first / count)
-        step(f"film-{first}", film, place, run_id, job.study_id, int(number), which)
+        step(f"film-{first}", film, place, run_id, job.study_id, job.number, which)
 
 
 def _film(place: Workplace, run_id: int, study_id: int, scenario: int, which: list[int]) -> None:

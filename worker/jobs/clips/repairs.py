@@ -16,6 +16,7 @@ from app.domain.clips import Clip, Rollout
 from app.domain.evaluation import Film
 from app.domain.models import RunKind
 from app.domain.preferences import LabelEvent, Query
+from app.domain.run_keys import AGAIN, RunKey
 from app.domain.studies import Participant, Study
 from app.errors import AppError
 from worker.compute import simulation
@@ -24,9 +25,6 @@ from worker.jobs.runtime.context import Step, Workplace
 from worker.jobs.runtime.records import Job
 from worker.sim.render.clip import RenderedClip
 from worker.trajectory import Trajectory
-
-AGAIN = "again"
-"""In the name of a finding: files of a rollout or film were lost at that moment."""
 
 
 class NotTheSameAgain(AppError):
@@ -54,26 +52,25 @@ def due(session: Session, study: Study, lost: Mapping[str, int]) -> list[Job]:
     for rollout, *hashes in session.execute(pool):
         stamps[rollout] = max(stamps.get(rollout, 0), *(lost.get(sha256, 0) for sha256 in hashes))
     jobs = [
-        Job(f"clips/study-{study.id}/{AGAIN}-{rollout}-{stamp}", RunKind.CLIPS, study.id)
+        Job(RunKey(RunKind.CLIPS, study.id, subject=AGAIN, number=rollout, mark=str(stamp)), study.id)
         for rollout, stamp in stamps.items()
     ]
     for film, person, *hashes in session.execute(films):
         stamp = max(lost.get(sha256, 0) for sha256 in hashes)
-        name = f"films/participant-{person}/{AGAIN}-{film}-{stamp}"
-        jobs.append(Job(name, RunKind.FILMS, study.id, person))
+        key = RunKey(RunKind.FILMS, participant_id=person, subject=AGAIN, number=film, mark=str(stamp))
+        jobs.append(Job(key, study.id))
     return jobs
 
 
 def is_about(job: Job) -> bool:
     """Whether the job makes something again."""
-    return job.finding.rsplit("/", 1)[1].startswith(f"{AGAIN}-")
+    return job.about.subject == AGAIN
 
 
 def make_again(place: Workplace, job: Job, run_id: int, step: Step) -> None:
     """Make the lost files of the rollout or film that the job names. Raises NotTheSameAgain and FilmLost."""
-    number = int(job.finding.rsplit("/", 1)[1].split("-")[1])
     place.report(run_id, "making lost files again", 0.0)
-    step(AGAIN, _film_again if job.kind == RunKind.FILMS else _clips_again, place, run_id, number)
+    step(AGAIN, _film_again if job.kind == RunKind.FILMS else _clips_again, place, run_id, job.number)
 
 
 def stored(place: Workplace, clip: RenderedClip) -> dict[str, Any]:

@@ -7,12 +7,14 @@ participant's, so a killed worker goes on where it was; the folder is removed at
 import shutil
 import time
 from collections.abc import Callable, Collection
+from dataclasses import replace
 from pathlib import Path
 
 from sqlalchemy.orm import Session
 
 from app.domain.models import ModelKind, RunKind
 from app.domain.protocol import EvaluatedMethod
+from app.domain.run_keys import RunKey
 from app.domain.studies import Participant, RewardKind, Study
 from app.services.evaluation import evaluation_plan
 from worker.analysis.evaluation import evaluate
@@ -35,30 +37,24 @@ TRAINING_SHARE = 0.9
 """Of the progress; the rest is the drive through unseen scenarios."""
 
 
-def due(study: Study, participant_id: int, ending: str) -> list[Job]:
-    """What is to be trained for somebody whose last reward model is there. ``ending``: labels and last answer."""
+def due(study: Study, reward: RunKey) -> list[Job]:
+    """What is to be trained for somebody whose last reward model, that of ``reward``, is there."""
     settings = evaluation_plan.settings_of(study)
-    labels = study.settings.labels_per_participant
     return [
-        Job(finding(participant_id, method, ending), RunKind.METHOD, study.id, participant_id, labels)
+        Job(replace(reward, kind=RunKind.METHOD, subject=method), study.id)
         for method in (settings.methods if settings else ())
         if method in evaluation_plan.TRAINED
     ]
 
 
-def finding(participant_id: int, method: str, ending: str) -> str:
-    """The name of one training."""
-    return f"method/participant-{participant_id}/{method}/{ending}"
-
-
-def all_trained(study: Study, participant_id: int, ending: str, succeeded: Collection[str]) -> bool:
+def all_trained(study: Study, reward: RunKey, succeeded: Collection[str]) -> bool:
     """Whether everything that is due has been done."""
-    return all(job.finding in succeeded for job in due(study, participant_id, ending))
+    return all(job.key in succeeded for job in due(study, reward))
 
 
 def train_method(place: Workplace, job: Job, run_id: int, step: Step) -> None:
     """Train the method that the job names, drive it through unseen scenarios, and keep it."""
-    method = EvaluatedMethod(job.finding.split("/")[2])
+    method = EvaluatedMethod(job.about.subject)
     reward = step("reward", _choose_reward, place, run_id, job)
     trained = step("train", _train, place, run_id, job, method.value, reward)
     if not trained:

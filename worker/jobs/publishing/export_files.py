@@ -14,7 +14,7 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from app.db import now
-from app.domain.models import Export, RunKind
+from app.domain.models import Export
 from app.domain.studies import Deviation, Participant, Study
 from app.paths import DOCS
 from app.services.archives import archive, archive_reading, sealing
@@ -46,12 +46,12 @@ _ARROW = {
 def due(session: Session, study: Study) -> list[Job]:
     """Files that were asked for and are not there."""
     waiting = select(Export).where(Export.study_id == study.id, Export.finished_at.is_(None)).order_by(Export.id)
-    return [Job(export_requests.finding(each), RunKind.EXPORT, study.id) for each in session.scalars(waiting)]
+    return [Job(export_requests.key_of(each), study.id) for each in session.scalars(waiting)]
 
 
 def make(place: Workplace, job: Job, run_id: int, step: Step) -> None:
-    """Make the file that the finding names."""
-    step("make", _make, place, int(job.finding.rpartition("-")[2]), run_id)
+    """Make the file that the export asks for."""
+    step("make", _make, place, job.number, run_id)
 
 
 def _make(place: Workplace, export_id: int, run_id: int) -> str:

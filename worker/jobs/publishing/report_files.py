@@ -16,6 +16,7 @@ from app.db import now
 from app.domain.evaluation import Rating, Trial
 from app.domain.models import Model, Report, Run, RunKind, RunStatus
 from app.domain.preferences import Exclusion, LabelEvent, Query
+from app.domain.run_keys import BASIS, RunKey
 from app.domain.studies import Participant, Study
 from app.services.answers import accuracy, answer_figures
 from app.services.evaluation import evaluation_plan, unblinding
@@ -44,11 +45,11 @@ def due(session: Session, study: Study) -> list[Job]:
     basis = basis_of(session, study)
     if basis is None or (last is not None and last.basis == basis):
         return []
-    name = _name(study.id, basis)
-    others = select(Run.id).where(Run.study_id == study.id, Run.kind == RunKind.REPORT, Run.workflow_id != name)
+    job = Job(RunKey(RunKind.REPORT, study.id, subject=BASIS, mark=basis[:16]), study.id)
+    others = select(Run.id).where(Run.study_id == study.id, Run.kind == RunKind.REPORT, Run.workflow_id != job.key)
     if session.scalar(others.where(Run.status.in_(RUNS_AT_ONCE)).limit(1)) is not None:
         return []
-    return [Job(name, RunKind.REPORT, study.id)]
+    return [job]
 
 
 def _rested(session: Session, study: Study, last: Report) -> datetime:
@@ -58,10 +59,6 @@ def _rested(session: Session, study: Study, last: Report) -> datetime:
     run = session.get_one(Run, last.run_id)
     took = run.finished_at - run.started_at if run.finished_at else timedelta(0)
     return last.created_at + max(AT_MOST_EVERY, min(REST * took, LONGEST_REST))
-
-
-def _name(study_id: int, basis: str) -> str:
-    return f"report/study-{study_id}/basis-{basis[:16]}"
 
 
 def basis_of(session: Session, study: Study) -> str | None:

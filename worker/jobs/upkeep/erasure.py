@@ -21,7 +21,7 @@ from app.domain.studies import Participant, Study
 from app.services.participants import withdrawal
 from worker.jobs.runtime import engine
 from worker.jobs.runtime.context import Workplace
-from worker.jobs.runtime.records import Job
+from worker.jobs.runtime.records import Job, from_arguments
 
 log = logging.getLogger("worker")
 
@@ -61,7 +61,7 @@ def erase_traces(
 ) -> Progress:
     """Erase what the worker knows of somebody who has withdrawn; asked again until it says that it has finished.
 
-    ``in_hand``: findings this process works on; ``stored``: artefacts that unfinished work has put away, by finding.
+    ``in_hand``: keys of runs this process works on; ``stored``: artefacts that unfinished work has put away, by key.
     """
     with place.database.reading() as session:
         study_id = session.get_one(Participant, participant_id).study_id
@@ -122,11 +122,11 @@ def _erase(
     active = [name for name, (_, status) in jobs.items() if status in _ACTIVE]
     if active:
         DBOS.cancel_workflows(active)  # and look again: one of them may just be beginning
-    if active or any(job.finding in in_hand for job, _ in jobs.values()):
+    if active or any(job.key in in_hand for job, _ in jobs.values()):
         return Progress(finished=False)
     left_over = {sha256 for name in jobs for sha256 in _artefacts_of_steps(name)}
     for job, _ in jobs.values():
-        left_over |= stored.pop(job.finding, set())
+        left_over |= stored.pop(job.key, set())
     with place.database.writing() as session:
         erase(session)
         for sha256 in left_over - withdrawal.in_use(session, left_over):
@@ -160,7 +160,12 @@ def _workflows(concerns: Callable[[Job], bool]) -> Iterator[tuple[str, tuple[Job
 
 def _job(workflow: WorkflowStatus) -> Job | None:
     arguments = workflow.input["args"][-1] if workflow.input and workflow.input["args"] else None
-    return Job(**arguments) if isinstance(arguments, Mapping) else None
+    if not isinstance(arguments, Mapping):
+        return None
+    try:
+        return from_arguments(arguments)
+    except (KeyError, ValueError):
+        return None
 
 
 def _artefacts_of_steps(workflow: str) -> set[str]:
