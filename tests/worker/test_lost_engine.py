@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from datetime import timedelta
 from pathlib import Path
+from typing import Any
 
 import pytest
 from dbos import DBOS, SetWorkflowID
@@ -21,14 +22,14 @@ from app.domain.studies import Participant
 from app.settings import Settings
 from app.storage import ArtefactStore
 from tests.waiting import PATIENCE_S, until
-from tests.worker.conftest import the_workshop
+from tests.worker.conftest import the_job_runner
 from tests.worker.invented import job_of
 from worker.compute.pools import Compute
 from worker.jobs import reconcile, service, workflows
 from worker.jobs.runtime import engine, records
-from worker.jobs.runtime.context import Step, Workplace
-from worker.jobs.runtime.records import Job, as_arguments
-from worker.jobs.workflows import Workshop
+from worker.jobs.runtime.context import Step, WorkerContext
+from worker.jobs.runtime.records import Job, as_arguments, from_arguments
+from worker.jobs.workflows import JobRunner
 
 Damage = Callable[[Path], None]
 
@@ -43,7 +44,7 @@ class Work:
         self.may_finish.set()
         self.fails: list[Exception] = []
 
-    def __call__(self, place: Workplace, job: Job, run_id: int, step: Step) -> None:
+    def __call__(self, context: WorkerContext, job: Job, run_id: int, step: Step) -> None:
         step("prepare", self.prepared.append, job.key)
         step("save", self._save, job)
 
@@ -87,16 +88,16 @@ def due(monkeypatch: pytest.MonkeyPatch, job: Job) -> Job:
 
 
 @contextmanager
-def worker(settings: Settings, database: Database, store: ArtefactStore) -> Iterator[Workshop]:
+def worker(settings: Settings, database: Database, store: ArtefactStore) -> Iterator[JobRunner]:
     """The worker's life in this process, from launching the engine to a stop."""
-    workshop, compute, stop = the_workshop(), Compute(1), threading.Event()
-    workshop.place = Workplace(database, store, compute)
+    runner, compute, stop = the_job_runner(), Compute(1), threading.Event()
+    runner.context = WorkerContext(database, store, compute)
     with engine.running(settings, database) as bond:
-        rounds = service._Rounds(settings, workshop, bond)
+        rounds = service._Rounds(settings, runner, bond)
         thread = threading.Thread(target=rounds.until, args=(stop,))
         thread.start()
         try:
-            yield workshop
+            yield runner
         finally:
             stop.set()
             thread.join()
@@ -296,7 +297,7 @@ def test_a_sign_of_life_that_cannot_be_written_does_not_end_the_work(
         run_id = records.begin_run(session, job, seed=1)
     with database.writing() as session:
         session.execute(text("DROP TABLE run"))
-    Workplace(database, store, Compute(1)).beat(run_id)()
+    WorkerContext(database, store, Compute(1)).beat(run_id)()
 
 
 def test_work_in_the_middle_of_which_the_worker_falls_again_and_again_counts_as_a_failed_attempt(
@@ -305,7 +306,7 @@ def test_work_in_the_middle_of_which_the_worker_falls_again_and_again_counts_as_
     path = lived(settings, database, store)
     engine.launch(settings)
     with SetWorkflowID(f"{due.key}#1"):
-        DBOS.enqueue_workflow("a queue of nobody", the_workshop().work, as_arguments(due))
+        DBOS.enqueue_workflow("a queue of nobody", the_job_runner().work, as_arguments(due))
     DBOS.destroy()
     with closing(sqlite3.connect(path)) as connection:
         connection.execute("UPDATE workflow_status SET status = 'MAX_RECOVERY_ATTEMPTS_EXCEEDED'")
@@ -315,6 +316,48 @@ def test_work_in_the_middle_of_which_the_worker_falls_again_and_again_counts_as_
         assert until(lambda: status_of(database, due) == RunStatus.SUCCEEDED)
     with database.reading() as session:
         assert session.scalars(select(Run.attempt)).one() == 2
+
+
+@pytest.mark.parametrize("status", ["ENQUEUED", "PENDING"])
+def test_what_the_previous_version_left_half_done_is_found_again_and_done(
+    settings: Settings, database: Database, store: ArtefactStore, work: Work, due: Job, status: str
+) -> None:
+    """Its workflows had another class, another version, and jobs of another form."""
+    path = lived(settings, database, store)
+    engine.launch(settings)
+    with SetWorkflowID(f"{due.key}#1"):
+        DBOS.enqueue_workflow("a queue of nobody", the_job_runner().work, as_arguments(due))
+    DBOS.destroy()
+    with closing(sqlite3.connect(path)) as connection:
+        connection.execute(
+            "UPDATE workflow_status SET status = ?, application_version = ?, class_name = ?, name = ?, config_name = ?",
+            (status, "3", "Workshop", "Workshop.work", "workshop"),
+        )
+        connection.commit()
+    left_behind(database, due)
+    with worker(settings, database, store):
+        assert until(lambda: status_of(database, due) == RunStatus.SUCCEEDED)
+    assert work.finished == [due.key]
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        {"key": "filter/participant-1/labels-10", "study_id": 1},
+        {
+            "finding": "filter/participant-1/labels-10",
+            "kind": "filter",
+            "study_id": 1,
+            "participant_id": 1,
+            "label_count": 10,
+            "label_hash": None,
+        },
+    ],
+)
+def test_a_job_is_read_as_this_version_and_the_previous_one_have_stored_it(arguments: dict[str, Any]) -> None:
+    """Whoever withdraws is erased from the engine's notes too, whichever version wrote them."""
+    job = from_arguments(arguments)
+    assert (job.key, job.study_id, job.participant_id) == ("filter/participant-1/labels-10", 1, 1)
 
 
 RUNNING_DAMAGES = [removed, overwritten, emptied, another_program_s, replaced_by_an_older_one]

@@ -24,8 +24,8 @@ from worker.jobs.learning.filters import train_filter
 from worker.jobs.learning.reward_models import train_reward
 from worker.jobs.publishing import export_files, report_files
 from worker.jobs.runtime import records
-from worker.jobs.runtime.context import Step, Workplace
-from worker.jobs.runtime.lanes import Turns
+from worker.jobs.runtime.context import Step, WorkerContext
+from worker.jobs.runtime.lanes import Lanes
 from worker.jobs.runtime.records import Job, from_arguments
 
 log = logging.getLogger("worker")
@@ -33,7 +33,7 @@ log = logging.getLogger("worker")
 FALLS_ALLOWED = 5
 """How often a worker may fall in the middle of an attempt before that has failed."""
 
-_BODIES: dict[RunKind, Callable[[Workplace, Job, int, Step], None]] = {
+_BODIES: dict[RunKind, Callable[[WorkerContext, Job, int, Step], None]] = {
     RunKind.CLIPS: build_clips,
     RunKind.REWARD: train_reward,
     RunKind.FILTER: train_filter,
@@ -49,12 +49,12 @@ class ParticipantWithdrew(AppError):
 
 
 @DBOS.dbos_class()
-class Workshop(DBOSConfiguredInstance):
+class JobRunner(DBOSConfiguredInstance):
     """Does jobs at one workplace."""
 
-    def __init__(self, place: Workplace, turns: Turns) -> None:
-        super().__init__("workshop")
-        self.place, self.turns = place, turns
+    def __init__(self, context: WorkerContext, lanes: Lanes) -> None:
+        super().__init__("job runner")
+        self.context, self.lanes = context, lanes
         self.in_hand: set[str] = set()
         """keys of runs that this process is working on"""
         self.stored: dict[str, set[str]] = {}
@@ -70,8 +70,8 @@ class Workshop(DBOSConfiguredInstance):
             run_id = _step("begin", self._begin, arguments)
             if run_id is None:
                 return
-            place = self.place.noting(self.stored.setdefault(job.key, set())).computing(self.turns.of(job))
-            _BODIES[RunKind(job.kind)](place, job, run_id, _step)
+            context = self.context.noting(self.stored.setdefault(job.key, set())).computing(self.lanes.of(job))
+            _BODIES[RunKind(job.kind)](context, job, run_id, _step)
             _step("finish", self._finish, run_id)
             self.stored.pop(job.key, None)
             log.info("%s done in %.1f s", job.key, time.monotonic() - started)
@@ -88,13 +88,13 @@ class Workshop(DBOSConfiguredInstance):
             self.in_hand.discard(job.key)
 
     def _is_pointless(self, job: Job) -> bool:
-        with self.place.database.reading() as session:
+        with self.context.database.reading() as session:
             return _has_withdrawn(session, job)
 
     def _begin(self, arguments: dict[str, Any]) -> int | None:
         """The run's id; None when there is nothing to be done, because an earlier life of this job has finished it."""
         job = from_arguments(arguments)
-        with self.place.database.writing() as session:
+        with self.context.database.writing() as session:
             if _has_withdrawn(session, job):
                 raise ParticipantWithdrew
             if records.has_succeeded(session, job.key):
@@ -102,11 +102,11 @@ class Workshop(DBOSConfiguredInstance):
             return records.begin_run(session, job, _seed(session, job))
 
     def _finish(self, run_id: int) -> None:
-        with self.place.database.writing() as session:
+        with self.context.database.writing() as session:
             records.finish_run(session, run_id)
 
     def _fail(self, key: str, error: str, counts: bool = True) -> None:
-        with self.place.database.writing() as session:
+        with self.context.database.writing() as session:
             records.fail_run(session, key, error, counts)
 
 

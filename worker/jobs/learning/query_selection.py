@@ -16,7 +16,7 @@ from worker.compute import learning, simulation
 from worker.jobs.learning import dataset, query_plan
 from worker.jobs.learning.query_plan import Slot
 from worker.jobs.runtime import records
-from worker.jobs.runtime.context import Workplace
+from worker.jobs.runtime.context import WorkerContext
 from worker.ml import acquisition
 from worker.ml.teachers import OMEGA, User
 from worker.sim.costs import preference_rewards
@@ -35,52 +35,56 @@ MOST_OTHERS = 12
 """More people cost time and hardly change on which pairs people differ."""
 
 
-def refill_queries(place: Workplace, participant_id: int) -> None:
+def refill_queries(context: WorkerContext, participant_id: int) -> None:
     """Make the queries the participant will meet next. Safe to call at any time, by any number of workers.
 
     Places are filled in their order: where one must wait, for clips to be filmed, the later ones wait as well. Pairs of
     a study of own clips that cannot be shown any more make room for others; clips of ours are made again.
     """
-    lost = place.store.lost()
-    with place.database.reading() as session:
+    lost = context.store.lost()
+    with context.database.reading() as session:
         participant = session.get_one(Participant, participant_id)
         study = session.get_one(Study, participant.study_id)
     if lost and study.material is not None:
-        with place.database.writing() as session:
+        with context.database.writing() as session:
             records.drop_lost_queries(session, participant_id, lost)
-    with place.database.reading() as session:
+    with context.database.reading() as session:
         free = records.free_ordinals(session, participant_id, study.settings)
         if not free:
             return
         slots = query_plan.plan(study.settings, participant.seed)
-        rows = _Choosing(place, session, participant, study, lost).rows([slots[ordinal - 1] for ordinal in free])
+        rows = _Choosing(context, session, participant, study, lost).rows([slots[ordinal - 1] for ordinal in free])
     if not rows:
         return
-    with place.database.writing() as session:
+    with context.database.writing() as session:
         records.save_queries(session, participant_id, rows)
-    predict_waiting(place, participant_id)
+    predict_waiting(context, participant_id)
 
 
-def predict_waiting(place: Workplace, participant_id: int) -> None:
+def predict_waiting(context: WorkerContext, participant_id: int) -> None:
     """Write the newest model's prediction to every query that has never been answered: honest by construction.
 
     Only to labels: a repeat was answered before, a catch pair is no question of taste, practice is none at all.
     """
-    with place.database.reading() as session:
+    with context.database.reading() as session:
         model = records.newest_model(session, participant_id, ModelKind.REWARD)
         waiting = records.unanswered(session, participant_id, *dataset.CLIPS_AND_ROLLOUTS)
         queries = [query for query in waiting if query.purpose in LEARNED_FROM]
         if model is None or all(query.predicted_by_model_id == model.id for query in queries):
             return
-        pairs = dataset.segment_pairs(place.store, [(query.left_clip, query.right_clip) for query in queries])
+        pairs = dataset.segment_pairs(context.store, [(query.left_clip, query.right_clip) for query in queries])
         ids = [query.id for query in queries]
-    probabilities = learning.probability_right(place.store.read(model.artefact_sha256), pairs)
-    with place.database.writing() as session:
+    probabilities = learning.probability_right(context.store.read(model.artefact_sha256), pairs)
+    with context.database.writing() as session:
         records.save_predictions(session, model.id, dict(zip(ids, probabilities, strict=True)))
 
 
 def _scores(
-    place: Workplace, session: Session, participant: Participant, pairs: list[tuple[Clip, Clip]], strategy: Strategy
+    context: WorkerContext,
+    session: Session,
+    participant: Participant,
+    pairs: list[tuple[Clip, Clip]],
+    strategy: Strategy,
 ) -> acquisition.Floats | None:
     """How much every candidate is worth asking; None when the choice is to be uniform."""
     if strategy is Strategy.UNIFORM:
@@ -88,30 +92,30 @@ def _scores(
     members = None
     model = records.newest_model(session, participant.id, ModelKind.REWARD)
     if model is not None:
-        segments = dataset.segment_pairs(place.store, pairs)
-        members = learning.member_probabilities(place.store.read(model.artefact_sha256), segments)
+        segments = dataset.segment_pairs(context.store, pairs)
+        members = learning.member_probabilities(context.store.read(model.artefact_sha256), segments)
     if strategy is Strategy.CONTESTED:
-        return acquisition.contested(_answers_of_others(place, session, participant, pairs), members)
+        return acquisition.contested(_answers_of_others(context, session, participant, pairs), members)
     return None if members is None else acquisition.score(strategy.value, members)
 
 
 def _answers_of_others(
-    place: Workplace, session: Session, participant: Participant, pairs: list[tuple[Clip, Clip]]
+    context: WorkerContext, session: Session, participant: Participant, pairs: list[tuple[Clip, Clip]]
 ) -> acquisition.Floats:
     """(U, M) what other people would say about each pair: participants, or the paper's users while there are few."""
     others = records.models_of_others(session, participant.id, ModelKind.REWARD, OTHERS_LABELS, MOST_OTHERS)
     if len(others) >= 2:
-        segments = dataset.segment_pairs(place.store, pairs)
-        said = [learning.probability_right(place.store.read(model.artefact_sha256), segments) for model in others]
+        segments = dataset.segment_pairs(context.store, pairs)
+        said = [learning.probability_right(context.store.read(model.artefact_sha256), segments) for model in others]
         return np.array(said, np.float64)
     task = simulation.task(session.get_one(Study, participant.study_id).task)
-    returns = {clip.id: _stand_ins(place, task, clip) for pair in pairs for clip in pair}
+    returns = {clip.id: _stand_ins(context, task, clip) for pair in pairs for clip in pair}
     return acquisition.expected_answers(np.array([returns[right.id] - returns[left.id] for left, right in pairs]).T)
 
 
-def _stand_ins(place: Workplace, task: Task, clip: Clip) -> acquisition.Floats:
+def _stand_ins(context: WorkerContext, task: Task, clip: Clip) -> acquisition.Floats:
     """(3,) what the paper's users would feel about what a clip shows, by their own costs."""
-    shown, steps = dataset.shown(place.store, clip), slice(clip.first_step, clip.first_step + clip.step_count)
+    shown, steps = dataset.shown(context.store, clip), slice(clip.first_step, clip.first_step + clip.step_count)
     costs, signals = shown.costs[steps], shown.signals[steps]
     return np.array([preference_rewards(task, costs, signals, OMEGA[user]).sum() for user in User])
 
@@ -120,10 +124,10 @@ class _Choosing:
     """Gives places of a participant's plan their clips. No pair of clips is chosen twice, on whichever side."""
 
     def __init__(
-        self, place: Workplace, session: Session, participant: Participant, study: Study, lost: Collection[str]
+        self, context: WorkerContext, session: Session, participant: Participant, study: Study, lost: Collection[str]
     ) -> None:
         self._lost = lost
-        self._place, self._session, self._participant, self._study = place, session, participant, study
+        self._context, self._session, self._participant, self._study = context, session, participant, study
         asked = select(Query).where(Query.participant_id == participant.id)
         self._sides = {query.ordinal: (query.left_clip_id, query.right_clip_id) for query in session.scalars(asked)}
         self._used = {frozenset(sides) for sides in self._sides.values()}
@@ -166,7 +170,7 @@ class _Choosing:
         if not pairs:
             return []
         settings, participant = self._study.settings, self._participant
-        scores = _scores(self._place, self._session, participant, pairs, settings.strategy)
+        scores = _scores(self._context, self._session, participant, pairs, settings.strategy)
         choice = acquisition.choose(
             len(ordinals),
             len(pairs),
@@ -194,7 +198,7 @@ class _Choosing:
         pairs = self._unused(self._clips)
         if not pairs:
             return None
-        rows = query_plan.very_different(dataset.segment_pairs(self._place.store, pairs))
+        rows = query_plan.very_different(dataset.segment_pairs(self._context.store, pairs))
         return self._one_of([pairs[row] for row in rows], PRACTICE, rng)
 
     def _catch(self, slot: Slot, rng: np.random.Generator) -> dict[str, Any] | None:
@@ -202,7 +206,7 @@ class _Choosing:
 
         While the pool is growing the place stays free, unless there is nothing else to go on with.
         """
-        store = self._place.store
+        store = self._context.store
         candidates = [
             (pair, answer)
             for pair in self._unused(self._clips)
