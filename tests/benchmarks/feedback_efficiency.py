@@ -41,6 +41,7 @@ from worker.ml.rewards.pooled_prior import Prior
 from worker.ml.rewards.reward_models import RewardModel
 from worker.ml.rewards.reward_training import SignalScale
 from worker.ml.teachers import TASTES, Manner, ScriptedTeacher, Taste, User, random_taste
+from worker.responses import TARGETS
 from worker.sim.costs import preference_rewards, signal_weights
 from worker.tasks.registry import ENVIRONMENTS
 from worker.trajectory import Array, Trajectory
@@ -59,7 +60,6 @@ EARLIER_PEOPLE = range(100, 112)
 RULES: tuple[acquisition.Rule, ...] = ("uniform", "disagreement", "entropy", "information_gain", "contested")
 AS_IN_A_STUDY: tuple[acquisition.Rule, ...] = ("uniform", "entropy")
 """rules that are also run with the pooled prior and with foreseen signals: random ones, and the studio's default"""
-TARGETS = {"left": 0.0, "right": 1.0, "equal": 0.5}
 DRIVEN = {
     ("structured", "entropy", 50),
     ("structured", "entropy", 200),
