@@ -169,11 +169,9 @@ class _Run:
             "cpu_s": round(self.cpu_s, 1),
             "versions": _versions(),
             "curve": self.curve,
-            "test_scenarios": [POLICY_TEST.start, POLICY_TEST[count - 1]],
-            "test_mean_action": evaluate(self.test_env, policy.mean, POLICY_TEST.start, count),
-            "test_sampled_action": evaluate(
-                self.test_env, lambda state: policy.sample(state, rng), POLICY_TEST.start, count
-            ),
+            "test_scenarios": [first, first + count - 1],
+            "test_mean_action": evaluate(self.test_env, policy.mean, first, count),
+            "test_sampled_action": evaluate(self.test_env, lambda state: policy.sample(state, rng), first, count),
         }
         text = json.dumps(record, indent=2) + "\n"
         _replace(self.folder / "training.json", lambda path: path.write_text(text))
