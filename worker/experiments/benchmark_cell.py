@@ -4,9 +4,7 @@ Everything is done in the process that calls run_cell(), on one core, so that se
 """
 
 import hashlib
-import io
 import json
-import os
 import platform
 import time
 from collections.abc import Mapping, Sequence
@@ -40,6 +38,7 @@ from worker.responses import TARGETS
 from worker.scenarios import EVALUATION, POOL, first_of
 from worker.sim.costs import CostForm, preference_rewards
 from worker.trajectory import Trajectory
+from worker.whole_files import written_whole
 
 SMALLEST_POOL = 48
 """scenarios, as in a study"""
@@ -154,11 +153,8 @@ def _write(target: Path, record: dict[str, Any], driven: Sequence[Trajectory], l
         "costs": [each.costs.sum(axis=0, dtype=np.float64) for each in driven],
         "signals": [each.signals.sum(axis=0, dtype=np.float64) for each in driven],
     }
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, **arrays)
-    partial = target.with_name(f".{target.name}.{os.getpid()}")
-    partial.write_bytes(buffer.getvalue())
-    partial.replace(target)
+    with written_whole(target) as draft:
+        np.savez_compressed(draft, **arrays)
     return target
 
 
@@ -238,9 +234,8 @@ class Bench:
             return load_reward_model(path.read_bytes())
         model = self._fit(self.terms.reward)
         path.parent.mkdir(parents=True, exist_ok=True)
-        partial = path.with_name(f".{path.name}.{os.getpid()}")
-        partial.write_bytes(model.to_bytes())
-        partial.replace(path)
+        with written_whole(path) as draft:
+            draft.write_bytes(model.to_bytes())
         return load_reward_model(path.read_bytes())  # as stored, whoever was first
 
     def _action_reward(self) -> RewardModel:

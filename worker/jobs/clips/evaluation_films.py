@@ -21,6 +21,7 @@ from worker.compute import baseline_fitting, simulation
 from worker.compute.pools import Lane
 from worker.compute.simulation import RecordedClip
 from worker.jobs.clips import repairs
+from worker.jobs.clips.stored_video import video_columns
 from worker.jobs.learning import baselines
 from worker.jobs.learning.filters import NothingToLearnFrom
 from worker.jobs.runtime import due_work, records
@@ -144,7 +145,7 @@ def _stored(context: WorkerContext, recorded: RecordedClip) -> dict[str, Any]:
     return {
         "success": recorded.success,
         "trajectory_sha256": context.store.put(recorded.trajectory),
-        **repairs.stored(context, recorded.clip),
+        **video_columns(context.store, recorded.clip),
     }
 
 

@@ -15,7 +15,7 @@ from sqlalchemy.orm import Session
 
 from app.db import now
 from app.domain.models import Export
-from app.domain.studies import Deviation, Participant, Study
+from app.domain.studies import Deviation, Study
 from app.paths import DOCS
 from app.services.archives import archive, archive_reading, sealing
 from app.services.evaluation import unblinding
@@ -27,6 +27,7 @@ from app.services.runs import reports
 from app.services.studies import preregistration
 from app.storage import ArtefactMissing
 from worker.jobs.publishing import preference_arrays
+from worker.jobs.runtime import records
 from worker.jobs.runtime.context import Step, WorkerContext
 from worker.jobs.runtime.records import Job
 
@@ -66,7 +67,7 @@ def _made(context: WorkerContext, export_id: int, run_id: int) -> str | None:
     with context.database.reading() as session:
         export = session.get_one(Export, export_id)
         study_id, kind = export.study_id, ExportKind(export.kind)
-        gone = _gone(session, study_id)
+        gone = records.withdrawn_ids(session, study_id)
     with _workspace(context) as folder:
         path = folder / "export.zip"
         context.report(run_id, "writing the file", 0.1)
@@ -75,7 +76,7 @@ def _made(context: WorkerContext, export_id: int, run_id: int) -> str | None:
             missing = write(session, context, session.get_one(Study, study_id), path)
         byte_count, sha256 = path.stat().st_size, context.store.take(path)
     with context.database.writing() as session:
-        if _gone(session, study_id) != gone:
+        if records.withdrawn_ids(session, study_id) != gone:
             context.store.delete(sha256)
             return None
         export = session.get_one(Export, export_id)
@@ -98,11 +99,6 @@ def _workspace(context: WorkerContext) -> Iterator[Path]:
     base.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=base, prefix="export-") as folder:
         yield Path(folder)
-
-
-def _gone(session: Session, study_id: int) -> Sequence[int]:
-    people = select(Participant.id).where(Participant.study_id == study_id, Participant.withdrawn_at.is_not(None))
-    return session.scalars(people.order_by(Participant.id)).all()
 
 
 def write_data(session: Session, context: WorkerContext, study: Study, path: Path) -> Missing:
