@@ -26,7 +26,8 @@ from worker.ml.filters.filter_onnx import to_onnx
 from worker.ml.policies.gaussian import GaussianPolicy
 from worker.ml.policies.policy_onnx import policy_to_onnx
 from worker.ml.rewards import reward_training
-from worker.ml.rewards.reward_models import StructuredReward, load_reward_model
+from worker.ml.rewards.loading import load_reward_model
+from worker.ml.rewards.reward_models import StructuredReward
 from worker.trajectory import SIGNALS
 
 POLICY = invented.small_policy()

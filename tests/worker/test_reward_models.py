@@ -8,9 +8,10 @@ import torch
 
 from tests.worker import invented
 from worker.ml.rewards import bradley_terry, reward_training
+from worker.ml.rewards.loading import load_reward_model
 from worker.ml.rewards.network_training import MlpTraining, TransformerTraining
 from worker.ml.rewards.pooled_prior import DEVIATION
-from worker.ml.rewards.reward_models import CLIP, RewardModel, StructuredReward, load_reward_model, stored_config
+from worker.ml.rewards.reward_models import CLIP, RewardModel, StructuredReward, stored_config
 from worker.ml.rewards.reward_training import SignalScale, fit, posterior
 from worker.ml.rewards.segments import SegmentPairs
 from worker.trajectory import SIGNALS

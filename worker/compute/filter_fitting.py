@@ -23,7 +23,7 @@ from worker.ml.filters import filter_problem, mode_search, printed_filter, resid
 from worker.ml.filters.filter_module import FilterWeights
 from worker.ml.filters.filter_problem import Act, FilterAct, FilterConfig, FilterDraft, FilterProblem, Progress, Trial
 from worker.ml.filters.response_surface import ResponseSurface
-from worker.ml.rewards.reward_models import load_reward_model
+from worker.ml.rewards.loading import load_reward_model
 from worker.scenarios import EVALUATION, RESIDUAL, first_of
 from worker.trajectory import Trajectory
 

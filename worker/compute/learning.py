@@ -10,8 +10,9 @@ import numpy.typing as npt
 from worker.compute.simulation import environment, reference_policy, reference_rollouts, signal_predictor
 from worker.ml.filters.filter_problem import Act, noisy
 from worker.ml.rewards import reward_training
+from worker.ml.rewards.loading import load_reward_model
 from worker.ml.rewards.pooled_prior import prior_of
-from worker.ml.rewards.reward_models import RewardModel, load_reward_model
+from worker.ml.rewards.reward_models import RewardModel
 from worker.ml.rewards.reward_training import SignalScale
 from worker.ml.rewards.segments import SegmentPairs
 from worker.sim.rollout import rollout

@@ -8,7 +8,7 @@ from tqdm import tqdm
 
 from worker.compute import simulation
 from worker.ml.policies import pretraining
-from worker.ml.policies.demonstrations import Demonstrate
+from worker.ml.policies.imitation import Demonstrate
 from worker.ml.policies.sac import SacConfig
 from worker.tasks.drinking.demonstrator import scripted_pouring
 

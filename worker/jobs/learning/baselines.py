@@ -27,7 +27,7 @@ from worker.jobs.runtime import due_work, records
 from worker.jobs.runtime.context import Step, WorkerContext
 from worker.jobs.runtime.records import Job
 from worker.ml.policies.checkpoint import ask_to_pause, share_done
-from worker.ml.rewards.reward_models import load_reward_model
+from worker.ml.rewards.loading import load_reward_model
 from worker.scenarios import EVALUATION, first_of
 from worker.trajectory import Trajectory
 

@@ -19,8 +19,9 @@ import torch
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from worker.ml.policies.demonstrations import Demonstrate, Demonstrations, collect, imitate
+from worker.ml.policies.demonstrations import Demonstrations
 from worker.ml.policies.gaussian import GaussianPolicy
+from worker.ml.policies.imitation import Demonstrate, collect, imitate
 from worker.ml.policies.sac import Actor, Array, Env, Learner, Replay, SacConfig
 from worker.scenarios import POLICY_SELECTION, POLICY_TEST, POLICY_TRAINING
 from worker.spaces import Field
