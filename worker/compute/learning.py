@@ -49,13 +49,13 @@ def fit_reward(
     is no reference policy to normalise over, and what the person was shown takes its place.
     Raises ValueError for a kind there is not, and laboratory.NoPredictor where the task's signals cannot be foreseen.
     """
-    if kind not in get_args(reward_training.Kind):
+    if kind not in get_args(reward_training.RewardKind):
         raise ValueError(f"There is no reward model of the kind {kind!r}.")
     prior = prior_of([_model(each) for each in earlier], scale.spread)
     fitted = reward_training.fit(
         pairs,
         targets,
-        cast(reward_training.Kind, kind),
+        cast(reward_training.RewardKind, kind),
         seed,
         scale=scale,
         reference=reference_rollouts(task) if recorded_signals is None else (),

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from worker.analysis.comparison import Cells, Row, Run, cost_rows, personalisation_rows, pooled, table_rows
+from worker.analysis.comparison import Cells, EvaluatedCell, Row, cost_rows, personalisation_rows, pooled, table_rows
 from worker.analysis.pareto import pareto_svg
 from worker.analysis.table_files import METHOD, to_csv, to_markdown
 from worker.compute import simulation
@@ -235,7 +235,7 @@ def _finished(terms: Terms, work: Path) -> Iterator[tuple[dict[str, Any], dict[s
         yield record, arrays, taste
 
 
-def _run(record: dict[str, Any], arrays: dict[str, Any], terms: Terms, tastes: dict[str, Taste]) -> Run:
+def _run(record: dict[str, Any], arrays: dict[str, Any], terms: Terms, tastes: dict[str, Taste]) -> EvaluatedCell:
     """r^H is linear in the measured sums, so every user can judge every run."""
     task = simulation.task(record["task"])
     true, at_stake = (
@@ -245,7 +245,7 @@ def _run(record: dict[str, Any], arrays: dict[str, Any], terms: Terms, tastes: d
         }
         for of in (preference_rewards, stakes)
     )
-    return Run(
+    return EvaluatedCell(
         record["task"],
         record["taste"]["name"],
         record["method"],
@@ -261,7 +261,7 @@ def _run(record: dict[str, Any], arrays: dict[str, Any], terms: Terms, tastes: d
     )
 
 
-def _order(run: Run) -> tuple[int, int, int, str]:
+def _order(run: EvaluatedCell) -> tuple[int, int, int, str]:
     users = [*PAPER_USERS, *OPPOSED_USERS, *INDIRECT_USERS]
     user = users.index(run.user) if run.user in users else len(users)
     return list(ENVIRONMENTS).index(run.task), user, list(METHODS).index(run.method), run.user

@@ -59,9 +59,9 @@ class Terms:
 
     labels: int = 200
     scenarios: int = 500
-    reward: reward_training.Kind = "structured"
+    reward: reward_training.RewardKind = "structured"
     form: CostForm = "calibrated"
-    rule: acquisition.Rule = "entropy"
+    rule: acquisition.Strategy = "entropy"
     """which pairs are asked; the studio's default, for every method alike"""
     manner: Manner = field(default_factory=Manner)
     """how the scripted users err; none of them skips"""
@@ -213,7 +213,7 @@ class Bench:
 
     def _scores(
         self, candidates: npt.NDArray[np.int64], asked: npt.NDArray[np.int64], targets: Floats
-    ) -> tuple[acquisition.Rule, Floats | None]:
+    ) -> tuple[acquisition.Strategy, Floats | None]:
         """The first labels are chosen at random, later ones by a structured model of those before."""
         if self.terms.rule == "uniform" or not len(asked):
             return "uniform", None
@@ -242,7 +242,7 @@ class Bench:
     def _action_reward(self) -> RewardModel:
         return self.reward if can_rank(self.reward) else self._fit("mlp")
 
-    def _fit(self, kind: reward_training.Kind) -> RewardModel:
+    def _fit(self, kind: reward_training.RewardKind) -> RewardModel:
         return reward_training.fit(
             self.labelled,
             self.targets,

@@ -21,7 +21,7 @@ from app.services.archives import archive, archive_reading, sealing
 from app.services.evaluation import unblinding
 from app.services.exports import export_formats, export_requests, export_rows, export_tables
 from app.services.exports.csv_cells import json_text
-from app.services.exports.export_formats import Kind, Provenance, Table
+from app.services.exports.export_formats import ColumnKind, RowProvenance, Table
 from app.services.exports.export_requests import ExportKind
 from app.services.runs import reports
 from app.services.studies import preregistration
@@ -35,12 +35,12 @@ Missing = Mapping[str, Sequence[str]]
 """Hashes of stored files that could not be had, by what they are."""
 
 _ARROW = {
-    Kind.TEXT: pa.string(),
-    Kind.INTEGER: pa.int64(),
-    Kind.NUMBER: pa.float64(),
-    Kind.BOOLEAN: pa.bool_(),
-    Kind.TIME: pa.timestamp("ms", "UTC"),
-    Kind.JSON: pa.string(),
+    ColumnKind.TEXT: pa.string(),
+    ColumnKind.INTEGER: pa.int64(),
+    ColumnKind.NUMBER: pa.float64(),
+    ColumnKind.BOOLEAN: pa.bool_(),
+    ColumnKind.TIME: pa.timestamp("ms", "UTC"),
+    ColumnKind.JSON: pa.string(),
 }
 
 
@@ -120,7 +120,9 @@ def write_data(session: Session, context: WorkerContext, study: Study, path: Pat
     return missing
 
 
-def _write_table(target: zipfile.ZipFile, session: Session, study: Study, table: Table, provenance: Provenance) -> None:
+def _write_table(
+    target: zipfile.ZipFile, session: Session, study: Study, table: Table, provenance: RowProvenance
+) -> None:
     for kind, write in (("csv", export_formats.csv_lines), ("jsonl", export_formats.json_lines)):
         with target.open(f"{kind}/{table.name}.{kind}", "w") as stream:
             for line in write(table, session, study, provenance):
@@ -129,7 +131,7 @@ def _write_table(target: zipfile.ZipFile, session: Session, study: Study, table:
         parquet.write_table(arrow_table(table, session, study, provenance), stream)
 
 
-def arrow_table(table: Table, session: Session, study: Study, provenance: Provenance) -> pa.Table:
+def arrow_table(table: Table, session: Session, study: Study, provenance: RowProvenance) -> pa.Table:
     """The table with typed columns; json columns are text, and meanings are kept with the columns."""
     columns = table.all_columns
     rows = [(*values, *provenance.values) for values in table.rows(session, study)]
@@ -144,8 +146,8 @@ def arrow_table(table: Table, session: Session, study: Study, provenance: Proven
     return pa.Table.from_arrays(arrays, schema=pa.schema(fields))
 
 
-def _arrow_value(kind: Kind, value: Any) -> Any:
-    return json_text(value) if kind is Kind.JSON and value is not None else value
+def _arrow_value(kind: ColumnKind, value: Any) -> Any:
+    return json_text(value) if kind is ColumnKind.JSON and value is not None else value
 
 
 def _write_report(
@@ -181,7 +183,7 @@ def _write_pairs(
     return written
 
 
-def _provenance(session: Session, study: Study, provenance: Provenance) -> dict[str, Any]:
+def _provenance(session: Session, study: Study, provenance: RowProvenance) -> dict[str, Any]:
     """Everything that says what this study was and what these files are."""
     deviations = session.scalars(select(Deviation).where(Deviation.study_id == study.id).order_by(Deviation.id))
     return {
@@ -209,7 +211,7 @@ def _provenance(session: Session, study: Study, provenance: Provenance) -> dict[
 
 
 def _readme(
-    study: Study, provenance: Provenance, about: dict[str, Any], pictures: Sequence[str], people: Sequence[str]
+    study: Study, provenance: RowProvenance, about: dict[str, Any], pictures: Sequence[str], people: Sequence[str]
 ) -> str:
     listed = [f"* {each['at']}, {each['actor']}: {' '.join(each['reason'].split())}" for each in about["deviations"]]
     lost = [f"* {what}: {', '.join(hashes)}" for what, hashes in about["missing"].items()]

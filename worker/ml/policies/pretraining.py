@@ -27,7 +27,7 @@ from worker.scenarios import POLICY_SELECTION, POLICY_TEST, POLICY_TRAINING
 from worker.spaces import Field
 from worker.whole_files import written_whole
 
-Progress = Callable[[int, dict[str, float]], None]
+TrainingProgress = Callable[[int, dict[str, float]], None]
 """Called with the number of environment steps done so far and the newest figures."""
 
 INPUT_SCALE = {"m": 3.0, "rad": 1.0, "1": 1.0, "N": 0.1}
@@ -39,7 +39,7 @@ def pretrain(
     make_env: Callable[[], Env],
     config: SacConfig,
     checkpoint_dir: Path,
-    progress: Progress | None = None,
+    progress: TrainingProgress | None = None,
     command: str = "",
     demonstrate: Demonstrate | None = None,
 ) -> dict[str, Any]:
