@@ -30,7 +30,7 @@ WANTED_RATIO = {"feeding": 10, "drinking": 20, "scratching": 12}
 PELLETS = (16, 32, 64)
 
 RESETS = 300
-CHECKPOINTS = Path(worker.__file__).parent / "checkpoints"
+TASKS = Path(worker.__file__).parent / "tasks"
 
 
 def main() -> None:
@@ -53,7 +53,7 @@ def main() -> None:
 
 def _row(label: str, name: str, make: Callable[[], AssistiveEnv], episodes: int) -> None:
     env, rng = make(), np.random.default_rng(0)
-    policy = GaussianPolicy.load(CHECKPOINTS / name / "policy.safetensors")
+    policy = GaussianPolicy.load(TASKS / name / "checkpoint" / "policy.safetensors")
     env.reset(seed=0)
     reset_s = _cpu_s(lambda: [env.reset(seed=scenario) for scenario in range(RESETS)]) / RESETS
     acting_s, physics_share = _stepping(env, lambda _: rng.uniform(-1, 1, 7).astype(np.float32), episodes)

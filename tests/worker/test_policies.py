@@ -10,7 +10,7 @@ import torch
 import worker
 from worker.ml.policies.gaussian import ACTION_STD_FLOOR, GaussianPolicy
 
-CHECKPOINT = Path(worker.__file__).parent / "checkpoints" / "feeding" / "policy.safetensors"
+CHECKPOINT = Path(worker.__file__).parent / "tasks" / "feeding" / "checkpoint" / "policy.safetensors"
 
 
 @pytest.fixture(scope="module")

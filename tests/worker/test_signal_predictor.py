@@ -141,7 +141,7 @@ def test_a_model_without_a_predictor_is_refused_in_words() -> None:
 def test_a_task_whose_signals_cannot_be_foreseen_says_what_to_do(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(simulation, "CHECKPOINTS", tmp_path)
+    monkeypatch.setattr(simulation, "TASKS", tmp_path)
     simulation.signal_predictor.cache_clear()
     with pytest.raises(simulation.NoPredictor, match="python -m worker foresee --task drinking"):
         simulation.signal_predictor("drinking")

@@ -24,7 +24,7 @@ from worker.tasks.drinking.environment import (
 )
 from worker.tasks.drinking.water import Cup
 
-REFERENCE_POLICY = Path(worker.__file__).parent / "checkpoints" / "drinking" / "policy.safetensors"
+REFERENCE_POLICY = Path(worker.__file__).parent / "tasks" / "drinking" / "checkpoint" / "policy.safetensors"
 STILL = np.zeros(7, np.float32)
 TIP = np.array([0, 0, 0, 0, 0, 0, 1], np.float32)
 SWING = np.array([1, 0, 0, 0, 0, 0, 0], np.float32)

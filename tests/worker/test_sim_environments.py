@@ -24,7 +24,7 @@ from worker.sim.seated_person import PERSON, add_person
 from worker.tasks.registry import ENVIRONMENTS
 from worker.trajectory import BODIES, SIGNALS
 
-CHECKPOINTS = Path(worker.__file__).parent / "checkpoints"
+TASKS = Path(worker.__file__).parent / "tasks"
 STILL = np.zeros(7, np.float32)
 
 
@@ -41,7 +41,7 @@ def env(kind: type[AssistiveEnv]) -> Iterator[AssistiveEnv]:
 
 
 def policy_for(kind: type[AssistiveEnv]) -> GaussianPolicy:
-    return GaussianPolicy.load(CHECKPOINTS / kind.task.name / "policy.safetensors")
+    return GaussianPolicy.load(TASKS / kind.task.name / "checkpoint" / "policy.safetensors")
 
 
 def field(env: AssistiveEnv, observation: np.ndarray, name: str) -> np.ndarray:

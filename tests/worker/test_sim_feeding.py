@@ -15,7 +15,7 @@ from worker.tasks.feeding.environment import FEEDING, SPOON, START, FeedingEnv
 from worker.tasks.feeding.food import BALLS
 
 EPISODE_STEPS = FEEDING.episode_steps
-REFERENCE_POLICY = Path(worker.__file__).parent / "checkpoints" / "feeding" / "policy.safetensors"
+REFERENCE_POLICY = Path(worker.__file__).parent / "tasks" / "feeding" / "checkpoint" / "policy.safetensors"
 
 
 @pytest.fixture(scope="module")

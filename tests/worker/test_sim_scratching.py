@@ -25,7 +25,7 @@ from worker.tasks.scratching.environment import (
 )
 from worker.tasks.scratching.yielding_arm import FOREARM, UPPER_ARM, YieldingArm
 
-REFERENCE_POLICY = Path(worker.__file__).parent / "checkpoints" / "scratching" / "policy.safetensors"
+REFERENCE_POLICY = Path(worker.__file__).parent / "tasks" / "scratching" / "checkpoint" / "policy.safetensors"
 
 
 @pytest.fixture(scope="module")

@@ -26,7 +26,7 @@ from worker.task import Task
 from worker.tasks.registry import ENVIRONMENTS
 from worker.trajectory import Array, Trajectory
 
-CHECKPOINTS = Path(worker.__file__).resolve().parent / "checkpoints"
+TASKS = Path(worker.__file__).resolve().parent / "tasks"
 
 REFERENCE_SCENARIOS = 2_000_000_000
 """First of the scenarios over which reward models are normalised."""
@@ -97,7 +97,7 @@ def _scene() -> Scene:
 
 def checkpoints(name: str) -> Path:
     """The folder with the task's trained policy and response surface."""
-    return CHECKPOINTS / environment_class(name).task.name
+    return TASKS / environment_class(name).task.name / "checkpoint"
 
 
 def surface_file(task: str) -> Path:
