@@ -9,6 +9,7 @@ import pytest
 
 from worker.compute import simulation
 from worker.compute.behaviours import Behaviour
+from worker.tasks import registry
 from worker.trajectory import Trajectory
 
 
@@ -39,5 +40,5 @@ def test_the_reference_rollouts_are_the_frozen_policys_own() -> None:
 
 
 def test_an_unknown_task_is_named_with_those_that_are_known() -> None:
-    with pytest.raises(simulation.UnknownTask, match="no task named 'dressing'; this installation knows feeding"):
-        simulation.task("dressing")
+    with pytest.raises(registry.UnknownTask, match="no task named 'dressing'; this installation knows feeding"):
+        registry.task("dressing")

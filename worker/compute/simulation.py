@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-import worker
+from installed_tasks import catalogue
 from worker.compute.behaviours import Behaviour, SlowWaves, draw_behaviours
 from worker.ml.policies.gaussian import GaussianPolicy
 from worker.ml.rewards.signal_predictor import SignalPredictor
@@ -23,10 +23,8 @@ from worker.sim.render.clip import STYLES, ClipRenderer, RenderedClip
 from worker.sim.render.scene import Scene
 from worker.sim.rollout import rollout
 from worker.task import Task
-from worker.tasks.registry import ENVIRONMENTS
+from worker.tasks.registry import checkpoint, environment_class, filmed_task, task
 from worker.trajectory import Array, Trajectory
-
-TASKS = Path(worker.__file__).resolve().parent / "tasks"
 
 REFERENCE_SCENARIOS = 2_000_000_000
 """First of the scenarios over which reward models are normalised."""
@@ -36,11 +34,11 @@ Act = Callable[[Array], Array]
 """observation (D,) -> action (7,)"""
 
 
-class UnknownTask(ValueError):
-    """This installation cannot simulate the task."""
+class NoPolicy(ValueError):
+    """Nothing was trained that does the task."""
 
-    def __init__(self, name: str) -> None:
-        super().__init__(f"There is no task named {name!r}; this installation knows {', '.join(ENVIRONMENTS)}.")
+    def __init__(self, task: str, file: Path) -> None:
+        super().__init__(f"The task {task} has no policy {file}: run python -m worker pretrain --task {task}.")
 
 
 class NoPredictor(ValueError):
@@ -61,32 +59,20 @@ class RecordedClip:
 
 def warm_up() -> None:
     """Import and build what making clips needs, so that the first clip comes quickly."""
-    environment("feeding")
+    environment(catalogue.usual())
     renderer("sharp")
-
-
-def environment_class(name: str) -> type[AssistiveEnv]:
-    """The environment of a task. Raises UnknownTask."""
-    if name not in ENVIRONMENTS:
-        raise UnknownTask(name)
-    return ENVIRONMENTS[name]
-
-
-def task(name: str) -> Task:
-    """The description of a task. Raises UnknownTask."""
-    return environment_class(name).task
 
 
 @cache
 def environment(name: str) -> AssistiveEnv:
-    """This process' environment of a task."""
+    """This process' environment of a task. Raises UnknownTask and TaskBroken."""
     return environment_class(name)()
 
 
 @cache
 def renderer(quality: str) -> ClipRenderer:
     """This process' renderer of clips in a quality."""
-    return ClipRenderer(STYLES[quality], scene=_scene())
+    return ClipRenderer(filmed_task, STYLES[quality], _scene())
 
 
 @cache
@@ -95,19 +81,14 @@ def _scene() -> Scene:
     return Scene()
 
 
-def checkpoints(name: str) -> Path:
-    """The folder with the task's trained policy and response surface."""
-    return TASKS / environment_class(name).task.name / "checkpoint"
-
-
-def surface_file(task: str) -> Path:
+def surface_file(name: str) -> Path:
     """Where a task's response surface is kept; its record lies beside it."""
-    return checkpoints(task) / "response_surface.safetensors"
+    return checkpoint(name) / "response_surface.safetensors"
 
 
 def predictor_file(name: str) -> Path:
     """Where a task's predictor of signals is kept; its record lies beside it."""
-    return checkpoints(name) / "signal_predictor.safetensors"
+    return checkpoint(name) / "signal_predictor.safetensors"
 
 
 @cache
@@ -120,13 +101,16 @@ def signal_predictor(name: str) -> SignalPredictor:
 
 @cache
 def reference_policy(name: str, early: str = "") -> GaussianPolicy:
-    """The frozen policy of a task that ships with the studio, or one from an early stage of its training."""
-    return GaussianPolicy.load(checkpoints(name) / (f"early/{early}.safetensors" if early else "policy.safetensors"))
+    """The frozen policy that lies in a task's folder, or one from an early stage of its training. Raises NoPolicy."""
+    file = checkpoint(name) / (f"early/{early}.safetensors" if early else "policy.safetensors")
+    if not file.exists():
+        raise NoPolicy(name, file)
+    return GaussianPolicy.load(file)
 
 
 def early_policies(name: str) -> list[str]:
     """Names of the early policies that ship with a task."""
-    return sorted(path.stem for path in (checkpoints(name) / "early").glob("*.safetensors"))
+    return sorted(path.stem for path in (checkpoint(name) / "early").glob("*.safetensors"))
 
 
 def behaviours(name: str, scenario: int, count: int) -> list[Behaviour]:

@@ -1,11 +1,21 @@
-"""The simulated robot, people and tasks. Importing this package registers its environments with Gymnasium."""
+"""The simulated robot and people. Importing this package registers every installed task with Gymnasium.
+
+The task ``feed_me`` is ``pbarl/FeedMe-v0``; its code is imported when one is made.
+"""
 
 import gymnasium
 
-FEEDING = "pbarl/Feeding-v0"
-DRINKING = "pbarl/Drinking-v0"
-SCRATCHING = "pbarl/Scratching-v0"
+from installed_tasks import catalogue
 
-gymnasium.register(FEEDING, entry_point="worker.tasks.feeding.environment:FeedingEnv", max_episode_steps=None)
-gymnasium.register(DRINKING, entry_point="worker.tasks.drinking.environment:DrinkingEnv", max_episode_steps=None)
-gymnasium.register(SCRATCHING, entry_point="worker.tasks.scratching.environment:ScratchingEnv", max_episode_steps=None)
+
+def gymnasium_id(task: str) -> str:
+    """The name under which Gymnasium knows a task."""
+    return f"pbarl/{''.join(word.capitalize() for word in task.split('_'))}-v0"
+
+
+for _task in catalogue.installed().tasks.values():
+    gymnasium.register(
+        gymnasium_id(_task.name),
+        entry_point=f"{_task.package}.{_task.description.environment}",
+        max_episode_steps=None,
+    )

@@ -12,7 +12,7 @@ from app.domain.clips import Clip
 from app.domain.models import ModelKind
 from app.domain.preferences import LEARNED_FROM, Purpose, Query
 from app.domain.studies import Participant, Strategy, Study
-from worker.compute import learning, simulation
+from worker.compute import learning
 from worker.jobs.learning import dataset, query_plan
 from worker.jobs.learning.query_plan import Slot
 from worker.jobs.runtime import records
@@ -21,6 +21,7 @@ from worker.ml import acquisition
 from worker.ml.teachers import OMEGA, User
 from worker.sim.costs import preference_rewards
 from worker.task import Task
+from worker.tasks import registry
 
 log = logging.getLogger("worker.jobs.learning.query_selection")
 
@@ -104,7 +105,7 @@ def _answers_of_others(
         segments = dataset.segment_pairs(place.store, pairs)
         said = [learning.probability_right(place.store.read(model.artefact_sha256), segments) for model in others]
         return np.array(said, np.float64)
-    task = simulation.task(session.get_one(Study, participant.study_id).task)
+    task = registry.task(session.get_one(Study, participant.study_id).task)
     returns = {clip.id: _stand_ins(place, task, clip) for pair in pairs for clip in pair}
     return acquisition.expected_answers(np.array([returns[right.id] - returns[left.id] for left, right in pairs]).T)
 

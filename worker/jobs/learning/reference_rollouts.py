@@ -6,6 +6,7 @@ from worker.compute.filter_fitting import CHUNK
 from worker.compute.pools import Computing, Lane
 from worker.jobs.learning.filters import filter_config
 from worker.ml.filters import filter_problem
+from worker.tasks import registry
 from worker.trajectory import Trajectory
 
 
@@ -19,7 +20,7 @@ def make_ready(
     """
     policy = simulation.reference_policy(task)
     if settings.method is Method.STUDIO:
-        filter_problem.trace(simulation.task(task).modes, policy)
+        filter_problem.trace(registry.task(task).modes, policy)
     act = policy.mean
     for scenarios in reference_blocks(task, settings):
         key, made = (task, scenarios), list[Trajectory]()
@@ -32,7 +33,7 @@ def make_ready(
 def reference_blocks(task: str, settings: StudySettings) -> list[range]:
     """The scenarios in which filters of such a study are compared with the reference policy."""
     config = filter_config(settings)
-    gate = [config.gate_block(simulation.task(task))] if settings.method is Method.STUDIO else []
+    gate = [config.gate_block(registry.task(task))] if settings.method is Method.STUDIO else []
     return [*gate, filter_problem.scenarios_for("evaluation", config.evaluation_scenarios)]
 
 
