@@ -76,7 +76,7 @@ $(VENV)/torch.stamp: $(VENV)/bin/python
 	else $(PIP) install "torch==$(TORCH_VERSION)"; fi
 	@touch $@
 
-$(VENV)/run.stamp: requirements.lock $(VENV)/torch.stamp
+$(VENV)/run.stamp: requirements.lock pyproject.toml $(VENV)/torch.stamp
 	@install/engine.sh $(VENV)
 	@echo "Installing pinned dependencies ..."
 	@$(PIP) install --no-deps --require-hashes -r requirements.lock

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Self
 from xml.etree import ElementTree
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic_core import ErrorDetails
 
 DESCRIPTION, PICTURE, CHECKPOINT = "task.toml", "picture.svg", "checkpoint"
 SHORTEST_CLIP_STEPS, LONGEST_CLIP_STEPS = 20, 600
@@ -21,12 +22,19 @@ _GEOMETRY = {*("class", "d", "points", "transform", "width", "height"), *("cx", 
 
 def _flowing(text: str) -> str:
     """An empty line makes a paragraph; other line breaks are those of the file."""
+    if "{" in text or "}" in text:
+        raise ValueError("must not have braces, which mean a variable in the texts of pages")
     return "\n\n".join(" ".join(paragraph.split()) for paragraph in re.split(r"\n\s*\n", text.strip()))
 
 
+_EXPLAINED = {
+    "missing": "is missing",
+    "extra_forbidden": "is not known here",
+    "string_pattern_mismatch": "must be like module:name, a name in a module of the package",
+}
+
 _Word = Annotated[str, Field(min_length=1, max_length=200)]
-_Text = Annotated[str, Field(min_length=1, max_length=4000, pattern=r"^[^{}]*$"), AfterValidator(_flowing)]
-"""Braces would be Fluent."""
+_Text = Annotated[str, Field(min_length=1, max_length=4000), AfterValidator(_flowing)]
 _Reference = Annotated[str, Field(pattern=r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*$")]
 """An object of the task's package: ``module:name``."""
 
@@ -78,9 +86,7 @@ class TaskDescription(BaseModel):
     @model_validator(mode="after")
     def _shown_within_the_episode(self) -> Self:
         if self.usual_clip_steps > self.episode_steps:
-            raise ValueError(
-                f"usual_clip_steps is {self.usual_clip_steps}, more than the {self.episode_steps} steps of an episode"
-            )
+            raise ValueError(f"usual_clip_steps: must not be more than the {self.episode_steps} steps of an episode")
         return self
 
 
@@ -113,8 +119,12 @@ def _description(file: Path) -> TaskDescription:
     except tomllib.TOMLDecodeError as error:
         raise TaskRefused(f"{file} is not valid TOML: {error}.") from error
     except ValidationError as error:
-        wrong = [f"{'.'.join(map(str, each['loc']))}: {each['msg']}".removeprefix(": ") for each in error.errors()]
-        raise TaskRefused(f"{file}: {'; '.join(wrong)}.") from error
+        raise TaskRefused(f"{file}: {'; '.join(map(_in_words, error.errors()))}.") from error
+
+
+def _in_words(wrong: ErrorDetails) -> str:
+    said = _EXPLAINED.get(wrong["type"], wrong["msg"].removeprefix("Value error, "))
+    return f"{'.'.join(map(str, wrong['loc']))}: {said}".removeprefix(": ")
 
 
 def _picture(file: Path) -> str:

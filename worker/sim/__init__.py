@@ -1,6 +1,6 @@
 """The simulated robot and people. Importing this package registers every installed task with Gymnasium.
 
-The task ``feed_me`` is ``pbarl/FeedMe-v0``; its code is imported when one is made.
+The task ``wipe_mouth`` is ``pbarl/WipeMouth-v0``; its code is imported when one is made.
 """
 
 import gymnasium
@@ -8,14 +8,13 @@ import gymnasium
 from installed_tasks import catalogue
 
 
-def gymnasium_id(task: str) -> str:
-    """The name under which Gymnasium knows a task."""
-    return f"pbarl/{''.join(word.capitalize() for word in task.split('_'))}-v0"
+def register_tasks() -> None:
+    """Tell Gymnasium of every task that it does not know yet."""
+    for task in catalogue.installed().tasks.values():
+        name = f"pbarl/{''.join(word.capitalize() for word in task.name.split('_'))}-v0"
+        if name not in gymnasium.registry:
+            entry_point = f"{task.package}.{task.description.environment}"
+            gymnasium.register(name, entry_point=entry_point, max_episode_steps=None)
 
 
-for _task in catalogue.installed().tasks.values():
-    gymnasium.register(
-        gymnasium_id(_task.name),
-        entry_point=f"{_task.package}.{_task.description.environment}",
-        max_episode_steps=None,
-    )
+register_tasks()
