@@ -20,8 +20,8 @@ run: $(VENV)/run.stamp ## Install what is missing, then start web server and wor
 link: $(VENV)/run.stamp ## Add a participant to the newest study and print the personal link
 	@$(PY) -m app link
 
-demo: $(VENV)/run.stamp ## Make a demo study of a task and print a participant link (TASK=feeding, drinking or scratching)
-	@$(PY) -m app demo --task $(or $(TASK),feeding)
+demo: $(VENV)/run.stamp ## Make a demo study of a task and print a participant link (TASK=drinking)
+	@$(PY) -m app demo $(if $(TASK),--task $(TASK))
 
 rehearse: $(VENV)/run.stamp ## Run scripted participants through the real pages to downloaded bundles (ARGS="--help")
 	@$(PY) -m worker rehearse $(ARGS)

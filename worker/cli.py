@@ -31,6 +31,8 @@ from worker.tasks.registry import checkpoint
 
 def run(arguments: Sequence[str] | None) -> int:
     """Parse the command line and do what it says; returns the exit code."""
+    for task in catalogue.installed().broken:
+        sys.stderr.write(f"{task.why}\n")
     options = parser().parse_args(arguments)
     result: int = options.act(options)
     return result

@@ -11,6 +11,7 @@ from app.domain.studies import Study, StudySettings
 from app.services.studies import studies
 from tests import factories
 from tests.app.conftest import agree
+from tests.app.study_pages import typed
 
 
 @pytest.fixture
@@ -74,6 +75,24 @@ def test_a_task_that_this_worker_does_not_know_is_a_failure_with_a_reason(
     page = experimenter.get("/studies/pilot").text
     assert "There is no task named &#39;dressing&#39;" in page
     assert "Try again" in page
+
+
+@pytest.mark.parametrize("task", ["dressing"])
+def test_a_study_of_an_unknown_task_can_be_changed_and_keeps_it(
+    experimenter: TestClient, study: Study, database: Database
+) -> None:
+    experimenter.post("/studies/pilot/settings", data=typed(experimenter, "/studies/pilot/settings", name="Renamed"))
+    with database.reading() as session:
+        changed = session.get_one(Study, study.id)
+        assert (changed.name, changed.task) == ("Renamed", "dressing")
+    for page in (
+        "/studies",
+        "/studies/pilot",
+        "/studies/pilot/results",
+        "/studies/pilot/answers",
+        "/studies/new?like=pilot",
+    ):
+        assert experimenter.get(page).status_code == 200
 
 
 @pytest.mark.parametrize("task", ["dressing"])
