@@ -25,6 +25,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 from tqdm import tqdm
+from worker.responses import TARGETS
 
 from installed_tasks import catalogue
 from tests.benchmarks import feedback_report
@@ -60,7 +61,6 @@ EARLIER_PEOPLE = range(100, 112)
 RULES: tuple[acquisition.Rule, ...] = ("uniform", "disagreement", "entropy", "information_gain", "contested")
 AS_IN_A_STUDY: tuple[acquisition.Rule, ...] = ("uniform", "entropy")
 """rules that are also run with the pooled prior and with foreseen signals: random ones, and the studio's default"""
-TARGETS = {"left": 0.0, "right": 1.0, "equal": 0.5}
 DRIVEN = {
     ("structured", "entropy", 50),
     ("structured", "entropy", 200),

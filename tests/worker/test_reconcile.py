@@ -13,6 +13,7 @@ from app.domain.models import Run, RunKind, RunStatus
 from app.domain.preferences import Exclusion, LabelEvent, Query, Response
 from app.domain.protocol import EvaluationSettings
 from app.domain.studies import Participant, Study, StudySettings
+from tests.worker.invented import job_of
 from worker.jobs import reconcile
 from worker.jobs.runtime import due_work, records
 
@@ -24,8 +25,8 @@ Answer = Callable[[Clip, Clip, Response], Query]
 def found(database: Database) -> Callable[[], dict[str, int]]:
     def look() -> dict[str, int]:
         with database.reading() as session:
-            found = reconcile.findings(session)
-            return {job.finding: attempt for job, attempt in found if job.kind is not RunKind.REPORT}
+            found = reconcile.due(session)
+            return {job.key: attempt for job, attempt in found if job.kind is not RunKind.REPORT}
 
     return look
 
@@ -42,9 +43,9 @@ def labels(add_clips: AddClips, answer: Answer, study: Study) -> Callable[[int],
     return give
 
 
-def succeed(database: Database, finding: str) -> None:
+def succeed(database: Database, key: str) -> None:
     with database.writing() as session:
-        session.add(Run(workflow_id=finding, kind="reward", study_id=1, status=RunStatus.SUCCEEDED))
+        session.add(Run(workflow_id=key, kind="reward", study_id=1, status=RunStatus.SUCCEEDED))
 
 
 def test_a_new_study_needs_clips_a_few_scenarios_at_a_time(study: Study, found: Callable[[], dict[str, int]]) -> None:
@@ -109,7 +110,7 @@ def test_a_running_run_is_left_alone_until_nobody_has_heard_of_it_for_a_minute(
     database: Database, labels: Callable[[int], list[Query]], found: Callable[[], dict[str, int]]
 ) -> None:
     labels(10)
-    job = records.Job("reward/participant-1/labels-10", RunKind.REWARD, 1, 1, 10)
+    job = job_of("reward/participant-1/labels-10", 1)
     with database.writing() as session:
         run_id = records.begin_run(session, job, seed=5)
     assert found() == {}
@@ -126,19 +127,19 @@ def test_a_failed_run_is_tried_again_a_few_times_and_then_only_when_somebody_ask
     database: Database, labels: Callable[[int], list[Query]], found: Callable[[], dict[str, int]]
 ) -> None:
     labels(10)
-    job = records.Job("reward/participant-1/labels-10", RunKind.REWARD, 1, 1, 10)
+    job = job_of("reward/participant-1/labels-10", 1)
     for attempt in range(1, records.ATTEMPTS + 1):
-        assert found() == {job.finding: attempt}
+        assert found() == {job.key: attempt}
         with database.writing() as session:
             run_id = records.begin_run(session, job, seed=5)
-            records.fail_run(session, job.finding, "it broke")
+            records.fail_run(session, job.key, "it broke")
         assert found() == {}, "a failed run waits before it is tried again"
         with database.writing() as session:
             session.get_one(Run, run_id).finished_at = now() - timedelta(hours=1)
     assert found() == {}
     with database.writing() as session:
         session.get_one(Run, run_id).status = RunStatus.RETRY
-    assert found() == {job.finding: records.ATTEMPTS + 1}
+    assert found() == {job.key: records.ATTEMPTS + 1}
 
 
 def test_milestones_that_were_passed_in_the_meantime_are_skipped() -> None:

@@ -48,7 +48,7 @@ class Finished:
 
 
 @dataclass(frozen=True)
-class Fitting:
+class FilterFit:
     """One filter in the making."""
 
     task: str

@@ -35,6 +35,7 @@ from worker.ml.rewards.reward_models import RewardModel, load_reward_model
 from worker.ml.rewards.reward_training import SignalScale
 from worker.ml.rewards.segments import SegmentPairs
 from worker.ml.teachers import INDIRECT, OPPOSED, TASTES, Manner, ScriptedTeacher, Taste, User
+from worker.responses import TARGETS
 from worker.sim.costs import CostForm, preference_rewards
 from worker.tasks import registry
 from worker.tasks.registry import installed_task
@@ -46,7 +47,6 @@ SMALLEST_POOL = 48
 CHOOSE_EVERY = 10
 """labels between two models that choose what is asked, as in a study"""
 PAIRS_PER_SCENARIO = BEHAVIOURS_PER_SCENARIO * (BEHAVIOURS_PER_SCENARIO - 1) // 2
-TARGETS = {"left": 0.0, "right": 1.0, "equal": 0.5}
 Floats = npt.NDArray[np.float64]
 
 PAPER_USERS: Mapping[str, Taste] = {user.value: TASTES[user.value] for user in User}
