@@ -1,7 +1,6 @@
 """From the last label to films and controllers of every evaluated method, and what reconcile asks for on the way."""
 
 import io
-import itertools
 import json
 import shutil
 import zipfile
@@ -28,7 +27,6 @@ from worker.jobs.learning.baselines import train_method
 from worker.jobs.runtime import records
 from worker.jobs.runtime.context import WorkerContext
 from worker.jobs.runtime.records import Job
-from worker.ml.filters import filter_problem
 from worker.ml.filters.filter_module import FilterWeights
 from worker.ml.methods import prefft
 from worker.ml.rewards.reward_models import StructuredReward
@@ -229,14 +227,6 @@ def test_repeats_and_catch_pairs_after_the_last_label_ask_for_nothing_new(
     with database.writing() as session:
         session.get_one(Query, query.id).purpose = "repeat"
     assert (names(due(database, RunKind.REWARD)), due(database, RunKind.REWARD)[0].key) == before
-
-
-def test_scenarios_of_trials_and_comparisons_are_used_by_nothing_else() -> None:
-    ours = [evaluation_plan.TRIAL_SCENARIOS, evaluation_plan.COMPARISON_SCENARIOS]
-    others = [range(first, first + 1_000_000) for first in filter_problem.SCENARIO_BLOCKS.values()]
-    pool = range(reconcile.scenario_seed(0, 0), reconcile.scenario_seed(89_999, 999))
-    spans = sorted([*ours, *others, pool], key=lambda span: span.start)
-    assert all(one.stop <= other.start for one, other in itertools.pairwise(spans))
 
 
 @pytest.mark.usefixtures("all_said")

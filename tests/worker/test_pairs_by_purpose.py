@@ -16,6 +16,7 @@ from app.domain.studies import Participant, Study, longest_clip_steps
 from app.storage import ArtefactStore
 from tests.worker.conftest import STEPS, make_trajectory
 from tests.worker.invented import job_of
+from worker import scenarios
 from worker.compute.pools import Compute
 from worker.jobs import reconcile
 from worker.jobs.learning import dataset, query_plan, query_selection, reward_models
@@ -276,10 +277,10 @@ def test_as_many_scenarios_are_filmed_whole_as_the_introduction_needs(
 ) -> None:
     settle(introduction_pairs=7)  # four behaviours make six pairs
     for index in range(4):
-        add_clips(reconcile.scenario_seed(study.seed, index))
+        add_clips(scenarios.of_pool(study.seed, index))
     with context.database.reading() as session:
         found = {job.key for job, _ in reconcile.due(session)}
-    assert found == {f"clips/study-1/whole-{reconcile.scenario_seed(study.seed, index)}" for index in range(2)}
+    assert found == {f"clips/study-1/whole-{scenarios.of_pool(study.seed, index)}" for index in range(2)}
 
 
 def test_whole_episodes_are_filmed_of_the_rollouts_that_are_there(
@@ -290,7 +291,7 @@ def test_whole_episodes_are_filmed_of_the_rollouts_that_are_there(
     from worker.sim.render.clip import RenderedClip
 
     settle(introduction_pairs=1)
-    scenario = reconcile.scenario_seed(study.seed, 0)
+    scenario = scenarios.of_pool(study.seed, 0)
     add_runs(context, study, scenario, (True, True))
     with context.database.writing() as session:
         for clip in session.scalars(select(Clip).where(Clip.step_count == WHOLE)):

@@ -14,6 +14,7 @@ from app.domain.preferences import Exclusion, LabelEvent, Query, Response
 from app.domain.protocol import EvaluationSettings
 from app.domain.studies import Participant, Study, StudySettings
 from tests.worker.invented import job_of
+from worker import scenarios
 from worker.jobs import reconcile
 from worker.jobs.runtime import due_work, records
 
@@ -36,7 +37,7 @@ def labels(add_clips: AddClips, answer: Answer, study: Study) -> Callable[[int],
     """Fill the pool, then give so many answers."""
 
     def give(count: int) -> list[Query]:
-        clips = [add_clips(reconcile.scenario_seed(study.seed, index)) for index in range(4)]
+        clips = [add_clips(scenarios.of_pool(study.seed, index)) for index in range(4)]
         pairs = [(four[i], four[j]) for four in clips for i in range(4) for j in range(i)]
         return [answer(*pairs[index], Response.LEFT) for index in range(count)]
 
@@ -49,17 +50,17 @@ def succeed(database: Database, key: str) -> None:
 
 
 def test_a_new_study_needs_clips_a_few_scenarios_at_a_time(study: Study, found: Callable[[], dict[str, int]]) -> None:
-    first, second = (reconcile.scenario_seed(study.seed, index) for index in (0, 1))
+    first, second = (scenarios.of_pool(study.seed, index) for index in (0, 1))
     assert found() == {f"clips/study-1/scenario-{first}": 1, f"clips/study-1/scenario-{second}": 1}
 
 
 def test_a_scenario_with_some_of_its_clips_still_needs_the_rest(
     study: Study, add_clips: AddClips, found: Callable[[], dict[str, int]]
 ) -> None:
-    add_clips(reconcile.scenario_seed(study.seed, 0), 3)
-    assert f"clips/study-1/scenario-{reconcile.scenario_seed(study.seed, 0)}" in found()
-    add_clips(reconcile.scenario_seed(study.seed, 1), 4)
-    assert f"clips/study-1/scenario-{reconcile.scenario_seed(study.seed, 1)}" not in found()
+    add_clips(scenarios.of_pool(study.seed, 0), 3)
+    assert f"clips/study-1/scenario-{scenarios.of_pool(study.seed, 0)}" in found()
+    add_clips(scenarios.of_pool(study.seed, 1), 4)
+    assert f"clips/study-1/scenario-{scenarios.of_pool(study.seed, 1)}" not in found()
 
 
 def test_the_reward_model_is_due_at_every_tenth_label(
@@ -167,12 +168,6 @@ def test_queries_are_made_ahead_but_never_more_than_planned(
     labels(15)
     with database.reading() as session:
         assert records.next_queries(session, participant.id, study.settings) == (16, 5)
-
-
-def test_pool_scenarios_never_meet_the_ones_filters_are_evaluated_on() -> None:
-    from worker.ml.filters.filter_problem import SCENARIO_BLOCKS
-
-    assert max(SCENARIO_BLOCKS.values()) + 1_000_000 <= reconcile.scenario_seed(0, 0)
 
 
 def exclude(database: Database, query: Query, *, excluded: bool = True) -> None:

@@ -36,12 +36,12 @@ from worker.ml.rewards.reward_training import SignalScale
 from worker.ml.rewards.segments import SegmentPairs
 from worker.ml.teachers import INDIRECT, OPPOSED, TASTES, Manner, ScriptedTeacher, Taste, User
 from worker.responses import TARGETS
+from worker.scenarios import EVALUATION, POOL, first_of
 from worker.sim.costs import CostForm, preference_rewards
 from worker.tasks import registry
 from worker.tasks.registry import installed_task
 from worker.trajectory import Trajectory
 
-POOL_FIRST = 10_000_000
 SMALLEST_POOL = 48
 """scenarios, as in a study"""
 CHOOSE_EVERY = 10
@@ -73,11 +73,11 @@ class Terms:
     @property
     def pool(self) -> range:
         """Scenarios of the clips that are compared."""
-        return range(POOL_FIRST, POOL_FIRST + max(self.smallest_pool, -(-self.labels // PAIRS_PER_SCENARIO)))
+        return first_of(POOL, max(self.smallest_pool, -(-self.labels // PAIRS_PER_SCENARIO)))
 
     def unseen(self, seed: int) -> range:
         """Scenarios of the evaluation; every seed has its own, so that another seed confirms with fresh ones."""
-        return filter_problem.scenarios_for("evaluation", self.scenarios, skip=seed * self.scenarios)
+        return first_of(EVALUATION, self.scenarios, skip=seed * self.scenarios)
 
     def directory(self, work: Path) -> Path:
         """Where cells under these terms are kept."""

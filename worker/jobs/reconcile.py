@@ -20,6 +20,7 @@ from app.domain.preferences import LabelEvent, Query, count_labels
 from app.domain.run_keys import SCENARIO, WHOLE, RunKey
 from app.domain.studies import Participant, Study
 from app.services.evaluation import evaluation_plan
+from worker import scenarios
 from worker.jobs.clips import evaluation_films, repairs
 from worker.jobs.learning import baselines
 from worker.jobs.publishing import export_files, report_files
@@ -155,7 +156,7 @@ def _missing_clips(session: Session, study: Study) -> list[Job]:
     clips = _clips_by_scenario(session, study, settings.clip_steps)
     whole = _clips_by_scenario(session, study, study.whole_clip_steps)
     for index in range(settings.pool_scenarios):
-        seed = scenario_seed(study.seed, index)
+        seed = scenarios.of_pool(study.seed, index)
         if clips.get(seed, 0) < settings.behaviours_per_scenario:
             jobs.append(Job(RunKey(RunKind.CLIPS, study.id, subject=SCENARIO, number=seed), study.id))
         elif index < settings.introduction_scenarios and whole.get(seed, 0) < settings.behaviours_per_scenario:
@@ -172,11 +173,6 @@ def _clips_by_scenario(session: Session, study: Study, step_count: int | None) -
         .group_by(Rollout.scenario)
     )
     return dict(session.execute(counted).all())
-
-
-def scenario_seed(study_seed: int, index: int) -> int:
-    """The scenario at one place of a study's pool; far from those that filters are trained and evaluated on."""
-    return 10_000_000 + study_seed % 90_000 * 1_000 + index
 
 
 def _stale_models(session: Session, study: Study, succeeded: Collection[str]) -> list[Job]:

@@ -32,7 +32,7 @@ TRAINED = (EvaluatedMethod.PREFFT, EvaluatedMethod.PREFFT_ANCHORED, EvaluatedMet
 """Methods that are trained for the evaluation alone; the reference is there, and pbarl is the participant's filter."""
 
 TRIAL_SCENARIOS = range(6_000_000, 6_800_000)
-"""Scenarios of trials; nothing else uses them (worker.ml.filters.filter_problem.SCENARIO_BLOCKS has the others)."""
+"""Scenarios of trials; nothing else uses them (worker.scenarios has the others)."""
 COMPARISON_SCENARIOS = range(6_800_000, 6_900_000)
 """Scenarios in which somebody's robot is shown before and after."""
 COMPARED = 2

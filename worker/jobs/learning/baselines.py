@@ -26,9 +26,9 @@ from worker.jobs.learning.filters import NothingToLearnFrom
 from worker.jobs.runtime import due_work, records
 from worker.jobs.runtime.context import Step, WorkerContext
 from worker.jobs.runtime.records import Job
-from worker.ml.filters import filter_problem
 from worker.ml.policies.checkpoint import ask_to_pause, share_done
 from worker.ml.rewards.reward_models import load_reward_model
+from worker.scenarios import EVALUATION, first_of
 from worker.trajectory import Trajectory
 
 CHUNK = 10
@@ -153,7 +153,7 @@ def _save(context: WorkerContext, run_id: int, job: Job, method: str, reward: st
     started = time.perf_counter()
     with context.database.reading() as session:
         study = session.get_one(Study, job.study_id)
-    scenarios = filter_problem.scenarios_for("evaluation", study.settings.evaluation_scenarios)
+    scenarios = first_of(EVALUATION, study.settings.evaluation_scenarios)
     model = context.store.read(str(trained["artefact"]))
 
     def beat_at(share: float) -> Callable[[], None]:

@@ -23,6 +23,7 @@ from torch import Tensor
 from worker.ml.policies.demonstrations import Demonstrate, Demonstrations, collect, imitate
 from worker.ml.policies.gaussian import GaussianPolicy
 from worker.ml.policies.sac import Actor, Array, Env, Learner, Replay, SacConfig
+from worker.scenarios import POLICY_SELECTION, POLICY_TEST, POLICY_TRAINING
 from worker.spaces import Field
 
 Progress = Callable[[int, dict[str, float]], None]
@@ -30,8 +31,6 @@ Progress = Callable[[int, dict[str, float]], None]
 
 INPUT_SCALE = {"m": 3.0, "rad": 1.0, "1": 1.0, "N": 0.1}
 """Factor on each unit of the observation, so that typical inputs are about one."""
-EVALUATION_SEED = 2_000_000
-TEST_SEED = 1_000_000
 REPLAY_FILE, STATE_FILE, PROGRESS_FILE = "replay.npy", "state.safetensors", "state.json"
 
 
@@ -90,7 +89,7 @@ class _Run:
         self.shown: Demonstrations | None = None
         if demonstrate and config.demonstrations:
             rng = np.random.default_rng([config.seed, 1])
-            self.shown = collect(self.test_env, demonstrate, config, rng, TEST_SEED)
+            self.shown = collect(self.test_env, demonstrate, config, rng, POLICY_TRAINING)
         self.steps = 0
         self.owed_updates = 0.0
         self.best = (-1.0, -math.inf)
@@ -134,7 +133,7 @@ class _Run:
         if self.learner is None:
             return {}
         policy = self.learner.average.policy(self.config.action_limit)
-        outcome = evaluate(self.test_env, policy.mean, EVALUATION_SEED, self.config.evaluation_episodes)
+        outcome = evaluate(self.test_env, policy.mean, POLICY_SELECTION.start, self.config.evaluation_episodes)
         temperature = float(self.learner.log_temperature.detach().exp())
         self.curve.append({"steps": self.steps, "cpu_s": round(self.cpu_s, 1), "alpha": temperature, **outcome})
         self._keep_early(policy, outcome["success"])
@@ -153,14 +152,14 @@ class _Run:
 
     def _watch_imitation(self, actor: Actor) -> None:
         policy = actor.policy(self.config.action_limit)
-        outcome = evaluate(self.test_env, policy.mean, EVALUATION_SEED, self.config.evaluation_episodes)
+        outcome = evaluate(self.test_env, policy.mean, POLICY_SELECTION.start, self.config.evaluation_episodes)
         self._keep_early(policy, outcome["success"])
 
     def finish(self) -> dict[str, Any]:
         """Test the exported policy on scenarios that played no part in the training; write the record."""
         policy = GaussianPolicy.load(self.folder / "policy.safetensors")
         rng = np.random.default_rng(self.config.seed)
-        count = self.config.test_episodes
+        first, count = POLICY_TEST.start, self.config.test_episodes
         record = {
             "command": self.command,
             "config": {key: value for key, value in asdict(self.config).items() if key != "observation"},
@@ -170,9 +169,11 @@ class _Run:
             "cpu_s": round(self.cpu_s, 1),
             "versions": _versions(),
             "curve": self.curve,
-            "test_scenarios": [TEST_SEED, TEST_SEED + count - 1],
-            "test_mean_action": evaluate(self.test_env, policy.mean, TEST_SEED, count),
-            "test_sampled_action": evaluate(self.test_env, lambda state: policy.sample(state, rng), TEST_SEED, count),
+            "test_scenarios": [POLICY_TEST.start, POLICY_TEST[count - 1]],
+            "test_mean_action": evaluate(self.test_env, policy.mean, POLICY_TEST.start, count),
+            "test_sampled_action": evaluate(
+                self.test_env, lambda state: policy.sample(state, rng), POLICY_TEST.start, count
+            ),
         }
         text = json.dumps(record, indent=2) + "\n"
         _replace(self.folder / "training.json", lambda path: path.write_text(text))
@@ -226,7 +227,7 @@ class _Run:
         return actions
 
     def _scenario(self) -> int:
-        return int(self.rng.integers(TEST_SEED))
+        return int(self.rng.integers(POLICY_TRAINING.start, POLICY_TRAINING.stop))
 
     def _imitate(self) -> None:
         if self.shown:
