@@ -86,7 +86,7 @@ class TaskDescription(BaseModel):
     @model_validator(mode="after")
     def _shown_within_the_episode(self) -> Self:
         if self.usual_clip_steps > self.episode_steps:
-            raise ValueError(f"usual_clip_steps: must not be more than the {self.episode_steps} steps of an episode")
+            raise ValueError(f"usual_clip_steps must not be more than the {self.episode_steps} steps of an episode")
         return self
 
 
@@ -123,8 +123,12 @@ def _description(file: Path) -> TaskDescription:
 
 
 def _in_words(wrong: ErrorDetails) -> str:
-    said = _EXPLAINED.get(wrong["type"], wrong["msg"].removeprefix("Value error, "))
-    return f"{'.'.join(map(str, wrong['loc']))}: {said}".removeprefix(": ")
+    place, said = ".".join(map(str, wrong["loc"])), wrong["msg"]
+    if wrong["type"] in _EXPLAINED:
+        return f"{place} {_EXPLAINED[wrong['type']]}"
+    if wrong["type"] == "value_error":
+        return f"{place} {said.removeprefix('Value error, ')}".strip()
+    return f"{place}: {said}"
 
 
 def _picture(file: Path) -> str:

@@ -36,15 +36,9 @@ Act = Callable[[Array], Array]
 class NoPolicy(ValueError):
     """Nothing was trained that does the task."""
 
-    def __init__(self, task: str, file: Path) -> None:
-        super().__init__(f"The task {task} has no policy {file}: run python -m worker pretrain --task {task}.")
-
 
 class NoPredictor(ValueError):
     """Nothing was trained that foresees the task's signals."""
-
-    def __init__(self, task: str) -> None:
-        super().__init__(f"The signals of {task} cannot be foreseen yet: run python -m worker foresee --task {task}.")
 
 
 @dataclass(frozen=True)
@@ -94,7 +88,7 @@ def predictor_file(name: str) -> Path:
 def signal_predictor(name: str) -> SignalPredictor:
     """What foresees a task's signals from state and action. Raises NoPredictor for a task that has none."""
     if not predictor_file(name).exists():
-        raise NoPredictor(name)
+        raise NoPredictor(f"The signals of {name} cannot be foreseen yet: run python -m worker foresee --task {name}.")
     return SignalPredictor.load(predictor_file(name))
 
 
@@ -103,7 +97,7 @@ def reference_policy(name: str, early: str = "") -> GaussianPolicy:
     """The frozen policy that lies in a task's folder, or one from an early stage of its training. Raises NoPolicy."""
     file = checkpoint(name) / (f"early/{early}.safetensors" if early else "policy.safetensors")
     if not file.exists():
-        raise NoPolicy(name, file)
+        raise NoPolicy(f"The task {name} has no policy {file}: run python -m worker pretrain --task {name}.")
     return GaussianPolicy.load(file)
 
 

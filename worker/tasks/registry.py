@@ -16,11 +16,6 @@ from worker.task import Task
 class UnknownTask(ValueError):
     """This installation cannot simulate the task."""
 
-    def __init__(self, name: str) -> None:
-        why = [each.why for each in catalogue.installed().broken if each.name == name]
-        known = f"There is no task named {name!r}; this installation knows {', '.join(catalogue.names())}."
-        super().__init__(" ".join([known, *why]))
-
 
 class TaskBroken(ValueError):
     """The task's description names something that its code does not have."""
@@ -30,7 +25,9 @@ def installed_task(name: str) -> InstalledTask:
     """What a task's folder says. Raises UnknownTask."""
     found = catalogue.find(name)
     if found is None:
-        raise UnknownTask(name)
+        why = [each.why for each in catalogue.installed().broken if each.name == name]
+        known = f"There is no task named {name!r}; this installation knows {', '.join(catalogue.names())}."
+        raise UnknownTask(" ".join([known, *why]))
     return found
 
 
