@@ -15,7 +15,7 @@ from app.domain.studies import PAPER_PROTOCOL, ClipQuality, Method, RewardKind, 
 from app.services.archives import demo_archive
 from app.settings import Settings
 from app.storage import ArtefactStore, keep_private
-from worker.compute import simulation
+from installed_tasks import catalogue
 from worker.experiments import benchmark, fit_response_surface, pretrain_policy, train_signal_predictor
 from worker.experiments.benchmark_cell import INDIRECT_USERS, OPPOSED_USERS, PAPER_USERS
 from worker.jobs import service
@@ -26,11 +26,13 @@ from worker.ml.rewards import reward_training
 from worker.ml.teachers import TASTES, Manner, Taste
 from worker.rehearsal import demo_study, rehearsal
 from worker.rehearsal.server import OwnStudio
-from worker.tasks.registry import ENVIRONMENTS
+from worker.tasks.registry import checkpoint
 
 
 def run(arguments: Sequence[str] | None) -> int:
     """Parse the command line and do what it says; returns the exit code."""
+    for task in catalogue.installed().broken:
+        sys.stderr.write(f"{task.why}\n")
     options = parser().parse_args(arguments)
     result: int = options.act(options)
     return result
@@ -97,7 +99,7 @@ def _add_benchmark(commands: _Commands) -> None:
     command = commands.add_parser("benchmark", help=benchmark.__doc__, formatter_class=argparse.RawTextHelpFormatter)
     command.add_argument("--profile", choices=list(benchmark.PROFILES), default="full")
     command.add_argument("--methods", nargs="+", choices=list(METHODS), default=list(METHODS))
-    command.add_argument("--tasks", nargs="+", choices=list(ENVIRONMENTS), default=list(ENVIRONMENTS))
+    command.add_argument("--tasks", nargs="+", choices=catalogue.names(), default=catalogue.names())
     command.add_argument(
         "--users",
         nargs="+",
@@ -245,13 +247,11 @@ def _add_demo_study(commands: _Commands) -> None:
 
 
 def _add_task(command: argparse.ArgumentParser) -> None:
-    command.add_argument("--task", choices=list(ENVIRONMENTS), default="feeding")
+    command.add_argument("--task", choices=catalogue.names(), default=catalogue.usual())
 
 
 def _pretrain(options: argparse.Namespace) -> int:
-    return pretrain_policy.pretrain(
-        options.task, options.seed, options.directory or simulation.checkpoints(options.task)
-    )
+    return pretrain_policy.pretrain(options.task, options.seed, options.directory or checkpoint(options.task))
 
 
 def _explore(options: argparse.Namespace) -> int:

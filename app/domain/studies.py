@@ -19,30 +19,23 @@ from app.domain.protocol import (
     Language,
     PlannedTest,
 )
+from installed_tasks import catalogue
+from installed_tasks.description import LONGEST_CLIP_STEPS, SHORTEST_CLIP_STEPS
 
-
-class TaskName(StrEnum):
-    """What the robot does; the worker simulates the tasks of these names."""
-
-    FEEDING = "feeding"
-    DRINKING = "drinking"
-    SCRATCHING = "scratching"
-
-
-USUAL_CLIP_STEPS = {TaskName.FEEDING: 60, TaskName.DRINKING: 70, TaskName.SCRATCHING: 60}
-"""Control steps (10 Hz) from the start in which what matters has happened: water is poured late."""
-LONGEST_CLIP_STEPS = {TaskName.FEEDING: 100, TaskName.DRINKING: 130, TaskName.SCRATCHING: 100}
-"""A whole episode."""
+USUAL_CLIP_STEPS = 60
+"""of a task that is not installed here"""
 
 
 def longest_clip_steps(task: str) -> int | None:
-    """Of a task by its name; None for one that is not simulated here."""
-    return {name.value: steps for name, steps in LONGEST_CLIP_STEPS.items()}.get(task)
+    """A whole episode of a task; None for one that is not installed here."""
+    installed = catalogue.find(task)
+    return installed.description.episode_steps if installed else None
 
 
 def usual_clip_steps(task: str) -> int:
-    """Of a task by its name; a task under construction, which has no row here yet, is shown as long as Feeding."""
-    return {name.value: steps for name, steps in USUAL_CLIP_STEPS.items()}.get(task, USUAL_CLIP_STEPS[TaskName.FEEDING])
+    """Control steps from the start in which what matters in a task has happened."""
+    installed = catalogue.find(task)
+    return installed.description.usual_clip_steps if installed else USUAL_CLIP_STEPS
 
 
 class Method(StrEnum):
@@ -87,9 +80,9 @@ class StudySettings(BaseModel):
     retrain_every_labels: int = Field(default=10, ge=1, le=100)
     filter_milestones: tuple[int, ...] = Field(default=(50, 100), description="Label counts; the end is implied.")
     clip_steps: int = Field(
-        default=USUAL_CLIP_STEPS[TaskName.FEEDING],
-        ge=20,
-        le=max(LONGEST_CLIP_STEPS.values()),
+        default=USUAL_CLIP_STEPS,
+        ge=SHORTEST_CLIP_STEPS,
+        le=LONGEST_CLIP_STEPS,
         description="Control steps shown, from the start (10 Hz).",
     )
     clip_quality: ClipQuality = ClipQuality.SHARP
@@ -203,7 +196,7 @@ class Study(Base):
     id: Mapped[int] = mapped_column(primary_key=True)
     slug: Mapped[str] = mapped_column(String(80), unique=True)
     name: Mapped[str] = mapped_column(String(120))
-    task: Mapped[str] = mapped_column(String(40), default=TaskName.FEEDING)
+    task: Mapped[str] = mapped_column(String(40), default=catalogue.usual)
     stored_settings: Mapped[dict[str, Any]]
     seed: Mapped[int]
     created_at: Mapped[datetime] = mapped_column(default=now)
@@ -231,7 +224,7 @@ class Study(Base):
 
     @property
     def whole_clip_steps(self) -> int | None:
-        """Steps of a clip of a whole episode; None for a task that is not simulated here."""
+        """Steps of a clip of a whole episode; None for a task that is not installed here."""
         return longest_clip_steps(self.task)
 
 

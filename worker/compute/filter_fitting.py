@@ -33,6 +33,7 @@ from worker.ml.filters.filter_problem import (
 from worker.ml.filters.response_surface import ResponseSurface
 from worker.ml.rewards.loading import load_reward_model
 from worker.scenarios import EVALUATION, RESIDUAL, first_of
+from worker.tasks import registry
 from worker.trajectory import Trajectory
 
 CHUNK = 3
@@ -72,7 +73,7 @@ class FilterFit:
     @property
     def problem(self) -> FilterProblem:
         """What is to be fitted, in the words of the learning code."""
-        task, policy = simulation.task(self.task), simulation.reference_policy(self.task)
+        task, policy = registry.task(self.task), simulation.reference_policy(self.task)
         return FilterProblem(task, policy, load_reward_model(self.reward), self.seed, self.config)
 
     def find_mode(self, pool: Sequence[Trajectory]) -> FilterDraft:

@@ -9,10 +9,11 @@ from fastapi import Form
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from app.domain.protocol import FormItem
-from app.domain.studies import LONGEST_CLIP_STEPS, PAPER_PROTOCOL, USUAL_CLIP_STEPS, StudySettings, TaskName
+from app.domain.studies import PAPER_PROTOCOL, StudySettings, longest_clip_steps, usual_clip_steps
 from app.web.experimenter import form_lines
 from app.web.texts.own_texts import CONSENT
 from app.web.texts.wording import broken_texts
+from installed_tasks import catalogue
 
 _Value = TypeVar("_Value")
 _Text = Annotated[str, Field(max_length=500)]
@@ -155,7 +156,7 @@ class Typed:
     """A study as it was typed, checked."""
 
     name: str
-    task: TaskName
+    task: str
     seed: int | None
     """None: one is to be drawn."""
     settings: StudySettings
@@ -163,7 +164,7 @@ class Typed:
 
 def form_with_defaults(preset: Preset = Preset.LEARNING) -> StudyForm:
     """The form as it is first shown; the length of clips is left to the task."""
-    return form_of("", TaskName.FEEDING, None, PRESETS[preset]).model_copy(update={"clip_steps": ""})
+    return form_of("", catalogue.usual(), None, PRESETS[preset]).model_copy(update={"clip_steps": ""})
 
 
 def with_preset(form: StudyForm, preset: Preset) -> StudyForm:
@@ -211,10 +212,13 @@ def form_of(name: str, task: str, seed: int | None, settings: StudySettings) -> 
     )
 
 
-def typed_study(form: StudyForm) -> Typed:
-    """What was typed, checked; clips without a length get the task's usual one. Raises FormInvalid."""
+def typed_study(form: StudyForm, own_task: str | None = None) -> Typed:
+    """What was typed, checked; clips without a length get the task's usual one. Raises FormInvalid.
+
+    ``own_task``: the task of a study which is changed or copied; it may stay although it is not installed here.
+    """
     errors: dict[str, str] = {}
-    task = _task(errors, form.task)
+    task = _task(errors, form.task, own_task)
     values: dict[str, Any] = {name: getattr(form, name).strip() for name in _WORDS}
     values |= {name: getattr(form, name) == "yes" for name in _SWITCHES}
     values |= _numbers(errors, form, task)
@@ -257,15 +261,15 @@ def _field(location: Sequence[int | str]) -> str:
     return str(location[0])
 
 
-def _numbers(errors: dict[str, str], form: StudyForm, task: TaskName) -> dict[str, Any]:
+def _numbers(errors: dict[str, str], form: StudyForm, task: str) -> dict[str, Any]:
     values: dict[str, Any] = {}
     for name in _COUNTS:
         values[name] = _number(errors, name, getattr(form, name), whole=True)
     if not form.clip_steps.strip():
         errors.pop("clip_steps", None)
-        values["clip_steps"] = USUAL_CLIP_STEPS[task]
-    elif values["clip_steps"] is not None and values["clip_steps"] > LONGEST_CLIP_STEPS[task]:
-        errors["clip_steps"] = f"An episode of this task has {LONGEST_CLIP_STEPS[task]} steps. Enter at most as many."
+        values["clip_steps"] = usual_clip_steps(task)
+    elif values["clip_steps"] is not None and values["clip_steps"] > (longest_clip_steps(task) or values["clip_steps"]):
+        errors["clip_steps"] = f"An episode of this task has {longest_clip_steps(task)} steps. Enter at most as many."
     for name in _PERCENTS:
         share = _number(errors, name, getattr(form, name), whole=False)
         values[name] = None if share is None else share / 100
@@ -311,12 +315,12 @@ def _switch(on: bool) -> str:
     return "yes" if on else "no"
 
 
-def _task(errors: dict[str, str], typed: str) -> TaskName:
-    try:
-        return TaskName(typed.strip() or TaskName.FEEDING)
-    except ValueError:
-        errors["task"] = "Choose one of the tasks."
-        return TaskName.FEEDING
+def _task(errors: dict[str, str], typed: str, own: str | None) -> str:
+    task = typed.strip() or catalogue.usual()
+    if task in (*catalogue.names(), own):
+        return task
+    errors["task"] = "Choose one of the tasks."
+    return catalogue.usual()
 
 
 def _number(errors: dict[str, str], name: str, typed: str, *, whole: bool) -> float | None:
