@@ -1,0 +1,1 @@
+"""The tables: studies and settings, pairs, answers, models."""

@@ -1,0 +1,1 @@
+"""The pages and the API. Routes translate HTTP; the services decide."""

@@ -1,0 +1,1 @@
+"""Simulation and learning together, in child processes."""

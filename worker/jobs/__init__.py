@@ -1,0 +1,1 @@
+"""Find what is due in the database and run it durably."""

@@ -1,0 +1,1 @@
+"""Reward models, policies, filters: plain torch and NumPy."""

@@ -1,4 +1,7 @@
-"""The simulated robot, people and tasks. Importing this package registers its environments with Gymnasium."""
+"""Robot arm, seated person, physics, measurements.
+
+Importing this package registers the tasks' environments with Gymnasium.
+"""
 
 import gymnasium
 

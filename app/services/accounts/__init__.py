@@ -1,0 +1,1 @@
+"""Passwords, browser sessions, roles, API tokens."""

@@ -1,0 +1,1 @@
+"""The blinded evaluation: plan, ratings, unblinding."""

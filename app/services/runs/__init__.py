@@ -1,0 +1,1 @@
+"""The worker's runs, reports and bundles, as pages need them."""

@@ -1,0 +1,1 @@
+"""Sessions, security headers, rate limits, uploads."""

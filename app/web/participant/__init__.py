@@ -1,0 +1,1 @@
+"""A participant's pages, from the personal link to the end."""

@@ -1,0 +1,1 @@
+"""Wording in every language, and the template engine."""

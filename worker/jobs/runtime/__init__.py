@@ -1,0 +1,1 @@
+"""The durable engine, queues, urgency, run records."""

@@ -1,0 +1,1 @@
+"""Bundles and controllers that run without the project."""

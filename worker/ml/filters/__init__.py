@@ -1,0 +1,1 @@
+"""The personal action filter, ours and as printed."""

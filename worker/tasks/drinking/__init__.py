@@ -1,0 +1,1 @@
+"""A cup of water, brought to the mouth and tipped."""
