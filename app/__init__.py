@@ -1,1 +1,1 @@
-"""The web server, and what both programs know: database, artefacts, settings."""
+"""The web server, and what both programs know: tables, files, settings."""

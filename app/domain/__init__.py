@@ -1,1 +1,1 @@
-"""The tables: studies and settings, pairs, answers, models."""
+"""Tables: studies, pairs, answers, models."""

@@ -1,1 +1,1 @@
-"""What people can do, one function each, in one transaction."""
+"""What people can do, one function each."""

@@ -1,1 +1,1 @@
-"""The pages and the API. Routes translate HTTP; the services decide."""
+"""Routes: from HTTP to a service and back."""

@@ -1,1 +1,1 @@
-"""Statistics, tests and figures of a study's report."""
+"""Statistics and figures of a study's report."""

@@ -1,1 +1,1 @@
-"""Simulation and learning together, in child processes."""
+"""Simulation and learning, in child processes."""

@@ -1,1 +1,1 @@
-"""Offline commands: benchmark, pre-training, surfaces."""
+"""Offline commands: benchmark, pre-training."""

@@ -1,1 +1,1 @@
-"""Find what is due in the database and run it durably."""
+"""Find what is due, and run it durably."""

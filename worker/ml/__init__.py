@@ -1,1 +1,1 @@
-"""Reward models, policies, filters: plain torch and NumPy."""
+"""Reward models, policies and filters."""

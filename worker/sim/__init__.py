@@ -1,4 +1,4 @@
-"""Robot arm, seated person, physics, measurements.
+"""Robot arm, seated person, physics.
 
 Importing this package registers the tasks' environments with Gymnasium.
 """

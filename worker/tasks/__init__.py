@@ -1,1 +1,1 @@
-"""The robot's tasks, one folder each, and their registry."""
+"""The robot's tasks, one folder each."""

@@ -1,1 +1,1 @@
-"""Passwords, browser sessions, roles, API tokens."""
+"""Passwords, sessions, roles, API tokens."""

@@ -1,1 +1,1 @@
-"""Store answers, serve the next pair, check consistency."""
+"""Store answers, serve the next pair."""

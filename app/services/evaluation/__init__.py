@@ -1,1 +1,1 @@
-"""The blinded evaluation: plan, ratings, unblinding."""
+"""Blinded evaluation: plan, ratings, key."""

@@ -1,1 +1,1 @@
-"""Tables of a study's data and their data dictionary."""
+"""Tables of a study's data, data dictionary."""

@@ -1,1 +1,1 @@
-"""The worker's runs, reports and bundles, as pages need them."""
+"""The worker's runs, reports and bundles."""

@@ -1,1 +1,1 @@
-"""The JSON API below /api/v1, its OpenAPI and its tokens."""
+"""The JSON API, its documentation and tokens."""

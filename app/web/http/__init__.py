@@ -1,1 +1,1 @@
-"""Sessions, security headers, rate limits, uploads."""
+"""Who asks, security headers, rate limits."""

@@ -1,1 +1,1 @@
-"""A participant's pages, from the personal link to the end."""
+"""A participant's pages, from link to debrief."""

@@ -1,1 +1,1 @@
-"""Wording in every language, and the template engine."""
+"""Wording in every language, templates."""

@@ -1,1 +1,1 @@
-"""Clips of the pool, evaluation films, imported clips."""
+"""Pool clips, evaluation films, imported clips."""

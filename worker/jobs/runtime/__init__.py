@@ -1,1 +1,1 @@
-"""The durable engine, queues, urgency, run records."""
+"""Durable engine, queues, urgency, run records."""

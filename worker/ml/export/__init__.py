@@ -1,1 +1,1 @@
-"""Bundles and controllers that run without the project."""
+"""Bundles that run without this project."""

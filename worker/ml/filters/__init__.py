@@ -1,1 +1,1 @@
-"""The personal action filter, ours and as printed."""
+"""Action filters: ours, and the paper's own."""

@@ -1,1 +1,1 @@
-"""Every method of the comparison, one interface."""
+"""Every method that the filter is set against."""

@@ -1,1 +1,1 @@
-"""The frozen reference policy and its SAC training."""
+"""The frozen reference policy, trained by SAC."""

@@ -1,1 +1,1 @@
-"""A cup of water, brought to the mouth and tipped."""
+"""A cup of water, to the mouth, and tipped."""
