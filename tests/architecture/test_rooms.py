@@ -10,7 +10,7 @@ PACKAGES = sorted({path.parent for program in rooms.PROGRAMS for path in (rooms.
 
 
 def test_the_picture_of_the_rooms_is_up_to_date() -> None:
-    assert rooms.PICTURE.read_text() == rooms.picture(), "Draw it anew: .venv/bin/python -m tests.pictures.rooms"
+    assert rooms.PICTURE.read_text() == rooms.picture(), "Draw it anew: python -m tests.pictures.rooms"
 
 
 @pytest.mark.parametrize("package", [".".join(each.relative_to(rooms.ROOT).parts) for each in PACKAGES])

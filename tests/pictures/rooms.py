@@ -1,8 +1,9 @@
 """Draws docs/pictures/rooms.svg: every package, in the layers of pyproject.toml, with the first line of its docstring.
 
-.venv/bin/python -m tests.pictures.rooms
+python -m tests.pictures.rooms
 """
 
+import argparse
 import ast
 import sys
 import tomllib
@@ -186,5 +187,6 @@ def picture() -> str:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter).parse_args()
     PICTURE.write_text(picture())
     sys.stdout.write(f"Wrote {PICTURE.relative_to(ROOT)}\n")
