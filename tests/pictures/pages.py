@@ -44,6 +44,7 @@ POSITION = "Math.max(...[...document.querySelectorAll('video')].map((each) => ea
 FRAME_MS, REST_MS = 100, 1000
 SECOND_PAIR_MS = 2000
 QUALITY = 70
+WIDE = 1366
 ANSWERS = ("Left", "Right", "Right", "Left")
 """Before the pair that is filmed, so that the dashboard has something to show of whoever answers."""
 
@@ -148,14 +149,17 @@ def _hold(film: Film, route: Route) -> None:
 
 def photograph_dashboard(chromium: Browser, address: str, cookie: str) -> None:
     """The study's page, once it says who is comparing."""
-    context = chromium.new_context(viewport={"width": 1366, "height": 800})
+    context = chromium.new_context(viewport={"width": WIDE, "height": 800})
     context.add_cookies([{"name": "studio_experimenter", "value": cookie, "url": address}])
     page = context.new_page()
     page.set_default_timeout(PATIENCE_MS)
     page.goto(f"{address}/studies")
     page.get_by_role("link", name="Demo: feeding").click()
     expect(page.get_by_role("row").filter(has_text="P04")).to_contain_text(f"{len(ANSWERS)} of 24")
-    page.screenshot(path=PICTURES / "dashboard.png", full_page=True)
+    table = page.get_by_role("table").first.bounding_box()
+    assert table is not None
+    down_to_it = {"x": 0, "y": 0, "width": WIDE, "height": table["y"] + table["height"] + 24}
+    page.screenshot(path=PICTURES / "dashboard.png", full_page=True, clip=down_to_it)
 
 
 if __name__ == "__main__":
