@@ -1,9 +1,8 @@
-"""Takes the pictures of the pages that README shows: the demo study in a studio of its own, photographed in Chromium.
+"""Takes the pictures of the pages that README and docs show, in Chromium: ``python -m tests.pictures.pages``.
 
-    python -m tests.pictures.pages
-
-writes docs/pictures/pair.webp, in which somebody answers a pair and sees the next one, and docs/pictures/dashboard.png.
-Takes some minutes: while clips are photographed they play at a tenth of their speed, so that no machine is too slow.
+A studio of its own shows the demo study. docs/pictures/pair.webp is somebody who answers a pair and sees the next one,
+docs/pictures/dashboard.png what the experimenter sees then. This takes some minutes: while clips are photographed they
+play at a tenth of their speed, so that no machine is too slow.
 """
 
 import argparse
@@ -158,8 +157,11 @@ def photograph_dashboard(chromium: Browser, address: str, cookie: str) -> None:
     expect(page.get_by_role("row").filter(has_text="P04")).to_contain_text(f"{len(ANSWERS)} of 24")
     table = page.get_by_role("table").first.bounding_box()
     assert table is not None
-    down_to_it = {"x": 0, "y": 0, "width": WIDE, "height": table["y"] + table["height"] + 24}
-    page.screenshot(path=PICTURES / "dashboard.png", full_page=True, clip=down_to_it)
+    page.screenshot(
+        path=PICTURES / "dashboard.png",
+        full_page=True,
+        clip={"x": 0, "y": 0, "width": WIDE, "height": table["y"] + table["height"] + 24},
+    )
 
 
 if __name__ == "__main__":

@@ -1,11 +1,12 @@
-"""Draws docs/pictures/rooms.svg: every package, in the layers of pyproject.toml, with the first line of its docstring.
+"""Draws the map of the code, docs/pictures/rooms.svg: ``python -m tests.pictures.rooms``.
 
-python -m tests.pictures.rooms
+Every package stands in the layer that the contracts of pyproject.toml give it, with the first line of its docstring.
 """
 
 import argparse
 import ast
 import sys
+import textwrap
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -25,8 +26,8 @@ COLUMN, MARGIN = 402, 18
 WIDTH = 2 * COLUMN + 3 * MARGIN
 ROW, HEAD, PAD, GAP = 22, 24, 9, 5
 NAME_WIDTH = 96
-LONGEST_LINE, LONGEST_TITLE = 48, 70
-"""Characters that fit into the box of a package, and below the name of a program."""
+LONGEST_LINE, LONGEST_TITLE, LONGEST_MODULES = 48, 70, 57
+"""Characters that fit into the box of a package, below the name of a program, and into a row of modules."""
 
 STYLE = """
     text { font: 11px system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", "Noto Sans", sans-serif }
@@ -91,8 +92,8 @@ def loaded_by(library: str) -> Iterator[str]:
 def _layer(names: Sequence[str]) -> tuple[Room, ...]:
     """Packages one by one, modules together."""
     modules = [name.rpartition(".")[2] for name in names if not is_package(name)]
-    together = (Room(" · ".join(modules)),) if modules else ()
-    return (*(room(name) for name in names if is_package(name)), *together)
+    together = textwrap.wrap("\N{NO-BREAK SPACE}· ".join(modules), LONGEST_MODULES)
+    return (*(room(name) for name in names if is_package(name)), *map(Room, together))
 
 
 # --- drawing ---------------------------------------------------------------------------------------------------------
