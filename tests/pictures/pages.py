@@ -160,7 +160,7 @@ def photograph_dashboard(chromium: Browser, address: str, cookie: str) -> None:
     page.screenshot(
         path=PICTURES / "dashboard.png",
         full_page=True,
-        clip={"x": 0, "y": 0, "width": WIDE, "height": table["y"] + table["height"] + 24},
+        clip={"x": 0, "y": 0, "width": WIDE, "height": table["y"] + table["height"] + 16},
     )
 
 
