@@ -23,9 +23,13 @@ from worker.compute import simulation
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
-PROGRAMS = [each for part in ("app", "worker", "tests/benchmarks") for each in sorted((ROOT / part).rglob("*.py"))]
+PROGRAMS = [
+    each
+    for part in ("app", "worker", "tests/benchmarks", "tests/pictures")
+    for each in sorted((ROOT / part).rglob("*.py"))
+]
 OTHERS = [*sorted((ROOT / "templates").rglob("*.html")), *sorted((ROOT / "install").glob("*.sh"))]
-OURS = r"(?:-m (?:app|worker|tests\.benchmarks\.\w+)|tests/benchmarks/\w+\.py)"
+OURS = r"(?:-m (?:app|worker|tests\.(?:benchmarks|pictures)\.\w+)|tests/benchmarks/\w+\.py)"
 VARIABLES = r"(?:[A-Z_]+=\S+ )"
 MAKE = rf"(?:{VARIABLES}+|(?<=[`>])|(?<=: )|(?<=^    ))make\b(?= |`|<|$)(?! them)"
 COMMAND = re.compile(
@@ -88,11 +92,13 @@ RUN: dict[str, str | Elsewhere | OnlyParsed] = {
     "first_robot": REAL_TIME,
     "in_imitation": OnlyParsed("needs the library imitation, in an environment of its own"),
     "onlookers": "--people 1 --labels 40 --labellers 1 --dashboards 1 --seconds 1 --thought 0.1",
+    "pages": OnlyParsed("photographs a real studio, which takes minutes, and writes to docs/pictures"),
     "pool_rollouts": "--first 10800000 --scenarios 1 --directory pool",
     "printed_readings": ROLLOUTS,
     "render_speed": "--tasks feeding --films 1 --steps 1",
     "replayed_waiting": REAL_TIME,
     "retraining": ROLLOUTS,
+    "rooms": Elsewhere("tests/architecture/test_rooms.py::test_the_picture_of_the_rooms_is_up_to_date"),
     "rounds": "1",
     "same_bits": "--tasks feeding",
     "save_latency": "52 1",  # beyond the first break
@@ -155,7 +161,9 @@ def planned(words: list[str]) -> list[str]:
 def file_of(program: str) -> Path:
     """What Python runs."""
     part = program.split()[0]
-    return ROOT / part / "__main__.py" if part in ("app", "worker") else ROOT / "tests/benchmarks" / f"{program}.py"
+    if part in ("app", "worker"):
+        return ROOT / part / "__main__.py"
+    return next((ROOT / "tests").glob(f"*/{program}.py"))
 
 
 def run(program: str, arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> int:
