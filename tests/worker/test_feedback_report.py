@@ -4,6 +4,7 @@ from pathlib import Path
 
 from tests.benchmarks import feedback_report
 from tests.benchmarks.feedback_report import Row
+from worker.tasks.registry import ENVIRONMENTS
 
 RESULTS = Path(__file__).resolve().parents[2] / "docs/results"
 
@@ -31,6 +32,6 @@ def test_people_of_the_population_stand_in_a_table_of_their_own() -> None:
 
 def test_the_published_page_says_what_the_files_beside_it_say() -> None:
     """python -m tests.benchmarks.feedback_report docs/results writes it anew."""
-    files = {task: RESULTS / f"feedback_efficiency-{task}.csv" for task in feedback_report.ENVIRONMENTS}
+    files = {task: RESULTS / f"feedback_efficiency-{task}.csv" for task in ENVIRONMENTS}
     tables = feedback_report.tables({task: feedback_report.read(file) for task, file in files.items()})
     assert (RESULTS / "feedback_efficiency.md").read_text().endswith(f"{feedback_report.MARK}\n\n{tables}")
