@@ -16,6 +16,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from worker.analysis import result_pages
 from worker.analysis.figures import LINE_COLOURS, MARKERS, STYLE, rendered
 from worker.tasks.registry import ENVIRONMENTS
 
@@ -33,9 +34,6 @@ DRAWN = (
 )
 """Lines of the picture: model, rule, name."""
 POOLED = ("structured", "entropy", "structured, by entropy, pooled prior")
-MARK = (
-    "<!-- Written from the CSV files by tests/benchmarks/feedback_report.py; what stands above this line is kept. -->"
-)
 
 
 def write(folder: Path) -> None:
@@ -45,8 +43,7 @@ def write(folder: Path) -> None:
     if by_task:
         (folder / "feedback_efficiency.svg").write_bytes(rendered(_curves(by_task))["svg"])
         page = folder / "feedback_efficiency.md"
-        head = page.read_text().partition(MARK)[0] if page.exists() else "# Feedback efficiency\n\n"
-        page.write_text(head + MARK + "\n\n" + tables(by_task))
+        page.write_text(result_pages.page(page, "# Feedback efficiency", tables(by_task)))
 
 
 def read(file: Path) -> list[Row]:
@@ -106,7 +103,7 @@ def tables(by_task: dict[str, list[Row]]) -> str:
 ## Every number of labels
 True preference gained in %, plus or minus its standard error over users, and the share of unseen pairs foreseen; the
 first seed, which all models have. The error is mostly how much users differ: lines are compared in the same users."""
-    return "\n\n".join([introduction, *parts]) + "\n"
+    return "\n\n".join([introduction, *parts])
 
 
 def _table(title: str, rows: Sequence[Row]) -> str:

@@ -1,12 +1,7 @@
-"""The tables of feedback_efficiency.md, from rows with known answers and from those that are published."""
-
-from pathlib import Path
+"""The tables of feedback_efficiency.md, from rows with known answers."""
 
 from tests.benchmarks import feedback_report
 from tests.benchmarks.feedback_report import Row
-from worker.tasks.registry import ENVIRONMENTS
-
-RESULTS = Path(__file__).resolve().parents[2] / "docs/results"
 
 
 def row(user: str, gain: float, *, seed: int = 0, pooled: bool = False, rule: str = "entropy") -> Row:
@@ -28,10 +23,3 @@ def test_people_of_the_population_stand_in_a_table_of_their_own() -> None:
     assert "10.0" in named
     assert "30.0" in people
     assert "30.0" not in named
-
-
-def test_the_published_page_says_what_the_files_beside_it_say() -> None:
-    """python -m tests.benchmarks.feedback_report docs/results writes it anew."""
-    files = {task: RESULTS / f"feedback_efficiency-{task}.csv" for task in ENVIRONMENTS}
-    tables = feedback_report.tables({task: feedback_report.read(file) for task, file in files.items()})
-    assert (RESULTS / "feedback_efficiency.md").read_text().endswith(f"{feedback_report.MARK}\n\n{tables}")

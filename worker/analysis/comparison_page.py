@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from worker.analysis import result_pages
 from worker.analysis.comparison import REFERENCE, Row, compared
 from worker.analysis.published import published
 from worker.analysis.table_files import DESCRIPTIONS, METHOD, Tables, read
@@ -14,8 +15,7 @@ from worker.analysis.table_files import DESCRIPTIONS, METHOD, Tables, read
 TOLERANCE = 0.05
 """Largest loss of success with which a method counts as keeping the task."""
 
-MARK = "<!-- Written from the files beside this page; what stands above this line is kept. -->"
-HEAD = "# Methods compared: the paper's Table I, measured here\n\n"
+HEAD = "# Methods compared: the paper's Table I, measured here"
 
 READING = """\
 Rows of `reference` are levels; all others are changes against the reference policy in the same scenarios, with their
@@ -29,10 +29,7 @@ unit, so compare signs and order, not sizes. Its PbARL (n = 10) stands beside bo
 
 def page(folder: Path) -> str:
     """The page of a folder, with what somebody has written above the mark."""
-    existing = folder / "table1.md"
-    text = existing.read_text() if existing.exists() else ""
-    head = text.partition(MARK)[0] if MARK in text else HEAD
-    return head + MARK + "\n\n" + generated(*read(folder))
+    return result_pages.page(folder / "table1.md", HEAD, generated(*read(folder)))
 
 
 def generated(tables: Tables, made: Mapping[str, Any]) -> str:
@@ -47,7 +44,7 @@ def generated(tables: Tables, made: Mapping[str, Any]) -> str:
         _made(made),
         _files(tables),
     ]
-    return "\n\n".join(part for part in parts if part) + "\n"
+    return "\n\n".join(part for part in parts if part)
 
 
 def _claim(tables: Tables) -> str:
