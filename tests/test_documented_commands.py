@@ -85,6 +85,7 @@ RUN: dict[str, str | Elsewhere | OnlyParsed] = {
     "api_pages": "--people 1 --answers 20",
     "behaviours": "--task feeding --scenarios 1 --axis-scenarios 1",
     "chosen_modes": ROLLOUTS,
+    "comparison_report": "results/paper_form",
     "contact_sheet": "sheets feeding --films 1 --steps 5 --no-people",
     "error_rates": Elsewhere("tests/worker/test_error_rates.py::test_the_command_writes_every_table"),
     "feedback_efficiency": OnlyParsed("begins with 240 rollouts of unseen scenarios, and draws all its figures"),
@@ -209,6 +210,7 @@ def directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
     results.mkdir()
     for file in (ROOT / "docs/results").glob("feedback_efficiency-*.csv"):
         shutil.copy(file, results)
+    shutil.copytree(ROOT / "docs/results/paper_form", results / "paper_form")
     return directory
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from worker import cli
+from worker.analysis.comparison import compared
 from worker.experiments import benchmark, benchmark_cell
 from worker.experiments.benchmark import PROFILES, Selection, with_options
 from worker.experiments.benchmark_cell import OPPOSED_USERS, PAPER_USERS, Cell, Terms
@@ -55,18 +56,22 @@ def test_the_tables_are_written_from_whatever_is_finished(work: Path, tmp_path: 
     assert {(row["labels"], row["scenarios"], row["seeds"]) for row in table} == {("12", "3", "1")}
     matrix = rows(tmp_path / "personalisation.csv")
     assert len(matrix) == 4
+    shy = [row for row in rows(tmp_path / "users.csv") if row["user"] == "shy"]
+    assert [row["weight"] for row in shy] == ["1", "3", "2", "2", "1", "1"]
     page = (tmp_path / "table1.md").read_text()
-    assert "shy (1, 3, 2, 2, 1, 1)" in page
     assert f"as a hash: {benchmark_cell.code_mark()} (4 runs)." in page
+    assert "    the command\n" in page
+    assert not (tmp_path / "paired.csv").exists(), "no baseline was run"
     assert (tmp_path / "pareto-feeding.svg").read_text().startswith("<svg")
     assert len(rows(tmp_path / "costs.csv")) == 4
 
 
 def test_pictures_show_users_for_whom_methods_can_be_compared() -> None:
-    alone = [{"user": "shy", "method": method} for method in ("reference", "pbarl")]
-    several = [{"user": "cautious", "method": method} for method in ("reference", "pbarl", "prefft")]
-    assert benchmark.compared([*alone, *several]) == several
-    assert benchmark.compared(alone) == alone
+    alone = [{"task": "feeding", "user": "shy", "method": method} for method in ("reference", "pbarl")]
+    elsewhere = [{**row, "task": "drinking"} for row in alone]
+    several = [{"task": "feeding", "user": "cautious", "method": method} for method in ("reference", "pbarl", "prefft")]
+    assert compared([*alone, *several, *elsewhere]) == several
+    assert compared(alone) == alone
 
 
 def test_cells_of_other_terms_are_not_mixed_in(work: Path, tmp_path: Path) -> None:
