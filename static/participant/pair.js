@@ -4,10 +4,10 @@
 import { keepOnly, makeVideo, preload } from "./clips.js";
 import { Enlarging } from "./enlarging.js";
 import { Events } from "./events.js";
-import { listen } from "./hotkeys.js";
-import { LockStep } from "./lock_step.js";
+import { listen } from "../base/hotkeys.js";
+import { LockStep } from "../base/lock_step.js";
 import { Outbox } from "./outbox.js";
-import { PlayerControls } from "./player_controls.js";
+import { PlayerControls } from "../base/player_controls.js";
 import { Practice } from "./practice.js";
 
 const SETTLE_MS = 200; // a press this soon after a new pair appeared was meant for the one before

@@ -1,9 +1,9 @@
 // Watching and rating one robot. Digits rate, Enter saves; a rating is kept in the browser until the server has it.
 
 import { Film } from "./film.js";
-import { listen } from "./hotkeys.js";
+import { listen } from "../base/hotkeys.js";
 import { Outbox } from "./outbox.js";
-import { PlayerControls } from "./player_controls.js";
+import { PlayerControls } from "../base/player_controls.js";
 
 const LOOK_MS = 3000; // physical mode: whether the operator has taken the trial back
 const REFUSED_MS = 4000; // so long a refusal can be read

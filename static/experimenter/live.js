@@ -1,6 +1,6 @@
 // Keeps an experimenter's page up to date: the server sends the parts that changed.
 
-import { morph } from "./morph.js";
+import { morph } from "../base/morph.js";
 
 const path = document.querySelector("[data-live]").dataset.live;
 const state = document.querySelector("[data-live-state]");
