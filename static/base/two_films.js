@@ -1,10 +1,10 @@
-// The person's robot before and after, as one: the films share one clock, one bar and one speed, as a pair of clips does.
+// Plays two films as one, with one clock, one bar and one speed, on pages that show them and ask nothing.
 
 import { listen } from "./hotkeys.js";
 import { LockStep } from "./lock_step.js";
 import { PlayerControls } from "./player_controls.js";
 
-const page = document.querySelector("[data-page=debrief]");
+const page = document.querySelector("[data-two-films]");
 const words = { play: page.dataset.sayPlay, pause: page.dataset.sayPause, position: page.dataset.sayPosition };
 const still = matchMedia("(prefers-reduced-motion: reduce)");
 const trouble = page.querySelector("[data-trouble]");
