@@ -181,7 +181,9 @@ def test_no_selector_stands_twice_under_the_same_conditions(sheet: str) -> None:
 @pytest.mark.parametrize("sheet", sorted(set(SHEETS) - {TOKENS}))
 def test_raw_colours_stand_among_the_tokens_only(sheet: str) -> None:
     said = " ".join(rule.declarations for rule in rules_of(sheet))
-    assert re.findall(r"#[0-9a-f]{3,8}\b|\b(?:rgb|hsl|oklch|color-mix)a?\(|(?<![\w-])(?:white|black)(?![\w-])", said) == []
+    assert (
+        re.findall(r"#[0-9a-f]{3,8}\b|\b(?:rgb|hsl|oklch|color-mix)a?\(|(?<![\w-])(?:white|black)(?![\w-])", said) == []
+    )
 
 
 def test_tokens_are_defined_once_for_each_theme_and_all_of_them_are_used() -> None:
@@ -242,6 +244,18 @@ def test_a_page_loads_the_sheets_of_what_it_shows_and_no_others(page: str) -> No
 
 def _styles(name: str, sheets: set[str]) -> bool:
     return any(name in styled_by(sheet) for sheet in sheets)
+
+
+def test_no_page_gives_a_class_that_no_sheet_styles() -> None:
+    """Scripts find their elements by attributes, tests by role and label."""
+    styled = {name for sheet in SHEETS for name in styled_by(sheet)}
+    written = {
+        word
+        for attribute in CLASS_ATTRIBUTE.findall(MARKUP)
+        for word in EXPRESSION.sub("\0", attribute).split()
+        if "\0" not in word
+    }
+    assert written - styled == set()
 
 
 def test_no_page_waits_for_many_sheets() -> None:
