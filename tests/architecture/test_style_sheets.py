@@ -1,4 +1,4 @@
-"""The style sheets: every rule in one place, nothing that no page shows, and every page with the sheets it needs."""
+"""Style sheets and templates: every rule in one place and for some page, every page with the sheets that it needs."""
 
 import re
 from collections import Counter, defaultdict
@@ -105,19 +105,23 @@ def template(name: str) -> tuple[Markup, Mapping[str, Markup], Mapping[str, str]
     return _markup(MACRO.sub("", text)), macros, imported
 
 
+@cache
 def shown_by(page: str) -> Markup:
     """Everything that a page can show: with its base, its pieces, and the macros that are called."""
-    whole, done = Markup(), set()
+    whole = Markup()
+    done: set[str] = set()
 
     def add(part: Markup, scope: dict[str, tuple[str, Markup]]) -> None:
         whole.classes.update(part.classes)
         whole.sheets.update(part.sheets)
+        whole.templates.update(part.templates)
         for each in sorted(part.templates):
             visit(each, scope)
         for macro in sorted(part.called & scope.keys()):
             home, body = scope[macro]
-            if (home, macro) not in done:
-                done.add((home, macro))
+            if f"{home} {macro}" not in done:
+                done.add(f"{home} {macro}")
+                whole.templates.add(home)
                 add(body, scope | scope_of(home))
 
     def visit(name: str, scope: dict[str, tuple[str, Markup]]) -> None:
@@ -145,6 +149,13 @@ PAGES = [
     )
     if path.name != "base.html"
 ]
+PARTS = sorted(
+    path.relative_to(TEMPLATES).as_posix()
+    for path in TEMPLATES.rglob("*.html")
+    if path.parent.name == "pieces" or len(path.relative_to(TEMPLATES).parts) > 2
+)
+OCCASIONAL = {"participant/preview.css", "participant/no_script.css"}
+"""Of previews, and of pages without scripts."""
 SCRIPTS = "\n".join(path.read_text(encoding="utf-8") for path in STATIC.rglob("*.js"))
 MARKUP = "\n".join(path.read_text(encoding="utf-8") for path in TEMPLATES.rglob("*.html"))
 WORDS = {
@@ -210,6 +221,7 @@ def test_every_rule_is_for_something_that_a_page_has(sheet: str) -> None:
 
 
 def _may_match(selector: str, classes: set[str]) -> bool:
+    """Whether the pages have what a selector names: classes, attributes with their values, elements."""
     completed = {name[:-1] for name in classes if name.endswith("*")}
     return (
         all(
@@ -217,19 +229,20 @@ def _may_match(selector: str, classes: set[str]) -> bool:
             for name in classes_of(selector)
         )
         and all(_is_written(*each) for each in re.findall(r"""\[([\w-]+)(?:="([^"]*)")?""", selector))
-        and all(f"<{tag}" in MARKUP for tag in re.findall(r"(?:^|[\s>+~(])([a-z][a-z0-9]*)", _plain(selector)))
+        and all(f"<{tag}" in MARKUP for tag in _elements(selector))
     )
 
 
 def _is_written(attribute: str, value: str) -> bool:
     """Whether a template or a script gives an element the attribute, and somebody names the value."""
     in_scripts = re.sub(r"-(\w)", lambda letter: letter[1].upper(), attribute.removeprefix("data-"))
-    known = f"{attribute}=" in MARKUP or re.search(rf"{attribute}\b", MARKUP) or f"dataset.{in_scripts}" in SCRIPTS
-    return bool(known or attribute in SCRIPTS) and (value in MARKUP or value in SCRIPTS)
+    known = re.search(rf"\b({attribute}|dataset\.{in_scripts})\b", MARKUP + SCRIPTS)
+    return known is not None and value in MARKUP + SCRIPTS
 
 
-def _plain(selector: str) -> str:
-    return re.sub(r'"[^"]*"|\[[^\]]*\]|::?[\w-]+(?:\((?=[^)]*[n\d][^)]*\)))?', " ", selector)
+def _elements(selector: str) -> list[str]:
+    without = re.sub(r"\[[^\]]*\]|::?[\w-]+(?:\(\d\))?", " ", selector)
+    return re.findall(r"(?:^|[\s>+~(])([a-z][a-z0-9]*)", without)
 
 
 @pytest.mark.parametrize("page", PAGES)
@@ -246,6 +259,23 @@ def _styles(name: str, sheets: set[str]) -> bool:
     return any(name in styled_by(sheet) for sheet in sheets)
 
 
+@pytest.mark.parametrize("sheet", sorted(set(SHEETS) - OCCASIONAL))
+def test_a_sheet_has_the_name_of_its_page_or_is_for_several(sheet: str) -> None:
+    loading = [page for page in PAGES if sheet in shown_by(page).sheets]
+    assert len(loading) > 1 or loading == [sheet.replace(".css", ".html")]
+
+
+@pytest.mark.parametrize("piece", PARTS)
+def test_a_piece_lies_in_the_folder_of_its_page_or_is_for_several(piece: str) -> None:
+    showing = [page for page in PAGES if piece in shown_by(page).templates]
+    folder = piece.rpartition("/")[0]
+    if folder.endswith("pieces"):
+        assert len(showing) > 1
+    else:
+        assert showing != []
+        assert all(page.startswith(folder) for page in showing)
+
+
 def test_no_page_gives_a_class_that_no_sheet_styles() -> None:
     """Scripts find their elements by attributes, tests by role and label."""
     styled = {name for sheet in SHEETS for name in styled_by(sheet)}
@@ -260,7 +290,3 @@ def test_no_page_gives_a_class_that_no_sheet_styles() -> None:
 
 def test_no_page_waits_for_many_sheets() -> None:
     assert max(len(shown_by(page).sheets - OCCASIONAL) for page in PAGES) <= 6
-
-
-OCCASIONAL = {"participant/preview.css", "participant/no_script.css"}
-"""Of previews, and of pages without scripts."""
