@@ -11,6 +11,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 TEMPLATES, STATIC = ROOT / "templates", ROOT / "static"
+TASK_PICTURES = "".join(each.read_text(encoding="utf-8") for each in ROOT.glob("worker/tasks/*/picture.svg"))
 SHEETS = sorted(path.relative_to(STATIC).as_posix() for path in STATIC.rglob("*.css"))
 TOKENS = "base/tokens.css"
 SIDES = ("participant", "experimenter")
@@ -102,6 +103,8 @@ def template(name: str) -> tuple[Markup, Mapping[str, Markup], Mapping[str, str]
     text = re.sub(r"{#.*?#}", "", (TEMPLATES / name).read_text(encoding="utf-8"), flags=re.DOTALL)
     imported = {macro.strip(): path for path, macros in IMPORT.findall(text) for macro in macros.split(",")}
     macros = {macro: _markup(body, macro) for macro, body in MACRO.findall(text)}
+    if "task_picture" in macros:
+        macros["task_picture"].classes.update(_markup(TASK_PICTURES).classes)
     return _markup(MACRO.sub("", text)), macros, imported
 
 
