@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import TypeAlias, get_args
 
 from app.db import Database
+from app.domain.choices import ClipQuality, Method, RewardKind, Strategy
 from app.domain.protocol import EvaluationSettings
-from app.domain.studies import PAPER_PROTOCOL, ClipQuality, Method, RewardKind, Strategy, StudySettings
+from app.domain.study_settings import PAPER_PROTOCOL, StudySettings
 from app.services.archives import demo_archive
 from app.settings import Settings
 from app.storage import ArtefactStore, keep_private

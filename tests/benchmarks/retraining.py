@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from app.domain.studies import StudySettings
+from app.domain.study_settings import StudySettings
 from worker.compute import learning
 from worker.compute.filter_fitting import Fitting
 from worker.compute.pools import Compute, Lane

@@ -12,7 +12,8 @@ from sqlalchemy.orm import Session
 
 from app.domain.participation import ParticipantEvent, StageRecord
 from app.domain.protocol import Stage
-from app.domain.studies import Participant, StudySettings
+from app.domain.studies import Participant
+from app.domain.study_settings import StudySettings
 from app.services.answers.next_query import LONGEST_PAUSE, Progress
 from app.services.participant_events import EventKind
 from app.services.participants import stages

@@ -8,7 +8,8 @@ from sqlalchemy.orm import Session
 
 from app.db import now
 from app.domain.models import Model, Run, RunKind, RunStatus
-from app.domain.studies import Participant, Study, StudySettings
+from app.domain.studies import Participant, Study
+from app.domain.study_settings import StudySettings
 
 RECENT = 9
 """Runs whose median is taken, the newest."""

@@ -16,7 +16,8 @@ from app.db import now
 from app.domain.clips import Rollout
 from app.domain.evaluation import Assignment
 from app.domain.preferences import Query
-from app.domain.studies import Deviation, Participant, Study, StudySettings, longest_clip_steps
+from app.domain.studies import Deviation, Participant, Study, longest_clip_steps
+from app.domain.study_settings import StudySettings
 from app.errors import AppError
 from app.services import audit
 from app.services.exports import export_formats

@@ -11,7 +11,8 @@ from sqlalchemy.orm import Session
 
 from app.db import Base
 from app.domain.clips import Clip, Rollout
-from app.domain.studies import LONGEST_CLIP_STEPS, Study, StudySettings, TaskName
+from app.domain.studies import LONGEST_CLIP_STEPS, Study, TaskName
+from app.domain.study_settings import StudySettings
 from app.errors import AppError
 from app.services import audit
 

@@ -9,7 +9,8 @@ from fastapi import Form
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from app.domain.protocol import FormItem
-from app.domain.studies import LONGEST_CLIP_STEPS, PAPER_PROTOCOL, USUAL_CLIP_STEPS, StudySettings, TaskName
+from app.domain.studies import LONGEST_CLIP_STEPS, USUAL_CLIP_STEPS, TaskName
+from app.domain.study_settings import PAPER_PROTOCOL, StudySettings
 from app.web.experimenter import form_lines
 from app.web.texts.own_texts import CONSENT
 from app.web.texts.wording import broken_texts

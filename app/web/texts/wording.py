@@ -15,7 +15,7 @@ from jinja2 import pass_context
 from jinja2.runtime import Context
 
 from app.domain.protocol import CONSENT_FACTS, Language
-from app.domain.studies import StudySettings
+from app.domain.study_settings import StudySettings
 from app.paths import WORDING
 
 log = logging.getLogger("app.wording")

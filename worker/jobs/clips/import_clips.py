@@ -21,8 +21,10 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from sqlalchemy.orm import Session
 
 from app.db import Database
+from app.domain.choices import RewardKind, Strategy
 from app.domain.clips import Clip, Rollout
-from app.domain.studies import LONGEST_CLIP_STEPS, RewardKind, Strategy, Study, StudySettings
+from app.domain.studies import LONGEST_CLIP_STEPS, Study
+from app.domain.study_settings import StudySettings
 from app.errors import AppError
 from app.services import audit
 from app.services.archives import unpacking

@@ -8,10 +8,11 @@ import numpy as np
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
+from app.domain.choices import Strategy
 from app.domain.clips import Clip
 from app.domain.models import ModelKind
 from app.domain.preferences import LEARNED_FROM, Purpose, Query
-from app.domain.studies import Participant, Strategy, Study
+from app.domain.studies import Participant, Study
 from worker.compute import learning, simulation
 from worker.jobs.learning import dataset, query_plan
 from worker.jobs.learning.query_plan import Slot
