@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Collection, Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from sqlalchemy import select
@@ -172,7 +172,7 @@ class _Choosing:
             len(ordinals),
             len(pairs),
             np.random.default_rng([participant.seed, ordinals[0]]),
-            rule="uniform" if scores is None else settings.strategy.value,
+            rule="uniform" if scores is None else cast(acquisition.Rule, settings.strategy.value),
             scores=scores,
             random_share=settings.random_share,
         )
