@@ -11,14 +11,15 @@ import pytest
 
 from app.domain.choices import ClipQuality, Method, RewardKind, Strategy
 from app.domain.preferences import Response
-from app.domain.protocol import EvaluatedMethod, EvaluationSettings, Language, PlannedTest
+from app.domain.protocol import LIKERT_POINTS, EvaluatedMethod, EvaluationSettings, Language, PlannedTest
 from app.domain.studies import LONGEST_CLIP_STEPS, USUAL_CLIP_STEPS, TaskName
 from app.domain.study_settings import StudySettings
 from app.paths import WORDING
 from app.services.evaluation import unblinding
+from app.services.participants import time_left
 from app.services.studies import preregistration
 from app.web.experimenter import results
-from worker.analysis import figures, hypothesis_tests
+from worker.analysis import figures, hypothesis_tests, statistics
 from worker.experiments import benchmark_cell, rollout_cache
 from worker.experiments.benchmark_cell import Terms
 from worker.ml import acquisition, teachers
@@ -28,6 +29,7 @@ from worker.ml.methods.prefft import FineTuning
 from worker.ml.methods.registry import METHODS
 from worker.ml.rewards import reward_training
 from worker.sim.render.clip import STYLES
+from worker.spaces import CONTROL_STEP_S
 
 USUAL = StudySettings()
 EVALUATION = EvaluationSettings()
@@ -52,6 +54,8 @@ def default(config: type, name: str) -> Any:
         (benchmark_cell.CHOOSE_EVERY, USUAL.retrain_every_labels),
         (rollout_cache.BEHAVIOURS_PER_SCENARIO, USUAL.behaviours_per_scenario),
         (USUAL_CLIP_STEPS[TaskName.FEEDING], USUAL.clip_steps),
+        (statistics.POINTS, (1, LIKERT_POINTS)),
+        (CONTROL_STEP_S, 1 / time_left.CONTROL_RATE_HZ),
     ],
 )
 def test_what_is_usual_without_a_study_is_what_is_usual_in_one(assumed: object, usual: object) -> None:

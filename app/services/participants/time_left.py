@@ -23,7 +23,7 @@ LEAST_PEOPLE = 3
 RECENT = 90
 """Rows looked at, the newest."""
 _AFTER_PAIRS = (Stage.EVALUATION, Stage.QUESTIONNAIRE, Stage.DEBRIEF)
-_CONTROL_RATE_HZ = 10
+CONTROL_RATE_HZ = 10
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ def _pairs_s(progress: Progress, settings: StudySettings, whole_clip_steps: int 
     """Whole episodes come first and play longer than what follows; the pace is that of what was answered last."""
     pace_s, left = progress.pace_s or 0.0, progress.wanted - progress.answered
     whole = max(0, settings.introduction_count - progress.answered)
-    shorter_s = ((whole_clip_steps or settings.clip_steps) - settings.clip_steps) / _CONTROL_RATE_HZ
+    shorter_s = ((whole_clip_steps or settings.clip_steps) - settings.clip_steps) / CONTROL_RATE_HZ
     after_s = pace_s - shorter_s if whole and pace_s > shorter_s else pace_s
     return whole * pace_s + (left - whole) * after_s
 

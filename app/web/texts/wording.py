@@ -20,10 +20,6 @@ from app.paths import WORDING
 
 log = logging.getLogger("app.wording")
 
-NAMES = {Language.ENGLISH: "English", Language.GERMAN: "Deutsch"}
-"""Each language in itself."""
-
-
 _ASKED = re.compile(r"(?:^|,)\s*([a-z]{2,8})(?:-[a-z0-9-]*)?\s*(?:;\s*q\s*=\s*(\d(?:\.\d{0,3})?))?")
 """One language of an Accept-Language header, without its region, and how much it is wanted."""
 
