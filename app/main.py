@@ -35,8 +35,8 @@ from app.web.http.deps import Studio
 from app.web.http.rate_limit import LoginAttempts
 from app.web.http.readiness import Readiness
 from app.web.http.security import Guard
-from app.web.http.session_queue import Turns
-from app.web.http.shared_pages import Screens
+from app.web.http.session_queue import SessionQueue
+from app.web.http.shared_pages import SharedPages
 from app.web.participant import consent, entry, evaluation, finish, forms, joining, pairs, withdrawal
 from app.web.texts import languages
 from app.web.texts.templating import make_environment
@@ -83,10 +83,10 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         settings=settings,
         database=database,
         store=ArtefactStore(settings.data_dir / "artefacts"),
-        turns=Turns(database),
+        session_queue=SessionQueue(database),
         login_attempts=LoginAttempts(settings.login_attempts_per_minute),
         token_attempts=LoginAttempts(settings.login_attempts_per_minute, WRONG_TOKENS, WRONG_TOKENS),
-        screens=Screens(database),
+        shared_pages=SharedPages(database),
     )
 
     readiness = Readiness(database, settings.data_dir)

@@ -33,7 +33,7 @@ from worker.analysis import figures
 from worker.analysis.report import make_report
 from worker.compute.pools import Compute
 from worker.jobs.publishing import export_files, preference_arrays, report_files
-from worker.jobs.runtime.context import Workplace
+from worker.jobs.runtime.context import WorkerContext
 
 WHEN = re.compile(
     rb"just now|\d+ (s|min|h|days) ago|\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d(\.\d+)?)?( UTC|Z|\+00:00)?|svg\?\d+"
@@ -103,7 +103,7 @@ def everything(
             found[f"api {path}"] = answer.content
         with database.reading() as session:
             there = session.get_one(Study, study.id)
-            place = Workplace(database, store, Compute(1))
+            place = WorkerContext(database, store, Compute(1))
             for name, write in (
                 ("data", lambda file: export_files.write_data(session, place, there, file)),
                 ("archive", lambda file: archive.write(session, store, there, file)),

@@ -67,8 +67,8 @@ def test_going_on_twice_or_without_a_break_notes_nothing_more(
 def test_after_the_last_answer_there_is_no_break(taking_part: TakingPart, settle: Callable[..., None]) -> None:
     settle(break_every=10)
     taking_part.turn()
-    turns = [taking_part.answer(query).json() for query in taking_part.queries[:10]]
-    assert turns[-1]["state"] == "finished"
+    session_queue = [taking_part.answer(query).json() for query in taking_part.queries[:10]]
+    assert session_queue[-1]["state"] == "finished"
 
 
 def test_practice_is_stored_but_is_no_label_and_no_progress(

@@ -44,9 +44,9 @@ def test_while_no_pair_is_ready_a_page_waits_by_itself(database: Database, takin
 
 def test_after_the_last_answer_the_participant_is_thanked(taking_part: TakingPart) -> None:
     taking_part.turn()
-    turns = [taking_part.answer(query).json() for query in taking_part.queries[:10]]
-    assert turns[8]["following"] == []
-    assert turns[9]["state"] == "finished"
+    session_queue = [taking_part.answer(query).json() for query in taking_part.queries[:10]]
+    assert session_queue[8]["following"] == []
+    assert session_queue[9]["state"] == "finished"
     assert taking_part.browser.get("/p/next").headers["location"] == "/p/finished"
     assert "Thank you" in taking_part.browser.get("/p/finished").text
     assert taking_part.answer(taking_part.queries[10]).status_code == 409

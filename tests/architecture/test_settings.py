@@ -19,10 +19,11 @@ from app.services.evaluation import unblinding
 from app.services.participants import time_left
 from app.services.studies import preregistration
 from app.web.experimenter import results
+from worker import responses
 from worker.analysis import figures, hypothesis_tests, statistics
 from worker.experiments import benchmark_cell, rollout_cache
 from worker.experiments.benchmark_cell import Terms
-from worker.ml import acquisition, teachers
+from worker.ml import acquisition
 from worker.ml.filters import filter_module
 from worker.ml.filters.filter_problem import FilterConfig
 from worker.ml.methods.prefft import FineTuning
@@ -69,7 +70,7 @@ def test_what_is_usual_without_a_study_is_what_is_usual_in_one(assumed: object, 
         (RewardKind, get_args(reward_training.Kind)),
         (Strategy, get_args(acquisition.Rule)),
         (ClipQuality, STYLES),
-        (Response, get_args(teachers.Answer)),
+        (Response, responses.TARGETS),
         (PlannedTest, hypothesis_tests.TESTS),
         (PlannedTest, preregistration.TEST_NAMES),
         (EvaluatedMethod, unblinding.NAMES),

@@ -33,7 +33,6 @@ from tests.benchmarks.pool_rollouts import Pool, pool_rollouts
 from worker.compute import learning, simulation
 from worker.compute.simulation import surface_file
 from worker.ml import acquisition
-from worker.ml.filters.filter_problem import scenarios_for
 from worker.ml.filters.gate import signal_changes, successes
 from worker.ml.filters.response_surface import ResponseSurface, best_mode
 from worker.ml.rewards import calibration, reward_training
@@ -41,6 +40,8 @@ from worker.ml.rewards.pooled_prior import Prior
 from worker.ml.rewards.reward_models import RewardModel
 from worker.ml.rewards.reward_training import SignalScale
 from worker.ml.teachers import TASTES, Manner, ScriptedTeacher, Taste, User, random_taste
+from worker.responses import TARGETS
+from worker.scenarios import EVALUATION, first_of
 from worker.sim.costs import preference_rewards, signal_weights
 from worker.tasks.registry import ENVIRONMENTS
 from worker.trajectory import Array, Trajectory
@@ -59,7 +60,6 @@ EARLIER_PEOPLE = range(100, 112)
 RULES: tuple[acquisition.Rule, ...] = ("uniform", "disagreement", "entropy", "information_gain", "contested")
 AS_IN_A_STUDY: tuple[acquisition.Rule, ...] = ("uniform", "entropy")
 """rules that are also run with the pooled prior and with foreseen signals: random ones, and the studio's default"""
-TARGETS = {"left": 0.0, "right": 1.0, "equal": 0.5}
 DRIVEN = {
     ("structured", "entropy", 50),
     ("structured", "entropy", 200),
@@ -232,7 +232,7 @@ class Bench:
     def driven_reference(self) -> list[Trajectory]:
         """The reference policy in the scenarios in which modes are driven."""
         policy = simulation.reference_policy(self.task.name)
-        scenarios = scenarios_for("evaluation", DRIVEN_SCENARIOS)
+        scenarios = first_of(EVALUATION, DRIVEN_SCENARIOS)
         return learning.run_scenarios(self.task.name, policy.mean, scenarios, 0.0, 0)
 
     def _percent(self, user: str, change: float) -> float:

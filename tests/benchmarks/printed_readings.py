@@ -23,10 +23,11 @@ from worker.analysis.evaluation import success_change
 from worker.compute import learning
 from worker.experiments.benchmark_cell import PAPER_USERS, Bench, Cell, Terms
 from worker.experiments.rollout_cache import Shelf
-from worker.ml.filters.filter_problem import act_of, scenarios_for
+from worker.ml.filters.filter_problem import act_of
 from worker.ml.filters.gate import successes
 from worker.ml.filters.pbarl_printed import BETAS, OTHER_TASKS_BETAS, PrintedConfig
 from worker.ml.filters.printed_filter import fit_printed
+from worker.scenarios import EVALUATION, RESIDUAL, first_of
 from worker.sim.costs import preference_rewards, stakes
 from worker.tasks.registry import ENVIRONMENTS
 from worker.trajectory import Trajectory
@@ -94,9 +95,9 @@ def _measured(task: str, name: str, options: argparse.Namespace) -> dict[str, An
     setting = bench.setting()
     problem = replace(setting.problem, reward=setting.action_reward())
     config = READINGS[name].config(task, options.steps)
-    draft = fit_printed(problem, shelf.reference(scenarios_for("residual", setting.config.printed_rollouts)), config)
+    draft = fit_printed(problem, shelf.reference(first_of(RESIDUAL, setting.config.printed_rollouts)), config)
     act = act_of(problem.task.modes, problem.policy, draft.weights)
-    scenarios = scenarios_for("evaluation", options.scenarios)
+    scenarios = first_of(EVALUATION, options.scenarios)
     before, after = shelf.reference(scenarios), learning.run_scenarios(task, act, scenarios, 0.0, 0)
     success = success_change(successes(before), successes(after))
     return {

@@ -40,7 +40,7 @@ from worker.compute.pools import Lane
 from worker.jobs import service, workflows
 from worker.jobs.learning import reference_rollouts
 from worker.jobs.runtime import records
-from worker.jobs.runtime.context import Step, Workplace
+from worker.jobs.runtime.context import Step, WorkerContext
 from worker.jobs.runtime.records import Job
 
 LABELS, TRIALS, BEHAVIOURS = 12, 3, 6
@@ -73,12 +73,12 @@ def nothing(*_arguments: Any) -> None:
     """What is made ready beforehand."""
 
 
-def clips(place: Workplace, job: Job, run_id: int, step: Step) -> None:
-    scenario = int(job.finding.rsplit("-", 1)[1])
+def clips(context: WorkerContext, job: Job, run_id: int, step: Step) -> None:
+    scenario = job.number
     for first in range(0, BEHAVIOURS, 2):
-        place.report(run_id, "filming", first / BEHAVIOURS)
-        place.compute.run_all(Lane.CLIPS, place.beat(run_id), busy, [(CLIP_S,)] * 2)
-        with place.database.writing() as session:
+        context.report(run_id, "filming", first / BEHAVIOURS)
+        context.compute.run_all(Lane.CLIPS, context.beat(run_id), busy, [(CLIP_S,)] * 2)
+        with context.database.writing() as session:
             for behaviour in (first, first + 1):
                 files = {"width": 1, "height": 1, "fps": 15, "duration_ms": 1, "byte_count": 1}
                 hashes = dict.fromkeys(("video_sha256", "poster_sha256"), f"{scenario:060d}{behaviour:04d}")
@@ -89,29 +89,29 @@ def clips(place: Workplace, job: Job, run_id: int, step: Step) -> None:
 
 
 def learning(lane: Lane, stages: tuple[tuple[int, int, float], ...]) -> Callable[..., None]:
-    def work(place: Workplace, job: Job, run_id: int, step: Step) -> None:
+    def work(context: WorkerContext, job: Job, run_id: int, step: Step) -> None:
         total, done = sum(often * tasks * each for often, tasks, each in stages), 0.0
         for often, tasks, each in stages:
             for _ in range(often):
-                place.report(run_id, "at work", done / total)
-                place.compute.run_all(lane, place.beat(run_id), busy, [(each,)] * tasks)
+                context.report(run_id, "at work", done / total)
+                context.compute.run_all(lane, context.beat(run_id), busy, [(each,)] * tasks)
                 done += tasks * each
-        with place.database.writing() as session:
+        with context.database.writing() as session:
             records.set_labels(session, run_id, LABELS, "hash")
             records.save_model(session, run_id, ModelKind(str(job.kind)), "0" * 64, {"method": "prefft"})
 
     return work
 
 
-def films(place: Workplace, job: Job, run_id: int, step: Step) -> None:
-    count = 3 * TRIALS if "/trials/" in job.finding else 4
+def films(context: WorkerContext, job: Job, run_id: int, step: Step) -> None:
+    count = 3 * TRIALS if job.about.subject == "trials" else 4
     for first in range(0, count, 2):
-        place.report(run_id, "filming", first / count)
-        place.compute.run_all(Lane.CLIPS, place.beat(run_id), busy, [(FILM_S,)] * min(2, count - first))
+        context.report(run_id, "filming", first / count)
+        context.compute.run_all(Lane.CLIPS, context.beat(run_id), busy, [(FILM_S,)] * min(2, count - first))
 
 
-def quick(place: Workplace, job: Job, run_id: int, step: Step) -> None:
-    place.compute.run(Lane.LEARNING, place.beat(run_id), busy, 2.0)
+def quick(context: WorkerContext, job: Job, run_id: int, step: Step) -> None:
+    context.compute.run(Lane.LEARNING, context.beat(run_id), busy, 2.0)
 
 
 def serve() -> None:

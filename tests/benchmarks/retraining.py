@@ -22,7 +22,7 @@ from tqdm import tqdm
 
 from app.domain.study_settings import StudySettings
 from worker.compute import learning
-from worker.compute.filter_fitting import Fitting
+from worker.compute.filter_fitting import FilterFit
 from worker.compute.pools import Compute, Lane
 from worker.experiments.benchmark_cell import Bench, Cell, Terms
 from worker.experiments.rollout_cache import Shelf
@@ -85,7 +85,7 @@ def _run(
     answers = (bench.labelled, bench.targets.astype(np.float32), bench.scale, 0)
     reward, _ = compute.run(Lane.REWARDS, _no_beat, learning.fit_reward, task, "structured", *answers)
     mark()
-    fitting = Fitting(
+    fitting = FilterFit(
         task, compute, _no_beat, reward, 0, FilterConfig(), progress=lambda stage, share: None, references=references
     )
     draft = fitting.find_mode(bench.pool)

@@ -58,7 +58,7 @@ def _finished_study(directory: Path, people: int) -> Database:
             for number in range(PAPER_PROTOCOL.practice_pairs + PAPER_PROTOCOL.question_count):
                 pair = clips[number % (CLIPS - 1)], clips[number % (CLIPS - 1) + 1]
                 factories.make_label(session, factories.make_query(session, participant, *pair))
-        while jobs := [job for job, _ in reconcile.findings(session) if job.participant_id is not None]:
+        while jobs := [job for job, _ in reconcile.due(session) if job.participant_id is not None]:
             for job in jobs:
                 run = session.get_one(Run, records.begin_run(session, job, seed=1))
                 run.status = RunStatus.SUCCEEDED
@@ -71,7 +71,7 @@ def _finished_study(directory: Path, people: int) -> Database:
 
 def _round(database: Database) -> None:
     with database.reading() as session:
-        list(reconcile.findings(session))
+        list(reconcile.due(session))
         reconcile.short_of_queries(session)
         reconcile.abandoned(session, ())
         reconcile.studies_with_answers(session)

@@ -20,18 +20,18 @@ from app.domain.study_settings import StudySettings
 from app.settings import Settings
 from app.storage import ArtefactStore
 from worker.compute.pools import Compute
-from worker.jobs.runtime.context import Workplace
-from worker.jobs.runtime.lanes import Turns
-from worker.jobs.workflows import Workshop
+from worker.jobs.runtime.context import WorkerContext
+from worker.jobs.runtime.lanes import Lanes
+from worker.jobs.workflows import JobRunner
 from worker.trajectory import COSTS, SIGNALS, Trajectory
 
 STEPS = 20
 
 
 @cache
-def the_workshop() -> Workshop:
-    """The engine knows one workshop per process; whoever borrows it gives it a place."""
-    return Workshop(cast("Workplace", None), Turns(Compute(1)))
+def the_job_runner() -> JobRunner:
+    """The engine knows one job runner per process; whoever borrows it gives it a context."""
+    return JobRunner(cast("WorkerContext", None), Lanes(Compute(1)))
 
 
 def make_trajectory(scenario: int, behaviour: int, steps: int = STEPS) -> Trajectory:

@@ -6,6 +6,8 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
+from app.domain import run_keys
+from worker.jobs.runtime.records import Job
 from worker.ml import dense_network
 from worker.ml.policies.gaussian import GaussianPolicy
 from worker.ml.rewards.segments import SegmentPairs
@@ -97,3 +99,10 @@ def answers_of(values: SegmentPairs, weights: Sequence[float] | npt.NDArray[np.f
     """Targets of somebody whose reward is linear in the signals and who never errs."""
     likes_right: npt.NDArray[np.bool_] = values.signal_differences() @ np.asarray(weights) > 0
     return likes_right.astype(np.float64)
+
+
+def job_of(key: str, study_id: int) -> Job:
+    """The job of a stored key."""
+    about = run_keys.read(key)
+    assert about is not None, key
+    return Job(about, study_id)

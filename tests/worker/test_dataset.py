@@ -13,6 +13,7 @@ from app.domain.studies import Participant
 from app.storage import ArtefactStore
 from tests.worker.conftest import STEPS, make_trajectory
 from worker.jobs.learning import dataset
+from worker.responses import TARGETS
 
 AddClips = Callable[..., list[Clip]]
 Answer = Callable[[Clip, Clip, Response], Query]
@@ -23,11 +24,11 @@ Answer = Callable[[Clip, Clip, Response], Query]
     [(Response.LEFT, 0.0), (Response.RIGHT, 1.0), (Response.EQUAL, 0.5), (Response.SKIP, None)],
 )
 def test_the_target_is_the_probability_that_right_is_preferred(response: Response, target: float | None) -> None:
-    assert dataset.target_of(response) == target
+    assert TARGETS[response] == target
 
 
 def test_every_response_has_a_target_rule() -> None:
-    assert all(dataset.target_of(response) in (0.0, 0.5, 1.0, None) for response in Response)
+    assert all(TARGETS[response] in (0.0, 0.5, 1.0, None) for response in Response)
 
 
 def test_left_and_right_keep_their_places_and_cant_tell_is_left_out(

@@ -25,7 +25,7 @@ from worker.jobs import reconcile
 from worker.jobs.learning import query_selection
 from worker.jobs.publishing import export_files, report_files
 from worker.jobs.runtime import records
-from worker.jobs.runtime.context import Workplace
+from worker.jobs.runtime.context import WorkerContext
 from worker.rehearsal import demo_study
 
 
@@ -41,8 +41,8 @@ class Here(Compute):
 
 
 @pytest.fixture
-def place(database: Database, store: ArtefactStore) -> Workplace:
-    return Workplace(database, store, Here())
+def context(database: Database, store: ArtefactStore) -> WorkerContext:
+    return WorkerContext(database, store, Here())
 
 
 @pytest.fixture
@@ -55,7 +55,7 @@ def visitor(database: Database, store: ArtefactStore) -> Participant:
 
 def test_nothing_is_made_again_but_the_report(visitor: Participant, database: Database) -> None:
     with database.reading() as session:
-        assert {job.kind for job, _ in reconcile.findings(session)} == {RunKind.REPORT}
+        assert {job.kind for job, _ in reconcile.due(session)} == {RunKind.REPORT}
 
 
 def test_its_settings_are_those_with_which_it_would_be_made_now(visitor: Participant, database: Database) -> None:
@@ -64,9 +64,9 @@ def test_its_settings_are_those_with_which_it_would_be_made_now(visitor: Partici
     assert (study.name, study.settings) == (demo_study.NAME, demo_study.SETTINGS)
 
 
-def test_the_visitor_has_pairs_as_soon_as_the_worker_runs(visitor: Participant, place: Workplace) -> None:
-    query_selection.refill_queries(place, visitor.id)
-    with place.database.reading() as session:
+def test_the_visitor_has_pairs_as_soon_as_the_worker_runs(visitor: Participant, context: WorkerContext) -> None:
+    query_selection.refill_queries(context, visitor.id)
+    with context.database.reading() as session:
         queries = session.scalars(select(Query).where(Query.participant_id == visitor.id)).all()
     assert queries
 
@@ -82,15 +82,15 @@ def test_each_scripted_person_has_their_robot_filmed_before_and_after(visitor: P
 
 
 def test_its_report_compares_the_methods(
-    visitor: Participant, place: Workplace, monkeypatch: pytest.MonkeyPatch
+    visitor: Participant, context: WorkerContext, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(figures, "DPI", 30)
-    with place.database.reading() as session:
+    with context.database.reading() as session:
         (job,) = report_files.due(session, session.get_one(Study, visitor.study_id))
-    with place.database.writing() as session:
+    with context.database.writing() as session:
         run_id = records.begin_run(session, job, seed=1)
-    report_files.make(place, job, run_id, lambda _name, function, *arguments: function(*arguments))
-    with place.database.reading() as session:
+    report_files.make(context, job, run_id, lambda _name, function, *arguments: function(*arguments))
+    with context.database.reading() as session:
         contents = session.scalars(select(Report)).one().contents
     assert not contents["blinded"]
     for scale in contents["ratings"]["scales"].values():
@@ -100,10 +100,12 @@ def test_its_report_compares_the_methods(
     assert len(contents["change"]["participants"]) == 3
 
 
-def test_its_data_for_analysis_say_who_is_no_person(visitor: Participant, place: Workplace, tmp_path: Path) -> None:
+def test_its_data_for_analysis_say_who_is_no_person(
+    visitor: Participant, context: WorkerContext, tmp_path: Path
+) -> None:
     path = tmp_path / "data.zip"
-    with place.database.reading() as session:
-        export_files.write_data(session, place, session.get_one(Study, visitor.study_id), path)
+    with context.database.reading() as session:
+        export_files.write_data(session, context, session.get_one(Study, visitor.study_id), path)
     with zipfile.ZipFile(path) as data:
         played = "P01 (neutral), P02 (cautious), P03 (impatient)"
         assert f"These participants are not people: {played}." in data.read("README.md").decode()

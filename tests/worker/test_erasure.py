@@ -17,17 +17,18 @@ from app.services.studies import retirement
 from app.settings import Settings
 from app.storage import ArtefactStore
 from tests.waiting import PATIENCE_S, until
-from tests.worker.conftest import the_workshop
+from tests.worker.conftest import the_job_runner
+from tests.worker.invented import job_of
 from worker.compute.pools import Compute
 from worker.jobs import workflows
-from worker.jobs.reconcile import findings, short_of_queries
+from worker.jobs.reconcile import due, short_of_queries
 from worker.jobs.runtime import engine, records
-from worker.jobs.runtime.context import Step, Workplace
-from worker.jobs.runtime.records import Job
+from worker.jobs.runtime.context import Step, WorkerContext
+from worker.jobs.runtime.records import Job, as_arguments
 from worker.jobs.upkeep import erasure
-from worker.jobs.workflows import Workshop, as_arguments
+from worker.jobs.workflows import JobRunner
 
-MARK = b"ERASE-ME-"
+MARK = b"erase-me"
 
 
 class Work:
@@ -36,18 +37,18 @@ class Work:
     def __init__(self) -> None:
         self.waits, self.may_go_on = threading.Event(), threading.Event()
 
-    def __call__(self, place: Workplace, job: Job, run_id: int, step: Step) -> None:
-        step("draft", self.draft, place)
-        step("save", self.save, place, run_id)
+    def __call__(self, context: WorkerContext, job: Job, run_id: int, step: Step) -> None:
+        step("draft", self.draft, context)
+        step("save", self.save, context, run_id)
 
-    def draft(self, place: Workplace) -> str:
-        return place.store.put(MARK + b"draft")
+    def draft(self, context: WorkerContext) -> str:
+        return context.store.put(MARK + b"draft")
 
-    def save(self, place: Workplace, run_id: int) -> None:
+    def save(self, context: WorkerContext, run_id: int) -> None:
         self.waits.set()
         assert self.may_go_on.wait(PATIENCE_S)
-        artefact = place.store.put(MARK + b"late model")
-        with place.database.writing() as session:
+        artefact = context.store.put(MARK + b"late model")
+        with context.database.writing() as session:
             records.set_labels(session, run_id, 10, "h" * 64)
             records.save_model(session, run_id, ModelKind.FILTER, artefact, {"mark": MARK.decode()})
 
@@ -60,24 +61,24 @@ def work(monkeypatch: pytest.MonkeyPatch) -> Work:
 
 
 @pytest.fixture
-def workshop(settings: Settings, database: Database, store: ArtefactStore) -> Iterator[Workshop]:
+def runner(settings: Settings, database: Database, store: ArtefactStore) -> Iterator[JobRunner]:
     """A worker's engine on the data directory."""
-    workshop, compute = the_workshop(), Compute(1)
-    workshop.place = Workplace(database, store, compute)
+    runner, compute = the_job_runner(), Compute(1)
+    runner.context = WorkerContext(database, store, compute)
     engine.launch(settings)
-    yield workshop
+    yield runner
     DBOS.destroy(destroy_registry=False)
     compute.close()
 
 
 @pytest.fixture
 def job(participant: Participant) -> Job:
-    return Job(f"filter/participant-{participant.id}/{MARK.decode()}", RunKind.FILTER, 1, participant.id, 10)
+    return job_of(f"filter/participant-{participant.id}/{MARK.decode()}/labels-10", 1)
 
 
-def start(workshop: Workshop, job: Job) -> None:
-    with SetWorkflowID(f"{job.finding}#1"):
-        DBOS.enqueue_workflow(RunKind.FILTER, workshop.work, as_arguments(job))
+def start(runner: JobRunner, job: Job) -> None:
+    with SetWorkflowID(f"{job.key}#1"):
+        DBOS.enqueue_workflow(RunKind.FILTER, runner.work, as_arguments(job))
 
 
 def withdraw(database: Database, store: ArtefactStore, participant_id: int) -> None:
@@ -85,9 +86,9 @@ def withdraw(database: Database, store: ArtefactStore, participant_id: int) -> N
         withdrawal.withdraw(session, store, session.get_one(Participant, participant_id), actor="P01")
 
 
-def erase(workshop: Workshop, settings: Settings, participant_id: int) -> bool:
-    place, file = workshop.place, engine.file_of(settings)
-    return erasure.erase_traces(place, participant_id, workshop.in_hand, workshop.stored, file).finished
+def erase(runner: JobRunner, settings: Settings, participant_id: int) -> bool:
+    context, file = runner.context, engine.file_of(settings)
+    return erasure.erase_traces(context, participant_id, runner.in_hand, runner.stored, file).finished
 
 
 def traces(folder: Path) -> list[str]:
@@ -101,29 +102,29 @@ def traces(folder: Path) -> list[str]:
 
 
 def test_work_under_way_is_abandoned_and_neither_draft_nor_late_result_nor_note_is_left(
-    workshop: Workshop, work: Work, job: Job, participant: Participant, settings: Settings
+    runner: JobRunner, work: Work, job: Job, participant: Participant, settings: Settings
 ) -> None:
-    place = workshop.place
-    start(workshop, job)
+    context = runner.context
+    start(runner, job)
     assert work.waits.wait(PATIENCE_S)
     assert any("engine" in name for name in traces(settings.data_dir)), "the engine keeps inputs: something to erase"
-    withdraw(place.database, place.store, participant.id)
-    assert not erase(workshop, settings, participant.id), "it is still being worked on"
-    with place.database.reading() as session:
+    withdraw(context.database, context.store, participant.id)
+    assert not erase(runner, settings, participant.id), "it is still being worked on"
+    with context.database.reading() as session:
         assert erasure.unfinished(session) == [participant.id]
     work.may_go_on.set()
-    assert until(lambda: erase(workshop, settings, participant.id))
+    assert until(lambda: erase(runner, settings, participant.id))
     assert traces(settings.data_dir) == []
     assert DBOS.list_workflows() == []
-    with place.database.reading() as session:
+    with context.database.reading() as session:
         assert erasure.unfinished(session) == []
         assert session.get_one(Participant, participant.id).erased_at is not None
 
 
 def test_drafts_of_work_under_way_are_known_as_long_as_it_is_under_way(
-    workshop: Workshop, work: Work, job: Job, participant: Participant
+    runner: JobRunner, work: Work, job: Job, participant: Participant
 ) -> None:
-    start(workshop, job)
+    start(runner, job)
     assert work.waits.wait(PATIENCE_S)
     assert until(lambda: erasure.drafts() == {hashlib.sha256(MARK + b"draft").hexdigest()})
     work.may_go_on.set()
@@ -131,95 +132,94 @@ def test_drafts_of_work_under_way_are_known_as_long_as_it_is_under_way(
 
 
 def test_finished_work_is_forgotten_and_its_drafts_are_erased(
-    workshop: Workshop, work: Work, job: Job, participant: Participant, settings: Settings
+    runner: JobRunner, work: Work, job: Job, participant: Participant, settings: Settings
 ) -> None:
-    place = workshop.place
+    context = runner.context
     work.may_go_on.set()
-    start(workshop, job)
+    start(runner, job)
     assert until(lambda: [each.status for each in DBOS.list_workflows()] == ["SUCCESS"])
-    withdraw(place.database, place.store, participant.id)
+    withdraw(context.database, context.store, participant.id)
     assert traces(settings.data_dir) != [], "the draft is known to the engine alone"
-    assert until(lambda: erase(workshop, settings, participant.id))
+    assert until(lambda: erase(runner, settings, participant.id))
     assert traces(settings.data_dir) == []
 
 
 def test_copies_made_before_upgrades_and_engine_s_files_that_were_set_aside_go_as_well(
-    workshop: Workshop, participant: Participant, settings: Settings
+    runner: JobRunner, participant: Participant, settings: Settings
 ) -> None:
-    place = workshop.place
+    context = runner.context
     for name in ("studio.sqlite3.before-0002-20260101T000000", "studio.sqlite3.copying"):
         (settings.data_dir / name).write_bytes(MARK)
     for name in ("engine.sqlite3.set-aside-20260101T000000", "engine.sqlite3-journal.set-aside-20260101T000000"):
         (settings.data_dir / name).write_bytes(MARK)
     assert len(traces(settings.data_dir)) == 4
-    withdraw(place.database, place.store, participant.id)
-    assert until(lambda: erase(workshop, settings, participant.id))
+    withdraw(context.database, context.store, participant.id)
+    assert until(lambda: erase(runner, settings, participant.id))
     assert traces(settings.data_dir) == []
 
 
 def test_work_that_begins_after_the_withdrawal_does_nothing(
-    workshop: Workshop, work: Work, job: Job, participant: Participant, settings: Settings
+    runner: JobRunner, work: Work, job: Job, participant: Participant, settings: Settings
 ) -> None:
-    place = workshop.place
-    withdraw(place.database, place.store, participant.id)
-    start(workshop, job)
-    assert until(lambda: erase(workshop, settings, participant.id))
+    context = runner.context
+    withdraw(context.database, context.store, participant.id)
+    start(runner, job)
+    assert until(lambda: erase(runner, settings, participant.id))
     assert not work.waits.is_set()
     assert traces(settings.data_dir) == []
 
 
 def test_what_the_worker_keeps_of_others_stays(
-    workshop: Workshop, work: Work, job: Job, participant: Participant, settings: Settings
+    runner: JobRunner, work: Work, job: Job, participant: Participant, settings: Settings
 ) -> None:
-    place = workshop.place
-    with place.database.writing() as session:
+    context = runner.context
+    with context.database.writing() as session:
         other = Participant(study_id=participant.study_id, number=99, token_sha256="o" * 64, seed=1)
         session.add(other)
     work.may_go_on.set()
-    start(workshop, Job("filter/of-another", RunKind.FILTER, participant.study_id, other.id, 10))
+    start(runner, job_of(f"filter/participant-{other.id}/labels-10", participant.study_id))
     assert until(lambda: [each.status for each in DBOS.list_workflows()] == ["SUCCESS"])
-    withdraw(place.database, place.store, participant.id)
-    assert until(lambda: erase(workshop, settings, participant.id))
-    assert [each.workflow_id for each in DBOS.list_workflows()] == ["filter/of-another#1"]
+    withdraw(context.database, context.store, participant.id)
+    assert until(lambda: erase(runner, settings, participant.id))
+    assert [each.workflow_id for each in DBOS.list_workflows()] == [f"filter/participant-{other.id}/labels-10#1"]
     assert len(traces(settings.data_dir)) == 3, "the other's draft, model, and row"
 
 
 def test_of_a_deleted_study_neither_drafts_nor_late_results_nor_notes_are_left_and_others_keep_theirs(
-    workshop: Workshop, work: Work, job: Job, participant: Participant, settings: Settings
+    runner: JobRunner, work: Work, job: Job, participant: Participant, settings: Settings
 ) -> None:
-    place, file = workshop.place, engine.file_of(settings)
-    start(workshop, job)
+    context, file = runner.context, engine.file_of(settings)
+    start(runner, job)
     assert work.waits.wait(PATIENCE_S)
-    with place.database.writing() as session:
+    with context.database.writing() as session:
         study = session.get_one(Study, participant.study_id)
-        retirement.delete(session, place.store, study, study.slug, "x")
+        retirement.delete(session, context.store, study, study.slug, "x")
         other = Study(slug="other", name="Other", stored_settings=study.stored_settings, seed=4)
         session.add(other)
 
     def erase_study() -> bool:
-        shop = workshop
-        return erasure.erase_traces_of_study(place, 1, shop.in_hand, shop.stored, file).finished
+        return erasure.erase_traces_of_study(context, 1, runner.in_hand, runner.stored, file).finished
 
-    with place.database.reading() as session:
+    with context.database.reading() as session:
         assert (erasure.unfinished_studies(session), erasure.unfinished(session)) == ([1], [])
     assert not erase_study(), "it is still being worked on"
     work.may_go_on.set()
     assert until(erase_study)
     assert traces(settings.data_dir) == []
     assert DBOS.list_workflows() == []
-    with place.database.reading() as session:
+    with context.database.reading() as session:
         assert erasure.unfinished_studies(session) == []
         assert session.get_one(Participant, participant.id).erased_at is not None
         assert session.get_one(Study, other.id).name == "Other"
 
 
 def test_work_for_a_deleted_study_does_nothing(
-    workshop: Workshop, work: Work, participant: Participant, settings: Settings
+    runner: JobRunner, work: Work, participant: Participant, settings: Settings
 ) -> None:
-    place = workshop.place
-    with place.database.writing() as session:
+    context = runner.context
+    with context.database.writing() as session:
         session.get_one(Study, participant.study_id).deleted_at = now()
-    start(workshop, Job("filter/of-the-study", RunKind.FILTER, participant.study_id))
+    start(runner, job_of(f"filter/study-{participant.study_id}", participant.study_id))
     assert until(lambda: [each.status for each in DBOS.list_workflows()] == ["SUCCESS"])
     assert not work.waits.is_set()
 
@@ -230,4 +230,4 @@ def test_nothing_is_due_for_somebody_who_has_withdrawn(
     withdraw(database, store, participant.id)
     with database.reading() as session:
         assert participant.id not in short_of_queries(session)
-        assert participant.id not in {job.participant_id for job, _ in findings(session)}
+        assert participant.id not in {job.participant_id for job, _ in due(session)}

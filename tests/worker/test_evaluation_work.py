@@ -1,7 +1,6 @@
 """From the last label to films and controllers of every evaluated method, and what reconcile asks for on the way."""
 
 import io
-import itertools
 import json
 import shutil
 import zipfile
@@ -26,9 +25,8 @@ from worker.jobs import reconcile
 from worker.jobs.clips.evaluation_films import make_films
 from worker.jobs.learning.baselines import train_method
 from worker.jobs.runtime import records
-from worker.jobs.runtime.context import Workplace
+from worker.jobs.runtime.context import WorkerContext
 from worker.jobs.runtime.records import Job
-from worker.ml.filters import filter_problem
 from worker.ml.filters.filter_module import FilterWeights
 from worker.ml.methods import prefft
 from worker.ml.rewards.reward_models import StructuredReward
@@ -56,8 +54,8 @@ def at_once(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
 
 
 @pytest.fixture
-def place(database: Database, store: ArtefactStore) -> Workplace:
-    return Workplace(database, store, AtHand(1))
+def context(database: Database, store: ArtefactStore) -> WorkerContext:
+    return WorkerContext(database, store, AtHand(1))
 
 
 def settle(database: Database, study: Study, **evaluation: Any) -> None:
@@ -83,56 +81,56 @@ def all_said(add_clips: Callable[[int], list[Clip]], answer: Callable[[Clip, Cli
 
 def due(database: Database, *kinds: RunKind) -> list[Job]:
     with database.reading() as session:
-        return [job for job, _ in reconcile.findings(session) if job.kind in kinds]
+        return [job for job, _ in reconcile.due(session) if job.kind in kinds]
 
 
-def done(place: Workplace, job: Job, work: Callable[..., None] | None = None) -> int:
-    with place.database.writing() as session:
+def done(context: WorkerContext, job: Job, work: Callable[..., None] | None = None) -> int:
+    with context.database.writing() as session:
         run_id = records.begin_run(session, job, seed=1)
         records.set_labels(session, run_id, LABELS, "hash")
     if work:
-        work(place, job, run_id, at_once)
-    with place.database.writing() as session:
+        work(context, job, run_id, at_once)
+    with context.database.writing() as session:
         records.finish_run(session, run_id)
     return run_id
 
 
-def learn(place: Workplace) -> None:
+def learn(context: WorkerContext) -> None:
     """The reward model and the filter of the last label, without the minutes they take."""
     rng = np.random.default_rng(0)
     reward = StructuredReward(0.1 * rng.standard_normal((8, len(SIGNALS)))).to_bytes()
     filtering = FilterWeights(mode={"speed_far": -0.5}).to_bytes()
     for kind, stored in ((RunKind.REWARD, reward), (RunKind.FILTER, filtering)):
-        (job,) = due(place.database, kind)
-        run_id = done(place, job)
-        with place.database.writing() as session:
-            records.save_model(session, run_id, ModelKind(kind.value), place.store.put(stored), {})
+        (job,) = due(context.database, kind)
+        run_id = done(context, job)
+        with context.database.writing() as session:
+            records.save_model(session, run_id, ModelKind(kind.value), context.store.put(stored), {})
 
 
 def names(jobs: list[Job]) -> list[str]:
-    return ["/".join(job.finding.split("/")[:3]) for job in jobs]
+    return ["/".join(job.key.split("/")[:3]) for job in jobs]
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("all_said")
 def test_after_the_last_label_every_method_is_trained_evaluated_and_filmed(
-    place: Workplace, database: Database, study: Study, participant: Participant, monkeypatch: pytest.MonkeyPatch
+    context: WorkerContext, database: Database, study: Study, participant: Participant, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name, value in (("critic_first_updates", 30), ("cloning_steps", 30)):
         monkeypatch.setattr(prefft.FineTuning, name, value)
     settle(database, study, trials=1, fine_tuning_steps=1000)
-    learn(place)
+    learn(context)
     (method,) = due(database, RunKind.METHOD)
     assert names([method]) == ["method/participant-1/prefft"]
-    run_id = done(place, method, train_method)
+    run_id = done(context, method, train_method)
     with database.reading() as session:
         model = session.scalars(select(Model).where(Model.kind == ModelKind.METHOD)).one()
     assert (model.run_id, model.metrics["method"]) == (run_id, "prefft")
     assert model.metrics["evaluation"]["scenarios"] == 10
-    assert not any(place.store.unfinished(participant.id).iterdir())
+    assert not any(context.store.unfinished(participant.id).iterdir())
 
     for filming in due(database, RunKind.FILMS):
-        done(place, filming, make_films)
+        done(context, filming, make_films)
     assert due(database, RunKind.METHOD, RunKind.FILMS) == []
 
     with database.reading() as session:
@@ -140,7 +138,7 @@ def test_after_the_last_label_every_method_is_trained_evaluated_and_filmed(
         trials = evaluation_plan.trials_of(session, participant.id)
         methods = {each.letter: each.method for each in evaluation_plan.assignments_of(session, participant.id)}
     assert len(films) == 3 + 4
-    assert all(place.store.has(film.video_sha256) and place.store.has(film.trajectory_sha256) for film in films)
+    assert all(context.store.has(film.video_sha256) and context.store.has(film.trajectory_sha256) for film in films)
     assert [trial.film is not None and trial.film.method for trial in trials] == [
         methods[trial.letter] for trial in trials
     ]
@@ -157,21 +155,21 @@ def test_after_the_last_label_every_method_is_trained_evaluated_and_filmed(
 @pytest.mark.slow
 @pytest.mark.usefixtures("all_said")
 def test_for_a_physical_robot_every_letter_gets_a_controller(
-    place: Workplace, database: Database, study: Study, participant: Participant
+    context: WorkerContext, database: Database, study: Study, participant: Participant
 ) -> None:
     settle(database, study, mode=EvaluationMode.PHYSICAL, methods=("reference", "pbarl"))
-    learn(place)
+    learn(context)
     controllers, before_after = due(database, RunKind.FILMS)
     assert names([controllers, before_after]) == [
         "films/participant-1/controllers",
         "films/participant-1/before-after",
     ]
-    done(place, controllers, make_films)
+    done(context, controllers, make_films)
     with database.reading() as session:
         packed = evaluation_plan.controllers_of(session, participant.id)
     assert list(packed) == ["A", "B"]
     for letter, controller in packed.items():
-        with zipfile.ZipFile(io.BytesIO(place.store.read(controller.artefact_sha256))) as archive:
+        with zipfile.ZipFile(io.BytesIO(context.store.read(controller.artefact_sha256))) as archive:
             manifest = json.loads(archive.read("manifest.json"))
         assert (manifest["letter"], manifest["participant"], manifest["task"]) == (letter, "P01", "feeding")
     assert len({controller.byte_count for controller in packed.values()}) == 1
@@ -179,33 +177,33 @@ def test_for_a_physical_robot_every_letter_gets_a_controller(
 
 @pytest.mark.usefixtures("all_said")
 def test_nothing_is_filmed_before_the_filter_and_no_trial_before_every_method(
-    place: Workplace, database: Database, study: Study
+    context: WorkerContext, database: Database, study: Study
 ) -> None:
     settle(database, study)
     (reward,) = due(database, RunKind.REWARD)
     assert due(database, RunKind.METHOD, RunKind.FILMS) == []
-    done(place, reward)
+    done(context, reward)
     assert names(due(database, RunKind.METHOD, RunKind.FILMS)) == ["method/participant-1/prefft"]
     (filtering,) = due(database, RunKind.FILTER)
-    done(place, filtering)
+    done(context, filtering)
     assert names(due(database, RunKind.FILMS)) == ["films/participant-1/before-after"]
     (method,) = due(database, RunKind.METHOD)
-    done(place, method)
+    done(context, method)
     assert names(due(database, RunKind.FILMS)) == ["films/participant-1/trials", "films/participant-1/before-after"]
 
 
 @pytest.mark.usefixtures("all_said")
-def test_only_what_is_not_there_is_trained(place: Workplace, database: Database, study: Study) -> None:
+def test_only_what_is_not_there_is_trained(context: WorkerContext, database: Database, study: Study) -> None:
     settle(database, study, methods=tuple(EvaluatedMethod))
     (reward,) = due(database, RunKind.REWARD)
-    done(place, reward)
+    done(context, reward)
     trained = [name.rsplit("/", 1)[1] for name in names(due(database, RunKind.METHOD))]
     assert trained == ["prefft", "prefft_anchored", "pbarl_printed"]
 
 
 @pytest.mark.usefixtures("all_said")
 def test_without_an_evaluation_only_before_and_after_are_filmed(
-    place: Workplace, database: Database, study: Study
+    context: WorkerContext, database: Database, study: Study
 ) -> None:
     settle(database, study)
     with database.writing() as session:
@@ -213,47 +211,39 @@ def test_without_an_evaluation_only_before_and_after_are_filmed(
         plain.stored_settings = {**plain.stored_settings, "evaluation": None}
     for kind in (RunKind.REWARD, RunKind.FILTER):
         (job,) = due(database, kind)
-        done(place, job)
+        done(context, job)
     assert names(due(database, RunKind.METHOD, RunKind.FILMS)) == ["films/participant-1/before-after"]
 
 
 @pytest.mark.usefixtures("all_said")
 def test_repeats_and_catch_pairs_after_the_last_label_ask_for_nothing_new(
-    place: Workplace, database: Database, study: Study, answer: Callable[[Clip, Clip, Response], Query]
+    context: WorkerContext, database: Database, study: Study, answer: Callable[[Clip, Clip, Response], Query]
 ) -> None:
     settle(database, study)
-    before = names(due(database, RunKind.REWARD)), due(database, RunKind.REWARD)[0].finding
+    before = names(due(database, RunKind.REWARD)), due(database, RunKind.REWARD)[0].key
     with database.reading() as session:
         clips = session.scalars(select(Clip)).all()
     query = answer(clips[0], clips[1], Response.LEFT)
     with database.writing() as session:
         session.get_one(Query, query.id).purpose = "repeat"
-    assert (names(due(database, RunKind.REWARD)), due(database, RunKind.REWARD)[0].finding) == before
-
-
-def test_scenarios_of_trials_and_comparisons_are_used_by_nothing_else() -> None:
-    ours = [evaluation_plan.TRIAL_SCENARIOS, evaluation_plan.COMPARISON_SCENARIOS]
-    others = [range(first, first + 1_000_000) for first in filter_problem.SCENARIO_BLOCKS.values()]
-    pool = range(reconcile.scenario_seed(0, 0), reconcile.scenario_seed(89_999, 999))
-    spans = sorted([*ours, *others, pool], key=lambda span: span.start)
-    assert all(one.stop <= other.start for one, other in itertools.pairwise(spans))
+    assert (names(due(database, RunKind.REWARD)), due(database, RunKind.REWARD)[0].key) == before
 
 
 @pytest.mark.usefixtures("all_said")
 def test_a_controller_is_not_exchanged_once_the_robot_has_moved(
-    place: Workplace, database: Database, study: Study, participant: Participant
+    context: WorkerContext, database: Database, study: Study, participant: Participant
 ) -> None:
     settle(database, study, mode=EvaluationMode.PHYSICAL, methods=("reference", "pbarl"))
-    learn(place)
+    learn(context)
     (job, _) = due(database, RunKind.FILMS)
-    done(place, job, make_films)
+    done(context, job, make_films)
     with database.writing() as session:
         kept = {each.method: each.artefact_sha256 for each in session.scalars(select(Controller))}
         session.scalars(select(Trial)).first().started_at = study.created_at  # type: ignore[union-attr]
         model = session.scalars(select(Model).where(Model.kind == ModelKind.FILTER)).one()
-        model.artefact_sha256 = place.store.put(FilterWeights(mode={"speed_far": 0.9}).to_bytes())
-        session.scalars(select(Run).where(Run.workflow_id == job.finding)).one().status = RunStatus.RETRY
-    done(place, job, make_films)
+        model.artefact_sha256 = context.store.put(FilterWeights(mode={"speed_far": 0.9}).to_bytes())
+        session.scalars(select(Run).where(Run.workflow_id == job.key)).one().status = RunStatus.RETRY
+    done(context, job, make_films)
     with database.reading() as session:
         assert {each.method: each.artefact_sha256 for each in session.scalars(select(Controller))} == kept
-    shutil.rmtree(place.store.unfinished(participant.id), ignore_errors=True)
+    shutil.rmtree(context.store.unfinished(participant.id), ignore_errors=True)

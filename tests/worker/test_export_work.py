@@ -32,7 +32,7 @@ from worker.jobs import reconcile
 from worker.jobs.learning import dataset
 from worker.jobs.publishing import export_files
 from worker.jobs.runtime import records
-from worker.jobs.runtime.context import Workplace
+from worker.jobs.runtime.context import WorkerContext
 from worker.trajectory import SIGNALS
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
@@ -42,8 +42,8 @@ SAID = (Response.LEFT, Response.RIGHT, Response.EQUAL, Response.SKIP)
 
 
 @pytest.fixture
-def place(database: Database, store: ArtefactStore) -> Workplace:
-    return Workplace(database, store, Compute(1))
+def context(database: Database, store: ArtefactStore) -> WorkerContext:
+    return WorkerContext(database, store, Compute(1))
 
 
 @pytest.fixture
@@ -56,25 +56,25 @@ def pairs(add_clips: AddClips, answer: Answer) -> list[tuple[Clip, Clip]]:
     return shown
 
 
-def make_export(place: Workplace, study: Study, kind: ExportKind = ExportKind.DATA) -> zipfile.ZipFile:
-    with place.database.writing() as session:
+def make_export(context: WorkerContext, study: Study, kind: ExportKind = ExportKind.DATA) -> zipfile.ZipFile:
+    with context.database.writing() as session:
         export_requests.request(session, session.get_one(Study, study.id), kind, "experimenter")
-    with place.database.reading() as session:
+    with context.database.reading() as session:
         (job,) = export_files.due(session, session.get_one(Study, study.id))
-        assert job.finding in {each.finding for each, _ in reconcile.findings(session)}
-    with place.database.writing() as session:
+        assert job.key in {each.key for each, _ in reconcile.due(session)}
+    with context.database.writing() as session:
         run_id = records.begin_run(session, job, seed=1)
-    export_files.make(place, job, run_id, lambda _name, function, *arguments: function(*arguments))
-    with place.database.reading() as session:
+    export_files.make(context, job, run_id, lambda _name, function, *arguments: function(*arguments))
+    with context.database.reading() as session:
         export = session.scalars(select(Export).order_by(Export.id.desc())).first()
         assert export is not None
         assert export_files.due(session, session.get_one(Study, study.id)) == []
     assert export.artefact_sha256 is not None
-    return zipfile.ZipFile(io.BytesIO(place.store.read(export.artefact_sha256)))
+    return zipfile.ZipFile(io.BytesIO(context.store.read(export.artefact_sha256)))
 
 
-def test_all_formats_have_the_same_rows(place: Workplace, study: Study, pairs: list[tuple[Clip, Clip]]) -> None:
-    archive = make_export(place, study)
+def test_all_formats_have_the_same_rows(context: WorkerContext, study: Study, pairs: list[tuple[Clip, Clip]]) -> None:
+    archive = make_export(context, study)
     for table in export_tables.TABLES:
         plain = list(csv.DictReader(io.TextIOWrapper(archive.open(f"csv/{table.name}.csv"))))
         lines = archive.read(f"jsonl/{table.name}.jsonl").decode().splitlines()
@@ -86,8 +86,8 @@ def test_all_formats_have_the_same_rows(place: Workplace, study: Study, pairs: l
     assert str(frame["answered_at"].dtype).startswith("datetime64")
 
 
-def test_the_file_explains_itself(place: Workplace, study: Study, pairs: list[tuple[Clip, Clip]]) -> None:
-    archive = make_export(place, study)
+def test_the_file_explains_itself(context: WorkerContext, study: Study, pairs: list[tuple[Clip, Clip]]) -> None:
+    archive = make_export(context, study)
     assert "not locked" in archive.read("README.md").decode()
     about = json.loads(archive.read("provenance.json"))
     assert (about["lock_hash"], about["deviations"], about["settings"]) == ("not locked", [], study.stored_settings)
@@ -99,7 +99,7 @@ def test_the_file_explains_itself(place: Workplace, study: Study, pairs: list[tu
 
 
 def test_an_export_that_somebody_withdraws_from_while_it_is_made_is_made_again_without_them(
-    place: Workplace,
+    context: WorkerContext,
     study: Study,
     participant: Participant,
     pairs: list[tuple[Clip, Clip]],
@@ -109,28 +109,28 @@ def test_an_export_that_somebody_withdraws_from_while_it_is_made_is_made_again_w
 
     write, held = export_files.write_data, list[str]()
 
-    def withdrawing(session: Session, place: Workplace, study: Study, path: Path) -> Any:
-        missing = write(session, place, study, path)
+    def withdrawing(session: Session, context: WorkerContext, study: Study, path: Path) -> Any:
+        missing = write(session, context, study, path)
         with zipfile.ZipFile(path) as made:
             held.append(made.read("csv/labels.csv").decode())
-        with place.database.writing() as another:
-            withdrawal.withdraw(another, place.store, another.get_one(Participant, participant.id), "P01")
+        with context.database.writing() as another:
+            withdrawal.withdraw(another, context.store, another.get_one(Participant, participant.id), "P01")
         return missing
 
     monkeypatch.setattr(export_files, "write_data", withdrawing)
-    made = make_export(place, study)
+    made = make_export(context, study)
     assert ["P01," in each for each in held] == [True, False], "made twice"
     assert "withdrawn" in made.read("csv/participants.csv").decode()
     assert "P01" not in made.read("csv/labels.csv").decode()
-    assert list(place.store.unfinished(0).parent.iterdir()) == []
-    with place.database.reading() as session:
+    assert list(context.store.unfinished(0).parent.iterdir()) == []
+    with context.database.reading() as session:
         kept = {each.artefact_sha256 for each in session.scalars(select(Export))}
-    assert {path.name for path in place.store.root.glob("??/*")} - withdrawal_keeps(place) == kept
+    assert {path.name for path in context.store.root.glob("??/*")} - withdrawal_keeps(context) == kept
 
 
-def withdrawal_keeps(place: Workplace) -> set[str]:
+def withdrawal_keeps(context: WorkerContext) -> set[str]:
     """Files of the pool, which belongs to nobody."""
-    with place.database.reading() as session:
+    with context.database.reading() as session:
         clips = session.scalars(select(Clip)).all()
         rollouts = session.scalars(select(Rollout)).all()
     return {
@@ -143,19 +143,19 @@ def withdrawal_keeps(place: Workplace) -> set[str]:
 @pytest.mark.parametrize("damage", [lambda path: path.unlink(), lambda path: path.write_bytes(b"something else")])
 @pytest.mark.parametrize("kind", ExportKind)
 def test_a_lost_or_damaged_recording_is_left_out_and_said_to_be(
-    place: Workplace,
+    context: WorkerContext,
     study: Study,
     pairs: list[tuple[Clip, Clip]],
     kind: ExportKind,
     damage: Callable[[Path], None],
     experimenter: TestClient,
 ) -> None:
-    with place.database.writing() as session:
+    with context.database.writing() as session:
         session.get_one(Study, study.id).unblinded_at = study.created_at
         lost = session.get_one(Rollout, pairs[0][0].rollout_id).trajectory_sha256
         others = len(session.scalars(select(Rollout.trajectory_sha256).distinct()).all()) - 1
-    damage(place.store.path(lost))
-    made = make_export(place, study, kind)
+    damage(context.store.path(lost))
+    made = make_export(context, study, kind)
     if kind is ExportKind.DATA:
         arrays = np.load(io.BytesIO(made.read("pairs/P01.npz")), allow_pickle=False)
         assert list(arrays["ordinals"]) == [2, 3]
@@ -164,14 +164,14 @@ def test_a_lost_or_damaged_recording_is_left_out_and_said_to_be(
     else:
         manifest = json.loads(made.read("manifest.json"))
         assert lost in manifest["missing"]
-        assert len([each for each in manifest["files"] if each in _trajectories(place)]) == others
+        assert len([each for each in manifest["files"] if each in _trajectories(context)]) == others
     page = experimenter.get(f"/studies/{study.slug}/export").text
     assert re.search(r"Without \d+ stored files? that (is|are) missing or damaged", page)
     assert lost[:12] in page
 
 
-def _trajectories(place: Workplace) -> set[str]:
-    with place.database.reading() as session:
+def _trajectories(context: WorkerContext) -> set[str]:
+    with context.database.reading() as session:
         return set(session.scalars(select(Rollout.trajectory_sha256)))
 
 
@@ -195,14 +195,14 @@ class TrajectoryWithRew:
 
 @pytest.fixture
 def snippet(
-    place: Workplace,
+    context: WorkerContext,
     study: Study,
     pairs: list[tuple[Clip, Clip]],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> Iterator[Callable[[str], dict[str, Any]]]:
     """Runs one piece of code of docs/arrays.md beside the exported files; gives what it has made."""
-    make_export(place, study).extract("pairs/P01.npz", tmp_path)
+    make_export(context, study).extract("pairs/P01.npz", tmp_path)
     monkeypatch.chdir(tmp_path)
     module = types.ModuleType("imitation.data.types")
     module.TrajectoryWithRew = TrajectoryWithRew  # type: ignore[attr-defined]
@@ -222,9 +222,9 @@ def snippet(
 
 
 def test_arrays_have_the_documented_layout(
-    place: Workplace, study: Study, pairs: list[tuple[Clip, Clip]], tmp_path: Path
+    context: WorkerContext, study: Study, pairs: list[tuple[Clip, Clip]], tmp_path: Path
 ) -> None:
-    file = np.load(io.BytesIO(make_export(place, study).read("pairs/P01.npz")), allow_pickle=False)
+    file = np.load(io.BytesIO(make_export(context, study).read("pairs/P01.npz")), allow_pickle=False)
     documented = set(re.findall(r"^\| `(\w+)`(?:, `(\w+)`)?", (DOCS / "arrays.md").read_text(), re.MULTILINE))
     assert set(file) == {name for names in documented for name in names if name}
     count, steps = 3, 20
@@ -234,15 +234,15 @@ def test_arrays_have_the_documented_layout(
     assert file["masks"].shape == (count, 2, steps)
     assert list(file["signal_names"]) == list(SIGNALS)
     assert list(file["targets"]) == [0.0, 1.0, 0.5], "left, right, equal; can't tell is left out"
-    left, right = (dataset.shown(place.store, _with_rollout(place, clip)) for clip in pairs[1])
+    left, right = (dataset.shown(context.store, _with_rollout(context, clip)) for clip in pairs[1])
     assert np.array_equal(file["signals"][1, 0], left.signals[:20])
     assert np.array_equal(file["actions"][1, 1], right.actions[:20])
     about = json.loads(str(file["about"]))
     assert (about["participant"], about["lock_hash"], about["deviations"]) == ("P01", None, "none")
 
 
-def _with_rollout(place: Workplace, clip: Clip) -> Clip:
-    with place.database.reading() as session:
+def _with_rollout(context: WorkerContext, clip: Clip) -> Clip:
+    with context.database.reading() as session:
         return next(each for each in dataset.pool_clips(session, 1) if each.id == clip.id)
 
 

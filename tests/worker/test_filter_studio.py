@@ -15,6 +15,7 @@ from worker.ml.filters.filter_problem import FilterConfig, FilterDraft, FilterPr
 from worker.ml.filters.residual import learn_round
 from worker.ml.filters.response_surface import ResponseSurface
 from worker.ml.rewards.reward_models import StructuredReward
+from worker.scenarios import GATE, first_of
 from worker.trajectory import SIGNALS, Trajectory
 
 POLICY = invented.small_policy()
@@ -63,7 +64,7 @@ def reward(weight: float) -> StructuredReward:
 
 @pytest.fixture(scope="module")
 def reference() -> list[Trajectory]:
-    return World().collect(POLICY.mean, filter_problem.scenarios_for("gate", 6), 0.0, 0)
+    return World().collect(POLICY.mean, first_of(GATE, 6), 0.0, 0)
 
 
 @pytest.fixture(scope="module")
@@ -204,11 +205,6 @@ def test_noise_belongs_to_the_scenario_and_not_to_the_order() -> None:
     alone = World().collect(POLICY.mean, [2], 0.2, 5)
     np.testing.assert_array_equal(together[1].actions, alone[0].actions)
     assert (together[0].actions != World().collect(POLICY.mean, [1], 0.2, 6)[0].actions).any()
-
-
-def test_no_two_purposes_share_a_scenario() -> None:
-    blocks = [set(filter_problem.scenarios_for(purpose, 1000)) for purpose in filter_problem.SCENARIO_BLOCKS]
-    assert len(set.union(*blocks)) == 1000 * len(blocks)
 
 
 def test_a_round_that_made_it_worse_is_taken_back_and_the_next_step_is_half_as_bold(

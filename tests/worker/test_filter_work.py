@@ -10,20 +10,21 @@ from app.db import Database
 from app.domain.clips import Clip
 from app.domain.models import Model, ModelKind, RunKind
 from app.domain.preferences import LabelEvent, Query, Response
+from app.domain.run_keys import RunKey
 from app.domain.studies import Participant, Study
 from app.services.answers import accuracy
 from app.storage import ArtefactStore
 from worker.compute.pools import Compute
 from worker.jobs.learning.filters import NothingToLearnFrom, notes_on_foresight, train_filter
 from worker.jobs.runtime import records
-from worker.jobs.runtime.context import Workplace
-from worker.jobs.runtime.due_work import ending, filter_name, is_outdated
+from worker.jobs.runtime.context import WorkerContext
+from worker.jobs.runtime.due_work import answers_known, is_outdated
 from worker.jobs.runtime.records import Job
 
 
 @pytest.fixture
-def place(database: Database, store: ArtefactStore) -> Workplace:
-    return Workplace(database, store, Compute(1))
+def context(database: Database, store: ArtefactStore) -> WorkerContext:
+    return WorkerContext(database, store, Compute(1))
 
 
 def at_once(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
@@ -31,32 +32,32 @@ def at_once(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
     return function(*arguments)
 
 
-def begin(place: Workplace, participant: Participant, kind: RunKind, name: str) -> tuple[Job, int]:
-    job = Job(name, kind, participant.study_id, participant.id, 10)
-    with place.database.writing() as session:
+def begin(context: WorkerContext, participant: Participant, kind: RunKind, answers: str = "") -> tuple[Job, int]:
+    job = Job(RunKey(kind, participant_id=participant.id, labels=10, answers=answers), participant.study_id)
+    with context.database.writing() as session:
         return job, records.begin_run(session, job, seed=1)
 
 
-def save_model(place: Workplace, participant: Participant, kind: ModelKind, label_hash: str) -> None:
-    _, run_id = begin(place, participant, RunKind(kind.value), f"{kind}/{label_hash}")
-    with place.database.writing() as session:
+def save_model(context: WorkerContext, participant: Participant, kind: ModelKind, label_hash: str) -> None:
+    _, run_id = begin(context, participant, RunKind(kind.value), label_hash)
+    with context.database.writing() as session:
         records.set_labels(session, run_id, 10, label_hash)
         records.save_model(session, run_id, kind, "0" * 64, {})
 
 
-def count_filters(place: Workplace) -> int:
-    with place.database.reading() as session:
+def count_filters(context: WorkerContext) -> int:
+    with context.database.reading() as session:
         return session.scalar(select(func.count(Model.id)).where(Model.kind == ModelKind.FILTER)) or 0
 
 
 def test_a_filter_that_has_seen_the_same_labels_is_not_trained_again(
-    place: Workplace, participant: Participant
+    context: WorkerContext, participant: Participant
 ) -> None:
-    save_model(place, participant, ModelKind.REWARD, "same labels")
-    save_model(place, participant, ModelKind.FILTER, "same labels")
-    job, run_id = begin(place, participant, RunKind.FILTER, "filter/participant-1/labels-10")
-    train_filter(place, job, run_id, at_once)
-    assert count_filters(place) == 1
+    save_model(context, participant, ModelKind.REWARD, "same labels")
+    save_model(context, participant, ModelKind.FILTER, "same labels")
+    job, run_id = begin(context, participant, RunKind.FILTER, "filter/participant-1/labels-10")
+    train_filter(context, job, run_id, at_once)
+    assert count_filters(context) == 1
 
 
 @pytest.fixture
@@ -73,43 +74,45 @@ def answered(
     return say
 
 
-def outdated_at(place: Workplace, participant: Participant, milestone: int, *, begun: bool) -> bool:
-    with place.database.reading() as session:
+def outdated_at(context: WorkerContext, participant: Participant, milestone: int, *, begun: bool) -> bool:
+    with context.database.reading() as session:
         settings = session.get_one(Study, participant.study_id).settings
         last_answer = session.scalar(select(func.max(LabelEvent.id))) or 0
-        name = filter_name(participant.id, milestone, ending(settings, milestone, last_answer, None))
-        job = Job(name, RunKind.FILTER, participant.study_id, participant.id, milestone)
-        return is_outdated(session, job, begun=begun)
+        known = answers_known(settings, milestone, last_answer, None)
+        key = RunKey(RunKind.FILTER, participant_id=participant.id, labels=milestone, answers=known)
+        return is_outdated(session, Job(key, participant.study_id), begun=begun)
 
 
 def test_of_two_milestones_that_were_passed_only_the_newer_filter_is_trained(
-    place: Workplace, participant: Participant, answered: Callable[[int], None]
+    context: WorkerContext, participant: Participant, answered: Callable[[int], None]
 ) -> None:
     answered(15)
-    assert not outdated_at(place, participant, 10, begun=False)
-    save_model(place, participant, ModelKind.REWARD, "ten labels")
-    with place.database.writing() as session:
+    assert not outdated_at(context, participant, 10, begun=False)
+    save_model(context, participant, ModelKind.REWARD, "ten labels")
+    with context.database.writing() as session:
         study = session.get_one(Study, participant.study_id)
         study.stored_settings = {**study.stored_settings, "filter_milestones": [10, 15]}
-    job, run_id = begin(place, participant, RunKind.FILTER, f"filter/participant-{participant.id}/labels-10")
-    train_filter(place, job, run_id, at_once)
-    assert count_filters(place) == 0, "the one of 15 is due"
-    assert not outdated_at(place, participant, 10, begun=True), "one that has begun is finished while they answer"
-    assert not outdated_at(place, participant, 15, begun=False)
+    job, run_id = begin(context, participant, RunKind.FILTER)
+    train_filter(context, job, run_id, at_once)
+    assert count_filters(context) == 0, "the one of 15 is due"
+    assert not outdated_at(context, participant, 10, begun=True), "one that has begun is finished while they answer"
+    assert not outdated_at(context, participant, 15, begun=False)
 
 
 def test_after_the_last_answer_an_earlier_filter_is_not_even_finished(
-    place: Workplace, participant: Participant, answered: Callable[[int], None]
+    context: WorkerContext, participant: Participant, answered: Callable[[int], None]
 ) -> None:
     answered(20)
-    assert outdated_at(place, participant, 10, begun=True)
-    assert not outdated_at(place, participant, 20, begun=True)
+    assert outdated_at(context, participant, 10, begun=True)
+    assert not outdated_at(context, participant, 20, begun=True)
 
 
-def test_without_a_reward_model_the_run_says_why_there_is_no_filter(place: Workplace, participant: Participant) -> None:
-    job, run_id = begin(place, participant, RunKind.FILTER, "filter/participant-1/labels-10")
+def test_without_a_reward_model_the_run_says_why_there_is_no_filter(
+    context: WorkerContext, participant: Participant
+) -> None:
+    job, run_id = begin(context, participant, RunKind.FILTER, "filter/participant-1/labels-10")
     with pytest.raises(NothingToLearnFrom, match="can't tell"):
-        train_filter(place, job, run_id, at_once)
+        train_filter(context, job, run_id, at_once)
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from tests.worker import test_querying
 from worker.compute.pools import Compute
 from worker.compute.simulation import surface_file, task
 from worker.jobs.learning import dataset, query_selection, reward_metrics
-from worker.jobs.runtime.context import Workplace
+from worker.jobs.runtime.context import WorkerContext
 from worker.ml.filters.response_surface import ResponseSurface
 from worker.ml.rewards.reward_models import StructuredReward
 from worker.ml.stopping import expected_regret
@@ -24,21 +24,21 @@ AddClips = Callable[..., list[Clip]]
 
 
 @pytest.fixture
-def place(database: Database, store: ArtefactStore) -> Workplace:
-    return Workplace(database, store, Compute(1))
+def context(database: Database, store: ArtefactStore) -> WorkerContext:
+    return WorkerContext(database, store, Compute(1))
 
 
 def test_clips_are_ranked_by_what_the_model_likes(
-    place: Workplace, participant: Participant, add_clips: AddClips
+    context: WorkerContext, participant: Participant, add_clips: AddClips
 ) -> None:
     add_clips(1)
     add_clips(2)
     likes_one_signal = StructuredReward(np.tile(np.eye(len(SIGNALS))[2], (8, 1)))
-    ranking = reward_metrics.insight(place, participant.id, likes_one_signal.to_bytes())["ranking"]
-    with place.database.reading() as session:
+    ranking = reward_metrics.insight(context, participant.id, likes_one_signal.to_bytes())["ranking"]
+    with context.database.reading() as session:
         clips = dataset.pool_clips(session, participant.study_id)
         sums = {
-            (clip.rollout.scenario, clip.rollout.behaviour): dataset.shown(place.store, clip).signals[:, 2].sum()
+            (clip.rollout.scenario, clip.rollout.behaviour): dataset.shown(context.store, clip).signals[:, 2].sum()
             for clip in clips
         }
     assert [(scenario, behaviour) for scenario, behaviour, _ in ranking] == sorted(sums, key=lambda name: -sums[name])
@@ -66,19 +66,19 @@ def test_a_model_that_wants_something_else_explains_little_by_the_costs(rng: np.
 
 
 def test_a_model_says_what_it_thinks_of_the_costs_of_the_studys_clips(
-    place: Workplace, participant: Participant, add_clips: AddClips
+    context: WorkerContext, participant: Participant, add_clips: AddClips
 ) -> None:
     fears_spilling = StructuredReward(np.tile(-np.eye(len(SIGNALS))[SIGNALS.index("spilled_on_person")], (8, 1)))
     add_clips(1)
-    assert "costs" not in reward_metrics.insight(place, participant.id, fears_spilling.to_bytes()), (
+    assert "costs" not in reward_metrics.insight(context, participant.id, fears_spilling.to_bytes()), (
         "too few clips to tell"
     )
     for scenario in (2, 3, 4, 5):
         add_clips(scenario)
-    with place.database.reading() as session:
+    with context.database.reading() as session:
         clips = dataset.pool_clips(session, participant.study_id)
         assert len(clips) >= reward_metrics.FEWEST_CLIPS
-    found = reward_metrics.insight(place, participant.id, fears_spilling.to_bytes())["costs"]
+    found = reward_metrics.insight(context, participant.id, fears_spilling.to_bytes())["costs"]
     assert list(found["weights"]) == list(COSTS)
     assert 0.0 <= found["explained"] <= 1.0
 
@@ -106,14 +106,14 @@ def test_the_less_is_known_the_more_could_be_gained(surface: ResponseSurface) ->
 
 
 def test_a_share_of_the_pairs_is_drawn_at_random_and_stored_as_such(
-    place: Workplace, participant: Participant, add_clips: AddClips
+    context: WorkerContext, participant: Participant, add_clips: AddClips
 ) -> None:
     """Only these measure a model without bias."""
-    test_querying.settle_on(place, Strategy.CONTESTED)
+    test_querying.settle_on(context, Strategy.CONTESTED)
     for scenario in (1, 2, 3, 4):
         add_clips(scenario)
-    query_selection.refill_queries(place, participant.id)
-    queries = test_querying.queries_of(place.database, participant)
+    query_selection.refill_queries(context, participant.id)
+    queries = test_querying.queries_of(context.database, participant)
     uniform = [query for query in queries if query.strategy == Strategy.UNIFORM]
     chosen = [query for query in queries if query.strategy == Strategy.CONTESTED]
     assert uniform

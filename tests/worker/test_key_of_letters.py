@@ -18,37 +18,38 @@ from app.domain.evaluation import Assignment, Controller, Film, Trial
 from app.domain.models import ModelKind, Run, RunKind
 from app.domain.preferences import Query, Response
 from app.domain.protocol import EvaluationMode, EvaluationSettings
+from app.domain.run_keys import CONTROLLERS, TRIALS
 from app.domain.studies import Participant, Study
 from app.services.archives import archive
 from app.services.evaluation import evaluation_plan, unblinding
 from app.services.studies import locking
 from app.storage import ArtefactStore
 from tests import factories
+from tests.worker.invented import job_of
 from tests.worker.test_evaluation_work import AtHand, done, due, learn, settle
 from worker.jobs.clips import evaluation_films
 from worker.jobs.clips.evaluation_films import make_films
 from worker.jobs.publishing import export_files
-from worker.jobs.runtime.context import Workplace
-from worker.jobs.runtime.records import Job
+from worker.jobs.runtime.context import WorkerContext
 
 METHODS = ("reference", "pbarl")
 MOMENT = re.compile(rb"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(\.\d+)?(\+00:00)?")
 
 
 @dataclass(frozen=True)
-class Told(Workplace):
+class Told(WorkerContext):
     """A workplace that remembers what it said about its progress."""
 
     said: list[str] = field(default_factory=list)
 
     def report(self, run_id: int, stage: str, progress: float) -> None:
-        """See Workplace."""
+        """See WorkerContext."""
         self.said.append(f"{stage} {progress:.2f}")
         super().report(run_id, stage, progress)
 
 
 @pytest.fixture
-def place(database: Database, store: ArtefactStore) -> Told:
+def context(database: Database, store: ArtefactStore) -> Told:
     return Told(database, store, AtHand(1))
 
 
@@ -73,37 +74,37 @@ def _keys() -> tuple[str, str]:
 @pytest.mark.usefixtures("all_said")
 @pytest.mark.parametrize("mode", EvaluationMode)
 def test_rows_times_progress_and_archives_say_the_same_whichever_method_a_letter_hides(
-    place: Told, database: Database, study: Study, participant: Participant, mode: EvaluationMode, tmp_path: Path
+    context: Told, database: Database, study: Study, participant: Participant, mode: EvaluationMode, tmp_path: Path
 ) -> None:
     settle(database, study, mode=mode, methods=METHODS, trials=1)
-    learn(place)
-    seen = [_prepared_under(place, study, participant, key, tmp_path) for key in _keys()]
+    learn(context)
+    seen = [_prepared_under(context, study, participant, key, tmp_path) for key in _keys()]
     (one, letters), (other, exchanged) = seen
     assert letters == {letter: {"A": exchanged["B"], "B": exchanged["A"]}[letter] for letter in letters}
     assert one == other
 
 
 def _prepared_under(
-    place: Told, study: Study, participant: Participant, key: str, folder: Path
+    context: Told, study: Study, participant: Participant, key: str, folder: Path
 ) -> tuple[dict[str, Any], dict[str, str]]:
     """Everything but the key itself that its robots leave behind, and the key."""
-    with place.database.writing() as session:
+    with context.database.writing() as session:
         for table in (Trial, Film, Controller, Assignment):
             session.execute(delete(table))
         session.execute(delete(Run).where(Run.kind == RunKind.FILMS))
         session.get_one(Study, study.id).key_secret = key
-    place.said.clear()
-    job = due(place.database, RunKind.FILMS)[0]
-    done(place, job, make_films)
-    with place.database.reading() as session:
+    context.said.clear()
+    job = due(context.database, RunKind.FILMS)[0]
+    done(context, job, make_films)
+    with context.database.reading() as session:
         here = session.get_one(Study, study.id)
         assert unblinding.is_blinded(here)
-        archive.write(session, place.store, here, folder / "study.zip")
-        export_files.write_data(session, place, here, folder / "data.zip")
+        archive.write(session, context.store, here, folder / "study.zip")
+        export_files.write_data(session, context, here, folder / "data.zip")
         left = {
             "films": _rows(session.scalars(select(Film).order_by(Film.method)).all()),
             "controllers": _rows(session.scalars(select(Controller).order_by(Controller.method)).all()),
-            "progress": list(place.said),
+            "progress": list(context.said),
             "archive": _from_outside(folder / "study.zip"),
             "data": _inside(folder / "data.zip"),
         }
@@ -133,29 +134,29 @@ def _inside(path: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.usefixtures("all_said")
-@pytest.mark.parametrize("what", [evaluation_films.TRIALS, evaluation_films.CONTROLLERS])
+@pytest.mark.parametrize("what", [TRIALS, CONTROLLERS])
 def test_the_order_in_which_robots_are_made_tells_no_method(
-    place: Told, database: Database, study: Study, participant: Participant, what: str
+    context: Told, database: Database, study: Study, participant: Participant, what: str
 ) -> None:
     """Or the times of files would. Films are made as they are shown, whatever the key; controllers in any order."""
     settle(database, study, methods=("reference", "pbarl", "prefft"), trials=1)
     with database.writing() as session:
         factories.make_model(session, study, participant, ModelKind.FILTER, factories.filter_metrics())
         factories.make_model(session, study, participant, ModelKind.METHOD, {"method": "prefft"})
-    job = Job(f"films/participant-1/{what}/x", RunKind.FILMS, study.id, participant.id)
+    job = job_of(f"films/participant-{participant.id}/{what}/labels-10", study.id)
     by_method, by_letter = set(), set()
     for number in range(20):
         with database.writing() as session:
             for table in (Trial, Assignment):
                 session.execute(delete(table))
             session.get_one(Study, study.id).key_secret = f"{number:064x}"
-        made = [method for method, *_ in evaluation_films._plan(place, job, what)]
+        made = [method for method, *_ in evaluation_films._plan(context, job, what)]
         with database.reading() as session:
             letters = {each.method: each.letter for each in evaluation_plan.assignments_of(session, participant.id)}
         by_method.add(tuple(made))
         by_letter.add("".join(letters[method] for method in made))
     assert len(by_method) > 3
-    assert by_letter == {"ABC"} if what == evaluation_films.TRIALS else len(by_letter) > 3
+    assert by_letter == {"ABC"} if what == TRIALS else len(by_letter) > 3
 
 
 def test_the_seed_that_everybody_sees_does_not_tell_the_letters(database: Database, study: Study) -> None:

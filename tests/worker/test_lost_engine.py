@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from datetime import timedelta
 from pathlib import Path
+from typing import Any
 
 import pytest
 from dbos import DBOS, SetWorkflowID
@@ -21,13 +22,14 @@ from app.domain.studies import Participant
 from app.settings import Settings
 from app.storage import ArtefactStore
 from tests.waiting import PATIENCE_S, until
-from tests.worker.conftest import the_workshop
+from tests.worker.conftest import the_job_runner
+from tests.worker.invented import job_of
 from worker.compute.pools import Compute
 from worker.jobs import reconcile, service, workflows
 from worker.jobs.runtime import engine, records
-from worker.jobs.runtime.context import Step, Workplace
-from worker.jobs.runtime.records import Job
-from worker.jobs.workflows import Workshop, as_arguments
+from worker.jobs.runtime.context import Step, WorkerContext
+from worker.jobs.runtime.records import Job, as_arguments, from_arguments
+from worker.jobs.workflows import JobRunner
 
 Damage = Callable[[Path], None]
 
@@ -42,8 +44,8 @@ class Work:
         self.may_finish.set()
         self.fails: list[Exception] = []
 
-    def __call__(self, place: Workplace, job: Job, run_id: int, step: Step) -> None:
-        step("prepare", self.prepared.append, job.finding)
+    def __call__(self, context: WorkerContext, job: Job, run_id: int, step: Step) -> None:
+        step("prepare", self.prepared.append, job.key)
         step("save", self._save, job)
 
     def _save(self, job: Job) -> None:
@@ -51,7 +53,7 @@ class Work:
         assert self.may_finish.wait(PATIENCE_S)
         if self.fails:
             raise self.fails.pop(0)
-        self.finished.append(job.finding)
+        self.finished.append(job.key)
 
 
 @pytest.fixture
@@ -63,21 +65,21 @@ def work(monkeypatch: pytest.MonkeyPatch) -> Work:
 
 @pytest.fixture
 def job(participant: Participant) -> Job:
-    return Job(f"filter/participant-{participant.id}/labels-10", RunKind.FILTER, 1, participant.id, 10)
+    return job_of(f"filter/participant-{participant.id}/labels-10", 1)
 
 
 @pytest.fixture
 def due(monkeypatch: pytest.MonkeyPatch, job: Job) -> Job:
     """The job is all that is ever missing, for as long as its run says so."""
 
-    def findings(session: object, _lost: object = None) -> Iterator[tuple[Job, int]]:
-        run = session.scalar(select(Run).where(Run.workflow_id == job.finding))  # type: ignore[attr-defined]
+    def found(session: object, _lost: object = None) -> Iterator[tuple[Job, int]]:
+        run = session.scalar(select(Run).where(Run.workflow_id == job.key))  # type: ignore[attr-defined]
         seen = run and reconcile._Attempted(run.status, run.attempt, run.finished_at)
         attempt = reconcile._attempt_due(seen, now())
         if attempt is not None:
             yield job, attempt
 
-    monkeypatch.setattr(reconcile, "findings", findings)
+    monkeypatch.setattr(reconcile, "due", found)
     monkeypatch.setattr(reconcile, "short_of_queries", lambda _session: [])
     monkeypatch.setattr(reconcile, "RETRY_AFTER", timedelta(seconds=0.2))
     monkeypatch.setattr(service, "LOOK_AGAIN_S", 0.2)
@@ -86,16 +88,16 @@ def due(monkeypatch: pytest.MonkeyPatch, job: Job) -> Job:
 
 
 @contextmanager
-def worker(settings: Settings, database: Database, store: ArtefactStore) -> Iterator[Workshop]:
+def worker(settings: Settings, database: Database, store: ArtefactStore) -> Iterator[JobRunner]:
     """The worker's life in this process, from launching the engine to a stop."""
-    workshop, compute, stop = the_workshop(), Compute(1), threading.Event()
-    workshop.place = Workplace(database, store, compute)
+    runner, compute, stop = the_job_runner(), Compute(1), threading.Event()
+    runner.context = WorkerContext(database, store, compute)
     with engine.running(settings, database) as bond:
-        rounds = service._Rounds(settings, workshop, bond)
+        rounds = service._Rounds(settings, runner, bond)
         thread = threading.Thread(target=rounds.until, args=(stop,))
         thread.start()
         try:
-            yield workshop
+            yield runner
         finally:
             stop.set()
             thread.join()
@@ -105,7 +107,7 @@ def worker(settings: Settings, database: Database, store: ArtefactStore) -> Iter
 
 def status_of(database: Database, job: Job) -> str | None:
     with database.reading() as session:
-        return session.scalar(select(Run.status).where(Run.workflow_id == job.finding))
+        return session.scalar(select(Run.status).where(Run.workflow_id == job.key))
 
 
 def lived(settings: Settings, database: Database, store: ArtefactStore) -> Path:
@@ -215,7 +217,7 @@ def test_work_goes_on_whatever_has_happened_to_the_engine_s_file(
         shutil.copy(path, damaged)
     with worker(settings, database, store):
         assert until(lambda: status_of(database, due) == RunStatus.SUCCEEDED)
-    assert work.finished == [due.finding]
+    assert work.finished == [due.key]
     if damaged.exists():
         kept = [aside.read_bytes() for aside in path.parent.glob("engine.sqlite3.set-aside-*")]
         assert kept == [damaged.read_bytes()], "what could not be used is kept"
@@ -242,7 +244,7 @@ def test_a_database_older_than_the_engine_s_file_gets_its_work_done_again(
     shutil.copy(tmp_path / "backup", settings.data_dir / "studio.sqlite3")
     with worker(settings, database, store):
         assert until(lambda: status_of(database, due) == RunStatus.SUCCEEDED)
-    assert work.prepared == work.finished == [due.finding] * 2
+    assert work.prepared == work.finished == [due.key] * 2
 
 
 def test_an_engine_s_file_older_than_the_database_does_nothing_twice(
@@ -262,7 +264,7 @@ def test_an_engine_s_file_older_than_the_database_does_nothing_twice(
     with worker(settings, database, store):
         seen = last_seen(database)
         assert until(lambda: last_seen(database) != seen)
-    assert work.finished == [due.finding]
+    assert work.finished == [due.key]
     assert len(list(path.parent.glob("engine.sqlite3.set-aside-*"))) == 1
 
 
@@ -272,8 +274,8 @@ def test_work_that_the_engine_takes_for_done_is_done_when_the_database_does_not_
     with worker(settings, database, store):
         assert until(lambda: status_of(database, due) == RunStatus.SUCCEEDED)
         with database.writing() as session:
-            session.delete(session.scalars(select(Run).where(Run.workflow_id == due.finding)).one())
-        assert until(lambda: work.finished == [due.finding] * 2)
+            session.delete(session.scalars(select(Run).where(Run.workflow_id == due.key)).one())
+        assert until(lambda: work.finished == [due.key] * 2)
 
 
 def test_work_that_fills_the_disk_is_tried_until_there_is_space(
@@ -282,10 +284,10 @@ def test_work_that_fills_the_disk_is_tried_until_there_is_space(
     full = OSError(errno.ENOSPC, "No space left on device")
     work.fails = [full] * (2 * records.ATTEMPTS)
     with worker(settings, database, store):
-        assert until(lambda: work.finished == [due.finding])
+        assert until(lambda: work.finished == [due.key])
         assert until(lambda: status_of(database, due) == RunStatus.SUCCEEDED)
     with database.reading() as session:
-        assert session.scalars(select(Run.attempt).where(Run.workflow_id == due.finding)).one() == 1
+        assert session.scalars(select(Run.attempt).where(Run.workflow_id == due.key)).one() == 1
 
 
 def test_a_sign_of_life_that_cannot_be_written_does_not_end_the_work(
@@ -295,7 +297,7 @@ def test_a_sign_of_life_that_cannot_be_written_does_not_end_the_work(
         run_id = records.begin_run(session, job, seed=1)
     with database.writing() as session:
         session.execute(text("DROP TABLE run"))
-    Workplace(database, store, Compute(1)).beat(run_id)()
+    WorkerContext(database, store, Compute(1)).beat(run_id)()
 
 
 def test_work_in_the_middle_of_which_the_worker_falls_again_and_again_counts_as_a_failed_attempt(
@@ -303,8 +305,8 @@ def test_work_in_the_middle_of_which_the_worker_falls_again_and_again_counts_as_
 ) -> None:
     path = lived(settings, database, store)
     engine.launch(settings)
-    with SetWorkflowID(f"{due.finding}#1"):
-        DBOS.enqueue_workflow("a queue of nobody", the_workshop().work, as_arguments(due))
+    with SetWorkflowID(f"{due.key}#1"):
+        DBOS.enqueue_workflow("a queue of nobody", the_job_runner().work, as_arguments(due))
     DBOS.destroy()
     with closing(sqlite3.connect(path)) as connection:
         connection.execute("UPDATE workflow_status SET status = 'MAX_RECOVERY_ATTEMPTS_EXCEEDED'")
@@ -314,6 +316,48 @@ def test_work_in_the_middle_of_which_the_worker_falls_again_and_again_counts_as_
         assert until(lambda: status_of(database, due) == RunStatus.SUCCEEDED)
     with database.reading() as session:
         assert session.scalars(select(Run.attempt)).one() == 2
+
+
+@pytest.mark.parametrize("status", ["ENQUEUED", "PENDING"])
+def test_what_the_previous_version_left_half_done_is_found_again_and_done(
+    settings: Settings, database: Database, store: ArtefactStore, work: Work, due: Job, status: str
+) -> None:
+    """Its workflows had another class, another version, and jobs of another form."""
+    path = lived(settings, database, store)
+    engine.launch(settings)
+    with SetWorkflowID(f"{due.key}#1"):
+        DBOS.enqueue_workflow("a queue of nobody", the_job_runner().work, as_arguments(due))
+    DBOS.destroy()
+    with closing(sqlite3.connect(path)) as connection:
+        connection.execute(
+            "UPDATE workflow_status SET status = ?, application_version = ?, class_name = ?, name = ?, config_name = ?",
+            (status, "3", "Workshop", "Workshop.work", "workshop"),
+        )
+        connection.commit()
+    left_behind(database, due)
+    with worker(settings, database, store):
+        assert until(lambda: status_of(database, due) == RunStatus.SUCCEEDED)
+    assert work.finished == [due.key]
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        {"key": "filter/participant-1/labels-10", "study_id": 1},
+        {
+            "finding": "filter/participant-1/labels-10",
+            "kind": "filter",
+            "study_id": 1,
+            "participant_id": 1,
+            "label_count": 10,
+            "label_hash": None,
+        },
+    ],
+)
+def test_a_job_is_read_as_this_version_and_the_previous_one_have_stored_it(arguments: dict[str, Any]) -> None:
+    """Whoever withdraws is erased from the engine's notes too, whichever version wrote them."""
+    job = from_arguments(arguments)
+    assert (job.key, job.study_id, job.participant_id) == ("filter/participant-1/labels-10", 1, 1)
 
 
 RUNNING_DAMAGES = [removed, overwritten, emptied, another_program_s, replaced_by_an_older_one]

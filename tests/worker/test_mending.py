@@ -24,43 +24,43 @@ from worker.jobs.clips.evaluation_films import make_films
 from worker.jobs.clips.pool_clips import build_clips
 from worker.jobs.clips.repairs import FilmLost, NotTheSameAgain
 from worker.jobs.runtime import records
-from worker.jobs.runtime.context import Workplace
+from worker.jobs.runtime.context import WorkerContext
 from worker.jobs.runtime.records import Job
 from worker.trajectory import Trajectory
 
 
 @pytest.fixture
-def place(database: Database, store: ArtefactStore) -> Workplace:
-    return Workplace(database, store, AtHand(1))
+def context(database: Database, store: ArtefactStore) -> WorkerContext:
+    return WorkerContext(database, store, AtHand(1))
 
 
 @pytest.fixture
-def clips(place: Workplace, study: Study) -> list[Clip]:
+def clips(context: WorkerContext, study: Study) -> list[Clip]:
     """Of one scenario, really simulated and filmed."""
-    job = next(job for job in due(place) if job.kind == RunKind.CLIPS)
+    job = next(job for job in due(context) if job.kind == RunKind.CLIPS)
     assert not repairs.is_about(job)
-    work(place, job)
-    with place.database.reading() as session:
+    work(context, job)
+    with context.database.reading() as session:
         return list(session.scalars(select(Clip).order_by(Clip.id)))
 
 
-def due(place: Workplace) -> list[Job]:
+def due(context: WorkerContext) -> list[Job]:
     """What the worker would begin now."""
-    with place.database.reading() as session:
-        return [job for job, _ in reconcile.findings(session, place.store.lost())]
+    with context.database.reading() as session:
+        return [job for job, _ in reconcile.due(session, context.store.lost())]
 
 
-def to_mend(place: Workplace) -> list[Job]:
+def to_mend(context: WorkerContext) -> list[Job]:
     """What of that is about lost files."""
-    return [job for job in due(place) if repairs.is_about(job)]
+    return [job for job in due(context) if repairs.is_about(job)]
 
 
-def work(place: Workplace, job: Job) -> None:
+def work(context: WorkerContext, job: Job) -> None:
     """Do one job from beginning to end."""
-    with place.database.writing() as session:
+    with context.database.writing() as session:
         run_id = records.begin_run(session, job, seed=1)
-    (make_films if job.kind == RunKind.FILMS else build_clips)(place, job, run_id, at_once)
-    with place.database.writing() as session:
+    (make_films if job.kind == RunKind.FILMS else build_clips)(context, job, run_id, at_once)
+    with context.database.writing() as session:
         records.finish_run(session, run_id)
 
 
@@ -71,50 +71,50 @@ def damage(path: Path) -> None:
     path.write_bytes(content)
 
 
-def test_a_damaged_clip_is_rendered_again(place: Workplace, clips: list[Clip]) -> None:
+def test_a_damaged_clip_is_rendered_again(context: WorkerContext, clips: list[Clip]) -> None:
     clip = clips[1]
     for _ in range(2):  # what is lost again is made again
-        damage(place.store.path(clip.video_sha256))
-        assert not place.store.has(clip.video_sha256)
-        (job,) = to_mend(place)
-        work(place, job)
-        with place.database.reading() as session:
+        damage(context.store.path(clip.video_sha256))
+        assert not context.store.has(clip.video_sha256)
+        (job,) = to_mend(context)
+        work(context, job)
+        with context.database.reading() as session:
             again = session.get_one(Clip, clip.id)
-        with av.open(io.BytesIO(place.store.read(again.video_sha256)), "r") as video:
+        with av.open(io.BytesIO(context.store.read(again.video_sha256)), "r") as video:
             frames = len(list(video.decode(video=0)))
         assert frames * 1000 == again.duration_ms * again.fps
-        assert place.store.has(again.poster_sha256)
-        assert to_mend(place) == []
-        assert place.store.lost() == {}
+        assert context.store.has(again.poster_sha256)
+        assert to_mend(context) == []
+        assert context.store.lost() == {}
         clip = again
 
 
-def test_what_was_never_looked_at_is_found_by_a_scrub_and_made_again(place: Workplace, clips: list[Clip]) -> None:
-    damage(place.store.path(clips[0].video_sha256))
-    place.store.path(clips[2].poster_sha256).unlink()
-    assert to_mend(place) == []
-    assert not any(place.store.scrub(sha256) for sha256 in (clips[0].video_sha256, clips[2].poster_sha256))
-    for job in to_mend(place):
-        work(place, job)
-    with place.database.reading() as session:
+def test_what_was_never_looked_at_is_found_by_a_scrub_and_made_again(context: WorkerContext, clips: list[Clip]) -> None:
+    damage(context.store.path(clips[0].video_sha256))
+    context.store.path(clips[2].poster_sha256).unlink()
+    assert to_mend(context) == []
+    assert not any(context.store.scrub(sha256) for sha256 in (clips[0].video_sha256, clips[2].poster_sha256))
+    for job in to_mend(context):
+        work(context, job)
+    with context.database.reading() as session:
         again = session.scalars(select(Clip).order_by(Clip.id)).all()
-    assert all(place.store.scrub(sha256) for clip in again for sha256 in (clip.video_sha256, clip.poster_sha256))
+    assert all(context.store.scrub(sha256) for clip in again for sha256 in (clip.video_sha256, clip.poster_sha256))
 
 
-def test_a_lost_recording_is_simulated_again(place: Workplace, clips: list[Clip]) -> None:
-    sha256 = trajectory_of(place, clips[0])
-    place.store.path(sha256).unlink()
-    assert not place.store.has(sha256)
-    (job,) = to_mend(place)
-    work(place, job)
-    again = Trajectory.load(io.BytesIO(place.store.read(trajectory_of(place, clips[0]))))
-    assert again.scenario == rollout_of(place, clips[0]).scenario
-    assert to_mend(place) == []
+def test_a_lost_recording_is_simulated_again(context: WorkerContext, clips: list[Clip]) -> None:
+    sha256 = trajectory_of(context, clips[0])
+    context.store.path(sha256).unlink()
+    assert not context.store.has(sha256)
+    (job,) = to_mend(context)
+    work(context, job)
+    again = Trajectory.load(io.BytesIO(context.store.read(trajectory_of(context, clips[0]))))
+    assert again.scenario == rollout_of(context, clips[0]).scenario
+    assert to_mend(context) == []
 
 
 @pytest.mark.parametrize("answered", [False, True])
 def test_another_recording_takes_its_place_only_where_nobody_has_answered(
-    place: Workplace,
+    context: WorkerContext,
     clips: list[Clip],
     answer: Callable[[Clip, Clip, Response], Query],
     monkeypatch: pytest.MonkeyPatch,
@@ -122,55 +122,55 @@ def test_another_recording_takes_its_place_only_where_nobody_has_answered(
 ) -> None:
     if answered:
         answer(clips[0], clips[1], Response.LEFT)
-    before = trajectory_of(place, clips[0])
-    damage(place.store.path(before))
-    assert not place.store.has(before)
+    before = trajectory_of(context, clips[0])
+    damage(context.store.path(before))
+    assert not context.store.has(before)
     simulate = simulation.record_clip
 
     def differently(name: str, quality: str, scenario: int, *shot: Any) -> simulation.RecordedClip:
         return simulate(name, quality, scenario + 1, *shot)
 
     monkeypatch.setattr(simulation, "record_clip", differently)
-    (job,) = to_mend(place)
+    (job,) = to_mend(context)
     if answered:
         with pytest.raises(NotTheSameAgain, match="backup"):
-            work(place, job)
-        assert trajectory_of(place, clips[0]) == before
+            work(context, job)
+        assert trajectory_of(context, clips[0]) == before
         return
-    work(place, job)
-    assert trajectory_of(place, clips[0]) != before
-    with place.database.reading() as session:
+    work(context, job)
+    assert trajectory_of(context, clips[0]) != before
+    with context.database.reading() as session:
         assert session.get_one(Clip, clips[0].id).video_sha256 != clips[0].video_sha256
 
 
 def test_a_film_is_rendered_again_from_its_recording(
-    place: Workplace, clips: list[Clip], study: Study, participant: Participant
+    context: WorkerContext, clips: list[Clip], study: Study, participant: Participant
 ) -> None:
-    with place.database.writing() as session:
-        film = factories.make_film(session, place.store, session.get_one(Participant, participant.id), "reference")
-        film.trajectory_sha256 = trajectory_of(place, clips[0])
-    damage(place.store.path(film.video_sha256))
-    assert not place.store.has(film.video_sha256)
-    (job,) = to_mend(place)
+    with context.database.writing() as session:
+        film = factories.make_film(session, context.store, session.get_one(Participant, participant.id), "reference")
+        film.trajectory_sha256 = trajectory_of(context, clips[0])
+    damage(context.store.path(film.video_sha256))
+    assert not context.store.has(film.video_sha256)
+    (job,) = to_mend(context)
     assert job.participant_id == participant.id
-    work(place, job)
-    with place.database.reading() as session:
+    work(context, job)
+    with context.database.reading() as session:
         again = session.get_one(type(film), film.id)
-    assert place.store.has(again.video_sha256)
-    damage(place.store.path(film.trajectory_sha256))
-    place.store.path(again.video_sha256).unlink()
-    assert not place.store.has(again.video_sha256)
-    assert not place.store.has(film.trajectory_sha256)
+    assert context.store.has(again.video_sha256)
+    damage(context.store.path(film.trajectory_sha256))
+    context.store.path(again.video_sha256).unlink()
+    assert not context.store.has(again.video_sha256)
+    assert not context.store.has(film.trajectory_sha256)
     with pytest.raises(FilmLost, match="backup"):
-        work(place, next(job for job in to_mend(place) if job.kind == RunKind.FILMS))
+        work(context, next(job for job in to_mend(context) if job.kind == RunKind.FILMS))
 
 
-def trajectory_of(place: Workplace, clip: Clip) -> str:
+def trajectory_of(context: WorkerContext, clip: Clip) -> str:
     """The name of what was recorded of a clip."""
-    return rollout_of(place, clip).trajectory_sha256
+    return rollout_of(context, clip).trajectory_sha256
 
 
-def rollout_of(place: Workplace, clip: Clip) -> Rollout:
+def rollout_of(context: WorkerContext, clip: Clip) -> Rollout:
     """What a clip shows a stretch of."""
-    with place.database.reading() as session:
+    with context.database.reading() as session:
         return session.get_one(Rollout, clip.rollout_id)

@@ -13,7 +13,7 @@ from app.domain.studies import Participant, Study
 from app.storage import ArtefactStore
 from tests import factories
 from worker.compute.pools import Compute
-from worker.jobs.runtime.context import Workplace
+from worker.jobs.runtime.context import WorkerContext
 from worker.jobs.upkeep import unused_files
 
 TWO_DAYS_S = 2 * 24 * 3600
@@ -25,36 +25,38 @@ def age(path: Path) -> None:
 
 
 @pytest.fixture
-def place(database: Database, store: ArtefactStore) -> Workplace:
-    return Workplace(database, store, cast("Compute", None))
+def context(database: Database, store: ArtefactStore) -> WorkerContext:
+    return WorkerContext(database, store, cast("Compute", None))
 
 
-def stored(place: Workplace, content: bytes) -> str:
+def stored(context: WorkerContext, content: bytes) -> str:
     """An artefact that was stored two days ago."""
-    sha256 = place.store.put(content)
-    age(place.store.path(sha256))
+    sha256 = context.store.put(content)
+    age(context.store.path(sha256))
     return sha256
 
 
-def test_old_files_that_nobody_refers_to_go_and_all_others_stay(place: Workplace, participant: Participant) -> None:
-    lost, promised, wanted_again = (stored(place, name) for name in (b"lost", b"promised", b"wanted again"))
-    fresh = place.store.put(b"just stored")
-    place.store.put(b"wanted again")
-    with place.database.writing() as session:
+def test_old_files_that_nobody_refers_to_go_and_all_others_stay(
+    context: WorkerContext, participant: Participant
+) -> None:
+    lost, promised, wanted_again = (stored(context, name) for name in (b"lost", b"promised", b"wanted again"))
+    fresh = context.store.put(b"just stored")
+    context.store.put(b"wanted again")
+    with context.database.writing() as session:
         study = session.get_one(Study, participant.study_id)
         model = factories.make_model(session, study, participant, ModelKind.REWARD, factories.reward_metrics())
-        model.artefact_sha256 = used = stored(place, b"a model")
-    assert unused_files.clear_away(place, {promised}) == 1
-    assert not place.store.has(lost)
-    assert all(place.store.has(each) for each in (promised, wanted_again, fresh, used))
-    assert unused_files.clear_away(place, {promised}) == 0
+        model.artefact_sha256 = used = stored(context, b"a model")
+    assert unused_files.clear_away(context, {promised}) == 1
+    assert not context.store.has(lost)
+    assert all(context.store.has(each) for each in (promised, wanted_again, fresh, used))
+    assert unused_files.clear_away(context, {promised}) == 0
 
 
-def test_what_was_never_written_to_its_end_goes_as_well(place: Workplace) -> None:
-    folder = place.store.path(place.store.put(b"whole")).parent
+def test_what_was_never_written_to_its_end_goes_as_well(context: WorkerContext) -> None:
+    folder = context.store.path(context.store.put(b"whole")).parent
     old, young = folder / ".writing-old", folder / ".writing-young"
     for path in (old, young):
         path.write_bytes(b"half")
     age(old)
-    unused_files.clear_away(place, ())
+    unused_files.clear_away(context, ())
     assert (old.exists(), young.exists()) == (False, True)

@@ -28,7 +28,7 @@ from worker.jobs.learning import dataset, query_selection
 from worker.jobs.learning.reward_models import train_reward
 from worker.jobs.publishing import preference_arrays
 from worker.jobs.runtime import records
-from worker.jobs.runtime.context import Workplace
+from worker.jobs.runtime.context import WorkerContext
 from worker.jobs.runtime.records import Job
 from worker.ml.rewards.reward_models import StructuredReward, load_reward_model
 from worker.sim.render.video import encode_mp4, playable
@@ -60,14 +60,14 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.fixture
-def place(database: Database, store: ArtefactStore) -> Workplace:
-    return Workplace(database, store, Here(1))
+def context(database: Database, store: ArtefactStore) -> WorkerContext:
+    return WorkerContext(database, store, Here(1))
 
 
 @pytest.fixture
-def own(place: Workplace, folder: Path) -> Study:
-    slug = import_clips(place.database, place.store, folder)
-    with place.database.reading() as session:
+def own(context: WorkerContext, folder: Path) -> Study:
+    slug = import_clips(context.database, context.store, folder)
+    with context.database.reading() as session:
         return session.scalars(select(Study).where(Study.slug == slug)).one()
 
 
@@ -77,86 +77,86 @@ def edit(folder: Path, change: Callable[[dict[str, Any]], None]) -> None:
     (folder / "manifest.json").write_text(json.dumps(manifest))
 
 
-def test_the_documented_example_becomes_a_study(place: Workplace, own: Study) -> None:
+def test_the_documented_example_becomes_a_study(context: WorkerContext, own: Study) -> None:
     assert (own.slug, own.task) == ("handover-with-our-arm", "handover")
     assert own.settings.labels_per_participant == 12
     assert own.material is not None
     assert [each["unit"] for each in own.material["signals"]] == ["m/s", "m"]
-    with place.database.reading() as session:
+    with context.database.reading() as session:
         clips = dataset.pool_clips(session, own.id)
         assert len(clips) == 8
         assert len(dataset.matched_pairs(clips)) == 12
-        assert all(place.store.has(clip.video_sha256) and place.store.has(clip.poster_sha256) for clip in clips)
+        assert all(context.store.has(clip.video_sha256) and context.store.has(clip.poster_sha256) for clip in clips)
         assert clips[0].rollout.mode["imported"]["label"] == "slow, far"
 
 
-def test_the_same_as_a_zip_file(place: Workplace, folder: Path) -> None:
+def test_the_same_as_a_zip_file(context: WorkerContext, folder: Path) -> None:
     path = folder.parent / "my-clips.zip"
     with zipfile.ZipFile(path, "w") as archive:
         for file in folder.rglob("*.*"):
             archive.write(file, Path("my-clips") / file.relative_to(folder))
-    assert import_clips(place.database, place.store, path) == "handover-with-our-arm"
+    assert import_clips(context.database, context.store, path) == "handover-with-our-arm"
 
 
-def test_nothing_is_simulated_for_it(place: Workplace, own: Study) -> None:
-    with place.database.reading() as session:
-        assert list(reconcile.findings(session)) == []
+def test_nothing_is_simulated_for_it(context: WorkerContext, own: Study) -> None:
+    with context.database.reading() as session:
+        assert list(reconcile.due(session)) == []
 
 
 def test_people_are_asked_and_a_reward_model_learns_what_they_want_in_the_labs_own_signals(
-    place: Workplace, own: Study
+    context: WorkerContext, own: Study
 ) -> None:
-    person = _answer_everything(place, own)
-    with place.database.reading() as session:
-        due = [job for job, _ in reconcile.findings(session) if job.kind is RunKind.REWARD]
+    person = _answer_everything(context, own)
+    with context.database.reading() as session:
+        due = [job for job, _ in reconcile.due(session) if job.kind is RunKind.REWARD]
         assert len(due) == 1
-    _train(place, due[0])
-    with place.database.reading() as session:
+    _train(context, due[0])
+    with context.database.reading() as session:
         model = session.scalars(select(Model).where(Model.kind == ModelKind.REWARD)).one()
     assert set(model.metrics["weights"]) == {"speed_m_s", "distance_m"}
     assert model.metrics["weights"]["speed_m_s"]["mean"] < 0, "this person likes it slow"
-    learned = load_reward_model(place.store.read(model.artefact_sha256))
+    learned = load_reward_model(context.store.read(model.artefact_sha256))
     assert isinstance(learned, StructuredReward)
     assert learned.weights.shape[1] == 2
-    with place.database.writing() as session:
-        factories.make_run(session, own, session.get_one(Participant, person)).workflow_id = due[0].finding + "/x"
+    with context.database.writing() as session:
+        factories.make_run(session, own, session.get_one(Participant, person)).workflow_id = due[0].key + "/x"
         run = session.scalars(select(Model.run_id)).one()
         records.finish_run(session, run)
-    with place.database.reading() as session:
-        kinds = {job.kind for job, _ in reconcile.findings(session)}
+    with context.database.reading() as session:
+        kinds = {job.kind for job, _ in reconcile.due(session)}
     assert kinds <= {RunKind.REPORT}, "no filter, no method, no film: there is no simulator to make them in"
 
 
-def _answer_everything(place: Workplace, own: Study) -> int:
+def _answer_everything(context: WorkerContext, own: Study) -> int:
     """A person who prefers the slower clip, and what is near where both are equally fast."""
-    with place.database.writing() as session:
+    with context.database.writing() as session:
         participant, _ = enrolment.add_participant(session, own)
         person = participant.id
     for _ in range(3):
-        query_selection.refill_queries(place, person)
-        with place.database.writing() as session:
+        query_selection.refill_queries(context, person)
+        with context.database.writing() as session:
             for query in records.unanswered(session, person, *dataset.CLIPS_AND_ROLLOUTS):
                 left, right = (
-                    dataset.stretch(place.store, clip).cut("signals").sum(axis=0)
+                    dataset.stretch(context.store, clip).cut("signals").sum(axis=0)
                     for clip in (query.left_clip, query.right_clip)
                 )
                 says = Response.LEFT if tuple(left) < tuple(right) else Response.RIGHT
                 factories.make_label(session, query, says, response_time_ms=900)
-    with place.database.reading() as session:
+    with context.database.reading() as session:
         assert session.scalar(select(func.count(Query.id))) == 12
     return person
 
 
-def _train(place: Workplace, job: Job) -> None:
-    with place.database.writing() as session:
+def _train(context: WorkerContext, job: Job) -> None:
+    with context.database.writing() as session:
         run_id = records.begin_run(session, job, seed=5)
-    train_reward(place, job, run_id, lambda _name, function, *arguments: function(*arguments))
+    train_reward(context, job, run_id, lambda _name, function, *arguments: function(*arguments))
 
 
-def test_exports_hold_the_labs_own_signals_and_actions(place: Workplace, own: Study) -> None:
-    person = _answer_everything(place, own)
-    with place.database.reading() as session:
-        stored = preference_arrays.arrays_of(session, place.store, own, session.get_one(Participant, person), set())
+def test_exports_hold_the_labs_own_signals_and_actions(context: WorkerContext, own: Study) -> None:
+    person = _answer_everything(context, own)
+    with context.database.reading() as session:
+        stored = preference_arrays.arrays_of(session, context.store, own, session.get_one(Participant, person), set())
     assert stored is not None
     file = np.load(io.BytesIO(stored))
     assert list(file["signal_names"]) == ["speed_m_s", "distance_m"]
@@ -164,14 +164,14 @@ def test_exports_hold_the_labs_own_signals_and_actions(place: Workplace, own: St
     assert (file["actions"].shape[-1], file["observations"].shape[-1]) == (1, 0)
 
 
-def test_npz_files_are_read_as_well(place: Workplace, folder: Path) -> None:
+def test_npz_files_are_read_as_well(context: WorkerContext, folder: Path) -> None:
     signals = np.full((20, 2), 0.5, np.float32)
     np.savez(folder / "trajectories" / "one.npz", signals=signals, actions=np.zeros((20, 1)))
     edit(folder, lambda manifest: manifest["clips"][0].update(trajectory="trajectories/one.npz"))
-    import_clips(place.database, place.store, folder)
-    with place.database.reading() as session:
+    import_clips(context.database, context.store, folder)
+    with context.database.reading() as session:
         clip = dataset.pool_clips(session, 1)[0]
-        assert np.array_equal(dataset.stretch(place.store, clip).cut("signals"), signals)
+        assert np.array_equal(dataset.stretch(context.store, clip).cut("signals"), signals)
 
 
 def test_videos_that_browsers_cannot_play_are_converted(tmp_path: Path) -> None:
@@ -206,24 +206,24 @@ WRONG: list[tuple[str, Callable[[dict[str, Any]], None], str]] = [
 
 @pytest.mark.parametrize(("change", "words"), [each[1:] for each in WRONG], ids=[each[0] for each in WRONG])
 def test_what_is_wrong_is_said_and_nothing_is_imported(
-    place: Workplace, folder: Path, change: Callable[[dict[str, Any]], None], words: str
+    context: WorkerContext, folder: Path, change: Callable[[dict[str, Any]], None], words: str
 ) -> None:
     edit(folder, change)
     with pytest.raises(ClipsInvalid, match=re.escape(words)):
-        import_clips(place.database, place.store, folder)
-    with place.database.reading() as session:
+        import_clips(context.database, context.store, folder)
+    with context.database.reading() as session:
         assert session.scalar(select(func.count(Study.id))) == 0
         assert session.scalar(select(func.count(Rollout.id))) == 0
         assert session.scalar(select(func.count(Clip.id))) == 0
-    assert list(place.store.root.glob("??/*")) == []
+    assert list(context.store.root.glob("??/*")) == []
 
 
 @pytest.mark.parametrize("cell", ["nan", "", "inf", "fast"])
-def test_numbers_that_are_none_are_refused(place: Workplace, folder: Path, cell: str) -> None:
+def test_numbers_that_are_none_are_refused(context: WorkerContext, folder: Path, cell: str) -> None:
     path = folder / "trajectories" / "slow_far_1.csv"
     path.write_text(path.read_text().replace("0.1,0.51", f"{cell},0.51", 1))
     with pytest.raises(ClipsInvalid, match=re.escape("trajectories/slow_far_1.csv")):
-        import_clips(place.database, place.store, folder)
+        import_clips(context.database, context.store, folder)
 
 
 def _zipped(folder: Path, name: str, content: bytes) -> Path:
@@ -252,41 +252,41 @@ def _boundless_arrays() -> bytes:
 
 
 @pytest.mark.parametrize("name", ["manifest.json", "videos/slow_far_1.mp4", "trajectories/slow_far_1.csv"])
-def test_noughts_in_a_zip_file_fill_no_memory(place: Workplace, folder: Path, name: str) -> None:
+def test_noughts_in_a_zip_file_fill_no_memory(context: WorkerContext, folder: Path, name: str) -> None:
     path = _zipped(folder, name, bytes(200 << 20))
     assert path.stat().st_size < 2 << 20
-    _refused_within_memory(place, path)
+    _refused_within_memory(context, path)
 
 
-def test_arrays_that_swell_fill_no_memory(place: Workplace, folder: Path) -> None:
+def test_arrays_that_swell_fill_no_memory(context: WorkerContext, folder: Path) -> None:
     (folder / "trajectories" / "one.npz").write_bytes(_swollen_arrays())
     edit(folder, lambda manifest: manifest["clips"][0].update(trajectory="trajectories/one.npz"))
-    _refused_within_memory(place, folder)
+    _refused_within_memory(context, folder)
 
 
-def test_an_array_that_says_it_is_boundless_is_refused(place: Workplace, folder: Path) -> None:
+def test_an_array_that_says_it_is_boundless_is_refused(context: WorkerContext, folder: Path) -> None:
     """numpy asks for all that memory, and never touches it."""
     (folder / "trajectories" / "one.npz").write_bytes(_boundless_arrays())
     edit(folder, lambda manifest: manifest["clips"][0].update(trajectory="trajectories/one.npz"))
     with pytest.raises(ClipsInvalid, match=re.escape("trajectories/one.npz")):
-        import_clips(place.database, place.store, folder)
+        import_clips(context.database, context.store, folder)
 
 
-def _refused_within_memory(place: Workplace, path: Path) -> None:
+def _refused_within_memory(context: WorkerContext, path: Path) -> None:
     tracemalloc.start()
     try:
         with pytest.raises(ClipsInvalid):
-            import_clips(place.database, place.store, path)
+            import_clips(context.database, context.store, path)
         assert tracemalloc.get_traced_memory()[1] < 48 << 20
     finally:
         tracemalloc.stop()
-    assert list(place.store.root.glob("??/*")) == []
+    assert list(context.store.root.glob("??/*")) == []
 
 
-def test_a_table_with_the_line_ends_of_any_machine_is_read(place: Workplace, folder: Path) -> None:
+def test_a_table_with_the_line_ends_of_any_machine_is_read(context: WorkerContext, folder: Path) -> None:
     for path, end in zip(sorted((folder / "trajectories").iterdir()), (b"\r", b"\r\n", b"\n") * 3, strict=False):
         path.write_bytes(path.read_bytes().replace(b"\r\n", b"\n").replace(b"\n", end))
-    assert import_clips(place.database, place.store, folder)
+    assert import_clips(context.database, context.store, folder)
 
 
 def test_a_long_video_is_looked_at_picture_by_picture() -> None:
@@ -299,34 +299,34 @@ def test_a_long_video_is_looked_at_picture_by_picture() -> None:
         tracemalloc.stop()
 
 
-def test_pairs_whose_videos_are_lost_make_room_for_others(place: Workplace, own: Study) -> None:
-    with place.database.writing() as session:
+def test_pairs_whose_videos_are_lost_make_room_for_others(context: WorkerContext, own: Study) -> None:
+    with context.database.writing() as session:
         participant, _ = enrolment.add_participant(session, own)
-    query_selection.refill_queries(place, participant.id)
+    query_selection.refill_queries(context, participant.id)
 
     def waiting() -> list[Query]:
-        with place.database.reading() as session:
+        with context.database.reading() as session:
             return list(records.unanswered(session, participant.id, *dataset.CLIPS_AND_ROLLOUTS))
 
     before = waiting()
     lost = before[0].left_clip
-    with place.database.writing() as session:
+    with context.database.writing() as session:
         session.get_one(Query, before[0].id).served_at = now()
-    place.store.path(lost.video_sha256).write_bytes(b"no video")
-    assert not place.store.has(lost.video_sha256)
-    with place.database.reading() as session:
-        assert reconcile.with_lost_queries(session, place.store.lost()) != []
-        assert list(reconcile.findings(session, place.store.lost())) == [], "nobody can film another lab's robot again"
-    query_selection.refill_queries(place, participant.id)
+    context.store.path(lost.video_sha256).write_bytes(b"no video")
+    assert not context.store.has(lost.video_sha256)
+    with context.database.reading() as session:
+        assert reconcile.with_lost_queries(session, context.store.lost()) != []
+        assert list(reconcile.due(session, context.store.lost())) == [], "nobody can film another lab's robot again"
+    query_selection.refill_queries(context, participant.id)
     after = waiting()
     showing = [query.id for query in after if lost.id in (query.left_clip_id, query.right_clip_id)]
     assert showing == [before[0].id], "the one in front of the participant may still be answered"
-    with place.database.writing() as session:
+    with context.database.writing() as session:
         session.get_one(Query, before[0].id).served_at = now() - records.LIES_OPEN
-    query_selection.refill_queries(place, participant.id)
-    with place.database.reading() as session:
+    query_selection.refill_queries(context, participant.id)
+    with context.database.reading() as session:
         shown = [clip for clip in dataset.pool_clips(session, own.id) if clip.id != lost.id]
         left_over = {frozenset((left.id, right.id)) for left, right in dataset.matched_pairs(shown)}
     assert {frozenset((query.left_clip_id, query.right_clip_id)) for query in waiting()} == left_over, "all there is"
-    with place.database.reading() as session:
-        assert reconcile.with_lost_queries(session, place.store.lost()) == []
+    with context.database.reading() as session:
+        assert reconcile.with_lost_queries(session, context.store.lost()) == []

@@ -15,12 +15,13 @@ from app.domain.preferences import LabelEvent, Purpose, Query, Response
 from app.domain.studies import LONGEST_CLIP_STEPS, Participant, Study, TaskName
 from app.storage import ArtefactStore
 from tests.worker.conftest import STEPS, make_trajectory
+from tests.worker.invented import job_of
+from worker import scenarios
 from worker.compute.pools import Compute
 from worker.jobs import reconcile
 from worker.jobs.learning import dataset, query_plan, query_selection, reward_models
 from worker.jobs.runtime import records
-from worker.jobs.runtime.context import Workplace
-from worker.jobs.runtime.records import Job
+from worker.jobs.runtime.context import WorkerContext
 from worker.trajectory import SIGNALS
 
 WHOLE = LONGEST_CLIP_STEPS[TaskName.FEEDING]
@@ -28,8 +29,8 @@ ENDS = ("undelivered", "spilled_on_person", "high_force_n")
 
 
 @pytest.fixture
-def place(database: Database, store: ArtefactStore) -> Workplace:
-    return Workplace(database, store, Compute(1))
+def context(database: Database, store: ArtefactStore) -> WorkerContext:
+    return WorkerContext(database, store, Compute(1))
 
 
 @pytest.fixture
@@ -44,7 +45,7 @@ def settle(database: Database, study: Study) -> Callable[..., None]:
     return change
 
 
-def add_runs(place: Workplace, study: Study, scenario: int, ends_well: Sequence[bool]) -> None:
+def add_runs(context: WorkerContext, study: Study, scenario: int, ends_well: Sequence[bool]) -> None:
     """One rollout per behaviour, filmed as a clip and whole; it ends well within the clip or fails."""
     for behaviour, well in enumerate(ends_well):
         run = make_trajectory(scenario, behaviour, WHOLE)
@@ -57,33 +58,33 @@ def add_runs(place: Workplace, study: Study, scenario: int, ends_well: Sequence[
             "scenario": scenario,
             "behaviour": behaviour,
             "mode": {},
-            "trajectory_sha256": place.store.put(target.getvalue()),
+            "trajectory_sha256": context.store.put(target.getvalue()),
             "success": well,
         }
         for steps in (STEPS, WHOLE):
             name = f"{scenario:032x}{behaviour:016x}{steps:016x}"
             clip = {"first_step": 0, "step_count": steps, "video_sha256": name, "poster_sha256": name}
             size = {"width": 640, "height": 480, "fps": 15, "duration_ms": 100 * steps, "byte_count": 1}
-            with place.database.writing() as session:
+            with context.database.writing() as session:
                 records.save_clip(session, study.id, rollout, {**clip, **size})
 
 
-def fill_pool(place: Workplace, study: Study) -> None:
+def fill_pool(context: WorkerContext, study: Study) -> None:
     for scenario in range(4):
-        add_runs(place, study, scenario, (True, True, False, True))
+        add_runs(context, study, scenario, (True, True, False, True))
 
 
-def queries_of(place: Workplace, participant: Participant) -> Sequence[Query]:
+def queries_of(context: WorkerContext, participant: Participant) -> Sequence[Query]:
     of_person = select(Query).where(Query.participant_id == participant.id).order_by(Query.ordinal)
-    with place.database.reading() as session:
+    with context.database.reading() as session:
         return session.scalars(of_person.options(*dataset.CLIPS_AND_ROLLOUTS)).all()
 
 
-def answer_all(place: Workplace, participant: Participant, response: Response = Response.LEFT) -> None:
+def answer_all(context: WorkerContext, participant: Participant, response: Response = Response.LEFT) -> None:
     """Refill and answer until nothing more is asked."""
     for _ in range(10):
-        query_selection.refill_queries(place, participant.id)
-        with place.database.writing() as session:
+        query_selection.refill_queries(context, participant.id)
+        with context.database.writing() as session:
             waiting = records.unanswered(session, participant.id)
             for query in waiting:
                 uuid = f"{query.ordinal}"
@@ -93,48 +94,51 @@ def answer_all(place: Workplace, participant: Participant, response: Response = 
 
 
 def test_the_queries_follow_the_plan_to_its_end(
-    place: Workplace, study: Study, participant: Participant, settle: Callable[..., None]
+    context: WorkerContext, study: Study, participant: Participant, settle: Callable[..., None]
 ) -> None:
     settle(practice_pairs=2, introduction_pairs=5, repeated_pairs=4, catch_pairs=2)
-    fill_pool(place, study)
-    answer_all(place, participant)
-    with place.database.reading() as session:
+    fill_pool(context, study)
+    answer_all(context, participant)
+    with context.database.reading() as session:
         plan = query_plan.plan(session.get_one(Study, study.id).settings, participant.seed)
-    queries = queries_of(place, participant)
+    queries = queries_of(context, participant)
     assert [(query.ordinal, query.purpose) for query in queries] == [(slot.ordinal, slot.purpose) for slot in plan]
 
 
 def test_the_introduction_shows_whole_episodes_and_everything_else_clips(
-    place: Workplace, study: Study, participant: Participant, settle: Callable[..., None]
+    context: WorkerContext, study: Study, participant: Participant, settle: Callable[..., None]
 ) -> None:
     settle(practice_pairs=1, introduction_pairs=5, repeated_pairs=2)
-    fill_pool(place, study)
-    answer_all(place, participant)
-    for query in queries_of(place, participant):
+    fill_pool(context, study)
+    answer_all(context, participant)
+    for query in queries_of(context, participant):
         expected = WHOLE if query.purpose == Purpose.INTRODUCTION else STEPS
         assert {query.left_clip.step_count, query.right_clip.step_count} == {expected}
         assert query.left_clip.rollout.scenario == query.right_clip.rollout.scenario
 
 
 def test_while_whole_episodes_are_being_filmed_nobody_is_sent_ahead(
-    place: Workplace, participant: Participant, settle: Callable[..., None], add_clips: Callable[[int], list[Clip]]
+    context: WorkerContext,
+    participant: Participant,
+    settle: Callable[..., None],
+    add_clips: Callable[[int], list[Clip]],
 ) -> None:
     settle(practice_pairs=1, introduction_pairs=5)
     for scenario in range(4):
         add_clips(scenario)
-    query_selection.refill_queries(place, participant.id)
-    assert [query.purpose for query in queries_of(place, participant)] == [Purpose.PRACTICE]
+    query_selection.refill_queries(context, participant.id)
+    assert [query.purpose for query in queries_of(context, participant)] == [Purpose.PRACTICE]
 
 
 def test_a_repeat_asks_the_same_clips_again_on_the_sides_the_plan_says(
-    place: Workplace, study: Study, participant: Participant, settle: Callable[..., None]
+    context: WorkerContext, study: Study, participant: Participant, settle: Callable[..., None]
 ) -> None:
     settle(repeated_pairs=4)
-    fill_pool(place, study)
-    answer_all(place, participant)
-    with place.database.reading() as session:
+    fill_pool(context, study)
+    answer_all(context, participant)
+    with context.database.reading() as session:
         plan = query_plan.plan(session.get_one(Study, study.id).settings, participant.seed)
-    by_ordinal = {query.ordinal: query for query in queries_of(place, participant)}
+    by_ordinal = {query.ordinal: query for query in queries_of(context, participant)}
     repeats = [slot for slot in plan if slot.purpose is Purpose.REPEAT]
     assert len(repeats) == 4
     for slot in repeats:
@@ -145,12 +149,12 @@ def test_a_repeat_asks_the_same_clips_again_on_the_sides_the_plan_says(
 
 
 def test_a_catch_pair_shows_a_success_beside_a_failure_and_says_which_is_which(
-    place: Workplace, study: Study, participant: Participant, settle: Callable[..., None]
+    context: WorkerContext, study: Study, participant: Participant, settle: Callable[..., None]
 ) -> None:
     settle(catch_pairs=3)
-    fill_pool(place, study)
-    answer_all(place, participant)
-    caught = [query for query in queries_of(place, participant) if query.purpose == Purpose.CATCH]
+    fill_pool(context, study)
+    answer_all(context, participant)
+    caught = [query for query in queries_of(context, participant) if query.purpose == Purpose.CATCH]
     assert len(caught) == 3
     for query in caught:
         assert query.left_clip.rollout.success != query.right_clip.rollout.success
@@ -158,7 +162,7 @@ def test_a_catch_pair_shows_a_success_beside_a_failure_and_says_which_is_which(
 
 
 def test_a_pool_without_an_obvious_pair_gives_repeats_instead_and_a_note(
-    place: Workplace,
+    context: WorkerContext,
     study: Study,
     participant: Participant,
     settle: Callable[..., None],
@@ -166,130 +170,130 @@ def test_a_pool_without_an_obvious_pair_gives_repeats_instead_and_a_note(
 ) -> None:
     settle(catch_pairs=3)
     for scenario in range(4):
-        add_runs(place, study, scenario, (True, True, True, True))
+        add_runs(context, study, scenario, (True, True, True, True))
     with caplog.at_level(logging.WARNING, logger="worker.jobs.learning.query_selection"):
-        answer_all(place, participant)
-    instead = [query for query in queries_of(place, participant) if query.strategy == query_selection.NO_OBVIOUS_PAIR]
+        answer_all(context, participant)
+    instead = [query for query in queries_of(context, participant) if query.strategy == query_selection.NO_OBVIOUS_PAIR]
     assert {(query.purpose, query.expected) for query in instead} == {(Purpose.REPEAT, None)}
     assert len(instead) == 3
     assert "no pair with an obvious answer" in caplog.text
-    with place.database.reading() as session:
+    with context.database.reading() as session:
         (note,) = reward_models.notes_on_pairs(session, participant.id)
     assert note.startswith("3 catch pairs could not be had")
 
 
 def test_a_catch_pair_waits_for_the_pool_to_grow_and_nobody_waits_for_it(
-    place: Workplace, study: Study, participant: Participant, settle: Callable[..., None]
+    context: WorkerContext, study: Study, participant: Participant, settle: Callable[..., None]
 ) -> None:
     settle(catch_pairs=3)
     for scenario in range(3):
-        add_runs(place, study, scenario, (True, True, True, True))
-    query_selection.refill_queries(place, participant.id)
-    with place.database.writing() as session:
+        add_runs(context, study, scenario, (True, True, True, True))
+    query_selection.refill_queries(context, participant.id)
+    with context.database.writing() as session:
         waiting = records.unanswered(session, participant.id)
         for query in waiting[:-1]:
             session.add(LabelEvent(query_id=query.id, revision=1, response="left", client_uuid=f"{query.id}"))
         plan = query_plan.plan(session.get_one(Study, study.id).settings, participant.seed)
-    query_selection.refill_queries(place, participant.id)
+    query_selection.refill_queries(context, participant.id)
     caught = [slot.ordinal for slot in plan if slot.purpose is Purpose.CATCH]
-    made = [query.ordinal for query in queries_of(place, participant)]
+    made = [query.ordinal for query in queries_of(context, participant)]
     assert caught[0] not in made
     assert max(made) > caught[0]
-    add_runs(place, study, 3, (True, True, False, False))
-    query_selection.refill_queries(place, participant.id)
-    purposes = {query.ordinal: query.purpose for query in queries_of(place, participant)}
+    add_runs(context, study, 3, (True, True, False, False))
+    query_selection.refill_queries(context, participant.id)
+    purposes = {query.ordinal: query.purpose for query in queries_of(context, participant)}
     assert purposes[caught[0]] == Purpose.CATCH
 
 
 def test_only_labels_are_learned_from_counted_and_fingerprinted(
-    place: Workplace, study: Study, participant: Participant, settle: Callable[..., None]
+    context: WorkerContext, study: Study, participant: Participant, settle: Callable[..., None]
 ) -> None:
     settle(practice_pairs=2, introduction_pairs=5, repeated_pairs=4, catch_pairs=2)
-    fill_pool(place, study)
-    answer_all(place, participant, Response.RIGHT)
-    with place.database.reading() as session:
-        learned = dataset.load_preferences(session, place.store, participant.id)
+    fill_pool(context, study)
+    answer_all(context, participant, Response.RIGHT)
+    with context.database.reading() as session:
+        learned = dataset.load_preferences(session, context.store, participant.id)
     assert learned.pairs is not None
     assert (learned.label_count, len(learned.pairs), len(learned.targets)) == (20, 20, 20)
     assert learned.pairs.shown.sum(axis=2).tolist() == [[WHOLE] * 2] * 5 + [[STEPS] * 2] * 15
-    with place.database.writing() as session:
+    with context.database.writing() as session:
         measured = select(Query.id).where(Query.purpose.in_([Purpose.REPEAT, Purpose.CATCH, Purpose.PRACTICE]))
         for event in session.scalars(select(LabelEvent).where(LabelEvent.query_id.in_(measured))):
             event.response = Response.LEFT
-    with place.database.reading() as session:
-        assert dataset.load_preferences(session, place.store, participant.id).label_hash == learned.label_hash
+    with context.database.reading() as session:
+        assert dataset.load_preferences(session, context.store, participant.id).label_hash == learned.label_hash
 
 
 def test_models_are_due_by_labels_alone(
-    place: Workplace, study: Study, participant: Participant, settle: Callable[..., None]
+    context: WorkerContext, study: Study, participant: Participant, settle: Callable[..., None]
 ) -> None:
     settle(practice_pairs=2, introduction_pairs=2, repeated_pairs=4, catch_pairs=2)
-    fill_pool(place, study)
-    query_selection.refill_queries(place, participant.id)
-    with place.database.writing() as session:
+    fill_pool(context, study)
+    query_selection.refill_queries(context, participant.id)
+    with context.database.writing() as session:
         waiting = records.unanswered(session, participant.id)
         for query in waiting[:11]:  # two of them practice
             session.add(LabelEvent(query_id=query.id, revision=1, response="left", client_uuid=f"{query.id}"))
-    with place.database.reading() as session:
-        assert RunKind.REWARD not in {job.kind for job, _ in reconcile.findings(session)}
+    with context.database.reading() as session:
+        assert RunKind.REWARD not in {job.kind for job, _ in reconcile.due(session)}
 
 
 def test_only_labels_are_predicted(
-    place: Workplace, study: Study, participant: Participant, settle: Callable[..., None]
+    context: WorkerContext, study: Study, participant: Participant, settle: Callable[..., None]
 ) -> None:
     from tests.worker.test_querying import save_reward_model
 
     settle(practice_pairs=1, introduction_pairs=3, repeated_pairs=4, catch_pairs=2)
-    fill_pool(place, study)
-    query_selection.refill_queries(place, participant.id)
-    with place.database.writing() as session:
+    fill_pool(context, study)
+    query_selection.refill_queries(context, participant.id)
+    with context.database.writing() as session:
         for query in records.unanswered(session, participant.id):
             session.add(LabelEvent(query_id=query.id, revision=1, response="right", client_uuid=f"{query.id}"))
-    model_id = save_reward_model(place, participant)
-    query_selection.refill_queries(place, participant.id)
-    later = queries_of(place, participant)[12:]
+    model_id = save_reward_model(context, participant)
+    query_selection.refill_queries(context, participant.id)
+    later = queries_of(context, participant)[12:]
     assert Purpose.REPEAT in {query.purpose for query in later}
     for query in later:
         assert (query.predicted_by_model_id == model_id) == (query.purpose == Purpose.PREFERENCE)
 
 
 def test_a_newer_model_chooses_other_pairs_but_leaves_the_plan_as_it_is(
-    place: Workplace, study: Study, participant: Participant, settle: Callable[..., None]
+    context: WorkerContext, study: Study, participant: Participant, settle: Callable[..., None]
 ) -> None:
     settle(practice_pairs=1, introduction_pairs=2, repeated_pairs=4)
-    fill_pool(place, study)
-    query_selection.refill_queries(place, participant.id)
-    before = [(query.ordinal, query.purpose) for query in queries_of(place, participant)]
-    with place.database.writing() as session:
+    fill_pool(context, study)
+    query_selection.refill_queries(context, participant.id)
+    before = [(query.ordinal, query.purpose) for query in queries_of(context, participant)]
+    with context.database.writing() as session:
         records.drop_unseen_queries(session, participant.id, keep=3)
-    kept = [query.ordinal for query in queries_of(place, participant)]
+    kept = [query.ordinal for query in queries_of(context, participant)]
     assert kept == [1, 2, 3]
-    query_selection.refill_queries(place, participant.id)
-    assert [(query.ordinal, query.purpose) for query in queries_of(place, participant)] == before
+    query_selection.refill_queries(context, participant.id)
+    assert [(query.ordinal, query.purpose) for query in queries_of(context, participant)] == before
 
 
 def test_as_many_scenarios_are_filmed_whole_as_the_introduction_needs(
-    place: Workplace, study: Study, settle: Callable[..., None], add_clips: Callable[[int], list[Clip]]
+    context: WorkerContext, study: Study, settle: Callable[..., None], add_clips: Callable[[int], list[Clip]]
 ) -> None:
     settle(introduction_pairs=7)  # four behaviours make six pairs
     for index in range(4):
-        add_clips(reconcile.scenario_seed(study.seed, index))
-    with place.database.reading() as session:
-        found = {job.finding for job, _ in reconcile.findings(session)}
-    assert found == {f"clips/study-1/whole-{reconcile.scenario_seed(study.seed, index)}" for index in range(2)}
+        add_clips(scenarios.of_pool(study.seed, index))
+    with context.database.reading() as session:
+        found = {job.key for job, _ in reconcile.due(session)}
+    assert found == {f"clips/study-1/whole-{scenarios.of_pool(study.seed, index)}" for index in range(2)}
 
 
 def test_whole_episodes_are_filmed_of_the_rollouts_that_are_there(
-    place: Workplace, study: Study, settle: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+    context: WorkerContext, study: Study, settle: Callable[..., None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from worker.compute import simulation
     from worker.jobs.clips import pool_clips
     from worker.sim.render.clip import RenderedClip
 
     settle(introduction_pairs=1)
-    scenario = reconcile.scenario_seed(study.seed, 0)
-    add_runs(place, study, scenario, (True, True))
-    with place.database.writing() as session:
+    scenario = scenarios.of_pool(study.seed, 0)
+    add_runs(context, study, scenario, (True, True))
+    with context.database.writing() as session:
         for clip in session.scalars(select(Clip).where(Clip.step_count == WHOLE)):
             session.delete(clip)
     filmed: list[tuple[bytes, int, int]] = []
@@ -300,15 +304,15 @@ def test_whole_episodes_are_filmed_of_the_rollouts_that_are_there(
 
     monkeypatch.setattr(simulation, "film_again", film)
     monkeypatch.setattr(
-        place.compute, "run_all", lambda _lane, _beat, function, shots: [function(*shot) for shot in shots]
+        context.compute, "run_all", lambda _lane, _beat, function, shots: [function(*shot) for shot in shots]
     )
-    job = Job(f"clips/study-{study.id}/whole-{scenario}", RunKind.CLIPS, study.id)
-    with place.database.writing() as session:
+    job = job_of(f"clips/study-{study.id}/whole-{scenario}", study.id)
+    with context.database.writing() as session:
         run_id = records.begin_run(session, job, 0)
-    pool_clips.build_clips(place, job, run_id, lambda _name, function, *arguments: function(*arguments))
-    with place.database.reading() as session:
+    pool_clips.build_clips(context, job, run_id, lambda _name, function, *arguments: function(*arguments))
+    with context.database.reading() as session:
         rollouts = session.scalars(select(Rollout).order_by(Rollout.behaviour)).all()
         whole = session.scalars(select(Clip).where(Clip.step_count == WHOLE).order_by(Clip.id)).all()
     assert [clip.rollout_id for clip in whole] == [rollout.id for rollout in rollouts]
-    stored = [place.store.read(rollout.trajectory_sha256) for rollout in rollouts]
+    stored = [context.store.read(rollout.trajectory_sha256) for rollout in rollouts]
     assert filmed == [(trajectory, 0, WHOLE) for trajectory in stored]

@@ -11,7 +11,7 @@ import pytest
 
 from worker.analysis.proof import case_against
 from worker.compute import learning
-from worker.compute.filter_fitting import Finished, Fitting
+from worker.compute.filter_fitting import FilterFit, Finished
 from worker.compute.pools import Compute
 from worker.ml.export import bundle
 from worker.ml.export.bundle import Provenance
@@ -57,7 +57,7 @@ def test_what_costs_nothing_may_stay_although_its_gain_is_not_sure(worse: Mappin
     assert not case_against(measured(-0.1, 0.2, **worse))
 
 
-class HereAndNow(Fitting):
+class HereAndNow(FilterFit):
     """Rolls out in this process."""
 
     def collect(self, act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:

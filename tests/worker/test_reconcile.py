@@ -14,6 +14,8 @@ from app.domain.preferences import Exclusion, LabelEvent, Query, Response
 from app.domain.protocol import EvaluationSettings
 from app.domain.studies import Participant, Study
 from app.domain.study_settings import StudySettings
+from tests.worker.invented import job_of
+from worker import scenarios
 from worker.jobs import reconcile
 from worker.jobs.runtime import due_work, records
 
@@ -25,8 +27,8 @@ Answer = Callable[[Clip, Clip, Response], Query]
 def found(database: Database) -> Callable[[], dict[str, int]]:
     def look() -> dict[str, int]:
         with database.reading() as session:
-            found = reconcile.findings(session)
-            return {job.finding: attempt for job, attempt in found if job.kind is not RunKind.REPORT}
+            found = reconcile.due(session)
+            return {job.key: attempt for job, attempt in found if job.kind is not RunKind.REPORT}
 
     return look
 
@@ -36,30 +38,30 @@ def labels(add_clips: AddClips, answer: Answer, study: Study) -> Callable[[int],
     """Fill the pool, then give so many answers."""
 
     def give(count: int) -> list[Query]:
-        clips = [add_clips(reconcile.scenario_seed(study.seed, index)) for index in range(4)]
+        clips = [add_clips(scenarios.of_pool(study.seed, index)) for index in range(4)]
         pairs = [(four[i], four[j]) for four in clips for i in range(4) for j in range(i)]
         return [answer(*pairs[index], Response.LEFT) for index in range(count)]
 
     return give
 
 
-def succeed(database: Database, finding: str) -> None:
+def succeed(database: Database, key: str) -> None:
     with database.writing() as session:
-        session.add(Run(workflow_id=finding, kind="reward", study_id=1, status=RunStatus.SUCCEEDED))
+        session.add(Run(workflow_id=key, kind="reward", study_id=1, status=RunStatus.SUCCEEDED))
 
 
 def test_a_new_study_needs_clips_a_few_scenarios_at_a_time(study: Study, found: Callable[[], dict[str, int]]) -> None:
-    first, second = (reconcile.scenario_seed(study.seed, index) for index in (0, 1))
+    first, second = (scenarios.of_pool(study.seed, index) for index in (0, 1))
     assert found() == {f"clips/study-1/scenario-{first}": 1, f"clips/study-1/scenario-{second}": 1}
 
 
 def test_a_scenario_with_some_of_its_clips_still_needs_the_rest(
     study: Study, add_clips: AddClips, found: Callable[[], dict[str, int]]
 ) -> None:
-    add_clips(reconcile.scenario_seed(study.seed, 0), 3)
-    assert f"clips/study-1/scenario-{reconcile.scenario_seed(study.seed, 0)}" in found()
-    add_clips(reconcile.scenario_seed(study.seed, 1), 4)
-    assert f"clips/study-1/scenario-{reconcile.scenario_seed(study.seed, 1)}" not in found()
+    add_clips(scenarios.of_pool(study.seed, 0), 3)
+    assert f"clips/study-1/scenario-{scenarios.of_pool(study.seed, 0)}" in found()
+    add_clips(scenarios.of_pool(study.seed, 1), 4)
+    assert f"clips/study-1/scenario-{scenarios.of_pool(study.seed, 1)}" not in found()
 
 
 def test_the_reward_model_is_due_at_every_tenth_label(
@@ -110,7 +112,7 @@ def test_a_running_run_is_left_alone_until_nobody_has_heard_of_it_for_a_minute(
     database: Database, labels: Callable[[int], list[Query]], found: Callable[[], dict[str, int]]
 ) -> None:
     labels(10)
-    job = records.Job("reward/participant-1/labels-10", RunKind.REWARD, 1, 1, 10)
+    job = job_of("reward/participant-1/labels-10", 1)
     with database.writing() as session:
         run_id = records.begin_run(session, job, seed=5)
     assert found() == {}
@@ -127,19 +129,19 @@ def test_a_failed_run_is_tried_again_a_few_times_and_then_only_when_somebody_ask
     database: Database, labels: Callable[[int], list[Query]], found: Callable[[], dict[str, int]]
 ) -> None:
     labels(10)
-    job = records.Job("reward/participant-1/labels-10", RunKind.REWARD, 1, 1, 10)
+    job = job_of("reward/participant-1/labels-10", 1)
     for attempt in range(1, records.ATTEMPTS + 1):
-        assert found() == {job.finding: attempt}
+        assert found() == {job.key: attempt}
         with database.writing() as session:
             run_id = records.begin_run(session, job, seed=5)
-            records.fail_run(session, job.finding, "it broke")
+            records.fail_run(session, job.key, "it broke")
         assert found() == {}, "a failed run waits before it is tried again"
         with database.writing() as session:
             session.get_one(Run, run_id).finished_at = now() - timedelta(hours=1)
     assert found() == {}
     with database.writing() as session:
         session.get_one(Run, run_id).status = RunStatus.RETRY
-    assert found() == {job.finding: records.ATTEMPTS + 1}
+    assert found() == {job.key: records.ATTEMPTS + 1}
 
 
 def test_milestones_that_were_passed_in_the_meantime_are_skipped() -> None:
@@ -167,12 +169,6 @@ def test_queries_are_made_ahead_but_never_more_than_planned(
     labels(15)
     with database.reading() as session:
         assert records.next_queries(session, participant.id, study.settings) == (16, 5)
-
-
-def test_pool_scenarios_never_meet_the_ones_filters_are_evaluated_on() -> None:
-    from worker.ml.filters.filter_problem import SCENARIO_BLOCKS
-
-    assert max(SCENARIO_BLOCKS.values()) + 1_000_000 <= reconcile.scenario_seed(0, 0)
 
 
 def exclude(database: Database, query: Query, *, excluded: bool = True) -> None:

@@ -10,54 +10,54 @@ from app.db import Database
 from app.domain.choices import Method
 from app.domain.study_settings import StudySettings
 from app.storage import ArtefactStore
-from worker.compute.filter_fitting import Fitting
+from worker.compute.filter_fitting import FilterFit
 from worker.compute.pools import Compute
 from worker.jobs.learning.filters import filter_config
 from worker.jobs.learning.reference_rollouts import make_ready, reference_blocks
-from worker.jobs.runtime.context import Workplace
+from worker.jobs.runtime.context import WorkerContext
 
 SETTINGS = StudySettings(evaluation_scenarios=10)
 
 
 @pytest.fixture
-def place(database: Database, store: ArtefactStore) -> Iterator[Workplace]:
+def context(database: Database, store: ArtefactStore) -> Iterator[WorkerContext]:
     compute = Compute(2)
-    yield Workplace(database, store, compute)
+    yield WorkerContext(database, store, compute)
     compute.close()
 
 
-def fitting(place: Workplace) -> Fitting:
-    return Fitting(
+def fitting(context: WorkerContext) -> FilterFit:
+    return FilterFit(
         task="feeding",
-        compute=place.compute,
+        compute=context.compute,
         beat=lambda: None,
         reward=b"",
         seed=7,
         config=filter_config(SETTINGS),
         progress=lambda stage, share: None,
-        references=place.references,
+        references=context.references,
     )
 
 
-def test_they_are_those_a_filter_would_make_for_itself(place: Workplace) -> None:
+def test_they_are_those_a_filter_would_make_for_itself(context: WorkerContext) -> None:
     evaluation = reference_blocks("feeding", SETTINGS)[-1]
-    own = fitting(place).reference(evaluation)
-    del place.references["feeding", evaluation]
-    make_ready(place.compute, place.references, "feeding", SETTINGS)
-    cast("Compute", place.compute).close()  # whatever was missing now could not be made any more
+    own = fitting(context).reference(evaluation)
+    del context.references["feeding", evaluation]
+    make_ready(context.compute, context.references, "feeding", SETTINGS)
+    cast("Compute", context.compute).close()  # whatever was missing now could not be made any more
     for scenarios in reference_blocks("feeding", SETTINGS):
-        assert [each.scenario for each in fitting(place).reference(scenarios)] == list(scenarios)
-    for ahead, mine in zip(fitting(place).reference(evaluation), own, strict=True):
+        assert [each.scenario for each in fitting(context).reference(scenarios)] == list(scenarios)
+    for ahead, mine in zip(fitting(context).reference(evaluation), own, strict=True):
         np.testing.assert_array_equal(ahead.observations, mine.observations)
         np.testing.assert_array_equal(ahead.actions, mine.actions)
 
 
-def test_what_is_there_is_not_made_again(place: Workplace) -> None:
+def test_what_is_there_is_not_made_again(context: WorkerContext) -> None:
     for scenarios in reference_blocks("feeding", SETTINGS):
-        place.references["feeding", scenarios] = []
-    cast("Compute", place.compute).close()
-    make_ready(place.compute, place.references, "feeding", SETTINGS)
-    assert set(map(len, place.references.values())) == {0}
+        context.references["feeding", scenarios] = []
+    cast("Compute", context.compute).close()
+    make_ready(context.compute, context.references, "feeding", SETTINGS)
+    assert set(map(len, context.references.values())) == {0}
 
 
 def test_the_printed_method_which_has_no_gates_needs_the_evaluation_s_only() -> None:

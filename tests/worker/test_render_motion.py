@@ -84,13 +84,13 @@ def test_only_the_arm_that_turns_is_said_to_move() -> None:
 
 def test_quaternions_turn_vectors_like_their_matrices() -> None:
     rng = np.random.default_rng(1)
-    turns = np.linalg.qr(rng.normal(size=(200, 3, 3)))[0]
-    turns *= np.sign(np.linalg.det(turns))[:, None, None]
-    x, y, z, w = quaternions(turns).T
+    lanes = np.linalg.qr(rng.normal(size=(200, 3, 3)))[0]
+    lanes *= np.sign(np.linalg.det(lanes))[:, None, None]
+    x, y, z, w = quaternions(lanes).T
     vector = rng.normal(size=3)
     pure = np.stack([x, y, z], axis=-1)
     doubled = 2 * np.cross(pure, vector)
-    assert vector + w[:, None] * doubled + np.cross(pure, doubled) == pytest.approx(turns @ vector)
+    assert vector + w[:, None] * doubled + np.cross(pure, doubled) == pytest.approx(lanes @ vector)
 
 
 def test_a_cropped_picture_shows_the_same_points_as_the_whole() -> None:

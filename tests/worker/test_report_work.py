@@ -24,7 +24,7 @@ from worker.compute.pools import Compute
 from worker.jobs import reconcile
 from worker.jobs.publishing import report_files
 from worker.jobs.runtime import records
-from worker.jobs.runtime.context import Workplace
+from worker.jobs.runtime.context import WorkerContext
 from worker.jobs.runtime.records import Job
 
 
@@ -40,8 +40,8 @@ class Here(Compute):
 
 
 @pytest.fixture
-def place(database: Database, store: ArtefactStore) -> Workplace:
-    return Workplace(database, store, Here())
+def context(database: Database, store: ArtefactStore) -> WorkerContext:
+    return WorkerContext(database, store, Here())
 
 
 @pytest.fixture(autouse=True)
@@ -55,145 +55,145 @@ def finished(database: Database, store: ArtefactStore) -> Study:
         return make_finished_study(session, store, people=5, labels=6)
 
 
-def due(place: Workplace, study: Study) -> list[Job]:
-    with place.database.reading() as session:
+def due(context: WorkerContext, study: Study) -> list[Job]:
+    with context.database.reading() as session:
         return report_files.due(session, session.get_one(Study, study.id))
 
 
-def make_report(place: Workplace, study: Study) -> Report:
+def make_report(context: WorkerContext, study: Study) -> Report:
     """Make the report that is due, as the worker would."""
-    (job,) = due(place, study)
-    with place.database.writing() as session:
+    (job,) = due(context, study)
+    with context.database.writing() as session:
         run_id = records.begin_run(session, job, seed=1)
-    report_files.make(place, job, run_id, lambda _name, function, *arguments: function(*arguments))
-    with place.database.writing() as session:
+    report_files.make(context, job, run_id, lambda _name, function, *arguments: function(*arguments))
+    with context.database.writing() as session:
         records.finish_run(session, run_id)
         return session.scalars(select(Report)).one()
 
 
-def age(place: Workplace, by: timedelta, took: timedelta = timedelta(0)) -> None:
-    with place.database.writing() as session:
+def age(context: WorkerContext, by: timedelta, took: timedelta = timedelta(0)) -> None:
+    with context.database.writing() as session:
         for report in session.scalars(select(Report)):
             report.created_at = now() - by
             run = session.get_one(Run, report.run_id)
             run.started_at, run.finished_at = now() - took, now()
 
 
-def test_an_empty_study_has_no_report(place: Workplace) -> None:
-    with place.database.writing() as session:
+def test_an_empty_study_has_no_report(context: WorkerContext) -> None:
+    with context.database.writing() as session:
         study = factories.make_study(session)
-    assert due(place, study) == []
+    assert due(context, study) == []
 
 
 def test_reports_are_found_by_the_reconciler_and_only_while_something_is_newer(
-    place: Workplace, finished: Study
+    context: WorkerContext, finished: Study
 ) -> None:
-    with place.database.reading() as session:
-        assert RunKind.REPORT in {job.kind for job, _ in reconcile.findings(session)}
-    make_report(place, finished)
-    age(place, timedelta(hours=1))
-    assert due(place, finished) == []
+    with context.database.reading() as session:
+        assert RunKind.REPORT in {job.kind for job, _ in reconcile.due(session)}
+    make_report(context, finished)
+    age(context, timedelta(hours=1))
+    assert due(context, finished) == []
 
 
-def test_a_new_rating_makes_a_new_report_but_not_at_once(place: Workplace, finished: Study) -> None:
-    first = make_report(place, finished)
-    with place.database.writing() as session:
+def test_a_new_rating_makes_a_new_report_but_not_at_once(context: WorkerContext, finished: Study) -> None:
+    first = make_report(context, finished)
+    with context.database.writing() as session:
         factories.make_rated_trials(session, session.scalars(select(Participant)).first(), 1)  # type: ignore[arg-type]
-    assert due(place, finished) == []
-    age(place, report_files.AT_MOST_EVERY)
-    second = make_report(place, finished)
+    assert due(context, finished) == []
+    age(context, report_files.AT_MOST_EVERY)
+    second = make_report(context, finished)
     assert (second.id, second.basis) != (first.id, first.basis)
-    with place.database.reading() as session:
+    with context.database.reading() as session:
         runs = session.scalars(select(Run).where(Run.kind == RunKind.REPORT)).all()
         assert [run.id for run in runs] == [second.run_id], "older reports go with their runs"
 
 
-def test_an_excluded_answer_makes_a_new_report_without_it(place: Workplace, finished: Study) -> None:
-    before = make_report(place, finished).contents["answers"]["participants"][0]
-    age(place, timedelta(hours=1))
-    with place.database.writing() as session:
+def test_an_excluded_answer_makes_a_new_report_without_it(context: WorkerContext, finished: Study) -> None:
+    before = make_report(context, finished).contents["answers"]["participants"][0]
+    age(context, timedelta(hours=1))
+    with context.database.writing() as session:
         first = session.scalars(select(LabelEvent).join(Query).where(Query.ordinal == 2)).first()
         assert first is not None
         session.add(Exclusion(label_event_id=first.id, excluded=True, reason="phone", actor="x"))
-    after = make_report(place, finished).contents["answers"]["participants"][0]
+    after = make_report(context, finished).contents["answers"]["participants"][0]
     assert (before["labels"], after["labels"]) == (6, 5)
 
 
-def test_on_a_busy_machine_reports_do_not_keep_people_s_models_waiting(place: Workplace, finished: Study) -> None:
-    make_report(place, finished)
-    with place.database.writing() as session:
+def test_on_a_busy_machine_reports_do_not_keep_people_s_models_waiting(context: WorkerContext, finished: Study) -> None:
+    make_report(context, finished)
+    with context.database.writing() as session:
         session.get_one(Study, finished.id).unblinded_at = now() - timedelta(days=1)
         factories.make_rated_trials(session, session.scalars(select(Participant)).first(), 1)  # type: ignore[arg-type]
     slow, very_slow = timedelta(seconds=9), timedelta(minutes=9)
-    age(place, report_files.REST * slow - timedelta(seconds=1), slow)
-    assert due(place, finished) == []
-    age(place, report_files.REST * slow, slow)
-    assert len(due(place, finished)) == 1
-    age(place, report_files.LONGEST_REST, very_slow)
-    assert len(due(place, finished)) == 1, "somebody wants to see the end of it"
+    age(context, report_files.REST * slow - timedelta(seconds=1), slow)
+    assert due(context, finished) == []
+    age(context, report_files.REST * slow, slow)
+    assert len(due(context, finished)) == 1
+    age(context, report_files.LONGEST_REST, very_slow)
+    assert len(due(context, finished)) == 1, "somebody wants to see the end of it"
 
 
-def test_whoever_unblinds_a_study_does_not_wait_for_the_next_round(place: Workplace) -> None:
-    with place.database.writing() as session:
-        study = make_finished_study(session, place.store, people=3, labels=6, unblinded=False)
-    make_report(place, study)
-    assert due(place, study) == []
-    with place.database.writing() as session:
+def test_whoever_unblinds_a_study_does_not_wait_for_the_next_round(context: WorkerContext) -> None:
+    with context.database.writing() as session:
+        study = make_finished_study(session, context.store, people=3, labels=6, unblinded=False)
+    make_report(context, study)
+    assert due(context, study) == []
+    with context.database.writing() as session:
         session.get_one(Study, study.id).unblinded_at = now()
-    assert len(due(place, study)) == 1
+    assert len(due(context, study)) == 1
 
 
-def test_one_report_is_made_at_a_time(place: Workplace, finished: Study) -> None:
-    with place.database.writing() as session:
+def test_one_report_is_made_at_a_time(context: WorkerContext, finished: Study) -> None:
+    with context.database.writing() as session:
         factories.make_run(session, finished, kind=RunKind.REPORT, status=RunStatus.RUNNING)
-    assert due(place, finished) == []
+    assert due(context, finished) == []
 
 
-def test_pictures_of_an_older_report_go_with_it(place: Workplace, finished: Study) -> None:
-    old = {each["svg"] for each in make_report(place, finished).figures.values()}
-    with place.database.writing() as session:
+def test_pictures_of_an_older_report_go_with_it(context: WorkerContext, finished: Study) -> None:
+    old = {each["svg"] for each in make_report(context, finished).figures.values()}
+    with context.database.writing() as session:
         session.get_one(Study, finished.id).unblinded_at = None
-    age(place, timedelta(minutes=1))
-    new = {each["svg"] for each in make_report(place, finished).figures.values()}
-    assert [sha256 for sha256 in old - new if place.store.has(sha256)] == []
-    assert all(place.store.has(sha256) for sha256 in new)
+    age(context, timedelta(minutes=1))
+    new = {each["svg"] for each in make_report(context, finished).figures.values()}
+    assert [sha256 for sha256 in old - new if context.store.has(sha256)] == []
+    assert all(context.store.has(sha256) for sha256 in new)
 
 
-def test_a_blinded_report_has_letters_and_no_tests(place: Workplace) -> None:
-    with place.database.writing() as session:
-        study = make_finished_study(session, place.store, people=4, unblinded=False)
-    report = make_report(place, study)
+def test_a_blinded_report_has_letters_and_no_tests(context: WorkerContext) -> None:
+    with context.database.writing() as session:
+        study = make_finished_study(session, context.store, people=4, unblinded=False)
+    report = make_report(context, study)
     assert report.contents["ratings"]["groups"] == ["A", "B", "C"]
     assert report.contents["ratings"]["scales"]["satisfaction"]["comparisons"] == []
     text = repr(report.contents) + "".join(
-        place.store.read(each["svg"]).decode() for name, each in report.figures.items() if name.startswith("ratings")
+        context.store.read(each["svg"]).decode() for name, each in report.figures.items() if name.startswith("ratings")
     )
     assert not any(name in text for name in ("pbarl", "prefft", "PbARL", "PrefFT", "Pre-trained"))
 
 
-def test_somebody_who_withdraws_while_a_report_is_made_is_in_no_report(place: Workplace, finished: Study) -> None:
-    (job,) = due(place, finished)
-    with place.database.writing() as session:
+def test_somebody_who_withdraws_while_a_report_is_made_is_in_no_report(context: WorkerContext, finished: Study) -> None:
+    (job,) = due(context, finished)
+    with context.database.writing() as session:
         run_id = records.begin_run(session, job, seed=1)
 
     class Meanwhile(Here):
         def run(self, lane: Any, beat: Any, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-            with place.database.writing() as session:
+            with context.database.writing() as session:
                 person = session.scalars(select(Participant)).first()
                 assert person is not None
-                withdrawal.withdraw(session, place.store, person, "the person")
+                withdrawal.withdraw(session, context.store, person, "the person")
             return function(*args, **kwargs)
 
-    other = Workplace(place.database, place.store, Meanwhile())
+    other = WorkerContext(context.database, context.store, Meanwhile())
     stored = report_files._make(other, finished.id, run_id)
-    with place.database.reading() as session:
+    with context.database.reading() as session:
         assert session.scalars(select(Report)).all() == []
-    assert not any(place.store.has(sha256) for sha256 in stored)
+    assert not any(context.store.has(sha256) for sha256 in stored)
 
 
-def test_numbers_of_the_report_are_those_of_the_exported_csv(place: Workplace, finished: Study) -> None:
-    report = make_report(place, finished)
-    with place.database.reading() as session:
+def test_numbers_of_the_report_are_those_of_the_exported_csv(context: WorkerContext, finished: Study) -> None:
+    report = make_report(context, finished)
+    with context.database.reading() as session:
         study = session.get_one(Study, finished.id)
         provenance = export_formats.provenance_of(session, study)
         lines = export_formats.csv_lines(export_tables.BY_NAME["ratings"], session, study, provenance)

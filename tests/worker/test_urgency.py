@@ -10,10 +10,10 @@ import pytest
 from sqlalchemy.orm import Session
 
 from app.db import Database, now
-from app.domain.models import RunKind
 from app.domain.studies import Awaited, Participant, Study
+from tests.worker.invented import job_of
 from worker.compute.pools import Compute, Lane
-from worker.jobs.runtime.lanes import Turns
+from worker.jobs.runtime.lanes import Lanes
 from worker.jobs.runtime.records import Job
 from worker.jobs.runtime.urgency import Gate, Level, Urgency, WhoWaits
 
@@ -41,12 +41,11 @@ def add_person(session: Session, study: Study, awaited: Awaited | None = None, *
 
 
 def films(person: Participant, what: str = "trials") -> Job:
-    finding = f"films/participant-{person.id}/{what}/labels-20/answer-9"
-    return Job(finding, RunKind.FILMS, person.study_id, person.id, 20)
+    return job_of(f"films/participant-{person.id}/{what}/labels-20/answer-9", person.study_id)
 
 
 def clips(study: Study) -> Job:
-    return Job(f"clips/study-{study.id}/scenario-1", RunKind.CLIPS, study.id)
+    return job_of(f"clips/study-{study.id}/scenario-1", study.id)
 
 
 def level(database: Database, job: Job) -> Level:
@@ -62,8 +61,8 @@ def test_work_is_ordered_by_who_waits_and_how_long_and_not_by_study(database: Da
         longer = add_person(session, busy, Awaited.ROBOTS, seen=20, waiting=500)
         answering = add_person(session, third, seen=5)
         unopened = add_study(session, "unopened", study)
-    report = Job("report/study-1/basis-0", RunKind.REPORT, idle.id)
-    asked = Job("export/study-1/1", RunKind.EXPORT, idle.id)
+    report = job_of("report/study-1/basis-0", idle.id)
+    asked = job_of("export/study-1/data-1", idle.id)
     wanted = [films(longer), films(later), films(answering), asked, films(gone), clips(idle), clips(unopened), report]
     with database.reading() as session:
         waits = WhoWaits.look(session)
@@ -74,7 +73,7 @@ def test_work_is_ordered_by_who_waits_and_how_long_and_not_by_study(database: Da
 def test_of_one_person_what_the_first_robot_needs_comes_before_the_debrief(database: Database, study: Study) -> None:
     with database.writing() as session:
         person = add_person(session, study, Awaited.ROBOTS, seen=1, waiting=60)
-    learning = Job("filter/x", RunKind.FILTER, study.id, person.id, 20)
+    learning = job_of(f"filter/participant-{person.id}/labels-20", study.id)
     wanted = [learning, films(person), films(person, "before-after")]
     with database.reading() as session:
         waits = WhoWaits.look(session)
@@ -109,7 +108,7 @@ def test_clips_are_as_urgent_as_whoever_needs_pairs_of_them(
 
 
 def test_a_report_is_asked_for_once_the_study_is_unblinded(database: Database, study: Study) -> None:
-    report = Job("report/study-1/basis-0", RunKind.REPORT, study.id)
+    report = job_of("report/study-1/basis-0", study.id)
     assert level(database, report) is Level.UNREAD
     with database.writing() as session:
         session.get_one(Study, study.id).unblinded_at = now()
@@ -161,18 +160,18 @@ def test_a_long_job_that_began_earlier_gives_way_within_one_task(database: Datab
         away = add_person(session, study, seen=3600)
         waiting = add_person(session, study, Awaited.ROBOTS, seen=1, waiting=5)
     compute = Slowly()
-    turns = Turns(compute)
+    lanes = Lanes(compute)
     with database.reading() as session:
-        turns.who_waits = WhoWaits.look(session)
+        lanes.who_waits = WhoWaits.look(session)
 
     def work(person: Participant, name: str, tasks: int) -> threading.Thread:
-        turn = turns.of(films(person))
+        turn = lanes.of(films(person))
         arguments = [(f"{name}{index}",) for index in range(tasks)]
         thread = threading.Thread(target=turn.run_all, args=(Lane.CLIPS, lambda: None, compute.order.append, arguments))
         thread.start()
         return thread
 
-    gate = turns.gate(Lane.CLIPS)
+    gate = lanes.gate(Lane.CLIPS)
     long = work(away, "long", 6)
     while gate._free > 0:
         threading.Event().wait(0.01)
@@ -192,21 +191,21 @@ def test_while_somebody_waits_no_lane_takes_what_nobody_is_here_for(database: Da
     with database.writing() as session:
         waiting = add_person(session, study, Awaited.ROBOTS, seen=1, waiting=5)
         unopened = add_study(session, "unopened", study)
-    turns = Turns(Compute(1))
+    lanes = Lanes(Compute(1))
     with database.reading() as session:
-        turns.who_waits = WhoWaits.look(session)
+        lanes.who_waits = WhoWaits.look(session)
     done = threading.Event()
 
     def make_clips() -> None:
-        with turns.gate(Lane.CLIPS).passed(lambda: turns.who_waits.urgency(clips(unopened))):
+        with lanes.gate(Lane.CLIPS).passed(lambda: lanes.who_waits.urgency(clips(unopened))):
             done.set()
 
-    with turns.working(Lane.LEARNING, films(waiting)):
+    with lanes.working(Lane.LEARNING, films(waiting)):
         thread = threading.Thread(target=make_clips)
         thread.start()
-        while not turns.gate(Lane.CLIPS)._waiting:
+        while not lanes.gate(Lane.CLIPS)._waiting:
             threading.Event().wait(0.01)
-        with turns.gate(Lane.CLIPS).passed(lambda: turns.who_waits.urgency(films(waiting))):
+        with lanes.gate(Lane.CLIPS).passed(lambda: lanes.who_waits.urgency(films(waiting))):
             assert not done.is_set(), "there is room, but the processors are needed"
     thread.join()
     assert done.is_set()
@@ -215,12 +214,12 @@ def test_while_somebody_waits_no_lane_takes_what_nobody_is_here_for(database: Da
 def test_a_training_of_many_minutes_does_not_stop_the_other_lanes(database: Database, study: Study) -> None:
     with database.writing() as session:
         waiting = add_person(session, study, Awaited.ROBOTS, seen=1, waiting=5)
-    turns = Turns(Compute(1))
+    lanes = Lanes(Compute(1))
     with database.reading() as session:
-        turns.who_waits = WhoWaits.look(session)
+        lanes.who_waits = WhoWaits.look(session)
     with (
-        turns.working(Lane.PATIENT, films(waiting)),
-        turns.gate(Lane.CLIPS).passed(lambda: turns.who_waits.urgency(clips(study))),
+        lanes.working(Lane.PATIENT, films(waiting)),
+        lanes.gate(Lane.CLIPS).passed(lambda: lanes.who_waits.urgency(clips(study))),
     ):
         pass
 
@@ -229,6 +228,6 @@ def test_what_goes_wrong_in_one_task_reaches_the_job(database: Database, study: 
     compute = Slowly()
     for _ in range(3):
         compute.go_on.release()
-    turn = Turns(compute).of(clips(study))
+    turn = Lanes(compute).of(clips(study))
     with pytest.raises(ZeroDivisionError):
         turn.run_all(Lane.CLIPS, lambda: None, divmod, [(1, 1), (1, 0)])

@@ -35,7 +35,7 @@ COMPARED_EPISODES = 2
 
 
 @dataclass(frozen=True)
-class Rival:
+class Baseline:
     """A method to be fitted for one participant."""
 
     task: str
@@ -58,7 +58,7 @@ class FittedRival:
     seconds: float
 
 
-def fit(rival: Rival, folder: Path) -> FittedRival:
+def fit(baseline: Baseline, folder: Path) -> FittedRival:
     """Fit it on one core, keeping checkpoints in the folder, until it is done or asked to pause.
 
     Raises Abandoned when the folder is removed.
@@ -67,10 +67,10 @@ def fit(rival: Rival, folder: Path) -> FittedRival:
     started = time.perf_counter()
     begin_again(folder)
     try:
-        fitted = registry.fit(rival.method, _setting(rival, Checkpoint(folder)))
+        fitted = registry.fit(baseline.method, _setting(baseline, Checkpoint(folder)))
     except Paused:
         return FittedRival(None, (), round(time.perf_counter() - started, 1))
-    stored = controller.of_act(fitted.act, observations(rival.task))
+    stored = controller.of_act(fitted.act, observations(baseline.task))
     return FittedRival(stored, fitted.notes, round(time.perf_counter() - started, 1))
 
 
@@ -102,19 +102,19 @@ def observations(task: str) -> npt.NDArray[np.float32]:
     return np.concatenate([each.observations[:-1] for each in episodes]).astype(np.float32)
 
 
-def _setting(rival: Rival, checkpoint: Checkpoint) -> Setting:
-    task = simulation.task(rival.task)
-    policy = simulation.reference_policy(rival.task)
+def _setting(baseline: Baseline, checkpoint: Checkpoint) -> Setting:
+    task = simulation.task(baseline.task)
+    policy = simulation.reference_policy(baseline.task)
     return Setting(
-        problem=FilterProblem(task, policy, load_reward_model(rival.reward), rival.seed),
-        labels=rival.labels,
+        problem=FilterProblem(task, policy, load_reward_model(baseline.reward), baseline.seed),
+        labels=baseline.labels,
         pool=(),
         surface=_no_surface,
-        action_reward=lambda: _action_reward(rival),
-        reference=lambda scenarios: _collect(rival.task, policy.mean, scenarios, 0.0, 0),
-        collect=lambda act, scenarios, noise, seed: _collect(rival.task, act, scenarios, noise, seed),
-        make_env=simulation.environment_class(rival.task),
-        config=MethodConfig(fine_tuning=FineTuning(steps=rival.fine_tuning_steps)),
+        action_reward=lambda: _action_reward(baseline),
+        reference=lambda scenarios: _collect(baseline.task, policy.mean, scenarios, 0.0, 0),
+        collect=lambda act, scenarios, noise, seed: _collect(baseline.task, act, scenarios, noise, seed),
+        make_env=simulation.environment_class(baseline.task),
+        config=MethodConfig(fine_tuning=FineTuning(steps=baseline.fine_tuning_steps)),
         checkpoint=checkpoint,
     )
 
@@ -123,10 +123,10 @@ def _collect(task: str, act: Act, scenarios: Sequence[int], noise: float, seed: 
     return learning.run_scenarios(task, act, scenarios, noise, seed)
 
 
-def _action_reward(rival: Rival) -> RewardModel:
-    model = load_reward_model(rival.action_reward)
+def _action_reward(baseline: Baseline) -> RewardModel:
+    model = load_reward_model(baseline.action_reward)
     if not can_rank(model):
-        raise TypeError(f"{rival.method} needs a reward model on states and actions, not {type(model).__name__}.")
+        raise TypeError(f"{baseline.method} needs a reward model on states and actions, not {type(model).__name__}.")
     return model
 
 

@@ -24,6 +24,7 @@ from worker.ml.filters.filter_module import FilterWeights
 from worker.ml.filters.filter_problem import Act, FilterAct, FilterConfig, FilterDraft, FilterProblem, Progress, Trial
 from worker.ml.filters.response_surface import ResponseSurface
 from worker.ml.rewards.reward_models import load_reward_model
+from worker.scenarios import EVALUATION, RESIDUAL, first_of
 from worker.trajectory import Trajectory
 
 CHUNK = 3
@@ -47,7 +48,7 @@ class Finished:
 
 
 @dataclass(frozen=True)
-class Fitting:
+class FilterFit:
     """One filter in the making."""
 
     task: str
@@ -83,7 +84,7 @@ class Fitting:
 
     def fit_printed(self) -> FilterDraft:
         """The paper's PbARL as printed, on transitions of the frozen policy. Not gated: it is what it is."""
-        transitions = self.reference(filter_problem.scenarios_for("residual", PRINTED_ROLLOUTS))
+        transitions = self.reference(first_of(RESIDUAL, PRINTED_ROLLOUTS))
         self.progress("training the printed action encoder", 0.1)
         return self.compute.run(Lane.LEARNING, self.beat, printed_filter.fit_printed, self.problem, transitions)
 
@@ -134,14 +135,14 @@ class Fitting:
         return Finished(draft.weights.to_bytes(), bundle.write(contents), metrics)
 
     def _evaluate(self, act: FilterAct) -> tuple[dict[str, Any], list[Trajectory]]:
-        scenarios = filter_problem.scenarios_for("evaluation", self.config.evaluation_scenarios)
+        scenarios = first_of(EVALUATION, self.config.evaluation_scenarios)
         filtered = self.collect(act, scenarios, 0.0, self.seed)
         reference, reward = self.reference(scenarios), self.problem.reward
         return evaluate(reference, filtered, reward.returns(reference), reward.returns(filtered)), filtered
 
     def _evaluate_reference(self) -> tuple[dict[str, Any], list[Trajectory]]:
         """What would be measured of a filter that changes nothing: simulations repeat themselves exactly."""
-        reference = self.reference(filter_problem.scenarios_for("evaluation", self.config.evaluation_scenarios))
+        reference = self.reference(first_of(EVALUATION, self.config.evaluation_scenarios))
         returns = self.problem.reward.returns(reference)
         return evaluate(reference, reference, returns, returns), list(reference)
 

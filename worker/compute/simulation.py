@@ -18,6 +18,7 @@ import worker
 from worker.compute.behaviours import Behaviour, SlowWaves, draw_behaviours
 from worker.ml.policies.gaussian import GaussianPolicy
 from worker.ml.rewards.signal_predictor import SignalPredictor
+from worker.scenarios import NORMALISATION
 from worker.sim.assistive import AssistiveEnv
 from worker.sim.render.clip import STYLES, ClipRenderer, RenderedClip
 from worker.sim.render.scene import Scene
@@ -28,8 +29,6 @@ from worker.trajectory import Array, Trajectory
 
 CHECKPOINTS = Path(worker.__file__).resolve().parent / "checkpoints"
 
-REFERENCE_SCENARIOS = 2_000_000_000
-"""First of the scenarios over which reward models are normalised."""
 REFERENCE_COUNT = 40
 
 Act = Callable[[Array], Array]
@@ -197,7 +196,7 @@ def film_again(quality: str, trajectory: bytes, first_step: int, step_count: int
 
 @lru_cache(maxsize=4)
 def reference_rollouts(
-    name: str, first: int = REFERENCE_SCENARIOS, count: int = REFERENCE_COUNT
+    name: str, first: int = NORMALISATION.start, count: int = REFERENCE_COUNT
 ) -> tuple[Trajectory, ...]:
     """Rollouts of the frozen policy's mean action in consecutive scenarios."""
     policy = reference_policy(name)

@@ -34,6 +34,7 @@ from worker.ml.methods.registry import METHODS, MethodConfig
 from worker.ml.teachers import Manner, Taste, random_taste
 from worker.sim.costs import preference_rewards, stakes
 from worker.tasks.registry import ENVIRONMENTS
+from worker.whole_files import written_whole
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
@@ -330,6 +331,5 @@ def _spoken(manner: Manner) -> str:
 
 
 def _replace(path: Path, text: str) -> None:
-    partial = path.with_name(f".{path.name}")
-    partial.write_text(text)
-    partial.replace(path)
+    with written_whole(path) as draft:
+        draft.write_text(text)

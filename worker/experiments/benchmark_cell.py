@@ -4,9 +4,7 @@ Everything is done in the process that calls run_cell(), on one core, so that se
 """
 
 import hashlib
-import io
 import json
-import os
 import platform
 import time
 from collections.abc import Mapping, Sequence
@@ -36,16 +34,17 @@ from worker.ml.rewards.reward_models import RewardModel, load_reward_model
 from worker.ml.rewards.reward_training import SignalScale
 from worker.ml.rewards.segments import SegmentPairs
 from worker.ml.teachers import INDIRECT, OPPOSED, TASTES, Manner, ScriptedTeacher, Taste, User
+from worker.responses import TARGETS
+from worker.scenarios import EVALUATION, POOL, first_of
 from worker.sim.costs import CostForm, preference_rewards
 from worker.trajectory import Trajectory
+from worker.whole_files import written_whole
 
-POOL_FIRST = 10_000_000
 SMALLEST_POOL = 48
 """scenarios, as in a study"""
 CHOOSE_EVERY = 10
 """labels between two models that choose what is asked, as in a study"""
 PAIRS_PER_SCENARIO = BEHAVIOURS_PER_SCENARIO * (BEHAVIOURS_PER_SCENARIO - 1) // 2
-TARGETS = {"left": 0.0, "right": 1.0, "equal": 0.5}
 Floats = npt.NDArray[np.float64]
 
 PAPER_USERS: Mapping[str, Taste] = {user.value: TASTES[user.value] for user in User}
@@ -72,11 +71,11 @@ class Terms:
     @property
     def pool(self) -> range:
         """Scenarios of the clips that are compared."""
-        return range(POOL_FIRST, POOL_FIRST + max(self.smallest_pool, -(-self.labels // PAIRS_PER_SCENARIO)))
+        return first_of(POOL, max(self.smallest_pool, -(-self.labels // PAIRS_PER_SCENARIO)))
 
     def unseen(self, seed: int) -> range:
         """Scenarios of the evaluation; every seed has its own, so that another seed confirms with fresh ones."""
-        return filter_problem.scenarios_for("evaluation", self.scenarios, skip=seed * self.scenarios)
+        return first_of(EVALUATION, self.scenarios, skip=seed * self.scenarios)
 
     def directory(self, work: Path) -> Path:
         """Where cells under these terms are kept."""
@@ -154,11 +153,8 @@ def _write(target: Path, record: dict[str, Any], driven: Sequence[Trajectory], l
         "costs": [each.costs.sum(axis=0, dtype=np.float64) for each in driven],
         "signals": [each.signals.sum(axis=0, dtype=np.float64) for each in driven],
     }
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, **arrays)
-    partial = target.with_name(f".{target.name}.{os.getpid()}")
-    partial.write_bytes(buffer.getvalue())
-    partial.replace(target)
+    with written_whole(target) as draft:
+        np.savez_compressed(draft, **arrays)
     return target
 
 
@@ -238,9 +234,8 @@ class Bench:
             return load_reward_model(path.read_bytes())
         model = self._fit(self.terms.reward)
         path.parent.mkdir(parents=True, exist_ok=True)
-        partial = path.with_name(f".{path.name}.{os.getpid()}")
-        partial.write_bytes(model.to_bytes())
-        partial.replace(path)
+        with written_whole(path) as draft:
+            draft.write_bytes(model.to_bytes())
         return load_reward_model(path.read_bytes())  # as stored, whoever was first
 
     def _action_reward(self) -> RewardModel:

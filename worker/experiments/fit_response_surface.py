@@ -24,15 +24,15 @@ from worker.compute.pools import Compute, Lane
 from worker.ml.filters import response_surface
 from worker.ml.filters.response_surface import ResponseSurface, best_mode
 from worker.ml.teachers import random_taste
+from worker.scenarios import RESPONSE_SURFACE, RESPONSE_SURFACE_SOUGHT, first_of
 from worker.sim.costs import signal_weights
 from worker.sim.rollout import rollout
 from worker.task import Task
 from worker.trajectory import SIGNALS
+from worker.whole_files import written_whole
 
-FIRST_SCENARIO = 100_000
 SCENARIOS = 300
 """executed in random modes"""
-SOUGHT_FIRST = 150_000
 SOUGHT_SCENARIOS = 60
 """executed, in every later round, in modes that somebody would want"""
 ROUNDS = 3
@@ -91,7 +91,7 @@ def explore(task: str, work_directory: Path, processes: int, scenarios: int = SC
     described = simulation.task(task)
     blocks = [
         Block(task, first, _random_modes(described, first), work_directory / f"differences-{first}.npz")
-        for first in range(FIRST_SCENARIO, FIRST_SCENARIO + scenarios, BLOCK)
+        for first in first_of(RESPONSE_SURFACE, scenarios)[::BLOCK]
     ]
     compute = Compute(processes)
     try:
@@ -119,10 +119,9 @@ def compare_block(block: Block) -> None:
                 changed.signals.sum(axis=0, dtype=np.float64) - reference.signals.sum(axis=0, dtype=np.float64)
             )
             success.append(float(changed.success) - float(reference.success))
-    partial = block.file.with_suffix(".partial.npz")
     flat = block.modes.reshape(-1, block.modes.shape[-1])
-    np.savez(partial, modes=flat, signals=signals, success=success, reference_success=reference_success)
-    partial.replace(block.file)
+    with written_whole(block.file) as draft:
+        np.savez(draft, modes=flat, signals=signals, success=success, reference_success=reference_success)
 
 
 def _random_modes(task: Task, first: int) -> Floats:
@@ -146,7 +145,7 @@ def sought_blocks(task: Task, surface: ResponseSurface, number: int, work_direct
     width = surface.high - surface.low
     blocks = []
     for index in range(count):
-        first = SOUGHT_FIRST + 1000 * number + BLOCK * index
+        first = RESPONSE_SURFACE_SOUGHT.start + 1000 * number + BLOCK * index
         around = wanted[rng.permutation(per_block)] + JITTER * width * rng.standard_normal(wanted.shape)
         modes = np.clip(around, surface.low, surface.high).reshape(BLOCK, MODES_PER_SCENARIO, -1)
         blocks.append(Block(task.name, first, modes, work_directory / f"sought-{first}.npz"))
@@ -176,7 +175,7 @@ def _publish(task: Task, scenarios: int, found: Differences) -> dict[str, Any]:
     spread = np.maximum((found.signals**2).mean(axis=0), 1e-12)
     record = {
         "command": f"python -m worker explore --task {task.name} --scenarios {scenarios}",
-        "scenarios": [FIRST_SCENARIO, FIRST_SCENARIO + scenarios - 1],
+        "scenarios": [RESPONSE_SURFACE.start, RESPONSE_SURFACE[scenarios - 1]],
         "sought": {"rounds": ROUNDS, "scenarios_per_round": SOUGHT_SCENARIOS, "jitter": JITTER},
         "modes_per_scenario": MODES_PER_SCENARIO,
         "axes": {axis.name: [axis.low, axis.high] for axis in task.modes.axes},

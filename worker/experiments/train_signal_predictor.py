@@ -20,10 +20,9 @@ from worker.compute.pools import Compute, Lane
 from worker.experiments.rollout_cache import BEHAVIOURS_PER_SCENARIO, Shelf
 from worker.ml.rewards import signal_training
 from worker.ml.rewards.signal_training import PredictorTraining
+from worker.scenarios import SIGNAL_PREDICTOR, SIGNAL_PREDICTOR_TEST, first_of
 
-FIRST_SCENARIO = 200_000
 SCENARIOS = 150
-TESTED_FIRST = 250_000
 TESTED_SCENARIOS = 30
 """in which nothing is learned, only measured"""
 BLOCK = 5
@@ -42,8 +41,8 @@ def foresee(
 
     ``target``: where it goes; the task's checkpoints when None.
     """
-    learned_from = range(FIRST_SCENARIO, FIRST_SCENARIO + scenarios)
-    tested_on = range(TESTED_FIRST, TESTED_FIRST + tested)
+    learned_from = first_of(SIGNAL_PREDICTOR, scenarios)
+    tested_on = first_of(SIGNAL_PREDICTOR_TEST, tested)
     _roll_out(task, work_directory, processes, [*learned_from, *tested_on])
     shelf, config = Shelf(task, work_directory), training or PredictorTraining()
     with tqdm(total=config.steps, unit="step", desc="training") as bar:

@@ -1,10 +1,11 @@
 """What is missing or stale, asked of the database again and again: the answer is always the whole truth.
 
 Nothing here is remembered between two rounds, so a lost message, a killed worker or a second worker cannot leave
-anything undone or do it twice: each finding has one name, and work is started under that name at most once.
+anything undone or do it twice: each run has one key, and work is started under that key at most once.
 """
 
 from collections.abc import Collection, Iterable, Iterator, Mapping
+from dataclasses import replace
 from datetime import datetime, timedelta
 from typing import NamedTuple
 
@@ -12,19 +13,20 @@ from sqlalchemy import func, or_, select
 from sqlalchemy.orm import Session
 
 from app.db import now
+from app.domain import run_keys
 from app.domain.clips import Clip, Rollout
 from app.domain.models import Run, RunKind, RunStatus
 from app.domain.preferences import LabelEvent, Query, count_labels
+from app.domain.run_keys import SCENARIO, WHOLE, RunKey
 from app.domain.studies import Participant, Study
 from app.services.evaluation import evaluation_plan
+from worker import scenarios
 from worker.jobs.clips import evaluation_films, repairs
-from worker.jobs.clips.pool_clips import WHOLE
 from worker.jobs.learning import baselines
 from worker.jobs.publishing import export_files, report_files
 from worker.jobs.runtime.due_work import (
-    ending,
+    answers_known,
     filter_due,
-    filter_name,
     last_answers,
     last_exclusions,
     present_ids,
@@ -47,7 +49,7 @@ class _Attempted(NamedTuple):
     finished_at: datetime | None
 
 
-def findings(session: Session, lost: Mapping[str, int] | None = None) -> Iterator[tuple[Job, int]]:
+def due(session: Session, lost: Mapping[str, int] | None = None) -> Iterator[tuple[Job, int]]:
     """Every run that should exist and does not, or must be tried again, with the number of its attempt.
 
     ``lost``: stored files that are to be made again, as ArtefactStore.lost() gives them.
@@ -63,7 +65,7 @@ def findings(session: Session, lost: Mapping[str, int] | None = None) -> Iterato
         else:
             jobs = (*repairs.due(session, study, lost or {}), *_all_due(session, study, succeeded))
         for job in jobs:
-            attempt = _attempt_due(runs.get(job.finding), now())
+            attempt = _attempt_due(runs.get(job.key), now())
             one_at_a_time = job.kind == RunKind.FILTER and job.participant_id in being_filtered
             if attempt is not None and not one_at_a_time:
                 yield job, attempt
@@ -79,20 +81,22 @@ def _all_due(session: Session, study: Study, succeeded: Collection[str]) -> Iter
 def abandoned(session: Session, in_hand: Collection[str]) -> list[tuple[Job, int]]:
     """Runs that some worker began and of which nothing has been heard since, with the number of the attempt.
 
-    ``in_hand``: findings that this worker is busy with itself; a machine under load may be late with a sign of life.
+    ``in_hand``: keys of runs that this worker is busy with; a machine under load may be late with a sign of life.
     """
     lost = select(Run).where(Run.status == RunStatus.RUNNING, Run.heartbeat_at < now() - LEASE)
-    return [(job_of(run), run.attempt) for run in session.scalars(lost) if run.workflow_id not in in_hand]
+    left = [(job_of(run), run.attempt) for run in session.scalars(lost) if run.workflow_id not in in_hand]
+    return [(job, attempt) for job, attempt in left if job is not None]
 
 
-def job_of(run: Run) -> Job:
-    """What the run was begun for."""
-    return Job(run.workflow_id, RunKind(run.kind), run.study_id, run.participant_id, run.label_count, run.label_hash)
+def job_of(run: Run) -> Job | None:
+    """What the run was begun for; None when its key is not one of this studio's."""
+    key = run_keys.read(run.workflow_id)
+    return None if key is None else Job(key, run.study_id)
 
 
-def workflow_name(finding: str, attempt: int) -> str:
-    """The engine's name for one attempt at a finding."""
-    return f"{finding}#{attempt}"
+def workflow_name(key: str, attempt: int) -> str:
+    """The engine's name for one attempt at a run."""
+    return f"{key}#{attempt}"
 
 
 def studies_with_answers(session: Session) -> list[Study]:
@@ -152,11 +156,11 @@ def _missing_clips(session: Session, study: Study) -> list[Job]:
     clips = _clips_by_scenario(session, study, settings.clip_steps)
     whole = _clips_by_scenario(session, study, study.whole_clip_steps)
     for index in range(settings.pool_scenarios):
-        seed = scenario_seed(study.seed, index)
+        seed = scenarios.of_pool(study.seed, index)
         if clips.get(seed, 0) < settings.behaviours_per_scenario:
-            jobs.append(Job(f"clips/study-{study.id}/scenario-{seed}", RunKind.CLIPS, study.id))
+            jobs.append(Job(RunKey(RunKind.CLIPS, study.id, subject=SCENARIO, number=seed), study.id))
         elif index < settings.introduction_scenarios and whole.get(seed, 0) < settings.behaviours_per_scenario:
-            jobs.append(Job(f"clips/study-{study.id}/{WHOLE}-{seed}", RunKind.CLIPS, study.id))
+            jobs.append(Job(RunKey(RunKind.CLIPS, study.id, subject=WHOLE, number=seed), study.id))
     return jobs[:CLIPS_AHEAD]
 
 
@@ -171,41 +175,32 @@ def _clips_by_scenario(session: Session, study: Study, step_count: int | None) -
     return dict(session.execute(counted).all())
 
 
-def scenario_seed(study_seed: int, index: int) -> int:
-    """The scenario at one place of a study's pool; far from those that filters are trained and evaluated on."""
-    return 10_000_000 + study_seed % 90_000 * 1_000 + index
-
-
 def _stale_models(session: Session, study: Study, succeeded: Collection[str]) -> list[Job]:
     jobs, settings = [], study.settings
     answers, exclusions = last_answers(session, present_ids(study)), last_exclusions(session, present_ids(study))
     begun = evaluation_plan.begun(session, study)
     for participant_id, count in sorted(count_labels(session, present_ids(study)).items()):
-        suffix = ending(settings, count, answers[participant_id], exclusions.get(participant_id))
-        reward = reward_due(settings, count)
-        if reward:
-            name = f"reward/participant-{participant_id}/labels-{reward}{suffix}"
-            jobs.append(Job(name, RunKind.REWARD, study.id, participant_id, reward))
+        known = answers_known(settings, count, answers[participant_id], exclusions.get(participant_id))
+        labels = reward_due(settings, count)
+        reward = RunKey(RunKind.REWARD, participant_id=participant_id, labels=labels, answers=known)
+        if labels:
+            jobs.append(Job(reward, study.id))
             milestone = filter_due(settings, count)
-            if milestone and name in succeeded and study.material is None:  # no simulator, no filter
-                name = filter_name(participant_id, milestone, suffix)
-                jobs.append(Job(name, RunKind.FILTER, study.id, participant_id, milestone))
+            if milestone and str(reward) in succeeded and study.material is None:  # no simulator, no filter
+                jobs.append(Job(replace(reward, kind=RunKind.FILTER, labels=milestone), study.id))
         if count >= settings.labels_per_participant and study.material is None:
-            robots_shown = participant_id in begun
-            jobs += _missing_from_evaluation(study, participant_id, f"labels-{reward}{suffix}", succeeded, robots_shown)
+            jobs += _missing_from_evaluation(study, reward, succeeded, participant_id in begun)
     return jobs
 
 
-def _missing_from_evaluation(
-    study: Study, participant_id: int, ending: str, succeeded: Collection[str], robots_shown: bool
-) -> list[Job]:
-    """What is to be trained, filmed or packed for somebody who has given all labels.
+def _missing_from_evaluation(study: Study, reward: RunKey, succeeded: Collection[str], robots_shown: bool) -> list[Job]:
+    """What is to be trained, filmed or packed for somebody who has given all labels. ``reward``: their last model's.
 
     Whoever has been shown robots rates those: other ones, learned without an excluded answer, would be for nobody.
     """
-    if f"reward/participant-{participant_id}/{ending}" not in succeeded:
+    if str(reward) not in succeeded:
         return []
-    jobs = [] if robots_shown else baselines.due(study, participant_id, ending)
-    if f"filter/participant-{participant_id}/{ending}" in succeeded:
-        jobs += evaluation_films.due(study, participant_id, ending, succeeded, robots_shown)
+    jobs = [] if robots_shown else baselines.due(study, reward)
+    if str(replace(reward, kind=RunKind.FILTER)) in succeeded:
+        jobs += evaluation_films.due(study, reward, succeeded, robots_shown)
     return jobs

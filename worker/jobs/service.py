@@ -25,12 +25,12 @@ from worker.compute.pools import Compute, ComputeLost, Interrupted, Lane
 from worker.jobs import reconcile
 from worker.jobs.learning import query_selection, reference_rollouts
 from worker.jobs.runtime import engine, records
-from worker.jobs.runtime.context import Workplace
-from worker.jobs.runtime.lanes import Turns
-from worker.jobs.runtime.records import Job
+from worker.jobs.runtime.context import WorkerContext
+from worker.jobs.runtime.lanes import Lanes
+from worker.jobs.runtime.records import Job, as_arguments
 from worker.jobs.runtime.urgency import Level, WhoWaits
 from worker.jobs.upkeep import erasure, unused_files
-from worker.jobs.workflows import Workshop, as_arguments
+from worker.jobs.workflows import JobRunner
 from worker.stop_signals import Stop
 
 log = logging.getLogger("worker")
@@ -66,13 +66,13 @@ def run(settings: Settings) -> int:
         database = Database(settings.sqlalchemy_url)
         compute = Compute(settings.compute_processes, stop.asked)
         stop.at_once = compute.kill
-        place = Workplace(database, ArtefactStore(settings.data_dir / "artefacts"), compute)
-        workshop = Workshop(place, Turns(compute))
+        context = WorkerContext(database, ArtefactStore(settings.data_dir / "artefacts"), compute)
+        runner = JobRunner(context, Lanes(compute))
         try:
             compute.warm_up(Lane.CLIPS, simulation.warm_up)
             with engine.running(settings, database) as bond:
                 log.info("worker %s is ready", settings.worker_name)
-                _Rounds(settings, workshop, bond).until(stop.asked)
+                _Rounds(settings, runner, bond).until(stop.asked)
         except Interrupted:
             log.info("stopped while starting")
         finally:
@@ -100,12 +100,12 @@ def _only_one(settings: Settings) -> Iterator[None]:
 class _Rounds:
     """Asks the database again and again; remembers only what spares work, nothing that work depends on."""
 
-    def __init__(self, settings: Settings, workshop: Workshop, bond: engine.Bond) -> None:
+    def __init__(self, settings: Settings, runner: JobRunner, bond: engine.Bond) -> None:
         self._worker_name = settings.worker_name
         self._engine_file = engine.file_of(settings)
         self._bond = bond
-        self._workshop = workshop
-        self._place = workshop.place
+        self._runner = runner
+        self._context = runner.context
         self._started: dict[str, float] = {}  # what the engine has been told already, and when it was last asked
         self._told_at: dict[str, float] = {}
         self._born_at = time.monotonic()
@@ -117,7 +117,7 @@ class _Rounds:
 
     def until(self, stop: threading.Event) -> None:
         """One round after the other; a database that is away for a while is waited for."""
-        with closing(self._place.database.watch()) as watch:
+        with closing(self._context.database.watch()) as watch:
             while not stop.wait(ROUND_S):
                 self._look(watch)
 
@@ -137,7 +137,7 @@ class _Rounds:
             moment = now()
             if not self._bond.promise(moment):
                 return
-            with self._place.database.writing() as session:
+            with self._context.database.writing() as session:
                 records.sign_presence(session, self._worker_name, moment)
             self._bond.signed(moment)
             self._signed_at = time.monotonic()
@@ -145,19 +145,19 @@ class _Rounds:
     def _clear_away(self) -> None:
         """At the start and once a day."""
         if time.monotonic() - self._cleared_at >= CLEARING_S:
-            unused_files.clear_away(self._place, erasure.drafts() | set().union(*self._workshop.stored.values()))
+            unused_files.clear_away(self._context, erasure.drafts() | set().union(*self._runner.stored.values()))
             self._cleared_at = time.monotonic()
 
     def _round(self) -> None:
-        turns = self._workshop.turns
-        with self._place.database.reading() as session:
-            lost_files = self._place.store.lost()
-            due = list(reconcile.findings(session, lost_files))
+        lanes = self._runner.lanes
+        with self._context.database.reading() as session:
+            lost_files = self._context.store.lost()
+            due = list(reconcile.due(session, lost_files))
             hungry = {*reconcile.short_of_queries(session), *reconcile.with_lost_queries(session, lost_files)}
-            lost = reconcile.abandoned(session, self._workshop.in_hand)
+            lost = reconcile.abandoned(session, self._runner.in_hand)
             answered = reconcile.studies_with_answers(session)
             withdrawn, deleted = erasure.unfinished(session), erasure.unfinished_studies(session)
-            turns.who_waits = WhoWaits.look(session)
+            lanes.who_waits = WhoWaits.look(session)
         self._start_most_urgent(due)
         for participant_id in hungry - self._refused:
             self._refill(participant_id)
@@ -166,32 +166,31 @@ class _Rounds:
         for study_id in deleted:
             self._erase(erasure.erase_traces_of_study, study_id)
         for job, attempt in lost:
-            self._take_over(job, reconcile.workflow_name(job.finding, attempt))
+            self._take_over(job, reconcile.workflow_name(job.key, attempt))
         for study in answered:
             if study.id not in self._prepared:
                 self._prepared.add(study.id)
                 for lane in (Lane.REWARDS, Lane.LEARNING):
-                    turns.compute.warm_up(lane, partial(learning.warm_up, study.task))
+                    lanes.compute.warm_up(lane, partial(learning.warm_up, study.task))
                 threading.Thread(target=self._make_references, args=(study.task, study.settings), daemon=True).start()
 
     def _make_references(self, task: str, settings: StudySettings) -> None:
         """What the first filter would otherwise wait for."""
         try:
-            reference_rollouts.make_ready(self._place.compute, self._place.references, task, settings)
+            reference_rollouts.make_ready(self._context.compute, self._context.references, task, settings)
         except Interrupted:
             return
         except ComputeLost:
             log.warning("rollouts of the reference policy were lost; the first filter of %s will make them", task)
 
     def _erase(self, erase: erasure.Erase, row_id: int) -> None:
-        shop = self._workshop
-        progress = erase(self._place, row_id, shop.in_hand, shop.stored, self._engine_file)
+        progress = erase(self._context, row_id, self._runner.in_hand, self._runner.stored, self._engine_file)
         for name in progress.forgotten:
             self._started.pop(name, None)
 
     def _refill(self, participant_id: int) -> None:
         try:
-            query_selection.refill_queries(self._place, participant_id)
+            query_selection.refill_queries(self._context, participant_id)
         except AppError as refusal:  # one study that cannot go on must not stop the others
             log.warning("participant %d gets no further pairs: %s", participant_id, refusal.message)
             self._refused.add(participant_id)
@@ -201,13 +200,13 @@ class _Rounds:
 
         What the engine was told and has not begun is still due, and counts, unless it seems to have forgotten it.
         """
-        begun = Counter(finding.partition("/")[0] for finding in self._workshop.in_hand)
-        for job, attempt in sorted(due, key=lambda each: self._workshop.turns.who_waits.urgency(each[0])):
-            level = self._workshop.turns.who_waits.urgency(job).level
+        begun = Counter(key.partition("/")[0] for key in self._runner.in_hand)
+        for job, attempt in sorted(due, key=lambda each: self._runner.lanes.who_waits.urgency(each[0])):
+            level = self._runner.lanes.who_waits.urgency(job).level
             places = engine.QUEUES[job.kind] + (engine.RESERVE if level <= Level.ANSWERING else 0)
-            if job.finding in self._workshop.in_hand or begun[job.kind] >= places:
+            if job.key in self._runner.in_hand or begun[job.kind] >= places:
                 continue
-            name = reconcile.workflow_name(job.finding, attempt)
+            name = reconcile.workflow_name(job.key, attempt)
             self._start(job, name)
             begun[job.kind] += time.monotonic() - self._told_at.setdefault(name, time.monotonic()) < BEGINS_WITHIN_S
 
@@ -216,7 +215,7 @@ class _Rounds:
         if time.monotonic() - self._started.get(name, -math.inf) < LOOK_AGAIN_S:
             return
         self._started[name] = time.monotonic()
-        if job.finding not in self._workshop.in_hand and not engine.is_at_it(name):
+        if job.key not in self._runner.in_hand and not engine.is_at_it(name):
             self._go_on(job, name)
 
     def _take_over(self, job: Job, name: str) -> None:
@@ -229,8 +228,8 @@ class _Rounds:
         self._started[name] = time.monotonic()
         if engine.gave_up(name):
             log.warning("%s: %s", name, KeepsFelling().message)
-            with self._place.database.writing() as session:
-                records.fail_run(session, job.finding, KeepsFelling().message)
+            with self._context.database.writing() as session:
+                records.fail_run(session, job.key, KeepsFelling().message)
             return
         log.warning("%s was left behind; taking it over", name)
         self._go_on(job, name)
@@ -238,4 +237,4 @@ class _Rounds:
     def _go_on(self, job: Job, name: str) -> None:
         if not engine.resume(name):
             with SetWorkflowID(name):
-                DBOS.enqueue_workflow(job.kind, self._workshop.work, as_arguments(job))
+                DBOS.enqueue_workflow(job.kind, self._runner.work, as_arguments(job))

@@ -8,7 +8,6 @@ import errno
 import logging
 import time
 from collections.abc import Callable
-from dataclasses import asdict
 from typing import Any
 
 from dbos import DBOS, DBOSConfiguredInstance
@@ -25,16 +24,16 @@ from worker.jobs.learning.filters import train_filter
 from worker.jobs.learning.reward_models import train_reward
 from worker.jobs.publishing import export_files, report_files
 from worker.jobs.runtime import records
-from worker.jobs.runtime.context import Step, Workplace
-from worker.jobs.runtime.lanes import Turns
-from worker.jobs.runtime.records import Job
+from worker.jobs.runtime.context import Step, WorkerContext
+from worker.jobs.runtime.lanes import Lanes
+from worker.jobs.runtime.records import Job, from_arguments
 
 log = logging.getLogger("worker")
 
 FALLS_ALLOWED = 5
 """How often a worker may fall in the middle of an attempt before that has failed."""
 
-_BODIES: dict[RunKind, Callable[[Workplace, Job, int, Step], None]] = {
+_BODIES: dict[RunKind, Callable[[WorkerContext, Job, int, Step], None]] = {
     RunKind.CLIPS: build_clips,
     RunKind.REWARD: train_reward,
     RunKind.FILTER: train_filter,
@@ -50,65 +49,65 @@ class ParticipantWithdrew(AppError):
 
 
 @DBOS.dbos_class()
-class Workshop(DBOSConfiguredInstance):
+class JobRunner(DBOSConfiguredInstance):
     """Does jobs at one workplace."""
 
-    def __init__(self, place: Workplace, turns: Turns) -> None:
-        super().__init__("workshop")
-        self.place, self.turns = place, turns
+    def __init__(self, context: WorkerContext, lanes: Lanes) -> None:
+        super().__init__("job runner")
+        self.context, self.lanes = context, lanes
         self.in_hand: set[str] = set()
-        """findings that this process is working on"""
+        """keys of runs that this process is working on"""
         self.stored: dict[str, set[str]] = {}
-        """artefacts of work that has not succeeded yet, by finding: nothing else may know of them"""
+        """artefacts of work that has not succeeded yet, by key: nothing else may know of them"""
 
     @DBOS.workflow(max_recovery_attempts=FALLS_ALLOWED)
     def work(self, arguments: dict[str, Any]) -> None:
         """Do one job; what goes wrong is kept with the run and in the log, never raised."""
-        job = Job(**arguments)
-        self.in_hand.add(job.finding)
+        job = from_arguments(arguments)
+        self.in_hand.add(job.key)
         started = time.monotonic()
         try:
             run_id = _step("begin", self._begin, arguments)
             if run_id is None:
                 return
-            place = self.place.noting(self.stored.setdefault(job.finding, set())).computing(self.turns.of(job))
-            _BODIES[RunKind(job.kind)](place, job, run_id, _step)
+            context = self.context.noting(self.stored.setdefault(job.key, set())).computing(self.lanes.of(job))
+            _BODIES[RunKind(job.kind)](context, job, run_id, _step)
             _step("finish", self._finish, run_id)
-            self.stored.pop(job.finding, None)
-            log.info("%s done in %.1f s", job.finding, time.monotonic() - started)
+            self.stored.pop(job.key, None)
+            log.info("%s done in %.1f s", job.key, time.monotonic() - started)
         except AppError as refusal:  # foreseen, and already in words for people
-            log.warning("%s: %s", job.finding, refusal.message)
-            _step("fail", self._fail, job.finding, refusal.message)
+            log.warning("%s: %s", job.key, refusal.message)
+            _step("fail", self._fail, job.key, refusal.message)
         except Exception as error:  # the worker's edge: one failed job must not stop the others
             if self._is_pointless(job):
-                log.info("%s is abandoned: the participant has withdrawn, or the study was deleted", job.finding)
+                log.info("%s is abandoned: the participant has withdrawn, or the study was deleted", job.key)
                 return
-            log.exception("%s failed", job.finding)
-            _step("fail", self._fail, job.finding, f"{type(error).__name__}: {error}", not _is_the_machine_s(error))
+            log.exception("%s failed", job.key)
+            _step("fail", self._fail, job.key, f"{type(error).__name__}: {error}", not _is_the_machine_s(error))
         finally:
-            self.in_hand.discard(job.finding)
+            self.in_hand.discard(job.key)
 
     def _is_pointless(self, job: Job) -> bool:
-        with self.place.database.reading() as session:
+        with self.context.database.reading() as session:
             return _has_withdrawn(session, job)
 
     def _begin(self, arguments: dict[str, Any]) -> int | None:
         """The run's id; None when there is nothing to be done, because an earlier life of this job has finished it."""
-        job = Job(**arguments)
-        with self.place.database.writing() as session:
+        job = from_arguments(arguments)
+        with self.context.database.writing() as session:
             if _has_withdrawn(session, job):
                 raise ParticipantWithdrew
-            if records.has_succeeded(session, job.finding):
+            if records.has_succeeded(session, job.key):
                 return None
             return records.begin_run(session, job, _seed(session, job))
 
     def _finish(self, run_id: int) -> None:
-        with self.place.database.writing() as session:
+        with self.context.database.writing() as session:
             records.finish_run(session, run_id)
 
-    def _fail(self, finding: str, error: str, counts: bool = True) -> None:
-        with self.place.database.writing() as session:
-            records.fail_run(session, finding, error, counts)
+    def _fail(self, key: str, error: str, counts: bool = True) -> None:
+        with self.context.database.writing() as session:
+            records.fail_run(session, key, error, counts)
 
 
 def _step(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
@@ -134,8 +133,3 @@ def _seed(session: Session, job: Job) -> int:
     if job.participant_id is None:
         return session.get_one(Study, job.study_id).seed
     return session.get_one(Participant, job.participant_id).seed
-
-
-def as_arguments(job: Job) -> dict[str, Any]:
-    """The job as plain values, which is what the engine stores."""
-    return {name: str(value) if name == "kind" else value for name, value in asdict(job).items()}

@@ -9,15 +9,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from math import isfinite
-from typing import Literal, Self
+from typing import Self
 
 import numpy as np
 import numpy.typing as npt
 
+from worker.responses import Answer
 from worker.trajectory import COSTS, SIGNALS
 
 Floats = npt.NDArray[np.float64]
-Answer = Literal["left", "right", "equal", "skip"]
 """The words the database stores."""
 
 

@@ -68,7 +68,7 @@ def _has_everything(database: Database) -> bool | None:
     """Whether an imported copy would be left alone by the worker: nothing is missing or stale, nothing at work."""
     with database.reading() as session:
         at_work = session.scalar(select(Run.id).where(Run.status == RunStatus.RUNNING).limit(1))
-        return (at_work is None and not list(reconcile.findings(session))) or None
+        return (at_work is None and not list(reconcile.due(session))) or None
 
 
 def archive_study(database: Database, store: ArtefactStore, path: Path) -> None:

@@ -16,6 +16,7 @@ from pydantic import ValidationError
 from sqlalchemy import JSON, Boolean, Column, Float, Integer, String, Table
 
 from app.db import Base, UtcDateTime
+from app.domain import run_keys
 from app.domain.models import ModelKind, RunKind, RunStatus
 from app.domain.preferences import Purpose, Response, SkipReason
 from app.domain.protocol import EvaluatedMethod, Stage
@@ -26,8 +27,6 @@ from app.services.studies import locking
 
 MOST_ROWS = 3_000_000
 """Of all tables together that others refer to: their ids are held in memory."""
-REFERRED_BY_RUNS = {"answer": "label_event", "exclusion": "exclusion"}
-"""Tables whose ids stand in names of runs, by their word: reward/participant-12/labels-200/answer-345-exclusion-6."""
 _SMALLEST_ID, _LARGEST_ID = 1, 2**63 - 1
 _WORDS: Mapping[tuple[str, str], type[StrEnum]] = {
     ("query", "purpose"): Purpose,
@@ -60,7 +59,7 @@ class RowCheck:
         """By table and id the participant a row belongs to; 0: the study as a whole."""
         self._referred = {
             key.column.table.name for table in Base.metadata.sorted_tables for key in table.foreign_keys
-        } | set(REFERRED_BY_RUNS.values())
+        } | set(run_keys.ROWS.values())
         self._study: dict[str, Any] | None = None
 
     def table(self, table: Table, path: Path) -> None:

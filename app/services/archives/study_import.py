@@ -1,7 +1,6 @@
 """Bringing in an archive of a study: completely or not at all, with new ids and links, and nothing of other studies."""
 
 import hashlib
-import re
 import tempfile
 import uuid
 from collections.abc import Iterator, Mapping, Sequence
@@ -14,6 +13,7 @@ from typing import IO, Any
 from sqlalchemy import Table, insert, select, update
 from sqlalchemy.orm import Session
 
+from app.domain import run_keys
 from app.domain.models import Run, RunStatus
 from app.domain.studies import Participant, Study
 from app.errors import AppError
@@ -21,16 +21,12 @@ from app.services import audit
 from app.services.archives import archive_reading
 from app.services.archives.archive import ArchiveInvalid, tables_of
 from app.services.archives.archive_reading import Checked
-from app.services.archives.archive_rows import REFERRED_BY_RUNS
 from app.services.participants import enrolment
 from app.services.participants.withdrawal import in_use
 from app.services.studies import studies
 from app.storage import ArtefactStore
 
 _ROWS_AT_ONCE = 500
-_PLACES = {"participant": "participant", "study": "study", **REFERRED_BY_RUNS}
-"""What the numbers in names of runs are ids of."""
-
 Ids = dict[str, dict[int, int]]
 """By table the new id of every old one."""
 
@@ -181,15 +177,11 @@ def _taken(session: Session, table: Table, rows: Sequence[Mapping[str, Any]]) ->
 
 
 def _name_runs(session: Session, runs: Iterator[Mapping[str, Any]], ids: Ids) -> None:
-    """Runs keep their names with new numbers, so that the worker finds done what was done."""
-
-    def renumbered(match: re.Match[str]) -> str:
-        known = ids.get(_PLACES[match[1]], {})
-        return f"{match[1]}-{known.get(int(match[2]), 0)}"
-
+    """Runs keep their keys with new numbers, so that the worker finds done what was done."""
     for run in runs:
-        name = re.sub(rf"\b({'|'.join(_PLACES)})-(\d+)", renumbered, run["workflow_id"])
-        if session.scalar(select(Run.id).where(Run.workflow_id == name)) is not None:
+        key = run_keys.read(run["workflow_id"])
+        name = str(run_keys.renumbered(key, lambda table, old: ids.get(table, {}).get(old, 0))) if key else ""
+        if not key or session.scalar(select(Run.id).where(Run.workflow_id == name)) is not None:
             name += f"/imported-{uuid.uuid4()}"
         session.get_one(Run, ids["run"][run["id"]]).workflow_id = name
 

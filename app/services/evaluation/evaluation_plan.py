@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
-from sqlalchemy import func, or_, select
+from sqlalchemy import or_, select
 from sqlalchemy.orm import Session, joinedload
 
 from app.db import now
@@ -32,7 +32,7 @@ TRAINED = (EvaluatedMethod.PREFFT, EvaluatedMethod.PREFFT_ANCHORED, EvaluatedMet
 """Methods that are trained for the evaluation alone; the reference is there, and pbarl is the participant's filter."""
 
 TRIAL_SCENARIOS = range(6_000_000, 6_800_000)
-"""Scenarios of trials; nothing else uses them (worker.ml.filters.filter_problem.SCENARIO_BLOCKS has the others)."""
+"""Scenarios of trials; nothing else uses them (worker.scenarios has the others)."""
 COMPARISON_SCENARIOS = range(6_800_000, 6_900_000)
 """Scenarios in which somebody's robot is shown before and after."""
 COMPARED = 2
@@ -207,12 +207,6 @@ def controllers_of(session: Session, participant_id: int) -> dict[str, Controlle
         .order_by(Assignment.letter)
     )
     return dict(rows.all())
-
-
-def rated_count(session: Session, participant_id: int) -> int:
-    """How many trials the participant has rated."""
-    rated = select(func.count(func.distinct(Rating.trial_id))).join(Trial)
-    return session.scalar(rated.where(Trial.participant_id == participant_id)) or 0
 
 
 def film_of(session: Session, participant_id: int, method: str, scenario: int, model_id: int | None) -> Film | None:

@@ -7,11 +7,11 @@ from sqlalchemy.orm import Session
 
 from app.domain.models import Model, ModelKind, Run, RunKind, RunStatus
 from app.domain.protocol import EvaluatedMethod, EvaluationMode
+from app.domain.run_keys import BEFORE_AFTER, CONTROLLERS, TRIALS
 from app.domain.studies import Participant
 from app.services.evaluation import evaluation_plan
 from app.services.runs import estimates
 
-TRIALS, CONTROLLERS, BEFORE_AFTER = "trials", "controllers", "before-after"
 """What films are for, as the worker names its runs."""
 
 

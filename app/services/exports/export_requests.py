@@ -8,6 +8,7 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from app.domain.models import Export, Run, RunKind, RunStatus
+from app.domain.run_keys import RunKey
 from app.domain.studies import Study
 from app.errors import AppError
 from app.services import audit
@@ -47,14 +48,14 @@ def of_study(session: Session, study: Study) -> Sequence[Export]:
     return session.scalars(select(Export).where(Export.study_id == study.id).order_by(Export.id.desc())).all()
 
 
-def finding(export: Export) -> str:
-    """The name under which the worker makes the file."""
-    return f"export/study-{export.study_id}/{export.kind}-{export.id}"
+def key_of(export: Export) -> RunKey:
+    """The key of the run that makes the file."""
+    return RunKey(RunKind.EXPORT, export.study_id, subject=export.kind, number=export.id)
 
 
 def run_of(session: Session, export: Export) -> Run | None:
     """The run that makes the file, while it works or after it failed."""
-    run = session.scalar(select(Run).where(Run.kind == RunKind.EXPORT, Run.workflow_id == finding(export)))
+    run = session.scalar(select(Run).where(Run.kind == RunKind.EXPORT, Run.workflow_id == str(key_of(export))))
     return run if run is not None and run.status != RunStatus.SUCCEEDED else None
 
 

@@ -7,7 +7,9 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from app.db import now
+from app.domain import run_keys
 from app.domain.models import Model, Run, RunKind, RunStatus
+from app.domain.run_keys import SCENARIO
 from app.domain.studies import Participant, Study
 from app.domain.study_settings import StudySettings
 
@@ -62,7 +64,7 @@ def newest_run(session: Session, participant: Participant, kind: RunKind, what: 
     labels = participant.study.settings.labels_per_participant
     theirs = select(Run).where(Run.participant_id == participant.id, Run.kind == kind)
     runs = session.scalars(theirs.order_by(Run.id.desc())).all()
-    return next((run for run in runs if _what(run) == what and f"/labels-{labels}" in run.workflow_id), None)
+    return next((run for run in runs if _what(run) == what and _labels(run) == labels), None)
 
 
 def until_pair_s(session: Session, study: Study) -> float | None:
@@ -82,10 +84,14 @@ def are_others_first(session: Session, participant: Participant) -> bool:
 
 
 def _what(run: Run) -> str:
-    """Of a finding such as films/participant-1/trials/labels-200 or method/participant-1/prefft/labels-200."""
-    if run.kind in (RunKind.FILMS, RunKind.METHOD):
-        return "".join(run.workflow_id.split("/")[2:3])
-    return "whole" if "/whole-" in run.workflow_id else ""
+    """The subject of its key; clips of a scenario are the usual work of their kind."""
+    key = run_keys.read(run.workflow_id)
+    return "" if key is None or key.subject == SCENARIO else key.subject
+
+
+def _labels(run: Run) -> int | None:
+    key = run_keys.read(run.workflow_id)
+    return None if key is None else key.labels
 
 
 def _what_matters(kind: RunKind, settings: StudySettings) -> tuple[object, ...]:

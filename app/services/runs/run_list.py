@@ -8,7 +8,8 @@ from typing import NamedTuple, TypeVar
 from sqlalchemy import ColumnElement, func, or_, select
 from sqlalchemy.orm import Session
 
-from app.domain.models import Run, RunKind, RunStatus
+from app.domain import run_keys
+from app.domain.models import Run, RunStatus
 from app.domain.studies import Participant, Study
 
 
@@ -99,9 +100,6 @@ def _present_runs(session: Session, *which: ColumnElement[bool]) -> Sequence[Gla
 
 
 def _work_of(run: Run | Glance) -> str:
-    """What a later run of the same work makes good: of films and methods each has its own, and so has every export."""
-    if "/again-" in run.workflow_id:  # lost files made again, see worker.jobs.clips.repairs; the last number says when
-        return run.workflow_id.rpartition("-")[0]
-    if run.kind in (RunKind.METHOD, RunKind.FILMS):
-        return run.workflow_id.rpartition("/")[0]
-    return run.workflow_id if run.kind == RunKind.EXPORT else run.kind
+    """What a later run of the same work makes good."""
+    key = run_keys.read(run.workflow_id)
+    return run.workflow_id if key is None else str(key.series)

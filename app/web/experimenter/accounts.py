@@ -33,7 +33,7 @@ async def add_account(
 ) -> Response:
     """Add somebody and show their one-time password, this one time."""
     password = await studio.hashing_for_known.run(accounts.new_one_time_password)
-    async with studio.turns.writing() as session:
+    async with studio.session_queue.writing() as session:
         return await run_in_threadpool(_add, request, session, owner, name, role, password)
 
 
@@ -51,7 +51,7 @@ def _add(
 async def reset_account(request: Request, account_id: RowId, owner: OwnerBriefly, studio: StudioDep) -> Response:
     """A new one-time password; the old one and every login of the account end."""
     password = await studio.hashing_for_known.run(accounts.new_one_time_password)
-    async with studio.turns.writing() as session:
+    async with studio.session_queue.writing() as session:
         return await run_in_threadpool(_reset, request, session, owner, account_id, password)
 
 

@@ -60,7 +60,7 @@ def show_import(request: Request, experimenter: CurrentExperimenter) -> Response
 
 async def _may_import(request: Request, studio: StudioDep) -> Experimenter:
     """Checked before a byte of the upload is read, and without a session that lasts as long as the upload."""
-    async with studio.turns.reading() as session:
+    async with studio.session_queue.reading() as session:
         experimenter = await run_in_threadpool(experimenter_asking, request, session)
     roles.require(experimenter, Role.EXPERIMENTER)
     return experimenter
@@ -94,13 +94,13 @@ async def import_study(
     slug = imported.study.slug
     if not links:
         return RedirectResponse(request.app.url_path_for("show_study", slug=slug), HTTPStatus.SEE_OTHER)
-    key = studio.link_desk.leave(experimenter.id, links)
+    key = studio.new_links.leave(experimenter.id, links)
     return RedirectResponse(request.app.url_path_for("show_links", slug=slug, key=key), HTTPStatus.SEE_OTHER)
 
 
 async def _bring_in(studio: Studio, file: IO[bytes], seal_key: str, actor: str) -> Imported:
     unpacking = study_import.unpack(studio.store, file, seal_key)
-    async with contextmanager_in_threadpool(unpacking) as unpacked, studio.turns.writing() as session:
+    async with contextmanager_in_threadpool(unpacking) as unpacked, studio.session_queue.writing() as session:
         return await run_in_threadpool(study_import.bring_in, session, studio.store, unpacked, actor)
 
 

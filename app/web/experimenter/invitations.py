@@ -45,7 +45,7 @@ def add_participants(
     study = studies.find_study(session, slug)
     added = [enrolment.add_participant(session, study, experimenter.name) for _ in range(count)]
     links = [Link(participant.code, link_of(request, studio, token)) for participant, token in added]
-    return _see(request, "show_links", slug=slug, key=studio.link_desk.leave(experimenter.id, links))
+    return _see(request, "show_links", slug=slug, key=studio.new_links.leave(experimenter.id, links))
 
 
 @router.post("/{slug}/participants/{code}/link", name="renew_link")
@@ -62,7 +62,7 @@ def renew_link(
     participant = enrolment.find_by_code(session, study, code)
     token = enrolment.renew_link(session, study, participant, experimenter.name)
     links = [Link(participant.code, link_of(request, studio, token))]
-    return _see(request, "show_links", slug=slug, key=studio.link_desk.leave(experimenter.id, links))
+    return _see(request, "show_links", slug=slug, key=studio.new_links.leave(experimenter.id, links))
 
 
 @router.get("/{slug}/links/{key}", name="show_links")
@@ -78,7 +78,7 @@ def show_links(
     context = {
         "study": studies.find_study(session, slug),
         "experimenter": experimenter,
-        "links": studio.link_desk.pick_up(experimenter.id, key),
+        "links": studio.new_links.pick_up(experimenter.id, key),
         "key": key,
     }
     return page(request, "experimenter/links.html", context)
@@ -94,7 +94,7 @@ def show_sheet(
     studio: StudioDep,
 ) -> Response:
     """A card for each participant, with code, link and QR code: to print and to cut."""
-    links = studio.link_desk.pick_up(experimenter.id, key)
+    links = studio.new_links.pick_up(experimenter.id, key)
     context = {
         "study": studies.find_study(session, slug),
         "cards": [(link, _qr_code(link.url)) for link in links],
@@ -107,7 +107,7 @@ def show_sheet(
 def download_links(slug: Slug, key: LinkKey, experimenter: CurrentExperimenter, studio: StudioDep) -> Response:
     """Codes and links as a file that spreadsheets and mail programs read."""
     headers = {"content-disposition": f'attachment; filename="{slug}-links.csv"'}
-    links = studio.link_desk.pick_up(experimenter.id, key)
+    links = studio.new_links.pick_up(experimenter.id, key)
     return Response(_as_csv(links), media_type="text/csv; charset=utf-8", headers=headers)
 
 

@@ -29,7 +29,7 @@ async def redrawn_parts(request: Request, studio: Studio, draw: Draw) -> AsyncIt
     """An endless stream of what changed. Ends when the login or the page does, or the server stops."""
     sent: Mapping[str, Pieces] = {}
     loop, asked_at_s = asyncio.get_running_loop(), 0.0
-    with studio.screens.watching(f"{request.url.path}?{request.url.query}", draw) as screen:
+    with studio.shared_pages.watching(f"{request.url.path}?{request.url.query}", draw) as screen:
         while not studio.closing.is_set() and not screen.ended:
             drawn, parts = screen.drawn, screen.parts
             changes = list(_changes(sent, parts))

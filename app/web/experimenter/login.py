@@ -93,14 +93,14 @@ async def change_password(
         status = error.status if isinstance(error, TooManyAttempts) else HTTPStatus.UNPROCESSABLE_ENTITY
         context = {"experimenter": experimenter, "error": error.message}
         return page(request, "experimenter/password.html", context, status)
-    async with studio.turns.writing() as session:
+    async with studio.session_queue.writing() as session:
         changed = await run_in_threadpool(accounts.set_password, session, experimenter, password_hash)
     return await _enter(request, studio, changed, _inside(""), "logged in with the new password")
 
 
 async def _verified(request: Request, studio: Studio, name: str, password: str) -> Experimenter:
     """Raises WrongNameOrPassword and TooManyAttempts."""
-    async with studio.turns.reading() as session:
+    async with studio.session_queue.reading() as session:
         account = await run_in_threadpool(accounts.by_name, session, name)
     browser = known_browsers.name_in(request.cookies.get(KNOWN_BROWSER_COOKIE, ""), account)
     _count_attempt(request, studio, name, browser)
@@ -117,7 +117,7 @@ def _count_attempt(request: Request, studio: Studio, account: str, browser: str 
 async def _enter(request: Request, studio: Studio, experimenter: Experimenter, target: str, act: str) -> Response:
     """Raises WrongNameOrPassword when the password was replaced while it was being checked."""
     lifetime = timedelta(hours=studio.settings.login_hours)
-    async with studio.turns.writing() as session:
+    async with studio.session_queue.writing() as session:
         cookie = await run_in_threadpool(_open_session, session, experimenter, lifetime, act)
     response = RedirectResponse(target or request.app.url_path_for("show_studies"), HTTPStatus.SEE_OTHER)
     set_cookie(response, studio.settings, EXPERIMENTER_COOKIE, cookie, lifetime)

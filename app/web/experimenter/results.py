@@ -219,7 +219,7 @@ def download_table(
         found = studies.find_study(later, slug)
         return _handfuls(write(export_tables.BY_NAME[table], later, found, provenance))
 
-    return StreamingResponse(spooled(studio.turns, lines), media_type=MEDIA_TYPES[kind], headers=headers)
+    return StreamingResponse(spooled(studio.session_queue, lines), media_type=MEDIA_TYPES[kind], headers=headers)
 
 
 def _handfuls(lines: Iterator[str]) -> Iterator[str]:

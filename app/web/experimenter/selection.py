@@ -56,7 +56,7 @@ def renew_links(
     for participant in _ticked(session, study, code):
         token = enrolment.renew_link(session, study, participant, experimenter.name)
         links.append(Link(participant.code, link_of(request, studio, token)))
-    key = studio.link_desk.leave(experimenter.id, links)
+    key = studio.new_links.leave(experimenter.id, links)
     address = request.app.url_path_for("show_links", slug=slug, key=key)
     return RedirectResponse(address, HTTPStatus.SEE_OTHER)
 

@@ -20,11 +20,11 @@ from app.services.monitoring.tallies import Tallies
 from app.settings import Settings
 from app.storage import ArtefactStore
 from app.web.http.hashing import Hashing
-from app.web.http.import_limit import ImportDesk
-from app.web.http.new_links import LinkDesk
+from app.web.http.import_limit import ImportLimit
+from app.web.http.new_links import NewLinks
 from app.web.http.rate_limit import LoginAttempts
-from app.web.http.session_queue import Turns
-from app.web.http.shared_pages import Screens
+from app.web.http.session_queue import SessionQueue
+from app.web.http.shared_pages import SharedPages
 
 PARTICIPANT_COOKIE = "studio_participant"
 EXPERIMENTER_COOKIE = "studio_experimenter"
@@ -64,16 +64,16 @@ class Studio:
     settings: Settings
     database: Database
     store: ArtefactStore
-    turns: Turns
+    session_queue: SessionQueue
     login_attempts: LoginAttempts
-    screens: Screens
+    shared_pages: SharedPages
     token_attempts: LoginAttempts
     """Of their own: a program with an old token must not lock out the people who log in from the same address."""
     hashing: Hashing = field(default_factory=Hashing)
     hashing_for_known: Hashing = field(default_factory=Hashing)
     """For people whose browser is known or who are logged in: they do not queue behind strangers who guess."""
-    link_desk: LinkDesk = field(default_factory=LinkDesk)
-    imports: ImportDesk = field(default_factory=ImportDesk)
+    new_links: NewLinks = field(default_factory=NewLinks)
+    imports: ImportLimit = field(default_factory=ImportLimit)
     tallies: Tallies = field(default_factory=Tallies)
     closing: Event = field(default_factory=Event)
     """Set when the server is asked to stop, so that open event streams end by themselves."""
@@ -89,12 +89,12 @@ StudioDep = Annotated[Studio, Depends(studio_of)]
 
 
 async def _reading_session(studio: StudioDep) -> AsyncIterator[Session]:
-    async with studio.turns.reading() as session:
+    async with studio.session_queue.reading() as session:
         yield session
 
 
 async def _writing_session(studio: StudioDep) -> AsyncIterator[Session]:
-    async with studio.turns.writing() as session:
+    async with studio.session_queue.writing() as session:
         yield session
 
 
@@ -151,12 +151,12 @@ def _owner(request: Request, session: ReadingSession) -> Experimenter:
 
 
 async def _owner_briefly(request: Request, studio: StudioDep) -> Experimenter:
-    async with studio.turns.reading() as session:
+    async with studio.session_queue.reading() as session:
         return await run_in_threadpool(_owner, request, session)
 
 
 async def _logged_in_briefly(request: Request, studio: StudioDep) -> Experimenter:
-    async with studio.turns.reading() as session:
+    async with studio.session_queue.reading() as session:
         return await run_in_threadpool(experimenter_logged_in, request, session)
 
 

@@ -15,7 +15,7 @@ class TooManyImports(AppError):
     status = HTTPStatus.SERVICE_UNAVAILABLE
 
 
-class ImportDesk:
+class ImportLimit:
     """Places for uploads, all in one event loop."""
 
     def __init__(self) -> None:

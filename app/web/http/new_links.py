@@ -17,7 +17,7 @@ class Link:
     url: str
 
 
-class LinkDesk:
+class NewLinks:
     """Links wait here between the form that made them and the page that shows them, and are forgotten soon after."""
 
     def __init__(self) -> None:

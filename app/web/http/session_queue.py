@@ -20,7 +20,7 @@ WRITERS = 8
 """Both together stay below SQLAlchemy's default of 15 connections."""
 
 
-class Turns:
+class SessionQueue:
     """Sessions on the database for requests, a limited number at a time and first come, first served."""
 
     def __init__(self, database: Database) -> None:

@@ -32,7 +32,7 @@ Pieces = Sequence[str]
 _ROW = re.compile(r"(?=<[a-z]+\b[^>]*\bdata-row=)")
 
 
-class Screens:
+class SharedPages:
     """The pages that somebody looks at, each drawn once for all who do."""
 
     def __init__(self, database: Database) -> None:

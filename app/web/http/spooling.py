@@ -13,16 +13,16 @@ from typing import IO
 from fastapi.concurrency import run_in_threadpool
 from sqlalchemy.orm import Session
 
-from app.web.http.session_queue import Turns
+from app.web.http.session_queue import SessionQueue
 
 CHUNK_BYTES = 64 * 1024
 
 
-async def spooled(turns: Turns, texts: Callable[[Session], Iterator[str]]) -> AsyncIterator[bytes]:
+async def spooled(session_queue: SessionQueue, texts: Callable[[Session], Iterator[str]]) -> AsyncIterator[bytes]:
     """What ``texts`` yields, sent while it is still being written. Writing stops when nobody reads any more."""
     file = tempfile.TemporaryFile()  # noqa: SIM115  (closed when its writer has ended, which may be later)
     written, gone = asyncio.Event(), threading.Event()
-    writer = asyncio.create_task(_write(turns, texts, file, written, gone))
+    writer = asyncio.create_task(_write(session_queue, texts, file, written, gone))
     writer.add_done_callback(lambda _: written.set())
     try:
         offset, finished = 0, False
@@ -40,7 +40,7 @@ async def spooled(turns: Turns, texts: Callable[[Session], Iterator[str]]) -> As
 
 
 async def _write(
-    turns: Turns,
+    session_queue: SessionQueue,
     texts: Callable[[Session], Iterator[str]],
     file: IO[bytes],
     written: asyncio.Event,
@@ -56,5 +56,5 @@ async def _write(
             file.flush()
             loop.call_soon_threadsafe(written.set)
 
-    async with turns.reading() as session:
+    async with session_queue.reading() as session:
         await run_in_threadpool(write, session)

@@ -5,7 +5,7 @@ Three kinds of runs: ``before-after`` (the participant's robot beside the refere
 """
 
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from sqlalchemy import select
@@ -14,21 +14,22 @@ from sqlalchemy.orm import Session
 from app.domain.evaluation import Controller, Film, Trial
 from app.domain.models import Model, ModelKind, RunKind
 from app.domain.protocol import EvaluatedMethod, EvaluationMode
+from app.domain.run_keys import BEFORE_AFTER, CONTROLLERS, TRIALS, RunKey
 from app.domain.studies import Participant, Study
 from app.services.evaluation import evaluation_plan
 from worker.compute import baseline_fitting, simulation
 from worker.compute.pools import Lane
 from worker.compute.simulation import RecordedClip
 from worker.jobs.clips import repairs
+from worker.jobs.clips.stored_video import video_columns
 from worker.jobs.learning import baselines
 from worker.jobs.learning.filters import NothingToLearnFrom
 from worker.jobs.runtime import due_work, records
-from worker.jobs.runtime.context import Step, Workplace
+from worker.jobs.runtime.context import Step, WorkerContext
 from worker.jobs.runtime.records import Job
 
 AT_A_TIME = 2
 """Films between two marks of progress."""
-BEFORE_AFTER, TRIALS, CONTROLLERS = "before-after", "trials", "controllers"
 
 
 @dataclass(frozen=True)
@@ -40,54 +41,51 @@ class Robot:
     controller: bytes
 
 
-def due(
-    study: Study, participant_id: int, ending: str, succeeded: Collection[str], robots_shown: bool = False
-) -> list[Job]:
-    """What is to be filmed or packed for somebody whose last filter is there. ``ending``: labels and last answer.
+def due(study: Study, reward: RunKey, succeeded: Collection[str], robots_shown: bool = False) -> list[Job]:
+    """What is to be filmed or packed for somebody whose last filter is there. ``reward``: their last model's.
 
     ``robots_shown``: they have begun to rate, so that what they rate stays.
     """
     wanted = [BEFORE_AFTER] if study.material is None else []
     settings = None if robots_shown else evaluation_plan.settings_of(study)
-    if settings and baselines.all_trained(study, participant_id, ending, succeeded):
+    if settings and baselines.all_trained(study, reward, succeeded):
         wanted.append(TRIALS if settings.mode is EvaluationMode.VIDEO else CONTROLLERS)
-    labels = study.settings.labels_per_participant
     return [
-        Job(f"films/participant-{participant_id}/{what}/{ending}", RunKind.FILMS, study.id, participant_id, labels)
+        Job(replace(reward, kind=RunKind.FILMS, subject=what), study.id)
         for what in reversed(wanted)  # the debrief comes last
     ]
 
 
-def make_films(place: Workplace, job: Job, run_id: int, step: Step) -> None:
+def make_films(context: WorkerContext, job: Job, run_id: int, step: Step) -> None:
     """Make what the job names; a killed worker loses two films at most."""
     if repairs.is_about(job):
-        repairs.make_again(place, job, run_id, step)
+        repairs.make_again(context, job, run_id, step)
         return
-    what = job.finding.split("/")[2]
-    shots = step("plan", _plan, place, job, what)
+    what = job.about.subject
+    shots = step("plan", _plan, context, job, what)
     for first in range(0, len(shots), AT_A_TIME):
-        if step(f"is-outdated-{first}", _is_outdated, place, job):
+        if step(f"is-outdated-{first}", _is_outdated, context, job):
             return
-        place.report(run_id, f"{_DOING[what]} {first + 1} of {len(shots)}", first / len(shots))
+        context.report(run_id, f"{_DOING[what]} {first + 1} of {len(shots)}", first / len(shots))
         some = shots[first : first + AT_A_TIME]
-        step(f"shots-{first}", _pack if what == CONTROLLERS else _film, place, run_id, job, some)
+        step(f"shots-{first}", _pack if what == CONTROLLERS else _film, context, run_id, job, some)
 
 
 _DOING = {BEFORE_AFTER: "filming before and after,", TRIALS: "filming robot", CONTROLLERS: "packing robot"}
 
 
-def _is_outdated(place: Workplace, job: Job) -> bool:
-    with place.database.reading() as session:
+def _is_outdated(context: WorkerContext, job: Job) -> bool:
+    with context.database.reading() as session:
         return due_work.is_outdated(session, job)
 
 
-def _plan(place: Workplace, job: Job, what: str) -> list[list[Any]]:
+def _plan(context: WorkerContext, job: Job, what: str) -> list[list[Any]]:
     """[method, model, scenario] of every film in the order of showing, or [method, model, letter] of every controller.
 
     Draws the evaluation if need be. Whoever has begun to watch sees the models they began with to the end. Controllers
     come in an order of their own: which was made when then tells nothing of the key.
     """
-    with place.database.writing() as session:
+    with context.database.writing() as session:
         study, participant = session.get_one(Study, job.study_id), session.get_one(Participant, job.participant)
         if what == BEFORE_AFTER:
             methods = (EvaluatedMethod.REFERENCE.value, EvaluatedMethod.PBARL.value)
@@ -115,18 +113,18 @@ def _newest_model(session: Session, participant_id: int, method: str) -> int | N
         own = records.newest_model(session, participant_id, ModelKind.FILTER)
         found = None if own is None else own.id
     else:
-        rival = baselines.newest(session, participant_id, method)
-        found = None if rival is None else rival[0]
+        baseline = baselines.newest(session, participant_id, method)
+        found = None if baseline is None else baseline[0]
     if found is None:
         raise NothingToLearnFrom
     return found
 
 
-def _film(place: Workplace, run_id: int, job: Job, shots: list[list[Any]]) -> None:
-    task = _task(place, job)
+def _film(context: WorkerContext, run_id: int, job: Job, shots: list[list[Any]]) -> None:
+    task = _task(context, job)
     wanted = dict.fromkeys((method, model_id) for method, model_id, _ in shots)
-    robots = {method: _robot(place, run_id, task, method, model_id) for method, model_id in wanted}
-    with place.database.reading() as session:
+    robots = {method: _robot(context, run_id, task, method, model_id) for method, model_id in wanted}
+    with context.database.reading() as session:
         quality = session.get_one(Study, job.study_id).settings.clip_quality.value
         missing = [
             (robots[method], scenario)
@@ -134,20 +132,20 @@ def _film(place: Workplace, run_id: int, job: Job, shots: list[list[Any]]) -> No
             if evaluation_plan.film_of(session, job.participant, method, scenario, model_id) is None
         ]
     arguments = [(task, quality, robot.controller, scenario) for robot, scenario in missing]
-    recorded = place.compute.run_all(Lane.CLIPS, place.beat(run_id), simulation.film, arguments)
-    files = [_stored(place, each) for each in recorded]
-    with place.database.writing() as session:
+    recorded = context.compute.run_all(Lane.CLIPS, context.beat(run_id), simulation.film, arguments)
+    files = [_stored(context, each) for each in recorded]
+    with context.database.writing() as session:
         for (robot, scenario), columns in zip(missing, files, strict=True):
             _save(session, job.participant, robot, scenario, columns)
         for method, model_id, scenario in shots:
             _show(session, job.participant, method, scenario, model_id)
 
 
-def _stored(place: Workplace, recorded: RecordedClip) -> dict[str, Any]:
+def _stored(context: WorkerContext, recorded: RecordedClip) -> dict[str, Any]:
     return {
         "success": recorded.success,
-        "trajectory_sha256": place.store.put(recorded.trajectory),
-        **repairs.stored(place, recorded.clip),
+        "trajectory_sha256": context.store.put(recorded.trajectory),
+        **video_columns(context.store, recorded.clip),
     }
 
 
@@ -174,15 +172,15 @@ def _show(session: Session, participant_id: int, method: str, scenario: int, mod
             trial.film_id = film.id
 
 
-def _pack(place: Workplace, run_id: int, job: Job, shots: list[list[Any]]) -> None:
-    task = _task(place, job)
-    with place.database.reading() as session:
+def _pack(context: WorkerContext, run_id: int, job: Job, shots: list[list[Any]]) -> None:
+    task = _task(context, job)
+    with context.database.reading() as session:
         slug, code = session.get_one(Study, job.study_id).slug, session.get_one(Participant, job.participant).code
     for method, model_id, letter in shots:
-        robot = _robot(place, run_id, task, method, model_id)
+        robot = _robot(context, run_id, task, method, model_id)
         packed = baseline_fitting.packed(task, slug, code, letter, robot.controller)
-        artefact = place.store.put(packed)
-        with place.database.writing() as session:
+        artefact = context.store.put(packed)
+        with context.database.writing() as session:
             _keep_controller(session, job.participant, robot, artefact, len(packed))
 
 
@@ -199,20 +197,20 @@ def _keep_controller(session: Session, participant_id: int, robot: Robot, artefa
     known.model_id, known.artefact_sha256, known.byte_count = robot.model_id, artefact, byte_count
 
 
-def _robot(place: Workplace, run_id: int, task: str, method: str, model_id: int | None) -> Robot:
+def _robot(context: WorkerContext, run_id: int, task: str, method: str, model_id: int | None) -> Robot:
     """A model of the method as a controller."""
-    beat = place.beat(run_id)
+    beat = context.beat(run_id)
     if model_id is None:
         return Robot(
-            method, None, place.compute.run(Lane.LEARNING, beat, baseline_fitting.controller_of_reference, task)
+            method, None, context.compute.run(Lane.LEARNING, beat, baseline_fitting.controller_of_reference, task)
         )
-    with place.database.reading() as session:
-        stored = place.store.read(session.get_one(Model, model_id).artefact_sha256)
+    with context.database.reading() as session:
+        stored = context.store.read(session.get_one(Model, model_id).artefact_sha256)
     if method == EvaluatedMethod.PBARL:
-        stored = place.compute.run(Lane.LEARNING, beat, baseline_fitting.controller_of_filter, task, stored)
+        stored = context.compute.run(Lane.LEARNING, beat, baseline_fitting.controller_of_filter, task, stored)
     return Robot(method, model_id, stored)
 
 
-def _task(place: Workplace, job: Job) -> str:
-    with place.database.reading() as session:
+def _task(context: WorkerContext, job: Job) -> str:
+    with context.database.reading() as session:
         return session.get_one(Study, job.study_id).task

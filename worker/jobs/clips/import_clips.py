@@ -31,6 +31,7 @@ from app.services.archives import unpacking
 from app.services.participants import withdrawal
 from app.services.studies import studies
 from app.storage import ArtefactStore
+from worker.jobs.clips.stored_video import video_columns
 from worker.jobs.learning.dataset import IMPORTED
 from worker.jobs.runtime.context import NotingStore
 from worker.sim.render.video import PlayableVideo, playable
@@ -304,17 +305,7 @@ def _stored(store: ArtefactStore, own: OwnClip, recording: Recording, video: Pla
     recording.save(file)
     mode = {IMPORTED: {"video": own.video, "trajectory": own.trajectory, "label": own.label}}
     rollout = {"mode": mode, "trajectory_sha256": store.put(file.getvalue()), "success": recording.success}
-    clip = {
-        "first_step": 0,
-        "step_count": len(recording),
-        "video_sha256": store.put(video.video),
-        "poster_sha256": store.put(video.poster),
-        "width": video.width,
-        "height": video.height,
-        "fps": video.fps,
-        "duration_ms": video.duration_ms,
-        "byte_count": len(video.video),
-    }
+    clip = {"first_step": 0, "step_count": len(recording), **video_columns(store, video)}
     columns = recording.observations.shape[1], recording.actions.shape[1]
     return _Ready(own.scenario, rollout, clip, len(recording), columns)
 

@@ -2,70 +2,69 @@
 
 from typing import Any
 
+from app.domain.run_keys import WHOLE
 from app.domain.studies import Study
 from worker.compute import simulation
 from worker.compute.pools import Lane
 from worker.jobs.clips import repairs
+from worker.jobs.clips.stored_video import video_columns
 from worker.jobs.runtime import records
-from worker.jobs.runtime.context import Step, Workplace
+from worker.jobs.runtime.context import Step, WorkerContext
 from worker.jobs.runtime.records import Job
 from worker.sim.render.clip import RenderedClip
 
-WHOLE = "whole"
-"""In the name of a finding: whole episodes of the scenario's rollouts are missing, for the introduction."""
 AT_A_TIME = 2
 """Two clips already make a pair that can be labelled."""
 
 
-def build_clips(place: Workplace, job: Job, run_id: int, step: Step) -> None:
+def build_clips(context: WorkerContext, job: Job, run_id: int, step: Step) -> None:
     """Film what is still missing of the scenario that the job names: clips, or whole episodes."""
     if repairs.is_about(job):
-        repairs.make_again(place, job, run_id, step)
+        repairs.make_again(context, job, run_id, step)
         return
-    what, number = job.finding.rsplit("/", 1)[1].rsplit("-", 1)
-    film = _film_whole if what == WHOLE else _film
-    with place.database.reading() as session:
+    film = _film_whole if job.about.subject == WHOLE else _film
+    with context.database.reading() as session:
         count = session.get_one(Study, job.study_id).settings.behaviours_per_scenario
     for first in range(0, count, AT_A_TIME):
         which = list(range(first, min(first + AT_A_TIME, count)))
-        place.report(run_id, f"filming behaviours {which[0] + 1} to {which[-1] + 1} of {count}", first / count)
-        step(f"film-{first}", film, place, run_id, job.study_id, int(number), which)
+        context.report(run_id, f"filming behaviours {which[0] + 1} to {which[-1] + 1} of {count}", first / count)
+        step(f"film-{first}", film, context, run_id, job.study_id, job.number, which)
 
 
-def _film(place: Workplace, run_id: int, study_id: int, scenario: int, which: list[int]) -> None:
-    with place.database.reading() as session:
+def _film(context: WorkerContext, run_id: int, study_id: int, scenario: int, which: list[int]) -> None:
+    with context.database.reading() as session:
         study = session.get_one(Study, study_id)
         task, settings = study.task, study.settings
     behaviours = simulation.behaviours(task, scenario, settings.behaviours_per_scenario)
     quality = settings.clip_quality.value
     shots = [(task, quality, scenario, behaviours[index], 0, settings.clip_steps) for index in which]
-    recorded = place.compute.run_all(Lane.CLIPS, place.beat(run_id), simulation.record_clip, shots)
+    recorded = context.compute.run_all(Lane.CLIPS, context.beat(run_id), simulation.record_clip, shots)
     for index, each in zip(which, recorded, strict=True):
         rollout = {
             "scenario": scenario,
             "behaviour": index,
             "mode": behaviours[index].described(),
-            "trajectory_sha256": place.store.put(each.trajectory),
+            "trajectory_sha256": context.store.put(each.trajectory),
             "success": each.success,
         }
-        clip = _columns(place, each.clip, settings.clip_steps)
-        with place.database.writing() as session:
+        clip = _columns(context, each.clip, settings.clip_steps)
+        with context.database.writing() as session:
             records.save_clip(session, study_id, rollout, clip)
 
 
-def _film_whole(place: Workplace, run_id: int, study_id: int, scenario: int, which: list[int]) -> None:
+def _film_whole(context: WorkerContext, run_id: int, study_id: int, scenario: int, which: list[int]) -> None:
     """The same rollouts again, from beginning to end."""
-    with place.database.reading() as session:
+    with context.database.reading() as session:
         study = session.get_one(Study, study_id)
         steps, quality = study.whole_clip_steps or 0, study.settings.clip_quality.value
         rollouts = records.rollouts_of(session, study_id, scenario, which)
-    shots = [(quality, place.store.read(rollout.trajectory_sha256), 0, steps) for rollout in rollouts]
-    filmed = place.compute.run_all(Lane.CLIPS, place.beat(run_id), simulation.film_again, shots)
+    shots = [(quality, context.store.read(rollout.trajectory_sha256), 0, steps) for rollout in rollouts]
+    filmed = context.compute.run_all(Lane.CLIPS, context.beat(run_id), simulation.film_again, shots)
     for rollout, each in zip(rollouts, filmed, strict=True):
-        clip = _columns(place, each, steps)
-        with place.database.writing() as session:
+        clip = _columns(context, each, steps)
+        with context.database.writing() as session:
             records.save_clip(session, study_id, {"scenario": scenario, "behaviour": rollout.behaviour}, clip)
 
 
-def _columns(place: Workplace, clip: RenderedClip, steps: int) -> dict[str, Any]:
-    return {"first_step": 0, "step_count": steps, **repairs.stored(place, clip)}
+def _columns(context: WorkerContext, clip: RenderedClip, steps: int) -> dict[str, Any]:
+    return {"first_step": 0, "step_count": steps, **video_columns(context.store, clip)}

@@ -16,17 +16,15 @@ from app.domain.clips import Clip, Rollout
 from app.domain.evaluation import Film
 from app.domain.models import RunKind
 from app.domain.preferences import LabelEvent, Query
+from app.domain.run_keys import AGAIN, RunKey
 from app.domain.studies import Participant, Study
 from app.errors import AppError
 from worker.compute import simulation
 from worker.compute.pools import Lane
-from worker.jobs.runtime.context import Step, Workplace
+from worker.jobs.clips.stored_video import video_columns
+from worker.jobs.runtime.context import Step, WorkerContext
 from worker.jobs.runtime.records import Job
-from worker.sim.render.clip import RenderedClip
 from worker.trajectory import Trajectory
-
-AGAIN = "again"
-"""In the name of a finding: files of a rollout or film were lost at that moment."""
 
 
 class NotTheSameAgain(AppError):
@@ -54,83 +52,69 @@ def due(session: Session, study: Study, lost: Mapping[str, int]) -> list[Job]:
     for rollout, *hashes in session.execute(pool):
         stamps[rollout] = max(stamps.get(rollout, 0), *(lost.get(sha256, 0) for sha256 in hashes))
     jobs = [
-        Job(f"clips/study-{study.id}/{AGAIN}-{rollout}-{stamp}", RunKind.CLIPS, study.id)
+        Job(RunKey(RunKind.CLIPS, study.id, subject=AGAIN, number=rollout, mark=str(stamp)), study.id)
         for rollout, stamp in stamps.items()
     ]
     for film, person, *hashes in session.execute(films):
         stamp = max(lost.get(sha256, 0) for sha256 in hashes)
-        name = f"films/participant-{person}/{AGAIN}-{film}-{stamp}"
-        jobs.append(Job(name, RunKind.FILMS, study.id, person))
+        key = RunKey(RunKind.FILMS, participant_id=person, subject=AGAIN, number=film, mark=str(stamp))
+        jobs.append(Job(key, study.id))
     return jobs
 
 
 def is_about(job: Job) -> bool:
     """Whether the job makes something again."""
-    return job.finding.rsplit("/", 1)[1].startswith(f"{AGAIN}-")
+    return job.about.subject == AGAIN
 
 
-def make_again(place: Workplace, job: Job, run_id: int, step: Step) -> None:
+def make_again(context: WorkerContext, job: Job, run_id: int, step: Step) -> None:
     """Make the lost files of the rollout or film that the job names. Raises NotTheSameAgain and FilmLost."""
-    number = int(job.finding.rsplit("/", 1)[1].split("-")[1])
-    place.report(run_id, "making lost files again", 0.0)
-    step(AGAIN, _film_again if job.kind == RunKind.FILMS else _clips_again, place, run_id, number)
+    context.report(run_id, "making lost files again", 0.0)
+    step(AGAIN, _film_again if job.kind == RunKind.FILMS else _clips_again, context, run_id, job.number)
 
 
-def stored(place: Workplace, clip: RenderedClip) -> dict[str, Any]:
-    """The columns of a clip or film that are about its video, once its files are stored."""
-    return {
-        "video_sha256": place.store.put(clip.video),
-        "poster_sha256": place.store.put(clip.poster),
-        "width": clip.width,
-        "height": clip.height,
-        "fps": clip.fps,
-        "duration_ms": clip.duration_ms,
-        "byte_count": len(clip.video),
-    }
-
-
-def _clips_again(place: Workplace, run_id: int, rollout_id: int) -> None:
-    with place.database.reading() as session:
+def _clips_again(context: WorkerContext, run_id: int, rollout_id: int) -> None:
+    with context.database.reading() as session:
         rollout = session.get_one(Rollout, rollout_id)
         clips = session.scalars(select(Clip).where(Clip.rollout_id == rollout_id)).all()
         may_differ = not _answered(session, clips)
         study = session.get_one(Study, rollout.study_id)
         task, settings, quality = study.task, study.settings, study.settings.clip_quality.value
-    whole = place.store.has(rollout.trajectory_sha256)
+    whole = context.store.has(rollout.trajectory_sha256)
     if whole:
-        trajectory = place.store.read(rollout.trajectory_sha256)
+        trajectory = context.store.read(rollout.trajectory_sha256)
     else:
         drawn = simulation.behaviours(task, rollout.scenario, settings.behaviours_per_scenario)[rollout.behaviour]
         shot = (task, quality, rollout.scenario, drawn, 0, settings.clip_steps)
-        trajectory = place.compute.run(Lane.CLIPS, place.beat(run_id), simulation.record_clip, *shot).trajectory
+        trajectory = context.compute.run(Lane.CLIPS, context.beat(run_id), simulation.record_clip, *shot).trajectory
     sha256 = hashlib.sha256(trajectory).hexdigest()
     if sha256 != rollout.trajectory_sha256 and not may_differ:
         raise NotTheSameAgain
-    lost = [clip for clip in clips if sha256 != rollout.trajectory_sha256 or not _is_whole(place, clip)]
+    lost = [clip for clip in clips if sha256 != rollout.trajectory_sha256 or not _is_whole(context, clip)]
     shots = [(quality, trajectory, clip.first_step, clip.step_count) for clip in lost]
-    filmed = place.compute.run_all(Lane.CLIPS, place.beat(run_id), simulation.film_again, shots)
-    place.store.put(trajectory)
-    columns = [stored(place, each) for each in filmed]
+    filmed = context.compute.run_all(Lane.CLIPS, context.beat(run_id), simulation.film_again, shots)
+    context.store.put(trajectory)
+    columns = [video_columns(context.store, each) for each in filmed]
     success = Trajectory.load(io.BytesIO(trajectory)).success
-    with place.database.writing() as session:
+    with context.database.writing() as session:
         again = session.get_one(Rollout, rollout_id)
         again.trajectory_sha256, again.success = sha256, success
         for clip, each in zip(lost, columns, strict=True):
             _change(session.get_one(Clip, clip.id), each)
 
 
-def _film_again(place: Workplace, run_id: int, film_id: int) -> None:
-    with place.database.reading() as session:
+def _film_again(context: WorkerContext, run_id: int, film_id: int) -> None:
+    with context.database.reading() as session:
         film = session.get_one(Film, film_id)
         study = session.get_one(Study, session.get_one(Participant, film.participant_id).study_id)
         quality = study.settings.clip_quality.value
-    if not place.store.has(film.trajectory_sha256):
+    if not context.store.has(film.trajectory_sha256):
         raise FilmLost
-    trajectory = place.store.read(film.trajectory_sha256)
+    trajectory = context.store.read(film.trajectory_sha256)
     steps = len(Trajectory.load(io.BytesIO(trajectory)))
-    filmed = place.compute.run(Lane.CLIPS, place.beat(run_id), simulation.film_again, quality, trajectory, 0, steps)
-    columns = stored(place, filmed)
-    with place.database.writing() as session:
+    filmed = context.compute.run(Lane.CLIPS, context.beat(run_id), simulation.film_again, quality, trajectory, 0, steps)
+    columns = video_columns(context.store, filmed)
+    with context.database.writing() as session:
         _change(session.get_one(Film, film_id), columns)
 
 
@@ -139,8 +123,8 @@ def _change(row: Clip | Film, columns: Mapping[str, Any]) -> None:
         setattr(row, name, value)
 
 
-def _is_whole(place: Workplace, clip: Clip) -> bool:
-    return place.store.has(clip.video_sha256) and place.store.has(clip.poster_sha256)
+def _is_whole(context: WorkerContext, clip: Clip) -> bool:
+    return context.store.has(clip.video_sha256) and context.store.has(clip.poster_sha256)
 
 
 def _answered(session: Session, clips: Sequence[Clip]) -> bool:

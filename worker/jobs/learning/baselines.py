@@ -7,6 +7,7 @@ participant's, so a killed worker goes on where it was; the folder is removed at
 import shutil
 import time
 from collections.abc import Callable, Collection
+from dataclasses import replace
 from pathlib import Path
 
 from sqlalchemy.orm import Session
@@ -14,20 +15,21 @@ from sqlalchemy.orm import Session
 from app.domain.choices import RewardKind
 from app.domain.models import ModelKind, RunKind
 from app.domain.protocol import EvaluatedMethod
+from app.domain.run_keys import RunKey
 from app.domain.studies import Participant, Study
 from app.services.evaluation import evaluation_plan
 from worker.analysis.evaluation import evaluate
 from worker.compute import baseline_fitting, learning
-from worker.compute.baseline_fitting import Rival
+from worker.compute.baseline_fitting import Baseline
 from worker.compute.pools import Lane
 from worker.jobs.learning import dataset
-from worker.jobs.learning.filters import NothingToLearnFrom
+from worker.jobs.learning.filters import NothingToLearnFrom, reward_to_follow
 from worker.jobs.runtime import due_work, records
-from worker.jobs.runtime.context import Step, Workplace
+from worker.jobs.runtime.context import Step, WorkerContext
 from worker.jobs.runtime.records import Job
-from worker.ml.filters import filter_problem
 from worker.ml.policies.checkpoint import ask_to_pause, share_done
 from worker.ml.rewards.reward_models import load_reward_model
+from worker.scenarios import EVALUATION, first_of
 from worker.trajectory import Trajectory
 
 CHUNK = 10
@@ -36,112 +38,102 @@ TRAINING_SHARE = 0.9
 """Of the progress; the rest is the drive through unseen scenarios."""
 
 
-def due(study: Study, participant_id: int, ending: str) -> list[Job]:
-    """What is to be trained for somebody whose last reward model is there. ``ending``: labels and last answer."""
+def due(study: Study, reward: RunKey) -> list[Job]:
+    """What is to be trained for somebody whose last reward model, that of ``reward``, is there."""
     settings = evaluation_plan.settings_of(study)
-    labels = study.settings.labels_per_participant
     return [
-        Job(finding(participant_id, method, ending), RunKind.METHOD, study.id, participant_id, labels)
+        Job(replace(reward, kind=RunKind.METHOD, subject=method), study.id)
         for method in (settings.methods if settings else ())
         if method in evaluation_plan.TRAINED
     ]
 
 
-def finding(participant_id: int, method: str, ending: str) -> str:
-    """The name of one training."""
-    return f"method/participant-{participant_id}/{method}/{ending}"
-
-
-def all_trained(study: Study, participant_id: int, ending: str, succeeded: Collection[str]) -> bool:
+def all_trained(study: Study, reward: RunKey, succeeded: Collection[str]) -> bool:
     """Whether everything that is due has been done."""
-    return all(job.finding in succeeded for job in due(study, participant_id, ending))
+    return all(job.key in succeeded for job in due(study, reward))
 
 
-def train_method(place: Workplace, job: Job, run_id: int, step: Step) -> None:
+def train_method(context: WorkerContext, job: Job, run_id: int, step: Step) -> None:
     """Train the method that the job names, drive it through unseen scenarios, and keep it."""
-    method = EvaluatedMethod(job.finding.split("/")[2])
-    reward = step("reward", _choose_reward, place, run_id, job)
-    trained = step("train", _train, place, run_id, job, method.value, reward)
+    method = EvaluatedMethod(job.about.subject)
+    reward = step("reward", _choose_reward, context, run_id, job)
+    trained = step("train", _train, context, run_id, job, method.value, reward)
     if not trained:
         return  # the last answer was given again, and the same method is due anew
-    step("save", _save, place, run_id, job, method.value, reward, trained)
+    step("save", _save, context, run_id, job, method.value, reward, trained)
 
 
-def _choose_reward(place: Workplace, run_id: int, job: Job) -> str:
-    with place.database.writing() as session:
-        model = records.newest_model(session, job.participant, ModelKind.REWARD)
-        if model is None:
-            raise NothingToLearnFrom
-        records.set_labels(session, run_id, model.label_count, model.label_hash)
-        return model.artefact_sha256
+def _choose_reward(context: WorkerContext, run_id: int, job: Job) -> str:
+    with context.database.writing() as session:
+        return reward_to_follow(session, run_id, job).artefact_sha256
 
 
-def _train(place: Workplace, run_id: int, job: Job, method: str, reward: str) -> dict[str, object]:
+def _train(context: WorkerContext, run_id: int, job: Job, method: str, reward: str) -> dict[str, object]:
     """The artefact of the finished controller, and what is to be said about it; empty when nobody needs it any more.
 
     A training makes room for that of somebody who waits, and goes on from its checkpoint afterwards.
     """
-    folder = _folder(place, job, run_id)
+    folder = _folder(context, job, run_id)
     folder.mkdir(parents=True, exist_ok=True)
-    rival = _rival(place, run_id, job, method, reward, folder)
+    baseline = _baseline(context, run_id, job, method, reward, folder)
 
     def beat() -> None:
         share = share_done(folder)
-        place.report(run_id, f"training a method to be evaluated, {share:.0%} done", TRAINING_SHARE * share)
-        if place.compute.is_needed_elsewhere(Lane.PATIENT) or _is_outdated(place, job):
+        context.report(run_id, f"training a method to be evaluated, {share:.0%} done", TRAINING_SHARE * share)
+        if context.compute.is_needed_elsewhere(Lane.PATIENT) or _is_outdated(context, job):
             ask_to_pause(folder)
 
     seconds = 0.0
-    while not _is_outdated(place, job):
-        fitted = place.compute.run(Lane.PATIENT, beat, baseline_fitting.fit, rival, folder)
+    while not _is_outdated(context, job):
+        fitted = context.compute.run(Lane.PATIENT, beat, baseline_fitting.fit, baseline, folder)
         seconds += fitted.seconds
         if fitted.controller is not None:
-            return {"artefact": place.store.put(fitted.controller), "notes": list(fitted.notes), "seconds": seconds}
+            return {"artefact": context.store.put(fitted.controller), "notes": list(fitted.notes), "seconds": seconds}
     shutil.rmtree(folder, ignore_errors=True)
     return {}
 
 
-def _is_outdated(place: Workplace, job: Job) -> bool:
-    with place.database.reading() as session:
+def _is_outdated(context: WorkerContext, job: Job) -> bool:
+    with context.database.reading() as session:
         return due_work.is_outdated(session, job)
 
 
-def _rival(place: Workplace, run_id: int, job: Job, method: str, reward: str, folder: Path) -> Rival:
-    with place.database.reading() as session:
+def _baseline(context: WorkerContext, run_id: int, job: Job, method: str, reward: str, folder: Path) -> Baseline:
+    with context.database.reading() as session:
         study = session.get_one(Study, job.study_id)
         settings = evaluation_plan.settings_of(study)
         seed = session.get_one(Participant, job.participant).seed
         labels = records.seen_labels(session, run_id).label_count
     needs_actions = method == EvaluatedMethod.PBARL_PRINTED
-    return Rival(
+    return Baseline(
         task=study.task,
         method=method,
-        reward=place.store.read(reward),
-        action_reward=_action_reward(place, run_id, job, reward, folder) if needs_actions else b"",
+        reward=context.store.read(reward),
+        action_reward=_action_reward(context, run_id, job, reward, folder) if needs_actions else b"",
         labels=labels,
         seed=seed,
         fine_tuning_steps=settings.fine_tuning_steps if settings else 0,
     )
 
 
-def _action_reward(place: Workplace, run_id: int, job: Job, reward: str, folder: Path) -> bytes:
+def _action_reward(context: WorkerContext, run_id: int, job: Job, reward: str, folder: Path) -> bytes:
     """A reward model that can rate untried actions: the participant's own if it can, else one of the same labels."""
     kept = folder / "action_reward.safetensors"
-    with place.database.reading() as session:
+    with context.database.reading() as session:
         study = session.get_one(Study, job.study_id)
         seed = session.get_one(Participant, job.participant).seed
         if study.settings.reward_kind is not RewardKind.STRUCTURED:
-            return place.store.read(reward)
-        preferences = dataset.load_preferences(session, place.store, job.participant)
-        scale = dataset.signal_scale(session, place.store, job.study_id)
+            return context.store.read(reward)
+        preferences = dataset.load_preferences(session, context.store, job.participant)
+        scale = dataset.signal_scale(session, context.store, job.study_id)
     if kept.exists():
         return kept.read_bytes()
     if preferences.pairs is None:
         raise NothingToLearnFrom
-    place.report(run_id, "learning a reward model on states and actions", 0.01)
-    stored, _ = place.compute.run(
+    context.report(run_id, "learning a reward model on states and actions", 0.01)
+    stored, _ = context.compute.run(
         Lane.PATIENT,
-        place.beat(run_id),
+        context.beat(run_id),
         learning.fit_reward,
         study.task,
         RewardKind.MLP.value,
@@ -154,50 +146,50 @@ def _action_reward(place: Workplace, run_id: int, job: Job, reward: str, folder:
     return stored
 
 
-def _save(place: Workplace, run_id: int, job: Job, method: str, reward: str, trained: dict[str, object]) -> None:
+def _save(context: WorkerContext, run_id: int, job: Job, method: str, reward: str, trained: dict[str, object]) -> None:
     started = time.perf_counter()
-    with place.database.reading() as session:
+    with context.database.reading() as session:
         study = session.get_one(Study, job.study_id)
-    scenarios = filter_problem.scenarios_for("evaluation", study.settings.evaluation_scenarios)
-    model = place.store.read(str(trained["artefact"]))
+    scenarios = first_of(EVALUATION, study.settings.evaluation_scenarios)
+    model = context.store.read(str(trained["artefact"]))
 
     def beat_at(share: float) -> Callable[[], None]:
         words, done = "driving the method through unseen scenarios", TRAINING_SHARE + (1 - TRAINING_SHARE) * share
-        return lambda: place.report(run_id, words, done)
+        return lambda: context.report(run_id, words, done)
 
-    driven = _driven(place, study.task, model, scenarios, beat_at)
-    reference = _reference(place, study.task, scenarios, place.beat(run_id))
-    returns = load_reward_model(place.store.read(reward)).returns
+    driven = _driven(context, study.task, model, scenarios, beat_at)
+    reference = _reference(context, study.task, scenarios, context.beat(run_id))
+    returns = load_reward_model(context.store.read(reward)).returns
     metrics = {
         "method": method,
         "evaluation": evaluate(reference, driven, returns(reference), returns(driven)),
         "notes": trained["notes"],
         "seconds": {"fit": trained["seconds"], "evaluation": round(time.perf_counter() - started, 1)},
     }
-    with place.database.writing() as session:
+    with context.database.writing() as session:
         records.save_model(session, run_id, ModelKind.METHOD, str(trained["artefact"]), metrics)
-    shutil.rmtree(_folder(place, job, run_id), ignore_errors=True)
+    shutil.rmtree(_folder(context, job, run_id), ignore_errors=True)
 
 
 def _driven(
-    place: Workplace, task: str, model: bytes, scenarios: range, beat_at: Callable[[float], Callable[[], None]]
+    context: WorkerContext, task: str, model: bytes, scenarios: range, beat_at: Callable[[float], Callable[[], None]]
 ) -> list[Trajectory]:
     driven: list[Trajectory] = []
     for first in range(0, len(scenarios), CHUNK):
         beat = beat_at(first / len(scenarios))
-        driven += place.compute.run(
+        driven += context.compute.run(
             Lane.PATIENT, beat, baseline_fitting.drive, task, model, scenarios[first : first + CHUNK]
         )
     return driven
 
 
-def _reference(place: Workplace, task: str, scenarios: range, beat: Callable[[], None]) -> list[Trajectory]:
+def _reference(context: WorkerContext, task: str, scenarios: range, beat: Callable[[], None]) -> list[Trajectory]:
     """The frozen policy's rollouts, which the training of filters has made before in most cases."""
     key = (task, scenarios)
-    if key not in place.references:
+    if key not in context.references:
         model = baseline_fitting.controller_of_reference(task)
-        place.references[key] = _driven(place, task, model, scenarios, lambda share: beat)
-    return place.references[key]
+        context.references[key] = _driven(context, task, model, scenarios, lambda share: beat)
+    return context.references[key]
 
 
 def newest(session: Session, participant_id: int, method: str) -> tuple[int, str] | None:
@@ -208,5 +200,5 @@ def newest(session: Session, participant_id: int, method: str) -> tuple[int, str
     return None
 
 
-def _folder(place: Workplace, job: Job, run_id: int) -> Path:
-    return place.store.unfinished(job.participant) / f"run-{run_id}"
+def _folder(context: WorkerContext, job: Job, run_id: int) -> Path:
+    return context.store.unfinished(job.participant) / f"run-{run_id}"

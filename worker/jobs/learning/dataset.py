@@ -1,7 +1,4 @@
-"""From rows to arrays: what was shown and said, as the learning code wants it.
-
-``target_of`` is the one place where a response becomes a number.
-"""
+"""From rows to arrays: what was shown and said, as the learning code wants it."""
 
 import hashlib
 import io
@@ -15,13 +12,14 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session, contains_eager, joinedload
 
 from app.domain.clips import Clip, Rollout
-from app.domain.preferences import Label, Query, Response, count_labels, current_labels
+from app.domain.preferences import Label, Query, count_labels, current_labels
 from app.domain.studies import Participant, Study
 from app.errors import AppError
 from app.storage import ArtefactStore
 from worker.ml import acquisition
 from worker.ml.rewards.reward_training import SignalScale
 from worker.ml.rewards.segments import SegmentPairs, Stretch
+from worker.responses import TARGETS
 from worker.trajectory import SIGNALS, Array, OutdatedTrajectory, Recorded, Recording, Trajectory
 
 
@@ -31,14 +29,6 @@ class RecordedByAnOlderVersion(AppError):
 
 IMPORTED = "imported"
 """In a rollout's mode: it was recorded elsewhere, and this says where it came from."""
-
-_TARGETS = {Response.LEFT: 0.0, Response.EQUAL: 0.5, Response.RIGHT: 1.0, Response.SKIP: None}
-
-
-def target_of(response: Response) -> float | None:
-    """The paper's y: P(right preferred), left being sigma^0 and right sigma^1. "Can't tell" says nothing: None."""
-    return _TARGETS[response]
-
 
 CLIPS_AND_ROLLOUTS = (
     joinedload(Query.left_clip).joinedload(Clip.rollout),
@@ -77,7 +67,7 @@ def load_preferences(session: Session, store: ArtefactStore, participant_id: int
     """The participant's labels as arrays; pairs without a target, and excluded ones, are left out."""
     given = count_labels(session, select(Participant.id).where(Participant.id == participant_id))
     labels = labels_with_clips(session, participant_id)
-    said = [(label, target) for label in labels if (target := target_of(label.response)) is not None]
+    said = [(label, target) for label in labels if (target := TARGETS[label.response]) is not None]
     return Preferences(
         pairs=segment_pairs(store, [(each.query.left_clip, each.query.right_clip) for each, _ in said])
         if said

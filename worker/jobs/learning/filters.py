@@ -2,8 +2,10 @@
 
 from collections.abc import Sequence
 
+from sqlalchemy.orm import Session
+
 from app.domain.choices import Method, RewardKind
-from app.domain.models import ModelKind
+from app.domain.models import Model, ModelKind
 from app.domain.studies import Participant, Study
 from app.domain.study_settings import StudySettings
 from app.errors import AppError
@@ -11,11 +13,11 @@ from app.services.answers import accuracy
 from app.services.exports.export_formats import provenance_of
 from app.services.monitoring import dashboard
 from worker.compute import filter_fitting, learning
-from worker.compute.filter_fitting import Fitting
+from worker.compute.filter_fitting import FilterFit
 from worker.compute.pools import Lane
 from worker.jobs.learning import dataset
 from worker.jobs.runtime import due_work, records
-from worker.jobs.runtime.context import Step, Workplace
+from worker.jobs.runtime.context import Step, WorkerContext
 from worker.jobs.runtime.records import Job
 from worker.ml.export.bundle import Provenance
 from worker.ml.filters.filter_problem import FilterConfig, FilterDraft
@@ -27,59 +29,65 @@ class NothingToLearnFrom(AppError):
     """Every answer so far was "can't tell", so there is no reward model and no filter can be trained."""
 
 
-def train_filter(place: Workplace, job: Job, run_id: int, step: Step) -> None:
+def train_filter(context: WorkerContext, job: Job, run_id: int, step: Step) -> None:
     """Train, evaluate and publish; every stage is a step, so that a killed worker loses one stage at most.
 
     Nothing is made of a filter that is outdated before it is begun, and none is gone on with once its person has given
     the last answer, for then they wait for the last one.
     """
-    if step("is-outdated", _is_outdated, place, job, False):
+    if step("is-outdated", _is_outdated, context, job, False):
         return
-    reward = step("reward", _choose_reward, place, run_id, job)
+    reward = step("reward", _choose_reward, context, run_id, job)
     if not reward:
         return
-    with place.database.reading() as session:
+    with context.database.reading() as session:
         settings = session.get_one(Study, job.study_id).settings
     draft = ""
     for stage in STAGES[settings.method]:
-        if step(f"is-outdated-before-{stage}", _is_outdated, place, job, True):
+        if step(f"is-outdated-before-{stage}", _is_outdated, context, job, True):
             return
-        draft = step(stage, _stage, place, run_id, job, reward, draft, stage)
-    step("publish", _publish, place, run_id, job, reward, draft)
+        draft = step(stage, _stage, context, run_id, job, reward, draft, stage)
+    step("publish", _publish, context, run_id, job, reward, draft)
 
 
-def _is_outdated(place: Workplace, job: Job, begun: bool) -> bool:
-    with place.database.reading() as session:
+def _is_outdated(context: WorkerContext, job: Job, begun: bool) -> bool:
+    with context.database.reading() as session:
         return due_work.is_outdated(session, job, begun=begun)
 
 
-def _choose_reward(place: Workplace, run_id: int, job: Job) -> str:
+def reward_to_follow(session: Session, run_id: int, job: Job) -> Model:
+    """The participant's newest reward model; the run is now about the labels behind it. Raises NothingToLearnFrom."""
+    model = records.newest_model(session, job.participant, ModelKind.REWARD)
+    if model is None:
+        raise NothingToLearnFrom
+    records.set_labels(session, run_id, model.label_count, model.label_hash)
+    return model
+
+
+def _choose_reward(context: WorkerContext, run_id: int, job: Job) -> str:
     """The artefact of the reward model to follow: the newest. The printed method needs one on states and actions.
 
     Empty when the newest filter has already seen the same labels: somebody who answers faster than filters are trained
     passes several milestones at once.
     """
-    with place.database.writing() as session:
+    with context.database.writing() as session:
         study = session.get_one(Study, job.study_id)
         task, settings = study.task, study.settings
-        model = records.newest_model(session, job.participant, ModelKind.REWARD)
-        if model is None:
-            raise NothingToLearnFrom
-        records.set_labels(session, run_id, model.label_count, model.label_hash)
+        model = reward_to_follow(session, run_id, job)
         newest = records.newest_model(session, job.participant, ModelKind.FILTER)
         if newest is not None and newest.label_hash == model.label_hash:
             return ""
     if settings.method is Method.STUDIO or settings.reward_kind is not RewardKind.STRUCTURED:
         return model.artefact_sha256
-    place.report(run_id, "learning a reward model on states and actions", 0.05)
-    with place.database.reading() as session:
-        preferences = dataset.load_preferences(session, place.store, job.participant)
-        scale = dataset.signal_scale(session, place.store, job.study_id)
+    context.report(run_id, "learning a reward model on states and actions", 0.05)
+    with context.database.reading() as session:
+        preferences = dataset.load_preferences(session, context.store, job.participant)
+        scale = dataset.signal_scale(session, context.store, job.study_id)
     if preferences.pairs is None:
         raise NothingToLearnFrom
-    stored, _ = place.compute.run(
+    stored, _ = context.compute.run(
         Lane.LEARNING,
-        place.beat(run_id),
+        context.beat(run_id),
         learning.fit_reward,
         task,
         RewardKind.MLP.value,
@@ -88,27 +96,27 @@ def _choose_reward(place: Workplace, run_id: int, job: Job) -> str:
         scale,
         model.seed,
     )
-    return place.store.put(stored)
+    return context.store.put(stored)
 
 
-def _stage(place: Workplace, run_id: int, job: Job, reward: str, draft: str, stage: str) -> str:
+def _stage(context: WorkerContext, run_id: int, job: Job, reward: str, draft: str, stage: str) -> str:
     """One stage of the fit: the artefact of a draft in, the artefact of a better one out."""
-    fitting = _fitting(place, run_id, job, reward)
+    fitting = _fitting(context, run_id, job, reward)
     if stage in {"mode", "printed"}:
-        with place.database.reading() as session:
+        with context.database.reading() as session:
             clips = dataset.pool_clips(session, job.study_id)
-        pool = [dataset.shown(place.store, clip) for clip in clips]
+        pool = [dataset.shown(context.store, clip) for clip in clips]
         result = fitting.find_mode(pool) if stage == "mode" else fitting.fit_printed()
     else:
-        before = _draft(place, draft)
+        before = _draft(context, draft)
         result = fitting.train_residual(before) if stage == "residual" else fitting.gate_residual(before)
-    return place.store.put(filter_fitting.draft_to_bytes(result))
+    return context.store.put(filter_fitting.draft_to_bytes(result))
 
 
-def _publish(place: Workplace, run_id: int, job: Job, reward: str, draft: str) -> None:
+def _publish(context: WorkerContext, run_id: int, job: Job, reward: str, draft: str) -> None:
     """Evaluate on unseen scenarios, write the bundle, and only then let anybody see it."""
-    fitting = _fitting(place, run_id, job, reward)
-    with place.database.reading() as session:
+    fitting = _fitting(context, run_id, job, reward)
+    with context.database.reading() as session:
         participant = session.get_one(Participant, job.participant)
         study = session.get_one(Study, job.study_id)
         model = records.newest_model(session, job.participant, ModelKind.REWARD)
@@ -128,9 +136,9 @@ def _publish(place: Workplace, run_id: int, job: Job, reward: str, draft: str) -
         deviations=export.deviations,
     )
     learned = {**(model.metrics if model else {}), "foresight_notes": notes}
-    finished = fitting.finish(_draft(place, draft), provenance, learned)
-    model_artefact, bundle_artefact = place.store.put(finished.filter_weights), place.store.put(finished.bundle)
-    with place.database.writing() as session:
+    finished = fitting.finish(_draft(context, draft), provenance, learned)
+    model_artefact, bundle_artefact = context.store.put(finished.filter_weights), context.store.put(finished.bundle)
+    with context.database.writing() as session:
         saved = records.save_model(session, run_id, ModelKind.FILTER, model_artefact, finished.metrics)
         records.save_bundle(session, saved, version, bundle_artefact, len(finished.bundle))
 
@@ -156,8 +164,8 @@ def notes_on_foresight(curve: accuracy.Curve) -> Sequence[str]:
     ]
 
 
-def _draft(place: Workplace, artefact: str) -> FilterDraft:
-    return filter_fitting.draft_from_bytes(place.store.read(artefact))
+def _draft(context: WorkerContext, artefact: str) -> FilterDraft:
+    return filter_fitting.draft_from_bytes(context.store.read(artefact))
 
 
 def filter_config(settings: StudySettings) -> FilterConfig:
@@ -167,18 +175,18 @@ def filter_config(settings: StudySettings) -> FilterConfig:
     )
 
 
-def _fitting(place: Workplace, run_id: int, job: Job, reward: str) -> Fitting:
-    with place.database.reading() as session:
+def _fitting(context: WorkerContext, run_id: int, job: Job, reward: str) -> FilterFit:
+    with context.database.reading() as session:
         study = session.get_one(Study, job.study_id)
         task, settings = study.task, study.settings
         seed = session.get_one(Participant, job.participant).seed
-    return Fitting(
+    return FilterFit(
         task=task,
-        compute=place.compute,
-        beat=place.beat(run_id),
-        reward=place.store.read(reward),
+        compute=context.compute,
+        beat=context.beat(run_id),
+        reward=context.store.read(reward),
         seed=seed,
         config=filter_config(settings),
-        progress=lambda stage, share: place.report(run_id, stage, share),
-        references=place.references,
+        progress=lambda stage, share: context.report(run_id, stage, share),
+        references=context.references,
     )

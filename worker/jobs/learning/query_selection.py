@@ -1,7 +1,8 @@
 """What each participant is asked next, and what the newest model expects them to say."""
 
 import logging
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
@@ -10,14 +11,14 @@ from sqlalchemy.orm import Session
 
 from app.domain.choices import Strategy
 from app.domain.clips import Clip
-from app.domain.models import ModelKind
+from app.domain.models import Model, ModelKind
 from app.domain.preferences import LEARNED_FROM, Purpose, Query
 from app.domain.studies import Participant, Study
 from worker.compute import learning, simulation
 from worker.jobs.learning import dataset, query_plan
 from worker.jobs.learning.query_plan import Slot
 from worker.jobs.runtime import records
-from worker.jobs.runtime.context import Workplace
+from worker.jobs.runtime.context import WorkerContext
 from worker.ml import acquisition
 from worker.ml.teachers import OMEGA, User
 from worker.sim.costs import preference_rewards
@@ -36,83 +37,128 @@ MOST_OTHERS = 12
 """More people cost time and hardly change on which pairs people differ."""
 
 
-def refill_queries(place: Workplace, participant_id: int) -> None:
+def refill_queries(context: WorkerContext, participant_id: int) -> None:
     """Make the queries the participant will meet next. Safe to call at any time, by any number of workers.
 
     Places are filled in their order: where one must wait, for clips to be filmed, the later ones wait as well. Pairs of
     a study of own clips that cannot be shown any more make room for others; clips of ours are made again.
     """
-    lost = place.store.lost()
-    with place.database.reading() as session:
-        participant = session.get_one(Participant, participant_id)
-        study = session.get_one(Study, participant.study_id)
+    lost = context.store.lost()
+    with context.database.reading() as session:
+        study = session.get_one(Study, session.get_one(Participant, participant_id).study_id)
     if lost and study.material is not None:
-        with place.database.writing() as session:
+        with context.database.writing() as session:
             records.drop_lost_queries(session, participant_id, lost)
-    with place.database.reading() as session:
-        free = records.free_ordinals(session, participant_id, study.settings)
-        if not free:
-            return
-        slots = query_plan.plan(study.settings, participant.seed)
-        rows = _Choosing(place, session, participant, study, lost).rows([slots[ordinal - 1] for ordinal in free])
+    with context.database.reading() as session:
+        known = _load(session, participant_id, lost)
+    rows = _Choosing(context, known).rows() if known.free else []
     if not rows:
         return
-    with place.database.writing() as session:
+    with context.database.writing() as session:
         records.save_queries(session, participant_id, rows)
-    predict_waiting(place, participant_id)
+    predict_waiting(context, participant_id)
 
 
-def predict_waiting(place: Workplace, participant_id: int) -> None:
+def predict_waiting(context: WorkerContext, participant_id: int) -> None:
     """Write the newest model's prediction to every query that has never been answered: honest by construction.
 
     Only to labels: a repeat was answered before, a catch pair is no question of taste, practice is none at all.
     """
-    with place.database.reading() as session:
+    with context.database.reading() as session:
         model = records.newest_model(session, participant_id, ModelKind.REWARD)
         waiting = records.unanswered(session, participant_id, *dataset.CLIPS_AND_ROLLOUTS)
-        queries = [query for query in waiting if query.purpose in LEARNED_FROM]
-        if model is None or all(query.predicted_by_model_id == model.id for query in queries):
-            return
-        pairs = dataset.segment_pairs(place.store, [(query.left_clip, query.right_clip) for query in queries])
-        ids = [query.id for query in queries]
-    probabilities = learning.probability_right(place.store.read(model.artefact_sha256), pairs)
-    with place.database.writing() as session:
-        records.save_predictions(session, model.id, dict(zip(ids, probabilities, strict=True)))
+    queries = [query for query in waiting if query.purpose in LEARNED_FROM]
+    if model is None or all(query.predicted_by_model_id == model.id for query in queries):
+        return
+    pairs = dataset.segment_pairs(context.store, [(query.left_clip, query.right_clip) for query in queries])
+    probabilities = learning.probability_right(context.store.read(model.artefact_sha256), pairs)
+    by_query = dict(zip((query.id for query in queries), probabilities, strict=True))
+    with context.database.writing() as session:
+        records.save_predictions(session, model.id, by_query)
+
+
+@dataclass(frozen=True)
+class _Known:
+    """All that choosing a participant's next pairs asks of the database."""
+
+    participant: Participant
+    study: Study
+    free: Sequence[Slot]
+    """Places of the plan that are to be filled, in their order."""
+    sides: Mapping[int, tuple[int, int]]
+    """The clips on the left and right of every pair that has been chosen, by its place."""
+    clips: Sequence[Clip]
+    """Of the pool, as far as they can be shown."""
+    whole_clips: Sequence[Clip]
+    """Of whole trajectories."""
+    model: Model | None
+    """The participant's newest reward model."""
+    others: Sequence[Model]
+    """Newest reward models of other participants who have said enough."""
+    has_unanswered: bool
+    has_lost: bool
+    """Whether any stored file is lost."""
+
+
+def _load(session: Session, participant_id: int, lost: Collection[str]) -> _Known:
+    """``lost``: files that cannot be shown."""
+
+    def shown(clips: Sequence[Clip]) -> list[Clip]:
+        return [clip for clip in clips if clip.video_sha256 not in lost and clip.poster_sha256 not in lost]
+
+    participant = session.get_one(Participant, participant_id)
+    study = session.get_one(Study, participant.study_id)
+    settings, slots = study.settings, query_plan.plan(study.settings, participant.seed)
+    free = [slots[ordinal - 1] for ordinal in records.free_ordinals(session, participant_id, settings)]
+    wanted = {slot.purpose for slot in free}
+    scored = Purpose.PREFERENCE in wanted and settings.strategy is not Strategy.UNIFORM
+    contested = scored and settings.strategy is Strategy.CONTESTED
+    asked = select(Query).where(Query.participant_id == participant_id)
+    return _Known(
+        participant,
+        study,
+        free,
+        {query.ordinal: (query.left_clip_id, query.right_clip_id) for query in session.scalars(asked)},
+        shown(dataset.pool_clips(session, study.id)) if free else [],
+        shown(dataset.whole_clips(session, study.id)) if Purpose.INTRODUCTION in wanted else [],
+        records.newest_model(session, participant_id, ModelKind.REWARD) if scored else None,
+        records.models_of_others(session, participant_id, ModelKind.REWARD, OTHERS_LABELS, MOST_OTHERS)
+        if contested
+        else [],
+        bool(records.unanswered(session, participant_id)),
+        bool(lost),
+    )
 
 
 def _scores(
-    place: Workplace, session: Session, participant: Participant, pairs: list[tuple[Clip, Clip]], strategy: Strategy
+    context: WorkerContext, known: _Known, pairs: Sequence[tuple[Clip, Clip]], strategy: Strategy
 ) -> acquisition.Floats | None:
     """How much every candidate is worth asking; None when the choice is to be uniform."""
     if strategy is Strategy.UNIFORM:
         return None
     members = None
-    model = records.newest_model(session, participant.id, ModelKind.REWARD)
-    if model is not None:
-        segments = dataset.segment_pairs(place.store, pairs)
-        members = learning.member_probabilities(place.store.read(model.artefact_sha256), segments)
+    if known.model is not None:
+        segments = dataset.segment_pairs(context.store, pairs)
+        members = learning.member_probabilities(context.store.read(known.model.artefact_sha256), segments)
     if strategy is Strategy.CONTESTED:
-        return acquisition.contested(_answers_of_others(place, session, participant, pairs), members)
+        return acquisition.contested(_answers_of_others(context, known, pairs), members)
     return None if members is None else acquisition.score(strategy.value, members)
 
 
-def _answers_of_others(
-    place: Workplace, session: Session, participant: Participant, pairs: list[tuple[Clip, Clip]]
-) -> acquisition.Floats:
+def _answers_of_others(context: WorkerContext, known: _Known, pairs: Sequence[tuple[Clip, Clip]]) -> acquisition.Floats:
     """(U, M) what other people would say about each pair: participants, or the paper's users while there are few."""
-    others = records.models_of_others(session, participant.id, ModelKind.REWARD, OTHERS_LABELS, MOST_OTHERS)
-    if len(others) >= 2:
-        segments = dataset.segment_pairs(place.store, pairs)
-        said = [learning.probability_right(place.store.read(model.artefact_sha256), segments) for model in others]
-        return np.array(said, np.float64)
-    task = simulation.task(session.get_one(Study, participant.study_id).task)
-    returns = {clip.id: _stand_ins(place, task, clip) for pair in pairs for clip in pair}
+    if len(known.others) >= 2:
+        segments = dataset.segment_pairs(context.store, pairs)
+        models = (context.store.read(model.artefact_sha256) for model in known.others)
+        return np.array([learning.probability_right(model, segments) for model in models], np.float64)
+    task = simulation.task(known.study.task)
+    returns = {clip.id: _stand_ins(context, task, clip) for pair in pairs for clip in pair}
     return acquisition.expected_answers(np.array([returns[right.id] - returns[left.id] for left, right in pairs]).T)
 
 
-def _stand_ins(place: Workplace, task: Task, clip: Clip) -> acquisition.Floats:
+def _stand_ins(context: WorkerContext, task: Task, clip: Clip) -> acquisition.Floats:
     """(3,) what the paper's users would feel about what a clip shows, by their own costs."""
-    shown, steps = dataset.shown(place.store, clip), slice(clip.first_step, clip.first_step + clip.step_count)
+    shown, steps = dataset.shown(context.store, clip), slice(clip.first_step, clip.first_step + clip.step_count)
     costs, signals = shown.costs[steps], shown.signals[steps]
     return np.array([preference_rewards(task, costs, signals, OMEGA[user]).sum() for user in User])
 
@@ -120,18 +166,15 @@ def _stand_ins(place: Workplace, task: Task, clip: Clip) -> acquisition.Floats:
 class _Choosing:
     """Gives places of a participant's plan their clips. No pair of clips is chosen twice, on whichever side."""
 
-    def __init__(
-        self, place: Workplace, session: Session, participant: Participant, study: Study, lost: Collection[str]
-    ) -> None:
-        self._lost = lost
-        self._place, self._session, self._participant, self._study = place, session, participant, study
-        asked = select(Query).where(Query.participant_id == participant.id)
-        self._sides = {query.ordinal: (query.left_clip_id, query.right_clip_id) for query in session.scalars(asked)}
+    def __init__(self, context: WorkerContext, known: _Known) -> None:
+        self._context, self._known = context, known
+        self._participant, self._settings, self._clips = known.participant, known.study.settings, known.clips
+        self._sides = dict(known.sides)
         self._used = {frozenset(sides) for sides in self._sides.values()}
-        self._clips = self._shown(dataset.pool_clips(session, study.id))
 
-    def rows(self, slots: Sequence[Slot]) -> list[dict[str, Any]]:
-        """As many of these places as can be filled now, as columns of queries."""
+    def rows(self) -> list[dict[str, Any]]:
+        """As many of the free places as can be filled now, as columns of queries."""
+        slots = self._known.free
         own = {slot.ordinal: self._own(slot) for slot in slots if slot.purpose not in _CHOSEN_LATER}
         preferences = iter(self._preferences([slot.ordinal for slot in slots if slot.purpose is Purpose.PREFERENCE]))
         rows = []
@@ -166,12 +209,12 @@ class _Choosing:
         pairs = self._unused(self._clips) if ordinals else []
         if not pairs:
             return []
-        settings, participant = self._study.settings, self._participant
-        scores = _scores(self._place, self._session, participant, pairs, settings.strategy)
+        settings = self._settings
+        scores = _scores(self._context, self._known, pairs, settings.strategy)
         choice = acquisition.choose(
             len(ordinals),
             len(pairs),
-            np.random.default_rng([participant.seed, ordinals[0]]),
+            np.random.default_rng([self._participant.seed, ordinals[0]]),
             rule="uniform" if scores is None else cast(acquisition.Rule, settings.strategy.value),
             scores=scores,
             random_share=settings.random_share,
@@ -186,16 +229,14 @@ class _Choosing:
 
     def _introduction(self, rng: np.random.Generator) -> dict[str, Any] | None:
         """A pair of whole trajectories."""
-        return self._one_of(
-            self._unused(self._shown(dataset.whole_clips(self._session, self._study.id))), Strategy.UNIFORM, rng
-        )
+        return self._one_of(self._unused(self._known.whole_clips), Strategy.UNIFORM, rng)
 
     def _practice(self, rng: np.random.Generator) -> dict[str, Any] | None:
         """Two very different clips: the keys are to be learned, not to be pondered over."""
         pairs = self._unused(self._clips)
         if not pairs:
             return None
-        rows = query_plan.very_different(dataset.segment_pairs(self._place.store, pairs))
+        rows = query_plan.very_different(dataset.segment_pairs(self._context.store, pairs))
         return self._one_of([pairs[row] for row in rows], PRACTICE, rng)
 
     def _catch(self, slot: Slot, rng: np.random.Generator) -> dict[str, Any] | None:
@@ -203,7 +244,7 @@ class _Choosing:
 
         While the pool is growing the place stays free, unless there is nothing else to go on with.
         """
-        store = self._place.store
+        store = self._context.store
         candidates = [
             (pair, answer)
             for pair in self._unused(self._clips)
@@ -221,14 +262,13 @@ class _Choosing:
         return _columns(pair, swapped, OBVIOUS, 1.0 / len(candidates)) | {"expected": expected}
 
     def _may_yet_come(self) -> bool:
-        settings = self._study.settings
-        wanted = settings.pool_scenarios * settings.behaviours_per_scenario
-        growing = self._study.material is None and len(self._clips) < wanted
-        return growing and bool(records.unanswered(self._session, self._participant.id))
+        wanted = self._settings.pool_scenarios * self._settings.behaviours_per_scenario
+        growing = self._known.study.material is None and len(self._clips) < wanted
+        return growing and self._known.has_unanswered
 
     def _labels_before(self, ordinal: int) -> list[int]:
         """Places of earlier labels on clips that no repeat has asked again, the newest few left out where possible."""
-        slots = query_plan.plan(self._study.settings, self._participant.seed)
+        slots = query_plan.plan(self._settings, self._participant.seed)
         again = {slot.repeats_ordinal for slot in slots}
         known = [slot for slot in slots[: ordinal - 1] if slot.ordinal in self._sides]
         labels = [slot.ordinal for slot in known if slot.purpose is Purpose.PREFERENCE]
@@ -237,7 +277,7 @@ class _Choosing:
 
     def _askable(self, slot: Slot) -> int | None:
         """The place of the pair that is to be asked again; of another one if that cannot be shown any more."""
-        if not self._lost:
+        if not self._known.has_lost:
             return slot.repeats_ordinal
         known = {clip.id for clip in self._clips}
         places = (slot.repeats_ordinal, *self._labels_before(slot.ordinal))
@@ -263,10 +303,6 @@ class _Choosing:
             return None
         index, swapped = int(rng.integers(len(pairs))), bool(rng.integers(2))
         return _columns(pairs[index], swapped, strategy, 1.0 / len(pairs))
-
-    def _shown(self, clips: Sequence[Clip]) -> list[Clip]:
-        """Those of the clips that can be shown."""
-        return [clip for clip in clips if clip.video_sha256 not in self._lost and clip.poster_sha256 not in self._lost]
 
     def _unused(self, clips: Sequence[Clip]) -> list[tuple[Clip, Clip]]:
         """Pairs of clips of one scenario that this participant has not been given yet."""

@@ -7,6 +7,7 @@ from worker.compute.filter_fitting import CHUNK
 from worker.compute.pools import Computing, Lane
 from worker.jobs.learning.filters import filter_config
 from worker.ml.filters import filter_problem
+from worker.scenarios import EVALUATION, first_of
 from worker.trajectory import Trajectory
 
 
@@ -34,7 +35,7 @@ def reference_blocks(task: str, settings: StudySettings) -> list[range]:
     """The scenarios in which filters of such a study are compared with the reference policy."""
     config = filter_config(settings)
     gate = [config.gate_block(simulation.task(task))] if settings.method is Method.STUDIO else []
-    return [*gate, filter_problem.scenarios_for("evaluation", config.evaluation_scenarios)]
+    return [*gate, first_of(EVALUATION, config.evaluation_scenarios)]
 
 
 def _no_beat() -> None:

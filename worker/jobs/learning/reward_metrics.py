@@ -11,7 +11,7 @@ from app.domain.studies import Participant, Study
 from worker.compute import simulation
 from worker.compute.simulation import surface_file
 from worker.jobs.learning import dataset
-from worker.jobs.runtime.context import Workplace
+from worker.jobs.runtime.context import WorkerContext
 from worker.ml.filters.response_surface import ResponseSurface
 from worker.ml.rewards.reward_models import RewardModel, StructuredReward, load_reward_model
 from worker.ml.rewards.segments import LEFT, SegmentPairs, Stretch
@@ -25,15 +25,15 @@ WITHIN_95 = 1.96
 """Standard deviations on either side of a mean."""
 
 
-def insight(place: Workplace, participant_id: int, stored_model: bytes) -> dict[str, Any]:
+def insight(context: WorkerContext, participant_id: int, stored_model: bytes) -> dict[str, Any]:
     """More metrics of a reward model: ``ranking`` and, for simulated tasks, ``costs`` and ``advice``."""
     model = load_reward_model(stored_model)
-    with place.database.reading() as session:
+    with context.database.reading() as session:
         study = session.get_one(Study, session.get_one(Participant, participant_id).study_id)
         task, recorded = study.task, study.material is not None
         clips = dataset.pool_clips(session, study.id)
         names = [(clip.rollout.scenario, clip.rollout.behaviour) for clip in clips]
-        stretches = [dataset.stretch(place.store, clip) for clip in clips]
+        stretches = [dataset.stretch(context.store, clip) for clip in clips]
     returns = _returns(model, stretches) if stretches else np.zeros((1, 0))
     found: dict[str, Any] = {"ranking": _ranking(names, returns)}
     if recorded:

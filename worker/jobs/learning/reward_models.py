@@ -12,7 +12,7 @@ from worker.compute import learning
 from worker.compute.pools import Lane
 from worker.jobs.learning import dataset, query_selection, reward_metrics
 from worker.jobs.runtime import records
-from worker.jobs.runtime.context import Step, Workplace
+from worker.jobs.runtime.context import Step, WorkerContext
 from worker.jobs.runtime.records import Job
 
 KEPT_QUERIES = 3
@@ -21,28 +21,28 @@ MOST_EARLIER = 100
 """Participants whose weights make up a pooled prior."""
 
 
-def train_reward(place: Workplace, job: Job, run_id: int, step: Step) -> None:
+def train_reward(context: WorkerContext, job: Job, run_id: int, step: Step) -> None:
     """Fit the participant's reward model and let it look ahead."""
-    step("fit", _fit, place, run_id, job.participant)
-    step("look-ahead", _look_ahead, place, job.participant)
+    step("fit", _fit, context, run_id, job.participant)
+    step("look-ahead", _look_ahead, context, job.participant)
 
 
-def _fit(place: Workplace, run_id: int, participant_id: int) -> None:
-    with place.database.reading() as session:
+def _fit(context: WorkerContext, run_id: int, participant_id: int) -> None:
+    with context.database.reading() as session:
         participant = session.get_one(Participant, participant_id)
         study = session.get_one(Study, participant.study_id)
         task, kind = study.task, study.settings.reward_kind
         earlier = earlier_models(session, participant, study) if study.settings.pooled_prior else []
-        preferences = dataset.load_preferences(session, place.store, participant_id)
-        scale = dataset.signal_scale(session, place.store, participant.study_id)
+        preferences = dataset.load_preferences(session, context.store, participant_id)
+        scale = dataset.signal_scale(session, context.store, participant.study_id)
         notes = notes_on_pairs(session, participant_id)
         recorded_signals = None if study.material is None else dataset.signal_names(study)
     if preferences.pairs is None:
         return  # nothing but "can't tell" so far: there is nothing to learn from
-    place.report(run_id, f"learning from {preferences.label_count} labels", 0.2)
-    stored, metrics = place.compute.run(
+    context.report(run_id, f"learning from {preferences.label_count} labels", 0.2)
+    stored, metrics = context.compute.run(
         Lane.REWARDS,
-        place.beat(run_id),
+        context.beat(run_id),
         learning.fit_reward,
         task,
         kind.value,
@@ -50,12 +50,12 @@ def _fit(place: Workplace, run_id: int, participant_id: int) -> None:
         preferences.targets,
         scale,
         participant.seed,
-        [place.store.read(model.artefact_sha256) for model in earlier],
+        [context.store.read(model.artefact_sha256) for model in earlier],
         recorded_signals,
     )
-    artefact = place.store.put(stored)
-    metrics |= {"notes": notes, **reward_metrics.insight(place, participant_id, stored)}
-    with place.database.writing() as session:
+    artefact = context.store.put(stored)
+    metrics |= {"notes": notes, **reward_metrics.insight(context, participant_id, stored)}
+    with context.database.writing() as session:
         records.set_labels(session, run_id, preferences.label_count, preferences.label_hash)
         records.save_model(session, run_id, ModelKind.REWARD, artefact, metrics)
         stopping_advice.note(session, session.get_one(Study, participant.study_id), participant)
@@ -81,10 +81,10 @@ def earlier_models(session: Session, participant: Participant, study: Study) -> 
     return [model for model in others if model.participant_id is not None and model.participant_id < participant.id]
 
 
-def _look_ahead(place: Workplace, participant_id: int) -> None:
-    with place.database.writing() as session:
+def _look_ahead(context: WorkerContext, participant_id: int) -> None:
+    with context.database.writing() as session:
         participant = session.get_one(Participant, participant_id)
         if session.get_one(Study, participant.study_id).settings.strategy is not Strategy.UNIFORM:
             records.drop_unseen_queries(session, participant_id, keep=KEPT_QUERIES)
-    query_selection.refill_queries(place, participant_id)
-    query_selection.predict_waiting(place, participant_id)
+    query_selection.refill_queries(context, participant_id)
+    query_selection.predict_waiting(context, participant_id)

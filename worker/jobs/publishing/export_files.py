@@ -14,8 +14,8 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from app.db import now
-from app.domain.models import Export, RunKind
-from app.domain.studies import Deviation, Participant, Study
+from app.domain.models import Export
+from app.domain.studies import Deviation, Study
 from app.paths import DOCS
 from app.services.archives import archive, archive_reading, sealing
 from app.services.evaluation import unblinding
@@ -27,7 +27,8 @@ from app.services.runs import reports
 from app.services.studies import preregistration
 from app.storage import ArtefactMissing
 from worker.jobs.publishing import preference_arrays
-from worker.jobs.runtime.context import Step, Workplace
+from worker.jobs.runtime import records
+from worker.jobs.runtime.context import Step, WorkerContext
 from worker.jobs.runtime.records import Job
 
 Missing = Mapping[str, Sequence[str]]
@@ -46,37 +47,37 @@ _ARROW = {
 def due(session: Session, study: Study) -> list[Job]:
     """Files that were asked for and are not there."""
     waiting = select(Export).where(Export.study_id == study.id, Export.finished_at.is_(None)).order_by(Export.id)
-    return [Job(export_requests.finding(each), RunKind.EXPORT, study.id) for each in session.scalars(waiting)]
+    return [Job(export_requests.key_of(each), study.id) for each in session.scalars(waiting)]
 
 
-def make(place: Workplace, job: Job, run_id: int, step: Step) -> None:
-    """Make the file that the finding names."""
-    step("make", _make, place, int(job.finding.rpartition("-")[2]), run_id)
+def make(context: WorkerContext, job: Job, run_id: int, step: Step) -> None:
+    """Make the file that the export asks for."""
+    step("make", _make, context, job.number, run_id)
 
 
-def _make(place: Workplace, export_id: int, run_id: int) -> str:
+def _make(context: WorkerContext, export_id: int, run_id: int) -> str:
     """The artefact's hash. When somebody withdraws meanwhile, the file is thrown away and made again without them."""
-    while (sha256 := _made(place, export_id, run_id)) is None:
-        place.report(run_id, "writing the file again, because somebody has withdrawn", 0.1)
+    while (sha256 := _made(context, export_id, run_id)) is None:
+        context.report(run_id, "writing the file again, because somebody has withdrawn", 0.1)
     return sha256
 
 
-def _made(place: Workplace, export_id: int, run_id: int) -> str | None:
+def _made(context: WorkerContext, export_id: int, run_id: int) -> str | None:
     """The artefact's hash; None when somebody withdrew while it was made."""
-    with place.database.reading() as session:
+    with context.database.reading() as session:
         export = session.get_one(Export, export_id)
         study_id, kind = export.study_id, ExportKind(export.kind)
-        gone = _gone(session, study_id)
-    with _workspace(place) as folder:
+        gone = records.withdrawn_ids(session, study_id)
+    with _workspace(context) as folder:
         path = folder / "export.zip"
-        place.report(run_id, "writing the file", 0.1)
-        with place.database.reading() as session:
+        context.report(run_id, "writing the file", 0.1)
+        with context.database.reading() as session:
             write = write_data if kind is ExportKind.DATA else _write_archive
-            missing = write(session, place, session.get_one(Study, study_id), path)
-        byte_count, sha256 = path.stat().st_size, place.store.take(path)
-    with place.database.writing() as session:
-        if _gone(session, study_id) != gone:
-            place.store.delete(sha256)
+            missing = write(session, context, session.get_one(Study, study_id), path)
+        byte_count, sha256 = path.stat().st_size, context.store.take(path)
+    with context.database.writing() as session:
+        if records.withdrawn_ids(session, study_id) != gone:
+            context.store.delete(sha256)
             return None
         export = session.get_one(Export, export_id)
         export.artefact_sha256, export.byte_count, export.finished_at = sha256, byte_count, now()
@@ -84,28 +85,23 @@ def _made(place: Workplace, export_id: int, run_id: int) -> str | None:
     return sha256
 
 
-def _write_archive(session: Session, place: Workplace, study: Study, path: Path) -> Missing:
+def _write_archive(session: Session, context: WorkerContext, study: Study, path: Path) -> Missing:
     """Written, and read back as another installation would: nobody is to find out when it is needed."""
-    missing = archive.write(session, place.store, study, path)
+    missing = archive.write(session, context.store, study, path)
     archive_reading.verify(path, path.parent, sealing.key_of(study))
     return missing
 
 
 @contextmanager
-def _workspace(place: Workplace) -> Iterator[Path]:
+def _workspace(context: WorkerContext) -> Iterator[Path]:
     """A folder on the disk of the store, gone afterwards whatever happens."""
-    base = place.store.unfinished(0).parent
+    base = context.store.unfinished(0).parent
     base.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=base, prefix="export-") as folder:
         yield Path(folder)
 
 
-def _gone(session: Session, study_id: int) -> Sequence[int]:
-    people = select(Participant.id).where(Participant.study_id == study_id, Participant.withdrawn_at.is_not(None))
-    return session.scalars(people.order_by(Participant.id)).all()
-
-
-def write_data(session: Session, place: Workplace, study: Study, path: Path) -> Missing:
+def write_data(session: Session, context: WorkerContext, study: Study, path: Path) -> Missing:
     """Tables in three formats, their dictionary, the report with its figures, and preference pairs as arrays.
 
     A stored file that is missing or damaged is left out, and said to be.
@@ -116,8 +112,8 @@ def write_data(session: Session, place: Workplace, study: Study, path: Path) -> 
             _write_table(target, session, study, table, provenance)
         target.writestr("dictionary.csv", export_formats.dictionary_csv(export_tables.TABLES))
         target.writestr("dictionary.md", export_formats.dictionary_markdown(export_tables.TABLES))
-        pictures = _write_report(target, session, place, study, missing)
-        people = _write_pairs(target, session, place, study, missing)
+        pictures = _write_report(target, session, context, study, missing)
+        people = _write_pairs(target, session, context, study, missing)
         about = _provenance(session, study, provenance) | {"missing": missing}
         target.writestr("provenance.json", _json(about))
         target.writestr("README.md", _readme(study, provenance, about, pictures, people))
@@ -153,7 +149,7 @@ def _arrow_value(kind: Kind, value: Any) -> Any:
 
 
 def _write_report(
-    target: zipfile.ZipFile, session: Session, place: Workplace, study: Study, missing: dict[str, list[str]]
+    target: zipfile.ZipFile, session: Session, context: WorkerContext, study: Study, missing: dict[str, list[str]]
 ) -> list[str]:
     report = reports.newest(session, study)
     if report is None:
@@ -162,19 +158,19 @@ def _write_report(
     for name, formats in sorted(report.figures.items()):
         for kind, sha256 in formats.items():
             try:
-                target.writestr(f"report/{name}.{kind}", place.store.read(sha256))
+                target.writestr(f"report/{name}.{kind}", context.store.read(sha256))
             except ArtefactMissing:
                 missing.setdefault("figures of the report", []).append(sha256)
     return sorted(report.figures)
 
 
 def _write_pairs(
-    target: zipfile.ZipFile, session: Session, place: Workplace, study: Study, missing: dict[str, list[str]]
+    target: zipfile.ZipFile, session: Session, context: WorkerContext, study: Study, missing: dict[str, list[str]]
 ) -> list[str]:
     written = []
     for person in export_rows.everybody(session, study):
         lost = set[str]()
-        arrays = preference_arrays.arrays_of(session, place.store, study, person, lost)
+        arrays = preference_arrays.arrays_of(session, context.store, study, person, lost)
         if lost:
             missing[f"recordings: pairs of {person.code} that show them are not in its arrays"] = sorted(lost)
         if arrays is not None:

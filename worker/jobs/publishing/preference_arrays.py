@@ -15,6 +15,7 @@ from app.services.exports import export_formats
 from app.storage import ArtefactMissing, ArtefactStore
 from worker.jobs.learning import dataset
 from worker.ml.rewards.segments import SegmentPairs, Stretch
+from worker.responses import TARGETS
 from worker.trajectory import Array
 
 LAYOUT = 1
@@ -29,7 +30,7 @@ def arrays_of(
     Pairs whose recordings cannot be read are left out, and the recordings' hashes added to ``lost``.
     """
     labels = dataset.labels_with_clips(session, participant.id)
-    answered = [(each, target) for each in labels if (target := dataset.target_of(each.response)) is not None]
+    answered = [(each, target) for each in labels if (target := TARGETS[each.response]) is not None]
     said = [(each, target, both) for each, target in answered if (both := _stretches(store, each, lost))]
     if not said:
         return None

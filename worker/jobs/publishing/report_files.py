@@ -5,7 +5,7 @@ participant. Old reports go when a new one is there.
 """
 
 import hashlib
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from datetime import datetime, timedelta
 from typing import Any
 
@@ -16,6 +16,7 @@ from app.db import now
 from app.domain.evaluation import Rating, Trial
 from app.domain.models import Model, Report, Run, RunKind, RunStatus
 from app.domain.preferences import Exclusion, LabelEvent, Query
+from app.domain.run_keys import BASIS, RunKey
 from app.domain.studies import Participant, Study
 from app.services.answers import accuracy, answer_figures
 from app.services.evaluation import evaluation_plan, unblinding
@@ -25,7 +26,8 @@ from app.services.runs.reports import VERSION
 from app.services.studies import preregistration
 from worker.analysis.report import Tables, make_report
 from worker.compute.pools import Lane
-from worker.jobs.runtime.context import Step, Workplace
+from worker.jobs.runtime import records
+from worker.jobs.runtime.context import Step, WorkerContext
 from worker.jobs.runtime.records import Job
 
 AT_MOST_EVERY = timedelta(seconds=20)
@@ -44,11 +46,11 @@ def due(session: Session, study: Study) -> list[Job]:
     basis = basis_of(session, study)
     if basis is None or (last is not None and last.basis == basis):
         return []
-    name = _name(study.id, basis)
-    others = select(Run.id).where(Run.study_id == study.id, Run.kind == RunKind.REPORT, Run.workflow_id != name)
+    job = Job(RunKey(RunKind.REPORT, study.id, subject=BASIS, mark=basis[:16]), study.id)
+    others = select(Run.id).where(Run.study_id == study.id, Run.kind == RunKind.REPORT, Run.workflow_id != job.key)
     if session.scalar(others.where(Run.status.in_(RUNS_AT_ONCE)).limit(1)) is not None:
         return []
-    return [Job(name, RunKind.REPORT, study.id)]
+    return [job]
 
 
 def _rested(session: Session, study: Study, last: Report) -> datetime:
@@ -58,10 +60,6 @@ def _rested(session: Session, study: Study, last: Report) -> datetime:
     run = session.get_one(Run, last.run_id)
     took = run.finished_at - run.started_at if run.finished_at else timedelta(0)
     return last.created_at + max(AT_MOST_EVERY, min(REST * took, LONGEST_REST))
-
-
-def _name(study_id: int, basis: str) -> str:
-    return f"report/study-{study_id}/basis-{basis[:16]}"
 
 
 def basis_of(session: Session, study: Study) -> str | None:
@@ -82,27 +80,29 @@ def basis_of(session: Session, study: Study) -> str | None:
     return hashlib.sha256(repr(basis).encode()).hexdigest()
 
 
-def make(place: Workplace, job: Job, run_id: int, step: Step) -> None:
+def make(context: WorkerContext, job: Job, run_id: int, step: Step) -> None:
     """Statistics and figures; one step, for it takes seconds. Returns the artefacts, so that an erasure finds them."""
-    step("make", _make, place, job.study_id, run_id)
+    step("make", _make, context, job.study_id, run_id)
 
 
-def _make(place: Workplace, study_id: int, run_id: int) -> list[str]:
-    with place.database.reading() as session:
+def _make(context: WorkerContext, study_id: int, run_id: int) -> list[str]:
+    with context.database.reading() as session:
         study = session.get_one(Study, study_id)
-        basis, gone = basis_of(session, study), _gone(session, study_id)
+        basis, gone = basis_of(session, study), records.withdrawn_ids(session, study_id)
         tables = tables_of(session, study)
     if basis is None:
         return []
-    place.report(run_id, "computing statistics and drawing figures", 0.2)
-    contents, files = place.compute.run(Lane.LEARNING, place.beat(run_id), make_report, tables)
-    figures = {name: {kind: place.store.put(file) for kind, file in each.items()} for name, each in files.items()}
+    context.report(run_id, "computing statistics and drawing figures", 0.2)
+    contents, files = context.compute.run(Lane.LEARNING, context.beat(run_id), make_report, tables)
+    figures = {name: {kind: context.store.put(file) for kind, file in each.items()} for name, each in files.items()}
     stored = [sha256 for each in figures.values() for sha256 in each.values()]
-    with place.database.writing() as session:
-        if _gone(session, study_id) == gone:  # else somebody has withdrawn meanwhile, and is in these numbers
-            _save(place, session, run_id, Report(basis=basis, contents=contents, figures=figures))
+    with context.database.writing() as session:
+        if (
+            records.withdrawn_ids(session, study_id) == gone
+        ):  # else somebody has withdrawn meanwhile, and is in these numbers
+            _save(context, session, run_id, Report(basis=basis, contents=contents, figures=figures))
         for sha256 in set(stored) - withdrawal.in_use(session, stored):
-            place.store.delete(sha256)
+            context.store.delete(sha256)
     return stored
 
 
@@ -133,12 +133,7 @@ def _plan(session: Session, study: Study) -> dict[str, Any]:
     return {"standing": plan.standing.value, "planned": list(plan.planned), "in_words": plan.in_words}
 
 
-def _gone(session: Session, study_id: int) -> Collection[int]:
-    people = select(Participant.id).where(Participant.study_id == study_id, Participant.withdrawn_at.is_not(None))
-    return set(session.scalars(people))
-
-
-def _save(place: Workplace, session: Session, run_id: int, report: Report) -> None:
+def _save(context: WorkerContext, session: Session, run_id: int, report: Report) -> None:
     """Keep the report; older ones, their runs and their pictures go. Doing it twice changes nothing."""
     if session.scalar(select(Report.id).where(Report.run_id == run_id)) is not None:
         return
@@ -151,10 +146,4 @@ def _save(place: Workplace, session: Session, run_id: int, report: Report) -> No
     session.add(report)
     session.flush()
     for sha256 in pictures - withdrawal.in_use(session, pictures):
-        place.store.delete(sha256)
-
-
-def newest(session: Session, study_id: int) -> dict[str, Any] | None:
-    """The figures of the study's report, by name; None without one."""
-    report = session.scalar(select(Report).where(Report.study_id == study_id).order_by(Report.id.desc()).limit(1))
-    return None if report is None else dict(report.figures)
+        context.store.delete(sha256)

@@ -46,7 +46,7 @@ class NotingStore(ArtefactStore):
 
 
 @dataclass(frozen=True)
-class Workplace:
+class WorkerContext:
     """One worker's means."""
 
     database: Database
@@ -55,12 +55,12 @@ class Workplace:
     references: dict[tuple[str, range], list[Trajectory]] = field(default_factory=dict)
     """rollouts of the frozen policy by scenarios: the same for everybody, so each worker makes them once"""
 
-    def noting(self, noted: set[str]) -> "Workplace":
-        """The same place, remembering the artefacts that are stored through it."""
+    def noting(self, noted: set[str]) -> "WorkerContext":
+        """The same context, remembering the artefacts that are stored through it."""
         return replace(self, store=NotingStore(self.store, noted))
 
-    def computing(self, compute: Computing) -> "Workplace":
-        """The same place with another way to the compute processes."""
+    def computing(self, compute: Computing) -> "WorkerContext":
+        """The same context with another way to the compute processes."""
         return replace(self, compute=compute)
 
     def report(self, run_id: int, stage: str, progress: float) -> None:

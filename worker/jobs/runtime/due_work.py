@@ -41,16 +41,11 @@ def last_exclusions(session: Session, people: Select[int]) -> dict[int, int]:
     return dict(session.execute(words.group_by(Query.participant_id)).all())
 
 
-def ending(settings: StudySettings, answered: int, last_answer: int, last_exclusion: int | None) -> str:
-    """Of the names of models: a last answer that is changed afterwards makes them new, and so does every exclusion."""
+def answers_known(settings: StudySettings, answered: int, last_answer: int, last_exclusion: int | None) -> str:
+    """Of the keys of models: a last answer that is changed afterwards makes them new, and so does every exclusion."""
     marks = [f"answer-{last_answer}"] if answered >= settings.labels_per_participant else []
     marks += [] if last_exclusion is None else [f"exclusion-{last_exclusion}"]
-    return "/" + "-".join(marks) if marks else ""
-
-
-def filter_name(participant_id: int, milestone: int, name_ending: str) -> str:
-    """The name of the filter of a milestone."""
-    return f"filter/participant-{participant_id}/labels-{milestone}{name_ending}"
+    return "-".join(marks)
 
 
 def is_outdated(session: Session, job: Job, *, begun: bool = False) -> bool:
@@ -65,7 +60,8 @@ def is_outdated(session: Session, job: Job, *, begun: bool = False) -> bool:
     everything = settings.labels_per_participant
     if answered < everything and (begun or job.kind != RunKind.FILTER):
         return False
-    if job.kind == RunKind.FILTER and filter_due(settings, answered) > (job.label_count or 0):
+    if job.kind == RunKind.FILTER and filter_due(settings, answered) > (job.about.labels or 0):
         return True
     last, excluded = (each(session, mine).get(job.participant) for each in (last_answers, last_exclusions))
-    return not job.finding.endswith(ending(settings, answered, last or 0, excluded))
+    known = answers_known(settings, answered, last or 0, excluded)
+    return known != "" and known != job.about.answers

@@ -22,8 +22,8 @@ from app.settings import Settings
 
 log = logging.getLogger("worker")
 
-VERSION = "3"
-"""Raised when the steps of a workflow change so that a half-finished one could not be resumed."""
+VERSION = "4"
+"""Raised when steps or names of workflows change, so that a half-finished one could not be resumed: it begins anew."""
 
 QUEUES = {
     RunKind.CLIPS: 2,

@@ -24,7 +24,7 @@ AHEAD = 1
 
 
 @dataclass
-class Turns:
+class Lanes:
     """The gates of one worker's lanes, and who waits, as it was last seen."""
 
     compute: Compute
@@ -39,9 +39,9 @@ class Turns:
             for lane in Lane
         }
 
-    def of(self, job: Job) -> "Turn":
+    def of(self, job: Job) -> "LanesOfJob":
         """The compute processes as this job may use them."""
-        return Turn(self, job)
+        return LanesOfJob(self, job)
 
     @contextmanager
     def working(self, lane: Lane, job: Job) -> Iterator[None]:
@@ -69,10 +69,10 @@ class Turns:
 
 
 @dataclass(frozen=True)
-class Turn:
+class LanesOfJob:
     """The compute processes for one job; see worker.compute.pools.Compute for what the methods raise."""
 
-    turns: Turns
+    lanes: Lanes
     job: Job
 
     def run(
@@ -89,15 +89,15 @@ class Turn:
 
     def is_needed_elsewhere(self, lane: Lane) -> bool:
         """Whether the job should leave its place in the lane to one of a more urgent level."""
-        return self.turns.gate(lane).is_awaited_above(self._urgency().level)
+        return self.lanes.gate(lane).is_awaited_above(self._urgency().level)
 
     def _urgency(self) -> Urgency:
-        return self.turns.who_waits.urgency(self.job)
+        return self.lanes.who_waits.urgency(self.job)
 
     def _each(self, lane: Lane, beat: Callable[[], None], tasks: "list[partial[R]]") -> list[R]:
-        at_once = min(self.turns.compute.size(lane) + AHEAD, len(tasks)) or 1
+        at_once = min(self.lanes.compute.size(lane) + AHEAD, len(tasks)) or 1
         with (
-            self.turns.working(lane, self.job),
+            self.lanes.working(lane, self.job),
             ThreadPoolExecutor(max_workers=at_once, thread_name_prefix=f"turn-{lane}") as threads,
         ):
             futures = [threads.submit(self._in_turn, lane, task) for task in tasks]
@@ -114,8 +114,8 @@ class Turn:
                     future.cancel()
 
     def _in_turn(self, lane: Lane, task: "partial[R]") -> R:
-        with self.turns.gate(lane).passed(self._urgency):
-            return self.turns.compute.run(lane, _no_beat, task)
+        with self.lanes.gate(lane).passed(self._urgency):
+            return self.lanes.compute.run(lane, _no_beat, task)
 
 
 def _no_beat() -> None:

@@ -3,7 +3,7 @@
 Every function is one short step inside a transaction of its caller; none computes.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from typing import Any
@@ -13,9 +13,11 @@ from sqlalchemy.orm import Session, joinedload
 from sqlalchemy.sql.base import ExecutableOption
 
 from app.db import now
+from app.domain import run_keys
 from app.domain.clips import Clip, Rollout
 from app.domain.models import Bundle, Model, ModelKind, Run, RunKind, RunStatus, WorkerPresence
 from app.domain.preferences import LabelEvent, Purpose, Query
+from app.domain.run_keys import RunKey
 from app.domain.studies import Participant
 from app.domain.study_settings import StudySettings
 
@@ -34,40 +36,71 @@ LEASE = timedelta(seconds=60)
 
 @dataclass(frozen=True)
 class Job:
-    """What one run is about; travels through the durable engine as plain values."""
+    """One piece of work that is due, in one study."""
 
-    finding: str
-    kind: RunKind
+    about: RunKey
     study_id: int
-    participant_id: int | None = None
-    label_count: int | None = None
-    label_hash: str | None = None
+
+    @property
+    def key(self) -> str:
+        """Under which there is at most one run."""
+        return str(self.about)
+
+    @property
+    def kind(self) -> RunKind:
+        """Which kind of work it is."""
+        return self.about.kind
+
+    @property
+    def participant_id(self) -> int | None:
+        """The participant the run is for; None when it is for the whole study."""
+        return self.about.participant_id
 
     @property
     def participant(self) -> int:
         """The participant the run is for. Raises ValueError for work that is for a whole study."""
         if self.participant_id is None:
-            raise ValueError(f"{self.finding} is not about one participant.")
+            raise ValueError(f"{self.key} is not about one participant.")
         return self.participant_id
+
+    @property
+    def number(self) -> int:
+        """What the subject is about: a scenario or a row. Raises ValueError for work that has none."""
+        if self.about.number is None:
+            raise ValueError(f"{self.key} has no number.")
+        return self.about.number
+
+
+def as_arguments(job: Job) -> dict[str, Any]:
+    """The job as plain values, which is what the engine stores."""
+    return {"key": job.key, "study_id": job.study_id}
+
+
+def from_arguments(arguments: Mapping[str, Any]) -> Job:
+    """Read what as_arguments() made, or earlier versions, where the key was a finding. Raises ValueError."""
+    key = run_keys.read(str(arguments.get("key", arguments.get("finding"))))
+    if key is None:
+        raise ValueError(f"No job of this studio: {arguments}")
+    return Job(key, int(arguments["study_id"]))
 
 
 def begin_run(session: Session, job: Job, seed: int) -> int:
-    """The id of the run for this finding: a new one, or the earlier one set to running again."""
-    run = session.scalar(select(Run).where(Run.workflow_id == job.finding))
+    """The id of the run of this key: a new one, or the earlier one set to running again."""
+    run = session.scalar(select(Run).where(Run.workflow_id == job.key))
     if run is None:
-        run = Run(workflow_id=job.finding, kind=job.kind, study_id=job.study_id)
+        run = Run(workflow_id=job.key, kind=job.kind, study_id=job.study_id)
         session.add(run)
     run.participant_id = job.participant_id
-    run.label_count, run.label_hash = job.label_count, job.label_hash
+    run.label_count, run.label_hash = job.about.labels, None
     run.status, run.error, run.finished_at = RunStatus.RUNNING, None, None
     run.seed, run.heartbeat_at = seed, now()
     session.flush()
     return run.id
 
 
-def has_succeeded(session: Session, finding: str) -> bool:
-    """Whether there is nothing left to be done about this finding."""
-    done = select(Run.id).where(Run.workflow_id == finding, Run.status == RunStatus.SUCCEEDED)
+def has_succeeded(session: Session, key: str) -> bool:
+    """Whether there is nothing left to be done under this key."""
+    done = select(Run.id).where(Run.workflow_id == key, Run.status == RunStatus.SUCCEEDED)
     return session.scalar(done) is not None
 
 
@@ -88,12 +121,12 @@ def finish_run(session: Session, run_id: int) -> None:
     run.status, run.stage, run.progress, run.finished_at = RunStatus.SUCCEEDED, "done", 1.0, now()
 
 
-def fail_run(session: Session, finding: str, error: str, counts: bool = True) -> None:
+def fail_run(session: Session, key: str, error: str, counts: bool = True) -> None:
     """Keep what went wrong; the run is tried again until its attempts are used up.
 
     What is no fault of the work (a full disk) does not count as an attempt: it is tried until it succeeds.
     """
-    run = session.scalar(select(Run).where(Run.workflow_id == finding))
+    run = session.scalar(select(Run).where(Run.workflow_id == key))
     if run is not None:
         run.status, run.error, run.finished_at = RunStatus.FAILED, error, now()
         run.attempt += counts
@@ -309,6 +342,12 @@ def models_of_others(
     newest = [newest_model(session, other, kind) for other in others]
     enough = [model for model in newest if model is not None and (model.label_count or 0) >= at_least_labels]
     return enough[-most:]
+
+
+def withdrawn_ids(session: Session, study_id: int) -> Collection[int]:
+    """Who has withdrawn from the study."""
+    people = select(Participant.id).where(Participant.study_id == study_id, Participant.withdrawn_at.is_not(None))
+    return set(session.scalars(people))
 
 
 def sign_presence(session: Session, name: str, moment: datetime) -> None:

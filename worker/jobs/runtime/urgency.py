@@ -16,6 +16,7 @@ from sqlalchemy.orm import Session
 
 from app.db import now
 from app.domain.models import RunKind
+from app.domain.run_keys import BEFORE_AFTER
 from app.domain.studies import Awaited, Participant, Study
 from worker.jobs.runtime.records import Job
 
@@ -120,7 +121,7 @@ class WhoWaits:
 
 
 def _of_person(person: _Person, job: Job) -> Urgency:
-    before_after = job.kind == RunKind.FILMS and "/before-after/" in job.finding
+    before_after = job.about.subject == BEFORE_AFTER
     step = _LAST_STEP if before_after else _STEPS.get(RunKind(job.kind), _LAST_STEP)
     if not person.present:
         return Urgency(Level.DUE, person.seen_at or _BEGINNING, step)

@@ -20,8 +20,8 @@ from app.domain.models import RunKind
 from app.domain.studies import Participant, Study
 from app.services.participants import withdrawal
 from worker.jobs.runtime import engine
-from worker.jobs.runtime.context import Workplace
-from worker.jobs.runtime.records import Job
+from worker.jobs.runtime.context import WorkerContext
+from worker.jobs.runtime.records import Job, from_arguments
 
 log = logging.getLogger("worker")
 
@@ -53,7 +53,7 @@ def unfinished_studies(session: Session) -> Sequence[int]:
 
 
 def erase_traces(
-    place: Workplace,
+    context: WorkerContext,
     participant_id: int,
     in_hand: Collection[str],
     stored: MutableMapping[str, set[str]],
@@ -61,9 +61,9 @@ def erase_traces(
 ) -> Progress:
     """Erase what the worker knows of somebody who has withdrawn; asked again until it says that it has finished.
 
-    ``in_hand``: findings this process works on; ``stored``: artefacts that unfinished work has put away, by finding.
+    ``in_hand``: keys of runs this process works on; ``stored``: artefacts that unfinished work has put away, by key.
     """
-    with place.database.reading() as session:
+    with context.database.reading() as session:
         study_id = session.get_one(Participant, participant_id).study_id
 
     def concerns(job: Job) -> bool:
@@ -71,17 +71,17 @@ def erase_traces(
         return job.participant_id == participant_id or of_study
 
     def erase(session: Session) -> None:
-        withdrawal.erase(session, place.store, session.get_one(Participant, participant_id))
+        withdrawal.erase(session, context.store, session.get_one(Participant, participant_id))
 
     def finish(session: Session) -> None:
         session.get_one(Participant, participant_id).erased_at = now()
         log.info("participant %d has withdrawn: the last traces are erased", participant_id)
 
-    return _erase(place, concerns, erase, finish, in_hand, stored, engine_file)
+    return _erase(context, concerns, erase, finish, in_hand, stored, engine_file)
 
 
 def erase_traces_of_study(
-    place: Workplace,
+    context: WorkerContext,
     study_id: int,
     in_hand: Collection[str],
     stored: MutableMapping[str, set[str]],
@@ -93,24 +93,24 @@ def erase_traces_of_study(
         return job.study_id == study_id
 
     def erase(session: Session) -> None:
-        withdrawal.erase_study(session, place.store, session.get_one(Study, study_id))
+        withdrawal.erase_study(session, context.store, session.get_one(Study, study_id))
 
     def finish(session: Session) -> None:
         session.get_one(Study, study_id).erased_at = now()
         session.execute(update(Participant).where(Participant.study_id == study_id).values(erased_at=now()))
         log.info("study %d was deleted: the last traces are erased", study_id)
 
-    return _erase(place, concerns, erase, finish, in_hand, stored, engine_file)
+    return _erase(context, concerns, erase, finish, in_hand, stored, engine_file)
 
 
 Erase = Callable[
-    [Workplace, int, Collection[str], MutableMapping[str, set[str]], Path | None],
+    [WorkerContext, int, Collection[str], MutableMapping[str, set[str]], Path | None],
     Progress,
 ]
 
 
 def _erase(
-    place: Workplace,
+    context: WorkerContext,
     concerns: Callable[[Job], bool],
     erase: Callable[[Session], None],
     finish: Callable[[Session], None],
@@ -122,24 +122,24 @@ def _erase(
     active = [name for name, (_, status) in jobs.items() if status in _ACTIVE]
     if active:
         DBOS.cancel_workflows(active)  # and look again: one of them may just be beginning
-    if active or any(job.finding in in_hand for job, _ in jobs.values()):
+    if active or any(job.key in in_hand for job, _ in jobs.values()):
         return Progress(finished=False)
     left_over = {sha256 for name in jobs for sha256 in _artefacts_of_steps(name)}
     for job, _ in jobs.values():
-        left_over |= stored.pop(job.finding, set())
-    with place.database.writing() as session:
+        left_over |= stored.pop(job.key, set())
+    with context.database.writing() as session:
         erase(session)
         for sha256 in left_over - withdrawal.in_use(session, left_over):
-            place.store.delete(sha256)
+            context.store.delete(sha256)
     DBOS.delete_workflows(list(jobs))
-    if not place.database.forget_erased() or (engine_file is not None and not rewrite(engine_file)):
+    if not context.database.forget_erased() or (engine_file is not None and not rewrite(engine_file)):
         return Progress(finished=False, forgotten=frozenset(jobs))  # somebody is reading; the next round tries again
     if engine_file is not None:
         engine.forget_set_aside(engine_file)
-    database_file = file_of(place.database.url)
+    database_file = file_of(context.database.url)
     if database_file is not None:
         upgrading.forget_copies(database_file)
-    with place.database.writing() as session:
+    with context.database.writing() as session:
         finish(session)
     return Progress(finished=True, forgotten=frozenset(jobs))
 
@@ -160,7 +160,12 @@ def _workflows(concerns: Callable[[Job], bool]) -> Iterator[tuple[str, tuple[Job
 
 def _job(workflow: WorkflowStatus) -> Job | None:
     arguments = workflow.input["args"][-1] if workflow.input and workflow.input["args"] else None
-    return Job(**arguments) if isinstance(arguments, Mapping) else None
+    if not isinstance(arguments, Mapping):
+        return None
+    try:
+        return from_arguments(arguments)
+    except (KeyError, ValueError):
+        return None
 
 
 def _artefacts_of_steps(workflow: str) -> set[str]:

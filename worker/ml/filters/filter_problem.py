@@ -24,6 +24,7 @@ from worker.ml.filters.filter_onnx import OnnxFilter, to_onnx
 from worker.ml.policies.gaussian import GaussianPolicy
 from worker.ml.rewards.reward_models import RewardModel
 from worker.modes import ModeFamily
+from worker.scenarios import GATE, RESIDUAL, first_of
 from worker.task import Task
 from worker.trajectory import Trajectory
 
@@ -86,11 +87,11 @@ class FilterConfig:
 
     def gate_block(self, task: Task) -> range:
         """Scenarios on which a setting is tried before it is accepted."""
-        return scenarios_for("gate", _affordable(self.gate_scenarios, task))
+        return first_of(GATE, _affordable(self.gate_scenarios, task))
 
     def residual_block(self, task: Task, number: int) -> range:
         """Scenarios in which the filter is rolled out before round ``number`` of residual learning."""
-        return scenarios_for("residual", _affordable(self.residual_rollouts, task), 1000 * number)
+        return first_of(RESIDUAL, _affordable(self.residual_rollouts, task), 1000 * number)
 
     def learning_steps(self, number: int) -> tuple[int, int]:
         """Gradient steps of the value and of the encoder in round ``number``, from 0 on."""
@@ -143,17 +144,6 @@ class FilterDraft:
         """The same with the seconds since ``started`` added to a stage."""
         spent = self.seconds.get(stage, 0.0) + time.perf_counter() - started
         return replace(self, seconds={**self.seconds, stage: round(spent, 3)})
-
-
-SCENARIO_BLOCKS = {"gate": 2_000_000, "residual": 3_000_000, "evaluation": 4_000_000, "recording": 5_000_000}
-"""First scenario of each purpose. Others: exploration 100_000, foresight 200_000, test of the policy 1_000_000, what is
-rated or shown before and after 6_000_000 (app.services.evaluation.evaluation_plan), clips from 10_000_000."""
-
-
-def scenarios_for(purpose: str, count: int, skip: int = 0) -> range:
-    """Scenarios that no other purpose uses."""
-    first = SCENARIO_BLOCKS[purpose] + skip
-    return range(first, first + count)
 
 
 def _affordable(episodes: int, task: Task) -> int:

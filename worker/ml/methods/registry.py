@@ -27,6 +27,7 @@ from worker.ml.methods.preference_rl import Env, MakeEnv, PolicyAct, learned
 from worker.ml.methods.prefft import TIED, FineTuning
 from worker.ml.policies.checkpoint import Checkpoint
 from worker.ml.rewards.reward_models import RewardModel
+from worker.scenarios import RESIDUAL, first_of
 from worker.trajectory import Trajectory
 
 Array = npt.NDArray[np.float32]
@@ -114,7 +115,7 @@ def fit_pbarl(setting: Setting) -> tuple[Act, tuple[str, ...]]:
 def fit_as_printed(setting: Setting, list_length: int) -> tuple[Act, tuple[str, ...]]:
     """The paper's objective with a list of n actions; no gate, as the paper has none."""
     problem = replace(setting.problem, reward=setting.action_reward())
-    rollouts = setting.reference(filter_problem.scenarios_for("residual", setting.config.printed_rollouts))
+    rollouts = setting.reference(first_of(RESIDUAL, setting.config.printed_rollouts))
     config = PrintedConfig(
         list_length=list_length,
         betas=BETAS.get(problem.task.name, OTHER_TASKS_BETAS),
@@ -152,7 +153,7 @@ def fit_pbrl_hri(setting: Setting) -> tuple[Act, tuple[str, ...]]:
 def fit_best_of(setting: Setting) -> tuple[Act, tuple[str, ...]]:
     """The most valuable of n samples in every step."""
     problem, config = setting.problem, setting.config
-    scenarios = filter_problem.scenarios_for("residual", config.value_rollouts)
+    scenarios = first_of(RESIDUAL, config.value_rollouts)
     rollouts = setting.collect(PolicyAct(problem.policy), scenarios, config.value_noise, problem.seed)
     act = fit_best_of_n(problem.policy, problem.reward, rollouts, config.candidates, config.value_steps, problem.seed)
     return act, (f"n = {config.candidates} samples and the mean, ranked by value.",)

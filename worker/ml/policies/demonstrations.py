@@ -42,13 +42,17 @@ class Demonstrations:
 
 
 def collect(
-    env: gymnasium.Env[Any, Any], demonstrate: Demonstrate, config: "SacConfig", rng: np.random.Generator, below: int
+    env: gymnasium.Env[Any, Any],
+    demonstrate: Demonstrate,
+    config: "SacConfig",
+    rng: np.random.Generator,
+    scenarios: range,
 ) -> Demonstrations:
-    """Play ``config.demonstrations`` episodes in random scenarios below ``below``."""
+    """Play ``config.demonstrations`` episodes in random ones of the scenarios."""
     rows, wanted = [], []
     for episode in range(config.demonstrations):
         noise = NOISES[episode % len(NOISES)]
-        state, _ = env.reset(seed=int(rng.integers(below)))
+        state, _ = env.reset(seed=int(rng.integers(scenarios.start, scenarios.stop)))
         over = False
         while not over:
             shown = np.clip(demonstrate(state) / config.training_limit, -1.0, 1.0)

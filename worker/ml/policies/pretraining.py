@@ -6,7 +6,6 @@ is written atomically, so that a killed training resumes. Single-threaded: a lap
 
 import json
 import math
-import os
 import platform
 import time
 from collections.abc import Callable
@@ -23,15 +22,15 @@ from torch import Tensor
 from worker.ml.policies.demonstrations import Demonstrate, Demonstrations, collect, imitate
 from worker.ml.policies.gaussian import GaussianPolicy
 from worker.ml.policies.sac import Actor, Array, Env, Learner, Replay, SacConfig
+from worker.scenarios import POLICY_SELECTION, POLICY_TEST, POLICY_TRAINING
 from worker.spaces import Field
+from worker.whole_files import written_whole
 
 Progress = Callable[[int, dict[str, float]], None]
 """Called with the number of environment steps done so far and the newest figures."""
 
 INPUT_SCALE = {"m": 3.0, "rad": 1.0, "1": 1.0, "N": 0.1}
 """Factor on each unit of the observation, so that typical inputs are about one."""
-EVALUATION_SEED = 2_000_000
-TEST_SEED = 1_000_000
 REPLAY_FILE, STATE_FILE, PROGRESS_FILE = "replay.npy", "state.safetensors", "state.json"
 
 
@@ -90,7 +89,7 @@ class _Run:
         self.shown: Demonstrations | None = None
         if demonstrate and config.demonstrations:
             rng = np.random.default_rng([config.seed, 1])
-            self.shown = collect(self.test_env, demonstrate, config, rng, TEST_SEED)
+            self.shown = collect(self.test_env, demonstrate, config, rng, POLICY_TRAINING)
         self.steps = 0
         self.owed_updates = 0.0
         self.best = (-1.0, -math.inf)
@@ -134,13 +133,14 @@ class _Run:
         if self.learner is None:
             return {}
         policy = self.learner.average.policy(self.config.action_limit)
-        outcome = evaluate(self.test_env, policy.mean, EVALUATION_SEED, self.config.evaluation_episodes)
+        outcome = evaluate(self.test_env, policy.mean, POLICY_SELECTION.start, self.config.evaluation_episodes)
         temperature = float(self.learner.log_temperature.detach().exp())
         self.curve.append({"steps": self.steps, "cpu_s": round(self.cpu_s, 1), "alpha": temperature, **outcome})
         self._keep_early(policy, outcome["success"])
         if (outcome["success"], outcome["return"]) > self.best:
             self.best = (outcome["success"], outcome["return"])
-            _replace(self.folder / "policy.safetensors", policy.save)
+            with written_whole(self.folder / "policy.safetensors") as draft:
+                policy.save(draft)
         return outcome
 
     def _keep_early(self, policy: GaussianPolicy, success: float) -> None:
@@ -148,19 +148,20 @@ class _Run:
             early = self.folder / "early" / f"success_{round(100 * share)}.safetensors"
             if share <= success < share + 0.3 and not early.exists():
                 early.parent.mkdir(exist_ok=True)
-                _replace(early, policy.save)
+                with written_whole(early) as draft:
+                    policy.save(draft)
                 break
 
     def _watch_imitation(self, actor: Actor) -> None:
         policy = actor.policy(self.config.action_limit)
-        outcome = evaluate(self.test_env, policy.mean, EVALUATION_SEED, self.config.evaluation_episodes)
+        outcome = evaluate(self.test_env, policy.mean, POLICY_SELECTION.start, self.config.evaluation_episodes)
         self._keep_early(policy, outcome["success"])
 
     def finish(self) -> dict[str, Any]:
         """Test the exported policy on scenarios that played no part in the training; write the record."""
         policy = GaussianPolicy.load(self.folder / "policy.safetensors")
         rng = np.random.default_rng(self.config.seed)
-        count = self.config.test_episodes
+        first, count = POLICY_TEST.start, self.config.test_episodes
         record = {
             "command": self.command,
             "config": {key: value for key, value in asdict(self.config).items() if key != "observation"},
@@ -170,12 +171,13 @@ class _Run:
             "cpu_s": round(self.cpu_s, 1),
             "versions": _versions(),
             "curve": self.curve,
-            "test_scenarios": [TEST_SEED, TEST_SEED + count - 1],
-            "test_mean_action": evaluate(self.test_env, policy.mean, TEST_SEED, count),
-            "test_sampled_action": evaluate(self.test_env, lambda state: policy.sample(state, rng), TEST_SEED, count),
+            "test_scenarios": [first, first + count - 1],
+            "test_mean_action": evaluate(self.test_env, policy.mean, first, count),
+            "test_sampled_action": evaluate(self.test_env, lambda state: policy.sample(state, rng), first, count),
         }
         text = json.dumps(record, indent=2) + "\n"
-        _replace(self.folder / "training.json", lambda path: path.write_text(text))
+        with written_whole(self.folder / "training.json") as draft:
+            draft.write_text(text)
         for env in (*self.envs, self.test_env):
             env.close()
         return record
@@ -188,8 +190,10 @@ class _Run:
         resume = self.folder / "resume"
         tensors = {**self.learner.state(), "torch_rng": torch.get_rng_state()}
         rows = self.replay.rows[: self.replay.count].numpy()
-        _replace(resume / REPLAY_FILE, lambda path: _write_rows(path, rows))
-        _replace(resume / STATE_FILE, lambda path: save_file(tensors, path))
+        with written_whole(resume / REPLAY_FILE) as draft:
+            np.save(draft, rows, allow_pickle=False)
+        with written_whole(resume / STATE_FILE) as draft:
+            save_file(tensors, draft)
         counts = {
             "steps": self.steps,
             "updates": self.learner.updates,
@@ -198,7 +202,8 @@ class _Run:
             "curve": self.curve,
             "rng": self.rng.bit_generator.state,
         }
-        _replace(resume / PROGRESS_FILE, lambda path: path.write_text(json.dumps(counts)))
+        with written_whole(resume / PROGRESS_FILE) as draft:
+            draft.write_text(json.dumps(counts))
 
     def resume(self) -> None:
         """Continue a killed training; the episodes that were in flight start anew."""
@@ -226,7 +231,7 @@ class _Run:
         return actions
 
     def _scenario(self) -> int:
-        return int(self.rng.integers(TEST_SEED))
+        return int(self.rng.integers(POLICY_TRAINING.start, POLICY_TRAINING.stop))
 
     def _imitate(self) -> None:
         if self.shown:
@@ -271,20 +276,6 @@ def evaluate(env: Env, act: Callable[[Array], Array], first_scenario: int, episo
         "max_force_n": float(np.mean(forces)),
         "max_force_n_95": float(np.percentile(forces, 95)),
     }
-
-
-def _replace(path: Path, write: Callable[[Path], Any]) -> None:
-    """Write to a neighbour and rename, so that a reader or a restart never sees half a file."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    write(temporary)
-    with temporary.open("rb") as handle:
-        os.fsync(handle.fileno())
-    temporary.replace(path)
-
-
-def _write_rows(path: Path, rows: Array) -> None:
-    with path.open("wb") as handle:
-        np.save(handle, rows, allow_pickle=False)
 
 
 def _versions() -> dict[str, str]:

@@ -1,0 +1,42 @@
+"""Which scenarios (environment seeds) serve which purpose: nothing is judged on what it was fitted to.
+
+The web server draws from the two of the evaluation, which app.services.evaluation.evaluation_plan defines; a test holds
+all of them apart.
+"""
+
+RESPONSE_SURFACE = range(100_000, 150_000)
+"""Random modes, from which the response surface is fitted."""
+RESPONSE_SURFACE_SOUGHT = range(150_000, 200_000)
+"""Modes that somebody would want, with which it is refined."""
+SIGNAL_PREDICTOR = range(200_000, 250_000)
+SIGNAL_PREDICTOR_TEST = range(250_000, 300_000)
+POLICY_TRAINING = range(300_000, 1_000_000)
+"""Demonstrations and pre-training. (The policies that ship with version 0.1 were trained in 0 to 999 999.)"""
+POLICY_TEST = range(1_000_000, 1_500_000)
+POLICY_SELECTION = range(1_500_000, 2_000_000)
+"""Which state of a pre-training is kept. (Of those that ship with version 0.1 in those of the gate.)"""
+GATE = range(2_000_000, 3_000_000)
+"""Whether a mode or residual is accepted."""
+RESIDUAL = range(3_000_000, 4_000_000)
+"""Rollouts from which the residual and the printed encoder learn."""
+EVALUATION = range(4_000_000, 5_000_000)
+"""What is reported of a filter."""
+POOL = range(10_000_000, 100_000_000)
+"""Clips of studies, and the pools of scripted users."""
+NORMALISATION = range(2_000_000_000, 2_000_001_000)
+"""Over which reward models have mean 0 and deviation 1."""
+
+_POOL_OF_A_STUDY = 1_000
+
+
+def first_of(block: range, count: int, skip: int = 0) -> range:
+    """So many scenarios of a block, after ``skip`` others. Raises ValueError when it has not enough."""
+    if not 0 <= skip <= len(block) - count:
+        raise ValueError(f"There are only {len(block)} scenarios from {block.start} on, not {skip + count}.")
+    return block[skip : skip + count]
+
+
+def of_pool(study_seed: int, index: int) -> int:
+    """The scenario at one place of a study's pool."""
+    pools = len(POOL) // _POOL_OF_A_STUDY
+    return POOL.start + study_seed % pools * _POOL_OF_A_STUDY + index
