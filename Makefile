@@ -20,8 +20,8 @@ run: $(VENV)/run.stamp ## Install what is missing, then start web server and wor
 link: $(VENV)/run.stamp ## Add a participant to the newest study and print the personal link
 	@$(PY) -m app link
 
-demo: $(VENV)/run.stamp ## Make a demo study of a task and print a participant link (TASK=feeding, drinking or scratching)
-	@$(PY) -m app demo --task $(or $(TASK),feeding)
+demo: $(VENV)/run.stamp ## Make a demo study of a task and print a participant link (TASK=drinking)
+	@$(PY) -m app demo $(if $(TASK),--task $(TASK))
 
 rehearse: $(VENV)/run.stamp ## Run scripted participants through the real pages to downloaded bundles (ARGS="--help")
 	@$(PY) -m worker rehearse $(ARGS)
@@ -76,7 +76,7 @@ $(VENV)/torch.stamp: $(VENV)/bin/python
 	else $(PIP) install "torch==$(TORCH_VERSION)"; fi
 	@touch $@
 
-$(VENV)/run.stamp: requirements.lock $(VENV)/torch.stamp
+$(VENV)/run.stamp: requirements.lock pyproject.toml $(VENV)/torch.stamp
 	@install/engine.sh $(VENV)
 	@echo "Installing pinned dependencies ..."
 	@$(PIP) install --no-deps --require-hashes -r requirements.lock

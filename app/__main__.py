@@ -12,7 +12,7 @@ from sqlalchemy.orm import Session
 
 from app import upgrading
 from app.db import Database
-from app.domain.studies import Study, TaskName
+from app.domain.studies import Study
 from app.errors import EXPLAINED, AppError, in_words
 from app.paths import DOCS
 from app.programs import Programs, say
@@ -25,6 +25,7 @@ from app.services.monitoring import damage
 from app.services.participants import enrolment
 from app.settings import Settings
 from app.storage import ArtefactStore, keep_private
+from installed_tasks import catalogue
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -34,7 +35,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for name, act in _COMMANDS.items():
         commands.add_parser(name, help=act.__doc__).set_defaults(act=act)
     demo = commands.add_parser("demo", help=demo_study.__doc__)
-    demo.add_argument("--task", choices=[task.value for task in TaskName], default=TaskName.FEEDING.value)
+    demo.add_argument("--task", choices=catalogue.names(), default=catalogue.usual())
     demo.set_defaults(act=demo_study)
     importing = commands.add_parser("import-study", help=import_study.__doc__)
     importing.add_argument("file", type=Path, help="the archive")
@@ -121,7 +122,7 @@ def demo_study(settings: Settings, task: str) -> int:
     """Make a demo study of a task with one participant and print the personal link."""
     migrate(settings)
     with _database(settings).writing() as session:
-        token = demo.make_empty(session, TaskName(task))
+        token = demo.make_empty(session, task)
     say(f"{settings.base_url}/p/{token}")
     return 0
 
@@ -195,7 +196,7 @@ def _demo(session: Session, settings: Settings) -> tuple[str, Sequence[str]]:
     try:
         return demo.import_finished(session, ArtefactStore(settings.data_dir / "artefacts")), []
     except AppError as error:
-        token = demo.make_empty(session, TaskName.FEEDING)
+        token = demo.make_empty(session, catalogue.usual())
         instead = "An empty demo study was made instead of the finished one; its first clips take a few minutes."
         return token, ["", f"  {instead}", f"  {error}"]
 

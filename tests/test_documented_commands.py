@@ -32,8 +32,8 @@ COMMAND = re.compile(
     rf"((?:{MAKE}|{VARIABLES}*(?:[\w.]+/)*python {OURS}|\.venv/bin/[\w-]+)(?:(?! {{2}}| #| \.\.\.)[^`<\n])*)",
     re.MULTILINE,
 )
-EXAMPLE = {"dabbing": "feeding"}
-"""The task that docs/new_task.md makes up."""
+EXAMPLE = {"dabbing": "feeding", "NAME": "feeding"}
+"""The task that docs/new_task.md makes up, and any task."""
 
 
 @dataclass(frozen=True)

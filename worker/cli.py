@@ -15,8 +15,8 @@ from app.domain.study_settings import PAPER_PROTOCOL, StudySettings
 from app.services.archives import demo_archive
 from app.settings import Settings
 from app.storage import ArtefactStore, keep_private
+from installed_tasks import catalogue
 from worker import options
-from worker.compute import simulation
 from worker.experiments import benchmark, fit_response_surface, pretrain_policy, train_signal_predictor
 from worker.experiments.benchmark_cell import INDIRECT_USERS, OPPOSED_USERS, PAPER_USERS
 from worker.jobs import service
@@ -25,11 +25,13 @@ from worker.ml.methods.registry import METHODS
 from worker.ml.teachers import Manner, Taste
 from worker.rehearsal import demo_study, rehearsal
 from worker.rehearsal.server import OwnStudio
-from worker.tasks.registry import ENVIRONMENTS
+from worker.tasks.registry import checkpoint
 
 
 def run(arguments: Sequence[str] | None) -> int:
     """Parse the command line and do what it says; returns the exit code."""
+    for task in catalogue.installed().broken:
+        sys.stderr.write(f"{task.why}\n")
     said = parser().parse_args(arguments)
     result: int = said.act(said)
     return result
@@ -111,7 +113,7 @@ def _add_benchmark(commands: _Commands) -> None:
     command = commands.add_parser("benchmark", help=benchmark.__doc__, formatter_class=argparse.RawTextHelpFormatter)
     command.add_argument("--profile", choices=list(benchmark.PROFILES), default="full")
     command.add_argument("--methods", nargs="+", choices=list(METHODS), default=list(usual.methods))
-    command.add_argument("--tasks", nargs="+", choices=list(ENVIRONMENTS), default=list(usual.tasks))
+    command.add_argument("--tasks", nargs="+", choices=catalogue.names(), default=list(usual.tasks))
     command.add_argument(
         "--users",
         nargs="+",
@@ -209,11 +211,11 @@ def _add_processes(command: argparse.ArgumentParser) -> None:
 
 
 def _add_task(command: argparse.ArgumentParser) -> None:
-    command.add_argument("--task", choices=list(ENVIRONMENTS), default="feeding")
+    command.add_argument("--task", choices=catalogue.names(), default=catalogue.usual())
 
 
 def _pretrain(said: argparse.Namespace) -> int:
-    return pretrain_policy.pretrain(said.task, said.seed, said.directory or simulation.checkpoints(said.task))
+    return pretrain_policy.pretrain(said.task, said.seed, said.directory or checkpoint(said.task))
 
 
 def _explore(said: argparse.Namespace) -> int:

@@ -1,9 +1,9 @@
-"""What a task is to those who learn it: the pure description that simulation, learning and bundles share.
+"""What a task is to those who learn it: what simulation, learning and bundles share of it.
 
-Each task's own description lives beside its environment in worker/sim/<task>.py and travels from there as an argument.
+Each task's own stands beside its environment in the task's folder and travels from there as an argument.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from worker.modes import ModeFamily
 from worker.spaces import Space
@@ -15,7 +15,9 @@ class Task:
 
     name: str
     """as stored in studies, trajectories and bundles"""
-    title: str
+    title: str = field(default="", kw_only=True)
+    """Pages read task.toml. This one belongs to the mark under which rollouts and benchmark results of the first tasks
+    are kept (policy_mark)."""
     observation: Space
     modes: ModeFamily
     calibrated_speed_weight: float
@@ -23,6 +25,10 @@ class Task:
     policy's own speed; measured by tests/benchmarks/speed_cost_weight.py, to be repeated for a new policy."""
     speed_counts_near: bool = True
     """Whether the calibrated speed cost counts within 20 cm of the target; not where motion there is the service."""
+    printed_betas: tuple[float, float, float, float] = field(default=(1.0, 1.5, 0.1, 1.0), repr=False)
+    """Weights of the printed method's losses Rec, Pref, KL and Dyn (paper, Implementation Details). No rollout depends
+    on them, so they are no part of its mark."""
     episode_steps: int = 100
+    """as in the folder's task.toml"""
     pieces: int = 8
     """of food or water in the usual portion"""

@@ -9,31 +9,20 @@ from sqlalchemy import ForeignKey, String, Text, UniqueConstraint, false
 from sqlalchemy.orm import Mapped, mapped_column, relationship
 
 from app.db import Base, now
-from app.domain.study_settings import StudySettings
-
-
-class TaskName(StrEnum):
-    """What the robot does; the worker simulates the tasks of these names."""
-
-    FEEDING = "feeding"
-    DRINKING = "drinking"
-    SCRATCHING = "scratching"
-
-
-USUAL_CLIP_STEPS = {TaskName.FEEDING: 60, TaskName.DRINKING: 70, TaskName.SCRATCHING: 60}
-"""Control steps (10 Hz) from the start in which what matters has happened: water is poured late."""
-LONGEST_CLIP_STEPS = {TaskName.FEEDING: 100, TaskName.DRINKING: 130, TaskName.SCRATCHING: 100}
-"""A whole episode."""
+from app.domain.study_settings import USUAL_CLIP_STEPS, StudySettings
+from installed_tasks import catalogue
 
 
 def longest_clip_steps(task: str) -> int | None:
-    """Of a task by its name; None for one that is not simulated here."""
-    return {name.value: steps for name, steps in LONGEST_CLIP_STEPS.items()}.get(task)
+    """A whole episode of a task; None for one that is not installed here."""
+    installed = catalogue.find(task)
+    return installed.description.episode_steps if installed else None
 
 
 def usual_clip_steps(task: str) -> int:
-    """Of a task by its name; a task under construction, which has no row here yet, is shown as long as Feeding."""
-    return {name.value: steps for name, steps in USUAL_CLIP_STEPS.items()}.get(task, USUAL_CLIP_STEPS[TaskName.FEEDING])
+    """Control steps from the start in which what matters in a task has happened."""
+    installed = catalogue.find(task)
+    return installed.description.usual_clip_steps if installed else USUAL_CLIP_STEPS
 
 
 def new_key_secret() -> str:
@@ -49,7 +38,7 @@ class Study(Base):
     id: Mapped[int] = mapped_column(primary_key=True)
     slug: Mapped[str] = mapped_column(String(80), unique=True)
     name: Mapped[str] = mapped_column(String(120))
-    task: Mapped[str] = mapped_column(String(40), default=TaskName.FEEDING)
+    task: Mapped[str] = mapped_column(String(40), default=catalogue.usual)
     stored_settings: Mapped[dict[str, Any]]
     seed: Mapped[int]
     created_at: Mapped[datetime] = mapped_column(default=now)
@@ -77,7 +66,7 @@ class Study(Base):
 
     @property
     def whole_clip_steps(self) -> int | None:
-        """Steps of a clip of a whole episode; None for a task that is not simulated here."""
+        """Steps of a clip of a whole episode; None for a task that is not installed here."""
         return longest_clip_steps(self.task)
 
 

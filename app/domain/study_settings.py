@@ -16,6 +16,10 @@ from app.domain.protocol import (
     Language,
     PlannedTest,
 )
+from installed_tasks.description import LONGEST_CLIP_STEPS, SHORTEST_CLIP_STEPS
+
+USUAL_CLIP_STEPS = 60
+"""Of a task that is not installed here."""
 
 
 class StudySettings(BaseModel):
@@ -233,14 +237,14 @@ class StudySettings(BaseModel):
         6, Section.CLIPS, "Ways of doing each", "Pairs show two of them.", fixed_by=Use.CLIPS, ge=2, le=8
     )
     clip_steps: int = setting(
-        60,
+        USUAL_CLIP_STEPS,
         Section.CLIPS,
         "Length of a clip",
         "10 steps are one second; empty: what suits the task.",
         unit="steps",
         fixed_by=Use.CLIPS,
-        ge=20,
-        le=130,
+        ge=SHORTEST_CLIP_STEPS,
+        le=LONGEST_CLIP_STEPS,
     )
     clip_quality: ClipQuality = setting(ClipQuality.SHARP, Section.CLIPS, "Quality", fixed_by=Use.CLIPS)
     planned_tests: tuple[PlannedTest, ...] = setting((PlannedTest.PAIRED_T,), Section.TESTS, "Tests on the ratings")

@@ -76,9 +76,6 @@ form-comments = Möchten Sie uns sonst noch etwas mitteilen?
 ## Anleitung
 
 instructions-title = So funktioniert es
-task-feeding = Ein Roboterarm reicht einer sitzenden Person mit einem Löffel Essen an. Jedes Paar zeigt dieselbe Situation in zwei Ausführungen: Der Roboter kann schneller oder langsamer sein, einen anderen Weg nehmen, den Löffel mehr oder weniger weit in den Mund führen oder etwas Essen verlieren. Stellen Sie sich vor, dass Ihnen selbst das Essen angereicht wird.
-task-drinking = Ein Roboterarm bringt einer sitzenden Person einen Becher Wasser und neigt ihn, sodass sie trinken kann; das Wasser ist blau dargestellt. Jedes Paar zeigt dieselbe Situation in zwei Ausführungen: Der Roboter kann schneller oder langsamer sein, einen anderen Weg nehmen, vor dem Mund warten, mehr oder weniger auf einmal geben oder etwas verschütten. Stellen Sie sich vor, dass Sie selbst trinken.
-task-scratching = Ein Roboterarm kratzt eine juckende Stelle, den rötlichen Fleck am rechten Arm einer sitzenden Person. Jedes Paar zeigt dieselbe Situation in zwei Ausführungen: Der Roboter kann schneller oder langsamer sein, einen anderen Weg nehmen, vor der Berührung warten, stärker oder schwächer drücken, ruhiger oder flotter kratzen. Stellen Sie sich vor, dass es Ihr Arm ist.
 task-other = Ein Roboterarm hilft einer sitzenden Person. Jedes Paar zeigt dieselbe Situation in zwei Ausführungen. Stellen Sie sich vor, dass Ihnen selbst geholfen wird.
 instructions-keys = Antworten und ihre Tasten
 instructions-key = Taste

@@ -78,9 +78,6 @@ form-comments = Is there anything else you would like to tell us?
 ## Instructions
 
 instructions-title = How it works
-task-feeding = A robot arm feeds a seated person with a spoon. Each pair shows the same situation handled in two different ways: the robot may be faster or slower, take a different path, move the spoon less or more deeply into the mouth, or drop some food. Imagine that you are the one being fed.
-task-drinking = A robot arm brings a cup of water to a seated person and tips it so that they can drink; the water is shown in blue. Each pair shows the same situation handled in two different ways: the robot may be faster or slower, take a different path, wait in front of the mouth, pour less or more at a time, or spill some. Imagine that you are the one drinking.
-task-scratching = A robot arm scratches an itch, the reddish spot on a seated person’s right arm. Each pair shows the same situation handled in two different ways: the robot may be faster or slower, take a different path, wait before it touches the skin, press more lightly or more firmly, or stroke more slowly or more briskly. Imagine that it is your arm.
 task-other = A robot arm helps a seated person. Each pair shows the same situation handled in two different ways. Imagine that you are the one being helped.
 instructions-keys = Answers and their keys
 instructions-key = Key

@@ -12,10 +12,11 @@ from sqlalchemy import select
 from app.__main__ import _first_start, main, migrate
 from app.db import Database
 from app.domain.clips import Clip
-from app.domain.studies import USUAL_CLIP_STEPS, Participant, Study, TaskName
+from app.domain.studies import Participant, Study, usual_clip_steps
 from app.services.archives import demo_archive
 from app.settings import Settings
 from app.storage import ArtefactStore
+from installed_tasks import catalogue
 
 MOST_BYTES = 6_000_000
 """Everybody who clones the repository loads every version of it."""
@@ -160,9 +161,9 @@ def test_a_file_that_is_missing_or_damaged_does_not_keep_the_studio_from_startin
     assert [path for path in (tmp_path / "data" / "artefacts").rglob("*") if path.is_file()] == []
 
 
-@pytest.mark.parametrize("task", TaskName)
+@pytest.mark.parametrize("task", catalogue.names())
 def test_a_demo_study_has_one_participant_whose_link_is_printed(
-    task: TaskName, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    task: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("DATA_DIR", str(tmp_path))
     assert main(["demo", "--task", task]) == 0
@@ -170,7 +171,7 @@ def test_a_demo_study_has_one_participant_whose_link_is_printed(
     database = Database(Settings(_env_file=None, data_dir=tmp_path).sqlalchemy_url)
     with database.reading() as session:
         study = session.scalars(select(Study)).one()
-        assert (study.task, study.settings.clip_steps) == (task, USUAL_CLIP_STEPS[task])
+        assert (study.task, study.settings.clip_steps) == (task, usual_clip_steps(task))
         assert session.scalars(select(Participant.study_id)).all() == [study.id]
     database.dispose()
 

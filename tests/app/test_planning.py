@@ -11,7 +11,7 @@ from app.db import Database, now
 from app.domain.evaluation import Rating
 from app.domain.preferences import Exclusion, LabelEvent, Query
 from app.domain.protocol import PlannedTest
-from app.domain.studies import Deviation, Study, TaskName
+from app.domain.studies import Deviation, Study
 from app.services.answers import exclusions
 from app.services.exports import export_formats
 from app.services.studies import locking, preregistration
@@ -103,7 +103,7 @@ def test_a_test_that_was_named_under_the_lock_is_not_planned(
             store,
             locked,
             name=locked.name,
-            task=TaskName(locked.task),
+            task=locked.task,
             seed=None,
             settings=settings,
             actor="Ada",

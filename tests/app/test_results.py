@@ -13,7 +13,7 @@ from app.db import Database, now
 from app.domain.models import Report, RunStatus
 from app.domain.preferences import Query, Response
 from app.domain.protocol import PlannedTest
-from app.domain.studies import Study, TaskName
+from app.domain.studies import Study
 from app.services.answers import exclusions
 from app.services.monitoring import dashboard
 from app.services.studies import locking
@@ -99,7 +99,7 @@ def test_a_test_named_under_the_lock_is_exploratory_and_the_change_is_listed(
     with database.writing() as session:
         locked = session.get_one(Study, study.id)
         settings = locked.settings.model_copy(update={"planned_tests": (PlannedTest.WILCOXON,)})
-        name, task = locked.name, TaskName(locked.task)
+        name, task = locked.name, locked.task
         locking.change(
             session, store, locked, name=name, task=task, seed=None, settings=settings, actor="Ada", reason="Nicer."
         )

@@ -242,12 +242,12 @@ class TestDuplicating:
     ) -> None:
         with database.writing() as session:
             source = factories.make_study(session, "Pilot")
-            source.material = {"signals": [{"name": "force_n"}]}
+            source.task, source.material = "own_clips", {"signals": [{"name": "force_n"}]}
             clips = [factories.make_clip(session, store, source) for _ in range(3)]
         experimenter.post("/studies/new", data=typed(experimenter, "/studies/new?like=pilot"))
         with database.reading() as session:
             copy = session.scalars(select(Study).where(Study.slug == "pilot-copy")).one()
-            assert copy.material == source.material
+            assert (copy.task, copy.material) == ("own_clips", source.material)
             theirs = session.scalars(select(Clip).join(Rollout).where(Rollout.study_id == copy.id)).all()
         assert [clip.video_sha256 for clip in theirs] == [clip.video_sha256 for clip in clips]
         assert {clip.id for clip in theirs}.isdisjoint({clip.id for clip in clips})

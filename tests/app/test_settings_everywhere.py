@@ -15,6 +15,7 @@ from app.domain.study_settings import PAPER_PROTOCOL, StudySettings
 from app.services.studies import locking
 from app.web.experimenter.form_fields import BY_NAME, FIELDS, Kind
 from app.web.experimenter.study_form import FormInvalid, StudyForm, form_of, form_with_defaults, typed_study
+from installed_tasks import catalogue
 
 NOT_ON_THE_FORM: dict[str, str] = {}
 """Settings that the form leaves out, each with the reason; all are on it so far."""
@@ -74,7 +75,7 @@ def test_the_form_fills_settings_and_nothing_else_but_what_a_study_is_called_and
 
 @pytest.mark.parametrize("wanted", [StudySettings(), PAPER_PROTOCOL])
 def test_what_is_filled_in_are_the_defaults_of_the_settings(wanted: StudySettings) -> None:
-    assert typed_study(form_of("Pilot", "feeding", None, wanted)).settings == wanted
+    assert typed_study(form_of("Pilot", catalogue.usual(), None, wanted)).settings == wanted
 
 
 def test_defaults_keep_their_own_bounds() -> None:

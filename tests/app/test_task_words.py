@@ -7,11 +7,12 @@ from fastapi.testclient import TestClient
 
 from app.db import Database
 from app.domain.models import ModelKind, RunKind, RunStatus
-from app.domain.studies import Study, TaskName
+from app.domain.studies import Study
 from app.domain.study_settings import StudySettings
 from app.services.studies import studies
 from tests import factories
 from tests.app.conftest import agree
+from tests.app.study_pages import typed
 
 
 @pytest.fixture
@@ -78,6 +79,24 @@ def test_a_task_that_this_worker_does_not_know_is_a_failure_with_a_reason(
 
 
 @pytest.mark.parametrize("task", ["dressing"])
+def test_a_study_of_an_unknown_task_can_be_changed_and_keeps_it(
+    experimenter: TestClient, study: Study, database: Database
+) -> None:
+    experimenter.post("/studies/pilot/settings", data=typed(experimenter, "/studies/pilot/settings", name="Renamed"))
+    with database.reading() as session:
+        changed = session.get_one(Study, study.id)
+        assert (changed.name, changed.task) == ("Renamed", "dressing")
+    for page in (
+        "/studies",
+        "/studies/pilot",
+        "/studies/pilot/results",
+        "/studies/pilot/answers",
+        "/studies/new?like=pilot",
+    ):
+        assert experimenter.get(page).status_code == 200
+
+
+@pytest.mark.parametrize("task", ["dressing"])
 def test_a_participant_of_an_unknown_task_still_gets_instructions(
     study: Study, database: Database, client: TestClient
 ) -> None:
@@ -91,4 +110,4 @@ def test_a_participant_of_an_unknown_task_still_gets_instructions(
 def test_the_form_offers_every_task_with_one_chosen(experimenter: TestClient) -> None:
     page = experimenter.get("/studies/new").text
     offered = re.findall(r'name="task" value="(\w+)" (checked)?', page)
-    assert offered == [(TaskName.FEEDING, "checked"), (TaskName.DRINKING, ""), (TaskName.SCRATCHING, "")]
+    assert offered == [("feeding", "checked"), ("drinking", ""), ("scratching", "")]

@@ -12,7 +12,6 @@ import pytest
 from app.domain.choices import ClipQuality, Method, RewardKind, Strategy
 from app.domain.preferences import Response
 from app.domain.protocol import LIKERT_POINTS, EvaluatedMethod, EvaluationSettings, Language, PlannedTest
-from app.domain.studies import LONGEST_CLIP_STEPS, USUAL_CLIP_STEPS, TaskName
 from app.domain.study_settings import StudySettings
 from app.paths import WORDING
 from app.services.evaluation import unblinding
@@ -54,7 +53,6 @@ def default(config: type, name: str) -> Any:
         (acquisition.RANDOM_SHARE, USUAL.random_share),
         (benchmark_cell.CHOOSE_EVERY, USUAL.retrain_every_labels),
         (rollout_cache.BEHAVIOURS_PER_SCENARIO, USUAL.behaviours_per_scenario),
-        (USUAL_CLIP_STEPS[TaskName.FEEDING], USUAL.clip_steps),
         (statistics.POINTS, (1, LIKERT_POINTS)),
         (CONTROL_STEP_S, 1 / time_left.CONTROL_RATE_HZ),
     ],
@@ -89,8 +87,3 @@ def test_every_method_that_people_can_rate_is_one_of_the_benchmark() -> None:
 
 def test_the_methods_have_the_same_names_on_pages_and_in_figures() -> None:
     assert dict(figures.NAMES) == dict(results.METHOD_NAMES)
-
-
-def test_the_longest_clip_that_a_study_can_ask_for_is_the_longest_episode_there_is() -> None:
-    schema = StudySettings.model_json_schema()["properties"]["clip_steps"]
-    assert schema["maximum"] == max(LONGEST_CLIP_STEPS.values())

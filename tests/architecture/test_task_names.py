@@ -1,27 +1,59 @@
-"""Web and worker may not import each other's tasks; here both are seen, and agree."""
+"""A task is named in its folder and nowhere else; what the folder says fits what its code does."""
+
+import re
+import tomllib
+from pathlib import Path
 
 import pytest
 
-from app.domain.studies import LONGEST_CLIP_STEPS, USUAL_CLIP_STEPS, TaskName
+from app.domain.protocol import Language
 from app.web.texts.task_words import words_of
-from worker.tasks.registry import ENVIRONMENTS
+from installed_tasks import catalogue
+from worker.tasks import registry
 from worker.trajectory import COSTS, SIGNALS
 
+ROOT = Path(__file__).parents[2]
+NAMES = tuple(tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"][catalogue.GROUP])
+ELSEWHERE = {
+    "app/demo/feeding.zip": "the archive of the demo study, which is of a task",
+    "app/paths.py": "its file",
+    "worker/rehearsal/demo_study.py": "makes it",
+    "worker/analysis/published.py": "the numbers that the paper prints, by its names of tasks",
+}
 
-def test_the_tasks_that_studies_can_have_are_those_that_the_worker_simulates() -> None:
-    assert set(ENVIRONMENTS) == set(TaskName)
+
+def test_only_its_folder_names_a_task() -> None:
+    folders = [ROOT / "worker" / "tasks" / name for name in NAMES]
+    named = set()
+    for place in ("app", "installed_tasks", "worker", "templates", "static"):
+        for file in (ROOT / place).rglob("*"):
+            if not file.is_file() or "__pycache__" in file.parts or any(file.is_relative_to(each) for each in folders):
+                continue
+            said = file.relative_to(ROOT).as_posix().encode() + file.read_bytes() * (file.suffix != ".zip")
+            if re.search("|".join(NAMES).encode(), said, re.IGNORECASE):
+                named.add(file.relative_to(ROOT).as_posix())
+    assert named == set(ELSEWHERE)
 
 
-@pytest.mark.parametrize("task", TaskName)
-def test_the_longest_clip_is_a_whole_episode(task: TaskName) -> None:
-    assert LONGEST_CLIP_STEPS[task] == ENVIRONMENTS[task].task.episode_steps
-    assert USUAL_CLIP_STEPS[task] <= LONGEST_CLIP_STEPS[task]
+def test_our_tasks_come_first_and_in_our_order() -> None:
+    assert catalogue.names()[: len(NAMES)] == NAMES
+    assert catalogue.usual() == NAMES[0]
 
 
-@pytest.mark.parametrize("task", TaskName)
-def test_there_are_words_for_everything_that_the_worker_stores_about_a_task(task: TaskName) -> None:
+@pytest.mark.parametrize("task", NAMES)
+def test_environment_and_look_of_a_task_are_as_its_description_says(task: str) -> None:
+    installed = registry.installed_task(task)
+    assert registry.environment_class(task).task.name == task
+    assert registry.look(task).tool is not None
+    assert installed.picture
+    assert set(installed.description.instructions) == set(Language)
+    assert (registry.demonstrator(task) is None) == (installed.description.demonstrator is None)
+
+
+@pytest.mark.parametrize("task", NAMES)
+def test_there_are_words_for_everything_that_the_worker_stores_about_a_task(task: str) -> None:
     words = words_of(task)
-    assert set(ENVIRONMENTS[task].task.modes.names) <= set(words.axes)
+    assert set(registry.task(task).modes.names) <= set(words.axes)
     assert set(words.signals) == set(SIGNALS)
     assert words.silent_signals <= set(SIGNALS)
     assert set(words.costs) <= set(COSTS)

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import torch
 
+from installed_tasks import catalogue
 from tests.benchmarks.chosen_modes import FIRST_SEED, UnkeptBench, stake
-from worker.compute import simulation
 from worker.compute.simulation import surface_file
 from worker.experiments.benchmark_cell import PAPER_USERS, Cell, Terms
 from worker.experiments.rollout_cache import Shelf
@@ -22,7 +22,7 @@ from worker.ml.filters.response_surface import ResponseSurface, best_mode
 from worker.ml.stopping import expected_regret
 from worker.ml.teachers import Taste
 from worker.sim.costs import signal_weights
-from worker.tasks.registry import ENVIRONMENTS
+from worker.tasks import registry
 
 COUNTS = (20, 40, 60, 80, 100, 120, 150, 200)
 WORK = Path("data/benchmark/rollouts")
@@ -34,7 +34,7 @@ def main() -> None:
     parser.parse_args()
     torch.set_num_threads(1)
     sys.stdout.write("| task, user | " + " | ".join(map(str, COUNTS)) + " |\n" + "|---" * (1 + len(COUNTS)) + "|\n")
-    for task in ENVIRONMENTS:
+    for task in catalogue.names():
         for taste in PAPER_USERS.values():
             sys.stdout.write(f"| {task}, {taste.name} | " + " | ".join(_regrets(task, taste)) + " |\n")
             sys.stdout.flush()
@@ -42,7 +42,7 @@ def main() -> None:
 
 def _regrets(name: str, taste: Taste) -> list[str]:
     """Expected / true, for each number of answers."""
-    task = simulation.task(name)
+    task = registry.task(name)
     surface = ResponseSurface.load(surface_file(name), task.modes)
     wish, unit = signal_weights(task, taste.omega, taste.per_signal), stake(task, taste) / 100
     most = float(surface.predict(best_mode(surface, wish, 0))[0] @ wish)

@@ -16,13 +16,14 @@ import numpy as np
 import numpy.typing as npt
 from tqdm import tqdm
 
+from installed_tasks import catalogue
 from worker.compute import simulation
 from worker.ml.acquisition import matched_pairs
 from worker.ml.teachers import OMEGA, OPPOSED, User
 from worker.sim.costs import CostForm, preference_rewards
 from worker.sim.rollout import rollout
 from worker.task import Task
-from worker.tasks.registry import ENVIRONMENTS
+from worker.tasks import registry
 from worker.trajectory import SIGNALS, Trajectory
 
 FIRST_SCENARIO = 10_700_000
@@ -35,13 +36,13 @@ Floats = npt.NDArray[np.float64]
 def main() -> None:
     """Print one section per task."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("--task", nargs="+", choices=ENVIRONMENTS, default=list(ENVIRONMENTS))
+    parser.add_argument("--task", nargs="+", choices=catalogue.names(), default=catalogue.names())
     parser.add_argument("--scenarios", type=int, default=100)
     parser.add_argument("--axis-scenarios", type=int, default=20, help="in which the ends of the axes are tried")
     parser.add_argument("--steps", type=int, nargs="+", default=[60, 100], help="control steps shown, from the start")
     options = parser.parse_args()
     for name in options.task:
-        task, pool = simulation.task(name), _pool(name, options.scenarios)
+        task, pool = registry.task(name), _pool(name, options.scenarios)
         sys.stdout.write(f"## {task.title}\n\n{_successes(name, pool)}\n\n{_axes(name, options.axis_scenarios)}\n\n")
         found = [_agreements(task, pool, steps) for steps in options.steps]
         sys.stdout.write("| prefer the same clip | " + " | ".join(f"first {steps / 10:g} s" for steps in options.steps))
@@ -73,7 +74,7 @@ def _successes(name: str, pool: list[Trajectory]) -> str:
 
 def _axes(name: str, scenarios: int) -> str:
     """What each end of each mode axis does, over a few scenarios."""
-    family, environment = simulation.task(name).modes, simulation.environment(name)
+    family, environment = registry.task(name).modes, simulation.environment(name)
     lines = [
         "| mode | success | arrives, s | speed near, m/s | force at target, N | largest force, N | sideways, cm |",
         "|---|---|---|---|---|---|---|",

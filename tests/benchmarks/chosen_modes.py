@@ -27,6 +27,7 @@ import numpy.typing as npt
 import torch
 from tqdm import tqdm
 
+from installed_tasks import catalogue
 from worker.compute import simulation
 from worker.compute.pools import Compute, Lane
 from worker.compute.simulation import surface_file
@@ -39,7 +40,7 @@ from worker.ml.rewards.reward_models import RewardModel
 from worker.ml.teachers import TASTES, Manner, Taste, User
 from worker.sim.costs import signal_weights, stakes
 from worker.task import Task
-from worker.tasks.registry import ENVIRONMENTS
+from worker.tasks import registry
 
 Floats = npt.NDArray[np.float64]
 
@@ -109,7 +110,7 @@ def answer(question: Question, work: Path) -> dict[str, Any]:
     """Regrets (U,) in %, by how much the own mode beats the best of the others' for each user, predicted success."""
     torch.set_num_threads(1)
     pooled_prior.DEVIATION, bradley_terry.LAPSES = question.choice.deviation, question.choice.lapses
-    task = simulation.task(question.task)
+    task = registry.task(question.task)
     surface = ResponseSurface.load(surface_file(task.name), task.modes)
     wishes = np.array([signal_weights(task, TASTES[user].omega, TASTES[user].per_signal) for user in USERS])
     unit = np.array([stake(task, TASTES[user]) for user in USERS]) / 100
@@ -145,7 +146,7 @@ def questions(seeds: int) -> list[Question]:
     return [
         Question(task, labels, hesitant, choice, FIRST_SEED + seed)
         for seed, (labels, hesitant), choice, task in product(
-            range(seeds), [(200, False), (60, False), (200, True), (30, False)], CHOICES, ENVIRONMENTS
+            range(seeds), [(200, False), (60, False), (200, True), (30, False)], CHOICES, catalogue.names()
         )
     ]
 
@@ -202,15 +203,19 @@ def _markdown(found: Sequence[tuple[Question, dict[str, Any]]], seeds: int) -> s
     ]
     for labels, hesitant in dict.fromkeys((question.labels, question.hesitant) for question, _ in found):
         lines += ["", f"## {labels} labels{', hesitant users' if hesitant else ''}", ""]
-        lines += ["| choice | " + " | ".join(f"{task}: regret, %" for task in ENVIRONMENTS) + " | worst | own best |"]
-        lines += ["|---" * (3 + len(ENVIRONMENTS)) + "|"]
+        lines += [
+            "| choice | " + " | ".join(f"{task}: regret, %" for task in catalogue.names()) + " | worst | own best |"
+        ]
+        lines += ["|---" * (3 + len(catalogue.names())) + "|"]
         for choice in CHOICES:
             rows = [
                 (question.task, row)
                 for question, row in found
                 if (question.labels, question.hesitant, question.choice) == (labels, hesitant, choice)
             ]
-            means = [float(np.mean([row["regrets"] for where, row in rows if where == task])) for task in ENVIRONMENTS]
+            means = [
+                float(np.mean([row["regrets"] for where, row in rows if where == task])) for task in catalogue.names()
+            ]
             worst = max(max(row["regrets"]) for _, row in rows)
             advantages = np.array([row["advantages"] for _, row in rows])
             won = f"{int((advantages > 0).sum())} of {advantages.size}"

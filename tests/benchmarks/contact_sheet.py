@@ -15,10 +15,11 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from installed_tasks import catalogue
 from tests.benchmarks.films import films
 from worker.sim.human import BODY_SHAPES
 from worker.sim.render.clip import ClipRenderer
-from worker.tasks.registry import ENVIRONMENTS
+from worker.tasks.registry import filmed_task
 from worker.trajectory import BODIES, SKIN_TONES, Trajectory
 
 FRAMES = 5
@@ -29,13 +30,13 @@ def main() -> None:
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
-    parser.add_argument("tasks", nargs="*", default=list(ENVIRONMENTS))
+    parser.add_argument("tasks", nargs="*", default=catalogue.names())
     parser.add_argument("--films", type=int, default=6, help="of each task")
     parser.add_argument("--steps", type=int, default=60, help="of a film")
     parser.add_argument("--people", action=argparse.BooleanOptionalAction, default=True, help="people.png as well")
     options = parser.parse_args()
     options.folder.mkdir(parents=True, exist_ok=True)
-    renderer = ClipRenderer()
+    renderer = ClipRenderer(filmed_task)
     for task in options.tasks:
         rows = [strip(renderer, film, options.steps) for film in films(task, options.films)]
         _save(rows, options.folder / f"{task}.png")

@@ -26,6 +26,7 @@ import numpy.typing as npt
 import torch
 from tqdm import tqdm
 
+from installed_tasks import catalogue
 from tests.benchmarks import feedback_report
 from tests.benchmarks.chosen_modes import stake
 from tests.benchmarks.feedback_report import LINEAR, NAMED, Row
@@ -43,7 +44,7 @@ from worker.ml.teachers import TASTES, Manner, ScriptedTeacher, Taste, User, ran
 from worker.responses import TARGETS
 from worker.scenarios import EVALUATION, first_of
 from worker.sim.costs import preference_rewards, signal_weights
-from worker.tasks.registry import ENVIRONMENTS
+from worker.tasks import registry
 from worker.trajectory import Array, Trajectory
 
 Floats = npt.NDArray[np.float64]
@@ -114,7 +115,7 @@ class Bench:
     """Pools and users of one task."""
 
     def __init__(self, task: str, pool_scenarios: int, most_labels: int) -> None:
-        self.task, self.most_labels = simulation.task(task), most_labels
+        self.task, self.most_labels = registry.task(task), most_labels
         steps = 100 if task == "drinking" else 60
         self.pool = pool_rollouts(task, POOL_FIRST, pool_scenarios, steps)
         self.unseen = pool_rollouts(task, UNSEEN_FIRST, UNSEEN_SCENARIOS, steps)
@@ -339,7 +340,7 @@ def _write(file: Path, rows: Sequence[Row]) -> None:
 
 def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--task", choices=ENVIRONMENTS, default="feeding")
+    parser.add_argument("--task", choices=catalogue.names(), default="feeding")
     parser.add_argument("--seeds", type=int, default=2, help="of the quick chains; those of networks have one")
     parser.add_argument("--pool-scenarios", type=int, default=850)
     parser.add_argument("--most-labels", type=int, choices=COUNTS, default=5000)

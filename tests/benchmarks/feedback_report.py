@@ -16,8 +16,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from installed_tasks import catalogue
 from worker.analysis.figures import LINE_COLOURS, MARKERS, STYLE, rendered
-from worker.tasks.registry import ENVIRONMENTS
 
 Row = dict[str, Any]
 
@@ -38,7 +38,7 @@ FEW = ("uniform", "entropy", "entropy, pooled prior")
 def write(folder: Path) -> None:
     """See the module."""
     by_task = {}
-    for task in ENVIRONMENTS:
+    for task in catalogue.names():
         file = folder / f"feedback_efficiency-{task}.csv"
         if file.exists():
             by_task[task] = rows = read(file)

@@ -15,11 +15,12 @@ import numpy as np
 import numpy.typing as npt
 from tqdm import tqdm
 
+from installed_tasks import catalogue
 from worker.compute import simulation
 from worker.ml.acquisition import matched_pairs
 from worker.ml.rewards.segments import SegmentPairs
 from worker.sim.rollout import rollout
-from worker.tasks.registry import ENVIRONMENTS
+from worker.tasks import registry
 
 Array = npt.NDArray[np.float32]
 Indices = npt.NDArray[np.int64]
@@ -114,12 +115,12 @@ def _fingerprint(task: str) -> str:
 def main() -> None:
     """Make rollouts ahead of time."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--task", choices=ENVIRONMENTS, default="feeding")
+    parser.add_argument("--task", choices=catalogue.names(), default="feeding")
     parser.add_argument("--first", type=int, required=True)
     parser.add_argument("--scenarios", type=int, required=True)
     parser.add_argument("--directory", type=Path, default=DIRECTORY, help="where they are kept")
     options = parser.parse_args()
-    steps = simulation.task(options.task).episode_steps
+    steps = registry.task(options.task).episode_steps
     pool_rollouts(options.task, options.first, options.scenarios, steps, options.directory)
 
 

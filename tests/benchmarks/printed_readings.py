@@ -19,17 +19,18 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
+from installed_tasks import catalogue
 from worker.analysis.evaluation import success_change
 from worker.compute import learning
 from worker.experiments.benchmark_cell import PAPER_USERS, Bench, Cell, Terms
 from worker.experiments.rollout_cache import Shelf
 from worker.ml.filters.filter_problem import act_of
 from worker.ml.filters.gate import successes
-from worker.ml.filters.pbarl_printed import BETAS, OTHER_TASKS_BETAS, PrintedConfig
+from worker.ml.filters.pbarl_printed import PrintedConfig
 from worker.ml.filters.printed_filter import fit_printed
 from worker.scenarios import EVALUATION, RESIDUAL, first_of
 from worker.sim.costs import preference_rewards, stakes
-from worker.tasks.registry import ENVIRONMENTS
+from worker.tasks import registry
 from worker.trajectory import Trajectory
 
 LOSSES = ("rec", "pref", "kl", "dyn")
@@ -46,7 +47,7 @@ class Reading:
 
     def config(self, task: str, steps: int) -> PrintedConfig:
         """For a task."""
-        betas = BETAS.get(task, OTHER_TASKS_BETAS)
+        betas = registry.task(task).printed_betas
         rec, pref, kl, dyn = (beta * self.weights.get(loss, 1.0) for loss, beta in zip(LOSSES, betas, strict=True))
         return replace(PrintedConfig(betas=(rec, pref, kl, dyn), steps=steps), **self.changes)
 
@@ -151,7 +152,7 @@ def _page(rows: list[dict[str, Any]], options: argparse.Namespace) -> str:
 
 def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--tasks", nargs="+", choices=ENVIRONMENTS, default=list(ENVIRONMENTS))
+    parser.add_argument("--tasks", nargs="+", choices=catalogue.names(), default=catalogue.names())
     parser.add_argument("--user", choices=PAPER_USERS, default="neutral")
     parser.add_argument("--steps", type=int, default=3000)
     parser.add_argument("--scenarios", type=int, default=200)

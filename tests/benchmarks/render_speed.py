@@ -15,15 +15,16 @@ import time
 from collections.abc import Callable
 from functools import partial
 
+from installed_tasks import catalogue
 from tests.benchmarks.films import films
 from worker.sim.render.clip import STYLES, ClipRenderer
-from worker.tasks.registry import ENVIRONMENTS
+from worker.tasks.registry import filmed_task
 from worker.trajectory import Trajectory
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--tasks", nargs="+", choices=ENVIRONMENTS, default=list(ENVIRONMENTS))
+    parser.add_argument("--tasks", nargs="+", choices=catalogue.names(), default=catalogue.names())
     parser.add_argument("--quality", choices=STYLES, default="sharp", help="of the clips")
     parser.add_argument("--films", type=int, default=6, help="of each task")
     parser.add_argument("--steps", type=int, default=50, help="of a clip")
@@ -33,7 +34,7 @@ def main() -> None:
     trajectories = {task: list(films(task, options.films)) for task in options.tasks}
     before_mib = resident_mib()
     start = time.process_time()
-    renderer = ClipRenderer(STYLES[options.quality])
+    renderer = ClipRenderer(filmed_task, STYLES[options.quality])
     first_picture(renderer, next(iter(trajectories.values()))[0])
     log.info("first picture of all, with one body  %5.2f s", time.process_time() - start)
     log.info("task         ms per frame   start of a clip, s   5 s clip, s   (max)   kB   (max)")

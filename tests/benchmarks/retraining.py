@@ -21,6 +21,7 @@ import numpy as np
 from tqdm import tqdm
 
 from app.domain.study_settings import StudySettings
+from installed_tasks import catalogue
 from worker.compute import learning
 from worker.compute.filter_fitting import FilterFit
 from worker.compute.pools import Compute, Lane
@@ -30,7 +31,6 @@ from worker.jobs.learning.reference_rollouts import make_ready
 from worker.ml.export.bundle import Provenance
 from worker.ml.filters.filter_problem import FilterConfig
 from worker.ml.teachers import TASTES
-from worker.tasks.registry import ENVIRONMENTS
 from worker.trajectory import Trajectory
 
 STAGES = ("reward", "mode", "residual", "gates", "evaluation_and_bundle")
@@ -134,7 +134,7 @@ beforehand, while people answer, in one process behind everything else. As numbe
 
 def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--tasks", nargs="+", choices=ENVIRONMENTS, default=list(ENVIRONMENTS))
+    parser.add_argument("--tasks", nargs="+", choices=catalogue.names(), default=catalogue.names())
     parser.add_argument("--users", nargs="+", choices=TASTES, default=["cautious", "impatient"])
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument(

@@ -22,6 +22,7 @@ from typing import get_args
 import numpy as np
 import torch
 
+from installed_tasks import catalogue
 from worker.compute import simulation
 from worker.experiments.benchmark_cell import Bench, Cell, Terms
 from worker.experiments.rollout_cache import Shelf
@@ -34,7 +35,6 @@ from worker.ml.methods.registry import MethodConfig
 from worker.ml.rewards import reward_training
 from worker.ml.teachers import TASTES, User
 from worker.sim.rollout import rollout
-from worker.tasks.registry import ENVIRONMENTS
 from worker.trajectory import Trajectory
 
 LIBRARIES = ("numpy", "scipy", "onnxruntime", "pybullet", "av", "pillow")
@@ -58,7 +58,7 @@ TERMS = Terms(labels=20, smallest_pool=4, filter=FILTER, methods=MethodConfig(fi
 def main() -> None:
     """See the module."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--tasks", nargs="+", choices=list(ENVIRONMENTS), default=list(ENVIRONMENTS))
+    parser.add_argument("--tasks", nargs="+", choices=catalogue.names(), default=catalogue.names())
     tasks = parser.parse_args().tasks
     torch.set_num_threads(1)
     used = ", ".join(f"{name} {version(name)}" for name in LIBRARIES)

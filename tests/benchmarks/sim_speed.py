@@ -18,11 +18,11 @@ from pathlib import Path
 
 import numpy as np
 
-import worker
+from installed_tasks import catalogue
 from worker.ml.policies.gaussian import GaussianPolicy
 from worker.sim.assistive import AssistiveEnv
 from worker.tasks.drinking.environment import DrinkingEnv
-from worker.tasks.registry import ENVIRONMENTS
+from worker.tasks.registry import checkpoint, environment_class
 
 BENCHMARK_STEPS_PER_S = {"feeding": 160.0, "drinking": 21.0, "scratching": 268.0}
 """Medians measured on a comparable core (facts sheet of Assistive Gym v1.0); Drinking with 64 pellets."""
@@ -30,7 +30,6 @@ WANTED_RATIO = {"feeding": 10, "drinking": 20, "scratching": 12}
 PELLETS = (16, 32, 64)
 
 RESETS = 300
-CHECKPOINTS = Path(worker.__file__).parent / "checkpoints"
 
 
 def main() -> None:
@@ -41,19 +40,19 @@ def main() -> None:
     options = parser.parse_args()
     sys.stdout.write("| task | random steps/s | x benchmark (wanted) | physics share | policy steps/s | reset ms |\n")
     sys.stdout.write("|---|---|---|---|---|---|\n")
-    for name, kind in ENVIRONMENTS.items():
+    for name, kind in ((name, environment_class(name)) for name in catalogue.names()):
         if name == "drinking":
             for pellets in PELLETS:
                 _row(f"{name}, {pellets} pellets", name, partial(DrinkingEnv, pellets=pellets), options.episodes)
         else:
             _row(name, name, kind, options.episodes)
-    for name, kind in ENVIRONMENTS.items():
+    for name, kind in ((name, environment_class(name)) for name in catalogue.names()):
         sys.stdout.write(f"{name}: {_growth_kib(kind(), options.resets):+d} KiB over {options.resets} resets\n")
 
 
 def _row(label: str, name: str, make: Callable[[], AssistiveEnv], episodes: int) -> None:
     env, rng = make(), np.random.default_rng(0)
-    policy = GaussianPolicy.load(CHECKPOINTS / name / "policy.safetensors")
+    policy = GaussianPolicy.load(checkpoint(name) / "policy.safetensors")
     env.reset(seed=0)
     reset_s = _cpu_s(lambda: [env.reset(seed=scenario) for scenario in range(RESETS)]) / RESETS
     acting_s, physics_share = _stepping(env, lambda _: rng.uniform(-1, 1, 7).astype(np.float32), episodes)

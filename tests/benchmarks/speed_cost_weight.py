@@ -11,10 +11,11 @@ import sys
 
 import numpy as np
 
+from installed_tasks import catalogue
 from worker.compute import simulation
 from worker.sim.costs import BASE_WEIGHTS, cost_items
 from worker.sim.rollout import Act, rollout
-from worker.tasks.registry import ENVIRONMENTS
+from worker.tasks import registry
 from worker.trajectory import COSTS
 
 FACTORS = (0.8, 0.9, 1.0, 1.1, 1.2)
@@ -24,7 +25,7 @@ FIRST_SCENARIO = 3_000_000
 def main() -> None:
     """Print each item's mean sum per factor, its slope over the logarithm of the factor, and the weight."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("--task", choices=ENVIRONMENTS, default="feeding")
+    parser.add_argument("--task", choices=catalogue.names(), default="feeding")
     parser.add_argument("--scenarios", type=int, default=200)
     options = parser.parse_args()
     task, scenarios = options.task, range(FIRST_SCENARIO, FIRST_SCENARIO + options.scenarios)
@@ -34,7 +35,7 @@ def main() -> None:
         successes = 0
         for scenario in scenarios:
             episode = rollout(env, scaled(task, factor), scenario)
-            items = cost_items(simulation.task(task), episode.costs, episode.signals, "calibrated").sum(0)
+            items = cost_items(registry.task(task), episode.costs, episode.signals, "calibrated").sum(0)
             sums[row] += items / len(scenarios)
             successes += episode.success
         printed = "  ".join(f"{name} {value:7.3f}" for name, value in zip(COSTS, sums[row], strict=True))
@@ -52,7 +53,7 @@ def main() -> None:
 
 def scaled(task: str, factor: float) -> Act:
     """The reference policy, faster or slower where its speed is a cost."""
-    described = simulation.task(task)
+    described = registry.task(task)
     if described.speed_counts_near:
         policy = simulation.reference_policy(task)
         return lambda seen: factor * policy.mean(seen)

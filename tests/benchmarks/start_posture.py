@@ -11,10 +11,11 @@ import sys
 import numpy as np
 import numpy.typing as npt
 
+from installed_tasks import catalogue
 from worker.sim.arm import tool_jacobian
 from worker.sim.assistive import ARM, AssistiveEnv
 from worker.sim.seated_person import PERSON
-from worker.tasks.registry import ENVIRONMENTS
+from worker.tasks.registry import environment_class
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -26,10 +27,10 @@ LIMITED_JOINTS = [1, 3, 5]
 def main() -> None:
     """Score random restarts by manipulability, clearance and joint margins; print the best."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("--task", choices=ENVIRONMENTS, default="feeding")
+    parser.add_argument("--task", choices=catalogue.names(), default="feeding")
     parser.add_argument("--restarts", type=int, default=4000)
     options = parser.parse_args()
-    kind, restarts = ENVIRONMENTS[options.task], options.restarts
+    kind, restarts = environment_class(options.task), options.restarts
     rng, robot = np.random.default_rng(1), kind.robot
     orientation = robot.mount_rotation.T @ np.array(kind.start.tool_axes).T
     low, high = np.maximum(robot.lower_rad, -np.pi), np.minimum(robot.upper_rad, 1.5 * np.pi)

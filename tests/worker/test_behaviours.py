@@ -6,15 +6,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from installed_tasks import catalogue
 from worker.compute import simulation
 from worker.compute.behaviours import DIFFERENT_ENOUGH, Behaviour, draw_behaviours
-from worker.tasks.registry import ENVIRONMENTS
+from worker.tasks import registry
 from worker.trajectory import Trajectory
 
 EARLY = ["success_40", "success_70"]
 
 
-@pytest.fixture(params=ENVIRONMENTS)
+@pytest.fixture(params=catalogue.names())
 def name(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
@@ -27,7 +28,7 @@ def test_the_same_scenario_has_the_same_behaviours_and_another_one_others(name: 
 
 
 def test_every_kind_of_behaviour_occurs_and_plain_modes_are_the_rule(name: str) -> None:
-    task = simulation.task(name)
+    task = registry.task(name)
     drawn = [each for scenario in range(150) for each in draw_behaviours(task, scenario, 4, EARLY)]
     plain = [each for each in drawn if not (each.temperature or each.disturbance or each.checkpoint)]
     assert 0.73 < len(plain) / len(drawn) < 0.87
@@ -37,17 +38,17 @@ def test_every_kind_of_behaviour_occurs_and_plain_modes_are_the_rule(name: str) 
 
 
 def test_behaviours_of_one_scenario_differ_on_some_axis_by_almost_half_its_range(name: str) -> None:
-    family = simulation.task(name).modes
+    family = registry.task(name).modes
     width = np.array([axis.high - axis.low for axis in family.axes])
     for scenario in range(30):
-        drawn = draw_behaviours(simulation.task(name), scenario, 4, EARLY)
+        drawn = draw_behaviours(registry.task(name), scenario, 4, EARLY)
         modes = [np.array(family.vector(each.mode)) for each in drawn]
         for index, mode in enumerate(modes):
             assert all((np.abs(mode - other) / width).max() >= DIFFERENT_ENOUGH for other in modes[:index])
 
 
 def test_many_behaviours_on_few_axes_stand_closer_but_are_found() -> None:
-    task = simulation.task("feeding")
+    task = registry.task("feeding")
     narrow = replace(task, modes=replace(task.modes, axes=task.modes.axes[:1]))
     assert len({each.mode["speed_far"] for each in draw_behaviours(narrow, 3, 8)}) == 8
 

@@ -228,7 +228,7 @@ def test_without_policy_means_the_bundle_asks_its_own_policy(unzipped: Path, con
 
 
 def test_the_exported_policy_is_the_shipped_one() -> None:
-    policy = GaussianPolicy.load(Path("worker/checkpoints/feeding/policy.safetensors"))
+    policy = GaussianPolicy.load(Path("worker/tasks/feeding/checkpoint/policy.safetensors"))
     observations = np.random.default_rng(0).standard_normal((50, len(policy.offset))).astype(np.float32)
     session = onnxruntime.InferenceSession(policy_to_onnx(policy))
     (means,) = session.run(["policy_mean"], {"observation": observations})

@@ -8,8 +8,9 @@ from worker.compute import simulation
 from worker.experiments import fit_response_surface
 from worker.experiments.fit_response_surface import BLOCK, MODES_PER_SCENARIO, Block
 from worker.ml.filters.response_surface import ResponseSurface
+from worker.tasks import registry
 
-FEEDING = simulation.task("feeding")
+FEEDING = registry.task("feeding")
 
 
 def sought(number: int, work: Path) -> list[Block]:

@@ -12,12 +12,13 @@ from app.domain.studies import Participant
 from app.storage import ArtefactStore
 from tests.worker import test_querying
 from worker.compute.pools import Compute
-from worker.compute.simulation import surface_file, task
+from worker.compute.simulation import surface_file
 from worker.jobs.learning import dataset, query_selection, reward_metrics
 from worker.jobs.runtime.context import WorkerContext
 from worker.ml.filters.response_surface import ResponseSurface
 from worker.ml.rewards.reward_models import StructuredReward
 from worker.ml.stopping import expected_regret
+from worker.tasks.registry import task
 from worker.trajectory import COSTS, SIGNALS
 
 AddClips = Callable[..., list[Clip]]

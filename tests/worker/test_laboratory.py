@@ -3,12 +3,14 @@
 import io
 import subprocess
 import sys
+from copy import copy
 
 import numpy as np
 import pytest
 
 from worker.compute import simulation
 from worker.compute.behaviours import Behaviour
+from worker.tasks import registry
 from worker.trajectory import Trajectory
 
 
@@ -39,5 +41,8 @@ def test_the_reference_rollouts_are_the_frozen_policys_own() -> None:
 
 
 def test_an_unknown_task_is_named_with_those_that_are_known() -> None:
-    with pytest.raises(simulation.UnknownTask, match="no task named 'dressing'; this installation knows feeding"):
-        simulation.task("dressing")
+    with pytest.raises(
+        registry.UnknownTask, match="no task named 'dressing'; this installation knows feeding"
+    ) as raised:
+        registry.task("dressing")
+    assert str(copy(raised.value)) == str(raised.value), "as it comes out of a compute process"

@@ -12,7 +12,7 @@ from app.db import Database
 from app.domain.clips import Clip, Rollout
 from app.domain.models import RunKind
 from app.domain.preferences import LabelEvent, Purpose, Query, Response
-from app.domain.studies import LONGEST_CLIP_STEPS, Participant, Study, TaskName
+from app.domain.studies import Participant, Study, longest_clip_steps
 from app.storage import ArtefactStore
 from tests.worker.conftest import STEPS, make_trajectory
 from tests.worker.invented import job_of
@@ -24,7 +24,7 @@ from worker.jobs.runtime import records
 from worker.jobs.runtime.context import WorkerContext
 from worker.trajectory import SIGNALS
 
-WHOLE = LONGEST_CLIP_STEPS[TaskName.FEEDING]
+WHOLE = longest_clip_steps("feeding") or 0
 ENDS = ("undelivered", "spilled_on_person", "high_force_n")
 
 

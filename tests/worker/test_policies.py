@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-import worker
 from worker.ml.policies.gaussian import ACTION_STD_FLOOR, GaussianPolicy
+from worker.tasks.registry import checkpoint
 
-CHECKPOINT = Path(worker.__file__).parent / "checkpoints" / "feeding" / "policy.safetensors"
+CHECKPOINT = checkpoint("feeding") / "policy.safetensors"
 
 
 @pytest.fixture(scope="module")

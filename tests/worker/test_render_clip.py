@@ -14,27 +14,26 @@ from worker.sim.human import BROAD, RIGHT
 from worker.sim.jaco import JACO
 from worker.sim.render import compositing
 from worker.sim.render.camera import scene_camera
-from worker.sim.render.clip import INSET_MARGIN_PX, STYLES, ClipRenderer
+from worker.sim.render.clip import INSET_MARGIN_PX, STYLES, ClipRenderer, FilmedTask
 from worker.sim.render.close_up import close_up
 from worker.sim.render.highlight import Highlight
 from worker.sim.render.interpolation import clip_motion
 from worker.sim.render.passes import Shot
 from worker.sim.render.stage import Stage
-from worker.sim.render.task_look import LOOKS
-from worker.tasks.feeding.environment import SPOON, FeedingEnv
-from worker.tasks.registry import ENVIRONMENTS
-from worker.tasks.scratching.environment import SCRATCHER, ScratchingEnv
+from worker.sim.render.task_look import TaskLook
+from worker.tasks.feeding.environment import SPOON
+from worker.tasks.registry import filmed_task, look
+from worker.tasks.scratching.environment import SCRATCHER
 from worker.trajectory import Trajectory
 
 Picture = npt.NDArray[np.uint8]
 QUICK = STYLES["quick"]
 PLAIN = replace(QUICK, inset=False)
-FILMED = {**ENVIRONMENTS, ScratchingEnv.task.name: ScratchingEnv}
 
 
 @pytest.fixture(scope="module")
 def renderer() -> Iterator[ClipRenderer]:
-    renderer = ClipRenderer(QUICK, FILMED)
+    renderer = ClipRenderer(filmed_task, QUICK)
     yield renderer
     renderer.close()
 
@@ -56,7 +55,7 @@ def different(first: Picture, second: Picture, by: int = 12) -> npt.NDArray[np.b
 
 def around(point_m: npt.NDArray[np.floating], task: str = "feeding", reach: int = 12) -> tuple[slice, slice]:
     """A square of the picture around a point in the world."""
-    x, y = scene_camera(LOOKS[task], 640, 480).pixels(point_m.astype(float)).astype(int)
+    x, y = scene_camera(look(task), 640, 480).pixels(point_m.astype(float)).astype(int)
     return np.s_[y - reach : y + reach, x - reach : x + reach]
 
 
@@ -68,7 +67,7 @@ def test_a_clip_reports_what_it_holds(renderer: ClipRenderer) -> None:
 
 
 def test_a_sharp_clip_shows_the_same_in_more_pixels_and_pictures(renderer: ClipRenderer) -> None:
-    sharp = ClipRenderer(STYLES["sharp"], FILMED)
+    sharp = ClipRenderer(filmed_task, STYLES["sharp"])
     trajectory = waving_trajectory(2)
     clip, first = sharp.render_clip(trajectory, 0, 2), next(sharp.pictures(trajectory, 0, 1)).resize((640, 480))
     sharp.close()
@@ -84,7 +83,7 @@ def test_the_close_up_looks_the_person_in_the_face_wherever_it_turns(renderer: C
         pivot = np.array(BROAD.neck_pivot_m)
         trajectory.target_m[:] = pivot + rotation_of(turn) @ BROAD.mouth_from_neck_m
         motion = clip_motion(trajectory, JACO, SPOON, 0, 1, 15)
-        camera = close_up(LOOKS["feeding"], motion, 312, 228)
+        camera = close_up(look("feeding"), motion, 312, 228)
         towards = np.array(camera.eye_m) - camera.target_m
         out_of_the_face = rotation_of(turn) @ [0.0, -1.0, 0.0]
         assert towards @ out_of_the_face / np.linalg.norm(towards) > np.cos(np.radians(40))
@@ -95,12 +94,12 @@ def test_two_clips_of_a_scenario_are_seen_from_the_same_place() -> None:
     for task, tool in (("feeding", SPOON), ("scratching", SCRATCHER)):
         first = itching_trajectory(3) if task == "scratching" else waving_trajectory(3)
         other = replace(first, joint_positions=first.joint_positions + np.float32(0.1))
-        cameras = {close_up(LOOKS[task], clip_motion(each, JACO, tool, 0, 3, 15), 208, 152) for each in (first, other)}
+        cameras = {close_up(look(task), clip_motion(each, JACO, tool, 0, 3, 15), 208, 152) for each in (first, other)}
         assert len(cameras) == 1
 
 
 def test_what_lies_behind_a_camera_is_not_drawn_and_what_reaches_behind_it_is_drawn_whole() -> None:
-    camera = scene_camera(LOOKS["feeding"], 640, 480)
+    camera = scene_camera(look("feeding"), 640, 480)
     ahead, eye = np.array(camera.target_m), np.array(camera.eye_m)
     behind = 2 * eye - ahead
     boxes = camera.boxes(np.array([[ahead, ahead], [behind, behind], [ahead, behind], [[np.nan] * 3] * 2]))
@@ -126,7 +125,7 @@ def test_nothing_of_other_clips_remains(renderer: ClipRenderer) -> None:
     first = [film(renderer, trajectory) for trajectory in trajectories]
     for trajectory, before in reversed(list(zip(trajectories, first, strict=True))):
         assert all((now == then).all() for now, then in zip(film(renderer, trajectory), before, strict=True))
-    fresh = ClipRenderer(QUICK, FILMED)
+    fresh = ClipRenderer(filmed_task, QUICK)
     assert (film(fresh, trajectories[2])[1] == first[2][1]).all()
     fresh.close()
 
@@ -215,17 +214,15 @@ def test_a_trembling_head_is_drawn_moving(renderer: ClipRenderer) -> None:
 
 
 def test_a_task_nobody_designed_a_look_for_is_filmed_all_the_same() -> None:
-    class CombingEnv(FeedingEnv):
-        tool = Tool("comb", (0.13, 0, 0), (-np.pi / 2, 0, 0), (Shape.box((0, 0, 0), (0.06, 0.03, 0.03)),), 0.03)
-
-    renderer = ClipRenderer(PLAIN, {"combing": CombingEnv})
+    comb = Tool("comb", (0.13, 0, 0), (-np.pi / 2, 0, 0), (Shape.box((0, 0, 0), (0.06, 0.03, 0.03)),), 0.03)
+    renderer = ClipRenderer(lambda name: FilmedTask(JACO, comb, TaskLook()), PLAIN)
     with_comb = film(renderer, replace(waving_trajectory(1), task="combing"))[0]
     renderer.close()
-    renderer = ClipRenderer(PLAIN)
+    renderer = ClipRenderer(filmed_task, PLAIN)
     with_spoon = film(renderer, waving_trajectory(1))[0]
     renderer.close()
-    comb = clip_motion(waving_trajectory(1), JACO, CombingEnv.tool, 0, 1, 15).frames[0, -1, :3, 3]
-    assert different(with_comb, with_spoon)[around(comb, reach=4)].mean() > 0.7
+    comb_m = clip_motion(waving_trajectory(1), JACO, comb, 0, 1, 15).frames[0, -1, :3, 3]
+    assert different(with_comb, with_spoon)[around(comb_m, reach=4)].mean() > 0.7
     assert not different(with_comb, with_spoon)[:, 400:].any()
 
 
@@ -249,7 +246,7 @@ def test_turning_the_head_moves_the_face_and_leaves_the_arm(renderer: ClipRender
 
 
 def test_a_style_without_inset_shows_the_room_in_the_corner() -> None:
-    plain = ClipRenderer(PLAIN)
+    plain = ClipRenderer(filmed_task, PLAIN)
     picture = pictures(plain, steps=1)[0]
     plain.close()
     assert picture[:30, :30].std(axis=(0, 1)).max() < 6

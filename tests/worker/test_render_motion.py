@@ -3,14 +3,16 @@
 import numpy as np
 import pytest
 
+from installed_tasks import catalogue
 from tests.worker.waving import MOUNT, itching_trajectory, waving_trajectory
 from worker.sim.human import BROAD, LEFT, RIGHT
 from worker.sim.jaco import JACO
 from worker.sim.render.camera import lamp, scene_camera
 from worker.sim.render.interpolation import Motion, clip_motion, quaternions, smoothly
 from worker.sim.render.rectangles import GRID_PX, cover, on_grid
-from worker.sim.render.task_look import FEEDING_LOOK, LOOKS, task_look
+from worker.sim.render.task_look import TaskLook
 from worker.tasks.feeding.environment import SPOON
+from worker.tasks.registry import look
 from worker.trajectory import Trajectory
 
 MOUTH_M = np.array(BROAD.neck_pivot_m) + BROAD.mouth_from_neck_m
@@ -94,7 +96,7 @@ def test_quaternions_turn_vectors_like_their_matrices() -> None:
 
 
 def test_a_cropped_picture_shows_the_same_points_as_the_whole() -> None:
-    camera = scene_camera(FEEDING_LOOK, 640, 480)
+    camera = scene_camera(look("feeding"), 640, 480)
     rectangle = (100.0, 60.0, 260.0, 180.0)
     point = np.array([0.0, -0.07, 1.2, 1.0])
     device = camera.projection(rectangle) @ camera.view @ point
@@ -103,15 +105,16 @@ def test_a_cropped_picture_shows_the_same_points_as_the_whole() -> None:
 
 
 def test_the_person_and_the_spoons_whole_path_are_in_the_picture() -> None:
-    camera = scene_camera(FEEDING_LOOK, 640, 480)
+    camera = scene_camera(look("feeding"), 640, 480)
     pixels = camera.pixels(np.array([[-0.23, -0.55, 1.0], [-0.13, -0.45, 1.10], [0.0, -0.07, 1.2], [0.0, 0.05, 1.38]]))
     assert (pixels > 0).all()
     assert (pixels < [640, 480]).all()
 
 
 def test_a_task_nobody_designed_a_look_for_is_filmed_like_feeding() -> None:
-    assert task_look("combing") is FEEDING_LOOK
-    assert len(set(LOOKS.values())) == 3
+    cameras = {scene_camera(each, 640, 480) for each in (TaskLook(), look("feeding"))}
+    assert len(cameras) == 1
+    assert len({look(name) for name in catalogue.names()}) == 3
 
 
 def test_the_lamp_sees_the_head_and_the_floor_below_the_arm() -> None:

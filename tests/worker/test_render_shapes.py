@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from installed_tasks import catalogue
 from worker.sim import human
 from worker.sim.arm import Tool
 from worker.sim.geometry import Shape
@@ -28,10 +29,10 @@ from worker.sim.render.meshes.mesh import (
 )
 from worker.sim.render.passes import MACHINE_LIGHT
 from worker.sim.render.stage import Paints, Stage
-from worker.sim.render.task_look import LOOKS
-from worker.tasks.drinking.environment import CUP, PELLETS, pellet_radius_m, resting_places_m
-from worker.tasks.feeding.environment import SPOON
-from worker.tasks.scratching.environment import SCRATCHER
+from worker.tasks.drinking import cup_mesh
+from worker.tasks.drinking.environment import PELLETS, pellet_radius_m, resting_places_m
+from worker.tasks.feeding.spoon_mesh import spoon
+from worker.tasks.registry import filmed_task, look
 from worker.trajectory import SKIN_TONES
 
 BALL = sphere((0.0, 0.0, 0.0), 0.1)
@@ -168,22 +169,22 @@ def test_full_light_is_not_wrapped_around_to_darkness() -> None:
 def test_the_mouth_is_open_wide_enough_for_the_spoon_and_no_wider_for_a_cup_or_nothing() -> None:
     middle, features = head_mesh.MOUTH, head_mesh.FEATURES["broad"]
     bowl_edges = middle + np.array([[0.019, -0.005, 0.0], [-0.019, -0.005, 0.0], [0, 0.02, 0.008], [0, 0.02, -0.004]])
-    assert (head_mesh.face(features, LOOKS["feeding"].mouth)(bowl_edges) > 0).all()
+    assert (head_mesh.face(features, look("feeding").mouth)(bowl_edges) > 0).all()
     below_the_rim = middle + np.array([[0.0, 0.0, -0.009]])
-    assert (head_mesh.face(features, LOOKS["drinking"].mouth)(below_the_rim) < 0).all()
-    assert (head_mesh.face(features, LOOKS["scratching"].mouth)(middle + np.array([[0.0, 0.004, 0.004]])) < 0).all()
+    assert (head_mesh.face(features, look("drinking").mouth)(below_the_rim) < 0).all()
+    assert (head_mesh.face(features, look("scratching").mouth)(middle + np.array([[0.0, 0.004, 0.004]])) < 0).all()
 
 
 def test_the_cup_is_cut_out_for_the_nose_and_whole_where_it_is_drunk_from() -> None:
-    for mesh in (tool_mesh.cup(arm_mesh.Detail(Palette())), tool_mesh.cup_glass(arm_mesh.Detail(Palette()))):
-        x, y, z = (mesh.vertices - tool_mesh.CUP_CENTRE_M).T
+    for mesh in (cup_mesh.cup(arm_mesh.Detail(Palette())), cup_mesh.cup_glass(arm_mesh.Detail(Palette()))):
+        x, y, z = (mesh.vertices - cup_mesh.CUP_CENTRE_M).T
         angle = np.arctan2(np.abs(y), x)
         assert z[angle < 0.5].max() == pytest.approx(0.0, abs=0.004)
-        assert z[angle > 2.9].max() == pytest.approx(-tool_mesh.NOSE_CUT_M, abs=0.004)
+        assert z[angle > 2.9].max() == pytest.approx(-cup_mesh.NOSE_CUT_M, abs=0.004)
 
 
 def test_water_in_a_level_cup_stays_below_the_cut() -> None:
-    assert resting_places_m(PELLETS)[:, 2].max() + pellet_radius_m(PELLETS) < -tool_mesh.NOSE_CUT_M + 0.002
+    assert resting_places_m(PELLETS)[:, 2].max() + pellet_radius_m(PELLETS) < -cup_mesh.NOSE_CUT_M + 0.002
 
 
 def test_the_mirror_image_of_a_mesh_still_faces_outwards() -> None:
@@ -232,10 +233,11 @@ def test_the_drawn_mouth_is_where_the_simulation_feeds(body: BodyShape) -> None:
     assert drawn == pytest.approx(np.array(body.mouth_from_neck_m), abs=0.001)
 
 
-@pytest.mark.parametrize("tool", [SPOON, CUP, SCRATCHER], ids=lambda tool: tool.name)
-def test_known_tools_have_a_designed_look_as_large_as_what_the_simulation_moves(tool: Tool) -> None:
-    detail = arm_mesh.Detail(Palette())
-    drawn = tool_mesh.tool_look(tool).solid(detail).vertices
+@pytest.mark.parametrize("task", catalogue.names())
+def test_our_tools_have_a_designed_look_as_large_as_what_the_simulation_moves(task: str) -> None:
+    detail, (_, tool, look) = arm_mesh.Detail(Palette()), filmed_task(task)
+    assert look.tool is not None
+    drawn = look.tool.solid(detail).vertices
     felt = tool_mesh.plain(detail, tool.shapes).vertices
     # The spoon's handle is drawn longer, for the hand to hold.
     assert drawn.min(axis=0) == pytest.approx(felt.min(axis=0), abs=0.065)
@@ -245,7 +247,7 @@ def test_known_tools_have_a_designed_look_as_large_as_what_the_simulation_moves(
 def test_a_tool_nobody_designed_is_drawn_from_its_collision_shapes() -> None:
     shapes = (Shape.box((0, 0, 0), (0.02, 0.04, 0.06)), Shape("capsule", 0.01, 0.1), Shape("sphere", 0.02))
     comb = Tool("comb", (0, 0, 0), (0, 0, 0), shapes, 0.1)
-    mesh = tool_mesh.tool_look(comb).solid(arm_mesh.Detail(Palette()))
+    mesh = tool_mesh.plain_look(comb.shapes).solid(arm_mesh.Detail(Palette()))
     assert mesh.vertices.max(axis=0) == pytest.approx([0.02, 0.02, 0.06], abs=0.002)
     assert volume(mesh) > 0
 
@@ -258,7 +260,7 @@ def test_a_robot_nobody_designed_is_drawn_from_its_links() -> None:
 
 def test_the_fingers_touch_the_handle_without_cutting_through_it() -> None:
     detail = arm_mesh.Detail(Palette())
-    handle = tool_mesh.spoon(detail).vertices
+    handle = spoon(detail).vertices
     grip = handle[(handle[:, 0] > -0.155) & (handle[:, 0] < -0.105)]
     lowest_above, highest_below = _finger_gap(detail)
     assert lowest_above >= grip[:, 2].max() - 0.004
@@ -268,8 +270,9 @@ def test_the_fingers_touch_the_handle_without_cutting_through_it() -> None:
 
 def _finger_gap(detail: arm_mesh.Detail) -> tuple[float, float]:
     """Heights of the fingertips above and of the thumb below the handle, in the spoon's frame."""
-    grip = tool_mesh.tool_look(SPOON).grip
-    hand = arm_mesh.arm_meshes(detail, JACO, grip)["link_7"].vertices
+    held = look("feeding").tool
+    assert held is not None
+    hand = arm_mesh.arm_meshes(detail, JACO, held.grip)["link_7"].vertices
     up = -hand[:, 1]  # the spoon's z axis is link 7's -y axis
     tips = (hand[:, 2] < -0.155) & (hand[:, 2] > -0.165)
     return float(up[tips & (up > 0)].min()), float(up[tips & (up < 0)].max())

@@ -8,6 +8,7 @@ import numpy.typing as npt
 import pytest
 import torch
 
+from installed_tasks import catalogue
 from tests.worker import invented
 from worker.compute import learning, simulation
 from worker.experiments import train_signal_predictor
@@ -21,7 +22,6 @@ from worker.ml.rewards.segments import SegmentPairs
 from worker.ml.rewards.signal_predictor import UNSENSED, SignalPredictor
 from worker.ml.rewards.signal_training import PredictorTraining
 from worker.sim.rollout import rollout
-from worker.tasks.registry import ENVIRONMENTS
 from worker.trajectory import SIGNALS, Trajectory
 
 QUICK = PredictorTraining(hidden=16, steps=60, batch=64, learning_rate=1e-2)
@@ -47,7 +47,7 @@ def episodes(task: str, count: int) -> list[Trajectory]:
     return found
 
 
-@pytest.mark.parametrize("task", ENVIRONMENTS)
+@pytest.mark.parametrize("task", catalogue.names())
 def test_what_ships_foresees_the_signals_of_clips_it_has_not_seen(task: str) -> None:
     found = signal_training.explained(simulation.signal_predictor(task), episodes(task, 4), steps=60)
     assert found["distance_m"]["clip"] > 0.9
@@ -141,7 +141,7 @@ def test_a_model_without_a_predictor_is_refused_in_words() -> None:
 def test_a_task_whose_signals_cannot_be_foreseen_says_what_to_do(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(simulation, "CHECKPOINTS", tmp_path)
+    monkeypatch.setattr(simulation, "checkpoint", lambda name: tmp_path / name)
     simulation.signal_predictor.cache_clear()
     with pytest.raises(simulation.NoPredictor, match="python -m worker foresee --task drinking"):
         simulation.signal_predictor("drinking")

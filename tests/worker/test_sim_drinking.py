@@ -1,13 +1,11 @@
 """Water in a cup: what Drinking adds to what every task promises (test_sim_environments.py)."""
 
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-import worker
 from worker.ml.policies.gaussian import GaussianPolicy
 from worker.sim.assistive import ACTION_UNIT_RAD
 from worker.sim.jaco import JACO
@@ -23,8 +21,9 @@ from worker.tasks.drinking.environment import (
     pellet_radius_m,
 )
 from worker.tasks.drinking.water import Cup
+from worker.tasks.registry import checkpoint
 
-REFERENCE_POLICY = Path(worker.__file__).parent / "checkpoints" / "drinking" / "policy.safetensors"
+REFERENCE_POLICY = checkpoint("drinking") / "policy.safetensors"
 STILL = np.zeros(7, np.float32)
 TIP = np.array([0, 0, 0, 0, 0, 0, 1], np.float32)
 SWING = np.array([1, 0, 0, 0, 0, 0, 0], np.float32)

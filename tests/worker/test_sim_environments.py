@@ -12,8 +12,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_for_sb3
 
-import worker
-import worker.sim
+from installed_tasks import catalogue
 from worker.ml.policies.gaussian import GaussianPolicy
 from worker.sim import human
 from worker.sim.arm import start_postures
@@ -21,16 +20,15 @@ from worker.sim.assistive import ARM, AssistiveEnv
 from worker.sim.bullet import Bullet
 from worker.sim.geometry import rotation_of
 from worker.sim.seated_person import PERSON, add_person
-from worker.tasks.registry import ENVIRONMENTS
+from worker.tasks.registry import checkpoint, environment_class
 from worker.trajectory import BODIES, SIGNALS
 
-CHECKPOINTS = Path(worker.__file__).parent / "checkpoints"
 STILL = np.zeros(7, np.float32)
 
 
-@pytest.fixture(params=ENVIRONMENTS, scope="module")
+@pytest.fixture(params=catalogue.names(), scope="module")
 def kind(request: pytest.FixtureRequest) -> type[AssistiveEnv]:
-    return ENVIRONMENTS[request.param]
+    return environment_class(request.param)
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +39,7 @@ def env(kind: type[AssistiveEnv]) -> Iterator[AssistiveEnv]:
 
 
 def policy_for(kind: type[AssistiveEnv]) -> GaussianPolicy:
-    return GaussianPolicy.load(CHECKPOINTS / kind.task.name / "policy.safetensors")
+    return GaussianPolicy.load(checkpoint(kind.task.name) / "policy.safetensors")
 
 
 def field(env: AssistiveEnv, observation: np.ndarray, name: str) -> np.ndarray:
@@ -111,7 +109,7 @@ def test_the_same_seed_replays_bit_identically_after_other_episodes(env: Assisti
 def test_the_same_seed_replays_bit_identically_in_a_fresh_process(env: AssistiveEnv) -> None:
     program = (
         "import sys; from tests.worker.test_sim_environments import *;"
-        f"o = episode(ENVIRONMENTS[{env.task.name!r}](), 5);"
+        f"o = episode(environment_class({env.task.name!r})(), 5);"
         "sys.stdout.buffer.write(b'BEGIN' + o.tobytes())"
     )
     output = subprocess.run([sys.executable, "-c", program], capture_output=True, check=True).stdout

@@ -1,21 +1,20 @@
 """Food on a spoon: what Feeding adds to what every task promises (test_sim_environments.py)."""
 
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-import worker
 from worker.ml.policies.gaussian import GaussianPolicy
 from worker.sim.bullet import Bullet
 from worker.sim.geometry import rotation_of
 from worker.sim.jaco import JACO
 from worker.tasks.feeding.environment import FEEDING, SPOON, START, FeedingEnv
 from worker.tasks.feeding.food import BALLS
+from worker.tasks.registry import checkpoint
 
 EPISODE_STEPS = FEEDING.episode_steps
-REFERENCE_POLICY = Path(worker.__file__).parent / "checkpoints" / "feeding" / "policy.safetensors"
+REFERENCE_POLICY = checkpoint("feeding") / "policy.safetensors"
 
 
 @pytest.fixture(scope="module")

@@ -1,13 +1,11 @@
 """The yielding arm and the counting of strokes: what Itch Scratching adds to what every task promises."""
 
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-import worker
 from worker.ml.policies.gaussian import GaussianPolicy
 from worker.sim import human
 from worker.sim.bullet import Bullet
@@ -15,6 +13,7 @@ from worker.sim.geometry import rotation_of
 from worker.sim.human import BODY_SHAPES, RIGHT, Person, draw_person
 from worker.sim.measures import HIGH_FORCE_N
 from worker.sim.seated_person import PERSON
+from worker.tasks.registry import checkpoint
 from worker.tasks.scratching.environment import (
     BARE_SKIN,
     SCRATCHING,
@@ -25,7 +24,7 @@ from worker.tasks.scratching.environment import (
 )
 from worker.tasks.scratching.yielding_arm import FOREARM, UPPER_ARM, YieldingArm
 
-REFERENCE_POLICY = Path(worker.__file__).parent / "checkpoints" / "scratching" / "policy.safetensors"
+REFERENCE_POLICY = checkpoint("scratching") / "policy.safetensors"
 
 
 @pytest.fixture(scope="module")

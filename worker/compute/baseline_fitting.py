@@ -28,6 +28,7 @@ from worker.ml.methods.registry import MethodConfig, Setting
 from worker.ml.policies.checkpoint import Checkpoint, Paused, begin_again
 from worker.ml.rewards.action_ranking import can_rank
 from worker.ml.rewards.reward_models import RewardModel, load_reward_model
+from worker.tasks import registry as tasks
 from worker.trajectory import Trajectory
 
 COMPARED_EPISODES = 2
@@ -81,14 +82,14 @@ def controller_of_reference(task: str) -> bytes:
 
 def controller_of_filter(task: str, weights: bytes) -> bytes:
     """The frozen policy with somebody's filter behind it as a controller."""
-    policy, family = simulation.reference_policy(task), simulation.task(task).modes
+    policy, family = simulation.reference_policy(task), tasks.task(task).modes
     act = filter_problem.act_of(family, policy, FilterWeights.from_bytes(weights))
     return controller.of_act(act, observations(task))
 
 
 def packed(task: str, study: str, participant: str, letter: str, model: bytes) -> bytes:
     """A controller as its operator gets it, by letter."""
-    return controller.write(Blinded(simulation.task(task), study, participant, letter, model, observations(task)))
+    return controller.write(Blinded(tasks.task(task), study, participant, letter, model, observations(task)))
 
 
 def drive(task: str, model: bytes, scenarios: Sequence[int]) -> list[Trajectory]:
@@ -103,7 +104,7 @@ def observations(task: str) -> npt.NDArray[np.float32]:
 
 
 def _setting(baseline: Baseline, checkpoint: Checkpoint) -> Setting:
-    task = simulation.task(baseline.task)
+    task = tasks.task(baseline.task)
     policy = simulation.reference_policy(baseline.task)
     return Setting(
         problem=FilterProblem(task, policy, load_reward_model(baseline.reward), baseline.seed),
@@ -113,7 +114,7 @@ def _setting(baseline: Baseline, checkpoint: Checkpoint) -> Setting:
         action_reward=lambda: _action_reward(baseline),
         reference=lambda scenarios: _collect(baseline.task, policy.mean, scenarios, 0.0, 0),
         collect=lambda act, scenarios, noise, seed: _collect(baseline.task, act, scenarios, noise, seed),
-        make_env=simulation.environment_class(baseline.task),
+        make_env=tasks.environment_class(baseline.task),
         config=MethodConfig(fine_tuning=FineTuning(steps=baseline.fine_tuning_steps)),
         checkpoint=checkpoint,
     )

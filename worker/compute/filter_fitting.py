@@ -25,6 +25,7 @@ from worker.ml.filters.filter_problem import Act, FilterAct, FilterConfig, Filte
 from worker.ml.filters.response_surface import ResponseSurface
 from worker.ml.rewards.reward_models import load_reward_model
 from worker.scenarios import EVALUATION, RESIDUAL, first_of
+from worker.tasks import registry
 from worker.trajectory import Trajectory
 
 CHUNK = 3
@@ -64,7 +65,7 @@ class FilterFit:
     @property
     def problem(self) -> FilterProblem:
         """What is to be fitted, in the words of the learning code."""
-        task, policy = simulation.task(self.task), simulation.reference_policy(self.task)
+        task, policy = registry.task(self.task), simulation.reference_policy(self.task)
         return FilterProblem(task, policy, load_reward_model(self.reward), self.seed, self.config)
 
     def find_mode(self, pool: Sequence[Trajectory]) -> FilterDraft:

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-import worker
+from installed_tasks import catalogue
 from worker.compute.behaviours import Behaviour, SlowWaves, draw_behaviours
 from worker.ml.policies.gaussian import GaussianPolicy
 from worker.ml.rewards.signal_predictor import SignalPredictor
@@ -24,10 +24,8 @@ from worker.sim.render.clip import STYLES, ClipRenderer, RenderedClip
 from worker.sim.render.scene import Scene
 from worker.sim.rollout import rollout
 from worker.task import Task
-from worker.tasks.registry import ENVIRONMENTS
+from worker.tasks.registry import checkpoint, environment_class, filmed_task, task
 from worker.trajectory import Array, Trajectory
-
-CHECKPOINTS = Path(worker.__file__).resolve().parent / "checkpoints"
 
 REFERENCE_COUNT = 40
 
@@ -35,18 +33,12 @@ Act = Callable[[Array], Array]
 """observation (D,) -> action (7,)"""
 
 
-class UnknownTask(ValueError):
-    """This installation cannot simulate the task."""
-
-    def __init__(self, name: str) -> None:
-        super().__init__(f"There is no task named {name!r}; this installation knows {', '.join(ENVIRONMENTS)}.")
+class NoPolicy(ValueError):
+    """Nothing was trained that does the task."""
 
 
 class NoPredictor(ValueError):
     """Nothing was trained that foresees the task's signals."""
-
-    def __init__(self, task: str) -> None:
-        super().__init__(f"The signals of {task} cannot be foreseen yet: run python -m worker foresee --task {task}.")
 
 
 @dataclass(frozen=True)
@@ -60,32 +52,20 @@ class RecordedClip:
 
 def warm_up() -> None:
     """Import and build what making clips needs, so that the first clip comes quickly."""
-    environment("feeding")
+    environment(catalogue.usual())
     renderer("sharp")
-
-
-def environment_class(name: str) -> type[AssistiveEnv]:
-    """The environment of a task. Raises UnknownTask."""
-    if name not in ENVIRONMENTS:
-        raise UnknownTask(name)
-    return ENVIRONMENTS[name]
-
-
-def task(name: str) -> Task:
-    """The description of a task. Raises UnknownTask."""
-    return environment_class(name).task
 
 
 @cache
 def environment(name: str) -> AssistiveEnv:
-    """This process' environment of a task."""
+    """This process' environment of a task. Raises UnknownTask and TaskBroken."""
     return environment_class(name)()
 
 
 @cache
 def renderer(quality: str) -> ClipRenderer:
     """This process' renderer of clips in a quality."""
-    return ClipRenderer(STYLES[quality], scene=_scene())
+    return ClipRenderer(filmed_task, STYLES[quality], _scene())
 
 
 @cache
@@ -94,38 +74,36 @@ def _scene() -> Scene:
     return Scene()
 
 
-def checkpoints(name: str) -> Path:
-    """The folder with the task's trained policy and response surface."""
-    return CHECKPOINTS / environment_class(name).task.name
-
-
-def surface_file(task: str) -> Path:
+def surface_file(name: str) -> Path:
     """Where a task's response surface is kept; its record lies beside it."""
-    return checkpoints(task) / "response_surface.safetensors"
+    return checkpoint(name) / "response_surface.safetensors"
 
 
 def predictor_file(name: str) -> Path:
     """Where a task's predictor of signals is kept; its record lies beside it."""
-    return checkpoints(name) / "signal_predictor.safetensors"
+    return checkpoint(name) / "signal_predictor.safetensors"
 
 
 @cache
 def signal_predictor(name: str) -> SignalPredictor:
     """What foresees a task's signals from state and action. Raises NoPredictor for a task that has none."""
     if not predictor_file(name).exists():
-        raise NoPredictor(name)
+        raise NoPredictor(f"The signals of {name} cannot be foreseen yet: run python -m worker foresee --task {name}.")
     return SignalPredictor.load(predictor_file(name))
 
 
 @cache
 def reference_policy(name: str, early: str = "") -> GaussianPolicy:
-    """The frozen policy of a task that ships with the studio, or one from an early stage of its training."""
-    return GaussianPolicy.load(checkpoints(name) / (f"early/{early}.safetensors" if early else "policy.safetensors"))
+    """The frozen policy that lies in a task's folder, or one from an early stage of its training. Raises NoPolicy."""
+    file = checkpoint(name) / (f"early/{early}.safetensors" if early else "policy.safetensors")
+    if not file.exists():
+        raise NoPolicy(f"The task {name} has no policy {file}: run python -m worker pretrain --task {name}.")
+    return GaussianPolicy.load(file)
 
 
 def early_policies(name: str) -> list[str]:
     """Names of the early policies that ship with a task."""
-    return sorted(path.stem for path in (checkpoints(name) / "early").glob("*.safetensors"))
+    return sorted(path.stem for path in (checkpoint(name) / "early").glob("*.safetensors"))
 
 
 def behaviours(name: str, scenario: int, count: int) -> list[Behaviour]:

@@ -19,10 +19,10 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
+from installed_tasks import catalogue
 from worker.analysis.comparison import Cells, Row, Run, cost_rows, personalisation_rows, pooled, table_rows
 from worker.analysis.pareto import pareto_svg
 from worker.analysis.table_files import METHOD, to_csv, to_markdown
-from worker.compute import simulation
 from worker.compute.pools import Compute, Lane
 from worker.experiments import benchmark_cell
 from worker.experiments.benchmark_cell import INDIRECT_USERS, OPPOSED_USERS, PAPER_USERS, Cell, Terms
@@ -33,7 +33,8 @@ from worker.ml.methods.prefft import FineTuning
 from worker.ml.methods.registry import METHODS, MethodConfig
 from worker.ml.teachers import Manner, Taste, random_taste
 from worker.sim.costs import preference_rewards, stakes
-from worker.tasks.registry import ENVIRONMENTS
+from worker.tasks import registry
+from worker.tasks.registry import checkpoint
 from worker.whole_files import written_whole
 
 INTERRUPTED = 130
@@ -76,7 +77,7 @@ class Selection:
     """What is to be run; the tables also show what was run earlier under the same terms."""
 
     methods: Sequence[str] = tuple(METHODS)
-    tasks: Sequence[str] = tuple(ENVIRONMENTS)
+    tasks: Sequence[str] = catalogue.names()
     tastes: Sequence[Taste] = tuple(PAPER_USERS.values())
     seeds: int = 1
 
@@ -134,7 +135,7 @@ def _fill_shelves(compute: Compute, processes: int, missing: Sequence[Cell], ter
     """Rollouts that all cells of a task share, first and in parallel."""
     jobs = []
     for task in dict.fromkeys(cell.task for cell in missing):
-        gate = terms.filter.gate_block(simulation.task(task))
+        gate = terms.filter.gate_block(registry.task(task))
         jobs += [(task, work, "behaviours", chunk) for chunk in _chunks(terms.pool)]
         unseen = [terms.unseen(seed) for seed in dict.fromkeys(cell.seed for cell in missing)]
         jobs += [(task, work, "reference", chunk) for part in (*unseen, gate) for chunk in _chunks(part)]
@@ -222,8 +223,8 @@ def _finished(terms: Terms, work: Path) -> Iterator[tuple[dict[str, Any], dict[s
     """Every cell under these terms that was run with the present policies."""
     present = {
         f"{task}-{policy_mark(task)}"
-        for task in ENVIRONMENTS
-        if (simulation.checkpoints(task) / "policy.safetensors").exists()
+        for task in catalogue.names()
+        if (checkpoint(task) / "policy.safetensors").exists()
     }
     for path in sorted(terms.directory(work).glob("*/*/*.npz")):
         if path.parts[-3] not in present or path.name.startswith("."):
@@ -237,7 +238,7 @@ def _finished(terms: Terms, work: Path) -> Iterator[tuple[dict[str, Any], dict[s
 
 def _run(record: dict[str, Any], arrays: dict[str, Any], terms: Terms, tastes: dict[str, Taste]) -> Run:
     """r^H is linear in the measured sums, so every user can judge every run."""
-    task = simulation.task(record["task"])
+    task = registry.task(record["task"])
     true, at_stake = (
         {
             name: of(task, arrays["costs"], arrays["signals"], taste.omega, terms.form, taste.per_signal)
@@ -264,7 +265,7 @@ def _run(record: dict[str, Any], arrays: dict[str, Any], terms: Terms, tastes: d
 def _order(run: Run) -> tuple[int, int, int, str]:
     users = [*PAPER_USERS, *OPPOSED_USERS, *INDIRECT_USERS]
     user = users.index(run.user) if run.user in users else len(users)
-    return list(ENVIRONMENTS).index(run.task), user, list(METHODS).index(run.method), run.user
+    return catalogue.names().index(run.task), user, list(METHODS).index(run.method), run.user
 
 
 def _groups(users: Sequence[str]) -> list[list[str]]:

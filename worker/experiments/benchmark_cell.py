@@ -18,7 +18,6 @@ import numpy.typing as npt
 import torch
 
 import worker
-from app.domain.studies import usual_clip_steps
 from worker.compute import learning, simulation
 from worker.compute.simulation import surface_file
 from worker.experiments.rollout_cache import BEHAVIOURS_PER_SCENARIO, Shelf, policy_mark
@@ -37,6 +36,8 @@ from worker.ml.teachers import INDIRECT, OPPOSED, TASTES, Manner, ScriptedTeache
 from worker.responses import TARGETS
 from worker.scenarios import EVALUATION, POOL, first_of
 from worker.sim.costs import CostForm, preference_rewards
+from worker.tasks import registry
+from worker.tasks.registry import installed_task
 from worker.trajectory import Trajectory
 from worker.whole_files import written_whole
 
@@ -163,9 +164,9 @@ class Bench:
 
     def __init__(self, cell: Cell, terms: Terms, shelf: Shelf, work: Path) -> None:
         self.cell, self.terms, self.shelf = cell, terms, shelf
-        self.task = simulation.task(cell.task)
+        self.task = registry.task(cell.task)
         self.pool = shelf.behaviours(terms.pool)
-        self.clip_steps = min(usual_clip_steps(cell.task), self.task.episode_steps)
+        self.clip_steps = installed_task(cell.task).description.usual_clip_steps
         self.rows = acquisition.matched_pairs([each.scenario for each in self.pool])
         episode_means = [each.signals.mean(axis=0, dtype=np.float64) for each in self.pool]
         self.scale = SignalScale.of(self._cut(self.rows), episode_means)
@@ -184,7 +185,7 @@ class Bench:
             action_reward=self._action_reward,
             reference=self.shelf.reference,
             collect=self._collect,
-            make_env=simulation.environment_class(self.cell.task),
+            make_env=registry.environment_class(self.cell.task),
             config=self.terms.methods,
         )
 

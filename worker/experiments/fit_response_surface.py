@@ -1,4 +1,4 @@
-"""Explores once, for everybody, what a task's execution modes change: ``python -m worker explore --task feeding``.
+"""Explores once, for everybody, what a task's execution modes change: ``python -m worker explore --task NAME``.
 
 Every scenario is executed by the reference policy and in several modes; the differences are fitted by a response
 surface, which ships with the studio. First the modes are drawn at random; then, for some rounds, they are the ones that
@@ -28,6 +28,7 @@ from worker.scenarios import RESPONSE_SURFACE, RESPONSE_SURFACE_SOUGHT, first_of
 from worker.sim.costs import signal_weights
 from worker.sim.rollout import rollout
 from worker.task import Task
+from worker.tasks import registry
 from worker.trajectory import SIGNALS
 from worker.whole_files import written_whole
 
@@ -88,7 +89,7 @@ class Block:
 def explore(task: str, work_directory: Path, processes: int, scenarios: int = SCENARIOS) -> dict[str, Any]:
     """Run what is missing, fit the response surface, write it and its record; returns the record."""
     work_directory.mkdir(parents=True, exist_ok=True)
-    described = simulation.task(task)
+    described = registry.task(task)
     blocks = [
         Block(task, first, _random_modes(described, first), work_directory / f"differences-{first}.npz")
         for first in first_of(RESPONSE_SURFACE, scenarios)[::BLOCK]

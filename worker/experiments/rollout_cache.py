@@ -8,6 +8,7 @@ from pathlib import Path
 from worker.compute import simulation
 from worker.compute.behaviours import Behaviour
 from worker.sim.rollout import rollout
+from worker.tasks import registry
 from worker.trajectory import Trajectory
 from worker.whole_files import written_whole
 
@@ -52,7 +53,7 @@ class Shelf:
 
 def policy_mark(task: str) -> str:
     """Eight characters that change with the task's frozen policy and with anything its description says."""
-    mark = hashlib.sha256(repr(simulation.task(task)).encode())
+    mark = hashlib.sha256(repr(registry.task(task)).encode())
     for name, array in sorted(simulation.reference_policy(task).weights.items()):
         mark.update(name.encode() + array.tobytes())
     return mark.hexdigest()[:8]

@@ -1,4 +1,4 @@
-"""Trains once, for everybody, what foresees a task's signals: ``python -m worker foresee --task feeding``.
+"""Trains once, for everybody, what foresees a task's signals: ``python -m worker foresee --task NAME``.
 
 The rollouts are behaviours like those of a study's pool, in scenarios of their own. They are kept, so an interrupted
 run goes on where it was; the predictor and its record ship with the studio.
@@ -14,13 +14,13 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from app.domain.studies import usual_clip_steps
 from worker.compute import simulation
 from worker.compute.pools import Compute, Lane
 from worker.experiments.rollout_cache import BEHAVIOURS_PER_SCENARIO, Shelf
 from worker.ml.rewards import signal_training
 from worker.ml.rewards.signal_training import PredictorTraining
 from worker.scenarios import SIGNAL_PREDICTOR, SIGNAL_PREDICTOR_TEST, first_of
+from worker.tasks import registry
 
 SCENARIOS = 150
 TESTED_SCENARIOS = 30
@@ -47,7 +47,7 @@ def foresee(
     shelf, config = Shelf(task, work_directory), training or PredictorTraining()
     with tqdm(total=config.steps, unit="step", desc="training") as bar:
         predictor = signal_training.fit(shelf.behaviours(learned_from), 0, config, lambda step: _moved(bar, step))
-    clip_steps = min(usual_clip_steps(task), simulation.task(task).episode_steps)
+    clip_steps = registry.installed_task(task).description.usual_clip_steps
     file = target or simulation.predictor_file(task)
     predictor.save(file)
     record = {

@@ -18,13 +18,13 @@ from app.domain.models import ModelKind
 from app.domain.preferences import Query
 from app.domain.studies import Study
 from app.storage import ArtefactStore
-from worker.compute import simulation
 from worker.jobs.learning import dataset
 from worker.jobs.runtime import records
 from worker.ml.rewards.reward_models import RewardModel, load_reward_model
 from worker.ml.scripted_ratings import RatingManner, ScriptedRater
 from worker.ml.teachers import Manner, ScriptedTeacher, Taste, segment_returns
 from worker.sim.costs import preference_rewards
+from worker.tasks import registry
 from worker.trajectory import Trajectory
 
 CALIBRATION_PAIRS = 200
@@ -61,7 +61,7 @@ class ScriptedPerson:
         self, database: Database, store: ArtefactStore, study: Study, taste: Taste, manner: Manner, seed: int
     ) -> None:
         self._database, self._store, self._study_id = database, store, study.id
-        self._task = simulation.task(study.task)
+        self._task = registry.task(study.task)
         self._taste, self._manner = taste, manner
         self._rng = np.random.default_rng(seed)
         self._teacher: ScriptedTeacher | None = None

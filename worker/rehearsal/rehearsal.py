@@ -23,7 +23,7 @@ from app.db import Database
 from app.domain.models import Bundle, Model, ModelKind, Run, RunKind, RunStatus
 from app.domain.preferences import LEARNED_FROM, Query
 from app.domain.protocol import EvaluationMode
-from app.domain.studies import Study, TaskName
+from app.domain.studies import Study
 from app.domain.study_settings import StudySettings
 from app.services.accounts import accounts
 from app.services.monitoring import dashboard
@@ -148,7 +148,7 @@ class Rehearsal:
     def run(self, task: str, tastes: Sequence[Taste], settings: StudySettings, manner: Manner, seed: int) -> Rehearsed:
         """One participant per taste, one after the other; the bundles are waited for and downloaded at the end."""
         with self.database.writing() as session:
-            study = studies.create_study(session, self.name, settings, seed=seed, task=TaskName(task))
+            study = studies.create_study(session, self.name, settings, seed=seed, task=task)
             study.key_secret = hashlib.sha256(f"rehearsal/{seed}".encode()).hexdigest()  # nobody rates who could cheat
             enrolled = [enrolment.add_participant(session, study, scripted_as=taste.name) for taste in tastes]
             password = accounts.create_first_experimenter(session)

@@ -1,11 +1,20 @@
-"""The simulated robot, people and tasks. Importing this package registers its environments with Gymnasium."""
+"""The simulated robot and people. Importing this package registers every installed task with Gymnasium.
+
+The task ``wipe_mouth`` is ``pbarl/WipeMouth-v0``; its code is imported when one is made.
+"""
 
 import gymnasium
 
-FEEDING = "pbarl/Feeding-v0"
-DRINKING = "pbarl/Drinking-v0"
-SCRATCHING = "pbarl/Scratching-v0"
+from installed_tasks import catalogue
 
-gymnasium.register(FEEDING, entry_point="worker.tasks.feeding.environment:FeedingEnv", max_episode_steps=None)
-gymnasium.register(DRINKING, entry_point="worker.tasks.drinking.environment:DrinkingEnv", max_episode_steps=None)
-gymnasium.register(SCRATCHING, entry_point="worker.tasks.scratching.environment:ScratchingEnv", max_episode_steps=None)
+
+def register_tasks() -> None:
+    """Tell Gymnasium of every task that it does not know yet."""
+    for task in catalogue.installed().tasks.values():
+        name = f"pbarl/{''.join(word.capitalize() for word in task.name.split('_'))}-v0"
+        if name not in gymnasium.registry:
+            entry_point = f"{task.package}.{task.description.environment}"
+            gymnasium.register(name, entry_point=entry_point, max_episode_steps=None)
+
+
+register_tasks()

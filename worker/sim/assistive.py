@@ -1,7 +1,7 @@
 """What every task shares: a robot arm with a tool, a seated person, and measuring what the one does to the other.
 
-A task subclasses `AssistiveEnv` and says where its target is, what lies around, and what counts (see feeding.py and
-docs/new_task.md). World frame: see human.py. Observations are in the robot base frame, see worker/spaces.py.
+A task subclasses `AssistiveEnv` and says where its target is, what lies around, and what counts (see worker/tasks
+and docs/new_task.md). World frame: see human.py. Observations are in the robot base frame, see worker/spaces.py.
 """
 
 from abc import abstractmethod

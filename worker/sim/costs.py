@@ -29,7 +29,7 @@ SPEED_SCALE_M_S = 0.2
 """At this speed the calibrated item equals the paper's."""
 
 PIECES_AT_WEIGHT_ONE = 8
-"""The calibrated form counts eighths of the portion, as Feeding's eight balls are."""
+"""The calibrated form counts eighths of the portion."""
 
 _SPEED = COSTS.index("C_v")
 _PIECES = [COSTS.index("C_fd"), COSTS.index("C_fdv")]

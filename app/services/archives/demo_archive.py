@@ -2,7 +2,7 @@
 
 from sqlalchemy.orm import Session
 
-from app.domain.studies import USUAL_CLIP_STEPS, TaskName
+from app.domain.studies import usual_clip_steps
 from app.domain.study_settings import StudySettings
 from app.errors import AppError
 from app.paths import DEMO_STUDY
@@ -35,8 +35,8 @@ def import_finished(session: Session, store: ArtefactStore) -> str:
     return enrolment.add_participant(session, study)[1]
 
 
-def make_empty(session: Session, task: TaskName) -> str:
+def make_empty(session: Session, task: str) -> str:
     """Make a study of the task, whose clips have yet to be made, with one participant, whose token is returned."""
-    usual = StudySettings(clip_steps=USUAL_CLIP_STEPS[task])
+    usual = StudySettings(clip_steps=usual_clip_steps(task))
     study = studies.create_study(session, f"Demo: {task}", usual, task=task)
     return enrolment.add_participant(session, study)[1]

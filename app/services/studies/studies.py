@@ -11,10 +11,11 @@ from sqlalchemy.orm import Session
 
 from app.db import Base
 from app.domain.clips import Clip, Rollout
-from app.domain.studies import LONGEST_CLIP_STEPS, Study, TaskName
+from app.domain.studies import Study, longest_clip_steps
 from app.domain.study_settings import StudySettings
 from app.errors import AppError
 from app.services import audit
+from installed_tasks import catalogue
 
 _SEED_LIMIT = 2**31
 _Row = TypeVar("_Row", bound=Base)
@@ -38,13 +39,14 @@ def create_study(
     settings: StudySettings,
     seed: int | None = None,
     actor: str = audit.SYSTEM,
-    task: TaskName = TaskName.FEEDING,
+    task: str | None = None,
 ) -> Study:
     """Open a study; the worker finds it and begins to fill its pool. Without a seed one is drawn and kept.
 
-    Raises ClipsTooLong.
+    Without a task it is the usual one. Raises ClipsTooLong.
     """
-    if settings.clip_steps > LONGEST_CLIP_STEPS[task]:
+    task = task or catalogue.usual()
+    if settings.clip_steps > (longest_clip_steps(task) or settings.clip_steps):
         raise ClipsTooLong
     study = Study(
         slug=free_slug(session, name),

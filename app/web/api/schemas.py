@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from app.domain.study_settings import StudySettings
+from installed_tasks import catalogue
 
 Link = Annotated[str, Field(examples=["http://localhost:8000/p/3mZ0c1..."])]
 
@@ -21,9 +22,9 @@ class Account(BaseModel):
 class StudyLine(BaseModel):
     """One study in a list."""
 
-    slug: str = Field(examples=["feeding-at-home"])
-    name: str = Field(examples=["Feeding at home"])
-    task: str = Field(examples=["feeding"])
+    slug: str = Field(examples=["pilot-at-home"])
+    name: str = Field(examples=["Pilot at home"])
+    task: str = Field(examples=[catalogue.usual()])
     created_at: datetime
     locked: bool
     blinded: bool
@@ -75,7 +76,7 @@ class Page(BaseModel):
     )
     next: str | None = Field(
         description="Address of the rows that follow; null at the end.",
-        examples=["/api/v1/studies/feeding-at-home/tables/ratings?limit=100&cursor=eyJvZiI6ImZlZWRpbmct..."],
+        examples=["/api/v1/studies/pilot-at-home/tables/ratings?limit=100&cursor=eyJvZiI6InBpbG90LWF0LWhv..."],
     )
 
 
@@ -105,7 +106,7 @@ class BundleAnswer(BaseModel):
     created_at: datetime
     byte_count: int
     sha256: str
-    download: str = Field(examples=["/api/v1/studies/feeding-at-home/participants/P01/bundles/1.zip"])
+    download: str = Field(examples=["/api/v1/studies/pilot-at-home/participants/P01/bundles/1.zip"])
 
 
 class ReportAnswer(BaseModel):
@@ -117,7 +118,7 @@ class ReportAnswer(BaseModel):
     blinded: bool
     contents: dict[str, Any]
     figures: dict[str, dict[str, str]] = Field(
-        examples=[{"ratings": {"svg": "/api/v1/studies/feeding-at-home/report/figures/ratings.svg"}}]
+        examples=[{"ratings": {"svg": "/api/v1/studies/pilot-at-home/report/figures/ratings.svg"}}]
     )
 
 
@@ -138,7 +139,7 @@ class ExportAnswer(BaseModel):
     finished_at: datetime | None
     byte_count: int | None
     error: str | None = Field(description="What went wrong at the last attempt.")
-    download: str | None = Field(examples=["/api/v1/studies/feeding-at-home/exports/1.zip"])
+    download: str | None = Field(examples=["/api/v1/studies/pilot-at-home/exports/1.zip"])
 
 
 class Problem(BaseModel):

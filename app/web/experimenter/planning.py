@@ -11,7 +11,7 @@ from sqlalchemy.orm import Session
 
 from app.domain.people import Experimenter
 from app.domain.protocol import Language
-from app.domain.studies import Study, TaskName
+from app.domain.studies import Study
 from app.services.accounts import browser_sessions
 from app.services.participants import enrolment
 from app.services.studies import locking, preregistration, studies
@@ -32,6 +32,7 @@ from app.web.http.deps import (
 from app.web.texts import task_words
 from app.web.texts.templating import page
 from app.web.texts.wording import built_in_texts, plain_text
+from installed_tasks import catalogue
 
 router = APIRouter(prefix="/studies")
 
@@ -49,7 +50,8 @@ def show_new_study(
 ) -> Response:
     """The form, filled in with what usually works, with the paper's protocol, or with another study's settings."""
     if like:
-        return _form_page(request, experimenter, _form_like(studies.find_study(session, like)))
+        source = studies.find_study(session, like)
+        return _form_page(request, experimenter, _form_like(source), own_task=_own_task(source))
     form = study_form.form_with_defaults(preset).model_copy(update={"preset": preset.value})
     return _form_page(request, experimenter, form)
 
@@ -59,14 +61,16 @@ def create_study(
     request: Request, form: TypedStudy, experimenter: ActingExperimenter, session: WritingSession
 ) -> Response:
     """Open the study, or show the form again: with what is wrong with it, or started from another preset."""
-    if form.switch_to in set(Preset):
-        return _form_page(request, experimenter, study_form.with_preset(form, Preset(form.switch_to)))
     source = studies.find_study(session, form.like) if form.like else None
+    own_task = _own_task(source) if source else None
+    if form.switch_to in set(Preset):
+        started = study_form.with_preset(form, Preset(form.switch_to))
+        return _form_page(request, experimenter, started, own_task=own_task)
     try:
-        typed = study_form.typed_study(form)
+        typed = study_form.typed_study(form, own_task)
         _check_name(session, form, typed.name)
     except FormInvalid as invalid:
-        return _form_page(request, experimenter, form, errors=invalid.errors)
+        return _form_page(request, experimenter, form, errors=invalid.errors, own_task=own_task)
     study = studies.create_study(
         session, typed.name, typed.settings, seed=typed.seed, actor=experimenter.name, task=typed.task
     )
@@ -103,7 +107,7 @@ def change_settings(
     study = studies.find_study(session, slug)
     form = _with_fixed(session, study, form)
     try:
-        typed = study_form.typed_study(form)
+        typed = study_form.typed_study(form, study.task)
         _check_name(session, form, typed.name, study)
         locking.change(
             session,
@@ -202,6 +206,11 @@ def _form_like(source: Study) -> StudyForm:
     return form.model_copy(update={"like": source.slug})
 
 
+def _own_task(source: Study) -> str | None:
+    """The task of clips that were made elsewhere, which a copy of their study takes along."""
+    return None if source.material is None else source.task
+
+
 def _check_name(session: Session, form: StudyForm, name: str, study: Study | None = None) -> None:
     """Two studies of one name are told apart by their addresses only. Raises FormInvalid until that is meant."""
     unchanged = study is not None and study.name == name
@@ -227,7 +236,11 @@ def _form_page(
     errors: Mapping[str, str] | None = None,
     study: Study | None = None,
     session: Session | None = None,
+    own_task: str | None = None,
 ) -> Response:
+    """``own_task``: may stay although it is not installed here, as that of a ``study`` may."""
+    own_task = study.task if study is not None else own_task
+    offered = [*catalogue.names(), *([own_task] if own_task and catalogue.find(own_task) is None else [])]
     fixed = locking.fixed_settings(session, study) if study is not None and session is not None else {}
     context = {
         "experimenter": experimenter,
@@ -235,7 +248,8 @@ def _form_page(
         "errors": errors or {},
         "first_wrong": next((each for each in StudyForm.model_fields if each in (errors or {})), None),
         "sections": SECTIONS,
-        "tasks": [(name, task_words.words_of(name)) for name in TaskName],
+        "tasks": [(name, task_words.words_of(name)) for name in offered],
+        "broken_tasks": catalogue.installed().broken,
         "presets": list(Preset),
         "study": study,
         "fixed": {each.name: fixed[each.fixed_with] for each in FIELDS if each.fixed_with in fixed},

@@ -9,12 +9,13 @@ from fastapi import Form
 from pydantic import ConfigDict, Field, ValidationError, create_model
 
 from app.domain.protocol import FormItem
-from app.domain.studies import LONGEST_CLIP_STEPS, USUAL_CLIP_STEPS, TaskName
+from app.domain.studies import longest_clip_steps, usual_clip_steps
 from app.domain.study_settings import PAPER_PROTOCOL, StudySettings
 from app.web.experimenter import form_lines
 from app.web.experimenter.form_fields import BY_NAME, FIELDS, FormField, Kind
 from app.web.texts.own_texts import CONSENT
 from app.web.texts.wording import broken_texts
+from installed_tasks import catalogue
 
 _Value = TypeVar("_Value")
 _Text = Annotated[str, Field(max_length=500)]
@@ -85,7 +86,7 @@ class Typed:
     """A study as it was typed, checked."""
 
     name: str
-    task: TaskName
+    task: str
     seed: int | None
     """None: one is to be drawn."""
     settings: StudySettings
@@ -93,7 +94,7 @@ class Typed:
 
 def form_with_defaults(preset: Preset = Preset.LEARNING) -> StudyForm:
     """The form as it is first shown; the length of clips is left to the task."""
-    return form_of("", TaskName.FEEDING, None, PRESETS[preset]).model_copy(update={"clip_steps": ""})
+    return form_of("", catalogue.usual(), None, PRESETS[preset]).model_copy(update={"clip_steps": ""})
 
 
 def with_preset(form: StudyForm, preset: Preset) -> StudyForm:
@@ -149,10 +150,13 @@ def _as_typed(kind: Kind, value: Any) -> str | list[str]:
     return str(value)
 
 
-def typed_study(form: StudyForm) -> Typed:
-    """What was typed, checked; clips without a length get the task's usual one. Raises FormInvalid."""
+def typed_study(form: StudyForm, own_task: str | None = None) -> Typed:
+    """What was typed, checked; clips without a length get the task's usual one. Raises FormInvalid.
+
+    ``own_task``: the task of a study which is changed or copied; it may stay although it is not installed here.
+    """
     errors: dict[str, str] = {}
-    task = _task(errors, form.task)
+    task = _task(errors, form.task, own_task)
     values = {each.setting: _value(errors, each, form) for each in FIELDS if each.setting and each.part is None}
     values["clip_steps"] = _clip_steps(errors, form, task, values["clip_steps"])
     values["wording"] = _wording(errors, form)
@@ -216,12 +220,12 @@ def _field(location: Sequence[int | str]) -> str:
     return str(location[0])
 
 
-def _clip_steps(errors: dict[str, str], form: StudyForm, task: TaskName, typed: int | None) -> int | None:
+def _clip_steps(errors: dict[str, str], form: StudyForm, task: str, typed: int | None) -> int | None:
     if not form.clip_steps.strip():
         errors.pop("clip_steps", None)
-        return USUAL_CLIP_STEPS[task]
-    if typed is not None and typed > LONGEST_CLIP_STEPS[task]:
-        errors["clip_steps"] = f"An episode of this task has {LONGEST_CLIP_STEPS[task]} steps. Enter at most as many."
+        return usual_clip_steps(task)
+    if typed is not None and typed > (longest_clip_steps(task) or typed):
+        errors["clip_steps"] = f"An episode of this task has {longest_clip_steps(task)} steps. Enter at most as many."
     return typed
 
 
@@ -250,12 +254,12 @@ def _read(errors: dict[str, str], name: str, reader: Callable[[str], _Value], ty
         return otherwise
 
 
-def _task(errors: dict[str, str], typed: str) -> TaskName:
-    try:
-        return TaskName(typed.strip() or TaskName.FEEDING)
-    except ValueError:
-        errors["task"] = "Choose one of the tasks."
-        return TaskName.FEEDING
+def _task(errors: dict[str, str], typed: str, own: str | None) -> str:
+    task = typed.strip() or catalogue.usual()
+    if task in (*catalogue.names(), own):
+        return task
+    errors["task"] = "Choose one of the tasks."
+    return catalogue.usual()
 
 
 def _number(errors: dict[str, str], name: str, typed: str, *, whole: bool) -> float | None:

@@ -1,9 +1,15 @@
-"""The words for each task. The worker stores names of axes and signals; what they mean to people is said here."""
+"""The words for a task and its parts: what the names of axes and signals that the worker stores mean to people.
+
+What all tasks share is worded here, with a task's own nouns; the rest its folder says.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from app.domain.studies import TaskName
+from installed_tasks import catalogue
+from installed_tasks.description import Words
+
+_NEUTRAL = Words(tool="tool", target="target", carried="food or water")
 
 
 @dataclass(frozen=True)
@@ -13,6 +19,8 @@ class TaskWords:
     title: str
     summary: str
     """One sentence for the person who chooses a task."""
+    picture: str
+    """shapes beside a seated person, as SVG"""
     costs: Mapping[str, str]
     """The paper's preference costs, by symbol; only those that can differ from 0 in this task."""
     axes: Mapping[str, str]
@@ -24,22 +32,33 @@ class TaskWords:
 
 
 def words_of(task: str) -> TaskWords:
-    """The words of a task; for one that this version does not know, its name and neutral words."""
-    if task in set(TaskName):
-        return _WORDS[TaskName(task)]
-    title = task.replace("_", " ").capitalize()
-    return TaskWords(title, "", _costs("tool", "target", "Food or water"), axes={}, signals={})
+    """The words of a task; for one that is not installed here, its name and neutral words."""
+    installed = catalogue.find(task)
+    if installed is None:
+        title = task.replace("_", " ").capitalize()
+        return TaskWords(title, "", "", _costs(_NEUTRAL), axes={}, signals={})
+    words = installed.description.words
+    return TaskWords(
+        installed.description.title,
+        installed.description.summary,
+        installed.picture,
+        _costs(words),
+        {**_approach(words.target), **words.axes},
+        _signals(words),
+        words.silent_signals,
+    )
 
 
-def _costs(tool: str, target: str, portion: str | None = None) -> Mapping[str, str]:
+def _costs(words: Words) -> Mapping[str, str]:
     costs = {
-        "C_d": f"Distance from the {target}",
-        "C_v": f"Speed of the {tool}",
-        "C_f": f"Force away from the {target}",
-        "C_hf": f"High force at the {target}",
+        "C_d": f"Distance from the {words.target}",
+        "C_v": f"Speed of the {words.tool}",
+        "C_f": f"Force away from the {words.target}",
+        "C_hf": f"High force at the {words.target}",
     }
-    if portion is not None:
-        costs |= {"C_fd": f"{portion} spilled on the person", "C_fdv": f"{portion} entering fast"}
+    if words.carried is not None:
+        carried = words.carried.capitalize()
+        costs |= {"C_fd": f"{carried} spilled on the person", "C_fdv": f"{carried} entering fast"}
     return costs
 
 
@@ -53,7 +72,8 @@ def _approach(target: str) -> Mapping[str, str]:
     }
 
 
-def _signals(tool: str, target: str, portion: str = "food") -> Mapping[str, str]:
+def _signals(words: Words) -> Mapping[str, str]:
+    tool, target, carried = words.tool, words.target, words.carried or _NEUTRAL.carried
     return {
         "distance_m": f"distance from the {target} (m)",
         "speed_m_s": f"{tool} speed (m/s)",
@@ -64,52 +84,14 @@ def _signals(tool: str, target: str, portion: str = "food") -> Mapping[str, str]
         "force_away_n": f"force away from the {target} (N)",
         "high_force_n": f"high force at the {target} (N)",
         "force_squared_n2": f"force squared at the {target} (N²)",
-        "spilled_on_person": f"{portion} spilled on the person",
-        "spilled": f"{portion} spilled anywhere",
-        "intake_speed_m_s": f"speed of the {portion} entering (m/s)",
+        "spilled_on_person": f"{carried} spilled on the person",
+        "spilled": f"{carried} spilled anywhere",
+        "intake_speed_m_s": f"speed of the {carried} entering (m/s)",
         "height_above_target_m": f"height above the {target} (m)",
         "lateral_offset_m": f"{tool} to one side of the {target} (m)",
         "tilt_rad": f"tilt of the {tool} (rad)",
         "turn_speed_squared_rad2_s2": f"turning of the {tool}, squared (rad²/s²)",
         "undelivered": "task not finished yet",
         "action_change_squared": "jerkiness of the arm",
-        "strokes": "strokes over the itch",
+        "strokes": f"strokes over the {target}",
     }
-
-
-_WORDS: Mapping[TaskName, TaskWords] = {
-    TaskName.FEEDING: TaskWords(
-        "Feeding",
-        "A spoon with eight pieces of food is brought to the mouth.",
-        _costs("spoon", "mouth", "Food"),
-        {**_approach("mouth"), "press": "goes into the mouth less (\N{MINUS SIGN}), deeper (+)"},
-        _signals("spoon", "mouth"),
-        frozenset({"strokes"}),
-    ),
-    TaskName.DRINKING: TaskWords(
-        "Drinking",
-        "A cup of water is brought to the mouth and tipped.",
-        _costs("cup", "mouth", "Water"),
-        {
-            **_approach("mouth"),
-            "tip_early": "tipped on the way less (\N{MINUS SIGN}), more (+)",
-            "pour_angle": "tipped at the mouth less (\N{MINUS SIGN}), more (+)",
-            "pour_haste": "pours slower (\N{MINUS SIGN}), quicker (+)",
-        },
-        _signals("cup", "mouth", "water"),
-        frozenset({"strokes"}),
-    ),
-    TaskName.SCRATCHING: TaskWords(
-        "Itch scratching",
-        "A scratcher gently strokes an itch on the right arm.",
-        _costs("scratcher", "itch"),
-        {
-            **_approach("itch"),
-            "to_side": "comes round one side of the itch (\N{MINUS SIGN}), the other (+)",
-            "press": "presses gently (\N{MINUS SIGN}), firmly (+)",
-            "stroke_speed": "strokes calmly (\N{MINUS SIGN}), briskly (+)",
-        },
-        _signals("scratcher", "itch"),
-        frozenset({"spilled_on_person", "spilled", "intake_speed_m_s"}),
-    ),
-}

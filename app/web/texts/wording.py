@@ -1,11 +1,12 @@
 """What the participant's pages say: one Fluent file per language, and a study's own words on top.
 
-Texts are plain; templates escape them like everything else. ``app/wording/*.ftl`` hold the built-in ones.
+Texts are plain; templates escape them like everything else. ``app/wording/*.ftl`` hold the built-in ones; what is said
+of a task, ``task-`` and its name, comes from the task's folder, in as many languages as it has.
 """
 
 import logging
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache, lru_cache
 from typing import Any
 
@@ -17,6 +18,7 @@ from jinja2.runtime import Context
 from app.domain.protocol import CONSENT_FACTS, Language
 from app.domain.study_settings import StudySettings
 from app.paths import WORDING
+from installed_tasks import catalogue
 
 log = logging.getLogger("app.wording")
 
@@ -171,7 +173,20 @@ def _own_words(language: Language, own: Mapping[str, str], study_language: Langu
 
 @cache
 def _resource(language: Language) -> ast.Resource:
-    return FluentResource((WORDING / f"{language}.ftl").read_text(encoding="utf-8"))
+    """The language's file, and in it what is said of each task, before what is said of any other."""
+    texts: list[ast.EntryType] = []
+    for entry in FluentResource((WORDING / f"{language}.ftl").read_text(encoding="utf-8")).body:
+        if isinstance(entry, ast.Message) and entry.id.name == "task-other":
+            texts += _of_tasks(language)
+        texts.append(entry)
+    return ast.Resource(texts)
+
+
+def _of_tasks(language: Language) -> Iterator[ast.Message]:
+    for task in catalogue.installed().tasks.values():
+        text = task.description.instructions.get(language)
+        if text is not None:
+            yield ast.Message(ast.Identifier(f"task-{task.name}"), ast.Pattern([ast.TextElement(text)]))
 
 
 @cache

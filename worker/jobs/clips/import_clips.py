@@ -23,7 +23,7 @@ from sqlalchemy.orm import Session
 from app.db import Database
 from app.domain.choices import RewardKind, Strategy
 from app.domain.clips import Clip, Rollout
-from app.domain.studies import LONGEST_CLIP_STEPS, Study
+from app.domain.studies import Study
 from app.domain.study_settings import StudySettings
 from app.errors import AppError
 from app.services import audit
@@ -44,7 +44,7 @@ LARGEST_UNPACKED_BYTES = 64 << 30
 LONGEST_DIFFERENCE_S = 0.5
 """Between a video and its trajectory."""
 FEWEST_STEPS = 2
-_FEWEST_CLIP_STEPS = 20
+_FEWEST_CLIP_STEPS, _MOST_CLIP_STEPS = 20, 130
 _MOST_BEHAVIOURS = 8
 
 
@@ -276,7 +276,7 @@ def _settings(manifest: Manifest, ready: Sequence[_Ready]) -> StudySettings:
         "strategy": Strategy.UNIFORM,
         "pool_scenarios": len(per_scenario),
         "behaviours_per_scenario": min(_MOST_BEHAVIOURS, *per_scenario.values()),
-        "clip_steps": min(max(longest, _FEWEST_CLIP_STEPS), max(LONGEST_CLIP_STEPS.values())),
+        "clip_steps": min(max(longest, _FEWEST_CLIP_STEPS), _MOST_CLIP_STEPS),
         "labels_per_participant": min(200, pairs),
         "filter_milestones": (),
     }

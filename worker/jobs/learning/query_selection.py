@@ -14,7 +14,7 @@ from app.domain.clips import Clip
 from app.domain.models import Model, ModelKind
 from app.domain.preferences import LEARNED_FROM, Purpose, Query
 from app.domain.studies import Participant, Study
-from worker.compute import learning, simulation
+from worker.compute import learning
 from worker.jobs.learning import dataset, query_plan
 from worker.jobs.learning.query_plan import Slot
 from worker.jobs.runtime import records
@@ -23,6 +23,7 @@ from worker.ml import acquisition
 from worker.ml.teachers import OMEGA, User
 from worker.sim.costs import preference_rewards
 from worker.task import Task
+from worker.tasks import registry
 
 log = logging.getLogger("worker.jobs.learning.query_selection")
 
@@ -151,7 +152,7 @@ def _answers_of_others(context: WorkerContext, known: _Known, pairs: Sequence[tu
         segments = dataset.segment_pairs(context.store, pairs)
         models = (context.store.read(model.artefact_sha256) for model in known.others)
         return np.array([learning.probability_right(model, segments) for model in models], np.float64)
-    task = simulation.task(known.study.task)
+    task = registry.task(known.study.task)
     returns = {clip.id: _stand_ins(context, task, clip) for pair in pairs for clip in pair}
     return acquisition.expected_answers(np.array([returns[right.id] - returns[left.id] for left, right in pairs]).T)
 

@@ -8,6 +8,7 @@ from worker.compute.pools import Computing, Lane
 from worker.jobs.learning.filters import filter_config
 from worker.ml.filters import filter_problem
 from worker.scenarios import EVALUATION, first_of
+from worker.tasks import registry
 from worker.trajectory import Trajectory
 
 
@@ -21,7 +22,7 @@ def make_ready(
     """
     policy = simulation.reference_policy(task)
     if settings.method is Method.STUDIO:
-        filter_problem.trace(simulation.task(task).modes, policy)
+        filter_problem.trace(registry.task(task).modes, policy)
     act = policy.mean
     for scenarios in reference_blocks(task, settings):
         key, made = (task, scenarios), list[Trajectory]()
@@ -34,7 +35,7 @@ def make_ready(
 def reference_blocks(task: str, settings: StudySettings) -> list[range]:
     """The scenarios in which filters of such a study are compared with the reference policy."""
     config = filter_config(settings)
-    gate = [config.gate_block(simulation.task(task))] if settings.method is Method.STUDIO else []
+    gate = [config.gate_block(registry.task(task))] if settings.method is Method.STUDIO else []
     return [*gate, first_of(EVALUATION, config.evaluation_scenarios)]
 
 

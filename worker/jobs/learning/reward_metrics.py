@@ -8,7 +8,6 @@ import numpy as np
 import numpy.typing as npt
 
 from app.domain.studies import Participant, Study
-from worker.compute import simulation
 from worker.compute.simulation import surface_file
 from worker.jobs.learning import dataset
 from worker.jobs.runtime.context import WorkerContext
@@ -16,6 +15,7 @@ from worker.ml.filters.response_surface import ResponseSurface
 from worker.ml.rewards.reward_models import RewardModel, StructuredReward, load_reward_model
 from worker.ml.rewards.segments import LEFT, SegmentPairs, Stretch
 from worker.ml.stopping import expected_regret
+from worker.tasks import registry
 from worker.trajectory import COSTS
 
 Floats = npt.NDArray[np.float64]
@@ -103,5 +103,5 @@ def _regret(task: str, model: RewardModel) -> float | None:
     """None for reward models that are not linear: their members' wishes are not known."""
     if not isinstance(model, StructuredReward) or not surface_file(task).exists():
         return None
-    surface = ResponseSurface.load(surface_file(task), simulation.task(task).modes)
+    surface = ResponseSurface.load(surface_file(task), registry.task(task).modes)
     return expected_regret(surface, model.signal_weights(()))

@@ -5,7 +5,7 @@ default filter is studio_filter. What the paper leaves open is a field of Printe
 """
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,15 +20,6 @@ from worker.ml.rewards.action_ranking import Ranker, RankerAt
 
 Progress = Callable[[float], None]
 
-BETAS: Mapping[str, tuple[float, float, float, float]] = {
-    "feeding": (1.0, 1.5, 0.1, 1.0),
-    "drinking": (1.0, 1.5, 0.1, 1.0),
-    "scratching": (1.0, 1.0, 0.1, 1.0),
-}
-"""beta of Rec, Pref, KL, Dyn per task (paper, Implementation Details)."""
-OTHER_TASKS_BETAS = BETAS["feeding"]
-"""For tasks that the paper does not have."""
-
 
 @dataclass(frozen=True)
 class PrintedConfig:
@@ -39,7 +30,7 @@ class PrintedConfig:
     sample of the policy, without a preference term, since one action says nothing about what is preferred to what"""
     epsilon: float = 1.0
     temperature: float = 1.0  # tau: not given
-    betas: tuple[float, float, float, float] = BETAS["feeding"]  # those of the task, see BETAS
+    betas: tuple[float, float, float, float] = (1.0, 1.5, 0.1, 1.0)  # a task has its own, see Task.printed_betas
     learning_rate: float = 1e-4
     steps: int = 3000
     """the paper trains 1.5e7 steps (days on this machine); for the web this is enough to see what the objective does"""

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from worker.ml.filters.filter_module import FilterWeights, state_of
 from worker.ml.filters.filter_problem import FilterDraft, FilterProblem, Progress
 from worker.ml.filters.fitted_q import Transitions
-from worker.ml.filters.pbarl_printed import BETAS, OTHER_TASKS_BETAS, PrintedConfig, train
+from worker.ml.filters.pbarl_printed import PrintedConfig, train
 from worker.ml.rewards.action_ranking import ranker_at
 from worker.trajectory import Trajectory
 
@@ -31,7 +31,7 @@ def fit_printed(
     def report(share: float) -> None:
         progress("training the printed action encoder", share)
 
-    settings = config or PrintedConfig(betas=BETAS.get(problem.task.name, OTHER_TASKS_BETAS))
+    settings = config or PrintedConfig(betas=problem.task.printed_betas)
     encoder, losses = train(problem.policy, ranker, data, settings, problem.seed, report)
     notes = (
         f"Printed method: {settings.steps} steps (the paper: 1.5e7), n = {settings.list_length},"

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from worker.ml.filters import filter_problem, pbarl
 from worker.ml.filters.filter_problem import Act, Collect, FilterDraft, FilterProblem
-from worker.ml.filters.pbarl_printed import BETAS, OTHER_TASKS_BETAS, PrintedConfig
+from worker.ml.filters.pbarl_printed import PrintedConfig
 from worker.ml.filters.printed_filter import fit_printed
 from worker.ml.filters.response_surface import ResponseSurface
 from worker.ml.methods import pbrl_hri, prefft
@@ -118,7 +118,7 @@ def fit_as_printed(setting: Setting, list_length: int) -> tuple[Act, tuple[str, 
     rollouts = setting.reference(first_of(RESIDUAL, setting.config.printed_rollouts))
     config = PrintedConfig(
         list_length=list_length,
-        betas=BETAS.get(problem.task.name, OTHER_TASKS_BETAS),
+        betas=problem.task.printed_betas,
         steps=setting.config.printed_steps,
     )
     checkpoint = setting.checkpoint

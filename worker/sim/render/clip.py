@@ -1,7 +1,7 @@
 """A piece of a trajectory as a short, calm video clip."""
 
 from collections import OrderedDict
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import chain
 from typing import NamedTuple
@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from PIL import Image
 
-from worker.sim.assistive import AssistiveEnv
+from worker.sim.arm import Robot, Tool
 from worker.sim.render import video
 from worker.sim.render.camera import Camera, scene_camera
 from worker.sim.render.close_up import close_up
@@ -19,8 +19,7 @@ from worker.sim.render.interpolation import clip_motion, frame_count
 from worker.sim.render.moving_parts import Person, Shoot, moving_lamp_depth, moving_parts, still_lamp_depth
 from worker.sim.render.passes import Depth, Frame, Shot, Supersampling
 from worker.sim.render.scene import Scene
-from worker.sim.render.task_look import TaskLook, task_look
-from worker.tasks.registry import ENVIRONMENTS
+from worker.sim.render.task_look import TaskLook
 from worker.trajectory import Trajectory
 
 STILL_PICTURES = 4
@@ -80,18 +79,23 @@ class Still(NamedTuple):
     lamp_depth: Depth
 
 
+class FilmedTask(NamedTuple):
+    """What a renderer has to know of a task."""
+
+    robot: Robot
+    tool: Tool
+    look: TaskLook
+
+
 class ClipRenderer:
     """Draws clips of any task one after the other. What it draws it makes when it is first needed, and keeps."""
 
     def __init__(
-        self,
-        style: RenderStyle = RenderStyle(),
-        environments: Mapping[str, type[AssistiveEnv]] = ENVIRONMENTS,
-        scene: Scene | None = None,
+        self, tasks: Callable[[str], FilmedTask], style: RenderStyle = RenderStyle(), scene: Scene | None = None
     ) -> None:
-        """``scene``: one that several renderers of a process draw from, by turns."""
+        """``tasks`` finds one by its name; ``scene``: one that several renderers of a process draw from, by turns."""
         self.style = style
-        self._environments = environments
+        self._task = tasks
         self._scene = scene or Scene()
         self._stills: OrderedDict[tuple[str, str], Still] = OrderedDict()
 
@@ -117,10 +121,9 @@ class ClipRenderer:
 
     def pictures(self, trajectory: Trajectory, first_step: int, n_steps: int) -> Iterator[Image.Image]:
         """The frames of steps first_step to first_step + n_steps, one after the other."""
-        env = self._environments[trajectory.task]
-        motion = clip_motion(trajectory, env.robot, env.tool, first_step, n_steps, self.style.fps)
-        look = task_look(trajectory.task)
-        kit = self._scene.kit(trajectory.task, env.robot, env.tool, look)
+        robot, tool, look = self._task(trajectory.task)
+        motion = clip_motion(trajectory, robot, tool, first_step, n_steps, self.style.fps)
+        kit = self._scene.kit(trajectory.task, robot, tool, look)
         kit.take(motion.particles_m.shape[1])
         sitter = self._scene.sitter(motion.body)
         sitter.sit(motion.skin_tone, look.mouth, kit.base)

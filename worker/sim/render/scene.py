@@ -16,7 +16,7 @@ from worker.sim.render.meshes.arm_mesh import Grip
 from worker.sim.render.meshes.distance_fields import Array, union
 from worker.sim.render.meshes.head_mesh import Mouth
 from worker.sim.render.meshes.mesh import Mesh, ball
-from worker.sim.render.meshes.tool_mesh import tool_look
+from worker.sim.render.meshes.tool_mesh import plain_look
 from worker.sim.render.stage import Paints, Stage, corners_around
 from worker.sim.render.task_look import TaskLook
 
@@ -96,7 +96,7 @@ class Kit:
     """The robot with the tool of one task and what the tool carries."""
 
     def __init__(self, task: str, robot: Robot, tool: Tool, look: TaskLook, stages: "Stages") -> None:
-        self._task, self._look, held = task, look, tool_look(tool)
+        self._task, self._look, held = task, look, look.tool or plain_look(tool.shapes)
         self._palette = stages.paints.palette
         detail, coarse = arm_mesh.Detail(self._palette, sides=14), arm_mesh.Detail(self._palette, sides=6)
         self.upper, self.casters = stages.upper, stages.small

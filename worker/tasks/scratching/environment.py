@@ -96,6 +96,7 @@ SCRATCHING = Task(
     ),
     calibrated_speed_weight=1.41,
     speed_counts_near=False,
+    printed_betas=(1.0, 1.0, 0.1, 1.0),
 )
 """Strokes are what the person asked for, so only the approach's speed is a cost. With strokes counted, no weight made
 paper's users differ: quick strokes take the tip away from the itch, and all three wanted the same slow ones. The weight

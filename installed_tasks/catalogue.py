@@ -1,0 +1,112 @@
+"""Which tasks there are: the entry points ``pbarl_studio.tasks``, and the folder of the package each of them names.
+
+The studio runs from its checkout, so its own entry points are read from the checkout's ``pyproject.toml``: an
+installation that is older than the checkout, or was never made, changes nothing. Those of other packages come from
+what is installed.
+"""
+
+import re
+import sys
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from importlib.machinery import ModuleSpec
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import NamedTuple
+
+from installed_tasks.description import InstalledTask, TaskRefused, read
+
+GROUP = "pbarl_studio.tasks"
+PROJECT = Path(__file__).resolve().parents[1] / "pyproject.toml"
+_NAME = r"[a-z][a-z0-9_]{0,39}"
+
+
+class Declared(NamedTuple):
+    """An entry point."""
+
+    name: str
+    package: str
+    distribution: str
+
+
+class BrokenTask(NamedTuple):
+    """A task that was declared and cannot be used."""
+
+    name: str
+    why: str
+    """in sentences, with what to do"""
+
+
+@dataclass(frozen=True)
+class Catalogue:
+    """What is installed: our own tasks first, in our order, then others by name."""
+
+    tasks: Mapping[str, InstalledTask]
+    broken: Sequence[BrokenTask]
+
+
+@cache
+def installed() -> Catalogue:
+    """Read once per process: a package that is added or corrected is seen by the next one."""
+    tasks: dict[str, InstalledTask] = {}
+    broken = []
+    for declared in _declared():
+        try:
+            if declared.name in tasks:
+                raise TaskRefused(f"{tasks[declared.name].package} is a task of the same name.")
+            tasks[declared.name] = _read(declared)
+        except TaskRefused as error:
+            advice = f"Correct it or uninstall {declared.distribution}, and start the studio again."
+            broken.append(BrokenTask(declared.name, f"The task {declared.name} cannot be used. {error} {advice}"))
+    return Catalogue(tasks, broken)
+
+
+def names() -> tuple[str, ...]:
+    """Of every task that can be used."""
+    return tuple(installed().tasks)
+
+
+def usual() -> str:
+    """The task that is taken where nobody says which."""
+    return names()[0]
+
+
+def find(name: str) -> InstalledTask | None:
+    """A task by its name; None when it is not installed here."""
+    return installed().tasks.get(name)
+
+
+def _declared() -> Iterator[Declared]:
+    project = tomllib.loads(PROJECT.read_text(encoding="utf-8"))["project"]
+    ours = project["name"]
+    yield from (Declared(name, package, ours) for name, package in project["entry-points"][GROUP].items())
+    for point in sorted(entry_points(group=GROUP)):
+        distribution = point.dist.name if point.dist else point.module
+        if distribution != ours:
+            yield Declared(point.name, point.value, distribution)
+
+
+def _read(declared: Declared) -> InstalledTask:
+    if not re.fullmatch(_NAME, declared.name):
+        raise TaskRefused("Its name must be at most 40 small letters, digits and underscores.")
+    return read(declared.name, declared.package, folder_of(declared.package))
+
+
+def folder_of(package: str) -> Path:
+    """Where a package lies. It is found as an import would find it, and neither it nor a parent is imported."""
+    places: list[str] | None = None
+    parts = package.split(".")
+    for count in range(1, len(parts) + 1):
+        name = ".".join(parts[:count])
+        spec = _spec(name, places)
+        if spec is None or spec.origin is None or spec.submodule_search_locations is None:
+            raise TaskRefused(f"There is no package {name} with an __init__.py; its entry point is {package!r}.")
+        places = list(spec.submodule_search_locations)
+    return Path(places[0] if places else "")
+
+
+def _spec(name: str, places: list[str] | None) -> ModuleSpec | None:
+    found = (finder.find_spec(name, places) for finder in sys.meta_path)
+    return next((spec for spec in found if spec is not None), None)

@@ -1,0 +1,158 @@
+"""A task's folder, as far as it can be read without running any of its code: ``task.toml`` and ``picture.svg``."""
+
+import re
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Self
+from xml.etree import ElementTree
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic_core import ErrorDetails
+
+DESCRIPTION, PICTURE, CHECKPOINT = "task.toml", "picture.svg", "checkpoint"
+SHORTEST_CLIP_STEPS, LONGEST_CLIP_STEPS = 20, 600
+"""Control steps of 0.1 s."""
+PICTURE_FRAME = "0 0 240 150"
+_SHAPES = {"g", "path", "circle", "ellipse", "rect", "line", "polyline", "polygon"}
+_GEOMETRY = {*("class", "d", "points", "transform", "width", "height"), *("cx", "cy", "r", "rx", "ry", "x", "y")} | {
+    *("x1", "y1", "x2", "y2")
+}
+
+
+def _flowing(text: str) -> str:
+    """An empty line makes a paragraph; other line breaks are those of the file."""
+    if "{" in text or "}" in text:
+        raise ValueError("must not have braces, which mean a variable in the texts of pages")
+    return "\n\n".join(" ".join(paragraph.split()) for paragraph in re.split(r"\n\s*\n", text.strip()))
+
+
+_EXPLAINED = {
+    "missing": "is missing",
+    "extra_forbidden": "is not known here",
+    "string_pattern_mismatch": "must be like module:name, a name in a module of the package",
+}
+
+_Word = Annotated[str, Field(min_length=1, max_length=200)]
+_Text = Annotated[str, Field(min_length=1, max_length=4000), AfterValidator(_flowing)]
+_Reference = Annotated[str, Field(pattern=r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*$")]
+"""An object of the task's package: ``module:name``."""
+
+
+class TaskRefused(ValueError):
+    """A task's folder is not as it must be; the message says where and why."""
+
+
+class Words(BaseModel):
+    """What experimenters' pages call the parts of a task, in English."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    tool: _Word
+    """what the robot holds"""
+    target: _Word
+    """where it goes"""
+    carried: _Word | None = None
+    """what can be spilled; None: nothing"""
+    axes: dict[str, _Word] = {}
+    """The ways in which executions differ, beyond those of every approach; the sign says which end."""
+    silent_signals: frozenset[str] = frozenset()
+    """Always 0 in this task; a weight of them says nothing."""
+
+
+class TaskDescription(BaseModel):
+    """What ``task.toml`` says."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    title: str = Field(min_length=1, max_length=60)
+    summary: str = Field(max_length=200)
+    """One sentence for the person who chooses a task."""
+    episode_steps: int = Field(ge=SHORTEST_CLIP_STEPS, le=LONGEST_CLIP_STEPS)
+    usual_clip_steps: int = Field(ge=SHORTEST_CLIP_STEPS)
+    """from the start, in which what matters has happened"""
+    environment: _Reference
+    """a subclass of worker.sim.assistive.AssistiveEnv"""
+    look: _Reference | None = None
+    """a worker.sim.render.task_look.TaskLook; None: the usual one"""
+    demonstrator: _Reference | None = None
+    """returns a scripted controller that the reference policy imitates first; None: trial and error alone"""
+    training: dict[str, Any] = {}
+    """What the reference policy's training does otherwise than worker.ml.policies.sac.SacConfig."""
+    words: Words
+    instructions: dict[str, _Text]
+    """What participants read of the task, by language; an empty line makes a paragraph."""
+
+    @model_validator(mode="after")
+    def _shown_within_the_episode(self) -> Self:
+        if self.usual_clip_steps > self.episode_steps:
+            raise ValueError(f"usual_clip_steps must not be more than the {self.episode_steps} steps of an episode")
+        return self
+
+
+@dataclass(frozen=True)
+class InstalledTask:
+    """One task that studies can have."""
+
+    name: str
+    """as stored in studies, trajectories and bundles"""
+    package: str
+    folder: Path
+    description: TaskDescription
+    picture: str
+    """shapes beside a seated person, as SVG; empty: none"""
+
+    @property
+    def checkpoint(self) -> Path:
+        """The folder with the reference policy and what was learned with it."""
+        return self.folder / CHECKPOINT
+
+
+def read(name: str, package: str, folder: Path) -> InstalledTask:
+    """What a folder says. Raises TaskRefused."""
+    return InstalledTask(name, package, folder, _description(folder / DESCRIPTION), _picture(folder / PICTURE))
+
+
+def _description(file: Path) -> TaskDescription:
+    try:
+        return TaskDescription.model_validate(tomllib.loads(_text(file)))
+    except tomllib.TOMLDecodeError as error:
+        raise TaskRefused(f"{file} is not valid TOML: {error}.") from error
+    except ValidationError as error:
+        raise TaskRefused(f"{file}: {'; '.join(map(_in_words, error.errors()))}.") from error
+
+
+def _in_words(wrong: ErrorDetails) -> str:
+    place, said = ".".join(map(str, wrong["loc"])), wrong["msg"]
+    if wrong["type"] in _EXPLAINED:
+        return f"{place} {_EXPLAINED[wrong['type']]}"
+    if wrong["type"] == "value_error":
+        return f"{place} {said.removeprefix('Value error, ')}".strip()
+    return f"{place}: {said}"
+
+
+def _picture(file: Path) -> str:
+    """Its shapes alone, so that a page can hold them."""
+    if not file.exists():
+        return ""
+    try:
+        drawing = ElementTree.fromstring(_text(file))  # noqa: S314 -- a file of an installed package
+    except ElementTree.ParseError as error:
+        raise TaskRefused(f"{file} is not valid SVG: {error}.") from error
+    if drawing.get("viewBox") != PICTURE_FRAME:
+        raise TaskRefused(f'{file}: its viewBox must be "{PICTURE_FRAME}", the person sits on the left of it.')
+    for element in drawing.iter():
+        element.tag = element.tag.rpartition("}")[2]
+        unknown = [element.tag] if element.tag not in _SHAPES else sorted(set(element.keys()) - _GEOMETRY)
+        if element is not drawing and unknown:
+            raise TaskRefused(f"{file}: a picture has no {unknown[0]}; use {', '.join(sorted(_SHAPES))} and classes.")
+    return "".join(ElementTree.tostring(shape, encoding="unicode") for shape in drawing)
+
+
+def _text(file: Path) -> str:
+    try:
+        return file.read_text(encoding="utf-8")
+    except OSError as error:
+        raise TaskRefused(f"{file} cannot be read: {error.strerror}.") from error
+    except UnicodeDecodeError as error:
+        raise TaskRefused(f"{file} is not UTF-8.") from error
