@@ -82,3 +82,10 @@ def settings_of(model: type[BaseModel]) -> Iterator[tuple[str, Any, Shown]]:
         if not isinstance(shown, Shown):
             raise TypeError(f"{model.__name__}.{name} is no setting(): it does not say how it is shown.")
         yield name, field.annotation, shown
+
+
+def bounds_of(model: type[BaseModel], name: str) -> tuple[Any, Any]:
+    """The smallest and the largest value that a setting can have; None where there is no bound."""
+    rules = model.model_fields[name].metadata
+    smallest, largest = ([getattr(rule, end) for rule in rules if hasattr(rule, end)] for end in ("ge", "le"))
+    return (smallest or [None])[0], (largest or [None])[0]

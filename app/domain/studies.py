@@ -12,6 +12,10 @@ from app.db import Base, now
 from app.domain.study_settings import USUAL_CLIP_STEPS, StudySettings
 from installed_tasks import catalogue
 
+NAME_LENGTH = 120
+SEED_LIMIT = 2**31
+"""Seeds of studies are smaller."""
+
 
 def longest_clip_steps(task: str) -> int | None:
     """A whole episode of a task; None for one that is not installed here."""
@@ -37,7 +41,7 @@ class Study(Base):
 
     id: Mapped[int] = mapped_column(primary_key=True)
     slug: Mapped[str] = mapped_column(String(80), unique=True)
-    name: Mapped[str] = mapped_column(String(120))
+    name: Mapped[str] = mapped_column(String(NAME_LENGTH))
     task: Mapped[str] = mapped_column(String(40), default=catalogue.usual)
     stored_settings: Mapped[dict[str, Any]]
     seed: Mapped[int]

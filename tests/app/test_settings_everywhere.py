@@ -9,7 +9,7 @@ from fastapi.testclient import TestClient
 from pydantic import BaseModel
 
 from app.domain.choices import Choice
-from app.domain.described import settings_of
+from app.domain.described import bounds_of, settings_of
 from app.domain.protocol import EvaluationSettings
 from app.domain.study_settings import PAPER_PROTOCOL, StudySettings
 from app.services.studies import locking
@@ -110,6 +110,11 @@ def test_the_api_describes_the_settings_as_they_are(client: TestClient) -> None:
 def test_whatever_can_be_chosen_has_a_name_for_people() -> None:
     for enumeration in Choice.__subclasses__():
         assert all(each.label for each in enumeration), enumeration
+
+
+def test_the_bounds_of_a_setting_can_be_asked_for() -> None:
+    assert bounds_of(StudySettings, "behaviours_per_scenario") == (2, 8)
+    assert bounds_of(StudySettings, "question") == (None, None)
 
 
 def test_a_setting_without_words_is_refused() -> None:

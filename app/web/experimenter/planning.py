@@ -11,7 +11,7 @@ from sqlalchemy.orm import Session
 
 from app.domain.people import Experimenter
 from app.domain.protocol import Language
-from app.domain.studies import Study
+from app.domain.studies import NAME_LENGTH, Study
 from app.services.accounts import browser_sessions
 from app.services.participants import enrolment
 from app.services.studies import locking, preregistration, studies
@@ -201,7 +201,7 @@ def _form_of(study: Study) -> StudyForm:
 
 def _form_like(source: Study) -> StudyForm:
     """Everything but what belongs to one study alone: its name, its seed, its people."""
-    name = f"{source.name}, copy"[: study_form.NAME_LENGTH]
+    name = f"{source.name}, copy"[:NAME_LENGTH]
     form = study_form.form_of(name, source.task, None, source.settings)
     return form.model_copy(update={"like": source.slug})
 

@@ -9,7 +9,7 @@ from fastapi import Form
 from pydantic import ConfigDict, Field, ValidationError, create_model
 
 from app.domain.protocol import FormItem
-from app.domain.studies import longest_clip_steps, usual_clip_steps
+from app.domain.studies import NAME_LENGTH, SEED_LIMIT, longest_clip_steps, usual_clip_steps
 from app.domain.study_settings import PAPER_PROTOCOL, StudySettings
 from app.web.experimenter import form_lines
 from app.web.experimenter.form_fields import BY_NAME, FIELDS, FormField, Kind
@@ -57,9 +57,6 @@ class StudyForm(_Fields):
 
 
 TypedStudy = Annotated[StudyForm, Form()]
-
-NAME_LENGTH = 120
-_SEED_LIMIT = 2**31
 
 
 class Preset(StrEnum):
@@ -166,8 +163,8 @@ def typed_study(form: StudyForm, own_task: str | None = None) -> Typed:
     if not 1 <= len(name) <= NAME_LENGTH:
         errors["name"] = f"Give the study a name of at most {NAME_LENGTH} characters."
     seed = None if not form.seed.strip() else _number(errors, "seed", form.seed, whole=True)
-    if seed is not None and seed >= _SEED_LIMIT:
-        errors["seed"] = f"Enter a number below {_SEED_LIMIT}."
+    if seed is not None and seed >= SEED_LIMIT:
+        errors["seed"] = f"Enter a number below {SEED_LIMIT}."
     settings = _settings(errors, values)
     if errors or settings is None:
         if len(errors) > 1:
