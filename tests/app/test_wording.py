@@ -9,7 +9,7 @@ from fastapi.testclient import TestClient
 from fluent.syntax import ast
 
 from app.domain.protocol import Language
-from app.domain.studies import StudySettings
+from app.domain.study_settings import StudySettings
 from app.paths import ROOT, WORDING
 from app.web.texts import wording
 from app.web.texts.wording import Wording, built_in_texts, variables_of, wording_for

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from app.domain.studies import StudySettings
+from app.domain.study_settings import StudySettings
 from installed_tasks import catalogue
 from worker.analysis import result_pages
 from worker.compute import learning

@@ -11,7 +11,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -331,27 +331,3 @@ def _spoken(manner: Manner) -> str:
 def _replace(path: Path, text: str) -> None:
     with written_whole(path) as draft:
         draft.write_text(text)
-
-
-def with_options(
-    terms: Terms,
-    *,
-    prefft_steps: int | None = None,
-    pbrl_steps: int | None = None,
-    printed_steps: int | None = None,
-    rationality: float | None = None,
-    mistakes: float | None = None,
-    **values: Any,
-) -> Terms:
-    """A profile with what was said on the command line; None leaves a value as it is."""
-    chosen = terms.methods
-    if prefft_steps is not None:
-        chosen = replace(chosen, fine_tuning=replace(chosen.fine_tuning, steps=prefft_steps))
-    if pbrl_steps is not None:
-        chosen = replace(chosen, from_scratch=replace(chosen.from_scratch, steps=pbrl_steps))
-    if printed_steps is not None:
-        chosen = replace(chosen, printed_steps=printed_steps)
-    errs = {"rationality": rationality, "mistakes": mistakes}
-    manner = replace(terms.manner, **{name: value for name, value in errs.items() if value is not None})
-    given = {name: value for name, value in values.items() if value is not None}
-    return replace(terms, methods=chosen, manner=manner, **given)

@@ -1,6 +1,6 @@
 """Making a study, changing it, looking at it as a participant would, and locking it."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from datetime import timedelta
 from http import HTTPStatus
 from typing import Annotated, Any
@@ -11,12 +11,13 @@ from sqlalchemy.orm import Session
 
 from app.domain.people import Experimenter
 from app.domain.protocol import Language
-from app.domain.studies import Study
+from app.domain.studies import NAME_LENGTH, Study
 from app.services.accounts import browser_sessions
 from app.services.participants import enrolment
 from app.services.studies import locking, preregistration, studies
 from app.services.studies.studies import ClipsTooLong
 from app.web.experimenter import study_form
+from app.web.experimenter.form_fields import FIELDS, SECTIONS
 from app.web.experimenter.study_form import FormInvalid, Preset, StudyForm, TypedStudy
 from app.web.http.deps import (
     PARTICIPANT_COOKIE,
@@ -200,7 +201,7 @@ def _form_of(study: Study) -> StudyForm:
 
 def _form_like(source: Study) -> StudyForm:
     """Everything but what belongs to one study alone: its name, its seed, its people."""
-    name = f"{source.name}, copy"[: study_form.NAME_LENGTH]
+    name = f"{source.name}, copy"[:NAME_LENGTH]
     form = study_form.form_of(name, source.task, None, source.settings)
     return form.model_copy(update={"like": source.slug})
 
@@ -222,14 +223,9 @@ def _with_fixed(session: Session, study: Study, form: StudyForm) -> StudyForm:
     return form.model_copy(update=_stored(study, locking.fixed_settings(session, study)))
 
 
-def _stored(study: Study, names: Mapping[str, str]) -> dict[str, Any]:
+def _stored(study: Study, names: Collection[str]) -> dict[str, Any]:
     stored = _form_of(study).model_dump()
-    return {field: value for field, value in stored.items() if _setting(field) in names}
-
-
-def _setting(field: str) -> str:
-    """The setting a field belongs to: those of the evaluation are fixed together."""
-    return "evaluation" if field.startswith("evaluation_") and field != "evaluation_scenarios" else field
+    return {each.name: stored[each.name] for each in FIELDS if each.fixed_with in names}
 
 
 def _form_page(
@@ -251,11 +247,12 @@ def _form_page(
         "form": form,
         "errors": errors or {},
         "first_wrong": next((each for each in StudyForm.model_fields if each in (errors or {})), None),
+        "sections": SECTIONS,
         "tasks": [(name, task_words.words_of(name)) for name in offered],
         "broken_tasks": catalogue.installed().broken,
         "presets": list(Preset),
         "study": study,
-        "fixed": {each: fixed[_setting(each)] for each in StudyForm.model_fields if _setting(each) in fixed},
+        "fixed": {each.name: fixed[each.fixed_with] for each in FIELDS if each.fixed_with in fixed},
     }
     return page(
         request, "experimenter/new_study.html", context, HTTPStatus.UNPROCESSABLE_ENTITY if errors else HTTPStatus.OK
