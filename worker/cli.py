@@ -115,8 +115,8 @@ def _add_benchmark(commands: _Commands) -> None:
     command.add_argument("--seeds", type=int, default=1)
     command.add_argument("--labels", type=int, help="200; the paper's offline training has 5000")
     command.add_argument("--scenarios", type=int, help="unseen ones; 500")
-    command.add_argument("--reward", choices=get_args(reward_training.Kind))
-    command.add_argument("--rule", choices=get_args(acquisition.Rule), help="which pairs are asked; entropy")
+    command.add_argument("--reward", choices=get_args(reward_training.RewardKind))
+    command.add_argument("--rule", choices=get_args(acquisition.Strategy), help="which pairs are asked; entropy")
     command.add_argument("--form", choices=["calibrated", "paper"], help="of the costs")
     command.add_argument("--mistakes", type=_share, help="share of answers that say the opposite; 0.05")
     command.add_argument(

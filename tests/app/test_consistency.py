@@ -8,20 +8,20 @@ import pytest
 from app.domain.clips import Clip
 from app.domain.preferences import Label, LabelEvent, Purpose, Query, Response
 from app.services.answers import consistency
-from app.services.answers.consistency import Answer, Consistency
+from app.services.answers.consistency import Consistency, JudgedAnswer
 
 LEFT, RIGHT, EQUAL, SKIP = Response.LEFT, Response.RIGHT, Response.EQUAL, Response.SKIP
 numbers = count(1)
 
 
-def answer(response: Response = LEFT, **columns: object) -> Answer:
+def answer(response: Response = LEFT, **columns: object) -> JudgedAnswer:
     """One answer to a pair of clips of its own."""
     number = next(numbers)
-    usual = Answer(number, number, Purpose.PREFERENCE, response, 10 * number, 10 * number + 1)
+    usual = JudgedAnswer(number, number, Purpose.PREFERENCE, response, 10 * number, 10 * number + 1)
     return replace(usual, **columns)  # type: ignore[arg-type]
 
 
-def again(before: Answer, response: Response, *, swapped: bool = False) -> Answer:
+def again(before: JudgedAnswer, response: Response, *, swapped: bool = False) -> JudgedAnswer:
     """The same pair asked again."""
     sides = (before.left_clip_id, before.right_clip_id)
     left, right = sides[::-1] if swapped else sides
@@ -30,12 +30,12 @@ def again(before: Answer, response: Response, *, swapped: bool = False) -> Answe
     )
 
 
-def asked_twice(*said: tuple[Response, Response], swapped: bool = False) -> list[Answer]:
+def asked_twice(*said: tuple[Response, Response], swapped: bool = False) -> list[JudgedAnswer]:
     firsts = [answer(first) for first, _ in said]
     return [*firsts, *(again(each, second, swapped=swapped) for each, (_, second) in zip(firsts, said, strict=True))]
 
 
-def of(answers: list[Answer]) -> Consistency:
+def of(answers: list[JudgedAnswer]) -> Consistency:
     return consistency.consistency(answers)
 
 

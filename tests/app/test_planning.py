@@ -15,7 +15,7 @@ from app.domain.studies import Deviation, Study
 from app.services.answers import exclusions
 from app.services.exports import export_formats
 from app.services.studies import locking, preregistration
-from app.services.studies.preregistration import Plan, Standing
+from app.services.studies.preregistration import Plan, PlanStanding
 from app.storage import ArtefactStore
 from tests import factories
 from tests.finished_study import make_finished_study
@@ -52,21 +52,21 @@ def plan_of(database: Database, study: Study) -> Plan:
 @pytest.mark.parametrize(
     ("locked_on_day", "standing", "may_be_called_planned"),
     [
-        (None, Standing.NOT_LOCKED, False),
-        (5, Standing.BEFORE_DATA, True),
-        (10, Standing.BEFORE_RATINGS, True),
-        (15, Standing.BEFORE_RATINGS, True),
-        (20, Standing.AFTER_RATINGS, False),
-        (25, Standing.AFTER_RATINGS, False),
-        (30, Standing.AFTER_UNBLINDING, False),
-        (35, Standing.AFTER_UNBLINDING, False),
+        (None, PlanStanding.NOT_LOCKED, False),
+        (5, PlanStanding.BEFORE_DATA, True),
+        (10, PlanStanding.BEFORE_RATINGS, True),
+        (15, PlanStanding.BEFORE_RATINGS, True),
+        (20, PlanStanding.AFTER_RATINGS, False),
+        (25, PlanStanding.AFTER_RATINGS, False),
+        (30, PlanStanding.AFTER_UNBLINDING, False),
+        (35, PlanStanding.AFTER_UNBLINDING, False),
     ],
 )
 def test_only_what_was_locked_before_the_first_rating_is_called_planned(
     database: Database,
     planned: Planned,
     locked_on_day: int | None,
-    standing: Standing,
+    standing: PlanStanding,
     may_be_called_planned: bool,
 ) -> None:
     study = planned(locked_on_day)
@@ -88,7 +88,7 @@ def test_answers_to_practice_and_of_previews_are_no_data(database: Database, sto
         (query,) = factories.make_queries(session, store, guest, 1)
         factories.make_label(session, query)
         locking.lock(session, study, study.slug, "Ada")
-    assert plan_of(database, study).standing is Standing.BEFORE_DATA
+    assert plan_of(database, study).standing is PlanStanding.BEFORE_DATA
 
 
 def test_a_test_that_was_named_under_the_lock_is_not_planned(

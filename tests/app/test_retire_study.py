@@ -14,7 +14,7 @@ from app.domain.people import AuditEvent, Experimenter, Role
 from app.domain.protocol import EvaluationSettings, Stage
 from app.domain.studies import PAPER_PROTOCOL, Participant, Study
 from app.services.monitoring import dashboard, study_state
-from app.services.monitoring.study_state import State
+from app.services.monitoring.study_state import StudyState
 from app.services.participants import enrolment, withdrawal
 from app.storage import ArtefactStore
 from tests import factories
@@ -299,7 +299,7 @@ def test_a_study_prepares_its_clips_and_then_waits(database: Database, store: Ar
         for _ in range(clips):
             factories.make_clip(session, store, study)
         factories.make_participant(session, study, ready=False)
-    assert standing(database) is (State.WAITING if clips else State.PREPARING)
+    assert standing(database) is (StudyState.WAITING if clips else StudyState.PREPARING)
 
 
 def test_a_study_runs_evaluates_finishes_and_asks_for_attention(database: Database, store: ArtefactStore) -> None:
@@ -309,21 +309,21 @@ def test_a_study_runs_evaluates_finishes_and_asks_for_attention(database: Databa
         second, _ = factories.make_participant(session, study)
         gone, _ = factories.make_participant(session, study)
         gone.withdrawn_at = gone.created_at
-    assert standing(database) is State.RUNNING
+    assert standing(database) is StudyState.RUNNING
     with database.writing() as session:
         session.get_one(Participant, first.id).completed_at = first.created_at
         session.add(StageRecord(participant_id=second.id, stage=Stage.EVALUATION))
-    assert standing(database) is State.EVALUATING
+    assert standing(database) is StudyState.EVALUATING
     with database.writing() as session:
         session.get_one(Participant, second.id).completed_at = second.created_at
-    assert standing(database) is State.FINISHED
+    assert standing(database) is StudyState.FINISHED
     with database.writing() as session:
         factories.make_run(session, study, status=RunStatus.FAILED)
         assert session.scalars(select(Run)).one().status == RunStatus.FAILED
-    assert standing(database) is State.ATTENTION
+    assert standing(database) is StudyState.ATTENTION
 
 
-def standing(database: Database) -> State:
+def standing(database: Database) -> StudyState:
     with database.reading() as session:
         lines = dashboard.study_lines(session)
         return study_state.standings(session, lines)[lines[0].study.id].state

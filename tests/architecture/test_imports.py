@@ -1,7 +1,10 @@
-"""What the web server loads, and how fast."""
+"""What the web server loads, and that imports go one way."""
 
 import subprocess
 import sys
+from graphlib import TopologicalSorter
+
+import grimp
 
 HEAVY = ("torch", "pybullet", "numpy", "imageio", "av", "dbos", "worker")
 
@@ -18,3 +21,11 @@ def test_the_web_server_loads_nothing_of_the_learning_stack() -> None:
 def test_the_domain_loads_nothing_of_the_web() -> None:
     code = "import sys, app.domain.studies; print([n for n in ('fastapi', 'starlette', 'jinja2') if n in sys.modules])"
     assert python(code) == "[]"
+
+
+def test_no_module_imports_itself_by_way_of_others() -> None:
+    """Imports within functions count: whoever reads a module should not have to read it again first."""
+    graph = grimp.build_graph("app", "worker")
+    imports = {module: graph.find_modules_directly_imported_by(module) for module in graph.modules}
+    assert len(imports) > 200
+    TopologicalSorter(imports).prepare()  # raises CycleError, which names the circle

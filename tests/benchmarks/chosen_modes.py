@@ -63,7 +63,7 @@ class Choice:
     deviation: float = pooled_prior.DEVIATION
     lapses: float = bradley_terry.LAPSES
     caution: float = CAUTION
-    rule: acquisition.Rule = Terms.rule
+    rule: acquisition.Strategy = Terms.rule
 
     @property
     def name(self) -> str:

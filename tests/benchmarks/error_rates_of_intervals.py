@@ -8,7 +8,7 @@ import numpy as np
 
 from app.domain.preferences import Purpose, Response
 from app.services.answers import accuracy, consistency
-from app.services.answers.consistency import Answer
+from app.services.answers.consistency import JudgedAnswer
 from worker.analysis.agreement import wilson_interval
 from worker.analysis.effect_sizes import d_z_interval, rank_biserial, rank_biserial_interval
 from worker.analysis.evaluation import mean_change, success_change
@@ -98,7 +98,7 @@ def _ranks(rng: np.random.Generator, people: int) -> Callable[[], Bounds]:
     return draw
 
 
-def _pairs(rng: np.random.Generator, pairs: int, rate: float, equal: float = 0.0) -> list[Answer]:
+def _pairs(rng: np.random.Generator, pairs: int, rate: float, equal: float = 0.0) -> list[JudgedAnswer]:
     """So many pairs asked twice; both answers are the person's true one with this chance, else the opposite."""
     first, again = [], []
     for place in range(pairs):
@@ -106,8 +106,10 @@ def _pairs(rng: np.random.Generator, pairs: int, rate: float, equal: float = 0.0
         if rng.random() < equal:
             told = [Response.EQUAL, Response.EQUAL]
         sides = (2 * place, 2 * place + 1)
-        first.append(Answer(place, place, Purpose.PREFERENCE, told[0], *sides))
-        again.append(Answer(pairs + place, pairs + place, Purpose.REPEAT, told[1], *sides, repeats_query_id=place))
+        first.append(JudgedAnswer(place, place, Purpose.PREFERENCE, told[0], *sides))
+        again.append(
+            JudgedAnswer(pairs + place, pairs + place, Purpose.REPEAT, told[1], *sides, repeats_query_id=place)
+        )
     return [*first, *again]
 
 
@@ -155,7 +157,9 @@ def _slowing(rng: np.random.Generator, count: int) -> Callable[[], Bounds]:
     def draw() -> Bounds:
         times = np.exp(rng.normal(8.7, 0.5, count)).astype(int) + 1
         answers = [
-            Answer(place, place, Purpose.PREFERENCE, Response.LEFT, 0, 1, response_time_ms=int(time), clip_ms=6000)
+            JudgedAnswer(
+                place, place, Purpose.PREFERENCE, Response.LEFT, 0, 1, response_time_ms=int(time), clip_ms=6000
+            )
             for place, time in enumerate(times)
         ]
         found = consistency.slowing(answers)
@@ -184,7 +188,7 @@ def _flag(what: str, about: str, raised: Sequence[bool]) -> Row:
 
 def _ever_raised(random: Random) -> set[str]:
     """Every 25th pair is an obvious one, every 10th an earlier one again."""
-    answers: list[Answer] = []
+    answers: list[JudgedAnswer] = []
     raised: set[str] = set()
     for place in range(ANSWERS):
         answers.append(_next(random, answers, place))
@@ -192,18 +196,18 @@ def _ever_raised(random: Random) -> set[str]:
     return raised
 
 
-def _next(random: Random, answers: Sequence[Answer], place: int) -> Answer:
+def _next(random: Random, answers: Sequence[JudgedAnswer], place: int) -> JudgedAnswer:
     side = random.choice((Response.LEFT, Response.RIGHT))
     other = {Response.LEFT: Response.RIGHT, Response.RIGHT: Response.LEFT}
     if place % 25 == 24:
         said = other[side] if random.random() < 0.02 else side
-        return Answer(place, place, Purpose.CATCH, said, 2 * place, 2 * place + 1, expected=side)
+        return JudgedAnswer(place, place, Purpose.CATCH, said, 2 * place, 2 * place + 1, expected=side)
     if place % 10 == 9:
         before = answers[place - 9]
         said = other.get(before.response, side) if random.random() < 0.15 else before.response
         sides = (before.left_clip_id, before.right_clip_id)
-        return Answer(place, place, Purpose.REPEAT, said, *sides, repeats_query_id=before.query_id)
-    return Answer(place, place, Purpose.PREFERENCE, side, 2 * place, 2 * place + 1)
+        return JudgedAnswer(place, place, Purpose.REPEAT, said, *sides, repeats_query_id=before.query_id)
+    return JudgedAnswer(place, place, Purpose.PREFERENCE, side, 2 * place, 2 * place + 1)
 
 
 def _ever_better(random: Random, chance: float) -> bool:

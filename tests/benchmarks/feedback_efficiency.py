@@ -58,8 +58,8 @@ RETRAIN_EVERY = 10
 PEOPLE = tuple(f"person-{number}" for number in range(6))
 EARLIER_PEOPLE = range(100, 112)
 """Numbers of people from the same population who came before those who are measured."""
-RULES: tuple[acquisition.Rule, ...] = ("uniform", "disagreement", "entropy", "information_gain", "contested")
-AS_IN_A_STUDY: tuple[acquisition.Rule, ...] = ("uniform", "entropy")
+RULES: tuple[acquisition.Strategy, ...] = ("uniform", "disagreement", "entropy", "information_gain", "contested")
+AS_IN_A_STUDY: tuple[acquisition.Strategy, ...] = ("uniform", "entropy")
 """rules that are also run with the pooled prior and with foreseen signals: random ones, and the studio's default"""
 DRIVEN = {
     ("structured", "entropy", 50),
@@ -78,8 +78,8 @@ class Chain:
     """One user answering one pair after the other."""
 
     user: str
-    model: reward_training.Kind
-    rule: acquisition.Rule = "uniform"
+    model: reward_training.RewardKind
+    rule: acquisition.Strategy = "uniform"
     pooled: bool = False
     seed: int = 0
 
@@ -290,7 +290,7 @@ def _taste(user: str) -> Taste:
 
 def chains(seeds: int) -> list[Chain]:
     """What matters most first: when time is up, the rest is left out."""
-    networks: tuple[reward_training.Kind, ...] = ("mlp", "preference_transformer")
+    networks: tuple[reward_training.RewardKind, ...] = ("mlp", "preference_transformer")
     first, *others = [_linear_chains(seed) for seed in range(seeds)]
     slow = [Chain(user, kind) for user in NAMED for kind in networks]
     slow += [Chain(user, "mlp") for user in PEOPLE]

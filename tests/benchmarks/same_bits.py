@@ -96,7 +96,7 @@ def made(task: str, work: Path) -> Iterator[tuple[str, Iterable[bytes]]]:
     yield "poster", [clip.poster]
 
     yield "answers of a scripted person", [bench.labelled.signals.tobytes(), bench.targets.tobytes()]
-    for kind in get_args(reward_training.Kind):
+    for kind in get_args(reward_training.RewardKind):
         yield f"reward model, {kind}", [bench._fit(kind).to_bytes()]
     yield from learned(bench)
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from worker.ml.acquisition import (
-    Rule,
+    Strategy,
     balanced_sides,
     choose,
     contested,
@@ -113,11 +113,11 @@ def test_stand_ins_answer_by_their_returns_whatever_their_unit() -> None:
     assert expected[0, 2] == 0.5
 
 
-RULES: tuple[Rule, ...] = ("disagreement", "entropy", "information_gain")
+RULES: tuple[Strategy, ...] = ("disagreement", "entropy", "information_gain")
 
 
 @pytest.mark.parametrize("rule", RULES)
-def test_every_rule_logs_chances_of_the_whole_and_keeps_its_random_share(rule: Rule) -> None:
+def test_every_rule_logs_chances_of_the_whole_and_keeps_its_random_share(rule: Strategy) -> None:
     members = np.random.default_rng(1).random((4, 6))
     chances: dict[int, float] = {}
     for seed in range(300):

@@ -19,14 +19,15 @@ from tests.waiting import PATIENCE_S
 from tests.worker import invented
 from worker.analysis.evaluation import evaluate
 from worker.ml.export import bundle
-from worker.ml.export.bundle import BundleContents, BundleDamaged, Provenance, Recording
+from worker.ml.export.bundle import BundleContents, BundleDamaged, Provenance, RecordedSteps
 from worker.ml.export.model_card import model_card
 from worker.ml.filters.filter_module import FilterWeights, build
 from worker.ml.filters.filter_onnx import to_onnx
 from worker.ml.policies.gaussian import GaussianPolicy
 from worker.ml.policies.policy_onnx import policy_to_onnx
 from worker.ml.rewards import reward_training
-from worker.ml.rewards.reward_models import StructuredReward, load_reward_model
+from worker.ml.rewards.loading import load_reward_model
+from worker.ml.rewards.reward_models import StructuredReward
 from worker.trajectory import SIGNALS
 
 POLICY = invented.small_policy()
@@ -39,7 +40,7 @@ def contents() -> BundleContents:
     weights = FilterWeights(mode=invented.TASK.modes.named([-0.5, 0.2, 0.6, -0.4, 0.8]), gate=0.7)
     episodes = [invented.trajectory(np.random.default_rng(each), scenario=each) for each in range(4)]
     episodes = [replace(each, reference_actions=POLICY.mean(each.observations[:-1])) for each in episodes]
-    recording = Recording.of(episodes[:2])
+    recording = RecordedSteps.of(episodes[:2])
     return BundleContents(
         task=invented.TASK,
         filter_onnx=to_onnx(
@@ -165,7 +166,7 @@ def test_the_card_names_what_the_labels_are_sure_about_and_nothing_else(unzipped
     assert "tilt_rad" not in card
 
 
-@pytest.mark.parametrize("kind", get_args(reward_training.Kind))
+@pytest.mark.parametrize("kind", get_args(reward_training.RewardKind))
 def test_the_card_says_in_words_what_was_learned_from_the_labels(kind: str, unzipped: Path) -> None:
     manifest = json.loads((unzipped / "manifest.json").read_text())
     card = model_card(manifest | {"reward_kind": kind})

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from worker.analysis import comparison
-from worker.analysis.comparison import Run, pooled, table_rows
+from worker.analysis.comparison import EvaluatedCell, pooled, table_rows
 from worker.analysis.evaluation import success_change
 from worker.analysis.pareto import pareto_svg
 from worker.analysis.published import TABLE_1, published
@@ -33,11 +33,11 @@ HARDNESS = np.random.default_rng(0).normal(0.0, 5.0, N)
 """Scenarios differ far more than methods do."""
 
 
-def run(user: str, method: str, better: Sequence[float] = (0, 0, 0), seed: int = 0, lost: int = 0) -> Run:
+def run(user: str, method: str, better: Sequence[float] = (0, 0, 0), seed: int = 0, lost: int = 0) -> EvaluatedCell:
     """A run with true returns -20 for everybody, more by ``better``; ``lost``: episodes that fail."""
     success = np.ones(N)
     success[:lost] = 0.0
-    return Run(
+    return EvaluatedCell(
         task="feeding",
         user=user,
         method=method,
@@ -92,7 +92,7 @@ def test_every_episode_of_another_seed_narrows_the_interval() -> None:
     """Seeds have scenarios of their own, so two seeds are twice as many episodes."""
     second = [run("neutral", "reference", seed=1), run("neutral", "pbarl", (4, 1, -2), lost=2, seed=1)]
 
-    def width(runs: Sequence[Run]) -> float:
+    def width(runs: Sequence[EvaluatedCell]) -> float:
         row = next(row for row in table_rows(pooled(runs)) if (row["user"], row["method"]) == ("neutral", "pbarl"))
         return float(row["true_preference_high"] - row["true_preference_low"])
 

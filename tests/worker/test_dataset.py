@@ -5,7 +5,6 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from sqlalchemy import select
-from worker.responses import TARGETS
 
 from app.db import Database
 from app.domain.clips import Clip
@@ -14,6 +13,7 @@ from app.domain.studies import Participant
 from app.storage import ArtefactStore
 from tests.worker.conftest import STEPS, make_trajectory
 from worker.jobs.learning import dataset
+from worker.responses import TARGETS
 
 AddClips = Callable[..., list[Clip]]
 Answer = Callable[[Clip, Clip, Response], Query]

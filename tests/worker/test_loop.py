@@ -23,7 +23,7 @@ from tests.waiting import PATIENCE_S
 from worker.jobs.learning import dataset
 from worker.ml.export import bundle
 from worker.ml.teachers import TASTES, Manner
-from worker.rehearsal.rehearsal import Outcome, Rehearsal
+from worker.rehearsal.rehearsal import Rehearsal, RehearsedPerson
 from worker.rehearsal.server import OwnStudio
 
 LABELS = 12
@@ -46,7 +46,7 @@ def database(studio: OwnStudio) -> Iterator[Database]:
 
 
 @pytest.fixture(scope="module")
-def outcome(studio: OwnStudio, database: Database) -> Outcome:
+def outcome(studio: OwnStudio, database: Database) -> RehearsedPerson:
     """One cautious participant, with mistakes and indifference; the worker dies while filming and while training."""
     settings = StudySettings(
         labels_per_participant=LABELS,
@@ -105,14 +105,14 @@ def wait_for(true: Callable[[], bool]) -> bool:
     return False
 
 
-def test_every_answer_is_stored_exactly_once(outcome: Outcome, database: Database) -> None:
+def test_every_answer_is_stored_exactly_once(outcome: RehearsedPerson, database: Database) -> None:
     with database.reading() as session:
         assert session.scalar(select(func.count(LabelEvent.id))) == LABELS
         assert len(dataset.labels_with_clips(session, outcome.participant_id)) == LABELS
 
 
 def test_the_pool_is_complete_and_without_doubles_although_the_worker_was_killed(
-    outcome: Outcome, database: Database
+    outcome: RehearsedPerson, database: Database
 ) -> None:
     with database.reading() as session:
         assert session.scalar(select(func.count(Clip.id))) == SCENARIOS * BEHAVIOURS
@@ -120,7 +120,7 @@ def test_the_pool_is_complete_and_without_doubles_although_the_worker_was_killed
 
 
 def test_every_run_succeeded_at_its_first_attempt_although_the_worker_was_killed(
-    outcome: Outcome, database: Database
+    outcome: RehearsedPerson, database: Database
 ) -> None:
     with database.reading() as session:
         runs = session.scalars(select(Run).where(Run.kind != RunKind.REPORT)).all()  # there is always a newer one
@@ -129,7 +129,7 @@ def test_every_run_succeeded_at_its_first_attempt_although_the_worker_was_killed
     assert {run.attempt for run in runs} == {1}
 
 
-def test_the_last_model_has_seen_every_label(outcome: Outcome, database: Database, studio: OwnStudio) -> None:
+def test_the_last_model_has_seen_every_label(outcome: RehearsedPerson, database: Database, studio: OwnStudio) -> None:
     store = ArtefactStore(studio.settings.data_dir / "artefacts")
     with database.reading() as session:
         said = dataset.load_preferences(session, store, outcome.participant_id)
@@ -139,7 +139,7 @@ def test_the_last_model_has_seen_every_label(outcome: Outcome, database: Databas
 
 
 def test_labels_after_the_first_model_were_predicted_before_they_were_given(
-    outcome: Outcome, database: Database
+    outcome: RehearsedPerson, database: Database
 ) -> None:
     with database.reading() as session:
         labels = dataset.labels_with_clips(session, outcome.participant_id)
@@ -152,7 +152,7 @@ def test_labels_after_the_first_model_were_predicted_before_they_were_given(
         assert model.label_count < label.query.ordinal
 
 
-def test_the_downloaded_bundle_is_whole_and_runs_outside_the_project(outcome: Outcome, tmp_path: Path) -> None:
+def test_the_downloaded_bundle_is_whole_and_runs_outside_the_project(outcome: RehearsedPerson, tmp_path: Path) -> None:
     manifest = bundle.verify(outcome.bundle)
     assert manifest["labels"]["count"] == LABELS
     assert manifest["evaluation"]["scenarios"] == 10

@@ -30,7 +30,8 @@ from worker.jobs.publishing import preference_arrays
 from worker.jobs.runtime import records
 from worker.jobs.runtime.context import WorkerContext
 from worker.jobs.runtime.records import Job
-from worker.ml.rewards.reward_models import StructuredReward, load_reward_model
+from worker.ml.rewards.loading import load_reward_model
+from worker.ml.rewards.reward_models import StructuredReward
 from worker.sim.render.video import encode_mp4, playable
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"

@@ -13,6 +13,7 @@ from worker.ml.filters.filter_module import build
 from worker.ml.filters.filter_problem import FilterProblem
 from worker.ml.filters.pbarl_printed import PrintedConfig, PrintedEncoder, reconstruction_loss
 from worker.ml.filters.printed_filter import fit_printed
+from worker.ml.policies.torch_module import FrozenPolicy
 from worker.ml.rewards.network_training import MlpTraining, TransformerTraining
 from worker.ml.rewards.reward_models import StructuredReward
 from worker.ml.rewards.reward_training import fit
@@ -97,10 +98,10 @@ def test_reranking_puts_the_best_learned_reward_first() -> None:
 
 
 def test_the_list_is_sampled_from_the_policy_most_probable_first() -> None:
-    frozen = POLICY.as_module()
+    frozen = FrozenPolicy(POLICY.weights)
     states = torch.from_numpy(invented.observations(200, np.random.default_rng(0)))
     generator = torch.Generator().manual_seed(0)
-    actions = pbarl_printed.sample_ranked_list(frozen, states, 10, generator)  # type: ignore[arg-type]
+    actions = pbarl_printed.sample_ranked_list(frozen, states, 10, generator)
     centre, log_std = (each.numpy() for each in frozen(states))
     raw = np.arctanh(np.clip(actions.numpy() / 0.7, -0.9999999, 0.9999999))
     distance = (((raw - np.arctanh(centre / 0.7)[:, None]) / np.exp(log_std)[:, None]) ** 2).sum(-1)

@@ -5,7 +5,7 @@ import pytest
 
 from worker.compute import filter_fitting
 from worker.ml.filters.filter_module import FilterWeights
-from worker.ml.filters.filter_problem import FilterDraft, Trial
+from worker.ml.filters.filter_problem import FilterDraft, GateTrial
 
 
 def test_a_draft_comes_back_as_it_was_stored() -> None:
@@ -14,7 +14,7 @@ def test_a_draft_comes_back_as_it_was_stored() -> None:
         gate=0.7,
         encoder={"layer": np.arange(6, dtype=np.float32).reshape(2, 3)},
     )
-    trial = Trial(gate=0.7, residual_share=0.0, preference=0.4, success_change=-0.01, p95_force_n=2.0)
+    trial = GateTrial(gate=0.7, residual_share=0.0, preference=0.4, success_change=-0.01, p95_force_n=2.0)
     draft = FilterDraft(weights, {"value": np.ones(3, np.float32)}, (trial,), ("a note",), {"mode": 1.5})
     again = filter_fitting.draft_from_bytes(filter_fitting.draft_to_bytes(draft))
     assert again.weights.mode == draft.weights.mode

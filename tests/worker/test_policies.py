@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from worker.ml.policies.gaussian import ACTION_STD_FLOOR, GaussianPolicy
+from worker.ml.policies.torch_module import FrozenPolicy
 from worker.tasks.registry import checkpoint
 
 CHECKPOINT = checkpoint("feeding") / "policy.safetensors"
@@ -26,13 +27,13 @@ def observations(policy: GaussianPolicy) -> np.ndarray:
 
 def test_the_torch_twin_gives_the_same_actions_and_deviations(policy: GaussianPolicy, observations: np.ndarray) -> None:
     action, deviation = policy.mean_and_std(observations)
-    twin_action, twin_log_std = policy.as_module()(torch.from_numpy(observations))
+    twin_action, twin_log_std = FrozenPolicy(policy.weights)(torch.from_numpy(observations))
     np.testing.assert_allclose(twin_action.numpy(), action, atol=2e-6)
     np.testing.assert_allclose(twin_log_std.exp().numpy(), deviation, rtol=2e-5)
 
 
 def test_the_torch_twin_is_frozen(policy: GaussianPolicy) -> None:
-    assert list(policy.as_module().parameters()) == []
+    assert list(FrozenPolicy(policy.weights).parameters()) == []
 
 
 def test_leading_axes_do_not_matter(policy: GaussianPolicy, observations: np.ndarray) -> None:

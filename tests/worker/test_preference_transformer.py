@@ -10,9 +10,10 @@ import torch
 from tests.worker import invented
 from worker.ml.rewards import preference_transformer
 from worker.ml.rewards.action_ranking import HistoryMemory, ranker_at
+from worker.ml.rewards.loading import load_reward_model
 from worker.ml.rewards.network_training import MlpTraining, TransformerTraining
 from worker.ml.rewards.preference_transformer import PreferenceTransformer
-from worker.ml.rewards.reward_models import StructuredReward, load_reward_model
+from worker.ml.rewards.reward_models import StructuredReward
 from worker.ml.rewards.reward_training import fit
 from worker.ml.rewards.segments import SegmentPairs
 from worker.trajectory import SIGNALS

@@ -8,14 +8,15 @@ import torch
 
 from tests.worker import invented
 from worker.ml.rewards import bradley_terry, reward_training
+from worker.ml.rewards.loading import load_reward_model
 from worker.ml.rewards.network_training import MlpTraining, TransformerTraining
 from worker.ml.rewards.pooled_prior import DEVIATION
-from worker.ml.rewards.reward_models import CLIP, RewardModel, StructuredReward, load_reward_model, stored_config
+from worker.ml.rewards.reward_models import CLIP, RewardModel, StructuredReward, stored_config
 from worker.ml.rewards.reward_training import SignalScale, fit, posterior
 from worker.ml.rewards.segments import SegmentPairs
 from worker.trajectory import SIGNALS
 
-KINDS: tuple[reward_training.Kind, ...] = ("structured", "predicted", "mlp", "preference_transformer")
+KINDS: tuple[reward_training.RewardKind, ...] = ("structured", "predicted", "mlp", "preference_transformer")
 QUICK = MlpTraining(steps=100, members=3, hidden=16, learning_rate=5e-3)
 QUICK_TRANSFORMER = TransformerTraining(steps=120, members=2, hidden=16, learning_rate=1e-2, every_nth_step=1)
 PREDICTOR = invented.predictor()
@@ -132,7 +133,7 @@ def test_learned_weights_come_with_intervals_and_find_the_one_that_matters(
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_same_seed_gives_the_same_model_and_another_seed_another(
-    kind: reward_training.Kind, labelled: tuple[SegmentPairs, np.ndarray]
+    kind: reward_training.RewardKind, labelled: tuple[SegmentPairs, np.ndarray]
 ) -> None:
     first, again, other = (
         fit(*labelled, kind, seed, mlp=QUICK, transformer=QUICK_TRANSFORMER, predictor=PREDICTOR).model.to_bytes()

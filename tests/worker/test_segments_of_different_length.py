@@ -11,7 +11,7 @@ from worker.ml.rewards.segments import SegmentPairs, Stretch
 from worker.trajectory import Trajectory
 
 SHORT, LONG = 20, 33
-KINDS: tuple[reward_training.Kind, ...] = ("structured", "mlp", "preference_transformer")
+KINDS: tuple[reward_training.RewardKind, ...] = ("structured", "mlp", "preference_transformer")
 Both = list[tuple[Trajectory, Trajectory]]
 
 
@@ -72,7 +72,7 @@ def test_what_fills_up_a_pair_is_never_looked_at(model: RewardModel, both: Both)
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_training_never_looks_at_what_fills_up_a_pair(kind: reward_training.Kind, both: Both) -> None:
+def test_training_never_looks_at_what_fills_up_a_pair(kind: reward_training.RewardKind, both: Both) -> None:
     mixed = stretches(both, [LONG] * 10 + [SHORT] * 20)
     answers = invented.answers_of(mixed, np.ones(invented.S))
     brief, briefer = MlpTraining(steps=10), TransformerTraining(steps=4, hidden=16)

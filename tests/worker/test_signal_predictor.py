@@ -15,8 +15,9 @@ from worker.experiments import train_signal_predictor
 from worker.experiments.rollout_cache import Shelf
 from worker.ml.rewards import reward_training, signal_training
 from worker.ml.rewards.action_ranking import ranker_at
+from worker.ml.rewards.loading import load_reward_model
 from worker.ml.rewards.predicted_reward import PredictedReward
-from worker.ml.rewards.reward_models import StructuredReward, load_reward_model
+from worker.ml.rewards.reward_models import StructuredReward
 from worker.ml.rewards.reward_training import SignalScale
 from worker.ml.rewards.segments import SegmentPairs
 from worker.ml.rewards.signal_predictor import UNSENSED, SignalPredictor

@@ -25,7 +25,7 @@ REFERENCE = "reference"
 
 
 @dataclass(frozen=True)
-class Run:
+class EvaluatedCell:
     """One method fitted for one user with one seed, in N unseen scenarios."""
 
     task: str
@@ -53,8 +53,8 @@ class Run:
 class Pooled:
     """The runs of one method for one user beside the reference policy's, seed by seed in ascending order."""
 
-    runs: tuple[Run, ...]
-    references: tuple[Run, ...]
+    runs: tuple[EvaluatedCell, ...]
+    references: tuple[EvaluatedCell, ...]
 
     @property
     def seeds(self) -> set[int]:
@@ -89,9 +89,9 @@ Cells = dict[tuple[str, str, str], Pooled]
 """by task, user and method, in the order in which they came"""
 
 
-def pooled(runs: Iterable[Run]) -> Cells:
+def pooled(runs: Iterable[EvaluatedCell]) -> Cells:
     """Cells that have a reference run for at least one of their seeds."""
-    by_name: dict[tuple[str, str, str], dict[int, Run]] = {}
+    by_name: dict[tuple[str, str, str], dict[int, EvaluatedCell]] = {}
     for run in runs:
         by_name.setdefault((run.task, run.user, run.method), {})[run.seed] = run
     cells = {}

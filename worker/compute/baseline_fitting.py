@@ -27,7 +27,8 @@ from worker.ml.methods.prefft import FineTuning
 from worker.ml.methods.registry import MethodConfig, Setting
 from worker.ml.policies.checkpoint import Checkpoint, Paused, begin_again
 from worker.ml.rewards.action_ranking import can_rank
-from worker.ml.rewards.reward_models import RewardModel, load_reward_model
+from worker.ml.rewards.loading import load_reward_model
+from worker.ml.rewards.reward_models import RewardModel
 from worker.tasks import registry as tasks
 from worker.trajectory import Trajectory
 

@@ -18,12 +18,20 @@ from worker.compute import learning, simulation
 from worker.compute.pools import Computing, Lane
 from worker.compute.simulation import surface_file
 from worker.ml.export import bundle
-from worker.ml.export.bundle import BundleContents, Provenance, Recording
+from worker.ml.export.bundle import BundleContents, Provenance, RecordedSteps
 from worker.ml.filters import filter_problem, mode_search, printed_filter, residual
 from worker.ml.filters.filter_module import FilterWeights
-from worker.ml.filters.filter_problem import Act, FilterAct, FilterConfig, FilterDraft, FilterProblem, Progress, Trial
+from worker.ml.filters.filter_problem import (
+    Act,
+    FilterAct,
+    FilterConfig,
+    FilterDraft,
+    FilterProblem,
+    GateTrial,
+    ReportProgress,
+)
 from worker.ml.filters.response_surface import ResponseSurface
-from worker.ml.rewards.reward_models import load_reward_model
+from worker.ml.rewards.loading import load_reward_model
 from worker.scenarios import EVALUATION, RESIDUAL, first_of
 from worker.tasks import registry
 from worker.trajectory import Trajectory
@@ -58,7 +66,7 @@ class FilterFit:
     reward: bytes
     seed: int
     config: FilterConfig
-    progress: Progress
+    progress: ReportProgress
     references: dict[tuple[str, range], list[Trajectory]]
     """rollouts of the frozen policy that other fittings have already made"""
 
@@ -129,7 +137,7 @@ class FilterFit:
             weights=draft.weights,
             reward=self.problem.reward,
             policy=self.problem.policy,
-            recording=Recording.of(filtered[:RECORDED_EPISODES]),
+            recording=RecordedSteps.of(filtered[:RECORDED_EPISODES]),
             metrics=metrics,
             provenance=provenance,
         )
@@ -217,5 +225,5 @@ def draft_from_bytes(stored: bytes) -> FilterDraft:
         record = json.loads(str(arrays["record"]))
         value = {name.removeprefix("value/"): arrays[name] for name in arrays.files if name.startswith("value/")}
         weights = FilterWeights.from_bytes(arrays["weights"].tobytes())
-    trials = tuple(Trial(**each) for each in record["trials"])
+    trials = tuple(GateTrial(**each) for each in record["trials"])
     return FilterDraft(weights, value, trials, tuple(record["notes"]), record["seconds"])

@@ -10,8 +10,9 @@ import numpy.typing as npt
 from worker.compute.simulation import environment, reference_policy, reference_rollouts, signal_predictor
 from worker.ml.filters.filter_problem import Act, noisy
 from worker.ml.rewards import reward_training
+from worker.ml.rewards.loading import load_reward_model
 from worker.ml.rewards.pooled_prior import prior_of
-from worker.ml.rewards.reward_models import RewardModel, load_reward_model
+from worker.ml.rewards.reward_models import RewardModel
 from worker.ml.rewards.reward_training import SignalScale
 from worker.ml.rewards.segments import SegmentPairs
 from worker.sim.rollout import rollout
@@ -48,13 +49,13 @@ def fit_reward(
     is no reference policy to normalise over, and what the person was shown takes its place.
     Raises ValueError for a kind there is not, and laboratory.NoPredictor where the task's signals cannot be foreseen.
     """
-    if kind not in get_args(reward_training.Kind):
+    if kind not in get_args(reward_training.RewardKind):
         raise ValueError(f"There is no reward model of the kind {kind!r}.")
     prior = prior_of([_model(each) for each in earlier], scale.spread)
     fitted = reward_training.fit(
         pairs,
         targets,
-        cast(reward_training.Kind, kind),
+        cast(reward_training.RewardKind, kind),
         seed,
         scale=scale,
         reference=reference_rollouts(task) if recorded_signals is None else (),

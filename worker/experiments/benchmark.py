@@ -20,7 +20,7 @@ import torch
 from tqdm import tqdm
 
 from installed_tasks import catalogue
-from worker.analysis.comparison import Cells, Row, Run, cost_rows, personalisation_rows, pooled, table_rows
+from worker.analysis.comparison import Cells, EvaluatedCell, Row, cost_rows, personalisation_rows, pooled, table_rows
 from worker.analysis.pareto import pareto_svg
 from worker.analysis.table_files import METHOD, to_csv, to_markdown
 from worker.compute.pools import Compute, Lane
@@ -35,6 +35,7 @@ from worker.ml.teachers import Manner, Taste, random_taste
 from worker.sim.costs import preference_rewards, stakes
 from worker.tasks import registry
 from worker.tasks.registry import checkpoint
+from worker.whole_files import written_whole
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
@@ -235,7 +236,7 @@ def _finished(terms: Terms, work: Path) -> Iterator[tuple[dict[str, Any], dict[s
         yield record, arrays, taste
 
 
-def _run(record: dict[str, Any], arrays: dict[str, Any], terms: Terms, tastes: dict[str, Taste]) -> Run:
+def _run(record: dict[str, Any], arrays: dict[str, Any], terms: Terms, tastes: dict[str, Taste]) -> EvaluatedCell:
     """r^H is linear in the measured sums, so every user can judge every run."""
     task = registry.task(record["task"])
     true, at_stake = (
@@ -245,7 +246,7 @@ def _run(record: dict[str, Any], arrays: dict[str, Any], terms: Terms, tastes: d
         }
         for of in (preference_rewards, stakes)
     )
-    return Run(
+    return EvaluatedCell(
         record["task"],
         record["taste"]["name"],
         record["method"],
@@ -261,7 +262,7 @@ def _run(record: dict[str, Any], arrays: dict[str, Any], terms: Terms, tastes: d
     )
 
 
-def _order(run: Run) -> tuple[int, int, int, str]:
+def _order(run: EvaluatedCell) -> tuple[int, int, int, str]:
     users = [*PAPER_USERS, *OPPOSED_USERS, *INDIRECT_USERS]
     user = users.index(run.user) if run.user in users else len(users)
     return catalogue.names().index(run.task), user, list(METHODS).index(run.method), run.user
@@ -331,9 +332,8 @@ def _spoken(manner: Manner) -> str:
 
 
 def _replace(path: Path, text: str) -> None:
-    partial = path.with_name(f".{path.name}")
-    partial.write_text(text)
-    partial.replace(path)
+    with written_whole(path) as draft:
+        draft.write_text(text)
 
 
 def with_options(

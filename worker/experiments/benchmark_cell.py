@@ -4,9 +4,7 @@ Everything is done in the process that calls run_cell(), on one core, so that se
 """
 
 import hashlib
-import io
 import json
-import os
 import platform
 import time
 from collections.abc import Mapping, Sequence
@@ -31,7 +29,8 @@ from worker.ml.methods import registry as methods
 from worker.ml.methods.registry import MethodConfig, Setting
 from worker.ml.rewards import reward_training
 from worker.ml.rewards.action_ranking import can_rank
-from worker.ml.rewards.reward_models import RewardModel, load_reward_model
+from worker.ml.rewards.loading import load_reward_model
+from worker.ml.rewards.reward_models import RewardModel
 from worker.ml.rewards.reward_training import SignalScale
 from worker.ml.rewards.segments import SegmentPairs
 from worker.ml.teachers import INDIRECT, OPPOSED, TASTES, Manner, ScriptedTeacher, Taste, User
@@ -41,6 +40,7 @@ from worker.sim.costs import CostForm, preference_rewards
 from worker.tasks import registry
 from worker.tasks.registry import installed_task
 from worker.trajectory import Trajectory
+from worker.whole_files import written_whole
 
 SMALLEST_POOL = 48
 """scenarios, as in a study"""
@@ -60,9 +60,9 @@ class Terms:
 
     labels: int = 200
     scenarios: int = 500
-    reward: reward_training.Kind = "structured"
+    reward: reward_training.RewardKind = "structured"
     form: CostForm = "calibrated"
-    rule: acquisition.Rule = "entropy"
+    rule: acquisition.Strategy = "entropy"
     """which pairs are asked; the studio's default, for every method alike"""
     manner: Manner = field(default_factory=Manner)
     """how the scripted users err; none of them skips"""
@@ -155,11 +155,8 @@ def _write(target: Path, record: dict[str, Any], driven: Sequence[Trajectory], l
         "costs": [each.costs.sum(axis=0, dtype=np.float64) for each in driven],
         "signals": [each.signals.sum(axis=0, dtype=np.float64) for each in driven],
     }
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, **arrays)
-    partial = target.with_name(f".{target.name}.{os.getpid()}")
-    partial.write_bytes(buffer.getvalue())
-    partial.replace(target)
+    with written_whole(target) as draft:
+        np.savez_compressed(draft, **arrays)
     return target
 
 
@@ -217,7 +214,7 @@ class Bench:
 
     def _scores(
         self, candidates: npt.NDArray[np.int64], asked: npt.NDArray[np.int64], targets: Floats
-    ) -> tuple[acquisition.Rule, Floats | None]:
+    ) -> tuple[acquisition.Strategy, Floats | None]:
         """The first labels are chosen at random, later ones by a structured model of those before."""
         if self.terms.rule == "uniform" or not len(asked):
             return "uniform", None
@@ -239,15 +236,14 @@ class Bench:
             return load_reward_model(path.read_bytes())
         model = self._fit(self.terms.reward)
         path.parent.mkdir(parents=True, exist_ok=True)
-        partial = path.with_name(f".{path.name}.{os.getpid()}")
-        partial.write_bytes(model.to_bytes())
-        partial.replace(path)
+        with written_whole(path) as draft:
+            draft.write_bytes(model.to_bytes())
         return load_reward_model(path.read_bytes())  # as stored, whoever was first
 
     def _action_reward(self) -> RewardModel:
         return self.reward if can_rank(self.reward) else self._fit("mlp")
 
-    def _fit(self, kind: reward_training.Kind) -> RewardModel:
+    def _fit(self, kind: reward_training.RewardKind) -> RewardModel:
         return reward_training.fit(
             self.labelled,
             self.targets,

@@ -30,6 +30,7 @@ from worker.sim.rollout import rollout
 from worker.task import Task
 from worker.tasks import registry
 from worker.trajectory import SIGNALS
+from worker.whole_files import written_whole
 
 SCENARIOS = 300
 """executed in random modes"""
@@ -119,10 +120,9 @@ def compare_block(block: Block) -> None:
                 changed.signals.sum(axis=0, dtype=np.float64) - reference.signals.sum(axis=0, dtype=np.float64)
             )
             success.append(float(changed.success) - float(reference.success))
-    partial = block.file.with_suffix(".partial.npz")
     flat = block.modes.reshape(-1, block.modes.shape[-1])
-    np.savez(partial, modes=flat, signals=signals, success=success, reference_success=reference_success)
-    partial.replace(block.file)
+    with written_whole(block.file) as draft:
+        np.savez(draft, modes=flat, signals=signals, success=success, reference_success=reference_success)
 
 
 def _random_modes(task: Task, first: int) -> Floats:

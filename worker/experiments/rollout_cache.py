@@ -1,7 +1,6 @@
 """Rollouts that many fits need, kept on disk: one file per rollout, complete or absent, made by whoever comes first."""
 
 import hashlib
-import os
 from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
@@ -11,6 +10,7 @@ from worker.compute.behaviours import Behaviour
 from worker.sim.rollout import rollout
 from worker.tasks import registry
 from worker.trajectory import Trajectory
+from worker.whole_files import written_whole
 
 BEHAVIOURS_PER_SCENARIO = 6
 """As in a study (StudySettings.behaviours_per_scenario)."""
@@ -65,7 +65,6 @@ def _load(path: Path) -> Trajectory:
 
 
 def _kept(trajectory: Trajectory, path: Path) -> Trajectory:
-    partial = path.with_name(f".{path.stem}-{os.getpid()}.npz")
-    trajectory.save(partial)
-    partial.replace(path)
+    with written_whole(path) as draft:
+        trajectory.save(draft)
     return trajectory

@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-Rule = Literal["uniform", "disagreement", "entropy", "information_gain", "contested"]
+Strategy = Literal["uniform", "disagreement", "entropy", "information_gain", "contested"]
 Indices = npt.NDArray[np.int64]
 Floats = npt.NDArray[np.float64]
 
@@ -111,7 +111,7 @@ def choose(
     candidates: int,
     rng: np.random.Generator,
     *,
-    rule: Rule = "uniform",
+    rule: Strategy = "uniform",
     scores: Floats | None = None,
     random_share: float = RANDOM_SHARE,
 ) -> Choice:

@@ -14,7 +14,7 @@ from typing import Self
 import numpy as np
 import numpy.typing as npt
 
-from worker.responses import Answer
+from worker.responses import Response
 from worker.trajectory import COSTS, SIGNALS
 
 Floats = npt.NDArray[np.float64]
@@ -137,7 +137,7 @@ class ScriptedTeacher:
         spread = max(float(np.sqrt((differences**2).mean())), 1e-9)
         return cls(manner, spread, float(np.quantile(np.abs(differences), manner.equal_share)))
 
-    def answer(self, left_rewards: npt.ArrayLike, right_rewards: npt.ArrayLike, rng: np.random.Generator) -> Answer:
+    def answer(self, left_rewards: npt.ArrayLike, right_rewards: npt.ArrayLike, rng: np.random.Generator) -> Response:
         """What this teacher says about one pair, from the preference rewards (T,) of the shown steps."""
         skips, errs, decides = rng.random(3)  # always three draws: one answer does not shift the next one's luck
         if skips < self.manner.skip_share:

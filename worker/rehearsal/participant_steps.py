@@ -20,7 +20,8 @@ from app.domain.studies import Study
 from app.storage import ArtefactStore
 from worker.jobs.learning import dataset
 from worker.jobs.runtime import records
-from worker.ml.rewards.reward_models import RewardModel, load_reward_model
+from worker.ml.rewards.loading import load_reward_model
+from worker.ml.rewards.reward_models import RewardModel
 from worker.ml.scripted_ratings import RatingManner, ScriptedRater
 from worker.ml.teachers import Manner, ScriptedTeacher, Taste, segment_returns
 from worker.sim.costs import preference_rewards

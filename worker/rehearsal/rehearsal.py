@@ -39,7 +39,7 @@ from worker.rehearsal.server import PATIENCE_S, wait_until
 
 
 @dataclass
-class Outcome:
+class RehearsedPerson:
     """What came out for one scripted participant."""
 
     participant_id: int
@@ -68,7 +68,7 @@ class Outcome:
 class Rehearsed:
     """A whole rehearsal."""
 
-    outcomes: list[Outcome]
+    outcomes: list[RehearsedPerson]
     conclusion: Conclusion
     seconds: float
     """from the first personal link to the final figure"""
@@ -111,7 +111,7 @@ def _truth(insight: Insight | None) -> str:
     return "-" if insight is None else f"{insight.same_scenario:.2f} / {insight.other_scenarios:.2f}"
 
 
-def _rating_lines(outcomes: Sequence[Outcome]) -> list[str]:
+def _rating_lines(outcomes: Sequence[RehearsedPerson]) -> list[str]:
     """Mean satisfaction / personalisation per method, and in brackets how well its robot truly suits the person."""
     methods = sorted({each.method for outcome in outcomes for each in outcome.rated})
     if not methods:
@@ -161,7 +161,7 @@ class Rehearsal:
             for (participant, token), taste in zip(enrolled, tastes, strict=True):
                 person = ScriptedPerson(self.database, self.store, study, taste, manner, seed + participant.number)
                 persons.append(person)
-                outcome = Outcome(participant.id, participant.code, taste)
+                outcome = RehearsedPerson(participant.id, participant.code, taste)
                 with Visitor(self.base_url, f"/p/{token}") as visitor:
                     self._answer_everything(visitor, person, outcome, settings)
                 outcome.finished_at = time.monotonic()
@@ -176,7 +176,9 @@ class Rehearsal:
             ending = conclusion.conclude(experimenter, self.database, study)
         return Rehearsed(outcomes, ending, time.monotonic() - began)
 
-    def _rate_robots(self, visitor: Visitor, person: ScriptedPerson, outcome: Outcome, settings: StudySettings) -> None:
+    def _rate_robots(
+        self, visitor: Visitor, person: ScriptedPerson, outcome: RehearsedPerson, settings: StudySettings
+    ) -> None:
         """Everything between the last pair and the last rating; a physical robot needs an operator, who is not here."""
         evaluation = settings.evaluation
         if evaluation is None or evaluation.mode is not EvaluationMode.VIDEO:
@@ -191,7 +193,7 @@ class Rehearsal:
             outcome.rated.append(rated)
 
     def _answer_everything(
-        self, visitor: Visitor, person: ScriptedPerson, outcome: Outcome, settings: StudySettings
+        self, visitor: Visitor, person: ScriptedPerson, outcome: RehearsedPerson, settings: StudySettings
     ) -> None:
         visitor.come_in()
         came = time.monotonic()
@@ -219,7 +221,7 @@ class Rehearsal:
             pool = dashboard.study_overview(session, study).pool
             return pool.made >= pool.wanted
 
-    def _was_predicted(self, outcome: Outcome, query_id: int) -> bool | None:
+    def _was_predicted(self, outcome: RehearsedPerson, query_id: int) -> bool | None:
         """A pair is predicted right after it was made; whoever answers at once would be earlier."""
         with self.database.reading() as session:
             query = session.get_one(Query, query_id)
@@ -227,7 +229,7 @@ class Rehearsal:
             expected = self.unhurried and learned and query.purpose in LEARNED_FROM
             return (not expected or query.predicted_by_model_id is not None) or None
 
-    def _has_learned(self, outcome: Outcome) -> bool:
+    def _has_learned(self, outcome: RehearsedPerson) -> bool:
         """People are slower than a retraining; whoever answers at once would never meet a model's prediction."""
         with self.database.reading() as session:
             trained = session.scalar(
@@ -240,7 +242,7 @@ class Rehearsal:
             )
         return bool(trained)
 
-    def _await_bundle(self, outcome: Outcome, study: Study, experimenter: Visitor) -> None:
+    def _await_bundle(self, outcome: RehearsedPerson, study: Study, experimenter: Visitor) -> None:
         def finished() -> tuple[Model, Bundle] | None:
             with self.database.reading() as session:
                 row = session.execute(

@@ -227,19 +227,6 @@ class Bullet:
             physicsClientId=self.client,
         )
 
-    def set_damping(self, name: str, linear: float, angular: float) -> None:
-        """Air resistance of a body and all its links."""
-        for link in range(-1, len(self._links[name])):
-            pybullet.changeDynamics(
-                self._bodies[name],
-                link,
-                linearDamping=linear,
-                angularDamping=angular,
-                physicsClientId=self.client,
-            )
-
-    # Poses and joints
-
     def set_pose(self, name: str, position_m: Vector, quaternion: Vector = IDENTITY) -> None:
         """Teleport a body and stop it."""
         body = self._bodies[name]

@@ -52,7 +52,7 @@ class Predicted:
 
 
 @dataclass(frozen=True)
-class Point:
+class AccuracyPoint:
     """The accuracy over the last WINDOW scored answers, after ``scored`` of them."""
 
     scored: int
@@ -74,7 +74,7 @@ class Foresight(StrEnum):
 class Curve:
     """Accuracy over time; only answers that prefer a side and were predicted are scored."""
 
-    points: Sequence[Point]
+    points: Sequence[AccuracyPoint]
     overall: Share | None
     """None before the first scored answer."""
     foresight: Foresight
@@ -117,7 +117,7 @@ def curve(found: Sequence[float]) -> Curve:
     points = []
     for scored in range(FIRST_POINT, len(found) + 1):
         window = found[max(0, scored - WINDOW) : scored]
-        points.append(Point(scored, wilson(sum(window), len(window))))
+        points.append(AccuracyPoint(scored, wilson(sum(window), len(window))))
     return Curve(points, wilson(sum(found), len(found)) if found else None, foresight(found))
 
 

@@ -9,7 +9,7 @@ from app.domain.preferences import LEARNED_FROM, Label, Query, Response, current
 from app.domain.studies import Participant, Strategy
 from app.services.answers import accuracy
 from app.services.answers.accuracy import Curve, Predicted, Share
-from app.services.answers.consistency import Interval, answers_of, consistency
+from app.services.answers.consistency import Estimate, answers_of, consistency
 
 
 def figures_of(session: Session, participant: Participant) -> dict[str, Any]:
@@ -56,6 +56,6 @@ def _share(share: Share | None, names: tuple[str, str, str]) -> dict[str, Any]:
     return dict(zip((*names, "low", "high"), values, strict=True))
 
 
-def _interval(interval: Interval | None, name: str) -> dict[str, Any]:
+def _interval(interval: Estimate | None, name: str) -> dict[str, Any]:
     values = (None, None, None) if interval is None else (interval.value, interval.low, interval.high)
     return dict(zip((name, f"{name}_low", f"{name}_high"), values, strict=True))

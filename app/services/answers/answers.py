@@ -52,7 +52,7 @@ class Wanted:
 
 
 @dataclass(frozen=True)
-class Given:
+class ListedAnswer:
     """One answer that counts, with its pair (clips loaded) and what stands out about it."""
 
     participant: Participant
@@ -64,10 +64,10 @@ class Given:
 
 
 @dataclass(frozen=True)
-class Found:
+class AnswerPage:
     """One page of answers."""
 
-    answers: Sequence[Given]
+    answers: Sequence[ListedAnswer]
     count: int
     """on all pages"""
     page: int
@@ -78,7 +78,7 @@ class Found:
 class Looked:
     """One answer with all that was ever said about its pair, and its neighbours among what was looked for."""
 
-    given: Given
+    given: ListedAnswer
     events: Sequence[LabelEvent]
     """Oldest first; an event without a response takes the one before it back."""
     words: Sequence[Exclusion]
@@ -87,14 +87,14 @@ class Looked:
     later_id: int | None
 
 
-def find(session: Session, study: Study, wanted: Wanted) -> Found:
+def find(session: Session, study: Study, wanted: Wanted) -> AnswerPage:
     """One page of the answers that are wanted, by participant and in the order of the questions."""
     matching = _matching(study, wanted)
     count = session.scalar(select(func.count()).select_from(matching.subquery())) or 0
     pages = max(1, -(-count // PAGE_SIZE))
     page = min(max(1, wanted.page), pages)
     few = _in_order(matching).limit(PAGE_SIZE).offset((page - 1) * PAGE_SIZE)
-    return Found(_loaded(session, [row.event_id for row in session.execute(few)]), count, page, pages)
+    return AnswerPage(_loaded(session, [row.event_id for row in session.execute(few)]), count, page, pages)
 
 
 def look(session: Session, study: Study, query_id: int, wanted: Wanted) -> Looked:
@@ -223,7 +223,7 @@ def _contradicts() -> ColumnElement[bool]:
     return and_(Query.repeats_query_id.is_not(None), told, LabelEvent.response != same)
 
 
-def _loaded(session: Session, event_ids: Sequence[int]) -> Sequence[Given]:
+def _loaded(session: Session, event_ids: Sequence[int]) -> Sequence[ListedAnswer]:
     """These answers in this order."""
     clips = (joinedload(Query.left_clip), joinedload(Query.right_clip))
     marks = [_marked(mark).label(mark.value) for mark in Mark]
@@ -240,8 +240,8 @@ def _loaded(session: Session, event_ids: Sequence[int]) -> Sequence[Given]:
     return [given[event_id] for event_id in event_ids]
 
 
-def _given(row: Row[*tuple[object, ...]], word: Exclusion | None) -> Given:
-    return Given(
+def _given(row: Row[*tuple[object, ...]], word: Exclusion | None) -> ListedAnswer:
+    return ListedAnswer(
         participant=row.Participant,
         query=row.Query,
         event=row.LabelEvent,

@@ -41,7 +41,7 @@ _OTHER_SIDE = {Response.LEFT: Response.RIGHT, Response.RIGHT: Response.LEFT}
 
 
 @dataclass(frozen=True)
-class Answer:
+class JudgedAnswer:
     """One answer that counts, with what judging it needs."""
 
     ordinal: int
@@ -67,7 +67,7 @@ class Answer:
 
 
 @dataclass(frozen=True)
-class Interval:
+class Estimate:
     """A number with its 95 % interval."""
 
     value: float
@@ -86,9 +86,9 @@ class Repeats:
     agreement: Share | None
     """Same clip, or equal, both times."""
     decided: Share | None
-    kappa: Interval | None
+    kappa: Estimate | None
     """Cohen's kappa over (first clip, equal, second clip)."""
-    ceiling: Interval | None
+    ceiling: Estimate | None
     swapped: Share | None
     """Agreement where the sides were exchanged: low beside a high agreement otherwise means answering by side."""
     unswapped: Share | None
@@ -98,7 +98,7 @@ class Repeats:
 class Trend:
     """A change from the first to the last answer."""
 
-    per_hundred: Interval
+    per_hundred: Estimate
     """Change in percent per hundred answers (normal interval)."""
 
 
@@ -142,10 +142,10 @@ class Consistency:
         return [name for name, is_raised in raised.items() if is_raised]
 
 
-def answers_of(labels: Sequence[Label]) -> list[Answer]:
+def answers_of(labels: Sequence[Label]) -> list[JudgedAnswer]:
     """From rows as preferences.current_answers gives them, clips loaded; in the order of the queries."""
     return [
-        Answer(
+        JudgedAnswer(
             ordinal=each.query.ordinal,
             query_id=each.query.id,
             purpose=Purpose(each.query.purpose),
@@ -181,7 +181,7 @@ def seen(event: LabelEvent | Row[*tuple[Any, ...]], left_ms: int, right_ms: int)
     return min(1.0, event.response_time_ms * FASTEST / max(left_ms, right_ms))
 
 
-def consistency(answers: Sequence[Answer]) -> Consistency:
+def consistency(answers: Sequence[JudgedAnswer]) -> Consistency:
     """Judge one person's answers. Practice is left out of everything."""
     earnest = [answer for answer in answers if answer.purpose is not Purpose.PRACTICE]
     pairs = repeated(earnest)
@@ -206,7 +206,7 @@ def consistency(answers: Sequence[Answer]) -> Consistency:
     )
 
 
-def repeated(answers: Sequence[Answer]) -> list[tuple[Answer, Answer]]:
+def repeated(answers: Sequence[JudgedAnswer]) -> list[tuple[JudgedAnswer, JudgedAnswer]]:
     """Every repeat with the answer it repeats, (before, again), in the order of the repeats."""
     by_query = {answer.query_id: answer for answer in answers}
     return [
@@ -216,7 +216,7 @@ def repeated(answers: Sequence[Answer]) -> list[tuple[Answer, Answer]]:
     ]
 
 
-def repeats(pairs: Sequence[tuple[Answer, Answer]]) -> Repeats:
+def repeats(pairs: Sequence[tuple[JudgedAnswer, JudgedAnswer]]) -> Repeats:
     """Test and retest; sides are taken out first, so that it is about clips."""
     decided = [pair for pair in _told(pairs) if all(each.response in _SIDES for each in pair)]
     same_side = [pair for pair in pairs if pair[0].left_clip_id == pair[1].left_clip_id]
@@ -233,7 +233,7 @@ def repeats(pairs: Sequence[tuple[Answer, Answer]]) -> Repeats:
     )
 
 
-def agreement(pairs: Sequence[tuple[Answer, Answer]]) -> Share | None:
+def agreement(pairs: Sequence[tuple[JudgedAnswer, JudgedAnswer]]) -> Share | None:
     """Share of pairs answered alike both times (Wilson)."""
     told = _told(pairs)
     if not told:
@@ -241,7 +241,7 @@ def agreement(pairs: Sequence[tuple[Answer, Answer]]) -> Share | None:
     return wilson(sum(_verdict(before, before) == _verdict(again, before) for before, again in told), len(told))
 
 
-def kappa(pairs: Sequence[tuple[Answer, Answer]]) -> Interval | None:
+def kappa(pairs: Sequence[tuple[JudgedAnswer, JudgedAnswer]]) -> Estimate | None:
     """Cohen's kappa (1960) of test and retest, with Wilson's interval of the agreement carried through.
 
     The table is made symmetric, since which clip of a pair is the first means nothing: chance agreement then follows
@@ -257,10 +257,10 @@ def kappa(pairs: Sequence[tuple[Answer, Answer]]) -> Interval | None:
     if expected >= 1.0:
         return None
     value, low, high = ((share - expected) / (1 - expected) for share in (observed.value, observed.low, observed.high))
-    return Interval(value, low, high)
+    return Estimate(value, low, high)
 
 
-def noise_ceiling(decided: Share | None) -> Interval | None:
+def noise_ceiling(decided: Share | None) -> Estimate | None:
     """How often the best of models could foresee this person, if every answer is the opposite at one fixed rate.
 
     With q the chance of the true answer, two answers agree with c = q^2 + (1 - q)^2, so q = (1 + sqrt(2 c - 1)) / 2.
@@ -269,10 +269,10 @@ def noise_ceiling(decided: Share | None) -> Interval | None:
     """
     if decided is None or decided.scored < FEWEST_REPEATS or decided.low <= 0.5:
         return None
-    return Interval(_ceiling(decided.value), _ceiling(decided.low), _ceiling(decided.high))
+    return Estimate(_ceiling(decided.value), _ceiling(decided.low), _ceiling(decided.high))
 
 
-def catch_errors(answers: Sequence[Answer]) -> Share | None:
+def catch_errors(answers: Sequence[JudgedAnswer]) -> Share | None:
     """Share of answered catch pairs with the worse side preferred; equal is no error, can't tell no answer (Wilson)."""
     caught = [
         answer
@@ -283,7 +283,7 @@ def catch_errors(answers: Sequence[Answer]) -> Share | None:
     return wilson(wrong, len(caught)) if caught else None
 
 
-def left_share(answers: Sequence[Answer]) -> Share | None:
+def left_share(answers: Sequence[JudgedAnswer]) -> Share | None:
     """Share of left among answers that prefer a side (Wilson). Sides are drawn, so without bias it is one half.
 
     Catch pairs are left out: their answer is known.
@@ -292,18 +292,18 @@ def left_share(answers: Sequence[Answer]) -> Share | None:
     return wilson(sum(answer.response is Response.LEFT for answer in sided), len(sided)) if sided else None
 
 
-def too_fast(answers: Sequence[Answer]) -> Share | None:
+def too_fast(answers: Sequence[JudgedAnswer]) -> Share | None:
     """Share of answers given before TOO_FAST of both clips was played (Wilson)."""
     seen = [answer.seen for answer in answers if answer.seen is not None]
     return wilson(sum(share < TOO_FAST for share in seen), len(seen)) if seen else None
 
 
-def longest_run(answers: Sequence[Answer]) -> int:
+def longest_run(answers: Sequence[JudgedAnswer]) -> int:
     """The most times that the same was answered in a row."""
     return max((len(list(run)) for _, run in groupby(answers, key=lambda answer: answer.response)), default=0)
 
 
-def slowing(answers: Sequence[Answer]) -> Trend | None:
+def slowing(answers: Sequence[JudgedAnswer]) -> Trend | None:
     """The trend of log response time beyond the clip's length over the answers: least squares (normal interval)."""
     timed = [
         (place, _log_ratio(answer.response_time_ms, answer.clip_ms))
@@ -320,14 +320,14 @@ def slowing(answers: Sequence[Answer]) -> Trend | None:
     residual = sum((value - level - slope * (place - middle)) ** 2 for place, value in timed)
     error = sqrt(residual / (count - 2) / spread)
     low, value, high = (_percent(slope + step * error) for step in (-_Z, 0.0, _Z))
-    return Trend(Interval(value, low, high))
+    return Trend(Estimate(value, low, high))
 
 
-def _told(pairs: Sequence[tuple[Answer, Answer]]) -> list[tuple[Answer, Answer]]:
+def _told(pairs: Sequence[tuple[JudgedAnswer, JudgedAnswer]]) -> list[tuple[JudgedAnswer, JudgedAnswer]]:
     return [pair for pair in pairs if all(each.response is not Response.SKIP for each in pair)]
 
 
-def _verdict(answer: Answer, before: Answer) -> int:
+def _verdict(answer: JudgedAnswer, before: JudgedAnswer) -> int:
     """1: the clip that stood on the left at first, -1: the other one, 0: equal."""
     if answer.chosen_clip_id is None:
         return 0

@@ -20,7 +20,7 @@ from app.services.answers import answers
 LONGEST_REASON = 500
 
 
-class ReasonMissing(AppError):
+class ExclusionReasonMissing(AppError):
     """Say why this answer is left out: the reason stands beside it in every export. Nothing was changed."""
 
     status = HTTPStatus.UNPROCESSABLE_ENTITY
@@ -39,7 +39,7 @@ def exclude(session: Session, study: Study, query_id: int, reason: str, actor: s
     """Leave an answer out. Doing it again changes nothing. Raises AnswerNotFound and ReasonMissing."""
     event = answers.counting_event(session, study, query_id)
     if not reason.strip():
-        raise ReasonMissing
+        raise ExclusionReasonMissing
     _say(session, study, event, excluded=True, reason=reason.strip()[:LONGEST_REASON], actor=actor)
 
 

@@ -30,7 +30,7 @@ SEEN_EVERY = timedelta(seconds=10)
 
 
 @dataclass(frozen=True)
-class Given:
+class AnswerCounts:
     """The answers that count, in short."""
 
     count: int
@@ -44,7 +44,7 @@ class Given:
 
 
 @dataclass(frozen=True)
-class Progress:
+class PairProgress:
     """How far a participant is. Everything they will be asked counts, whatever it is for; practice does not."""
 
     answered: int
@@ -66,10 +66,10 @@ class Progress:
 
 
 @dataclass(frozen=True)
-class Turn:
+class NextPair:
     """What a participant is to be shown now."""
 
-    progress: Progress
+    progress: PairProgress
     query: Query | None
     """None while no pair is ready, during a break, and when all are answered."""
     following: Sequence[Query]
@@ -80,7 +80,7 @@ class Turn:
     """Whether a break is to be offered before the next pair."""
 
 
-def next_turn(session: Session, store: ArtefactStore, participant: Participant) -> Turn:
+def next_turn(session: Session, store: ArtefactStore, participant: Participant) -> NextPair:
     """The oldest ready pair of this participant, clips loaded, and what belongs on the page with it.
 
     Marks the pair as served. A pair whose files are not all stored is passed over.
@@ -89,16 +89,16 @@ def next_turn(session: Session, store: ArtefactStore, participant: Participant) 
     progress = progress_of(participant, given)
     undoable_id = given.newest_query_id if given.newest_is_practice == progress.practising else None
     if _break_due(session, participant, progress):
-        return Turn(progress, None, (), undoable_id, break_due=True)
+        return NextPair(progress, None, (), undoable_id, break_due=True)
     ready = [] if progress.finished else list(islice(_ready(session, store, participant), 1 + PAIRS_AHEAD))
     query = ready[0] if ready else None
     if query is not None and query.served_at is None:
         query.served_at = now()
     left = progress.practice_wanted - progress.practised + progress.wanted - progress.answered
-    return Turn(progress, query, ready[1:left], undoable_id)
+    return NextPair(progress, query, ready[1:left], undoable_id)
 
 
-def answers_given(session: Session, participant: Participant) -> Given:
+def answers_given(session: Session, participant: Participant) -> AnswerCounts:
     """How many answers count, and the newest of them. Counted by the database: this is asked for with every answer."""
     newer = aliased(LabelEvent)
     superseded = select(newer.id).where(newer.query_id == LabelEvent.query_id, newer.revision > LabelEvent.revision)
@@ -112,7 +112,7 @@ def answers_given(session: Session, participant: Participant) -> Given:
     total, practised = session.execute(
         select(func.count(), func.count().filter(answers.c.purpose == Purpose.PRACTICE)).select_from(answers)
     ).one()
-    return Given(
+    return AnswerCounts(
         count=total - practised,
         practised=practised,
         newest_query_id=newest[0].query_id if newest else None,
@@ -121,10 +121,10 @@ def answers_given(session: Session, participant: Participant) -> Given:
     )
 
 
-def progress_of(participant: Participant, given: Given) -> Progress:
+def progress_of(participant: Participant, given: AnswerCounts) -> PairProgress:
     """Given and wanted answers, and how fast they come."""
     settings = participant.study.settings
-    return Progress(
+    return PairProgress(
         answered=given.count,
         wanted=settings.question_count,
         pace_s=_pace_s(given.times),
@@ -140,7 +140,7 @@ def end_break(session: Session, participant: Participant) -> None:
         participant_events.note_once(session, participant, EventKind.BREAK_OVER, progress.answered)
 
 
-def _break_due(session: Session, participant: Participant, progress: Progress) -> bool:
+def _break_due(session: Session, participant: Participant, progress: PairProgress) -> bool:
     """After every so many answers, once: whoever takes one back and gives it again is not stopped again."""
     every = participant.study.settings.break_every
     between = every > 0 and 0 < progress.answered < progress.wanted and progress.answered % every == 0

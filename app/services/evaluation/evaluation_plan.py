@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
-from sqlalchemy import func, or_, select
+from sqlalchemy import or_, select
 from sqlalchemy.orm import Session, joinedload
 
 from app.db import now
@@ -40,7 +40,7 @@ COMPARED = 2
 _MOST_TRIALS = 20
 
 
-class State(StrEnum):
+class EvaluationState(StrEnum):
     """What a participant does now."""
 
     PREPARING = "preparing"
@@ -57,10 +57,10 @@ class State(StrEnum):
 
 
 @dataclass(frozen=True)
-class Turn:
+class NextTrial:
     """What a participant of the evaluation is to be shown now."""
 
-    state: State
+    state: EvaluationState
     rated: int
     wanted: int
     trial: Trial | None
@@ -154,7 +154,7 @@ def ratings_of(session: Session, participant_id: int) -> dict[int, Rating]:
     return {rating.trial_id: rating for rating in session.scalars(theirs)}
 
 
-def next_turn(session: Session, store: ArtefactStore, participant: Participant) -> Turn:
+def next_turn(session: Session, store: ArtefactStore, participant: Participant) -> NextTrial:
     """What the participant is to be shown; the study is loaded. Marks a film as shown."""
     draw(session, participant.study, participant)
     trials, ratings = trials_of(session, participant.id), ratings_of(session, participant.id)
@@ -162,27 +162,29 @@ def next_turn(session: Session, store: ArtefactStore, participant: Participant) 
     open_trials = [trial for trial in trials if trial.id not in ratings]
     last = rated[-1] if rated else None
     if trials and not open_trials:
-        return Turn(State.FINISHED, len(rated), len(trials), None, last)
+        return NextTrial(EvaluationState.FINISHED, len(rated), len(trials), None, last)
     state = _state(session, store, participant, trials)
-    if state is State.PREPARING:
-        return Turn(state, len(rated), len(trials), None, last)
+    if state is EvaluationState.PREPARING:
+        return NextTrial(state, len(rated), len(trials), None, last)
     trial = open_trials[0]
-    if state is State.WATCHING and trial.shown_at is None:
+    if state is EvaluationState.WATCHING and trial.shown_at is None:
         trial.shown_at = now()
-    return Turn(state, len(rated), len(trials), trial, last)
+    return NextTrial(state, len(rated), len(trials), trial, last)
 
 
-def _state(session: Session, store: ArtefactStore, participant: Participant, trials: Sequence[Trial]) -> State:
+def _state(
+    session: Session, store: ArtefactStore, participant: Participant, trials: Sequence[Trial]
+) -> EvaluationState:
     settings = settings_of(participant.study)
     ratings = ratings_of(session, participant.id)
     trial = next((each for each in trials if each.id not in ratings), None)
     if settings is None or trial is None or not is_ready(session, store, settings, participant.id, trial):
-        return State.PREPARING
+        return EvaluationState.PREPARING
     if settings.mode is EvaluationMode.VIDEO:
-        return State.WATCHING
+        return EvaluationState.WATCHING
     if trial.finished_at is not None:
-        return State.RATING
-    return State.COMING if trial.started_at is None else State.MOVING
+        return EvaluationState.RATING
+    return EvaluationState.COMING if trial.started_at is None else EvaluationState.MOVING
 
 
 def is_ready(
@@ -207,12 +209,6 @@ def controllers_of(session: Session, participant_id: int) -> dict[str, Controlle
         .order_by(Assignment.letter)
     )
     return dict(rows.all())
-
-
-def rated_count(session: Session, participant_id: int) -> int:
-    """How many trials the participant has rated."""
-    rated = select(func.count(func.distinct(Rating.trial_id))).join(Trial)
-    return session.scalar(rated.where(Trial.participant_id == participant_id)) or 0
 
 
 def film_of(session: Session, participant_id: int, method: str, scenario: int, model_id: int | None) -> Film | None:

@@ -40,7 +40,7 @@ class RatedMeanwhile(AppError):
     status = HTTPStatus.CONFLICT
 
 
-class ReasonMissing(AppError):
+class RepetitionReasonMissing(AppError):
     """Please write in a few words why the trial is repeated."""
 
     status = HTTPStatus.UNPROCESSABLE_ENTITY
@@ -115,7 +115,7 @@ def repeat(session: Session, study: Study, participant: Participant, ordinal: in
     """Take the trial back to its start, for a reason that is kept. Raises ReasonMissing, RatedMeanwhile, NotItsTurn."""
     words = " ".join(reason.split())[:LONGEST_REASON]
     if not words:
-        raise ReasonMissing
+        raise RepetitionReasonMissing
     trial = _trial(session, participant, ordinal)
     if session.scalar(select(Rating.id).where(Rating.trial_id == trial.id).limit(1)) is not None:
         raise RatedMeanwhile

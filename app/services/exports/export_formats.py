@@ -22,7 +22,7 @@ from app.services.exports.paging import EVERYTHING, Key, KeyedRows, Window
 NOT_LOCKED = "not locked"
 
 
-class Kind(StrEnum):
+class ColumnKind(StrEnum):
     """Type of a column."""
 
     TEXT = "text"
@@ -38,7 +38,7 @@ class Column:
     """One column: what it is called, what is in it, and what that means."""
 
     name: str
-    kind: Kind
+    kind: ColumnKind
     meaning: str
     unit: str = ""
     allowed: str = ""
@@ -66,7 +66,7 @@ class Table:
 
 
 @dataclass(frozen=True)
-class Provenance:
+class RowProvenance:
     """Where rows come from; stands in every row, so that a file that gets lost can still be told apart."""
 
     study: str
@@ -82,28 +82,28 @@ class Provenance:
 
 
 PROVENANCE = (
-    Column("study", Kind.TEXT, "Short name of the study, as in its address."),
+    Column("study", ColumnKind.TEXT, "Short name of the study, as in its address."),
     Column(
         "lock_hash",
-        Kind.TEXT,
+        ColumnKind.TEXT,
         "SHA-256 of the locked settings, plan and planned tests.",
         allowed=f"64 hexadecimal digits, or “{NOT_LOCKED}”",
     ),
     Column(
         "deviations",
-        Kind.TEXT,
+        ColumnKind.TEXT,
         "Changes after locking, each with its time and reason; the table deviations has what was changed.",
         allowed="“none”, or time: reason, joined by “ | ”",
     ),
-    Column("software_version", Kind.TEXT, "Version of PbARL Studio that wrote the file."),
-    Column("exported_at", Kind.TIME, "When the file was written."),
+    Column("software_version", ColumnKind.TEXT, "Version of PbARL Studio that wrote the file."),
+    Column("exported_at", ColumnKind.TIME, "When the file was written."),
 )
 
 
-def provenance_of(session: Session, study: Study, exported_at: datetime | None = None) -> Provenance:
+def provenance_of(session: Session, study: Study, exported_at: datetime | None = None) -> RowProvenance:
     """Of an export that is made now, or at another moment."""
     deviations = session.scalars(select(Deviation).where(Deviation.study_id == study.id).order_by(Deviation.id)).all()
-    return Provenance(
+    return RowProvenance(
         study=study.slug,
         lock_hash=study.lock_hash or NOT_LOCKED,
         deviations=" | ".join(f"{moment(each.at)}: {each.reason}" for each in deviations) or "none",
@@ -120,26 +120,26 @@ def software_version() -> str:
         return "unknown"
 
 
-def csv_lines(table: Table, session: Session, study: Study, provenance: Provenance) -> Iterator[str]:
+def csv_lines(table: Table, session: Session, study: Study, provenance: RowProvenance) -> Iterator[str]:
     """The file, line by line. Cells that would run as formulas are defused."""
     yield csv_line(column.name for column in table.all_columns)
     for values in _complete(table, session, study, provenance):
         yield csv_line(values)
 
 
-def json_lines(table: Table, session: Session, study: Study, provenance: Provenance) -> Iterator[str]:
+def json_lines(table: Table, session: Session, study: Study, provenance: RowProvenance) -> Iterator[str]:
     """The file, line by line: one object per row, every value as it is stored."""
     for record in records(table, session, study, provenance):
         yield json_text(record) + "\n"
 
 
-def records(table: Table, session: Session, study: Study, provenance: Provenance) -> Iterator[dict[str, Any]]:
+def records(table: Table, session: Session, study: Study, provenance: RowProvenance) -> Iterator[dict[str, Any]]:
     """The rows as plain values by column."""
     return (record for _, record in keyed_records(table, session, study, provenance, EVERYTHING))
 
 
 def keyed_records(
-    table: Table, session: Session, study: Study, provenance: Provenance, window: Window
+    table: Table, session: Session, study: Study, provenance: RowProvenance, window: Window
 ) -> Iterator[tuple[Key, dict[str, Any]]]:
     """The rows that are wanted as plain values by column, each with its key."""
     names = [column.name for column in table.all_columns]
@@ -205,7 +205,7 @@ def _markdown_table(columns: Sequence[Column]) -> str:
     return "\n".join(lines)
 
 
-def _complete(table: Table, session: Session, study: Study, provenance: Provenance) -> Iterator[Sequence[Any]]:
+def _complete(table: Table, session: Session, study: Study, provenance: RowProvenance) -> Iterator[Sequence[Any]]:
     for values in table.rows(session, study):
         yield (*values, *provenance.values)
 

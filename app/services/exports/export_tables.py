@@ -11,10 +11,10 @@ from app.domain.preferences import LabelEvent, Purpose, Query, Response, SkipRea
 from app.domain.protocol import EvaluatedMethod, Stage
 from app.domain.studies import Deviation, Participant
 from app.services.exports import export_rows
-from app.services.exports.export_formats import Column, Kind, Table
+from app.services.exports.export_formats import Column, ColumnKind, Table
 
-PARTICIPANT = Column("participant", Kind.TEXT, "Code of the participant.", allowed="P01, P02, ...")
-ORDINAL = Column("ordinal", Kind.INTEGER, "Place of the pair in this participant's order.", allowed="from 1")
+PARTICIPANT = Column("participant", ColumnKind.TEXT, "Code of the participant.", allowed="P01, P02, ...")
+ORDINAL = Column("ordinal", ColumnKind.INTEGER, "Place of the pair in this participant's order.", allowed="from 1")
 SHA256 = "64 hexadecimal digits"
 WITHOUT_SCRIPT = (
     "Whether the page's script sent it. False: a browser without script, where nothing is measured and nothing "
@@ -26,7 +26,8 @@ def _words(values: type[Any]) -> str:
     return ", ".join(value.value for value in values)
 
 
-T, I, N, B, W, J = Kind.TEXT, Kind.INTEGER, Kind.NUMBER, Kind.BOOLEAN, Kind.TIME, Kind.JSON  # noqa: E741
+T, I, N = ColumnKind.TEXT, ColumnKind.INTEGER, ColumnKind.NUMBER  # noqa: E741
+B, W, J = ColumnKind.BOOLEAN, ColumnKind.TIME, ColumnKind.JSON
 
 TABLES: Sequence[Table] = (
     Table(

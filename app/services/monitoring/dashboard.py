@@ -86,7 +86,7 @@ class ParticipantRow:
 
 
 @dataclass(frozen=True)
-class StudyLine:
+class StudySummary:
     """One study in one line."""
 
     study: Study
@@ -110,7 +110,7 @@ class StudyOverview:
     pool: Pool
     rows: Sequence[ParticipantRow]
     stage_counts: Sequence[tuple[str, int]]
-    jobs: Sequence[jobs.Job]
+    jobs: Sequence[jobs.NoteworthyRun]
     """Failures first, then the newest first."""
     answers_today: int
     disk_use_bytes: int
@@ -125,7 +125,7 @@ class ParticipantDetail:
     versions: Sequence[model_metrics.FilterVersion]
     """The newest first."""
     weights: Sequence[model_metrics.Weight]
-    taste: model_metrics.Taste | None
+    taste: model_metrics.LearnedCosts | None
     runs: Sequence[Run]
     """The newest first."""
     liked: participant_status.Liked | None
@@ -171,7 +171,7 @@ def fingerprint(session: Session) -> str:
     return repr(tuple(session.execute(select(*newest)).one()))
 
 
-def study_lines(session: Session, *, put_away: bool = False) -> Sequence[StudyLine]:
+def study_lines(session: Session, *, put_away: bool = False) -> Sequence[StudySummary]:
     """Every study that is at work, or every one that is put away; the newest first."""
     counted = session.execute(select(Rollout.study_id, func.count(Clip.id)).join(Clip).group_by(Rollout.study_id))
     clips = dict(counted.all())
@@ -187,7 +187,7 @@ def study_lines(session: Session, *, put_away: bool = False) -> Sequence[StudyLi
         given = [labels.get(person.id, 0) for person in people[study.id]]
         wanted = study.settings.labels_per_participant
         lines.append(
-            StudyLine(
+            StudySummary(
                 study=study,
                 participants=len(given),
                 finished=_finished(study, people[study.id], given),

@@ -22,7 +22,7 @@ from app.domain.preferences import LabelEvent, Purpose, Query, Response, is_excl
 from app.domain.protocol import Stage
 from app.domain.studies import Participant, Strategy, Study, StudySettings
 from app.services.answers import stopping_advice
-from app.services.answers.consistency import Answer, Consistency, consistency, seen
+from app.services.answers.consistency import Consistency, JudgedAnswer, consistency, seen
 from app.services.answers.stopping_advice import Advice
 from app.services.participants import stages
 
@@ -56,10 +56,10 @@ class Watched:
 
 
 @dataclass(frozen=True)
-class Given:
+class GivenAnswer:
     """One answer that counts, when it was given, and what had been foreseen."""
 
-    answer: Answer
+    answer: JudgedAnswer
     moment: datetime
     predicted_right: float | None
     drawn_at_random: bool
@@ -91,7 +91,7 @@ class StageTime:
     record: StageRecord
 
 
-def answers_given(session: Session, participant_ids: Sequence[int]) -> dict[int, list[Given]]:
+def answers_given(session: Session, participant_ids: Sequence[int]) -> dict[int, list[GivenAnswer]]:
     """Everything that each of them has answered and not undone, in the order of the queries."""
     left, right, newer = aliased(Clip), aliased(Clip), aliased(LabelEvent)
     superseded = select(newer.id).where(newer.query_id == LabelEvent.query_id, newer.revision > LabelEvent.revision)
@@ -111,9 +111,9 @@ def answers_given(session: Session, participant_ids: Sequence[int]) -> dict[int,
         .where(Query.participant_id.in_(participant_ids), LabelEvent.response.is_not(None), ~superseded.exists())
         .order_by(Query.participant_id, Query.ordinal)
     )  # columns, not objects: of 20 000 answers objects take two seconds
-    given: dict[int, list[Given]] = {each: [] for each in participant_ids}
+    given: dict[int, list[GivenAnswer]] = {each: [] for each in participant_ids}
     for row in rows:
-        answer = Answer(
+        answer = JudgedAnswer(
             ordinal=row.ordinal,
             query_id=row.id,
             purpose=_PURPOSES[row.purpose],
@@ -129,7 +129,7 @@ def answers_given(session: Session, participant_ids: Sequence[int]) -> dict[int,
         )
         drawn_at_random = row.strategy == Strategy.UNIFORM
         given[row.participant_id].append(
-            Given(answer, row.created_at, row.predicted_right, drawn_at_random, row.excluded)
+            GivenAnswer(answer, row.created_at, row.predicted_right, drawn_at_random, row.excluded)
         )
     return given
 
@@ -143,7 +143,7 @@ def reward_models(session: Session, participant_ids: Sequence[int]) -> dict[int,
     return models
 
 
-def judged(given: Sequence[Given], models: Sequence[Model]) -> Watched:
+def judged(given: Sequence[GivenAnswer], models: Sequence[Model]) -> Watched:
     """Everything that is said about the answers of one participant."""
     moments = sorted(each.moment for each in given if each.answer.purpose is not Purpose.PRACTICE)
     gaps = [(later - earlier).total_seconds() for earlier, later in pairwise(moments)]

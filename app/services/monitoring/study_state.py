@@ -10,10 +10,10 @@ from sqlalchemy.orm import Session
 from app.domain.participation import StageRecord
 from app.domain.protocol import Stage
 from app.domain.studies import Participant
-from app.services.monitoring.dashboard import StudyLine
+from app.services.monitoring.dashboard import StudySummary
 
 
-class State(StrEnum):
+class StudyState(StrEnum):
     """The first that is true."""
 
     ATTENTION = "attention"
@@ -29,15 +29,15 @@ class State(StrEnum):
 
 
 @dataclass(frozen=True)
-class Standing:
+class StudyStanding:
     """The state of a study with its numbers; who has withdrawn is in none of them."""
 
-    state: State
+    state: StudyState
     finished: int
     people: int
 
 
-def standings(session: Session, lines: Sequence[StudyLine]) -> Mapping[int, Standing]:
+def standings(session: Session, lines: Sequence[StudySummary]) -> Mapping[int, StudyStanding]:
     """By the study's id; a few queries for all studies together."""
     present = Participant.is_preview.is_(False) & Participant.withdrawn_at.is_(None)
     counted = session.execute(
@@ -59,15 +59,15 @@ def standings(session: Session, lines: Sequence[StudyLine]) -> Mapping[int, Stan
     }
 
 
-def _standing(line: StudyLine, people: int, begun: int, rating: int) -> Standing:
+def _standing(line: StudySummary, people: int, begun: int, rating: int) -> StudyStanding:
     if line.failed:
-        state = State.ATTENTION
+        state = StudyState.ATTENTION
     elif not begun:
-        state = State.PREPARING if line.clips < line.clips_wanted else State.WAITING
+        state = StudyState.PREPARING if line.clips < line.clips_wanted else StudyState.WAITING
     elif line.finished >= people:
-        state = State.FINISHED
+        state = StudyState.FINISHED
     elif rating and rating + line.finished >= begun:
-        state = State.EVALUATING
+        state = StudyState.EVALUATING
     else:
-        state = State.RUNNING
-    return Standing(state, line.finished, people)
+        state = StudyState.RUNNING
+    return StudyStanding(state, line.finished, people)

@@ -17,10 +17,10 @@ from app.domain.preferences import LEARNED_FROM, Exclusion, LabelEvent, Query, R
 from app.services.answers import accuracy
 from app.services.answers.accuracy import Predicted
 from app.services.monitoring import participant_status
-from app.services.monitoring.participant_status import Given
+from app.services.monitoring.participant_status import GivenAnswer
 from app.services.runs import model_metrics
 
-Mark = tuple[int | None, ...]
+Watermark = tuple[int | None, ...]
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Tallies:
 
     def __init__(self) -> None:
         self._lock = Lock()
-        self._known: dict[int, tuple[Mark, Tally]] = {}
+        self._known: dict[int, tuple[Watermark, Tally]] = {}
 
     def of(self, session: Session, participant_ids: Sequence[int]) -> dict[int, Tally]:
         """The tally of each of these participants."""
@@ -54,8 +54,8 @@ class Tallies:
         return {each: fresh[each] if each in fresh else known[each][1] for each in participant_ids}
 
 
-def _marks(session: Session, participant_ids: Sequence[int]) -> dict[int, Mark]:
-    marks: dict[int, Mark] = dict.fromkeys(participant_ids, ())
+def _marks(session: Session, participant_ids: Sequence[int]) -> dict[int, Watermark]:
+    marks: dict[int, Watermark] = dict.fromkeys(participant_ids, ())
     for whose, counted in (
         (Query.participant_id, select(Query.participant_id, func.count(), func.max(LabelEvent.id)).join(LabelEvent)),
         (Query.participant_id, _exclusions()),
@@ -81,7 +81,9 @@ def _count(session: Session, participant_ids: Sequence[int]) -> dict[int, Tally]
     return {each: _tally(given[each], models[each], filters.get(each)) for each in participant_ids}
 
 
-def _tally(given: Sequence[Given], models: Sequence[Model], newest_filter: model_metrics.FilterVersion | None) -> Tally:
+def _tally(
+    given: Sequence[GivenAnswer], models: Sequence[Model], newest_filter: model_metrics.FilterVersion | None
+) -> Tally:
     labels = [each for each in given if each.answer.purpose in LEARNED_FROM]
     counting = [each for each in labels if not each.excluded]
     counts = dict.fromkeys(Response, 0)

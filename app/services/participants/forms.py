@@ -16,7 +16,7 @@ _NUMBER = re.compile(r"[+\-\N{MINUS SIGN}]?[0-9]{1,12}([.,][0-9]{1,12})?")
 """28, 28.5 and 28,5."""
 
 
-class Problem(StrEnum):
+class AnswerProblem(StrEnum):
     """Why an answer cannot be kept as it is; also names the message that says so."""
 
     NUMBER = "form-number-problem"
@@ -35,7 +35,7 @@ def answers_of(session: Session, participant: Participant, form: Stage) -> dict[
     return {answer.item: answer.value for answer in session.scalars(given.order_by(FormAnswer.id))}
 
 
-def problems(items: Sequence[FormItem], given: Mapping[str, str]) -> dict[str, Problem]:
+def problems(items: Sequence[FormItem], given: Mapping[str, str]) -> dict[str, AnswerProblem]:
     """What is wrong with answers as they were typed, by question."""
     found = {item.name: _problem(item, given.get(item.name, "").strip()) for item in items}
     return {name: problem for name, problem in found.items() if problem is not None}
@@ -52,15 +52,15 @@ def record(
             session.add(FormAnswer(participant_id=participant.id, form=form, item=item.name, value=value))
 
 
-def _problem(item: FormItem, text: str) -> Problem | None:
+def _problem(item: FormItem, text: str) -> AnswerProblem | None:
     if not text:
         return None
     if item.kind == "number":
-        return None if _NUMBER.fullmatch(text) else Problem.NUMBER
+        return None if _NUMBER.fullmatch(text) else AnswerProblem.NUMBER
     if item.kind == "text":
-        return Problem.LONG if len(text) > MOST_CHARACTERS else None
+        return AnswerProblem.LONG if len(text) > MOST_CHARACTERS else None
     possible = item.choices if item.kind == "choice" else [str(point + 1) for point in range(LIKERT_POINTS)]
-    return None if text in possible else Problem.CHOICE
+    return None if text in possible else AnswerProblem.CHOICE
 
 
 def _stored(item: FormItem, text: str) -> str | None:

@@ -13,7 +13,7 @@ from sqlalchemy.orm import Session
 from app.domain.participation import ParticipantEvent, StageRecord
 from app.domain.protocol import Stage
 from app.domain.studies import Participant, StudySettings
-from app.services.answers.next_query import LONGEST_PAUSE, Progress
+from app.services.answers.next_query import LONGEST_PAUSE, PairProgress
 from app.services.participant_events import EventKind
 from app.services.participants import stages
 
@@ -34,7 +34,7 @@ class TimeLeft:
     """False: only of the comparing; nobody knows yet how long what comes afterwards takes."""
 
 
-def time_left(session: Session, participant: Participant, progress: Progress) -> TimeLeft | None:
+def time_left(session: Session, participant: Participant, progress: PairProgress) -> TimeLeft | None:
     """None while the person's pace is not known. The study is loaded."""
     if progress.pace_s is None:
         return None
@@ -46,7 +46,7 @@ def time_left(session: Session, participant: Participant, progress: Progress) ->
     return TimeLeft(round(pairs_s + (sum(usual[stage] for stage in later) if known else 0.0)), known)
 
 
-def _pairs_s(progress: Progress, settings: StudySettings, whole_clip_steps: int | None) -> float:
+def _pairs_s(progress: PairProgress, settings: StudySettings, whole_clip_steps: int | None) -> float:
     """Whole episodes come first and play longer than what follows; the pace is that of what was answered last."""
     pace_s, left = progress.pace_s or 0.0, progress.wanted - progress.answered
     whole = max(0, settings.introduction_count - progress.answered)
@@ -55,7 +55,7 @@ def _pairs_s(progress: Progress, settings: StudySettings, whole_clip_steps: int 
     return whole * pace_s + (left - whole) * after_s
 
 
-def _breaks_s(session: Session, participant: Participant, progress: Progress) -> float:
+def _breaks_s(session: Session, participant: Participant, progress: PairProgress) -> float:
     """Breaks still to come, at the median of those that this study's participants took; nothing while none is known."""
     every = participant.study.settings.break_every
     coming = (progress.wanted - 1) // every - progress.answered // every if every else 0

@@ -55,7 +55,7 @@ class Weight:
 
 
 @dataclass(frozen=True)
-class Taste:
+class LearnedCosts:
     """What a reward model, of whatever kind, thinks of the paper's six costs in the study's clips."""
 
     weights: Sequence[Weight]
@@ -161,10 +161,10 @@ def learned_weights(model: Model | None) -> Sequence[Weight]:
     return _strongest_first(_read(_Reward, model.metrics).weights)
 
 
-def taste(model: Model | None) -> Taste | None:
+def taste(model: Model | None) -> LearnedCosts | None:
     """What the newest reward model thinks of the six costs; None when it has not said."""
     costs = _read(_Reward, model.metrics).costs if model is not None else None
-    return None if costs is None else Taste(_strongest_first(costs.weights), costs.explained)
+    return None if costs is None else LearnedCosts(_strongest_first(costs.weights), costs.explained)
 
 
 def _strongest_first(weights: Mapping[str, _Weight]) -> Sequence[Weight]:

@@ -14,7 +14,7 @@ from app.domain.studies import Participant, Study
 
 
 @dataclass(frozen=True)
-class Job:
+class NoteworthyRun:
     """A run that deserves a line: at work, about to be tried again, or failed and not made good since."""
 
     run: Run
@@ -36,7 +36,7 @@ class Glance(NamedTuple):
 _R = TypeVar("_R", Run, Glance)
 
 
-def of_study(session: Session, study: Study) -> Sequence[Job]:
+def of_study(session: Session, study: Study) -> Sequence[NoteworthyRun]:
     """Of everybody still in the study, and of the study itself."""
     mine = Run.study_id == study.id
     at_work = _present_runs(session, mine, Run.status.in_((RunStatus.RUNNING, RunStatus.RETRY)))
@@ -47,7 +47,7 @@ def of_study(session: Session, study: Study) -> Sequence[Job]:
     runs = _whole(session, ids)
     people = select(Participant).where(Participant.id.in_([run.participant_id for run in runs.values()]))
     codes = {person.id: person.code for person in session.scalars(people)}
-    return [Job(runs[each], codes.get(runs[each].participant_id or 0)) for each in ids]
+    return [NoteworthyRun(runs[each], codes.get(runs[each].participant_id or 0)) for each in ids]
 
 
 def of_people(session: Session, participant_ids: Sequence[int]) -> dict[int, Run]:

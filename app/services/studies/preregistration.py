@@ -26,7 +26,7 @@ TEST_NAMES: Mapping[str, str] = {
 }
 
 
-class Standing(StrEnum):
+class PlanStanding(StrEnum):
     """What the study's times prove about its plan, the least first."""
 
     NOT_LOCKED = "not_locked"
@@ -38,13 +38,14 @@ class Standing(StrEnum):
 
 
 _IN_WORDS = {
-    Standing.NOT_LOCKED: "The study was never locked, so nothing shows that its tests were chosen before the data: "
+    PlanStanding.NOT_LOCKED: "The study was never locked, so nothing shows that its tests were chosen before the data: "
     "every test is exploratory.",
-    Standing.AFTER_UNBLINDING: "The study was locked after it had been unblinded, when results could be seen: every "
-    "test is exploratory.",
-    Standing.AFTER_RATINGS: "The study was locked after the first ratings had come in: every test is exploratory.",
-    Standing.BEFORE_RATINGS: "Planned tests were locked after the first answers to pairs, and before the first rating.",
-    Standing.BEFORE_DATA: "Planned tests were locked before the first answer.",
+    PlanStanding.AFTER_UNBLINDING: "The study was locked after it had been unblinded, when results could be seen: "
+    "every test is exploratory.",
+    PlanStanding.AFTER_RATINGS: "The study was locked after the first ratings had come in: every test is exploratory.",
+    PlanStanding.BEFORE_RATINGS: "Planned tests were locked after the first answers to pairs, and before the first "
+    "rating.",
+    PlanStanding.BEFORE_DATA: "Planned tests were locked before the first answer.",
 }
 
 
@@ -64,7 +65,7 @@ class LeftOut:
 class Plan:
     """The tests of a study, and the times that tell what they are worth."""
 
-    standing: Standing
+    standing: PlanStanding
     named: Sequence[str]
     """Tests of the locked document; of a study that is not locked those of its settings."""
     added: Sequence[str]
@@ -79,7 +80,7 @@ class Plan:
     @property
     def planned(self) -> Sequence[str]:
         """Tests that may be called planned: locked before anything that they test was there."""
-        return self.named if self.standing in (Standing.BEFORE_DATA, Standing.BEFORE_RATINGS) else ()
+        return self.named if self.standing in (PlanStanding.BEFORE_DATA, PlanStanding.BEFORE_RATINGS) else ()
 
     @property
     def in_words(self) -> str:
@@ -142,15 +143,15 @@ def _left_out(session: Session, study: Study) -> Sequence[LeftOut]:
     return [LeftOut(*same, codes) for same, codes in whose.items()]
 
 
-def _standing(study: Study, first_answer_at: datetime | None, first_rating_at: datetime | None) -> Standing:
+def _standing(study: Study, first_answer_at: datetime | None, first_rating_at: datetime | None) -> PlanStanding:
     if study.lock_document is None or study.locked_at is None:
-        return Standing.NOT_LOCKED
+        return PlanStanding.NOT_LOCKED
     moments = (
-        (study.unblinded_at, Standing.AFTER_UNBLINDING),
-        (first_rating_at, Standing.AFTER_RATINGS),
-        (first_answer_at, Standing.BEFORE_RATINGS),
+        (study.unblinded_at, PlanStanding.AFTER_UNBLINDING),
+        (first_rating_at, PlanStanding.AFTER_RATINGS),
+        (first_answer_at, PlanStanding.BEFORE_RATINGS),
     )
     for moment, standing in moments:
         if moment is not None and study.locked_at >= moment:
             return standing
-    return Standing.BEFORE_DATA
+    return PlanStanding.BEFORE_DATA

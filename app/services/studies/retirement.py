@@ -24,7 +24,7 @@ class StudyDeleted(AppError):
     status = HTTPStatus.GONE
 
 
-class NotConfirmed(AppError):
+class DeletionNotConfirmed(AppError):
     """What was typed is not the short name of this study. Nothing was deleted."""
 
     status = HTTPStatus.UNPROCESSABLE_ENTITY
@@ -50,7 +50,7 @@ def delete(session: Session, store: ArtefactStore, study: Study, typed: str, act
     What the worker keeps for itself it erases when it finds ``deleted_at`` without ``erased_at``.
     """
     if typed.strip() != study.slug:
-        raise NotConfirmed
+        raise DeletionNotConfirmed
     audit.record(session, actor, "study deleted", study.slug)
     study.deleted_at = now()
     withdrawal.erase_study(session, store, study)

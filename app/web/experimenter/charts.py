@@ -37,7 +37,7 @@ class AccuracyChart:
 
 
 @dataclass(frozen=True)
-class Interval:
+class IntervalMark:
     """A dot with its interval on a scale that is symmetric about zero, in SVG units."""
 
     width: float
@@ -90,7 +90,7 @@ def sparkline(curve: Curve, width: float = 96.0, height: float = 28.0) -> str:
     return _points(line)
 
 
-def interval(middle: float, low: float, high: float, reach: float | None = None, width: float = 160.0) -> Interval:
+def interval(middle: float, low: float, high: float, reach: float | None = None, width: float = 160.0) -> IntervalMark:
     """A value with its interval; ``reach`` is the value at the right edge, by default what just fits."""
     reach = reach or 1.15 * max(abs(low), abs(high), abs(middle)) or 1.0
 
@@ -98,7 +98,7 @@ def interval(middle: float, low: float, high: float, reach: float | None = None,
         inside = max(-1.0, min(1.0, value / reach))
         return round(width / 2 + inside * (width / 2 - 5), 1)
 
-    return Interval(width, width / 2, x(middle), x(low), x(high))
+    return IntervalMark(width, width / 2, x(middle), x(low), x(high))
 
 
 def _points(pairs: Sequence[tuple[float, float]]) -> str:

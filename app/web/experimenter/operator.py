@@ -14,7 +14,7 @@ from app.domain.people import Experimenter
 from app.domain.studies import Participant, Study
 from app.services import audit
 from app.services.evaluation import evaluation_plan, robot_operation, unblinding
-from app.services.evaluation.robot_operation import LONGEST_REASON, ReasonMissing
+from app.services.evaluation.robot_operation import LONGEST_REASON, RepetitionReasonMissing
 from app.services.evaluation.unblinding import NAMES, ConfirmationDiffers
 from app.services.participants import enrolment
 from app.services.studies import studies
@@ -95,7 +95,7 @@ def repeat_trial(
     study, participant = _found(session, slug, code)
     try:
         robot_operation.repeat(session, study, participant, ordinal, reason, experimenter.name)
-    except ReasonMissing as missing:
+    except RepetitionReasonMissing as missing:
         return _desk_page(request, session, studio, (study, participant), experimenter, missing.message)
     return _back(request, slug, code)
 

@@ -53,7 +53,7 @@ def delete_study(
     study = studies.find_study(session, slug)
     try:
         retirement.delete(session, studio.store, study, typed, experimenter.name)
-    except retirement.NotConfirmed as error:
+    except retirement.DeletionNotConfirmed as error:
         return _page(request, session, study, experimenter, error.message, error.status)
     response = RedirectResponse(request.app.url_path_for("show_studies"), HTTPStatus.SEE_OTHER)
     response.background = BackgroundTask(studio.database.forget_erased)  # after the commit

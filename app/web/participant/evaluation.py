@@ -13,7 +13,7 @@ from app.domain.protocol import LIKERT_POINTS, Stage
 from app.domain.studies import Awaited, Participant
 from app.services.answers import next_query
 from app.services.evaluation import evaluation_plan, ratings, robot_preparation
-from app.services.evaluation.evaluation_plan import State, Turn
+from app.services.evaluation.evaluation_plan import EvaluationState, NextTrial
 from app.web.error_pages import wants_json
 from app.web.http.deps import NotYet, RowId, StudioDep, WritingSession
 from app.web.participant.pages import go, has_reached, is_in, participant_page
@@ -28,11 +28,11 @@ InEvaluation = Annotated[Participant, is_in(Stage.EVALUATION)]
 AtEvaluation = Annotated[Participant, has_reached(Stage.EVALUATION)]
 
 _TEMPLATES = {
-    State.PREPARING: "participant/evaluation_waiting.html",
-    State.COMING: "participant/evaluation_robot.html",
-    State.MOVING: "participant/evaluation_robot.html",
-    State.WATCHING: "participant/evaluation.html",
-    State.RATING: "participant/evaluation_rating.html",
+    EvaluationState.PREPARING: "participant/evaluation_waiting.html",
+    EvaluationState.COMING: "participant/evaluation_robot.html",
+    EvaluationState.MOVING: "participant/evaluation_robot.html",
+    EvaluationState.WATCHING: "participant/evaluation.html",
+    EvaluationState.RATING: "participant/evaluation_rating.html",
 }
 
 
@@ -53,12 +53,12 @@ def show_evaluation(
     """The robot to watch and rate now, or how far the robots are."""
     next_query.seen(participant)
     turn = evaluation_plan.next_turn(session, studio.store, participant)
-    next_query.waits(participant, Awaited.ROBOTS if turn.state is State.PREPARING else None)
+    next_query.waits(participant, Awaited.ROBOTS if turn.state is EvaluationState.PREPARING else None)
     if wants_json(request):
         return JSONResponse(_for_script(request, turn))
     if turn.trial is None:
         context: dict[str, Any] = {"turn": turn, "preparation": robot_preparation.preparation(session, participant)}
-        return participant_page(request, _TEMPLATES[State.PREPARING], participant, context)
+        return participant_page(request, _TEMPLATES[EvaluationState.PREPARING], participant, context)
     return _trial_page(request, participant, turn, turn.trial, None, _TEMPLATES[turn.state])
 
 
@@ -68,7 +68,7 @@ def show_evaluation_done(
 ) -> Response:
     """Everything is rated; the last rating can still be changed."""
     turn = evaluation_plan.next_turn(session, studio.store, participant)
-    if turn.state is not State.FINISHED:
+    if turn.state is not EvaluationState.FINISHED:
         raise NotYet
     return participant_page(request, "participant/evaluation_done.html", participant, {"turn": turn})
 
@@ -81,7 +81,7 @@ def show_last_rating(
     trial, rated = ratings.find_rated(session, participant, trial_id)
     turn = evaluation_plan.next_turn(session, studio.store, participant)
     trials = {each.id: each for each in evaluation_plan.trials_of(session, participant.id)}
-    template = _TEMPLATES[State.WATCHING if trials[trial.id].film else State.RATING]
+    template = _TEMPLATES[EvaluationState.WATCHING if trials[trial.id].film else EvaluationState.RATING]
     return _trial_page(request, participant, turn, trials[trial.id], rated, template)
 
 
@@ -110,7 +110,7 @@ def rate_trial(
     )
     next_query.seen(participant)
     turn = evaluation_plan.next_turn(session, studio.store, participant)
-    name = "show_evaluation_done" if turn.state is State.FINISHED else "show_evaluation"
+    name = "show_evaluation_done" if turn.state is EvaluationState.FINISHED else "show_evaluation"
     if wants_json(request):
         return JSONResponse({**_for_script(request, turn), "next_path": request.app.url_path_for(name)})
     return RedirectResponse(request.app.url_path_for(name), HTTPStatus.SEE_OTHER)
@@ -123,7 +123,7 @@ def leave_evaluation(request: Request, participant: AtEvaluation) -> Response:
 
 
 def _trial_page(
-    request: Request, participant: Participant, turn: Turn, trial: Trial, rated: Rating | None, template: str
+    request: Request, participant: Participant, turn: NextTrial, trial: Trial, rated: Rating | None, template: str
 ) -> Response:
     settings = evaluation_plan.settings_of(participant.study)
     context = {
@@ -149,7 +149,7 @@ def _film(request: Request, film: Film) -> dict[str, Any]:
     }
 
 
-def _for_script(request: Request, turn: Turn) -> dict[str, Any]:
+def _for_script(request: Request, turn: NextTrial) -> dict[str, Any]:
     return {
         "state": turn.state,
         "trial": None if turn.trial is None else turn.trial.ordinal,

@@ -11,7 +11,7 @@ from fastapi.responses import Response
 from app.domain.protocol import LIKERT_POINTS, FormItem, Stage
 from app.domain.studies import Participant
 from app.services.participants import forms, stages
-from app.services.participants.forms import MOST_CHARACTERS, Problem
+from app.services.participants.forms import MOST_CHARACTERS, AnswerProblem
 from app.web.http.deps import Typed, WritingSession
 from app.web.participant.pages import back_from, go, has_reached, participant_page
 from app.web.texts.form_questions import choice_of, label_of, question_of
@@ -26,7 +26,7 @@ AtQuestionnaire = Annotated[Participant, has_reached(Stage.QUESTIONNAIRE)]
 
 
 @dataclass(frozen=True)
-class Field:
+class Question:
     """One question as the page needs it."""
 
     name: str
@@ -83,7 +83,11 @@ def _save(
 
 
 def _form(
-    request: Request, participant: Participant, form: Stage, values: Mapping[str, str], wrong: Mapping[str, Problem]
+    request: Request,
+    participant: Participant,
+    form: Stage,
+    values: Mapping[str, str],
+    wrong: Mapping[str, AnswerProblem],
 ) -> Response:
     settings = participant.study.settings
     wording = wording_of(request, participant)
@@ -102,8 +106,8 @@ def _form(
     return participant_page(request, "participant/form.html", participant, context, status)
 
 
-def _field(wording: Wording, item: FormItem, values: Mapping[str, str], problem: Problem | None) -> Field:
-    return Field(
+def _field(wording: Wording, item: FormItem, values: Mapping[str, str], problem: AnswerProblem | None) -> Question:
+    return Question(
         name=item.name,
         kind=item.kind,
         question=question_of(wording, item),

@@ -157,7 +157,7 @@ def in_words(say: Wording, left: TimeLeft) -> str:
     return time if left.is_all else say("pair-time-left-comparing", time=time)
 
 
-def _template(turn: next_query.Turn) -> str:
+def _template(turn: next_query.NextPair) -> str:
     if turn.break_due:
         return "break"
     if turn.query is None:
@@ -176,7 +176,7 @@ def _go_on(request: Request, session: Session, studio: Studio, participant: Part
 
 
 def _turn_for_script(
-    request: Request, session: Session, participant: Participant, turn: next_query.Turn
+    request: Request, session: Session, participant: Participant, turn: next_query.NextPair
 ) -> dict[str, Any]:
     progress, left = turn.progress, time_left.time_left(session, participant, turn.progress)
     practising = progress.practising
@@ -194,7 +194,7 @@ def _turn_for_script(
     }
 
 
-def _state(turn: next_query.Turn) -> str:
+def _state(turn: next_query.NextPair) -> str:
     if turn.progress.finished:
         return "finished"
     if turn.break_due:

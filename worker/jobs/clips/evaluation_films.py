@@ -21,6 +21,7 @@ from worker.compute import baseline_fitting, simulation
 from worker.compute.pools import Lane
 from worker.compute.simulation import RecordedClip
 from worker.jobs.clips import repairs
+from worker.jobs.clips.stored_video import video_columns
 from worker.jobs.learning import baselines
 from worker.jobs.learning.filters import NothingToLearnFrom
 from worker.jobs.runtime import due_work, records
@@ -32,7 +33,7 @@ AT_A_TIME = 2
 
 
 @dataclass(frozen=True)
-class Robot:
+class ShownRobot:
     """One method as it is shown to one participant."""
 
     method: str
@@ -144,11 +145,11 @@ def _stored(context: WorkerContext, recorded: RecordedClip) -> dict[str, Any]:
     return {
         "success": recorded.success,
         "trajectory_sha256": context.store.put(recorded.trajectory),
-        **repairs.stored(context, recorded.clip),
+        **video_columns(context.store, recorded.clip),
     }
 
 
-def _save(session: Session, participant_id: int, robot: Robot, scenario: int, columns: dict[str, Any]) -> None:
+def _save(session: Session, participant_id: int, robot: ShownRobot, scenario: int, columns: dict[str, Any]) -> None:
     """Record a film; doing it twice changes nothing."""
     if evaluation_plan.film_of(session, participant_id, robot.method, scenario, robot.model_id) is None:
         film = Film(participant_id=participant_id, method=robot.method, model_id=robot.model_id, scenario=scenario)
@@ -183,7 +184,7 @@ def _pack(context: WorkerContext, run_id: int, job: Job, shots: list[list[Any]])
             _keep_controller(session, job.participant, robot, artefact, len(packed))
 
 
-def _keep_controller(session: Session, participant_id: int, robot: Robot, artefact: str, byte_count: int) -> None:
+def _keep_controller(session: Session, participant_id: int, robot: ShownRobot, artefact: str, byte_count: int) -> None:
     """Record a controller; a newer one replaces it until the robot has been started."""
     theirs = select(Controller).where(Controller.participant_id == participant_id, Controller.method == robot.method)
     known = session.scalar(theirs)
@@ -196,18 +197,18 @@ def _keep_controller(session: Session, participant_id: int, robot: Robot, artefa
     known.model_id, known.artefact_sha256, known.byte_count = robot.model_id, artefact, byte_count
 
 
-def _robot(context: WorkerContext, run_id: int, task: str, method: str, model_id: int | None) -> Robot:
+def _robot(context: WorkerContext, run_id: int, task: str, method: str, model_id: int | None) -> ShownRobot:
     """A model of the method as a controller."""
     beat = context.beat(run_id)
     if model_id is None:
-        return Robot(
+        return ShownRobot(
             method, None, context.compute.run(Lane.LEARNING, beat, baseline_fitting.controller_of_reference, task)
         )
     with context.database.reading() as session:
         stored = context.store.read(session.get_one(Model, model_id).artefact_sha256)
     if method == EvaluatedMethod.PBARL:
         stored = context.compute.run(Lane.LEARNING, beat, baseline_fitting.controller_of_filter, task, stored)
-    return Robot(method, model_id, stored)
+    return ShownRobot(method, model_id, stored)
 
 
 def _task(context: WorkerContext, job: Job) -> str:

@@ -29,6 +29,7 @@ from app.services.archives import unpacking
 from app.services.participants import withdrawal
 from app.services.studies import studies
 from app.storage import ArtefactStore
+from worker.jobs.clips.stored_video import video_columns
 from worker.jobs.learning.dataset import IMPORTED
 from worker.jobs.runtime.context import NotingStore
 from worker.sim.render.video import PlayableVideo, playable
@@ -73,7 +74,7 @@ class OwnClip(_Entry):
     label: str = Field(default="", max_length=200)
 
 
-class Manifest(_Entry):
+class ClipManifest(_Entry):
     """manifest.json"""
 
     format: Literal["pbarl-studio-clips"]
@@ -169,9 +170,9 @@ def _import(database: Database, store: ArtefactStore, source: Source, actor: str
         raise
 
 
-def _manifest(source: Source) -> Manifest:
+def _manifest(source: Source) -> ClipManifest:
     try:
-        return Manifest.model_validate(json.loads(source.read(MANIFEST, LARGEST_MANIFEST_BYTES)))
+        return ClipManifest.model_validate(json.loads(source.read(MANIFEST, LARGEST_MANIFEST_BYTES)))
     except ValidationError as error:
         raise ClipsInvalid(f"{MANIFEST}: {_in_words(error)}") from error
     except (ValueError, RecursionError) as error:
@@ -184,7 +185,7 @@ def _in_words(error: ValidationError) -> str:
     return f"{place}: {first['msg']}."
 
 
-def _read(store: ArtefactStore, source: Source, manifest: Manifest, clip: OwnClip) -> _Ready:
+def _read(store: ArtefactStore, source: Source, manifest: ClipManifest, clip: OwnClip) -> _Ready:
     recording = _recording(source.read(clip.trajectory, LARGEST_TRAJECTORY_BYTES), manifest, clip)
     try:
         video = playable(source.read(clip.video, LARGEST_VIDEO_BYTES))
@@ -199,7 +200,7 @@ def _read(store: ArtefactStore, source: Source, manifest: Manifest, clip: OwnCli
     return _stored(store, clip, recording, video)
 
 
-def _recording(content: bytes, manifest: Manifest, clip: OwnClip) -> Recording:
+def _recording(content: bytes, manifest: ClipManifest, clip: OwnClip) -> Recording:
     read = _from_csv if clip.trajectory.lower().endswith(".csv") else _from_npz
     names = [signal.name for signal in manifest.signals]
     try:
@@ -261,7 +262,7 @@ def _check_observations(ready: Sequence[_Ready]) -> None:
         raise ClipsInvalid(f"Trajectories differ in how many observations and actions they have: {sorted(shapes)}.")
 
 
-def _settings(manifest: Manifest, ready: Sequence[_Ready]) -> StudySettings:
+def _settings(manifest: ClipManifest, ready: Sequence[_Ready]) -> StudySettings:
     """What the manifest says; the rest follows from the clips. Raises ClipsInvalid for what needs a simulator."""
     per_scenario = Counter(each.scenario for each in ready)
     pairs = sum(count * (count - 1) // 2 for count in per_scenario.values())
@@ -302,24 +303,14 @@ def _stored(store: ArtefactStore, own: OwnClip, recording: Recording, video: Pla
     recording.save(file)
     mode = {IMPORTED: {"video": own.video, "trajectory": own.trajectory, "label": own.label}}
     rollout = {"mode": mode, "trajectory_sha256": store.put(file.getvalue()), "success": recording.success}
-    clip = {
-        "first_step": 0,
-        "step_count": len(recording),
-        "video_sha256": store.put(video.video),
-        "poster_sha256": store.put(video.poster),
-        "width": video.width,
-        "height": video.height,
-        "fps": video.fps,
-        "duration_ms": video.duration_ms,
-        "byte_count": len(video.video),
-    }
+    clip = {"first_step": 0, "step_count": len(recording), **video_columns(store, video)}
     columns = recording.observations.shape[1], recording.actions.shape[1]
     return _Ready(own.scenario, rollout, clip, len(recording), columns)
 
 
 def _save(
     session: Session,
-    manifest: Manifest,
+    manifest: ClipManifest,
     settings: StudySettings,
     ready: Sequence[_Ready],
     actor: str,

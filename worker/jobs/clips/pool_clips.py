@@ -7,6 +7,7 @@ from app.domain.studies import Study
 from worker.compute import simulation
 from worker.compute.pools import Lane
 from worker.jobs.clips import repairs
+from worker.jobs.clips.stored_video import video_columns
 from worker.jobs.runtime import records
 from worker.jobs.runtime.context import Step, WorkerContext
 from worker.jobs.runtime.records import Job
@@ -66,4 +67,4 @@ def _film_whole(context: WorkerContext, run_id: int, study_id: int, scenario: in
 
 
 def _columns(context: WorkerContext, clip: RenderedClip, steps: int) -> dict[str, Any]:
-    return {"first_step": 0, "step_count": steps, **repairs.stored(context, clip)}
+    return {"first_step": 0, "step_count": steps, **video_columns(context.store, clip)}

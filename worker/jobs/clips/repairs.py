@@ -21,9 +21,9 @@ from app.domain.studies import Participant, Study
 from app.errors import AppError
 from worker.compute import simulation
 from worker.compute.pools import Lane
+from worker.jobs.clips.stored_video import video_columns
 from worker.jobs.runtime.context import Step, WorkerContext
 from worker.jobs.runtime.records import Job
-from worker.sim.render.clip import RenderedClip
 from worker.trajectory import Trajectory
 
 
@@ -73,19 +73,6 @@ def make_again(context: WorkerContext, job: Job, run_id: int, step: Step) -> Non
     step(AGAIN, _film_again if job.kind == RunKind.FILMS else _clips_again, context, run_id, job.number)
 
 
-def stored(context: WorkerContext, clip: RenderedClip) -> dict[str, Any]:
-    """The columns of a clip or film that are about its video, once its files are stored."""
-    return {
-        "video_sha256": context.store.put(clip.video),
-        "poster_sha256": context.store.put(clip.poster),
-        "width": clip.width,
-        "height": clip.height,
-        "fps": clip.fps,
-        "duration_ms": clip.duration_ms,
-        "byte_count": len(clip.video),
-    }
-
-
 def _clips_again(context: WorkerContext, run_id: int, rollout_id: int) -> None:
     with context.database.reading() as session:
         rollout = session.get_one(Rollout, rollout_id)
@@ -107,7 +94,7 @@ def _clips_again(context: WorkerContext, run_id: int, rollout_id: int) -> None:
     shots = [(quality, trajectory, clip.first_step, clip.step_count) for clip in lost]
     filmed = context.compute.run_all(Lane.CLIPS, context.beat(run_id), simulation.film_again, shots)
     context.store.put(trajectory)
-    columns = [stored(context, each) for each in filmed]
+    columns = [video_columns(context.store, each) for each in filmed]
     success = Trajectory.load(io.BytesIO(trajectory)).success
     with context.database.writing() as session:
         again = session.get_one(Rollout, rollout_id)
@@ -126,7 +113,7 @@ def _film_again(context: WorkerContext, run_id: int, film_id: int) -> None:
     trajectory = context.store.read(film.trajectory_sha256)
     steps = len(Trajectory.load(io.BytesIO(trajectory)))
     filmed = context.compute.run(Lane.CLIPS, context.beat(run_id), simulation.film_again, quality, trajectory, 0, steps)
-    columns = stored(context, filmed)
+    columns = video_columns(context.store, filmed)
     with context.database.writing() as session:
         _change(session.get_one(Film, film_id), columns)
 

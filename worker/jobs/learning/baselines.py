@@ -22,12 +22,12 @@ from worker.compute import baseline_fitting, learning
 from worker.compute.baseline_fitting import Baseline
 from worker.compute.pools import Lane
 from worker.jobs.learning import dataset
-from worker.jobs.learning.filters import NothingToLearnFrom
+from worker.jobs.learning.filters import NothingToLearnFrom, reward_to_follow
 from worker.jobs.runtime import due_work, records
 from worker.jobs.runtime.context import Step, WorkerContext
 from worker.jobs.runtime.records import Job
 from worker.ml.policies.checkpoint import ask_to_pause, share_done
-from worker.ml.rewards.reward_models import load_reward_model
+from worker.ml.rewards.loading import load_reward_model
 from worker.scenarios import EVALUATION, first_of
 from worker.trajectory import Trajectory
 
@@ -64,11 +64,7 @@ def train_method(context: WorkerContext, job: Job, run_id: int, step: Step) -> N
 
 def _choose_reward(context: WorkerContext, run_id: int, job: Job) -> str:
     with context.database.writing() as session:
-        model = records.newest_model(session, job.participant, ModelKind.REWARD)
-        if model is None:
-            raise NothingToLearnFrom
-        records.set_labels(session, run_id, model.label_count, model.label_hash)
-        return model.artefact_sha256
+        return reward_to_follow(session, run_id, job).artefact_sha256
 
 
 def _train(context: WorkerContext, run_id: int, job: Job, method: str, reward: str) -> dict[str, object]:

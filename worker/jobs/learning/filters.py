@@ -2,7 +2,9 @@
 
 from collections.abc import Sequence
 
-from app.domain.models import ModelKind
+from sqlalchemy.orm import Session
+
+from app.domain.models import Model, ModelKind
 from app.domain.studies import Method, Participant, RewardKind, Study, StudySettings
 from app.errors import AppError
 from app.services.answers import accuracy
@@ -51,6 +53,15 @@ def _is_outdated(context: WorkerContext, job: Job, begun: bool) -> bool:
         return due_work.is_outdated(session, job, begun=begun)
 
 
+def reward_to_follow(session: Session, run_id: int, job: Job) -> Model:
+    """The participant's newest reward model; the run is now about the labels behind it. Raises NothingToLearnFrom."""
+    model = records.newest_model(session, job.participant, ModelKind.REWARD)
+    if model is None:
+        raise NothingToLearnFrom
+    records.set_labels(session, run_id, model.label_count, model.label_hash)
+    return model
+
+
 def _choose_reward(context: WorkerContext, run_id: int, job: Job) -> str:
     """The artefact of the reward model to follow: the newest. The printed method needs one on states and actions.
 
@@ -60,10 +71,7 @@ def _choose_reward(context: WorkerContext, run_id: int, job: Job) -> str:
     with context.database.writing() as session:
         study = session.get_one(Study, job.study_id)
         task, settings = study.task, study.settings
-        model = records.newest_model(session, job.participant, ModelKind.REWARD)
-        if model is None:
-            raise NothingToLearnFrom
-        records.set_labels(session, run_id, model.label_count, model.label_hash)
+        model = reward_to_follow(session, run_id, job)
         newest = records.newest_model(session, job.participant, ModelKind.FILTER)
         if newest is not None and newest.label_hash == model.label_hash:
             return ""

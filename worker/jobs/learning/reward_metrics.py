@@ -12,7 +12,8 @@ from worker.compute.simulation import surface_file
 from worker.jobs.learning import dataset
 from worker.jobs.runtime.context import WorkerContext
 from worker.ml.filters.response_surface import ResponseSurface
-from worker.ml.rewards.reward_models import RewardModel, StructuredReward, load_reward_model
+from worker.ml.rewards.loading import load_reward_model
+from worker.ml.rewards.reward_models import RewardModel, StructuredReward
 from worker.ml.rewards.segments import LEFT, SegmentPairs, Stretch
 from worker.ml.stopping import expected_regret
 from worker.tasks import registry

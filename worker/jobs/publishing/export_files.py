@@ -15,18 +15,19 @@ from sqlalchemy.orm import Session
 
 from app.db import now
 from app.domain.models import Export
-from app.domain.studies import Deviation, Participant, Study
+from app.domain.studies import Deviation, Study
 from app.paths import DOCS
 from app.services.archives import archive, archive_reading, sealing
 from app.services.evaluation import unblinding
 from app.services.exports import export_formats, export_requests, export_rows, export_tables
 from app.services.exports.csv_cells import json_text
-from app.services.exports.export_formats import Kind, Provenance, Table
+from app.services.exports.export_formats import ColumnKind, RowProvenance, Table
 from app.services.exports.export_requests import ExportKind
 from app.services.runs import reports
 from app.services.studies import preregistration
 from app.storage import ArtefactMissing
 from worker.jobs.publishing import preference_arrays
+from worker.jobs.runtime import records
 from worker.jobs.runtime.context import Step, WorkerContext
 from worker.jobs.runtime.records import Job
 
@@ -34,12 +35,12 @@ Missing = Mapping[str, Sequence[str]]
 """Hashes of stored files that could not be had, by what they are."""
 
 _ARROW = {
-    Kind.TEXT: pa.string(),
-    Kind.INTEGER: pa.int64(),
-    Kind.NUMBER: pa.float64(),
-    Kind.BOOLEAN: pa.bool_(),
-    Kind.TIME: pa.timestamp("ms", "UTC"),
-    Kind.JSON: pa.string(),
+    ColumnKind.TEXT: pa.string(),
+    ColumnKind.INTEGER: pa.int64(),
+    ColumnKind.NUMBER: pa.float64(),
+    ColumnKind.BOOLEAN: pa.bool_(),
+    ColumnKind.TIME: pa.timestamp("ms", "UTC"),
+    ColumnKind.JSON: pa.string(),
 }
 
 
@@ -66,7 +67,7 @@ def _made(context: WorkerContext, export_id: int, run_id: int) -> str | None:
     with context.database.reading() as session:
         export = session.get_one(Export, export_id)
         study_id, kind = export.study_id, ExportKind(export.kind)
-        gone = _gone(session, study_id)
+        gone = records.withdrawn_ids(session, study_id)
     with _workspace(context) as folder:
         path = folder / "export.zip"
         context.report(run_id, "writing the file", 0.1)
@@ -75,7 +76,7 @@ def _made(context: WorkerContext, export_id: int, run_id: int) -> str | None:
             missing = write(session, context, session.get_one(Study, study_id), path)
         byte_count, sha256 = path.stat().st_size, context.store.take(path)
     with context.database.writing() as session:
-        if _gone(session, study_id) != gone:
+        if records.withdrawn_ids(session, study_id) != gone:
             context.store.delete(sha256)
             return None
         export = session.get_one(Export, export_id)
@@ -100,11 +101,6 @@ def _workspace(context: WorkerContext) -> Iterator[Path]:
         yield Path(folder)
 
 
-def _gone(session: Session, study_id: int) -> Sequence[int]:
-    people = select(Participant.id).where(Participant.study_id == study_id, Participant.withdrawn_at.is_not(None))
-    return session.scalars(people.order_by(Participant.id)).all()
-
-
 def write_data(session: Session, context: WorkerContext, study: Study, path: Path) -> Missing:
     """Tables in three formats, their dictionary, the report with its figures, and preference pairs as arrays.
 
@@ -124,7 +120,9 @@ def write_data(session: Session, context: WorkerContext, study: Study, path: Pat
     return missing
 
 
-def _write_table(target: zipfile.ZipFile, session: Session, study: Study, table: Table, provenance: Provenance) -> None:
+def _write_table(
+    target: zipfile.ZipFile, session: Session, study: Study, table: Table, provenance: RowProvenance
+) -> None:
     for kind, write in (("csv", export_formats.csv_lines), ("jsonl", export_formats.json_lines)):
         with target.open(f"{kind}/{table.name}.{kind}", "w") as stream:
             for line in write(table, session, study, provenance):
@@ -133,7 +131,7 @@ def _write_table(target: zipfile.ZipFile, session: Session, study: Study, table:
         parquet.write_table(arrow_table(table, session, study, provenance), stream)
 
 
-def arrow_table(table: Table, session: Session, study: Study, provenance: Provenance) -> pa.Table:
+def arrow_table(table: Table, session: Session, study: Study, provenance: RowProvenance) -> pa.Table:
     """The table with typed columns; json columns are text, and meanings are kept with the columns."""
     columns = table.all_columns
     rows = [(*values, *provenance.values) for values in table.rows(session, study)]
@@ -148,8 +146,8 @@ def arrow_table(table: Table, session: Session, study: Study, provenance: Proven
     return pa.Table.from_arrays(arrays, schema=pa.schema(fields))
 
 
-def _arrow_value(kind: Kind, value: Any) -> Any:
-    return json_text(value) if kind is Kind.JSON and value is not None else value
+def _arrow_value(kind: ColumnKind, value: Any) -> Any:
+    return json_text(value) if kind is ColumnKind.JSON and value is not None else value
 
 
 def _write_report(
@@ -185,7 +183,7 @@ def _write_pairs(
     return written
 
 
-def _provenance(session: Session, study: Study, provenance: Provenance) -> dict[str, Any]:
+def _provenance(session: Session, study: Study, provenance: RowProvenance) -> dict[str, Any]:
     """Everything that says what this study was and what these files are."""
     deviations = session.scalars(select(Deviation).where(Deviation.study_id == study.id).order_by(Deviation.id))
     return {
@@ -213,7 +211,7 @@ def _provenance(session: Session, study: Study, provenance: Provenance) -> dict[
 
 
 def _readme(
-    study: Study, provenance: Provenance, about: dict[str, Any], pictures: Sequence[str], people: Sequence[str]
+    study: Study, provenance: RowProvenance, about: dict[str, Any], pictures: Sequence[str], people: Sequence[str]
 ) -> str:
     listed = [f"* {each['at']}, {each['actor']}: {' '.join(each['reason'].split())}" for each in about["deviations"]]
     lost = [f"* {what}: {', '.join(hashes)}" for what, hashes in about["missing"].items()]

@@ -5,7 +5,7 @@ participant. Old reports go when a new one is there.
 """
 
 import hashlib
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from datetime import datetime, timedelta
 from typing import Any
 
@@ -26,6 +26,7 @@ from app.services.runs.reports import VERSION
 from app.services.studies import preregistration
 from worker.analysis.report import Tables, make_report
 from worker.compute.pools import Lane
+from worker.jobs.runtime import records
 from worker.jobs.runtime.context import Step, WorkerContext
 from worker.jobs.runtime.records import Job
 
@@ -87,7 +88,7 @@ def make(context: WorkerContext, job: Job, run_id: int, step: Step) -> None:
 def _make(context: WorkerContext, study_id: int, run_id: int) -> list[str]:
     with context.database.reading() as session:
         study = session.get_one(Study, study_id)
-        basis, gone = basis_of(session, study), _gone(session, study_id)
+        basis, gone = basis_of(session, study), records.withdrawn_ids(session, study_id)
         tables = tables_of(session, study)
     if basis is None:
         return []
@@ -96,7 +97,9 @@ def _make(context: WorkerContext, study_id: int, run_id: int) -> list[str]:
     figures = {name: {kind: context.store.put(file) for kind, file in each.items()} for name, each in files.items()}
     stored = [sha256 for each in figures.values() for sha256 in each.values()]
     with context.database.writing() as session:
-        if _gone(session, study_id) == gone:  # else somebody has withdrawn meanwhile, and is in these numbers
+        if (
+            records.withdrawn_ids(session, study_id) == gone
+        ):  # else somebody has withdrawn meanwhile, and is in these numbers
             _save(context, session, run_id, Report(basis=basis, contents=contents, figures=figures))
         for sha256 in set(stored) - withdrawal.in_use(session, stored):
             context.store.delete(sha256)
@@ -130,11 +133,6 @@ def _plan(session: Session, study: Study) -> dict[str, Any]:
     return {"standing": plan.standing.value, "planned": list(plan.planned), "in_words": plan.in_words}
 
 
-def _gone(session: Session, study_id: int) -> Collection[int]:
-    people = select(Participant.id).where(Participant.study_id == study_id, Participant.withdrawn_at.is_not(None))
-    return set(session.scalars(people))
-
-
 def _save(context: WorkerContext, session: Session, run_id: int, report: Report) -> None:
     """Keep the report; older ones, their runs and their pictures go. Doing it twice changes nothing."""
     if session.scalar(select(Report.id).where(Report.run_id == run_id)) is not None:
@@ -149,9 +147,3 @@ def _save(context: WorkerContext, session: Session, run_id: int, report: Report)
     session.flush()
     for sha256 in pictures - withdrawal.in_use(session, pictures):
         context.store.delete(sha256)
-
-
-def newest(session: Session, study_id: int) -> dict[str, Any] | None:
-    """The figures of the study's report, by name; None without one."""
-    report = session.scalar(select(Report).where(Report.study_id == study_id).order_by(Report.id.desc()).limit(1))
-    return None if report is None else dict(report.figures)

@@ -343,6 +343,12 @@ def models_of_others(
     return enough[-most:]
 
 
+def withdrawn_ids(session: Session, study_id: int) -> Collection[int]:
+    """Who has withdrawn from the study."""
+    people = select(Participant.id).where(Participant.study_id == study_id, Participant.withdrawn_at.is_not(None))
+    return set(session.scalars(people))
+
+
 def sign_presence(session: Session, name: str, moment: datetime) -> None:
     """Say that this worker lives."""
     presence = session.get(WorkerPresence, name)

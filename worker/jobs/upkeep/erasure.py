@@ -32,7 +32,7 @@ _SHA256 = re.compile(r"\b[0-9a-f]{64}\b")
 
 
 @dataclass(frozen=True)
-class Progress:
+class ErasureProgress:
     """What one attempt at erasing came to."""
 
     finished: bool
@@ -58,7 +58,7 @@ def erase_traces(
     in_hand: Collection[str],
     stored: MutableMapping[str, set[str]],
     engine_file: Path | None,
-) -> Progress:
+) -> ErasureProgress:
     """Erase what the worker knows of somebody who has withdrawn; asked again until it says that it has finished.
 
     ``in_hand``: keys of runs this process works on; ``stored``: artefacts that unfinished work has put away, by key.
@@ -86,7 +86,7 @@ def erase_traces_of_study(
     in_hand: Collection[str],
     stored: MutableMapping[str, set[str]],
     engine_file: Path | None,
-) -> Progress:
+) -> ErasureProgress:
     """The same for a study that was deleted, and for everybody in it at once."""
 
     def concerns(job: Job) -> bool:
@@ -105,7 +105,7 @@ def erase_traces_of_study(
 
 Erase = Callable[
     [WorkerContext, int, Collection[str], MutableMapping[str, set[str]], Path | None],
-    Progress,
+    ErasureProgress,
 ]
 
 
@@ -117,13 +117,13 @@ def _erase(
     in_hand: Collection[str],
     stored: MutableMapping[str, set[str]],
     engine_file: Path | None,
-) -> Progress:
+) -> ErasureProgress:
     jobs = dict(_workflows(concerns))
     active = [name for name, (_, status) in jobs.items() if status in _ACTIVE]
     if active:
         DBOS.cancel_workflows(active)  # and look again: one of them may just be beginning
     if active or any(job.key in in_hand for job, _ in jobs.values()):
-        return Progress(finished=False)
+        return ErasureProgress(finished=False)
     left_over = {sha256 for name in jobs for sha256 in _artefacts_of_steps(name)}
     for job, _ in jobs.values():
         left_over |= stored.pop(job.key, set())
@@ -133,7 +133,9 @@ def _erase(
             context.store.delete(sha256)
     DBOS.delete_workflows(list(jobs))
     if not context.database.forget_erased() or (engine_file is not None and not rewrite(engine_file)):
-        return Progress(finished=False, forgotten=frozenset(jobs))  # somebody is reading; the next round tries again
+        return ErasureProgress(
+            finished=False, forgotten=frozenset(jobs)
+        )  # somebody is reading; the next round tries again
     if engine_file is not None:
         engine.forget_set_aside(engine_file)
     database_file = file_of(context.database.url)
@@ -141,7 +143,7 @@ def _erase(
         upgrading.forget_copies(database_file)
     with context.database.writing() as session:
         finish(session)
-    return Progress(finished=True, forgotten=frozenset(jobs))
+    return ErasureProgress(finished=True, forgotten=frozenset(jobs))
 
 
 def drafts() -> set[str]:

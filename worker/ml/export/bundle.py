@@ -44,7 +44,7 @@ class BundleDamaged(ValueError):
 
 
 @dataclass(frozen=True)
-class Recording:
+class RecordedSteps:
     """Inputs of the filter during N control steps, for checking it elsewhere."""
 
     observations: Array
@@ -87,7 +87,7 @@ class BundleContents:
     weights: FilterWeights
     reward: RewardModel
     policy: GaussianPolicy
-    recording: Recording
+    recording: RecordedSteps
     metrics: Mapping[str, Any]
     """Model.metrics of the filter; evaluation, notes and the reward model's weights are published"""
     provenance: Provenance

@@ -29,7 +29,7 @@ from worker.task import Task
 from worker.trajectory import Trajectory
 
 Array = npt.NDArray[np.float32]
-Progress = Callable[[str, float], None]
+ReportProgress = Callable[[str, float], None]
 """What is being done in human words, and the share of the whole fit that is done."""
 
 
@@ -115,7 +115,7 @@ class FilterProblem:
 
 
 @dataclass(frozen=True)
-class Trial:
+class GateTrial:
     """One setting tried on the gate's scenarios."""
 
     gate: float
@@ -135,7 +135,7 @@ class FilterDraft:
     weights: FilterWeights
     value: Mapping[str, Array] = field(default_factory=dict)
     """state of the action value, so that a later round goes on from it"""
-    trials: tuple[Trial, ...] = ()
+    trials: tuple[GateTrial, ...] = ()
     """in their order, except that the chosen mode's comes after the other modes'"""
     notes: tuple[str, ...] = ()
     seconds: Mapping[str, float] = field(default_factory=dict)

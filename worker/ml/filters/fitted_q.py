@@ -22,7 +22,7 @@ DISCOUNT = 0.97
 POLYAK = 0.01
 BATCH = 192
 
-Actor = Callable[[Tensor], Tensor]
+DeterministicActor = Callable[[Tensor], Tensor]
 """observations (B, D) -> the deterministic actions of the filter being evaluated (B, 7)"""
 
 
@@ -92,7 +92,7 @@ def evaluate_filter(
     target: ActionValue,
     data: Transitions,
     newest: int,
-    actor: Actor,
+    actor: DeterministicActor,
     steps: int,
     generator: torch.Generator,
 ) -> float:

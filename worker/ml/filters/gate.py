@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from worker.ml.filters.filter_problem import Act, Collect, FilterProblem, Trial
+from worker.ml.filters.filter_problem import Act, Collect, FilterProblem, GateTrial
 from worker.trajectory import Trajectory
 
 Floats = npt.NDArray[np.float64]
@@ -18,14 +18,14 @@ def try_on(
     residual_share: float,
     reference: Sequence[Trajectory],
     collect: Collect,
-) -> tuple[Trial, Sequence[Trajectory]]:
+) -> tuple[GateTrial, Sequence[Trajectory]]:
     """What came of it in the scenarios of ``reference``, and the rollouts."""
     scenarios = [each.scenario for each in reference]
     filtered = collect(act, scenarios, 0.0, problem.seed)
     before, after = problem.reward.returns(reference), problem.reward.returns(filtered)
     unit = max(float(before.std()), 1e-9)
     success = float((successes(filtered) - successes(reference)).mean())
-    trial = Trial(gate, residual_share, float((after - before).mean()) / unit, success, _p95_force_n(filtered))
+    trial = GateTrial(gate, residual_share, float((after - before).mean()) / unit, success, _p95_force_n(filtered))
     return trial, filtered
 
 
@@ -42,7 +42,7 @@ def successes(trajectories: Sequence[Trajectory]) -> Floats:
     return np.array([float(each.success) for each in trajectories])
 
 
-def acceptable(problem: FilterProblem, trial: Trial, reference: Sequence[Trajectory]) -> bool:
+def acceptable(problem: FilterProblem, trial: GateTrial, reference: Sequence[Trajectory]) -> bool:
     """Whether it raises the learned return and keeps the task and the forces within the tolerances."""
     config = problem.config
     gentle = trial.p95_force_n <= max(config.force_limit_n, _p95_force_n(reference))

@@ -8,7 +8,15 @@ import numpy as np
 import numpy.typing as npt
 
 from worker.ml.filters.filter_module import FilterWeights
-from worker.ml.filters.filter_problem import Collect, FilterAct, FilterDraft, FilterProblem, Progress, Trial, act_of
+from worker.ml.filters.filter_problem import (
+    Collect,
+    FilterAct,
+    FilterDraft,
+    FilterProblem,
+    GateTrial,
+    ReportProgress,
+    act_of,
+)
 from worker.ml.filters.gate import acceptable, signal_changes, successes, try_on
 from worker.ml.filters.response_surface import CAUTION, ResponseSurface, best_mode
 from worker.trajectory import Trajectory
@@ -22,7 +30,7 @@ def find_mode(
     pool: Sequence[Trajectory],
     reference: Sequence[Trajectory],
     collect: Collect,
-    progress: Progress = lambda stage, share: None,
+    progress: ReportProgress = lambda stage, share: None,
 ) -> FilterDraft:
     """The mode with the best learned return of those tried that keep the task and its forces.
 
@@ -34,8 +42,8 @@ def find_mode(
     """
     started = time.perf_counter()
     wishes = problem.reward.signal_weights(pool)
-    tried: list[tuple[Trial, Floats]] = []
-    accepted: list[tuple[Trial, Floats]] = []
+    tried: list[tuple[GateTrial, Floats]] = []
+    accepted: list[tuple[GateTrial, Floats]] = []
     for attempt in range(problem.config.mode_attempts):
         if len(accepted) == problem.config.modes_to_choose_from:
             break
@@ -74,5 +82,5 @@ def _act_in(problem: FilterProblem, mode: Floats) -> FilterAct:
     return act_of(problem.task.modes, problem.policy, FilterWeights(mode=problem.task.modes.named(mode)))
 
 
-def _without_mode(note: str, trials: Sequence[Trial], started: float) -> FilterDraft:
+def _without_mode(note: str, trials: Sequence[GateTrial], started: float) -> FilterDraft:
     return FilterDraft(FilterWeights(), trials=tuple(trials), notes=(note,)).timed("mode", started)

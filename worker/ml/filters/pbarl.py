@@ -5,7 +5,7 @@ Every stage takes a draft and returns a better one.
 
 from collections.abc import Sequence
 
-from worker.ml.filters.filter_problem import Collect, FilterDraft, FilterProblem, Progress
+from worker.ml.filters.filter_problem import Collect, FilterDraft, FilterProblem, ReportProgress
 from worker.ml.filters.mode_search import find_mode
 from worker.ml.filters.residual import gate_residual, train_residual
 from worker.ml.filters.response_surface import ResponseSurface
@@ -18,7 +18,7 @@ def fit_studio(
     pool: Sequence[Trajectory],
     reference: Sequence[Trajectory],
     collect: Collect,
-    progress: Progress = lambda stage, share: None,
+    progress: ReportProgress = lambda stage, share: None,
 ) -> FilterDraft:
     """All stages in a row. ``reference``: rollouts of the reference policy on the problem's gate scenarios."""
     draft = find_mode(problem, surface, pool, reference, collect, progress)

@@ -18,7 +18,7 @@ from worker.ml.policies.gaussian import GaussianPolicy
 from worker.ml.policies.torch_module import FrozenPolicy
 from worker.ml.rewards.action_ranking import Ranker, RankerAt
 
-Progress = Callable[[float], None]
+ReportShare = Callable[[float], None]
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ def train(
     data: Transitions,
     config: PrintedConfig,
     seed: int,
-    progress: Progress = lambda share: None,
+    progress: ReportShare = lambda share: None,
 ) -> tuple[PrintedEncoder, dict[str, float]]:
     """Minimise Eq. (8), the weighted sum of the four losses, on transitions of the frozen policy.
 

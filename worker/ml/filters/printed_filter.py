@@ -4,7 +4,7 @@ import time
 from collections.abc import Sequence
 
 from worker.ml.filters.filter_module import FilterWeights, state_of
-from worker.ml.filters.filter_problem import FilterDraft, FilterProblem, Progress
+from worker.ml.filters.filter_problem import FilterDraft, FilterProblem, ReportProgress
 from worker.ml.filters.fitted_q import Transitions
 from worker.ml.filters.pbarl_printed import PrintedConfig, train
 from worker.ml.rewards.action_ranking import ranker_at
@@ -15,7 +15,7 @@ def fit_printed(
     problem: FilterProblem,
     reference: Sequence[Trajectory],
     config: PrintedConfig | None = None,
-    progress: Progress = lambda stage, share: None,
+    progress: ReportProgress = lambda stage, share: None,
 ) -> FilterDraft:
     """Train the printed method on the transitions of reference rollouts. Its gate is 1: the paper has none.
 

@@ -19,8 +19,8 @@ from worker.ml.filters.filter_problem import (
     FilterConfig,
     FilterDraft,
     FilterProblem,
-    Progress,
-    Trial,
+    GateTrial,
+    ReportProgress,
     act_of,
 )
 from worker.ml.filters.fitted_q import ActionValue, Transitions, evaluate_filter, spread_within_states
@@ -37,7 +37,7 @@ def train_residual(
     problem: FilterProblem,
     draft: FilterDraft,
     collect: Collect,
-    progress: Progress = lambda stage, share: None,
+    progress: ReportProgress = lambda stage, share: None,
     learn: Learn | None = None,
 ) -> FilterDraft:
     """Rounds of: roll out the current filter with noise, learn its value, move its actions up that value.
@@ -108,7 +108,7 @@ def gate_residual(
     draft: FilterDraft,
     reference: Sequence[Trajectory],
     collect: Collect,
-    progress: Progress = lambda stage, share: None,
+    progress: ReportProgress = lambda stage, share: None,
 ) -> FilterDraft:
     """Keep the largest share of the residual that keeps the task and is better than the mode alone; possibly none."""
     if not draft.weights.encoder:
@@ -116,7 +116,7 @@ def gate_residual(
     started = time.perf_counter()
     without = [trial for trial in draft.trials[-1:] if acceptable(problem, trial, reference)]
     to_beat = without[0].preference if without else 0.0
-    kept, trials = 0.0, list[Trial]()
+    kept, trials = 0.0, list[GateTrial]()
     for share in problem.config.residual_shares:
         progress(f"checking {share:.0%} of the residual on held-out scenarios", 0.75 + 0.1 * len(trials))
         weights = draft.weights.changed(residual_share=share)

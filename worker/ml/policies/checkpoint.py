@@ -5,8 +5,9 @@ whoever waits for it in another process. When the folder is gone, nobody wants t
 """
 
 import json
-import os
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,8 @@ from typing import Any
 from safetensors import safe_open
 from safetensors.torch import save_file
 from torch import Tensor
+
+from worker.whole_files import written_whole
 
 STATE_FILE, NOTE_FILE, PAUSE_FILE = "state.safetensors", "share", "pause"
 EVERY_S = 45.0
@@ -47,7 +50,8 @@ class Checkpoint:
             raise Abandoned(" ".join((Abandoned.__doc__ or "").split()))
         self._noted_at = time.monotonic()
         self.pause_is_asked = (self.folder / PAUSE_FILE).exists()
-        self._replace(NOTE_FILE, lambda path: path.write_text(f"{share:.4f}"))
+        with self._writing(NOTE_FILE) as draft:
+            draft.write_text(f"{share:.4f}")
 
     @property
     def is_due(self) -> bool:
@@ -57,7 +61,8 @@ class Checkpoint:
     def write(self, tensors: dict[str, Tensor], counts: dict[str, Any]) -> None:
         """Keep everything a restart needs: arrays, and plain values that JSON can hold."""
         whole = {name: tensor.contiguous() for name, tensor in tensors.items()}
-        self._replace(STATE_FILE, lambda path: save_file(whole, path, metadata={"counts": json.dumps(counts)}))
+        with self._writing(STATE_FILE) as draft:
+            save_file(whole, draft, metadata={"counts": json.dumps(counts)})
         self._written_at = time.monotonic()
 
     def read(self) -> tuple[dict[str, Tensor], dict[str, Any]] | None:
@@ -70,13 +75,13 @@ class Checkpoint:
             counts: dict[str, Any] = json.loads(stored.metadata()["counts"])
         return tensors, counts
 
-    def _replace(self, name: str, write: Any) -> None:
-        temporary = self.folder / f".{name}.{os.getpid()}"
+    @contextmanager
+    def _writing(self, name: str) -> Iterator[Path]:
         try:
-            write(temporary)
+            with written_whole(self.folder / name) as draft:
+                yield draft
         except FileNotFoundError as error:
             raise Abandoned(" ".join((Abandoned.__doc__ or "").split())) from error
-        temporary.replace(self.folder / name)
 
 
 def ask_to_pause(folder: Path) -> None:

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from safetensors.numpy import load_file, save_file
 
 if TYPE_CHECKING:
-    from torch import nn
+    pass
 
 Array = npt.NDArray[np.float32]
 
@@ -84,12 +84,6 @@ class GaussianPolicy:
         noise = rng.standard_normal(centre.shape, np.float32)
         action: Array = self._limit * np.tanh(centre + np.float32(temperature) * np.exp(self._log_std(raw)) * noise)
         return action
-
-    def as_module(self) -> "nn.Module":
-        """The same policy as a frozen torch module: observations -> (action after the tanh, log_std before)."""
-        from worker.ml.policies.torch_module import FrozenPolicy
-
-        return FrozenPolicy(self.weights)
 
     def _log_std(self, raw: Array) -> Array:
         share = 0.5 * (np.tanh(raw[..., self.action_size :]) + 1)

@@ -6,7 +6,6 @@ is written atomically, so that a killed training resumes. Single-threaded: a lap
 
 import json
 import math
-import os
 import platform
 import time
 from collections.abc import Callable
@@ -20,13 +19,15 @@ import torch
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from worker.ml.policies.demonstrations import Demonstrate, Demonstrations, collect, imitate
+from worker.ml.policies.demonstrations import Demonstrations
 from worker.ml.policies.gaussian import GaussianPolicy
+from worker.ml.policies.imitation import Demonstrate, collect, imitate
 from worker.ml.policies.sac import Actor, Array, Env, Learner, Replay, SacConfig
 from worker.scenarios import POLICY_SELECTION, POLICY_TEST, POLICY_TRAINING
 from worker.spaces import Field
+from worker.whole_files import written_whole
 
-Progress = Callable[[int, dict[str, float]], None]
+TrainingProgress = Callable[[int, dict[str, float]], None]
 """Called with the number of environment steps done so far and the newest figures."""
 
 INPUT_SCALE = {"m": 3.0, "rad": 1.0, "1": 1.0, "N": 0.1}
@@ -38,7 +39,7 @@ def pretrain(
     make_env: Callable[[], Env],
     config: SacConfig,
     checkpoint_dir: Path,
-    progress: Progress | None = None,
+    progress: TrainingProgress | None = None,
     command: str = "",
     demonstrate: Demonstrate | None = None,
 ) -> dict[str, Any]:
@@ -139,7 +140,8 @@ class _Run:
         self._keep_early(policy, outcome["success"])
         if (outcome["success"], outcome["return"]) > self.best:
             self.best = (outcome["success"], outcome["return"])
-            _replace(self.folder / "policy.safetensors", policy.save)
+            with written_whole(self.folder / "policy.safetensors") as draft:
+                policy.save(draft)
         return outcome
 
     def _keep_early(self, policy: GaussianPolicy, success: float) -> None:
@@ -147,7 +149,8 @@ class _Run:
             early = self.folder / "early" / f"success_{round(100 * share)}.safetensors"
             if share <= success < share + 0.3 and not early.exists():
                 early.parent.mkdir(exist_ok=True)
-                _replace(early, policy.save)
+                with written_whole(early) as draft:
+                    policy.save(draft)
                 break
 
     def _watch_imitation(self, actor: Actor) -> None:
@@ -169,14 +172,13 @@ class _Run:
             "cpu_s": round(self.cpu_s, 1),
             "versions": _versions(),
             "curve": self.curve,
-            "test_scenarios": [POLICY_TEST.start, POLICY_TEST[count - 1]],
-            "test_mean_action": evaluate(self.test_env, policy.mean, POLICY_TEST.start, count),
-            "test_sampled_action": evaluate(
-                self.test_env, lambda state: policy.sample(state, rng), POLICY_TEST.start, count
-            ),
+            "test_scenarios": [first, first + count - 1],
+            "test_mean_action": evaluate(self.test_env, policy.mean, first, count),
+            "test_sampled_action": evaluate(self.test_env, lambda state: policy.sample(state, rng), first, count),
         }
         text = json.dumps(record, indent=2) + "\n"
-        _replace(self.folder / "training.json", lambda path: path.write_text(text))
+        with written_whole(self.folder / "training.json") as draft:
+            draft.write_text(text)
         for env in (*self.envs, self.test_env):
             env.close()
         return record
@@ -189,8 +191,10 @@ class _Run:
         resume = self.folder / "resume"
         tensors = {**self.learner.state(), "torch_rng": torch.get_rng_state()}
         rows = self.replay.rows[: self.replay.count].numpy()
-        _replace(resume / REPLAY_FILE, lambda path: _write_rows(path, rows))
-        _replace(resume / STATE_FILE, lambda path: save_file(tensors, path))
+        with written_whole(resume / REPLAY_FILE) as draft:
+            np.save(draft, rows, allow_pickle=False)
+        with written_whole(resume / STATE_FILE) as draft:
+            save_file(tensors, draft)
         counts = {
             "steps": self.steps,
             "updates": self.learner.updates,
@@ -199,7 +203,8 @@ class _Run:
             "curve": self.curve,
             "rng": self.rng.bit_generator.state,
         }
-        _replace(resume / PROGRESS_FILE, lambda path: path.write_text(json.dumps(counts)))
+        with written_whole(resume / PROGRESS_FILE) as draft:
+            draft.write_text(json.dumps(counts))
 
     def resume(self) -> None:
         """Continue a killed training; the episodes that were in flight start anew."""
@@ -272,20 +277,6 @@ def evaluate(env: Env, act: Callable[[Array], Array], first_scenario: int, episo
         "max_force_n": float(np.mean(forces)),
         "max_force_n_95": float(np.percentile(forces, 95)),
     }
-
-
-def _replace(path: Path, write: Callable[[Path], Any]) -> None:
-    """Write to a neighbour and rename, so that a reader or a restart never sees half a file."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    write(temporary)
-    with temporary.open("rb") as handle:
-        os.fsync(handle.fileno())
-    temporary.replace(path)
-
-
-def _write_rows(path: Path, rows: Array) -> None:
-    with path.open("wb") as handle:
-        np.save(handle, rows, allow_pickle=False)
 
 
 def _versions() -> dict[str, str]:

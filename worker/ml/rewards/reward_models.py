@@ -16,7 +16,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 import numpy.typing as npt
-from safetensors.numpy import load, save
+from safetensors.numpy import save
 
 from worker.ml import dense_network
 from worker.ml.rewards.bradley_terry import preference_logits, probability_right
@@ -289,24 +289,6 @@ class MlpReward(RewardModel):
     def size(self) -> int:
         """See RewardModel."""
         return len(self.layers[0][0])
-
-
-def load_reward_model(stored: bytes) -> RewardModel:
-    """Read what to_bytes() wrote. Raises ValueError for a file that is something else."""
-    from worker.ml.rewards.predicted_reward import PredictedReward  # built on this module, as is the next
-    from worker.ml.rewards.preference_transformer import PreferenceTransformer
-
-    config = stored_config(stored)
-    kinds: tuple[type[RewardModel], ...] = (StructuredReward, PredictedReward, MlpReward, PreferenceTransformer)
-    for kind in kinds:
-        if config.get("kind") == kind.kind:
-            return replace(
-                kind.from_tensors(load(stored), config),
-                normalisation=Normalisation(float(config["offset"]), float(config["scale"])),
-                temperature=float(config.get("temperature", 1.0)),
-                undone_column=config.get("undone_column"),
-            )
-    raise ValueError(f"Not a reward model: {config!r}.")
 
 
 def stored_config(stored: bytes) -> dict[str, Any]:

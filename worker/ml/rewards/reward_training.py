@@ -21,7 +21,7 @@ from worker.ml.rewards.signal_predictor import SignalPredictor
 from worker.trajectory import SIGNALS, Trajectory
 
 Floats = npt.NDArray[np.float64]
-Kind = Literal["structured", "predicted", "mlp", "preference_transformer"]
+RewardKind = Literal["structured", "predicted", "mlp", "preference_transformer"]
 
 MEMBERS = 8
 LARGEST_GRADIENT = 1e-6
@@ -79,7 +79,7 @@ def _usual(means: Floats) -> tuple[Floats, Floats]:
 def fit(
     pairs: SegmentPairs,
     targets: npt.ArrayLike,
-    kind: Kind,
+    kind: RewardKind,
     seed: int,
     *,
     scale: SignalScale | None = None,
