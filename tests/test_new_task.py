@@ -247,9 +247,9 @@ def test_two_packages_cannot_bring_a_task_of_one_name(
     info = tmp_path / "copycat-1.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Name: copycat\nVersion: 1\n")
-    (info / "entry_points.txt").write_text(
-        "[pbarl_studio.tasks]\nfeeding = napkin_task\nnowhere = not.there\nother = napkin_task\nLarge = napkin_task\nobject = napkin_task:TASK\n"
-    )
+    declared = {"feeding": "napkin_task", "nowhere": "not.there", "other": "napkin_task", "Large": "napkin_task"}
+    lines = [f"{name} = {package}" for name, package in (declared | {"object": "napkin_task:TASK"}).items()]
+    (info / "entry_points.txt").write_text("\n".join(["[pbarl_studio.tasks]", *lines]))
     monkeypatch.syspath_prepend(tmp_path)
     forget()
     why = {each.name: each.why for each in catalogue.installed().broken}
