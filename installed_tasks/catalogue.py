@@ -20,7 +20,9 @@ from installed_tasks.description import InstalledTask, TaskRefused, read
 
 GROUP = "pbarl_studio.tasks"
 PROJECT = Path(__file__).resolve().parents[1] / "pyproject.toml"
-_NAME = r"[a-z][a-z0-9_]{0,39}"
+_NAME, _PACKAGE = r"[a-z][a-z0-9_]{0,39}", r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*"
+_RESERVED = {"other", "own_clips"}
+"""What is said of tasks that are not installed goes by one of these, studies of imported clips by the other."""
 
 
 class Declared(NamedTuple):
@@ -90,7 +92,11 @@ def _declared() -> Iterator[Declared]:
 
 def _read(declared: Declared) -> InstalledTask:
     if not re.fullmatch(_NAME, declared.name):
-        raise TaskRefused("Its name must be at most 40 small letters, digits and underscores.")
+        raise TaskRefused("Its name must be at most 40 small letters, digits and underscores, and begin with a letter.")
+    if declared.name in _RESERVED:
+        raise TaskRefused("This name is not free.")
+    if not re.fullmatch(_PACKAGE, declared.package):
+        raise TaskRefused(f"Its entry point must name a package, and is {declared.package!r}.")
     return read(declared.name, declared.package, folder_of(declared.package))
 
 

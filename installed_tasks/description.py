@@ -15,9 +15,8 @@ SHORTEST_CLIP_STEPS, LONGEST_CLIP_STEPS = 20, 600
 """Control steps of 0.1 s."""
 PICTURE_FRAME = "0 0 240 150"
 _SHAPES = {"g", "path", "circle", "ellipse", "rect", "line", "polyline", "polygon"}
-_GEOMETRY = {*("class", "d", "points", "transform", "width", "height"), *("cx", "cy", "r", "rx", "ry", "x", "y")} | {
-    *("x1", "y1", "x2", "y2")
-}
+_PLACES = {"cx", "cy", "x", "y", "x1", "y1", "x2", "y2"}
+_ATTRIBUTES = {"class", "d", "points", "transform", "width", "height", "r", "rx", "ry"} | _PLACES
 
 
 def _flowing(text: str) -> str:
@@ -25,6 +24,12 @@ def _flowing(text: str) -> str:
     if "{" in text or "}" in text:
         raise ValueError("must not have braces, which mean a variable in the texts of pages")
     return "\n\n".join(" ".join(paragraph.split()) for paragraph in re.split(r"\n\s*\n", text.strip()))
+
+
+def _code(language: str) -> str:
+    if not re.fullmatch("[a-z]{2,3}", language):
+        raise ValueError("must be the code of a language, such as en")
+    return language
 
 
 _EXPLAINED = {
@@ -35,6 +40,7 @@ _EXPLAINED = {
 
 _Word = Annotated[str, Field(min_length=1, max_length=200)]
 _Text = Annotated[str, Field(min_length=1, max_length=4000), AfterValidator(_flowing)]
+_Language = Annotated[str, AfterValidator(_code)]
 _Reference = Annotated[str, Field(pattern=r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*$")]
 """An object of the task's package: ``module:name``."""
 
@@ -80,7 +86,7 @@ class TaskDescription(BaseModel):
     training: dict[str, Any] = {}
     """What the reference policy's training does otherwise than worker.ml.policies.sac.SacConfig."""
     words: Words
-    instructions: dict[str, _Text]
+    instructions: dict[_Language, _Text]
     """What participants read of the task, by language; an empty line makes a paragraph."""
 
     @model_validator(mode="after")
@@ -143,7 +149,7 @@ def _picture(file: Path) -> str:
         raise TaskRefused(f'{file}: its viewBox must be "{PICTURE_FRAME}", the person sits on the left of it.')
     for element in drawing.iter():
         element.tag = element.tag.rpartition("}")[2]
-        unknown = [element.tag] if element.tag not in _SHAPES else sorted(set(element.keys()) - _GEOMETRY)
+        unknown = [element.tag] if element.tag not in _SHAPES else sorted(set(element.keys()) - _ATTRIBUTES)
         if element is not drawing and unknown:
             raise TaskRefused(f"{file}: a picture has no {unknown[0]}; use {', '.join(sorted(_SHAPES))} and classes.")
     return "".join(ElementTree.tostring(shape, encoding="unicode") for shape in drawing)

@@ -176,6 +176,7 @@ def test_the_web_server_reads_it_without_importing_it_or_what_it_needs(installed
         ("task.toml", 'summary = "', "summary = ", "task.toml is not valid TOML: "),
         ("task.toml", "press = ", 'press = "{', "task.toml is not valid TOML: "),
         ("task.toml", "Imagine that", "Imagine {that}", "task.toml: instructions.en must not have braces"),
+        ("task.toml", "en = ", "english = ", "task.toml: instructions.english.[key] must be the code of a language"),
         ("picture.svg", 'viewBox="0 0 240 150"', "", 'picture.svg: its viewBox must be "0 0 240 150"'),
         ("picture.svg", "<circle", "<script", "picture.svg: a picture has no script; use circle"),
         ("picture.svg", "<circle ", '<circle onclick="x" ', "picture.svg: a picture has no onclick; use circle"),
@@ -246,10 +247,15 @@ def test_two_packages_cannot_bring_a_task_of_one_name(
     info = tmp_path / "copycat-1.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Name: copycat\nVersion: 1\n")
-    (info / "entry_points.txt").write_text("[pbarl_studio.tasks]\nfeeding = napkin_task\nnowhere = not.there\n")
+    declared = {"feeding": "napkin_task", "nowhere": "not.there", "other": "napkin_task", "Large": "napkin_task"}
+    lines = [f"{name} = {package}" for name, package in (declared | {"object": "napkin_task:TASK"}).items()]
+    (info / "entry_points.txt").write_text("\n".join(["[pbarl_studio.tasks]", *lines]))
     monkeypatch.syspath_prepend(tmp_path)
     forget()
     why = {each.name: each.why for each in catalogue.installed().broken}
     assert "worker.tasks.feeding is a task of the same name. Correct it or uninstall copycat" in why["feeding"]
     assert "There is no package not with an __init__.py; its entry point is 'not.there'." in why["nowhere"]
+    assert "This name is not free." in why["other"]
+    assert "at most 40 small letters" in why["Large"]
+    assert "must name a package, and is 'napkin_task:TASK'" in why["object"]
     assert catalogue.names() == ("feeding", "drinking", "scratching", "dabbing")
