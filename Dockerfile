@@ -10,6 +10,7 @@ COPY worker worker
 COPY migrations migrations
 COPY templates templates
 COPY static static
+COPY docs/arrays.md docs/arrays.md
 RUN make .venv/run.stamp && useradd --create-home studio && mkdir /data && chown studio /data
 USER studio
 ENV DATA_DIR=/data HOST=0.0.0.0 PUBLIC_URL=http://localhost:8000

@@ -1,0 +1,1 @@
+"""The web server, and what both programs know: tables, files, settings."""

@@ -24,11 +24,11 @@ from app.web.experimenter import (
     live,
     login,
     operator,
+    planning,
     results,
     retirement,
     selection,
     studies,
-    study_settings,
     translations,
 )
 from app.web.http.deps import Studio
@@ -48,7 +48,7 @@ EXPERIMENTER_PARTS = (
     login,
     accounts,
     answers,
-    study_settings,
+    planning,
     translations,
     invitations,
     selection,

@@ -20,7 +20,8 @@ from app.domain.evaluation import Controller, Film, Rating, Trial
 from app.domain.models import Bundle, Model, ModelKind, Run, RunKind, RunStatus
 from app.domain.preferences import LabelEvent, Query, Response
 from app.domain.protocol import EvaluationMode, Stage
-from app.domain.studies import Participant, Study, StudySettings
+from app.domain.studies import Participant, Study
+from app.domain.study_settings import StudySettings
 from app.services.evaluation import evaluation_plan
 from app.services.participants import enrolment, stages
 from app.services.studies import studies

@@ -23,9 +23,13 @@ from worker.compute import simulation
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
-PROGRAMS = [each for part in ("app", "worker", "tests/benchmarks") for each in sorted((ROOT / part).rglob("*.py"))]
+PROGRAMS = [
+    each
+    for part in ("app", "worker", "tests/benchmarks", "tests/pictures")
+    for each in sorted((ROOT / part).rglob("*.py"))
+]
 OTHERS = [*sorted((ROOT / "templates").rglob("*.html")), *sorted((ROOT / "install").glob("*.sh"))]
-OURS = r"(?:-m (?:app|worker|tests\.benchmarks\.\w+)|tests/benchmarks/\w+\.py)"
+OURS = r"(?:-m (?:app|worker|tests\.(?:benchmarks|pictures)\.\w+)|tests/benchmarks/\w+\.py)"
 VARIABLES = r"(?:[A-Z_]+=\S+ )"
 MAKE = rf"(?:{VARIABLES}+|(?<=[`>])|(?<=: )|(?<=^    ))make\b(?= |`|<|$)(?! them)"
 COMMAND = re.compile(
@@ -81,6 +85,7 @@ RUN: dict[str, str | Elsewhere | OnlyParsed] = {
     "api_pages": "--people 1 --answers 20",
     "behaviours": "--task feeding --scenarios 1 --axis-scenarios 1",
     "chosen_modes": ROLLOUTS,
+    "comparison_report": "results/paper_form",
     "contact_sheet": "sheets feeding --films 1 --steps 5 --no-people",
     "error_rates": Elsewhere("tests/worker/test_error_rates.py::test_the_command_writes_every_table"),
     "feedback_efficiency": OnlyParsed("begins with 240 rollouts of unseen scenarios, and draws all its figures"),
@@ -88,11 +93,13 @@ RUN: dict[str, str | Elsewhere | OnlyParsed] = {
     "first_robot": REAL_TIME,
     "in_imitation": OnlyParsed("needs the library imitation, in an environment of its own"),
     "onlookers": "--people 1 --labels 40 --labellers 1 --dashboards 1 --seconds 1 --thought 0.1",
+    "pages": OnlyParsed("photographs a real studio, which takes minutes, and writes to docs/pictures"),
     "pool_rollouts": "--first 10800000 --scenarios 1 --directory pool",
     "printed_readings": ROLLOUTS,
     "render_speed": "--tasks feeding --films 1 --steps 1",
     "replayed_waiting": REAL_TIME,
     "retraining": ROLLOUTS,
+    "rooms": Elsewhere("tests/architecture/test_rooms.py::test_the_picture_of_the_rooms_is_up_to_date"),
     "rounds": "1",
     "same_bits": "--tasks feeding",
     "save_latency": "52 1",  # beyond the first break
@@ -101,7 +108,12 @@ RUN: dict[str, str | Elsewhere | OnlyParsed] = {
     "start_posture": "--restarts 50",
 }
 """What runs small enough, by program."""
-TOOLS = {"alembic": "check", "pre-commit": "validate-config", "pytest": "--collect-only -q tests/architecture"}
+TOOLS = {
+    "alembic": "check",
+    "pip": "show pbarl-studio",
+    "pre-commit": "validate-config",
+    "pytest": "--collect-only -q tests/architecture",
+}
 """What shows that a tool does its work here."""
 
 
@@ -155,7 +167,9 @@ def planned(words: list[str]) -> list[str]:
 def file_of(program: str) -> Path:
     """What Python runs."""
     part = program.split()[0]
-    return ROOT / part / "__main__.py" if part in ("app", "worker") else ROOT / "tests/benchmarks" / f"{program}.py"
+    if part in ("app", "worker"):
+        return ROOT / part / "__main__.py"
+    return next((ROOT / "tests").glob(f"*/{program}.py"))
 
 
 def run(program: str, arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> int:
@@ -201,6 +215,7 @@ def directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
     results.mkdir()
     for file in (ROOT / "docs/results").glob("feedback_efficiency-*.csv"):
         shutil.copy(file, results)
+    shutil.copytree(ROOT / "docs/results/paper_form", results / "paper_form")
     return directory
 
 

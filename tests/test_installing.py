@@ -1,15 +1,18 @@
-"""Which Python the installation chooses, and that the physics engine is built once and leaves nothing behind."""
+"""Which Python the installation chooses, that the physics engine is built once, and what the container holds."""
 
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable
+from fnmatch import fnmatch
 from pathlib import Path
 
 import pytest
 
+from app.paths import DEMO_STUDY, DOCS, MIGRATIONS, STATIC, TEMPLATES
 from tests.waiting import PATIENCE_S
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -195,3 +198,26 @@ def runs(pid: int) -> bool:
         return "\nState:\tZ" not in Path(f"/proc/{pid}/status").read_text()
     except OSError:
         return False
+
+
+def in_the_container(path: Path) -> bool:
+    """Whether the Dockerfile copies the file, and .dockerignore, whose last word counts, lets it."""
+    name = path.relative_to(ROOT).as_posix()
+    parts = {name, *(each.as_posix() for each in Path(name).parents)}
+    copies = re.findall(r"^COPY (.+) \S+$", (ROOT / "Dockerfile").read_text(), re.MULTILINE)
+    left_out = False
+    for rule in (ROOT / ".dockerignore").read_text().split():
+        if any(fnmatch(part, rule.lstrip("!")) for part in parts):
+            left_out = not rule.startswith("!")
+    return not left_out and not parts.isdisjoint(" ".join(copies).split())
+
+
+@pytest.mark.parametrize(
+    "needed", [MIGRATIONS / "env.py", STATIC / "icon.svg", TEMPLATES / "base.html", DEMO_STUDY, DOCS / "arrays.md"]
+)
+def test_the_container_has_the_files_that_the_programs_read(needed: Path) -> None:
+    assert in_the_container(needed)
+
+
+def test_the_container_has_no_tests() -> None:
+    assert not in_the_container(ROOT / "tests/conftest.py")

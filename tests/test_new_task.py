@@ -19,7 +19,7 @@ import worker.sim
 from app.db import Database
 from app.domain.models import ModelKind
 from app.domain.protocol import Language
-from app.domain.studies import StudySettings
+from app.domain.study_settings import StudySettings
 from app.services.studies import studies
 from app.web.texts import wording
 from installed_tasks import catalogue

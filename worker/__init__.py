@@ -1,0 +1,1 @@
+"""The worker: simulation, learning, clips, statistics, bundles."""

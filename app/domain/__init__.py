@@ -1,0 +1,1 @@
+"""Tables: studies, pairs, answers, models."""

@@ -5,12 +5,15 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from app.domain.choices import Choice
+from app.domain.described import Section, setting
 
-class Language(StrEnum):
-    """In which the participant's pages are written."""
 
-    ENGLISH = "en"
-    GERMAN = "de"
+class Language(Choice):
+    """In which the participant's pages are written; each is called as it calls itself."""
+
+    ENGLISH = "en", "English"
+    GERMAN = "de", "Deutsch"
 
 
 class Stage(StrEnum):
@@ -45,21 +48,21 @@ class FormItem(BaseModel):
         return self
 
 
-class EvaluatedMethod(StrEnum):
+class EvaluatedMethod(Choice):
     """What a participant can be asked to rate; names as in the benchmark."""
 
-    REFERENCE = "reference"
-    PREFFT = "prefft"
-    PREFFT_ANCHORED = "prefft_anchored"
-    PBARL = "pbarl"
-    PBARL_PRINTED = "pbarl_printed"
+    REFERENCE = "reference", "Reference", "The policy that nobody personalised."
+    PREFFT = "prefft", "PrefFT", "The policy fine-tuned on the learned reward."
+    PREFFT_ANCHORED = "prefft_anchored", "PrefFT, anchored", "Fine-tuned, but kept near the reference."
+    PBARL = "pbarl", "PbARL", "The personal filter, as set below."
+    PBARL_PRINTED = "pbarl_printed", "PbARL as printed", "Exactly as in the paper."
 
 
-class EvaluationMode(StrEnum):
+class EvaluationMode(Choice):
     """Where the robot moves."""
 
-    VIDEO = "video"
-    PHYSICAL = "physical"
+    VIDEO = "video", "On video", "Rendered when the last answer is given."
+    PHYSICAL = "physical", "In the room", "An operator runs the robots; the participant rates on the page."
 
 
 class EvaluationSettings(BaseModel):
@@ -67,12 +70,27 @@ class EvaluationSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    methods: tuple[EvaluatedMethod, ...] = Field(
-        default=(EvaluatedMethod.REFERENCE, EvaluatedMethod.PREFFT, EvaluatedMethod.PBARL), min_length=2, max_length=5
+    methods: tuple[EvaluatedMethod, ...] = setting(
+        (EvaluatedMethod.REFERENCE, EvaluatedMethod.PREFFT, EvaluatedMethod.PBARL),
+        Section.EVALUATION,
+        "Methods",
+        complaint="Choose two methods at least.",
+        min_length=2,
+        max_length=5,
     )
-    trials: int = Field(default=3, ge=1, le=20, description="Of each method.")
-    mode: EvaluationMode = EvaluationMode.VIDEO
-    fine_tuning_steps: int = Field(default=100_000, ge=1_000, le=2_000_000, description="Environment steps of PrefFT.")
+    mode: EvaluationMode = setting(EvaluationMode.VIDEO, Section.EVALUATION, "Where the robot moves")
+    trials: int = setting(
+        3, Section.EVALUATION, "Trials of each method", "The paper used 3.", unit="trials", ge=1, le=20
+    )
+    fine_tuning_steps: int = setting(
+        100_000,
+        Section.EVALUATION,
+        "Fine-tuning of PrefFT",
+        "More is better and takes longer: 100 000 steps are some minutes.",
+        unit="steps",
+        ge=1_000,
+        le=2_000_000,
+    )
 
     @model_validator(mode="after")
     def _each_once(self) -> "EvaluationSettings":
@@ -86,20 +104,32 @@ class EvaluationSettings(BaseModel):
         return len(self.methods) * self.trials
 
 
-class Advisor(StrEnum):
+class Advisor(Choice):
     """What becomes of the advice that more labels will hardly pay."""
 
-    SHOW = "show"
-    LOG = "log"
+    SHOW = "show", "Say so on the study's page", "Nobody is ever stopped by it."
+    LOG = "log", "Only keep a record", "As a study with a fixed number of answers should."
 
 
-class PlannedTest(StrEnum):
+class PlannedTest(Choice):
     """Tests that a study announces before its data are seen."""
 
-    TWO_SAMPLE_T = "two_sample_t"
-    PAIRED_T = "paired_t"
-    WILCOXON = "wilcoxon"
-    MIXED_MODEL = "mixed_model"
+    TWO_SAMPLE_T = (
+        "two_sample_t",
+        "Two-sample t",
+        "As in the paper; ignores that the same people rated all methods, and finds too much.",
+    )
+    PAIRED_T = "paired_t", "Paired t", "Each person with themselves: right for this design."
+    WILCOXON = (
+        "wilcoxon",
+        "Wilcoxon signed-rank",
+        "The same without assuming a normal distribution; finds nothing with fewer than six people.",
+    )
+    MIXED_MODEL = (
+        "mixed_model",
+        "Mixed model",
+        "Level and difference vary between people; the paired t, unless ratings are missing.",
+    )
 
 
 CONSENT_FACTS = ("duration", "payment", "ethics", "contact")

@@ -1,0 +1,1 @@
+"""Routes: from HTTP to a service and back."""

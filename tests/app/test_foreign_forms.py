@@ -62,7 +62,7 @@ def test_our_pages_let_browsers_send_their_origin_over_plain_http(taking_part: T
     assert taking_part.browser.get("/p/next").headers["referrer-policy"] == "same-origin"
 
 
-@pytest.mark.parametrize("path", ["/p/next", "/login", "/static/app.css", "/nowhere"])
+@pytest.mark.parametrize("path", ["/p/next", "/login", "/static/base/base.css", "/nowhere"])
 def test_every_answer_carries_the_headers(taking_part: TakingPart, path: str) -> None:
     headers = taking_part.browser.get(path).headers
     assert "script-src 'self'" in headers["content-security-policy"]

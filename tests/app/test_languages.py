@@ -8,7 +8,7 @@ from fastapi.testclient import TestClient
 
 from app.db import Database
 from app.domain.protocol import Language
-from app.domain.studies import StudySettings
+from app.domain.study_settings import StudySettings
 from app.services.participants import recruitment_panel
 from app.web.texts.wording import preferred, wording_for
 from tests import factories

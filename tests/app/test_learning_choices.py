@@ -5,7 +5,8 @@ from fastapi.testclient import TestClient
 from sqlalchemy import select
 
 from app.db import Database
-from app.domain.studies import RewardKind, Strategy, Study
+from app.domain.choices import RewardKind, Strategy
+from app.domain.studies import Study
 from app.web.experimenter.study_form import form_with_defaults
 
 CHOICES = [

@@ -11,7 +11,8 @@ from sqlalchemy import select
 from app.db import Database
 from app.domain.participation import ConsentRecord, FormAnswer
 from app.domain.protocol import FormItem, Language
-from app.domain.studies import Deviation, Study, StudySettings
+from app.domain.studies import Deviation, Study
+from app.domain.study_settings import StudySettings
 from app.services.studies import locking
 from app.web.texts.own_texts import missing_facts, missing_translations, own_texts, with_translations
 from app.web.texts.wording import Wording, question_of, wording_for

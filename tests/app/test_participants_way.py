@@ -12,7 +12,8 @@ from app.db import Database
 from app.domain.participation import ConsentRecord, FormAnswer, StageRecord
 from app.domain.preferences import Purpose, Query
 from app.domain.protocol import EvaluationSettings, FormItem, Stage
-from app.domain.studies import PAPER_PROTOCOL, Participant, Study, StudySettings
+from app.domain.studies import Participant, Study
+from app.domain.study_settings import PAPER_PROTOCOL, StudySettings
 from app.services.participants import stages
 from app.storage import ArtefactStore
 from tests import factories

@@ -12,7 +12,8 @@ from app.domain.models import Run, RunStatus
 from app.domain.participation import StageRecord
 from app.domain.people import AuditEvent, Experimenter, Role
 from app.domain.protocol import EvaluationSettings, Stage
-from app.domain.studies import PAPER_PROTOCOL, Participant, Study
+from app.domain.studies import Participant, Study
+from app.domain.study_settings import PAPER_PROTOCOL
 from app.services.monitoring import dashboard, study_state
 from app.services.monitoring.study_state import StudyState
 from app.services.participants import enrolment, withdrawal

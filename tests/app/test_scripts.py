@@ -1,23 +1,34 @@
 """The scripts of the pages: what one imports is asked for at once, not when it has been read."""
 
+import posixpath
 import re
-from pathlib import Path
+from pathlib import PurePosixPath
 
 import pytest
 
 from app.paths import ROOT
 from app.web.texts.templating import imports_of
 
-SCRIPTS = sorted((ROOT / "static").glob("*.js"))
+STATIC = ROOT / "static"
+SCRIPTS = sorted(path.relative_to(STATIC).as_posix() for path in STATIC.rglob("*.js"))
 
 
-@pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.name)
-def test_nothing_that_a_script_imports_is_overlooked(path: Path) -> None:
-    named = re.findall(r'from\s+"\./([^"]+)"', path.read_text(encoding="utf-8"))
-    assert set(named) <= set(imports_of(path.name))
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_nothing_that_a_script_imports_is_overlooked(script: str) -> None:
+    source = (STATIC / script).read_text(encoding="utf-8")
+    named = {
+        posixpath.normpath(PurePosixPath(script).parent / each) for each in re.findall(r'from\s+"([^"]+)"', source)
+    }
+    assert named <= set(imports_of(script)) <= set(SCRIPTS)
     for each in named:
-        assert set(imports_of(each)) <= set(imports_of(path.name))
+        assert set(imports_of(each)) <= set(imports_of(script))
+
+
+def test_no_side_takes_scripts_of_the_other() -> None:
+    for script in SCRIPTS:
+        assert {PurePosixPath(each).parts[0] for each in imports_of(script)} <= {"base", PurePosixPath(script).parts[0]}
 
 
 def test_the_labelling_page_asks_for_all_its_modules_at_once() -> None:
-    assert {"lock_step.js", "outbox.js", "clips.js"} <= set(imports_of("pair.js"))
+    wanted = {"base/lock_step.js", "participant/outbox.js", "participant/clips.js"}
+    assert wanted <= set(imports_of("participant/pair.js"))

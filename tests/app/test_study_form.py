@@ -10,7 +10,8 @@ from sqlalchemy import select
 
 from app.db import Database
 from app.domain.protocol import EvaluatedMethod, EvaluationMode, PlannedTest
-from app.domain.studies import PAPER_PROTOCOL, PREVIEW_NUMBERS, Deviation, Participant, Study, StudySettings
+from app.domain.studies import PREVIEW_NUMBERS, Deviation, Participant, Study
+from app.domain.study_settings import PAPER_PROTOCOL, StudySettings
 from app.services.studies import locking
 from app.storage import ArtefactStore
 from app.web.experimenter.form_lines import items_of, lines_of, lines_of_texts, texts_of

@@ -7,7 +7,8 @@ from fastapi.testclient import TestClient
 
 from app.db import Database
 from app.domain.models import ModelKind, RunKind, RunStatus
-from app.domain.studies import Study, StudySettings
+from app.domain.studies import Study
+from app.domain.study_settings import StudySettings
 from app.services.studies import studies
 from tests import factories
 from tests.app.conftest import agree

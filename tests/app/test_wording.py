@@ -9,13 +9,15 @@ from fastapi.testclient import TestClient
 from fluent.syntax import ast
 
 from app.domain.protocol import Language
-from app.domain.studies import StudySettings
+from app.domain.study_settings import StudySettings
 from app.paths import ROOT, WORDING
 from app.web.texts import wording
 from app.web.texts.wording import Wording, built_in_texts, variables_of, wording_for
 from installed_tasks import catalogue
 
-TEMPLATES = sorted((ROOT / "templates" / "participant").glob("*.html"))
+TEMPLATES = sorted(
+    [*(ROOT / "templates" / "participant").rglob("*.html"), ROOT / "templates" / "pieces" / "player.html"]
+)
 NAMES_FOR_CODE = r"{% block (page|page_data|body_class|sheet_class|width) %}.*?{% endblock %}"
 DATA = r"data-[\w-]+(=\"[^\"]*\")?"
 SAID = re.compile(r"""say\(\s*["']([a-zA-Z0-9_-]+)["']\s*[,)]""")

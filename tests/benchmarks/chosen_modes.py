@@ -28,6 +28,7 @@ import torch
 from tqdm import tqdm
 
 from installed_tasks import catalogue
+from worker.analysis import result_pages
 from worker.compute import simulation
 from worker.compute.pools import Compute, Lane
 from worker.compute.simulation import surface_file
@@ -151,6 +152,9 @@ def questions(seeds: int) -> list[Question]:
     ]
 
 
+TITLE = "# How good a mode the labels lead to, and what the choices behind it are worth"
+
+
 def main() -> None:
     """See the module."""
     options = _options()
@@ -172,7 +176,8 @@ def main() -> None:
     found = [(question, done[_key(question)]) for question in asked]
     sys.stdout.write(_markdown(found, options.seeds))
     if options.output:
-        options.output.with_suffix(".md").write_text(_page(found, options.seeds))
+        page = options.output.with_suffix(".md")
+        page.write_text(result_pages.page(page, TITLE, _markdown(found, options.seeds)))
         with options.output.with_suffix(".csv").open("w", newline="") as stream:
             writer = csv.writer(stream, lineterminator="\n")
             writer.writerow(COLUMNS)
@@ -188,11 +193,6 @@ def _lines(found: Sequence[tuple[Question, dict[str, Any]]]) -> Iterator[list[An
         where = [question.task, question.labels, question.hesitant, *asdict(question.choice).values(), question.seed]
         for user, *values in zip(USERS, row["regrets"], row["advantages"], row["success"], strict=True):
             yield [*where, user, *(f"{value:.3f}" for value in values)]
-
-
-def _page(found: Sequence[tuple[Question, dict[str, Any]]], seeds: int) -> str:
-    usage = (__doc__ or "").split("\n\n")
-    return f"# {usage[0].rstrip('.')}\n\n{usage[1]}\n\n{usage[2].strip()}\n\n{_markdown(found, seeds)}"
 
 
 def _markdown(found: Sequence[tuple[Question, dict[str, Any]]], seeds: int) -> str:

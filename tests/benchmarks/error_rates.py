@@ -20,6 +20,7 @@ import numpy.typing as npt
 from tqdm import tqdm
 
 from tests.benchmarks import error_rates_of_intervals
+from worker.analysis import result_pages
 from worker.analysis.effect_sizes import holm
 from worker.analysis.hypothesis_tests import TESTS, mixed_model, paired_t, two_sample_t, wilcoxon
 
@@ -160,7 +161,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     intervals = error_rates_of_intervals.rows(options.studies)
     _write(options.to / "error_rates.csv", rows)
     _write(options.to / "error_rates_of_intervals.csv", intervals)
-    (options.to / "error_rates.md").write_text(_page(rows, intervals, options.studies))
+    page = options.to / "error_rates.md"
+    page.write_text(result_pages.page(page, TITLE, tables(rows, intervals)))
 
 
 def _write(file: Path, rows: Sequence[Mapping[str, Any]]) -> None:
@@ -170,42 +172,23 @@ def _write(file: Path, rows: Sequence[Mapping[str, Any]]) -> None:
         writer.writerows(rows)
 
 
-HEAD = """\
-# Error rates of the tests and intervals that the studio shows
-
-    OMP_NUM_THREADS=1 python -m tests.benchmarks.error_rates --studies {studies}
-
-{studies} invented studies of each truth: three methods, three trials of each per person, as in the paper. A rating is
-the method's mean, the person's level (SD .6), what the method is to this person beyond its mean ("spread") and noise
-(SD .8). 5 % is what every test promises where nothing differs; the standard error of such a figure is {error:.1f}
-points, less where it is over three comparisons. What cannot be computed counts as nothing found. The same numbers as
-files: `error_rates.csv`, `error_rates_of_intervals.csv`.
-
-**Two-sample t** is the paper's test. **Mixed model** is `rating ~ method + (method | participant)`, t with people - 1
-degrees of freedom; with as many ratings of everybody it is the **paired t**-test (decision 64). **Wilcoxon** is exact.
-
-* Paired t and mixed model keep what they promise whatever differs between people, with whole ratings, with ratings
-  missing, from four people on. The paper's test does not, unless robots are the same to everybody: then it errs less
-  than it may, and finds less.
-* Wilcoxon's test is exact, and so errs at most as often as it promises: fewer than six people can never reach 5 %.
-* With ratings missing the mixed model finds a little more than the paired t.
-"""
+TITLE = "# Error rates of the tests and intervals that the studio shows"
 NAMES = {"two_sample_t": "two-sample t", "paired_t": "paired t", "wilcoxon": "Wilcoxon", "mixed_model": "mixed model"}
 
 
-def _page(rows: Sequence[Mapping[str, Any]], intervals: Sequence[Mapping[str, Any]], studies: int) -> str:
+def tables(rows: Sequence[Mapping[str, Any]], intervals: Sequence[Mapping[str, Any]]) -> str:
+    """What stands on the page; what was found after Holm's correction and what has no result is in the CSV only."""
+    studies = int(rows[0]["studies"])
     error = 100 * (ALPHA * (1 - ALPHA) / studies) ** 0.5
-    parts = [HEAD.format(studies=studies, error=error)]
-    parts.append("## Nothing differs: found all the same, % of comparisons")
-    parts.append("\n".join(_table(rows, "false_alarms_percent", "")))
-    parts.append("## Nothing differs: at least one of three found after Holm's correction, % of studies")
-    parts.append("\n".join(_table(rows, "false_alarms_of_family_percent", "")))
-    parts.append("## One method is better by .8: found, % of the comparisons that differ")
-    parts.append("\n".join(_table(rows, "power_percent", "better")))
-    parts.append("## Could not be computed, % of comparisons")
-    parts.append("\n".join(_table(rows, "not_computable_percent", "")))
-    parts.append(error_rates_of_intervals.page(intervals))
-    return "\n\n".join(parts) + "\n"
+    parts = [
+        "## Nothing differs: found all the same, % of comparisons",
+        f"{studies} studies of each truth; the standard error of 5 % is {error:.1f} points.",
+        "\n".join(_table(rows, "false_alarms_percent", "")),
+        "## One method is better by .8: found, % of the comparisons that differ",
+        "\n".join(_table(rows, "power_percent", "better")),
+        error_rates_of_intervals.page(intervals),
+    ]
+    return "\n\n".join(parts)
 
 
 def _table(rows: Sequence[Mapping[str, Any]], column: str, about: str) -> Iterator[str]:
@@ -213,7 +196,7 @@ def _table(rows: Sequence[Mapping[str, Any]], column: str, about: str) -> Iterat
     yield "|---" * (2 + len(NAMES)) + "|"
     for truth, people in dict.fromkeys((row["truth"], row["people"]) for row in rows):
         differs = "better" in truth
-        if differs == bool(about) or column.startswith("not"):
+        if differs == bool(about):
             of = {row["test"]: row[column] for row in rows if (row["truth"], row["people"]) == (truth, people)}
             yield f"| {truth} | {people} | " + " | ".join(str(of[test]) for test in NAMES) + " |"
 

@@ -227,7 +227,8 @@ def page(found: Sequence[Mapping[str, Any]]) -> str:
         [
             "## Intervals: how often they miss the truth\n\nAll are 95 % intervals, so 5 % is what they promise. An"
             " interval that is not shown in some cases (too few pairs, nothing to say) is judged where it is shown."
-            f"Cohen's d_z and the time per 100 answers are tried a {SLOW}th as often: chance moves them by 1.5 points.",
+            f" Cohen's d_z and the time per 100 answers are tried a {SLOW}th as often: chance moves them by 1.5"
+            " points.",
             _table(intervals, ("interval", "truth", "shown, %", "misses, %")),
             "## Flags and verdicts: how often they are raised, looking after every answer",
             f"Tried a {SLOW}th as often.",

@@ -1,8 +1,8 @@
-"""Tables and a picture of feedback_efficiency, from the files of rows that there are.
+"""The page and the picture of feedback_efficiency, from the files of rows that there are.
 
     python -m tests.benchmarks.feedback_report docs/results
 
-writes feedback_efficiency-<task>.md beside every feedback_efficiency-<task>.csv, and feedback_efficiency.svg.
+writes feedback_efficiency.svg, and the tables of feedback_efficiency.md below its mark; what stands above is kept.
 """
 
 import argparse
@@ -17,6 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from installed_tasks import catalogue
+from worker.analysis import result_pages
 from worker.analysis.figures import LINE_COLOURS, MARKERS, STYLE, rendered
 
 Row = dict[str, Any]
@@ -32,24 +33,17 @@ DRAWN = (
     ("preference_transformer", "uniform", "Preference Transformer, at random"),
 )
 """Lines of the picture: model, rule, name."""
-FEW = ("uniform", "entropy", "entropy, pooled prior")
+POOLED = ("structured", "entropy", "structured, by entropy, pooled prior")
 
 
 def write(folder: Path) -> None:
     """See the module."""
-    by_task = {}
-    for task in catalogue.names():
-        file = folder / f"feedback_efficiency-{task}.csv"
-        if file.exists():
-            by_task[task] = rows = read(file)
-            head = (
-                f"# Feedback efficiency: {task}\n\nWhat was run and what it says: "
-                "[feedback_efficiency.md](feedback_efficiency.md). In brackets: standard error over chains. "
-                f"Every row: [{file.name}]({file.name}).\n\n"
-            )
-            file.with_suffix(".md").write_text(head + tables(rows))
+    files = {task: folder / f"feedback_efficiency-{task}.csv" for task in catalogue.names()}
+    by_task = {task: read(file) for task, file in files.items() if file.exists()}
     if by_task:
         (folder / "feedback_efficiency.svg").write_bytes(rendered(_curves(by_task))["svg"])
+        page = folder / "feedback_efficiency.md"
+        page.write_text(result_pages.page(page, "# Feedback efficiency", tables(by_task)))
 
 
 def read(file: Path) -> list[Row]:
@@ -97,87 +91,41 @@ def _lines(axes: Axes, rows: Sequence[Row], field: str) -> None:
     axes.minorticks_off()
 
 
-def tables(rows: Sequence[Row]) -> str:
-    """Markdown tables: means over chains, of users and seeds that every line of a table has."""
-    named = [row for row in rows if row["user"] in NAMED and not row["pooled_prior"]]
-    uniform = [row for row in named if row["strategy"] == "uniform"]
-    structured = [row for row in named if row["model"] in LINEAR]
-    networks = [row for row in named if row["model"] not in LINEAR]
-    people = [
-        {**row, "strategy": f"{row['strategy']}, pooled prior" if row["pooled_prior"] else row["strategy"]}
-        for row in rows
-        if row["user"].startswith("person-")
-    ]
-    drawn = [row for row in people if row["model"] == "structured"]
-    accuracies = [
-        ("Reward models, pairs at random, named users", uniform),
-        ("Ways of choosing pairs, linear models, named users", structured),
-        ("Ways of choosing pairs and the pooled prior, structured, people of the population", drawn),
-        ("Few labels against many, people of the population", [row for row in people if row["strategy"] in FEW]),
-        ("Ways of choosing pairs, networks, users finished in time", networks),
-    ]
-    lines: list[str] = []
-    for title, chosen in accuracies:
-        lines += [f"### {title}: accuracy on all unseen pairs", "", *_table(chosen, "accuracy"), ""]
-        lines += [f"### {title}: accuracy on contested pairs", "", *_table(chosen, "contested_accuracy"), ""]
-    for title, chosen in accuracies[:4]:
-        lines += [
-            f"### {title}: true preference gained, % of the reference's",
-            "",
-            *_table(chosen, "gain_percent", 1),
-            "",
-        ]
-        lines += [f"### {title}: change of success, points", "", *_table(chosen, "success_points", 1), ""]
-    lines += ["### Promised and driven: gain of true preference in %, change of success in points", ""]
-    lines += [*_driven(rows), ""]
-    lines += ["### Expected calibration error without temperature", ""]
-    lines += [*_table(uniform, "calibration_error_uncalibrated"), "", "### Expected calibration error as shipped", ""]
-    return (
-        "\n".join([*lines, *_table(uniform, "calibration_error"), "", "### Seconds per fit", "", *_seconds(uniform)])
-        + "\n"
-    )
+def tables(by_task: dict[str, list[Row]]) -> str:
+    """The lines of the picture with standard errors, for the named users and for the people of the population."""
+    parts = []
+    for task, rows in by_task.items():
+        first = [row for row in rows if row["seed"] == 0]
+        named = [row for row in first if row["user"] in NAMED]
+        people = [row for row in first if row["user"].startswith("person-")]
+        parts += [_table(f"{task}: four named users", named), _table(f"{task}: six people of the population", people)]
+    introduction = """\
+## Every number of labels
+True preference gained in %, plus or minus its standard error over users, and the share of unseen pairs foreseen; the
+first seed, which all models have. The error is mostly how much users differ: lines are compared in the same users."""
+    return "\n\n".join([introduction, *parts])
 
 
-def _driven(rows: Sequence[Row]) -> list[str]:
-    lines = [
-        "| user | model | rule | labels | gain, promised | driven | success, promised | driven |",
-        "|---" * 8 + "|",
-    ]
-    for row in rows:
-        if row["driven_gain_percent"] is not None:
-            figures = ("gain_percent", "driven_gain_percent", "success_points", "driven_success_points")
-            names = " | ".join(str(row[name]) for name in ("user", "model", "strategy", "labels"))
-            lines.append(f"| {names} | " + " | ".join(f"{row[name]:+.1f}" for name in figures) + " |")
-    return lines
+def _table(title: str, rows: Sequence[Row]) -> str:
+    counts = sorted({row["labels"] for row in rows})
+    lines = [f"### {title}", "| reward model, pairs | " + " | ".join(map(str, counts)) + " |"]
+    lines.append("|---" * (1 + len(counts)) + "|")
+    for model, rule, words in (*DRAWN, POOLED):
+        kind = (model, rule, words == POOLED[2])
+        line = [row for row in rows if (row["model"], row["strategy"], row["pooled_prior"]) == kind]
+        cells = [_cell([row for row in line if row["labels"] == count]) for count in counts]
+        if line:
+            lines.append(f"| {words} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
 
 
-def _seconds(rows: Sequence[Row]) -> list[str]:
-    return _table(rows, "fit_seconds", 2)
-
-
-def _table(rows: Sequence[Row], field: str, digits: int = 3) -> list[str]:
-    lines_of = dict.fromkeys((row["model"], row["strategy"]) for row in rows)
-    chains_of = [
-        {(row["user"], row["seed"]) for row in rows if (row["model"], row["strategy"]) == line} for line in lines_of
-    ]
-    shared = set.intersection(*chains_of) if chains_of else set()
-    kept = [row for row in rows if (row["user"], row["seed"]) in shared and row[field] is not None]
-    counts = sorted({row["labels"] for row in kept})
-    head = "| model | pairs chosen | chains | " + " | ".join(map(str, counts)) + " |"
-    lines = [head, "|---" * (3 + len(counts)) + "|"]
-    for model, strategy in lines_of:
-        mine = [row for row in kept if (row["model"], row["strategy"]) == (model, strategy)]
-        cells = [_cell([row[field] for row in mine if row["labels"] == count], digits) for count in counts]
-        lines.append(f"| {model} | {strategy} | {len(shared)} | " + " | ".join(cells) + " |")
-    return lines
-
-
-def _cell(values: Sequence[float], digits: int) -> str:
-    """Mean and, of several chains, its standard error."""
-    if not values:
+def _cell(rows: Sequence[Row]) -> str:
+    """Mean gain, its standard error, mean accuracy."""
+    if not rows:
         return "-"
-    mean = f"{np.mean(values):.{digits}f}"
-    return f"{mean} ({np.std(values, ddof=1) / len(values) ** 0.5:.{digits}f})" if len(values) > 1 else mean
+    gains = [row["gain_percent"] for row in rows]
+    error = f" ± {np.std(gains, ddof=1) / len(gains) ** 0.5:.1f}" if len(gains) > 1 else ""
+    return f"{np.mean(gains):.1f}{error} ({np.mean([row['accuracy'] for row in rows]):.3f})"
 
 
 if __name__ == "__main__":

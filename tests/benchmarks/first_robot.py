@@ -19,7 +19,7 @@ from app.db import Database
 from app.domain.evaluation import Film, Trial
 from app.domain.models import Run, RunKind, RunStatus
 from app.domain.protocol import EvaluationSettings
-from app.domain.studies import PAPER_PROTOCOL, StudySettings
+from app.domain.study_settings import PAPER_PROTOCOL, StudySettings
 from app.services.evaluation import evaluation_plan
 from app.services.participants import enrolment
 from app.services.studies import studies

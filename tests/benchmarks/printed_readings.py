@@ -1,6 +1,6 @@
 """What becomes of the task under each reading of what the paper's PbARL leaves open, one choice changed at a time.
 
-    python -m tests.benchmarks.printed_readings --output docs/results/printed_readings.md
+    python -m tests.benchmarks.printed_readings --output docs/results/printed_readings
 
 A scripted user with 200 labels, the list ranked by a network on states and actions, nothing gated. Every filter is
 driven through unseen scenarios; changes are against the frozen policy in the same ones. Finished rows are kept in the
@@ -20,7 +20,10 @@ import torch
 from tqdm import tqdm
 
 from installed_tasks import catalogue
+from worker.analysis import result_pages
+from worker.analysis.comparison import Row
 from worker.analysis.evaluation import success_change
+from worker.analysis.table_files import to_csv
 from worker.compute import learning
 from worker.experiments.benchmark_cell import PAPER_USERS, Bench, Cell, Terms
 from worker.experiments.rollout_cache import Shelf
@@ -33,6 +36,7 @@ from worker.sim.costs import preference_rewards, stakes
 from worker.tasks import registry
 from worker.trajectory import Trajectory
 
+TITLE = "# PbARL as printed, reading by reading"
 LOSSES = ("rec", "pref", "kl", "dyn")
 
 
@@ -72,9 +76,9 @@ def main() -> None:
     torch.set_num_threads(1)
     options.work_directory.mkdir(parents=True, exist_ok=True)
     journal = options.work_directory / "printed_readings.jsonl"
-    rows = [json.loads(line) for line in journal.read_text().splitlines()] if journal.exists() else []
+    stored = [json.loads(line) for line in journal.read_text().splitlines()] if journal.exists() else []
     wanted = [(task, name) for task in options.tasks for name in READINGS]
-    known = {(row["task"], row["reading"], row["user"], row["steps"], row["scenarios"]): row for row in rows}
+    known = {(row["task"], row["reading"], row["user"], row["steps"], row["scenarios"]): row for row in stored}
     found = []
     for task, name in tqdm(wanted, unit="reading"):
         key = (task, name, options.user, options.steps, options.scenarios)
@@ -83,10 +87,12 @@ def main() -> None:
             with journal.open("a") as stream:
                 stream.write(json.dumps(known[key]) + "\n")
         found.append(known[key])
-    page = _page(found, options)
-    sys.stdout.write(page)
+    rows = [_row(each) for each in found]
+    sys.stdout.write(tables(rows) + "\n")
     if options.output:
-        options.output.write_text(page)
+        page = options.output.with_suffix(".md")
+        page.write_text(result_pages.page(page, TITLE, tables(rows)))
+        options.output.with_suffix(".csv").write_text(to_csv(rows))
 
 
 def _measured(task: str, name: str, options: argparse.Namespace) -> dict[str, Any]:
@@ -127,27 +133,30 @@ def _true_change(bench: Bench, before: Sequence[Trajectory], after: Sequence[Tra
     return float((is_now - was) / unit)
 
 
-def _page(rows: list[dict[str, Any]], options: argparse.Namespace) -> str:
+def _row(measured: dict[str, Any]) -> Row:
+    """A line of printed_readings.csv; success and changes are shares."""
+    named = {name: measured[name] for name in ("task", "reading", "user", "steps", "scenarios", "success")}
+    delta, low, high = measured["success_delta"]
+    changes = {"success_delta": delta, "success_delta_low": low, "success_delta_high": high}
+    losses = measured["losses"].removeprefix("Last losses: ").rstrip(".")
+    more = {"true_change": measured["true_change"], "moved": measured["moved"], "last_losses": losses}
+    return named | changes | more
+
+
+def tables(rows: Sequence[Row]) -> str:
+    """The page's table."""
     lines = [
-        "# PbARL as printed, reading by reading",
-        "",
-        "    python -m tests.benchmarks.printed_readings --output docs/results/printed_readings.md",
-        "",
-        f"User {options.user}, 200 labels (seed 0), {options.steps} gradient steps, {options.scenarios} unseen",
-        "scenarios, changes against the frozen policy in the same ones. Moved: mean absolute change of an action's",
-        "seven numbers; a trained policy's samples differ by about 0.1. What is not named is as in `PrintedConfig`.",
-        "",
-        "| task | reading | success, % | change, points | true r^H, % | moved | last losses |",
-        "|---|---|---|---|---|---|---|",
+        "| task | reading | success, % | change, points | true r^H, % | moved |",
+        "|---|---|---|---|---|---|",
     ]
     for row in rows:
-        delta, low, high = (100 * value for value in row["success_delta"])
-        losses = row["losses"].removeprefix("Last losses: ").rstrip(".")
+        delta, low, high = (100 * float(row[f"success_delta{end}"]) for end in ("", "_low", "_high"))
         lines.append(
-            f"| {row['task']} | {row['reading']} | {100 * row['success']:.1f} | {delta:+.1f} [{low:+.1f}, {high:+.1f}] "
-            f"| {100 * row['true_change']:+.0f} | {row['moved']:.3f} | {losses} |"
+            f"| {row['task']} | {row['reading']} | {100 * float(row['success']):.1f} |"
+            f" {delta:+.1f} [{low:+.1f}, {high:+.1f}] | {100 * float(row['true_change']):+.0f} |"
+            f" {float(row['moved']):.3f} |"
         )
-    return "\n".join(lines) + "\n"
+    return "\n".join(lines)
 
 
 def _options() -> argparse.Namespace:
@@ -157,7 +166,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--steps", type=int, default=3000)
     parser.add_argument("--scenarios", type=int, default=200)
     parser.add_argument("--work-directory", type=Path, default=Path("data/benchmark"))
-    parser.add_argument("--output", type=Path)
+    parser.add_argument("--output", type=Path, help="stem of the .md and the .csv")
     return parser.parse_args()
 
 

@@ -28,7 +28,8 @@ from app.db import Database, now
 from app.domain.clips import Rollout
 from app.domain.models import ModelKind, Run, RunKind, RunStatus
 from app.domain.protocol import EvaluationSettings
-from app.domain.studies import PAPER_PROTOCOL, Participant, Study, StudySettings
+from app.domain.studies import Participant, Study
+from app.domain.study_settings import PAPER_PROTOCOL, StudySettings
 from app.services.studies import studies
 from app.settings import Settings
 from app.storage import ArtefactStore

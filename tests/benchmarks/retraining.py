@@ -20,8 +20,9 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from app.domain.studies import StudySettings
+from app.domain.study_settings import StudySettings
 from installed_tasks import catalogue
+from worker.analysis import result_pages
 from worker.compute import learning
 from worker.compute.filter_fitting import FilterFit
 from worker.compute.pools import Compute, Lane
@@ -37,6 +38,9 @@ STAGES = ("reward", "mode", "residual", "gates", "evaluation_and_bundle")
 PROVENANCE = Provenance("benchmark", "P01", 1, 200, "", 0, "2000-01-01T00:00:00+00:00", "", "none")
 
 
+TITLE = "# From the last label to the bundle, in seconds"
+
+
 def main() -> None:
     """Measure every task and user that was asked for."""
     options = _options()
@@ -46,7 +50,8 @@ def main() -> None:
             rows += _measured(task, user, options)
     sys.stdout.write(_markdown(rows))
     if options.output:
-        options.output.with_suffix(".md").write_text(_page(rows, options))
+        page = options.output.with_suffix(".md")
+        page.write_text(result_pages.page(page, TITLE, _tables(rows, options)))
         with options.output.with_suffix(".csv").open("w", newline="") as stream:
             writer = csv.DictWriter(stream, list(rows[0]), lineterminator="\n")
             writer.writeheader()
@@ -119,15 +124,11 @@ def _markdown(rows: list[dict[str, Any]]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _page(rows: list[dict[str, Any]], options: argparse.Namespace) -> str:
+def _tables(rows: list[dict[str, Any]], options: argparse.Namespace) -> str:
     load = ", ".join(f"{value:.1f}" for value in os.getloadavg())
-    return f"""# From the last label to the bundle, in seconds
-
-    python -m tests.benchmarks.retraining --output docs/results/retraining
-
+    return f"""\
 200 scripted answers; {options.processes} processes of one thread on {os.cpu_count()} cores; load averages at the end
-{load}. Each is measured twice: the first after the worker's start, then another. "Made ready" is what the worker does
-beforehand, while people answer, in one process behind everything else. As numbers: [retraining.csv](retraining.csv).
+{load}.
 
 {_markdown(rows)}"""
 

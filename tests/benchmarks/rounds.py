@@ -18,7 +18,8 @@ from pathlib import Path
 from app.__main__ import migrate
 from app.db import Database
 from app.domain.models import Run, RunKind, RunStatus
-from app.domain.studies import PAPER_PROTOCOL, Participant
+from app.domain.studies import Participant
+from app.domain.study_settings import PAPER_PROTOCOL
 from app.settings import Settings
 from app.storage import ArtefactStore
 from tests import factories

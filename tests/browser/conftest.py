@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import pytest
 from axe_playwright_python.sync_playwright import Axe
-from playwright.sync_api import Browser, BrowserContext, Page, expect, sync_playwright
+from playwright.sync_api import Browser, BrowserContext, Locator, Page, expect, sync_playwright
 from sqlalchemy import select
 
 from app.db import Database
@@ -109,6 +109,12 @@ def new_page(chromium: Browser) -> Iterator[NewPage]:
     for context in contexts:
         context.close()
     assert errors == []
+
+
+def the_only(found: Locator) -> Locator:
+    """Once it is alone: without scripts the closed controls stay beside the plain ones until no_script.css is there."""
+    expect(found).to_have_count(1)
+    return found
 
 
 def hold_clips(page: Page) -> None:

@@ -12,7 +12,7 @@ from app.domain.evaluation import Rating
 from app.domain.protocol import EvaluatedMethod, EvaluationSettings
 from app.storage import ArtefactStore
 from tests import factories
-from tests.browser.conftest import Invited, NewPage, serious_findings, wait_ready
+from tests.browser.conftest import Invited, NewPage, serious_findings, the_only, wait_ready
 
 pytestmark = pytest.mark.browser
 
@@ -125,9 +125,9 @@ def test_without_scripts_pairs_are_answered_and_taken_back_by_plain_forms(invite
     page.goto(invited.link)
     expect(page.locator("video:visible")).to_have_count(2)
     expect(page.locator("video[controls]:visible")).to_have_count(2)
-    page.get_by_role("button", name="Left").click()
+    the_only(page.get_by_role("button", name="Left")).click()
     expect(page.get_by_text("1 of 10")).to_be_visible()
-    page.get_by_role("button", name="Undo").click()
+    the_only(page.get_by_role("button", name="Undo")).click()
     expect(page.get_by_text("0 of 10")).to_be_visible()
     first, undone = invited.events()
     assert (first.response, first.by_script, first.response_time_ms) == ("left", False, None)
@@ -141,8 +141,8 @@ def test_without_scripts_robots_are_rated_by_a_plain_form(
     page.goto(rating_link())
     expect(page.locator("video[controls]:visible")).to_have_count(1)
     for question in ("How satisfied", "How personalised"):
-        page.get_by_role("group", name=question).get_by_role("radio", name="4").check(force=True)
-    page.get_by_role("button", name="Save and go on").click()
+        the_only(page.get_by_role("group", name=question)).get_by_role("radio", name="4").check(force=True)
+    the_only(page.get_by_role("button", name="Save and go on")).click()
     expect(page.get_by_role("heading", name="Robot B")).to_be_visible()
     with database.reading() as session:
         stored = session.scalars(select(Rating)).one()

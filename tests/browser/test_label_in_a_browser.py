@@ -8,7 +8,7 @@ from app.domain.clips import Clip
 from app.domain.preferences import Query
 from app.storage import ArtefactStore
 from tests import factories
-from tests.browser.conftest import Invited, NewPage, serious_findings, wait_ready
+from tests.browser.conftest import Invited, NewPage, serious_findings, the_only, wait_ready
 
 pytestmark = pytest.mark.browser
 
@@ -285,7 +285,7 @@ def test_everything_works_without_script(invited: Invited, new_page: NewPage) ->
     page = new_page(java_script_enabled=False)
     page.goto(invited.link)
     for number, name in enumerate(["Left", "Right", "Undo", "Can\u2019t tell"]):
-        page.get_by_role("button", name=name).click()
+        the_only(page.get_by_role("button", name=name)).click()
         expect(page.locator("[data-count]")).to_have_text(f"{[1, 2, 1, 2][number]} of 10")
     assert invited.responses() == ["left", "skip"]
 

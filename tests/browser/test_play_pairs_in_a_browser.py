@@ -7,7 +7,7 @@ from sqlalchemy import select
 from app.domain.participation import ParticipantEvent
 from app.domain.preferences import Purpose, Query
 from tests import factories
-from tests.browser.conftest import Invited, NewPage, hold_clips, let_clips_run, serious_findings, wait_ready
+from tests.browser.conftest import Invited, NewPage, hold_clips, let_clips_run, serious_findings, the_only, wait_ready
 
 pytestmark = pytest.mark.browser
 
@@ -279,8 +279,9 @@ def test_without_script_the_clips_have_the_browser_s_controls_and_the_rest_stays
 ) -> None:
     page = new_page(java_script_enabled=False)
     page.goto(invited.link)
-    assert page.locator("video[controls]").count() == 2
+    expect(page.locator("video[controls]")).to_have_count(2)
     expect(page.locator("[data-player]")).to_be_hidden()
     expect(page.get_by_role("dialog")).to_be_hidden()
-    page.get_by_role("button", name="Equal").click()
+    the_only(page.get_by_role("button", name="Equal")).click()
+    expect(page.locator("[data-count]")).to_have_text("1 of 10")
     assert invited.responses() == ["equal"]

@@ -15,7 +15,8 @@ from app.__main__ import migrate
 from app.db import Database
 from app.domain.clips import Clip, Rollout
 from app.domain.preferences import LabelEvent, Query, Response
-from app.domain.studies import Participant, Study, StudySettings
+from app.domain.studies import Participant, Study
+from app.domain.study_settings import StudySettings
 from app.settings import Settings
 from app.storage import ArtefactStore
 from worker.compute.pools import Compute

@@ -6,9 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from worker import cli
+from worker import cli, options
+from worker.analysis.comparison import compared
 from worker.experiments import benchmark, benchmark_cell
-from worker.experiments.benchmark import PROFILES, Selection, with_options
+from worker.experiments.benchmark import PROFILES, Selection
 from worker.experiments.benchmark_cell import OPPOSED_USERS, PAPER_USERS, Cell, Terms
 from worker.ml.filters.filter_problem import FilterConfig
 from worker.ml.methods.registry import METHODS
@@ -16,7 +17,10 @@ from worker.ml.teachers import Taste
 
 SHY = Taste("shy", (1.0, 3.0, 2.0, 2.0, 1.0, 1.0))
 TINY = replace(
-    with_options(PROFILES["quick"], labels=12, scenarios=3, printed_steps=5),
+    PROFILES["quick"],
+    labels=12,
+    scenarios=3,
+    methods=replace(PROFILES["quick"].methods, printed_steps=5),
     smallest_pool=2,
     filter=FilterConfig(mode_attempts=1, gates=(), gate_scenarios=3, residual_rounds=0),
 )
@@ -55,22 +59,26 @@ def test_the_tables_are_written_from_whatever_is_finished(work: Path, tmp_path: 
     assert {(row["labels"], row["scenarios"], row["seeds"]) for row in table} == {("12", "3", "1")}
     matrix = rows(tmp_path / "personalisation.csv")
     assert len(matrix) == 4
+    shy = [row for row in rows(tmp_path / "users.csv") if row["user"] == "shy"]
+    assert [row["weight"] for row in shy] == ["1", "3", "2", "2", "1", "1"]
     page = (tmp_path / "table1.md").read_text()
-    assert "shy (1, 3, 2, 2, 1, 1)" in page
     assert f"as a hash: {benchmark_cell.code_mark()} (4 runs)." in page
+    assert "    the command\n" in page
+    assert not (tmp_path / "paired.csv").exists(), "no baseline was run"
     assert (tmp_path / "pareto-feeding.svg").read_text().startswith("<svg")
     assert len(rows(tmp_path / "costs.csv")) == 4
 
 
 def test_pictures_show_users_for_whom_methods_can_be_compared() -> None:
-    alone = [{"user": "shy", "method": method} for method in ("reference", "pbarl")]
-    several = [{"user": "cautious", "method": method} for method in ("reference", "pbarl", "prefft")]
-    assert benchmark.compared([*alone, *several]) == several
-    assert benchmark.compared(alone) == alone
+    alone = [{"task": "feeding", "user": "shy", "method": method} for method in ("reference", "pbarl")]
+    elsewhere = [{**row, "task": "drinking"} for row in alone]
+    several = [{"task": "feeding", "user": "cautious", "method": method} for method in ("reference", "pbarl", "prefft")]
+    assert compared([*alone, *several, *elsewhere]) == several
+    assert compared(alone) == alone
 
 
 def test_cells_of_other_terms_are_not_mixed_in(work: Path, tmp_path: Path) -> None:
-    assert report(work, tmp_path, with_options(TINY, labels=13)) == 0
+    assert report(work, tmp_path, replace(TINY, labels=13)) == 0
     assert not list(tmp_path.iterdir())
 
 
@@ -110,18 +118,18 @@ def test_the_quick_profile_does_everything_a_little() -> None:
     assert quick.methods.fine_tuning.steps < 5_000
     assert set(Selection().methods) == set(METHODS)
     assert len(full.pool) == 48
-    assert len(with_options(full, labels=5000).pool) == 334
+    assert len(replace(full, labels=5000).pool) == 334
 
 
 def test_users_are_named_or_given_by_their_weights() -> None:
-    assert cli._taste("slow") == OPPOSED_USERS["slow"]
-    assert cli._taste("shy=1,3,2,2,1,1") == SHY
-    level = cli._taste("level=1,1,1,1,1,1,tilt_rad:0.3")
+    assert options.taste("slow") == OPPOSED_USERS["slow"]
+    assert options.taste("shy=1,3,2,2,1,1") == SHY
+    level = options.taste("level=1,1,1,1,1,1,tilt_rad:0.3")
     assert (level.omega, level.per_signal) == ((1.0,) * 6, {"tilt_rad": 0.3})
     unknown_signal = "shy=1,1,1,1,1,1,noise:1"
     for wrong in ("nobody", "shy=1,2", "neutral=1,1,1,1,1,1", "a/b=1,1,1,1,1,1", "shy=a,1,1,1,1,1", unknown_signal):
         with pytest.raises(Exception, match="is none of"):
-            cli._taste(wrong)
+            options.taste(wrong)
 
 
 def test_the_command_can_only_report(tmp_path: Path) -> None:

@@ -2,19 +2,21 @@
 
 import csv
 import io
+import json
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 
-from worker.analysis import comparison
+from worker.analysis import comparison, comparison_page, result_pages
 from worker.analysis.comparison import EvaluatedCell, pooled, table_rows
 from worker.analysis.evaluation import success_change
 from worker.analysis.pareto import pareto_svg
 from worker.analysis.published import TABLE_1, published
-from worker.analysis.table_files import to_csv, to_markdown
+from worker.analysis.table_files import tables, to_csv
 from worker.ml.methods.registry import METHODS
 
 USERS = ("neutral", "cautious", "impatient")
@@ -111,23 +113,57 @@ def test_methods_and_users_are_compared_in_the_seeds_they_share() -> None:
     assert advantages[1] == pytest.approx(advantages[0])
 
 
-def test_the_page_shows_each_seed_alone() -> None:
-    assert "seed by seed" not in to_markdown(pooled(RUNS), [USERS], "")
+MADE = {
+    "commands": ["the command"],
+    "cells": 7,
+    "seeds": [0],
+    "labels": 200,
+    "manner": "5 % mistakes",
+    "pool_scenarios": 48,
+    "rule": "entropy",
+    "reward": "structured",
+    "form": "calibrated",
+    "scenarios": N,
+    "first_scenario": 4_000_000,
+    "prefft_steps": 10,
+    "pbrl_hri_steps": 10,
+    "printed_steps": 10,
+    "versions": "Python 3",
+    "policies": {"feeding": "abc"},
+    "code": {"def": 7},
+    "groups": [USERS],
+}
+
+
+def page_of(folder: Path, runs: Sequence[EvaluatedCell]) -> str:
+    """What stands on the page of these runs, by way of the files that it is made from."""
+    for name, rows in tables(pooled(runs), [USERS], [{"user": "neutral", "item": "C_d", "weight": 1.0}]).items():
+        (folder / f"{name}.csv").write_text(to_csv(rows))
+    (folder / "made.json").write_text(json.dumps(MADE))
+    return comparison_page.page(folder)
+
+
+def test_the_page_says_what_each_seed_alone_says(tmp_path: Path) -> None:
+    assert "Seed by seed" not in page_of(tmp_path, RUNS)
     second = [
         run("neutral", "reference", seed=1),
         run("cautious", "reference", seed=1),
         run("neutral", "pbarl", (3, 1, 0), seed=1),
         run("cautious", "pbarl", (5, 2, 0), seed=1),
     ]
-    page = to_markdown(pooled([*RUNS, *second]), [USERS], "")
-    table = page.split("seed by seed")[1]
+    page = page_of(tmp_path, [*RUNS, *second])
+    first, other = page.split("Seed by seed")[1].split("* Seed ")[1:3]
     unit = abs(HARDNESS.mean() - 20.0)
-    line = next(line for line in table.splitlines() if line.startswith("| feeding, neutral"))
-    assert f"{100 * (4 - 5) / unit:+.1f} [" in line  # first seed: the impatient user's filter is better
-    assert f"{100 * (3 - 5) / unit:+.1f} [" in line  # second: the cautious user's
-    assert next(line for line in table.splitlines() if line.startswith("| feeding, impatient")).endswith(
-        "| - | - | - |"
-    )
+    assert f"feeding, neutral: {100 * (4 - 5) / unit:+.1f} [" in first, "the impatient user's filter is better"
+    assert f"feeding, neutral: {100 * (3 - 5) / unit:+.1f} [" in other, "the cautious user's"
+    assert "in 2 of 3 columns" in first
+    assert "in 1 of 2 columns" in other, "the impatient user has one seed"
+
+
+def test_what_somebody_has_written_on_top_of_a_page_stays(tmp_path: Path) -> None:
+    page = page_of(tmp_path, RUNS)
+    (tmp_path / "table1.md").write_text(page.replace(comparison_page.HEAD, "# Mine"))
+    assert page_of(tmp_path, RUNS[:-1]).startswith(f"# Mine\n\n{result_pages.MARK}\n")
 
 
 def test_a_run_whose_reference_is_missing_waits_for_it() -> None:
@@ -172,15 +208,24 @@ def test_users_of_different_groups_are_not_compared() -> None:
     assert found["neutral", "neutral"]["own_advantage"] > 0
 
 
-def test_the_page_stands_beside_the_papers_numbers_and_says_where_the_claim_fails() -> None:
-    page = to_markdown(pooled(RUNS), [USERS], "    the command")
-    assert "| 88 (-4) |" in page
-    assert "| 50.7 (+39.5) |" in page
-    assert "| feeding, neutral | yes | yes | yes |" in page
-    assert "| feeding, neutral | +3.0" in page[page.index("`pbarl` minus `prefft`, paired") :]
-    assert "`pbarl` minus `pbrl_hri`" not in page, "what has not been run is not listed"
+def test_the_page_stands_beside_the_papers_numbers_and_says_where_the_claim_fails(tmp_path: Path) -> None:
+    page = page_of(tmp_path, RUNS)
+    assert "| neutral | `pbarl` | 1 | -5.0 [" in page
+    assert "] | -4 | +4.0 [" in page, "the paper's change beside ours"
+    assert "| +39.5 |" in page
+    assert "keeps the task (loses at most 5 points of success): 3 of 3.\n" in page
+    assert "`prefft`, 1 pairs of task and user: by R-hat ahead in 1, behind in 0" in page
+    assert "`pbrl_hri`" not in page, "what has not been run is not listed"
     worse = [each if each.method != "pbarl" else replace(each, success=np.zeros(N)) for each in RUNS]
-    assert "| feeding, neutral | **no** | yes | yes |" in to_markdown(pooled(worse), [USERS], "")
+    assert "2 of 3" not in page_of(tmp_path, worse).split("## Where")[0]
+    assert "of success): 0 of 3: all but\n  * feeding, neutral\n" in page_of(tmp_path, worse)
+
+
+def test_a_baseline_that_is_better_is_named_with_its_numbers(tmp_path: Path) -> None:
+    better = [*RUNS[:-1], run("neutral", "prefft", (9, 0, 0))]
+    page = page_of(tmp_path, better)
+    assert "by R-hat ahead in 0, behind in 1; by r^H ahead in 0, behind in 1." in page
+    assert "| feeding, neutral | `prefft` | -5.0 [-5.0, -5.0] | -5.00 [-5.00, -5.00] | -5.0 [" in page
 
 
 def test_time_is_averaged_over_users_and_seeds() -> None:

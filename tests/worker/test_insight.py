@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from app.db import Database
+from app.domain.choices import Strategy
 from app.domain.clips import Clip
-from app.domain.studies import Participant, Strategy
+from app.domain.studies import Participant
 from app.storage import ArtefactStore
 from tests.worker import test_querying
 from worker.compute.pools import Compute

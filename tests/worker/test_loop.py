@@ -17,7 +17,7 @@ from app.db import Database
 from app.domain.clips import Clip, Rollout
 from app.domain.models import Model, ModelKind, Run, RunKind, RunStatus
 from app.domain.preferences import LabelEvent
-from app.domain.studies import StudySettings
+from app.domain.study_settings import StudySettings
 from app.storage import ArtefactStore
 from tests.waiting import PATIENCE_S
 from worker.jobs.learning import dataset

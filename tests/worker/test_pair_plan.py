@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from app.domain.preferences import Purpose
-from app.domain.studies import StudySettings
+from app.domain.study_settings import StudySettings
 from tests.worker import invented
 from worker.jobs.learning import query_plan
 from worker.ml.rewards.segments import SegmentPairs, Stretch

@@ -10,10 +10,11 @@ import pytest
 from sqlalchemy import select
 
 from app.db import Database
+from app.domain.choices import Strategy
 from app.domain.clips import Clip
 from app.domain.models import ModelKind, Run
 from app.domain.preferences import Query, Response
-from app.domain.studies import Participant, Strategy, Study
+from app.domain.studies import Participant, Study
 from app.storage import ArtefactStore
 from worker.compute.pools import Compute
 from worker.jobs.learning import dataset, query_selection, reward_models

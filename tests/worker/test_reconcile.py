@@ -12,7 +12,8 @@ from app.domain.evaluation import Trial
 from app.domain.models import Run, RunKind, RunStatus
 from app.domain.preferences import Exclusion, LabelEvent, Query, Response
 from app.domain.protocol import EvaluationSettings
-from app.domain.studies import Participant, Study, StudySettings
+from app.domain.studies import Participant, Study
+from app.domain.study_settings import StudySettings
 from tests.worker.invented import job_of
 from worker import scenarios
 from worker.jobs import reconcile

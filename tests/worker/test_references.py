@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from app.db import Database
-from app.domain.studies import Method, StudySettings
+from app.domain.choices import Method
+from app.domain.study_settings import StudySettings
 from app.storage import ArtefactStore
 from worker.compute.filter_fitting import FilterFit
 from worker.compute.pools import Compute

@@ -15,7 +15,7 @@ from sqlalchemy import select
 
 from app.db import Database
 from app.domain.models import Run, RunStatus, WorkerPresence
-from app.domain.studies import StudySettings
+from app.domain.study_settings import StudySettings
 from app.services.studies import studies
 from app.settings import Settings
 from tests.waiting import PATIENCE_S, gone, hear_hangups, until

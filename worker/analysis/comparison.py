@@ -7,6 +7,7 @@ of r^H. Gains are changes of it as shares of what the judge minds and likes in t
 positively: for whoever only minds things, of the reference policy's own true return.
 """
 
+from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -159,21 +160,21 @@ def spent_rows(cells: Cells) -> list[Row]:
     ]
 
 
-def against(cells: Cells, method: str, rival: str) -> list[Row]:
-    """Per task and user: the method's preference minus the rival's, learned and true, paired by scenario.
+def against(cells: Cells, method: str, baseline: str) -> list[Row]:
+    """Per task and user: the method's preference minus the baseline's, learned and true, paired by scenario.
 
     Seeds that only one of them has been run with are left out.
     """
     rows = []
     for task, user, name in cells:
-        if name != method or (task, user, rival) not in cells:
+        if name != method or (task, user, baseline) not in cells:
             continue
-        mine, other = cells[task, user, method], cells[task, user, rival]
+        mine, other = cells[task, user, method], cells[task, user, baseline]
         shared = mine.seeds & other.seeds
         if not shared:
             continue
         mine, other = mine.of(shared), other.of(shared)
-        row: Row = {"task": task, "user": user}
+        row: Row = {"task": task, "user": user, "baseline": baseline}
         change = mean_change(other.both("preference")[1], mine.both("preference")[1])
         row |= _named("preference", change["delta"], change["low"], change["high"])
         change = mean_change(other.true_of(user)[1], mine.true_of(user)[1])
@@ -206,7 +207,7 @@ def _matrix_row(task: str, trained_for: str, judge: str, cell: Pooled, others: S
     row: Row = {"task": task, "trained_for": trained_for, "judged_by": judge, "labels": cell.runs[0].labels}
     row |= _named("gain", gain["delta"], gain["low"], gain["high"])
     row["success_delta"] = success_change(*cell.both("success"))["delta"]
-    row |= dict.fromkeys(("own_advantage", "own_advantage_low", "own_advantage_high"), "")
+    row |= dict.fromkeys(_names("own_advantage"), "")
     shared = cell.seeds.intersection(*(each.seeds for each in others))
     if trained_for == judge and others and shared:
         best = max((each.of(shared).true_of(judge)[1] for each in others), key=lambda returns: float(returns.mean()))
@@ -215,5 +216,39 @@ def _matrix_row(task: str, trained_for: str, judge: str, cell: Pooled, others: S
     return row
 
 
+def seed_rows(cells: Cells, method: str, groups: Sequence[Sequence[str]]) -> list[Row]:
+    """The diagonal of the personalisation matrix for each seed alone: other labels, trainings and scenarios."""
+    kept = (*_names("gain"), *_names("own_advantage"), "success_delta")
+    return [
+        {"task": row["task"], "user": row["trained_for"], "seed": seed} | {name: row[name] for name in kept}
+        for seed, of_seed in one_by_one(cells).items()
+        for row in personalisation_rows(of_seed, method, groups)
+        if row["trained_for"] == row["judged_by"]
+    ]
+
+
+def fit_rows(cells: Cells) -> list[Row]:
+    """What every fit says about itself."""
+    return [
+        {"task": task, "user": user, "method": method, "seed": run.seed, "notes": " ".join(run.notes)}
+        for (task, user, method), cell in cells.items()
+        for run in cell.runs
+        if run.notes
+    ]
+
+
+def compared(rows: Sequence[Row]) -> Sequence[Row]:
+    """The rows of those users of a task for whom several methods were run; all when there is no such user.
+
+    A single method beside the reference policy compares nothing.
+    """
+    counts = Counter((row["task"], row["user"]) for row in rows)
+    return [row for row in rows if counts[row["task"], row["user"]] > 2] or rows
+
+
 def _named(name: str, value: float, low: float, high: float) -> Row:
-    return {name: value, f"{name}_low": low, f"{name}_high": high}
+    return dict(zip(_names(name), (value, low, high), strict=True))
+
+
+def _names(name: str) -> tuple[str, str, str]:
+    return name, f"{name}_low", f"{name}_high"

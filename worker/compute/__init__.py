@@ -1,0 +1,1 @@
+"""Simulation and learning, in child processes."""

@@ -1,0 +1,1 @@
+"""Offline commands: benchmark, pre-training."""

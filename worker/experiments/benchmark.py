@@ -11,7 +11,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +20,10 @@ import torch
 from tqdm import tqdm
 
 from installed_tasks import catalogue
-from worker.analysis.comparison import Cells, EvaluatedCell, Row, cost_rows, personalisation_rows, pooled, table_rows
+from worker.analysis import comparison_page
+from worker.analysis.comparison import Cells, EvaluatedCell, Row, compared, pooled, table_rows
 from worker.analysis.pareto import pareto_svg
-from worker.analysis.table_files import METHOD, to_csv, to_markdown
+from worker.analysis.table_files import tables, to_csv
 from worker.compute.pools import Compute, Lane
 from worker.experiments import benchmark_cell
 from worker.experiments.benchmark_cell import INDIRECT_USERS, OPPOSED_USERS, PAPER_USERS, Cell, Terms
@@ -35,6 +36,7 @@ from worker.ml.teachers import Manner, Taste, random_taste
 from worker.sim.costs import preference_rewards, stakes
 from worker.tasks import registry
 from worker.tasks.registry import checkpoint
+from worker.trajectory import COSTS
 from worker.whole_files import written_whole
 
 INTERRUPTED = 130
@@ -208,10 +210,14 @@ def _report(terms: Terms, work: Path, output: Path, command: str) -> None:
         return
     output.mkdir(parents=True, exist_ok=True)
     groups = _groups(list(tastes))
-    _replace(output / "table1.csv", to_csv(table_rows(cells)))
-    _replace(output / "costs.csv", to_csv(cost_rows(cells)))
-    _replace(output / "personalisation.csv", to_csv(personalisation_rows(cells, METHOD, groups)))
-    _replace(output / "table1.md", to_markdown(cells, groups, _header(terms, cells, tastes, command, _states(found))))
+    for name, rows in tables(cells, groups, _users(tastes)).items():
+        if rows:
+            _replace(output / f"{name}.csv", to_csv(rows))
+        else:
+            (output / f"{name}.csv").unlink(missing_ok=True)
+    made = _made(terms, cells, command, groups, Counter(record.get("code", "not recorded") for record, _, _ in found))
+    _replace(output / "made.json", json.dumps(made, indent=2) + "\n")
+    _replace(output / "table1.md", comparison_page.page(output))
     for task, all_rows in _by_task(table_rows(cells)):
         rows = compared(all_rows)
         _replace(output / f"pareto-{task}.svg", pareto_svg(task, rows, list(METHODS)))
@@ -275,53 +281,44 @@ def _groups(users: Sequence[str]) -> list[list[str]]:
     return [*known, others]
 
 
-def compared(rows: Sequence[Row]) -> Sequence[Row]:
-    """Of one task's rows those of users for whom several methods were run; all when there is no such user.
-
-    A picture of a single method beside the reference policy compares nothing.
-    """
-    counts = Counter(row["user"] for row in rows)
-    return [row for row in rows if counts[row["user"]] > 2] or rows
-
-
 def _by_task(rows: Sequence[Row]) -> list[tuple[str, list[Row]]]:
     tasks = dict.fromkeys(row["task"] for row in rows)
     return [(task, [row for row in rows if row["task"] == task]) for task in tasks]
 
 
-def _header(terms: Terms, cells: Cells, tastes: dict[str, Taste], command: str, states: str) -> str:
-    seeds = sorted({run.seed for cell in cells.values() for run in cell.runs})
-    versions = f"Python {platform.python_version()}, NumPy {np.__version__}, torch {torch.__version__}"
-    marks = ", ".join(f"{task} {policy_mark(task)}" for task in dict.fromkeys(task for task, _, _ in cells))
-    weights = "; ".join(
-        f"{taste.name} ({', '.join(f'{value:g}' for value in taste.omega)}"
-        + "".join(f", {signal} {value:g}" for signal, value in taste.per_signal.items())
-        + ")"
+def _made(
+    terms: Terms, cells: Cells, command: str, groups: Sequence[Sequence[str]], states: Counter[str]
+) -> dict[str, Any]:
+    """How the tables were made. Cells do not run again when the code changes, so its states are counted."""
+    return {
+        "commands": [command],
+        "cells": len(cells),
+        "seeds": sorted({run.seed for cell in cells.values() for run in cell.runs}),
+        "labels": terms.labels,
+        "manner": _spoken(terms.manner),
+        "pool_scenarios": len(terms.pool),
+        "rule": terms.rule,
+        "reward": terms.reward,
+        "form": terms.form,
+        "scenarios": terms.scenarios,
+        "first_scenario": terms.unseen(0).start,
+        "prefft_steps": terms.methods.fine_tuning.steps,
+        "pbrl_hri_steps": terms.methods.from_scratch.steps,
+        "printed_steps": terms.methods.printed_steps,
+        "versions": f"Python {platform.python_version()}, NumPy {np.__version__}, torch {torch.__version__}",
+        "policies": {task: policy_mark(task) for task in dict.fromkeys(task for task, _, _ in cells)},
+        "code": dict(states.most_common()),
+        "groups": groups,
+    }
+
+
+def _users(tastes: dict[str, Taste]) -> list[Row]:
+    """What each scripted user minds: per item of r^H, and per unit of a further signal."""
+    return [
+        {"user": taste.name, "item": item, "weight": weight}
         for taste in tastes.values()
-    )
-    methods = terms.methods
-    lines = [
-        f"    {command}",
-        "",
-        f"{len(cells)} cells of task, user and method are finished; seeds {', '.join(map(str, seeds))}.",
-        f"{terms.labels} scripted labels per user and seed ({_spoken(terms.manner)}) on",
-        f"{len(terms.pool)} scenarios, pairs chosen by `{terms.rule}`, reward model `{terms.reward}`, costs in the",
-        f"`{terms.form}` form.",
-        f"Every method is driven through {terms.scenarios} scenarios per seed, from {terms.unseen(0).start} on: no",
-        "clip, surface, gate or training uses them; how settings were chosen is in docs/method.md, section 6.",
-        f"Environment steps: PrefFT {methods.fine_tuning.steps}, PbRL-HRI {methods.from_scratch.steps};",
-        f"gradient steps of printed PbARL {methods.printed_steps}. Weights of the users: {weights}.",
-        f"{versions}. Frozen policies: {marks}.",
-        states,
+        for item, weight in [*zip(COSTS, taste.omega, strict=True), *taste.per_signal.items()]
     ]
-    return "\n".join(lines)
-
-
-def _states(found: Sequence[tuple[dict[str, Any], dict[str, Any], Taste]]) -> str:
-    """Cells do not run again when the code changes, so the page says how many states of it they are from."""
-    counts = Counter(record.get("code", "not recorded") for record, _, _ in found)
-    told = ", ".join(f"{state} ({count} runs)" for state, count in counts.most_common())
-    return f"State of worker/ml, worker/sim and worker/experiments/benchmark_cell.py, as a hash: {told}."
 
 
 def _spoken(manner: Manner) -> str:
@@ -334,27 +331,3 @@ def _spoken(manner: Manner) -> str:
 def _replace(path: Path, text: str) -> None:
     with written_whole(path) as draft:
         draft.write_text(text)
-
-
-def with_options(
-    terms: Terms,
-    *,
-    prefft_steps: int | None = None,
-    pbrl_steps: int | None = None,
-    printed_steps: int | None = None,
-    rationality: float | None = None,
-    mistakes: float | None = None,
-    **values: Any,
-) -> Terms:
-    """A profile with what was said on the command line; None leaves a value as it is."""
-    chosen = terms.methods
-    if prefft_steps is not None:
-        chosen = replace(chosen, fine_tuning=replace(chosen.fine_tuning, steps=prefft_steps))
-    if pbrl_steps is not None:
-        chosen = replace(chosen, from_scratch=replace(chosen.from_scratch, steps=pbrl_steps))
-    if printed_steps is not None:
-        chosen = replace(chosen, printed_steps=printed_steps)
-    errs = {"rationality": rationality, "mistakes": mistakes}
-    manner = replace(terms.manner, **{name: value for name, value in errs.items() if value is not None})
-    given = {name: value for name, value in values.items() if value is not None}
-    return replace(terms, methods=chosen, manner=manner, **given)

@@ -1,0 +1,1 @@
+"""Find what is due, and run it durably."""

@@ -16,7 +16,7 @@ from dbos import DBOS, SetWorkflowID
 from sqlalchemy.exc import OperationalError
 
 from app.db import Database, Watch, complaints, now
-from app.domain.studies import StudySettings
+from app.domain.study_settings import StudySettings
 from app.errors import AppError, OncePerMinute
 from app.settings import Settings
 from app.storage import ArtefactStore, keep_private

@@ -1,0 +1,1 @@
+"""Reward models, policies and filters."""

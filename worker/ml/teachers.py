@@ -1,6 +1,6 @@
 """Scripted teachers: simulated participants with known tastes, for rehearsals, tests and measurements.
 
-A teacher sees the preference reward r^H of every step (the paper's Eq. 8; worker.sim.costs.preference_rewards computes
+A teacher sees the preference reward r^H of every step (the paper's Eq. 9; worker.sim.costs.preference_rewards computes
 it for an omega) and names the segment with the larger sum. How it errs follows B-Pref (Lee et al. 2021), with every
 threshold in units of the spread of returns, so that a setting means the same for every taste.
 """

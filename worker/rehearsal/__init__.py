@@ -1,0 +1,1 @@
+"""Scripted participants who use a running server."""

@@ -8,9 +8,11 @@ from pathlib import Path
 from sqlalchemy import select
 
 from app.db import Database
+from app.domain.choices import ClipQuality, Strategy
 from app.domain.models import Run, RunStatus
 from app.domain.protocol import EvaluatedMethod, EvaluationSettings, PlannedTest
-from app.domain.studies import ClipQuality, Strategy, Study, StudySettings
+from app.domain.studies import Study
+from app.domain.study_settings import StudySettings
 from app.services.archives import archive, archive_reading, sealing
 from app.storage import ArtefactStore
 from worker.experiments.benchmark_cell import PAPER_USERS

@@ -23,7 +23,8 @@ from app.db import Database
 from app.domain.models import Bundle, Model, ModelKind, Run, RunKind, RunStatus
 from app.domain.preferences import LEARNED_FROM, Query
 from app.domain.protocol import EvaluationMode
-from app.domain.studies import Study, StudySettings
+from app.domain.studies import Study
+from app.domain.study_settings import StudySettings
 from app.services.accounts import accounts
 from app.services.monitoring import dashboard
 from app.services.participants import enrolment

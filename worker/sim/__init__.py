@@ -1,6 +1,7 @@
-"""The simulated robot and people. Importing this package registers every installed task with Gymnasium.
+"""Robot arm, seated person, physics.
 
-The task ``wipe_mouth`` is ``pbarl/WipeMouth-v0``; its code is imported when one is made.
+Importing this package registers every installed task with Gymnasium: the task ``wipe_mouth`` is
+``pbarl/WipeMouth-v0``; its code is imported when one is made.
 """
 
 import gymnasium

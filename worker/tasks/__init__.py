@@ -1,0 +1,1 @@
+"""The robot's tasks, one folder each."""

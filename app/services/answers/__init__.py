@@ -1,0 +1,1 @@
+"""Store answers, serve the next pair."""

@@ -5,8 +5,9 @@ from typing import Any
 
 from sqlalchemy.orm import Session, joinedload
 
+from app.domain.choices import Strategy
 from app.domain.preferences import LEARNED_FROM, Label, Query, Response, current_answers
-from app.domain.studies import Participant, Strategy
+from app.domain.studies import Participant
 from app.services.answers import accuracy
 from app.services.answers.accuracy import Curve, Predicted, Share
 from app.services.answers.consistency import Estimate, answers_of, consistency

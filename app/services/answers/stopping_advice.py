@@ -14,7 +14,7 @@ from app.services import audit
 
 SMALL_REGRET = 0.2
 """Standard deviations of predicted return. With scripted people the expected regret begins at one to two and passes
-this at 60 to 100 answers in two of our tasks; in the third it says little (docs/method.md, section 2)."""
+this at 60 to 100 answers in two of our tasks; in the third it says little (docs/method.md, section 3)."""
 IN_A_ROW = 3
 """Retrainings with a small regret: a single one is often chance."""
 _ACT = "more answers would hardly pay"

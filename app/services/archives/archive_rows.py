@@ -20,7 +20,8 @@ from app.domain import run_keys
 from app.domain.models import ModelKind, RunKind, RunStatus
 from app.domain.preferences import Purpose, Response, SkipReason
 from app.domain.protocol import EvaluatedMethod, Stage
-from app.domain.studies import PREVIEW_NUMBERS, Participant, Study, StudySettings
+from app.domain.studies import PREVIEW_NUMBERS, Participant, Study
+from app.domain.study_settings import StudySettings
 from app.services.archives.archive import LARGEST_ROW_BYTES, REMADE, SECRETS, ArchiveInvalid, Manifest, artefacts
 from app.services.studies import locking
 

@@ -2,7 +2,8 @@
 
 from sqlalchemy.orm import Session
 
-from app.domain.studies import StudySettings, usual_clip_steps
+from app.domain.studies import usual_clip_steps
+from app.domain.study_settings import StudySettings
 from app.errors import AppError
 from app.paths import DEMO_STUDY
 from app.services import audit

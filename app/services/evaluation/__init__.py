@@ -1,0 +1,1 @@
+"""Blinded evaluation: plan, ratings, key."""

@@ -181,11 +181,12 @@ def dictionary_markdown(tables: Sequence[Table]) -> str:
 _HEAD = f"""\
 # Data dictionary
 
-Generated from `app/services/exports/export_tables.py` by `python -m app dictionary`; a test fails when it is
-out of date.
+Every table and column of a study's export, with type, unit and meaning. Each table can be downloaded as CSV or JSONL
+while the study runs. One zip file has all of them as CSV, JSONL and Parquet, with this dictionary, the report's figures
+and the preference pairs as arrays (`docs/arrays.md`).
 
-Every table can be downloaded by itself as CSV or JSONL while a study runs, and all of them together as one zip file
-(CSV, JSONL, Parquet, this dictionary, the report's figures, and the preference pairs as arrays: `docs/arrays.md`).
+This page is generated from `app/services/exports/export_tables.py` by `python -m app dictionary`; a test fails when it
+is out of date.
 
 * Files are UTF-8 without a byte order mark; CSV has a header line, commas, and double quotes where needed.
 * Times are UTC in ISO 8601. Unknown is empty in CSV and `null` elsewhere, never 0.
@@ -193,10 +194,10 @@ Every table can be downloaded by itself as CSV or JSONL while a study runs, and 
 * In CSV, an apostrophe stands wherever a spreadsheet would begin a formula in a text (before `=`, `+`, `-`, `@` at its
   start, and after a line break, a semicolon or a tab), because participants write some of these texts; line breaks are
   `\\n`, and control characters are replaced (U+FFFD). JSONL and Parquet have texts as they are.
-* Participants are known by codes. Of somebody who has withdrawn only a tombstone is left: code, and when it was.
-* Until a study is unblinded, methods of the evaluation are left out everywhere: letters stand for them, and a letter is
-  another method for every participant.
-* Study, lock hash ("{NOT_LOCKED}" if there is none), deviations, software version and time stand in every row."""
+* Participants are known by codes. Of somebody who has withdrawn only a tombstone is left: the code, and when.
+* Until a study is unblinded, letters stand for the methods of the evaluation everywhere, and the same letter can be
+  another method for another participant.
+* Every row ends with study, lock hash ("{NOT_LOCKED}" if there is none), deviations, software version and time."""
 
 
 def _markdown_table(columns: Sequence[Column]) -> str:

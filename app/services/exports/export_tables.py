@@ -32,22 +32,22 @@ B, W, J = ColumnKind.BOOLEAN, ColumnKind.TIME, ColumnKind.JSON
 TABLES: Sequence[Table] = (
     Table(
         "participants",
-        "One row per participant, tombstones of those who withdrew included.",
+        "One row per participant, including tombstones of those who withdrew.",
         (
             PARTICIPANT,
-            Column("status", T, "How far they are.", allowed="invited, consented, completed, withdrawn"),
-            Column("seed", I, "Everything drawn for this person follows from it."),
-            Column("language", T, "Of the pages.", allowed="en, de"),
+            Column("status", T, "How far they have come.", allowed="invited, consented, completed, withdrawn"),
+            Column("seed", I, "Seed of everything that is drawn for this person."),
+            Column("language", T, "Language of the pages.", allowed="en, de"),
             Column("invited_at", W, "When the personal link was made."),
             Column("consented_at", W, "When they agreed."),
-            Column("consent_version", T, "To which text."),
+            Column("consent_version", T, "Version of the text they agreed to."),
             Column("instructed_at", W, "When they had read the instructions."),
             Column("completed_at", W, "When they had finished everything."),
             Column("last_seen_at", W, "When their browser last asked for anything."),
-            Column("panel_id", T, "Who this is at the recruitment panel, if they came through one. Personal."),
-            Column("withdrawn_at", W, "When they withdrew; nothing else is kept of them."),
+            Column("panel_id", T, "Their id at the recruitment panel, if they came through one. Personal data."),
+            Column("withdrawn_at", W, "When they withdrew; nothing else about them is kept."),
             Column(
-                "scripted_as", T, "The user that a program plays: no person has answered or rated. Empty: a person."
+                "scripted_as", T, "The user that a program played; no person has answered or rated. Empty: a person."
             ),
         ),
         export_rows.participants,
@@ -55,13 +55,15 @@ TABLES: Sequence[Table] = (
     ),
     Table(
         "stages",
-        "When everybody came into each stage and was through with it.",
+        "When each participant entered and finished each stage.",
         (
             PARTICIPANT,
-            Column("stage", T, "Part of the way.", allowed=_words(Stage)),
+            Column("stage", T, "Which stage.", allowed=_words(Stage)),
             Column("entered_at", W, "When it was first shown."),
             Column(
-                "finished_at", W, "When it was done; empty where that is counted instead (practice, pairs, evaluation)."
+                "finished_at",
+                W,
+                "When it was finished; empty for stages that are counted instead (practice, pairs, evaluation).",
             ),
         ),
         export_rows.stages,
@@ -77,7 +79,7 @@ TABLES: Sequence[Table] = (
                 "purpose", T, "Why it is shown; only introduction and preference are learned from.", "", _words(Purpose)
             ),
             Column("repeats_ordinal", I, "Of a repeat: the ordinal of the pair that it asks again."),
-            Column("sides_swapped", B, "Of a repeat: whether the clips have changed sides."),
+            Column("sides_swapped", B, "Of a repeat: whether the clips have exchanged sides."),
             Column("expected", T, "Of a catch pair: the obvious answer.", allowed="left, right"),
             Column(
                 "left_scenario", I, "Situation of the left clip; with the behaviour it names the clip (table clips)."
@@ -90,7 +92,7 @@ TABLES: Sequence[Table] = (
             Column("left_video_sha256", T, "The video that was shown on the left.", allowed=SHA256),
             Column("right_video_sha256", T, "The video that was shown on the right.", allowed=SHA256),
             Column("strategy", T, "How the pair was chosen."),
-            Column("propensity", N, "Probability with which it was chosen among the candidates.", allowed="0 to 1"),
+            Column("propensity", N, "Probability with which it was chosen from the candidates.", allowed="0 to 1"),
             Column(
                 "predicted_right",
                 N,
@@ -105,7 +107,7 @@ TABLES: Sequence[Table] = (
             Column("reason", T, "Why they could not tell (skip).", allowed=_words(SkipReason)),
             Column("response_time_ms", I, "From the first frame of both videos to the answer.", "ms"),
             Column("answered_at", W, "When that answer reached the server."),
-            Column("revisions", I, "Answers and undos of this pair; table labels has them all."),
+            Column("revisions", I, "Number of answers and undos of this pair; the table labels has them all."),
             Column("is_label", B, "Whether the answer is learned from."),
             Column("excluded", B, "Whether an experimenter has left the answer out of learning and statistics."),
             Column("exclusion_reason", T, "Why, in their words."),
@@ -115,14 +117,16 @@ TABLES: Sequence[Table] = (
     ),
     Table(
         "labels",
-        "Every answer and every undo as it came in, those that no longer count included.",
+        "Every answer and every undo as it came in, including those that no longer count.",
         (
             PARTICIPANT,
             ORDINAL,
-            Column("purpose", T, "Of the pair.", allowed=_words(Purpose)),
-            Column("revision", I, "First, second, ... word about this pair.", allowed="from 1"),
-            Column("response", T, "What was said; empty: the answer before was taken back.", allowed=_words(Response)),
-            Column("superseded", B, "Whether a later word about this pair counts instead."),
+            Column("purpose", T, "Purpose of the pair.", allowed=_words(Purpose)),
+            Column("revision", I, "First, second, ... answer or undo of this pair.", allowed="from 1"),
+            Column(
+                "response", T, "What was said; empty: the previous answer was taken back.", allowed=_words(Response)
+            ),
+            Column("superseded", B, "Whether a later answer or undo of this pair counts instead."),
             Column("reason", T, "Why they could not tell (skip).", allowed=_words(SkipReason)),
             Column("response_time_ms", I, "From the first frame of both videos to the answer.", "ms"),
             Column("replay_count", I, "How often the clips were started again."),
@@ -133,11 +137,11 @@ TABLES: Sequence[Table] = (
             Column("right_watched_ms", I, "How much of the right clip had been played, in its own time.", "ms"),
             Column("play_error_count", I, "Clips that could not be loaded or played."),
             Column("stall_count", I, "How often a clip had to wait for the network."),
-            Column("stalled_ms", I, "How long altogether.", "ms"),
+            Column("stalled_ms", I, "How long it waited altogether.", "ms"),
             Column(
                 "largest_drift_ms",
                 I,
-                "How far the two clips were apart at worst, before they were brought together.",
+                "How far the two clips were apart at most, before they were synchronised.",
                 "ms",
             ),
             Column("by_script", B, WITHOUT_SCRIPT),
@@ -154,7 +158,7 @@ TABLES: Sequence[Table] = (
             PARTICIPANT,
             Column("form", T, "Which form.", allowed="demographics, questionnaire"),
             Column("item", T, "Name of the question."),
-            Column("value", T, "What was entered (likert: 1 to 5); empty: left out on purpose."),
+            Column("value", T, "What was entered (likert: 1 to 5); empty: skipped."),
             Column("superseded", B, "Whether a later answer to the same question counts instead."),
             Column("created_at", W, "When it reached the server."),
         ),
@@ -163,11 +167,11 @@ TABLES: Sequence[Table] = (
     ),
     Table(
         "consent",
-        "What exactly everybody agreed to.",
+        "The consent text each participant agreed to, word for word.",
         (
             PARTICIPANT,
             Column("version", T, "Version of the text."),
-            Column("language", T, "Of the text.", allowed="en, de"),
+            Column("language", T, "Language of the text.", allowed="en, de"),
             Column("agreed_at", W, "When they agreed."),
             Column("text", T, "The text, word for word."),
         ),
@@ -176,11 +180,11 @@ TABLES: Sequence[Table] = (
     ),
     Table(
         "events",
-        "What happened on the way besides answers: breaks, hidden pages, clips that would not play.",
+        "What happened besides answers: breaks, hidden pages, clips that would not play.",
         (
             PARTICIPANT,
-            Column("at", W, "When."),
-            Column("kind", T, "What; app/services/participant_events.py says what each means."),
+            Column("at", W, "When it happened."),
+            Column("kind", T, "What happened; app/services/participant_events.py says what each kind means."),
             Column("detail", J, "Numbers that belong to it."),
         ),
         export_rows.events,
@@ -188,13 +192,13 @@ TABLES: Sequence[Table] = (
     ),
     Table(
         "ratings",
-        "Every trial of the blinded evaluation with what was said about it; a corrected rating has a row per revision.",
+        "Every trial of the blinded evaluation with its rating; a corrected rating has one row per revision.",
         (
             PARTICIPANT,
             Column(
                 "letter",
                 T,
-                "Under which the participant met the method; letters go by the order of meeting.",
+                "The letter the participant knew the method by, in the order of appearance.",
                 "",
                 "A to E",
             ),
@@ -202,13 +206,15 @@ TABLES: Sequence[Table] = (
                 "method", T, "Which method it was; empty until the study is unblinded.", allowed=_words(EvaluatedMethod)
             ),
             Column("repetition", I, "Which trial of this method.", allowed="from 1"),
-            Column("order", I, "Place of the trial among all of this participant.", allowed="from 1"),
+            Column("order", I, "Place of the trial among all trials of this participant.", allowed="from 1"),
             Column("scenario", I, "Situation; the same for all methods of a participant and repetition."),
             Column("satisfaction", I, "Overall satisfaction.", allowed="1 to 5; empty: not rated"),
             Column("personalisation", I, "How personalised the robot seemed.", allowed="1 to 5; empty: not rated"),
-            Column("counts", B, "Whether this rating counts: false for a corrected one, and where there is none."),
+            Column("counts", B, "Whether this rating counts: false if it was corrected later, or if there is none."),
             Column("revision", I, "First, second, ... rating of this trial.", allowed="from 1"),
-            Column("response_time_ms", I, "From showing the scales to sending.", "ms"),
+            Column(
+                "response_time_ms", I, "From the moment the scales were shown to the moment the rating was sent.", "ms"
+            ),
             Column("by_script", B, WITHOUT_SCRIPT),
             Column("rated_at", W, "When it reached the server."),
             Column("shown_at", W, "Video: when the film was first shown."),
@@ -224,16 +230,16 @@ TABLES: Sequence[Table] = (
         "Every model that was trained for a participant.",
         (
             PARTICIPANT,
-            Column("kind", T, "What it is.", allowed=_words(ModelKind)),
+            Column("kind", T, "Kind of model.", allowed=_words(ModelKind)),
             Column(
                 "label_count",
                 I,
-                "Answers given by then, those without a preference and excluded ones included.",
+                "Answers given by then, including excluded ones and those without a preference.",
             ),
-            Column("label_hash", T, "Fingerprint of these answers.", allowed=SHA256),
-            Column("seed", I, "Of the training."),
+            Column("label_hash", T, "Hash of these answers.", allowed=SHA256),
+            Column("seed", I, "Seed of the training."),
             Column(
-                "artefact_sha256", T, "The stored file; of methods unknown while the study is blinded.", allowed=SHA256
+                "artefact_sha256", T, "The stored file; empty for methods while the study is blinded.", allowed=SHA256
             ),
             Column("created_at", W, "When it was ready."),
             Column("metrics", J, "What was measured while training."),
@@ -248,7 +254,7 @@ TABLES: Sequence[Table] = (
             PARTICIPANT,
             Column("label_count", I, "Answers the filter has learned from."),
             Column("newest", B, "Whether it is the participant's newest filter."),
-            Column("bundle_version", I, "Of the published bundle, if there is one."),
+            Column("bundle_version", I, "Version of the published bundle, if there is one."),
             Column("scenarios", I, "Unseen scenarios it was measured on."),
             Column(
                 "measure",
@@ -276,7 +282,7 @@ TABLES: Sequence[Table] = (
             Column("mode", J, "What the behaviour is."),
             Column("success", B, "Whether the whole trajectory succeeded."),
             Column("first_step", I, "First control step that is shown."),
-            Column("step_count", I, "How many are shown.", "control steps"),
+            Column("step_count", I, "How many steps are shown.", "control steps"),
             Column("duration_ms", I, "Length of the video.", "ms"),
             Column("fps", I, "Frames per second.", "1/s"),
             Column("trajectory_sha256", T, "The stored trajectory.", allowed=SHA256),
@@ -288,11 +294,11 @@ TABLES: Sequence[Table] = (
         "deviations",
         "Changes to the study after it was locked.",
         (
-            Column("at", W, "When."),
-            Column("actor", T, "Whose account."),
+            Column("at", W, "When it was made."),
+            Column("actor", T, "Account that made it."),
             Column("reason", T, "Why, in their words."),
-            Column("before", J, "What was changed, as it was."),
-            Column("after", J, "And as it is since."),
+            Column("before", J, "The changed settings, as they were."),
+            Column("after", J, "The changed settings, as they are since."),
         ),
         export_rows.deviations,
         (Deviation,),

@@ -1,0 +1,1 @@
+"""Dashboard figures, participants' states, health."""

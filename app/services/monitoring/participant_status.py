@@ -14,13 +14,15 @@ from sqlalchemy import func, select
 from sqlalchemy.orm import Session, aliased
 
 from app.db import now
+from app.domain.choices import Strategy
 from app.domain.clips import Clip, Rollout
 from app.domain.evaluation import Controller, Film
 from app.domain.models import Bundle, Export, Model, ModelKind
 from app.domain.participation import StageRecord
 from app.domain.preferences import LabelEvent, Purpose, Query, Response, is_excluded
 from app.domain.protocol import Stage
-from app.domain.studies import Participant, Strategy, Study, StudySettings
+from app.domain.studies import Participant, Study
+from app.domain.study_settings import StudySettings
 from app.services.answers import stopping_advice
 from app.services.answers.consistency import Consistency, JudgedAnswer, consistency, seen
 from app.services.answers.stopping_advice import Advice

@@ -1,0 +1,1 @@
+"""Enrolment, consent, stages, forms, withdrawal."""

@@ -9,7 +9,8 @@ from sqlalchemy.orm import Session
 
 from app.domain.participation import FormAnswer
 from app.domain.protocol import LIKERT_POINTS, FormItem, Stage
-from app.domain.studies import Participant, StudySettings
+from app.domain.studies import Participant
+from app.domain.study_settings import StudySettings
 
 MOST_CHARACTERS = 4000
 _NUMBER = re.compile(r"[+\-\N{MINUS SIGN}]?[0-9]{1,12}([.,][0-9]{1,12})?")

@@ -14,7 +14,8 @@ from app.domain.evaluation import Rating, Trial
 from app.domain.participation import StageRecord
 from app.domain.preferences import LabelEvent, Purpose, Query
 from app.domain.protocol import Stage
-from app.domain.studies import Participant, StudySettings
+from app.domain.studies import Participant
+from app.domain.study_settings import StudySettings
 
 
 def stages_of(settings: StudySettings) -> Sequence[Stage]:

@@ -12,7 +12,8 @@ from sqlalchemy.orm import Session
 
 from app.domain.participation import ParticipantEvent, StageRecord
 from app.domain.protocol import Stage
-from app.domain.studies import Participant, StudySettings
+from app.domain.studies import Participant
+from app.domain.study_settings import StudySettings
 from app.services.answers.next_query import LONGEST_PAUSE, PairProgress
 from app.services.participant_events import EventKind
 from app.services.participants import stages
@@ -22,7 +23,7 @@ LEAST_PEOPLE = 3
 RECENT = 90
 """Rows looked at, the newest."""
 _AFTER_PAIRS = (Stage.EVALUATION, Stage.QUESTIONNAIRE, Stage.DEBRIEF)
-_CONTROL_RATE_HZ = 10
+CONTROL_RATE_HZ = 10
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ def _pairs_s(progress: PairProgress, settings: StudySettings, whole_clip_steps: 
     """Whole episodes come first and play longer than what follows; the pace is that of what was answered last."""
     pace_s, left = progress.pace_s or 0.0, progress.wanted - progress.answered
     whole = max(0, settings.introduction_count - progress.answered)
-    shorter_s = ((whole_clip_steps or settings.clip_steps) - settings.clip_steps) / _CONTROL_RATE_HZ
+    shorter_s = ((whole_clip_steps or settings.clip_steps) - settings.clip_steps) / CONTROL_RATE_HZ
     after_s = pace_s - shorter_s if whole and pace_s > shorter_s else pace_s
     return whole * pace_s + (left - whole) * after_s
 

@@ -16,7 +16,8 @@ from app.domain import participation, preferences  # noqa: F401  (their tables b
 from app.domain.clips import Clip, Rollout
 from app.domain.evaluation import Controller, Film
 from app.domain.models import Bundle, Export, Model, Report, Run, RunKind
-from app.domain.studies import Participant, Study, StudySettings
+from app.domain.studies import Participant, Study
+from app.domain.study_settings import StudySettings
 from app.services import audit
 from app.storage import ArtefactStore
 

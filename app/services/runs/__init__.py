@@ -1,0 +1,1 @@
+"""The worker's runs, reports and bundles."""

@@ -10,7 +10,8 @@ from app.db import now
 from app.domain import run_keys
 from app.domain.models import Model, Run, RunKind, RunStatus
 from app.domain.run_keys import SCENARIO
-from app.domain.studies import Participant, Study, StudySettings
+from app.domain.studies import Participant, Study
+from app.domain.study_settings import StudySettings
 
 RECENT = 9
 """Runs whose median is taken, the newest."""

@@ -1,0 +1,1 @@
+"""Make a study, lock it, put it away, delete it."""

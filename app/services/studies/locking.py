@@ -14,9 +14,11 @@ from sqlalchemy.orm import Session
 
 from app.db import now
 from app.domain.clips import Rollout
+from app.domain.described import Use, settings_of
 from app.domain.evaluation import Assignment
 from app.domain.preferences import Query
-from app.domain.studies import Deviation, Participant, Study, StudySettings, longest_clip_steps
+from app.domain.studies import Deviation, Participant, Study, longest_clip_steps
+from app.domain.study_settings import StudySettings
 from app.errors import AppError
 from app.services import audit
 from app.services.exports import export_formats
@@ -28,9 +30,11 @@ from app.storage import ArtefactStore
 SEEDS_LISTED = 50
 """Of participants; those of later ones follow by the same rule."""
 
-OF_CLIPS = ("clip_steps", "clip_quality", "behaviours_per_scenario")
-OF_PAIRS = ("labels_per_participant", "practice_pairs", "introduction_pairs", "repeated_pairs", "catch_pairs")
-OF_EVALUATION = ("evaluation",)
+FIXED_BY: Mapping[str, Use] = {
+    **dict.fromkeys(("task", "seed"), Use.CLIPS),
+    **{name: shown.fixed_by for name, _, shown in settings_of(StudySettings) if shown.fixed_by},
+}
+"""What settles a setting, or task and seed of the study, for good."""
 
 
 class AlreadyLocked(AppError):
@@ -60,14 +64,13 @@ class SettingsFixed(AppError):
 def fixed_settings(session: Session, study: Study) -> Mapping[str, str]:
     """Names of settings, and of ``task`` and ``seed``, that nothing may change any more, each with the reason why."""
     real = select(Participant.id).where(Participant.study_id == study.id, Participant.is_preview.is_(False))
-    fixed: dict[str, str] = {}
-    if session.scalar(select(Rollout.id).where(Rollout.study_id == study.id).limit(1)) is not None:
-        fixed |= dict.fromkeys(("task", "seed", *OF_CLIPS), "Fixed: clips have been made.")
-    if session.scalar(select(Query.id).where(Query.participant_id.in_(real)).limit(1)) is not None:
-        fixed |= dict.fromkeys(OF_PAIRS, "Fixed: participants have been given pairs.")
-    if session.scalar(select(Assignment.id).where(Assignment.participant_id.in_(real)).limit(1)) is not None:
-        fixed |= dict.fromkeys(OF_EVALUATION, "Fixed: somebody has reached the evaluation.")
-    return fixed
+    signs = {
+        Use.CLIPS: select(Rollout.id).where(Rollout.study_id == study.id),
+        Use.PAIRS: select(Query.id).where(Query.participant_id.in_(real)),
+        Use.EVALUATION: select(Assignment.id).where(Assignment.participant_id.in_(real)),
+    }
+    happened = {use for use, sign in signs.items() if session.scalar(sign.limit(1)) is not None}
+    return {name: use.label for name, use in FIXED_BY.items() if use in happened}
 
 
 def change(
@@ -104,7 +107,7 @@ def change(
     study.name, study.task, study.seed = name, task, seed
     study.stored_settings = settings.model_dump(mode="json")
     audit.record(session, actor, "settings changed", f"{study.slug}: {', '.join(changed)}")
-    if {*changed} & {*OF_PAIRS, *OF_EVALUATION, *OF_CLIPS, "task", "seed"}:
+    if FIXED_BY.keys() & {*changed}:
         _end_previews(session, store, study, actor)
     return changed
 

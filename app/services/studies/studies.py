@@ -11,12 +11,12 @@ from sqlalchemy.orm import Session
 
 from app.db import Base
 from app.domain.clips import Clip, Rollout
-from app.domain.studies import Study, StudySettings, longest_clip_steps
+from app.domain.studies import SEED_LIMIT, Study, longest_clip_steps
+from app.domain.study_settings import StudySettings
 from app.errors import AppError
 from app.services import audit
 from installed_tasks import catalogue
 
-_SEED_LIMIT = 2**31
 _Row = TypeVar("_Row", bound=Base)
 
 
@@ -102,7 +102,7 @@ def _copied(row: _Row, **columns: object) -> _Row:
 
 def new_seed() -> int:
     """A seed for a study, drawn."""
-    return secrets.randbelow(_SEED_LIMIT)
+    return secrets.randbelow(SEED_LIMIT)
 
 
 def free_slug(session: Session, name: str) -> str:

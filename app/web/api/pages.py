@@ -32,7 +32,7 @@ def show_api(request: Request) -> Response:
         "base": str(request.base_url).rstrip("/"),
         "prefix": routes.PREFIX,
     }
-    return page(request, "api_docs.html", context)
+    return page(request, "experimenter/api_docs.html", context)
 
 
 @router.get("/tokens", name="show_tokens")

@@ -140,7 +140,7 @@ def show_study(slug: Slug, _caller: Caller, session: ReadingSession) -> answers.
         lock_hash=study.lock_hash,
         deviations=export_formats.provenance_of(session, study).deviations,
         unblinded_at=study.unblinded_at,
-        settings=study.settings.model_dump(mode="json"),
+        settings=study.settings,
     )
 
 

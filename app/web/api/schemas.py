@@ -5,6 +5,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from app.domain.study_settings import StudySettings
 from installed_tasks import catalogue
 
 Link = Annotated[str, Field(examples=["http://localhost:8000/p/3mZ0c1..."])]
@@ -36,7 +37,7 @@ class StudyAnswer(StudyLine):
     lock_hash: str | None = Field(description="SHA-256 of the locked settings and plan; null while not locked.")
     deviations: str = Field(examples=["none"])
     unblinded_at: datetime | None
-    settings: dict[str, Any]
+    settings: StudySettings
 
 
 class ParticipantAnswer(BaseModel):

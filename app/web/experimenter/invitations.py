@@ -100,7 +100,7 @@ def show_sheet(
         "cards": [(link, _qr_code(link.url)) for link in links],
         "key": key,
     }
-    return page(request, "experimenter/sheet.html", context)
+    return page(request, "experimenter/links_sheet.html", context)
 
 
 @router.get("/{slug}/links/{key}/links.csv", name="download_links")

@@ -42,13 +42,7 @@ TableName = Annotated[str, Path(pattern=r"^[a-z]{1,40}$")]
 FileKind = Literal["csv", "jsonl"]
 MEDIA_TYPES = {"csv": "text/csv; charset=utf-8", "jsonl": "application/x-ndjson"}
 LINES_AT_ONCE = 200
-METHOD_NAMES = {
-    "reference": "Pre-trained policy",
-    "prefft": "PrefFT",
-    "prefft_anchored": "PrefFT, anchored",
-    "pbarl": "PbARL",
-    "pbarl_printed": "PbARL as printed",
-}
+METHOD_NAMES = {method.value: name[:1].upper() + name[1:] for method, name in unblinding.NAMES.items()}
 FIGURES = {
     "ratings": ("Mean ratings, as in the paper", ""),
     "ratings_of_each_person": (

@@ -35,19 +35,25 @@ from app.web.texts.templating import page
 
 router = APIRouter(prefix="/studies")
 
-LIST_PARTS = ("machine", "study_list")
-STUDY_PARTS = ("machine", "jobs", "pool", "participants")
-PARTICIPANT_PARTS = (
-    "machine",
-    "participant_summary",
-    "trust",
-    "accuracy",
-    "participant_forms",
-    "weights",
-    "liked",
-    "filters",
-    "runs",
-)
+LIST_PARTS = {"machine": "pieces/machine", "study_list": "studies/list"}
+STUDY_PARTS = {
+    "machine": "pieces/machine",
+    "jobs": "study/jobs",
+    "pool": "study/pool",
+    "participants": "study/participants",
+}
+PARTICIPANT_PARTS = {
+    "machine": "pieces/machine",
+    "participant_summary": "participant/summary",
+    "trust": "participant/trust",
+    "accuracy": "participant/accuracy",
+    "participant_forms": "participant/forms",
+    "weights": "participant/weights",
+    "liked": "participant/liked",
+    "filters": "participant/filters",
+    "runs": "participant/runs",
+}
+"""What is drawn anew while a page is open: by its name in data-fragment, the template of the experimenter's side."""
 
 
 def _may_stream(request: Request, studio: StudioDep) -> None:
@@ -215,8 +221,8 @@ def _participant_context(session: Session, studio: Studio, slug: str, code: str)
     }
 
 
-def _draw(templates: Environment, parts: tuple[str, ...], context: Mapping[str, Any]) -> Mapping[str, str]:
-    return {name: templates.get_template(f"experimenter/_{name}.html").render(context) for name in parts}
+def _draw(templates: Environment, parts: Mapping[str, str], context: Mapping[str, Any]) -> Mapping[str, str]:
+    return {name: templates.get_template(f"experimenter/{piece}.html").render(context) for name, piece in parts.items()}
 
 
 def _see(request: Request, name: str, **parameters: str) -> RedirectResponse:

@@ -3,14 +3,16 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 from fastapi import Form
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import ConfigDict, Field, ValidationError, create_model
 
 from app.domain.protocol import FormItem
-from app.domain.studies import PAPER_PROTOCOL, StudySettings, longest_clip_steps, usual_clip_steps
+from app.domain.studies import NAME_LENGTH, SEED_LIMIT, longest_clip_steps, usual_clip_steps
+from app.domain.study_settings import PAPER_PROTOCOL, StudySettings
 from app.web.experimenter import form_lines
+from app.web.experimenter.form_fields import BY_NAME, FIELDS, FormField, Kind
 from app.web.texts.own_texts import CONSENT
 from app.web.texts.wording import broken_texts
 from installed_tasks import catalogue
@@ -21,60 +23,22 @@ _Lines = Annotated[str, Field(max_length=40_000)]
 _Several = Annotated[list[str], Field(max_length=20)]
 
 
-class StudyForm(BaseModel):
-    """What was typed, as text; fields are named as in StudySettings, those of its evaluation with ``evaluation_``.
+def _typed_as(kind: Kind) -> tuple[Any, Any]:
+    """Type and default of a field, as pydantic wants them."""
+    if kind is Kind.SEVERAL:
+        return (_Several, [])
+    return (_Lines if kind in (Kind.PARAGRAPHS, Kind.QUESTIONS, Kind.TEXTS) else _Text, "")
 
-    They stand in the order of the page, where the first wrong one is looked for.
-    """
+
+_definitions: Any = {each.name: _typed_as(each.kind) for each in FIELDS}
+_Fields = create_model("_Fields", **_definitions)
+
+
+class StudyForm(_Fields):
+    """What was typed, as text: the fields of FIELDS, and what the page sends besides."""
 
     model_config = ConfigDict(extra="ignore")
 
-    task: _Text = ""
-    name: _Text = ""
-    question: _Text = ""
-    labels_per_participant: _Text = ""
-    language: _Text = ""
-    languages: _Several = []
-    consent_duration: _Text = ""
-    consent_payment: _Text = ""
-    consent_contact: _Text = ""
-    consent_ethics: _Text = ""
-    consent_version: _Text = ""
-    consent_text: _Lines = ""
-    demographics: _Lines = ""
-    questionnaire: _Lines = ""
-    wording: _Lines = ""
-    practice_pairs: _Text = ""
-    introduction_pairs: _Text = ""
-    repeated_pairs: _Text = ""
-    catch_pairs: _Text = ""
-    break_every: _Text = ""
-    answer_after_first_play: _Text = ""
-    evaluation: _Text = ""
-    evaluation_methods: _Several = []
-    evaluation_mode: _Text = ""
-    evaluation_trials: _Text = ""
-    evaluation_fine_tuning_steps: _Text = ""
-    debrief: _Text = ""
-    panel_parameter: _Text = ""
-    completion_code: _Text = ""
-    return_url: _Text = ""
-    retrain_every_labels: _Text = ""
-    filter_milestones: _Text = ""
-    success_tolerance: _Text = ""
-    evaluation_scenarios: _Text = ""
-    method: _Text = ""
-    reward_kind: _Text = ""
-    strategy: _Text = ""
-    random_share: _Text = ""
-    pooled_prior: _Text = ""
-    advisor: _Text = ""
-    pool_scenarios: _Text = ""
-    behaviours_per_scenario: _Text = ""
-    clip_steps: _Text = ""
-    clip_quality: _Text = ""
-    seed: _Text = ""
-    planned_tests: _Several = []
     reason: _Lines = ""
     """Why a locked study is changed."""
     preset: _Text = ""
@@ -86,50 +50,13 @@ class StudyForm(BaseModel):
     same_name: _Text = ""
     """Whether another study may have this name."""
 
+    if TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            """The other fields."""
+
 
 TypedStudy = Annotated[StudyForm, Form()]
-
-_COUNTS = (
-    "labels_per_participant",
-    "retrain_every_labels",
-    "pool_scenarios",
-    "behaviours_per_scenario",
-    "clip_steps",
-    "evaluation_scenarios",
-    "practice_pairs",
-    "introduction_pairs",
-    "repeated_pairs",
-    "catch_pairs",
-    "break_every",
-)
-_PERCENTS = ("random_share", "success_tolerance")
-_WORDS = (
-    "method",
-    "reward_kind",
-    "strategy",
-    "question",
-    "language",
-    "consent_version",
-    "consent_duration",
-    "consent_payment",
-    "consent_ethics",
-    "consent_contact",
-    "completion_code",
-    "return_url",
-    "panel_parameter",
-    "advisor",
-    "clip_quality",
-)
-_SWITCHES = ("pooled_prior", "answer_after_first_play", "debrief")
-_ITEMS = ("demographics", "questionnaire")
-_EXPLAINED = {
-    "return_url": "Enter an address that begins with http:// or https://, or leave it empty.",
-    "panel_parameter": "Use letters, digits and underscores, such as PROLIFIC_PID.",
-    "evaluation_methods": "Choose two methods at least.",
-    "method": "Choose “studio” or “printed”.",
-}
-NAME_LENGTH = 120
-_SEED_LIMIT = 2**31
 
 
 class Preset(StrEnum):
@@ -179,37 +106,45 @@ def with_preset(form: StudyForm, preset: Preset) -> StudyForm:
 def _plain(form: StudyForm, name: str) -> object:
     """What a field says, whichever way a browser sends it: switches that are off are not sent at all."""
     value = getattr(form, name)
-    if name in (*_SWITCHES, "evaluation"):
+    if name in BY_NAME and BY_NAME[name].kind in (Kind.SWITCH, Kind.PART):
         return value == "yes"
     return value.replace("\r\n", "\n").strip() if isinstance(value, str) else value
 
 
 def form_of(name: str, task: str, seed: int | None, settings: StudySettings) -> StudyForm:
     """The form that describes these settings; what it says of an evaluation without one is what is usual."""
-    usual = settings.evaluation or PAPER_PROTOCOL.evaluation
-    if usual is None:
-        raise ValueError("The paper's protocol evaluates.")
-    values: dict[str, Any] = {each: str(getattr(settings, each)) for each in (*_COUNTS, *_WORDS)}
-    values |= {each: f"{getattr(settings, each) * 100:g}" for each in _PERCENTS}
-    values |= {each: _switch(getattr(settings, each)) for each in _SWITCHES}
-    values |= {each: form_lines.lines_of(getattr(settings, each)) for each in _ITEMS}
     own = dict(settings.wording)
-    return StudyForm(
-        name=name,
-        task=task,
-        seed="" if seed is None else str(seed),
-        **values,
-        filter_milestones=", ".join(str(count) for count in settings.filter_milestones),
-        consent_text=own.pop(CONSENT, ""),
-        wording=form_lines.lines_of_texts(own),
-        evaluation=_switch(settings.evaluation is not None),
-        evaluation_methods=[method.value for method in usual.methods],
-        evaluation_trials=str(usual.trials),
-        evaluation_mode=usual.mode.value,
-        evaluation_fine_tuning_steps=str(usual.fine_tuning_steps),
-        planned_tests=[test.value for test in settings.planned_tests],
-        languages=[each.value for each in settings.offered_languages],
-    )
+    values: dict[str, Any] = {
+        "name": name,
+        "task": task,
+        "seed": "" if seed is None else str(seed),
+        "consent_text": own.pop(CONSENT, ""),
+    }
+    described = settings.model_copy(update={"wording": own, "languages": settings.offered_languages})
+    usual = settings.evaluation or PAPER_PROTOCOL.evaluation
+    for each in FIELDS:
+        if each.part is not None:
+            values[each.name] = _as_typed(each.kind, getattr(usual, each.part))
+        elif each.setting is not None:
+            values[each.name] = _as_typed(each.kind, getattr(described, each.setting))
+    return StudyForm(**values)
+
+
+def _as_typed(kind: Kind, value: Any) -> str | list[str]:
+    match kind:
+        case Kind.SWITCH | Kind.PART:
+            return "yes" if value else "no"
+        case Kind.PERCENT:
+            return f"{value * 100:g}"
+        case Kind.COUNTS:
+            return ", ".join(str(count) for count in value)
+        case Kind.SEVERAL:
+            return [str(each) for each in value]
+        case Kind.QUESTIONS:
+            return form_lines.lines_of(value)
+        case Kind.TEXTS:
+            return form_lines.lines_of_texts(value)
+    return str(value)
 
 
 def typed_study(form: StudyForm, own_task: str | None = None) -> Typed:
@@ -219,21 +154,17 @@ def typed_study(form: StudyForm, own_task: str | None = None) -> Typed:
     """
     errors: dict[str, str] = {}
     task = _task(errors, form.task, own_task)
-    values: dict[str, Any] = {name: getattr(form, name).strip() for name in _WORDS}
-    values |= {name: getattr(form, name) == "yes" for name in _SWITCHES}
-    values |= _numbers(errors, form, task)
-    no_items: tuple[FormItem, ...] = ()
-    values |= {name: _read(errors, name, form_lines.items_of, getattr(form, name), no_items) for name in _ITEMS}
+    values = {each.setting: _value(errors, each, form) for each in FIELDS if each.setting and each.part is None}
+    values["clip_steps"] = _clip_steps(errors, form, task, values["clip_steps"])
     values["wording"] = _wording(errors, form)
-    values["evaluation"] = _evaluation(errors, form) if form.evaluation == "yes" else None
-    values["planned_tests"] = tuple(form.planned_tests)
-    values["languages"] = tuple(form.languages)
+    if form.evaluation == "yes":
+        values["evaluation"] = {each.part: _value(errors, each, form) for each in FIELDS if each.part}
     name = " ".join(form.name.split())
     if not 1 <= len(name) <= NAME_LENGTH:
         errors["name"] = f"Give the study a name of at most {NAME_LENGTH} characters."
     seed = None if not form.seed.strip() else _number(errors, "seed", form.seed, whole=True)
-    if seed is not None and seed >= _SEED_LIMIT:
-        errors["seed"] = f"Enter a number below {_SEED_LIMIT}."
+    if seed is not None and seed >= SEED_LIMIT:
+        errors["seed"] = f"Enter a number below {SEED_LIMIT}."
     settings = _settings(errors, values)
     if errors or settings is None:
         if len(errors) > 1:
@@ -242,13 +173,38 @@ def typed_study(form: StudyForm, own_task: str | None = None) -> Typed:
     return Typed(name, task, None if seed is None else int(seed), settings)
 
 
+def _value(errors: dict[str, str], field: FormField, form: StudyForm) -> Any:
+    """What was typed into a field, as its setting is stored; None, and an error, where that cannot be told."""
+    typed = getattr(form, field.name)
+    no_items: tuple[FormItem, ...] = ()
+    match field.kind:
+        case Kind.SWITCH:
+            return typed == "yes"
+        case Kind.COUNT:
+            return _number(errors, field.name, typed, whole=True)
+        case Kind.PERCENT:
+            percent = _number(errors, field.name, typed, whole=False)
+            return None if percent is None else percent / 100
+        case Kind.COUNTS:
+            parts = typed.replace(",", " ").split()
+            return tuple(_number(errors, field.name, part, whole=True) for part in parts)
+        case Kind.SEVERAL:
+            return tuple(typed)
+        case Kind.QUESTIONS:
+            return _read(errors, field.name, form_lines.items_of, typed, no_items)
+        case Kind.TEXT | Kind.CHOICE:
+            return typed.strip()
+    return None
+
+
 def _settings(errors: dict[str, str], values: Mapping[str, Any]) -> StudySettings | None:
     try:
         return StudySettings.model_validate(values)
     except ValidationError as found:
         for error in found.errors():
             place = _field(error["loc"])
-            errors.setdefault(place, _EXPLAINED.get(place) or _in_words(place, error["msg"]))
+            field = BY_NAME.get(place)
+            errors.setdefault(place, (field and field.shown.complaint) or _in_words(field, error["msg"]))
     return None
 
 
@@ -261,29 +217,13 @@ def _field(location: Sequence[int | str]) -> str:
     return str(location[0])
 
 
-def _numbers(errors: dict[str, str], form: StudyForm, task: str) -> dict[str, Any]:
-    values: dict[str, Any] = {}
-    for name in _COUNTS:
-        values[name] = _number(errors, name, getattr(form, name), whole=True)
+def _clip_steps(errors: dict[str, str], form: StudyForm, task: str, typed: int | None) -> int | None:
     if not form.clip_steps.strip():
         errors.pop("clip_steps", None)
-        values["clip_steps"] = usual_clip_steps(task)
-    elif values["clip_steps"] is not None and values["clip_steps"] > (longest_clip_steps(task) or values["clip_steps"]):
+        return usual_clip_steps(task)
+    if typed is not None and typed > (longest_clip_steps(task) or typed):
         errors["clip_steps"] = f"An episode of this task has {longest_clip_steps(task)} steps. Enter at most as many."
-    for name in _PERCENTS:
-        share = _number(errors, name, getattr(form, name), whole=False)
-        values[name] = None if share is None else share / 100
-    parts = form.filter_milestones.replace(",", " ").split()
-    values["filter_milestones"] = tuple(_number(errors, "filter_milestones", part, whole=True) for part in parts)
-    return values
-
-
-def _evaluation(errors: dict[str, str], form: StudyForm) -> dict[str, Any]:
-    counts = {
-        name: _number(errors, f"evaluation_{name}", getattr(form, f"evaluation_{name}"), whole=True)
-        for name in ("trials", "fine_tuning_steps")
-    }
-    return {"methods": tuple(form.evaluation_methods), "mode": form.evaluation_mode, **counts}
+    return typed
 
 
 def _wording(errors: dict[str, str], form: StudyForm) -> dict[str, str]:
@@ -311,10 +251,6 @@ def _read(errors: dict[str, str], name: str, reader: Callable[[str], _Value], ty
         return otherwise
 
 
-def _switch(on: bool) -> str:
-    return "yes" if on else "no"
-
-
 def _task(errors: dict[str, str], typed: str, own: str | None) -> str:
     task = typed.strip() or catalogue.usual()
     if task in (*catalogue.names(), own):
@@ -332,12 +268,13 @@ def _number(errors: dict[str, str], name: str, typed: str, *, whole: bool) -> fl
     return int(text) if whole else float(text)
 
 
-def _in_words(name: str, message: str) -> str:
+def _in_words(field: FormField | None, message: str) -> str:
     bounds = {"greater than or equal to": "at least", "less than or equal to": "at most"}
     for theirs, ours in bounds.items():
         if theirs in message:
             bound = message.rsplit(" ", 1)[-1]
-            return f"Enter {ours} {float(bound) * 100:g} %." if name in _PERCENTS else f"Enter {ours} {bound}."
+            in_percent = field is not None and field.kind is Kind.PERCENT
+            return f"Enter {ours} {float(bound) * 100:g} %." if in_percent else f"Enter {ours} {bound}."
     return message.removeprefix("Value error, ").removeprefix("Input ").capitalize() + (
         "" if message[-1] == "." else "."
     )

@@ -1,0 +1,1 @@
+"""Who asks, security headers, rate limits."""

@@ -8,7 +8,8 @@ from fastapi import Depends, Request
 from fastapi.responses import RedirectResponse, Response
 
 from app.domain.protocol import Stage
-from app.domain.studies import Participant, StudySettings
+from app.domain.studies import Participant
+from app.domain.study_settings import StudySettings
 from app.services.participants import stages
 from app.web.http.deps import CurrentParticipant, NotYet, WritingSession
 from app.web.texts import languages

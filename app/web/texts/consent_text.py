@@ -3,7 +3,8 @@
 from dataclasses import dataclass
 
 from app.domain.protocol import CONSENT_FACTS
-from app.domain.studies import Participant, StudySettings
+from app.domain.studies import Participant
+from app.domain.study_settings import StudySettings
 from app.web.texts.wording import Wording
 
 

@@ -17,7 +17,7 @@ from app.domain.protocol import Language
 from app.domain.studies import Participant
 from app.settings import Settings
 from app.web.http.deps import LANGUAGE_COOKIE, StudioDep, WritingSession, participant_or_nobody, set_cookie
-from app.web.texts.wording import NAMES, Wording, preferred, wording_for
+from app.web.texts.wording import Wording, preferred, wording_for
 
 router = APIRouter(prefix="/p")
 
@@ -68,7 +68,7 @@ def remember(response: Response, settings: Settings, language: Language) -> None
 def switch(request: Request, offered: Sequence[Language] = tuple(Language)) -> dict[str, Any]:
     """What a page needs to offer its languages: which, and where to come back to."""
     query = f"?{request.url.query}" if request.method == "GET" and request.url.query else ""
-    return {"languages": {each: NAMES[each] for each in offered}, "here": request.url.path + query}
+    return {"languages": {each: each.label for each in offered}, "here": request.url.path + query}
 
 
 def nobodys(request: Request, wording: Wording, offered: Sequence[Language] = tuple(Language)) -> dict[str, Any]:

@@ -6,7 +6,7 @@ Translations are texts of the study (StudySettings.wording) with the language be
 from collections.abc import Mapping, Sequence
 
 from app.domain.protocol import CONSENT_FACTS, FormItem, Language
-from app.domain.studies import StudySettings
+from app.domain.study_settings import StudySettings
 from app.web.texts.wording import Wording, built_in_texts
 
 CONSENT = "consent-body"

@@ -1,10 +1,12 @@
 """Pages from templates: one Jinja environment, strict about what is missing, and the words for numbers and times."""
 
+import posixpath
 import re
 from collections.abc import Callable, Iterable, Mapping
 from datetime import datetime
 from functools import cache
 from math import floor, log10
+from pathlib import PurePosixPath
 from typing import Any
 
 from fastapi import Request
@@ -28,7 +30,7 @@ _UNITS = {
     "_n": "N",
     "_rad": "rad",
 }
-_IMPORT = re.compile(r"""^import .* from "\./([a-z_]+\.js)";$""", re.MULTILINE)
+_IMPORT = re.compile(r"""^import .* from "(\.[a-z_./]+\.js)";$""", re.MULTILINE)
 _MINUTE_S, _HOUR_S, _DAY_S = 60, 3600, 86400
 
 
@@ -125,8 +127,10 @@ def fragment(request: Request, template: str, context: Mapping[str, Any]) -> str
 
 @cache
 def imports_of(script: str) -> tuple[str, ...]:
-    """The modules that a script of ours imports, and those that they import, each once and by name."""
-    direct = _IMPORT.findall((STATIC / script).read_text(encoding="utf-8"))
+    """The modules that a script of ours imports, and those that they import, each once, by their paths in static/."""
+    path = PurePosixPath(script)
+    written = _IMPORT.findall((STATIC / path).read_text(encoding="utf-8"))
+    direct = [posixpath.normpath(path.parent / each) for each in written]
     return tuple(dict.fromkeys(name for each in direct for name in (each, *imports_of(each))))
 
 

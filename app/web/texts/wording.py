@@ -16,15 +16,11 @@ from jinja2 import pass_context
 from jinja2.runtime import Context
 
 from app.domain.protocol import CONSENT_FACTS, Language
-from app.domain.studies import StudySettings
+from app.domain.study_settings import StudySettings
 from app.paths import WORDING
 from installed_tasks import catalogue
 
 log = logging.getLogger("app.wording")
-
-NAMES = {Language.ENGLISH: "English", Language.GERMAN: "Deutsch"}
-"""Each language in itself."""
-
 
 _ASKED = re.compile(r"(?:^|,)\s*([a-z]{2,8})(?:-[a-z0-9-]*)?\s*(?:;\s*q\s*=\s*(\d(?:\.\d{0,3})?))?")
 """One language of an Accept-Language header, without its region, and how much it is wanted."""

@@ -1,0 +1,1 @@
+"""Pool clips, evaluation films, imported clips."""

@@ -21,8 +21,11 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from sqlalchemy.orm import Session
 
 from app.db import Database
+from app.domain.choices import RewardKind, Strategy
 from app.domain.clips import Clip, Rollout
-from app.domain.studies import RewardKind, Strategy, Study, StudySettings
+from app.domain.described import bounds_of
+from app.domain.studies import NAME_LENGTH, Study
+from app.domain.study_settings import StudySettings
 from app.errors import AppError
 from app.services import audit
 from app.services.archives import unpacking
@@ -42,8 +45,6 @@ LARGEST_UNPACKED_BYTES = 64 << 30
 LONGEST_DIFFERENCE_S = 0.5
 """Between a video and its trajectory."""
 FEWEST_STEPS = 2
-_FEWEST_CLIP_STEPS, _MOST_CLIP_STEPS = 20, 130
-_MOST_BEHAVIOURS = 8
 
 
 class ClipsInvalid(AppError):
@@ -79,7 +80,7 @@ class ClipManifest(_Entry):
 
     format: Literal["pbarl-studio-clips"]
     version: Literal[1]
-    name: str = Field(min_length=1, max_length=120)
+    name: str = Field(min_length=1, max_length=NAME_LENGTH)
     task: str = Field(default="own_clips", pattern=r"^[a-z][a-z0-9_]{0,39}$")
     rate_hz: float = Field(gt=0, le=1000)
     signals: tuple[Signal, ...] = Field(min_length=1, max_length=200)
@@ -270,12 +271,14 @@ def _settings(manifest: ClipManifest, ready: Sequence[_Ready]) -> StudySettings:
     if alone:
         raise ClipsInvalid(f"Scenario {alone[0]} has one clip only; clips are compared within a scenario.")
     longest = max(each.steps for each in ready)
+    fewest_steps, most_steps = bounds_of(StudySettings, "clip_steps")
+    _, most_behaviours = bounds_of(StudySettings, "behaviours_per_scenario")
     usual: dict[str, Any] = {
         "strategy": Strategy.UNIFORM,
         "pool_scenarios": len(per_scenario),
-        "behaviours_per_scenario": min(_MOST_BEHAVIOURS, *per_scenario.values()),
-        "clip_steps": min(max(longest, _FEWEST_CLIP_STEPS), _MOST_CLIP_STEPS),
-        "labels_per_participant": min(200, pairs),
+        "behaviours_per_scenario": min(most_behaviours, *per_scenario.values()),
+        "clip_steps": min(max(longest, fewest_steps), most_steps),
+        "labels_per_participant": min(StudySettings.model_fields["labels_per_participant"].default, pairs),
         "filter_milestones": (),
     }
     try:

@@ -1,0 +1,1 @@
+"""Choose pairs, fit reward models and filters."""

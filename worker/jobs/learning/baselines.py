@@ -12,10 +12,11 @@ from pathlib import Path
 
 from sqlalchemy.orm import Session
 
+from app.domain.choices import RewardKind
 from app.domain.models import ModelKind, RunKind
 from app.domain.protocol import EvaluatedMethod
 from app.domain.run_keys import RunKey
-from app.domain.studies import Participant, RewardKind, Study
+from app.domain.studies import Participant, Study
 from app.services.evaluation import evaluation_plan
 from worker.analysis.evaluation import evaluate
 from worker.compute import baseline_fitting, learning

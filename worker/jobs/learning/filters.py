@@ -4,8 +4,10 @@ from collections.abc import Sequence
 
 from sqlalchemy.orm import Session
 
+from app.domain.choices import Method, RewardKind
 from app.domain.models import Model, ModelKind
-from app.domain.studies import Method, Participant, RewardKind, Study, StudySettings
+from app.domain.studies import Participant, Study
+from app.domain.study_settings import StudySettings
 from app.errors import AppError
 from app.services.answers import accuracy
 from app.services.exports.export_formats import provenance_of

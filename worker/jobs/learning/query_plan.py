@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from app.domain.preferences import Purpose
-from app.domain.studies import StudySettings
+from app.domain.study_settings import StudySettings
 from worker.ml.acquisition import balanced_sides
 from worker.ml.rewards.segments import SegmentPairs, Stretch
 from worker.trajectory import SIGNALS

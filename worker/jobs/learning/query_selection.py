@@ -3,16 +3,17 @@
 import logging
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
+from app.domain.choices import Strategy
 from app.domain.clips import Clip
 from app.domain.models import Model, ModelKind
 from app.domain.preferences import LEARNED_FROM, Purpose, Query
-from app.domain.studies import Participant, Strategy, Study
+from app.domain.studies import Participant, Study
 from worker.compute import learning
 from worker.jobs.learning import dataset, query_plan
 from worker.jobs.learning.query_plan import Slot
@@ -215,7 +216,7 @@ class _Choosing:
             len(ordinals),
             len(pairs),
             np.random.default_rng([self._participant.seed, ordinals[0]]),
-            rule="uniform" if scores is None else settings.strategy.value,
+            rule="uniform" if scores is None else cast(acquisition.Strategy, settings.strategy.value),
             scores=scores,
             random_share=settings.random_share,
         )

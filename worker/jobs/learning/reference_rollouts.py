@@ -1,6 +1,7 @@
 """What the first filter would wait for, made beforehand: the reference policy's rollouts, and the graphs of exports."""
 
-from app.domain.studies import Method, StudySettings
+from app.domain.choices import Method
+from app.domain.study_settings import StudySettings
 from worker.compute import learning, simulation
 from worker.compute.filter_fitting import CHUNK
 from worker.compute.pools import Computing, Lane

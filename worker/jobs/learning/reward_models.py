@@ -3,9 +3,10 @@
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
+from app.domain.choices import Strategy
 from app.domain.models import Model, ModelKind
 from app.domain.preferences import Query
-from app.domain.studies import Participant, Strategy, Study
+from app.domain.studies import Participant, Study
 from app.services.answers import stopping_advice
 from worker.compute import learning
 from worker.compute.pools import Lane

@@ -1,0 +1,1 @@
+"""Data exports, preference arrays, reports."""

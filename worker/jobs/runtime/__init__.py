@@ -1,0 +1,1 @@
+"""Durable engine, queues, urgency, run records."""

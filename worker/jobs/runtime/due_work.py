@@ -5,7 +5,8 @@ from sqlalchemy.orm import Session
 
 from app.domain.models import RunKind
 from app.domain.preferences import LEARNED_FROM, Exclusion, LabelEvent, Query, count_labels
-from app.domain.studies import Participant, Study, StudySettings
+from app.domain.studies import Participant, Study
+from app.domain.study_settings import StudySettings
 from worker.jobs.runtime.records import Job
 
 

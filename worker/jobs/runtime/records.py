@@ -18,7 +18,8 @@ from app.domain.clips import Clip, Rollout
 from app.domain.models import Bundle, Model, ModelKind, Run, RunKind, RunStatus, WorkerPresence
 from app.domain.preferences import LabelEvent, Purpose, Query
 from app.domain.run_keys import RunKey
-from app.domain.studies import Participant, StudySettings
+from app.domain.studies import Participant
+from app.domain.study_settings import StudySettings
 
 ATTEMPTS = 3
 """How often a failing run is tried before somebody has to look."""

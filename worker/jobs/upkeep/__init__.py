@@ -1,0 +1,1 @@
+"""Erasure after a withdrawal, unused files."""

@@ -1,0 +1,1 @@
+"""Action filters: ours, and the paper's own."""

@@ -1,7 +1,7 @@
 """PbARL as printed in the paper, in one file: the cVAE encoder, Eqs. (3) to (7), and its training.
 
 It is kept faithful on purpose, including what does not work well (docs/method.md has the measurements); the studio's
-default filter is studio_filter. What the paper leaves open is a field of PrintedConfig whose comment says so.
+default filter is pbarl. What the paper leaves open is a field of PrintedConfig whose comment says so.
 """
 
 import time

@@ -1,0 +1,1 @@
+"""The frozen reference policy, trained by SAC."""

@@ -1,0 +1,1 @@
+"""A cup of water, to the mouth, and tipped."""

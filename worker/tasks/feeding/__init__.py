@@ -1,0 +1,1 @@
+"""Eight balls of food on a spoon, to the mouth."""

@@ -1,0 +1,1 @@
+"""An itch on the right arm, which gives way."""

@@ -1,0 +1,1 @@
+"""Shapes and colours of what is drawn."""

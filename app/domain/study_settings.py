@@ -1,0 +1,308 @@
+"""What an experimenter decides about a study before its first participant: every setting, with its words, once.
+
+The form, the schema of the API and what locking fixes follow from these fields, which stand in the order of the page.
+"""
+
+from pydantic import BaseModel, ConfigDict, model_validator
+
+from app.domain.choices import ClipQuality, Method, RewardKind, Strategy
+from app.domain.described import Section, Use, setting
+from app.domain.protocol import (
+    PAPER_DEMOGRAPHICS,
+    USUAL_QUESTIONNAIRE,
+    Advisor,
+    EvaluationSettings,
+    FormItem,
+    Language,
+    PlannedTest,
+)
+from installed_tasks.description import LONGEST_CLIP_STEPS, SHORTEST_CLIP_STEPS
+
+USUAL_CLIP_STEPS = 60
+"""Of a task that is not installed here."""
+
+
+class StudySettings(BaseModel):
+    """What an experimenter decides before the first participant. Frozen per study."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    question: str = setting(
+        "Which robot would you rather have?",
+        Section.START,
+        "Question above every pair",
+        "What the participants answer. The usual one is translated by itself.",
+        min_length=1,
+        max_length=200,
+    )
+    labels_per_participant: int = setting(
+        200,
+        Section.START,
+        "Answers per participant",
+        "The paper used 200.",
+        unit="pairs",
+        fixed_by=Use.PAIRS,
+        ge=10,
+        le=1000,
+    )
+    language: Language = setting(Language.ENGLISH, Section.START, "Language of the study")
+    languages: tuple[Language, ...] = setting(tuple(Language), Section.START, "Languages people may choose")
+    consent_duration: str = setting(
+        "", Section.CONSENT, "How long taking part takes", "Such as: about 45 minutes, breaks included.", max_length=200
+    )
+    consent_payment: str = setting(
+        "",
+        Section.CONSENT,
+        "What people are given for it",
+        "Such as: 12 € per hour. Or say that there is no payment.",
+        max_length=200,
+    )
+    consent_contact: str = setting(
+        "",
+        Section.CONSENT,
+        "Whom people can ask",
+        "A name with an e-mail address or a telephone number.",
+        max_length=200,
+    )
+    consent_ethics: str = setting(
+        "", Section.CONSENT, "Ethics approval", "Who approved the study, and under which number.", max_length=200
+    )
+    consent_version: str = setting(
+        "1",
+        Section.CONSENT,
+        "Version of the consent text",
+        "Stored with every agreement. A new version is put to everybody again.",
+        min_length=1,
+        max_length=40,
+    )
+    demographics: tuple[FormItem, ...] = setting(
+        (),
+        Section.CONSENT,
+        "Questions at the start",
+        "One per line: name | kind | question. Kinds: number, text, choice, likert. After a choice its choices: "
+        "hand | choice | Which hand do you use? | left; right; both. After a likert scale its ends: tech | likert | "
+        "I like new technology. | not at all | very much. age, gender and robot_experience need no question. "
+        "No answer is ever required.",
+    )
+    questionnaire: tuple[FormItem, ...] = setting(
+        (),
+        Section.CONSENT,
+        "Questions at the end",
+        "Written in the same way. felt_understood, felt_safe, would_use and comments need no question.",
+    )
+    wording: dict[str, str] = setting(
+        {},
+        Section.CONSENT,
+        "Other texts in your own words",
+        "One per line: name = text. A text goes on in lines that begin with spaces. “de:” before a name means "
+        "German only; translations of your own texts have a page of their own.",
+    )
+    practice_pairs: int = setting(
+        0,
+        Section.PAIRS,
+        "Practice pairs",
+        "Before the first answer that counts. 1 in the paper protocol.",
+        unit="pairs",
+        fixed_by=Use.PAIRS,
+        ge=0,
+        le=5,
+    )
+    introduction_pairs: int = setting(
+        0,
+        Section.PAIRS,
+        "Of the answers, on whole trajectories",
+        "They come first. The paper used 10.",
+        unit="pairs",
+        fixed_by=Use.PAIRS,
+        ge=0,
+        le=50,
+    )
+    repeated_pairs: int = setting(
+        0,
+        Section.PAIRS,
+        "Pairs asked twice",
+        "On top of the answers, half of them with the sides exchanged. They measure how far people agree with "
+        "themselves; 20 say something.",
+        unit="pairs",
+        fixed_by=Use.PAIRS,
+        ge=0,
+        le=100,
+    )
+    catch_pairs: int = setting(
+        0,
+        Section.PAIRS,
+        "Catch pairs",
+        "On top of the answers: a clean success beside a clear failure.",
+        unit="pairs",
+        fixed_by=Use.PAIRS,
+        ge=0,
+        le=20,
+    )
+    break_every: int = setting(50, Section.PAIRS, "Offer a break every", "0: never.", unit="answers", ge=0, le=500)
+    answer_after_first_play: bool = setting(
+        True, Section.PAIRS, "Answers open after the first play", "Nobody can answer before both clips were seen once."
+    )
+    evaluation: EvaluationSettings | None = setting(
+        None,
+        Section.EVALUATION,
+        "Evaluate methods at the end",
+        "Balanced random order, unseen scenarios. Nobody knows which letter is which until you unblind the study.",
+        fixed_by=Use.EVALUATION,
+    )
+    debrief: bool = setting(
+        False,
+        Section.EVALUATION,
+        "Show people their own robot at the end",
+        "Before and after, side by side, and what it learned.",
+    )
+    panel_parameter: str = setting(
+        "PROLIFIC_PID",
+        Section.PANEL,
+        "Parameter that names the person",
+        "PROLIFIC_PID at Prolific. The same id comes back to the same participant. "
+        "Empty: anybody may join without a name.",
+        complaint="Use letters, digits and underscores, such as PROLIFIC_PID.",
+        pattern=r"^([A-Za-z][A-Za-z0-9_]{0,39})?$",
+    )
+    completion_code: str = setting("", Section.PANEL, "Completion code", "Shown at the end.", max_length=80)
+    return_url: str = setting(
+        "",
+        Section.PANEL,
+        "Address to return to",
+        "May contain {code}, {panel_id} and any parameter of the panel in braces.",
+        complaint="Enter an address that begins with http:// or https://, or leave it empty.",
+        max_length=500,
+        pattern=r"^(https?://\S+)?$",
+    )
+    retrain_every_labels: int = setting(
+        10,
+        Section.LEARNING,
+        "Train the reward model every",
+        "Then the next pairs are chosen.",
+        unit="answers",
+        ge=1,
+        le=100,
+    )
+    filter_milestones: tuple[int, ...] = setting(
+        (50, 100),
+        Section.LEARNING,
+        "Also train a filter after",
+        "Numbers of answers, with commas. One is always trained at the end.",
+        unit="answers",
+    )
+    success_tolerance: float = setting(
+        0.035,
+        Section.LEARNING,
+        "Success the filter may cost",
+        "Compared with the reference policy on unseen scenarios.",
+        unit="%",
+        ge=0.0,
+        le=0.5,
+    )
+    evaluation_scenarios: int = setting(
+        100, Section.LEARNING, "Scenarios that measure a filter", "Never seen in training.", ge=10, le=1000
+    )
+    method: Method = setting(
+        Method.STUDIO, Section.LEARNING, "Method", complaint="Choose “studio” or “printed”.", new_row=True
+    )
+    reward_kind: RewardKind = setting(RewardKind.STRUCTURED, Section.LEARNING, "Reward model")
+    strategy: Strategy = setting(Strategy.ENTROPY, Section.LEARNING, "How pairs are chosen")
+    random_share: float = setting(
+        0.3,
+        Section.LEARNING,
+        "Pairs always drawn at random",
+        "Matters unless all pairs are. The accuracy is measured on these.",
+        unit="%",
+        ge=0.1,
+        le=1.0,
+    )
+    pooled_prior: bool = setting(
+        False,
+        Section.LEARNING,
+        "Where the model starts",
+        options=(
+            ("no", "From nothing", "Only the participant's own answers count."),
+            (
+                "yes",
+                "From earlier participants",
+                "Helps with up to 100 answers; with ten or so it pulls people together. Structured models only.",
+            ),
+        ),
+    )
+    advisor: Advisor = setting(Advisor.SHOW, Section.LEARNING, "When more answers hardly pay")
+    pool_scenarios: int = setting(
+        48, Section.CLIPS, "Situations", "Each with its own start and seating position.", ge=1, le=500
+    )
+    behaviours_per_scenario: int = setting(
+        6, Section.CLIPS, "Ways of doing each", "Pairs show two of them.", fixed_by=Use.CLIPS, ge=2, le=8
+    )
+    clip_steps: int = setting(
+        USUAL_CLIP_STEPS,
+        Section.CLIPS,
+        "Length of a clip",
+        "10 steps are one second; empty: what suits the task.",
+        unit="steps",
+        fixed_by=Use.CLIPS,
+        ge=SHORTEST_CLIP_STEPS,
+        le=LONGEST_CLIP_STEPS,
+    )
+    clip_quality: ClipQuality = setting(ClipQuality.SHARP, Section.CLIPS, "Quality", fixed_by=Use.CLIPS)
+    planned_tests: tuple[PlannedTest, ...] = setting((PlannedTest.PAIRED_T,), Section.TESTS, "Tests on the ratings")
+
+    @model_validator(mode="after")
+    def _enough_pairs(self) -> "StudySettings":
+        pairs = self.pool_scenarios * self.pairs_per_scenario
+        short = self.labels_per_participant - self.introduction_count + self.practice_pairs + self.catch_pairs
+        if pairs < max(self.labels_per_participant, short):
+            also = "" if pairs < self.labels_per_participant else " with practice and catch pairs"
+            raise ValueError(
+                f"{self.pool_scenarios} scenarios with {self.behaviours_per_scenario} behaviours give "
+                f"{pairs} different pairs, fewer than the "
+                f"{max(self.labels_per_participant, short)} labels asked for{also}. Add scenarios or behaviours."
+            )
+        return self
+
+    @property
+    def offered_languages(self) -> tuple[Language, ...]:
+        """Languages people may choose from: the study's own first, which is always one of them."""
+        return (self.language, *(each for each in Language if each in self.languages and each != self.language))
+
+    @property
+    def pairs_per_scenario(self) -> int:
+        """Different pairs of clips of one scenario."""
+        return self.behaviours_per_scenario * (self.behaviours_per_scenario - 1) // 2
+
+    @property
+    def introduction_count(self) -> int:
+        """Labels on whole trajectories; never more than there are labels."""
+        return min(self.introduction_pairs, self.labels_per_participant)
+
+    @property
+    def introduction_scenarios(self) -> int:
+        """As many scenarios are filmed whole as the introduction needs."""
+        return -(-self.introduction_count // self.pairs_per_scenario)
+
+    @property
+    def question_count(self) -> int:
+        """Pairs a participant answers altogether: labels, repeats and catch pairs; practice not counted."""
+        return self.labels_per_participant + self.repeated_pairs + self.catch_pairs
+
+    @property
+    def milestones(self) -> tuple[int, ...]:
+        """Label counts at which a filter is trained, ascending, the last label included."""
+        early = {count for count in self.filter_milestones if 0 < count < self.labels_per_participant}
+        return (*sorted(early), self.labels_per_participant)
+
+
+PAPER_PROTOCOL = StudySettings(
+    strategy=Strategy.UNIFORM,
+    demographics=PAPER_DEMOGRAPHICS,
+    practice_pairs=1,
+    introduction_pairs=10,
+    evaluation=EvaluationSettings(),
+    questionnaire=USUAL_QUESTIONNAIRE,
+    debrief=True,
+    advisor=Advisor.LOG,
+    planned_tests=(PlannedTest.TWO_SAMPLE_T, PlannedTest.PAIRED_T, PlannedTest.MIXED_MODEL),
+)
+"""The user study of the paper: 10 + 190 labels, three methods, three trials each. The default of everything else."""

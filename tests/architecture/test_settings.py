@@ -1,0 +1,89 @@
+"""A study's settings are written once; what the worker and the offline commands assume for themselves agrees with them.
+
+The worker's learning may not import the domain, and neither may know the other's defaults: here both are seen.
+"""
+
+from dataclasses import fields
+from enum import StrEnum
+from typing import Any, get_args
+
+import pytest
+
+from app.domain.choices import ClipQuality, Method, RewardKind, Strategy
+from app.domain.preferences import Response
+from app.domain.protocol import LIKERT_POINTS, EvaluatedMethod, EvaluationSettings, Language, PlannedTest
+from app.domain.study_settings import StudySettings
+from app.paths import WORDING
+from app.services.evaluation import unblinding
+from app.services.participants import time_left
+from app.services.studies import preregistration
+from app.web.experimenter import results
+from worker import responses
+from worker.analysis import figures, hypothesis_tests, statistics
+from worker.experiments import benchmark_cell, rollout_cache
+from worker.experiments.benchmark_cell import Terms
+from worker.ml import acquisition
+from worker.ml.filters import filter_module
+from worker.ml.filters.filter_problem import FilterConfig
+from worker.ml.methods.prefft import FineTuning
+from worker.ml.methods.registry import METHODS
+from worker.ml.rewards import reward_training
+from worker.sim.render.clip import STYLES
+from worker.spaces import CONTROL_STEP_S
+
+USUAL = StudySettings()
+EVALUATION = EvaluationSettings()
+
+
+def default(config: type, name: str) -> Any:
+    """Of a dataclass's field."""
+    return next(each.default for each in fields(config) if each.name == name)
+
+
+@pytest.mark.parametrize(
+    ("assumed", "usual"),
+    [
+        (default(FilterConfig, "success_tolerance"), USUAL.success_tolerance),
+        (default(FilterConfig, "evaluation_scenarios"), USUAL.evaluation_scenarios),
+        (default(FineTuning, "steps"), EVALUATION.fine_tuning_steps),
+        (default(Terms, "labels"), USUAL.labels_per_participant),
+        (default(Terms, "rule"), USUAL.strategy),
+        (default(Terms, "reward"), USUAL.reward_kind),
+        (default(Terms, "smallest_pool"), USUAL.pool_scenarios),
+        (acquisition.RANDOM_SHARE, USUAL.random_share),
+        (benchmark_cell.CHOOSE_EVERY, USUAL.retrain_every_labels),
+        (rollout_cache.BEHAVIOURS_PER_SCENARIO, USUAL.behaviours_per_scenario),
+        (statistics.POINTS, (1, LIKERT_POINTS)),
+        (CONTROL_STEP_S, 1 / time_left.CONTROL_RATE_HZ),
+    ],
+)
+def test_what_is_usual_without_a_study_is_what_is_usual_in_one(assumed: object, usual: object) -> None:
+    assert assumed == usual
+
+
+@pytest.mark.parametrize(
+    ("offered", "known"),
+    [
+        (Method, get_args(filter_module.Method)),
+        (RewardKind, get_args(reward_training.RewardKind)),
+        (Strategy, get_args(acquisition.Strategy)),
+        (ClipQuality, STYLES),
+        (Response, responses.TARGETS),
+        (PlannedTest, hypothesis_tests.TESTS),
+        (PlannedTest, preregistration.TEST_NAMES),
+        (EvaluatedMethod, unblinding.NAMES),
+        (EvaluatedMethod, results.METHOD_NAMES),
+        (EvaluatedMethod, figures.NAMES),
+        (Language, [each.stem for each in WORDING.glob("*.ftl")]),
+    ],
+)
+def test_what_can_be_chosen_is_what_is_known_elsewhere(offered: type[StrEnum], known: Any) -> None:
+    assert {each.value for each in offered} == {str(each) for each in known}
+
+
+def test_every_method_that_people_can_rate_is_one_of_the_benchmark() -> None:
+    assert {each.value for each in EvaluatedMethod} <= set(METHODS)
+
+
+def test_the_methods_have_the_same_names_on_pages_and_in_figures() -> None:
+    assert dict(figures.NAMES) == dict(results.METHOD_NAMES)
