@@ -5,7 +5,6 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from fnmatch import fnmatch
 from pathlib import Path
@@ -13,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from app.paths import DEMO_STUDY, DOCS, MIGRATIONS, STATIC, TEMPLATES
-from tests.waiting import PATIENCE_S
+from tests.waiting import PATIENCE_S, gone, until
 
 ROOT = Path(__file__).resolve().parents[1]
 TOOLS = ("bash", "cat", "find", "mkdir", "mktemp", "rm", "sed", "sleep", "tail", "touch", "wc")
@@ -180,24 +179,11 @@ def test_ctrl_c_ends_the_compiler_too_and_leaves_no_files(tmp_path: Path) -> Non
         stdout=subprocess.DEVNULL,
     )
     compiler = tmp_path / "compiler"
-    deadline = time.monotonic() + PATIENCE_S
-    while not (compiler.exists() and compiler.read_text()):
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
+    assert until(lambda: compiler.exists() and bool(compiler.read_text()))
     os.killpg(build.pid, signal.SIGINT)  # as a terminal does
     assert build.wait(PATIENCE_S) != 0
-    while runs(int(compiler.read_text())):
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
+    assert until(lambda: gone(int(compiler.read_text())))
     assert list(work.iterdir()) == []
-
-
-def runs(pid: int) -> bool:
-    """Whether a process is there and not merely waited for."""
-    try:
-        return "\nState:\tZ" not in Path(f"/proc/{pid}/status").read_text()
-    except OSError:
-        return False
 
 
 def in_the_container(path: Path) -> bool:

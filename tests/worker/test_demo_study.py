@@ -5,9 +5,7 @@ A change after which this fails needs the archive anew: python -m worker demo-st
 
 import json
 import zipfile
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 from sqlalchemy import select
@@ -19,8 +17,8 @@ from app.domain.preferences import Query
 from app.domain.studies import Participant, Study
 from app.services.archives import demo_archive
 from app.storage import ArtefactStore
+from tests.worker.at_hand import AtHand
 from worker.analysis import figures
-from worker.compute.pools import Compute
 from worker.jobs import reconcile
 from worker.jobs.learning import query_selection
 from worker.jobs.publishing import export_files, report_files
@@ -29,20 +27,9 @@ from worker.jobs.runtime.context import WorkerContext
 from worker.rehearsal import demo_study
 
 
-class Here(Compute):
-    """Computes where it is asked, not in other processes."""
-
-    def __init__(self) -> None:
-        super().__init__(1)
-
-    def run(self, lane: Any, beat: Any, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-        """The function's result."""
-        return function(*args, **kwargs)
-
-
 @pytest.fixture
 def context(database: Database, store: ArtefactStore) -> WorkerContext:
-    return WorkerContext(database, store, Here())
+    return WorkerContext(database, store, AtHand())
 
 
 @pytest.fixture

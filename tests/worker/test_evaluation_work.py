@@ -20,7 +20,7 @@ from app.domain.protocol import EvaluatedMethod, EvaluationMode, EvaluationSetti
 from app.domain.studies import Participant, Study
 from app.services.evaluation import evaluation_plan
 from app.storage import ArtefactStore
-from worker.compute.pools import Compute, Lane
+from tests.worker.at_hand import AtHand, at_once
 from worker.jobs import reconcile
 from worker.jobs.clips.evaluation_films import make_films
 from worker.jobs.learning.baselines import train_method
@@ -35,27 +35,9 @@ from worker.trajectory import SIGNALS
 LABELS = 10
 
 
-class AtHand(Compute):
-    """Calls at once, in this process."""
-
-    def run(self, lane: Lane, beat: Callable[[], None], function: Any, *args: Any, **kwargs: Any) -> Any:
-        """See Compute."""
-        beat()
-        return function(*args, **kwargs)
-
-    def run_all(self, lane: Lane, beat: Callable[[], None], function: Any, arguments: list[tuple[Any, ...]]) -> Any:
-        """See Compute."""
-        return [self.run(lane, beat, function, *each) for each in arguments]
-
-
-def at_once(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
-    """A step of a workflow that nobody interrupts; what it returns survives being stored as JSON."""
-    return json.loads(json.dumps(function(*arguments)))
-
-
 @pytest.fixture
 def context(database: Database, store: ArtefactStore) -> WorkerContext:
-    return WorkerContext(database, store, AtHand(1))
+    return WorkerContext(database, store, AtHand())
 
 
 def settle(database: Database, study: Study, **evaluation: Any) -> None:

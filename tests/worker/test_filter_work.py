@@ -1,7 +1,6 @@
 """When a filter is trained, and when not."""
 
 from collections.abc import Callable
-from typing import Any
 
 import pytest
 from sqlalchemy import func, select
@@ -14,6 +13,7 @@ from app.domain.run_keys import RunKey
 from app.domain.studies import Participant, Study
 from app.services.answers import accuracy
 from app.storage import ArtefactStore
+from tests.worker.at_hand import at_once
 from worker.compute.pools import Compute
 from worker.jobs.learning.filters import NothingToLearnFrom, notes_on_foresight, train_filter
 from worker.jobs.runtime import records
@@ -25,11 +25,6 @@ from worker.jobs.runtime.records import Job
 @pytest.fixture
 def context(database: Database, store: ArtefactStore) -> WorkerContext:
     return WorkerContext(database, store, Compute(1))
-
-
-def at_once(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
-    """A step of a workflow that nobody interrupts."""
-    return function(*arguments)
 
 
 def begin(context: WorkerContext, participant: Participant, kind: RunKind, answers: str = "") -> tuple[Job, int]:

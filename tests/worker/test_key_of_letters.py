@@ -25,8 +25,9 @@ from app.services.evaluation import evaluation_plan, unblinding
 from app.services.studies import locking
 from app.storage import ArtefactStore
 from tests import factories
+from tests.worker.at_hand import AtHand
 from tests.worker.invented import job_of
-from tests.worker.test_evaluation_work import AtHand, done, due, learn, settle
+from tests.worker.test_evaluation_work import done, due, learn, settle
 from worker.jobs.clips import evaluation_films
 from worker.jobs.clips.evaluation_films import make_films
 from worker.jobs.publishing import export_files
@@ -50,7 +51,7 @@ class Told(WorkerContext):
 
 @pytest.fixture
 def context(database: Database, store: ArtefactStore) -> Told:
-    return Told(database, store, AtHand(1))
+    return Told(database, store, AtHand())
 
 
 @pytest.fixture

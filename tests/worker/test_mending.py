@@ -16,7 +16,7 @@ from app.domain.preferences import Query, Response
 from app.domain.studies import Participant, Study
 from app.storage import ArtefactStore
 from tests import factories
-from tests.worker.test_evaluation_work import AtHand, at_once
+from tests.worker.at_hand import AtHand, at_once
 from worker.compute import simulation
 from worker.jobs import reconcile
 from worker.jobs.clips import repairs
@@ -31,7 +31,7 @@ from worker.trajectory import Trajectory
 
 @pytest.fixture
 def context(database: Database, store: ArtefactStore) -> WorkerContext:
-    return WorkerContext(database, store, AtHand(1))
+    return WorkerContext(database, store, AtHand())
 
 
 @pytest.fixture

@@ -21,7 +21,7 @@ from app.domain.studies import Participant, Study
 from app.services.participants import enrolment
 from app.storage import ArtefactStore
 from tests import factories
-from worker.compute.pools import Compute
+from tests.worker.at_hand import AtHand
 from worker.jobs import reconcile
 from worker.jobs.clips.import_clips import ClipsInvalid, import_clips
 from worker.jobs.learning import dataset, query_selection
@@ -36,14 +36,6 @@ from worker.sim.render.video import encode_mp4, playable
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 WAYS = ("slow_far", "slow_near", "fast_far", "fast_near")
-
-
-class Here(Compute):
-    """Computes where it is asked, not in other processes."""
-
-    def run(self, lane: Any, beat: Any, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-        """The function's result."""
-        return function(*args, **kwargs)
 
 
 @pytest.fixture
@@ -62,7 +54,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def context(database: Database, store: ArtefactStore) -> WorkerContext:
-    return WorkerContext(database, store, Here(1))
+    return WorkerContext(database, store, AtHand())
 
 
 @pytest.fixture

@@ -19,8 +19,8 @@ from app.services.participants import withdrawal
 from app.storage import ArtefactStore
 from tests import factories
 from tests.finished_study import make_finished_study
+from tests.worker.at_hand import AtHand
 from worker.analysis import figures
-from worker.compute.pools import Compute
 from worker.jobs import reconcile
 from worker.jobs.publishing import report_files
 from worker.jobs.runtime import records
@@ -28,20 +28,9 @@ from worker.jobs.runtime.context import WorkerContext
 from worker.jobs.runtime.records import Job
 
 
-class Here(Compute):
-    """Computes where it is asked, not in other processes."""
-
-    def __init__(self) -> None:
-        super().__init__(1)
-
-    def run(self, lane: Any, beat: Any, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-        """The function's result."""
-        return function(*args, **kwargs)
-
-
 @pytest.fixture
 def context(database: Database, store: ArtefactStore) -> WorkerContext:
-    return WorkerContext(database, store, Here())
+    return WorkerContext(database, store, AtHand())
 
 
 @pytest.fixture(autouse=True)
@@ -176,7 +165,7 @@ def test_somebody_who_withdraws_while_a_report_is_made_is_in_no_report(context: 
     with context.database.writing() as session:
         run_id = records.begin_run(session, job, seed=1)
 
-    class Meanwhile(Here):
+    class Meanwhile(AtHand):
         def run(self, lane: Any, beat: Any, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
             with context.database.writing() as session:
                 person = session.scalars(select(Participant)).first()
