@@ -1,14 +1,14 @@
 """Which tasks there are: the entry points ``pbarl_studio.tasks``, and the folder of the package each of them names.
 
-The studio runs from its checkout, so its own entry points are read from the checkout's ``pyproject.toml``: an
+The studio runs from its checkout, so its own are read from the file beside this one that declares them: an
 installation that is older than the checkout, or was never made, changes nothing. Those of other packages come from
 what is installed.
 """
 
 import re
 import sys
-import tomllib
 from collections.abc import Iterator, Mapping, Sequence
+from configparser import ConfigParser
 from dataclasses import dataclass
 from functools import cache
 from importlib.machinery import ModuleSpec
@@ -19,7 +19,7 @@ from typing import NamedTuple
 from installed_tasks.description import InstalledTask, TaskRefused, read
 
 GROUP = "pbarl_studio.tasks"
-PROJECT = Path(__file__).resolve().parents[1] / "pyproject.toml"
+OURS, OUR_ENTRY_POINTS = "pbarl-studio", Path(__file__).with_name("entry_points.txt")
 _NAME, _PACKAGE = r"[a-z][a-z0-9_]{0,39}", r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*"
 _RESERVED = {"other", "own_clips"}
 """What is said of tasks that are not installed goes by one of these, studies of imported clips by the other."""
@@ -81,12 +81,12 @@ def find(name: str) -> InstalledTask | None:
 
 
 def _declared() -> Iterator[Declared]:
-    project = tomllib.loads(PROJECT.read_text(encoding="utf-8"))["project"]
-    ours = project["name"]
-    yield from (Declared(name, package, ours) for name, package in project["entry-points"][GROUP].items())
+    ours = ConfigParser()
+    ours.read(OUR_ENTRY_POINTS, encoding="utf-8")
+    yield from (Declared(name, package, OURS) for name, package in ours[GROUP].items())
     for point in sorted(entry_points(group=GROUP)):
         distribution = point.dist.name if point.dist else point.module
-        if distribution != ours:
+        if distribution != OURS:
             yield Declared(point.name, point.value, distribution)
 
 

@@ -108,7 +108,12 @@ RUN: dict[str, str | Elsewhere | OnlyParsed] = {
     "start_posture": "--restarts 50",
 }
 """What runs small enough, by program."""
-TOOLS = {"alembic": "check", "pre-commit": "validate-config", "pytest": "--collect-only -q tests/architecture"}
+TOOLS = {
+    "alembic": "check",
+    "pip": "show pbarl-studio",
+    "pre-commit": "validate-config",
+    "pytest": "--collect-only -q tests/architecture",
+}
 """What shows that a tool does its work here."""
 
 

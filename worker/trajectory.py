@@ -5,9 +5,8 @@ from pathlib import Path
 from typing import IO, Protocol, Self
 
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[np.float32]
+from worker.type_aliases import Float32Array
 
 COSTS = ("C_d", "C_v", "C_f", "C_hf", "C_fd", "C_fdv")
 """The paper's six preference items (r^H), unweighted and non-negative, one column each."""
@@ -47,17 +46,17 @@ class Recorded(Protocol):
     """What preferences are learned from, wherever it was recorded: T steps of signals, observations and actions."""
 
     @property
-    def signals(self) -> Array:
+    def signals(self) -> Float32Array:
         """(T, S) what was measured; the columns are the study's"""
         ...
 
     @property
-    def observations(self) -> Array:
+    def observations(self) -> Float32Array:
         """(T + 1, D), D may be 0"""
         ...
 
     @property
-    def actions(self) -> Array:
+    def actions(self) -> Float32Array:
         """(T, A), A may be 0"""
         ...
 
@@ -75,9 +74,9 @@ class Recorded(Protocol):
 class Recording:
     """An episode that was recorded elsewhere. Raises ValueError when arrays disagree about T, or are not finite."""
 
-    signals: Array
-    observations: Array
-    actions: Array
+    signals: Float32Array
+    observations: Float32Array
+    actions: Float32Array
     success: bool
 
     def __post_init__(self) -> None:
@@ -116,29 +115,29 @@ class Trajectory:
     Raises ValueError when an array's shape disagrees with the number of actions.
     """
 
-    observations: Array
+    observations: Float32Array
     """(T + 1, D)"""
-    actions: Array
+    actions: Float32Array
     """(T, 7) as executed, in [-1, 1]"""
-    reference_actions: Array
+    reference_actions: Float32Array
     """(T, 7) the frozen policy's mean action in the same states"""
-    signals: Array
+    signals: Float32Array
     """(T, S) columns as in SIGNALS"""
-    costs: Array
+    costs: Float32Array
     """(T, 6) columns as in COSTS"""
-    task_rewards: Array
+    task_rewards: Float32Array
     """(T,)"""
-    joint_positions: Array
+    joint_positions: Float32Array
     """(T + 1, 7) rad"""
-    particles: Array
+    particles: Float32Array
     """(T + 1, P, 3) m in the world frame; NaN once a particle has been eaten or lost"""
-    head_quaternions: Array
+    head_quaternions: Float32Array
     """(T + 1, 4) xyzw in the world frame"""
-    arm_positions_rad: Array
+    arm_positions_rad: Float32Array
     """(T + 1, 2, 4) the person's right and left arm: shoulder flexion, abduction, rotation, and elbow flexion"""
-    target_m: Array
+    target_m: Float32Array
     """(T + 1, 3) mouth or itch in the world frame"""
-    contact_force_n: Array
+    contact_force_n: Float32Array
     """(T,) summed normal force on the person"""
     success: bool
     scenario: int
@@ -190,7 +189,7 @@ class Trajectory:
         return cls(**{name: plain[name](value) if name in plain else value for name, value in values.items()})
 
 
-def _require_shape(name: str, array: Array, shape: tuple[int | None, ...]) -> None:
+def _require_shape(name: str, array: Float32Array, shape: tuple[int | None, ...]) -> None:
     matches = array.ndim == len(shape) and all(
         wanted in (None, got) for wanted, got in zip(shape, array.shape, strict=True)
     )

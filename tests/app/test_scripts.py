@@ -29,6 +29,12 @@ def test_no_side_takes_scripts_of_the_other() -> None:
         assert {PurePosixPath(each).parts[0] for each in imports_of(script)} <= {"base", PurePosixPath(script).parts[0]}
 
 
+def test_every_script_that_a_page_needs_is_there_and_no_other() -> None:
+    pages = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "templates").rglob("*.html"))
+    named = set(re.findall(r'"([\w/]+\.js)"', pages))
+    assert named | {each for script in named for each in imports_of(script)} == set(SCRIPTS)
+
+
 def test_the_labelling_page_asks_for_all_its_modules_at_once() -> None:
     wanted = {"base/lock_step.js", "participant/outbox.js", "participant/clips.js"}
     assert wanted <= set(imports_of("participant/pair.js"))

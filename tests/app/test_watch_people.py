@@ -223,7 +223,7 @@ def test_every_job_that_failed_or_is_at_work_is_listed_with_its_error_and_a_butt
     with database.writing() as session:
         for method, columns in (("prefft", failed), ("pbarl", {})):
             run = factories.make_run(session, study, participant, kind=RunKind.METHOD, **columns)
-            run.workflow_id = f"method/participant-1/{method}/labels"
+            run.workflow_id = f"method/participant-1/{method}/labels-10"
         factories.make_run(session, study, kind=RunKind.REPORT, status=RunStatus.FAILED, error="A bad day.")
         factories.make_run(session, study, kind=RunKind.REPORT)
         factories.make_run(session, study, kind=RunKind.CLIPS, status=RunStatus.RUNNING, stage="clip 3")

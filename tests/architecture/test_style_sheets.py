@@ -252,6 +252,7 @@ def _elements(selector: str) -> list[str]:
 def test_a_page_loads_the_sheets_of_what_it_shows_and_no_others(page: str) -> None:
     shown = shown_by(page)
     reachable = {sheet for sheet in SHEETS if sheet.split("/")[0] in ("base", page.split("/")[0])}
+    assert shown.sheets - OCCASIONAL <= reachable, "a side takes no sheet of the other"
     styled = {name: sheet for sheet in reachable for name in styled_by(sheet)}
     assert {name: styled[name] for name in shown.classes & styled.keys() if not _styles(name, shown.sheets)} == {}
     idle = {sheet for sheet in shown.sheets if styled_by(sheet) and not styled_by(sheet) & shown.classes}

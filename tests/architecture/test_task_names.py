@@ -1,7 +1,6 @@
 """A task is named in its folder and nowhere else; what the folder says fits what its code does."""
 
 import re
-import tomllib
 from pathlib import Path
 
 import pytest
@@ -13,10 +12,11 @@ from worker.tasks import registry
 from worker.trajectory import COSTS, SIGNALS
 
 ROOT = Path(__file__).parents[2]
-NAMES = tuple(tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"][catalogue.GROUP])
+NAMES = tuple(re.findall(r"^(\w+) = worker\.tasks\.", catalogue.OUR_ENTRY_POINTS.read_text(), re.MULTILINE))
 ELSEWHERE = {
     "app/demo/feeding.zip": "the archive of the demo study, which is of a task",
     "app/paths.py": "its file",
+    "installed_tasks/entry_points.txt": "declares them",
     "worker/rehearsal/demo_study.py": "makes it",
     "worker/analysis/published.py": "the numbers that the paper prints, by its names of tasks",
 }

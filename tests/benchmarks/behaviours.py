@@ -30,8 +30,6 @@ FIRST_SCENARIO = 10_700_000
 PER_SCENARIO = 4
 REACHED_M = 0.06
 
-Floats = npt.NDArray[np.float64]
-
 
 def main() -> None:
     """Print one section per task."""

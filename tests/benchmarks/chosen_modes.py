@@ -23,7 +23,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from tqdm import tqdm
 
@@ -42,8 +41,6 @@ from worker.ml.teachers import TASTES, Manner, Taste, User
 from worker.sim.costs import signal_weights, stakes
 from worker.task import Task
 from worker.tasks import registry
-
-Floats = npt.NDArray[np.float64]
 
 FIRST_SEED = 100
 USERS = tuple(user.value for user in User)

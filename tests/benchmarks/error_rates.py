@@ -23,9 +23,9 @@ from tests.benchmarks import error_rates_of_intervals
 from worker.analysis import result_pages
 from worker.analysis.effect_sizes import holm
 from worker.analysis.hypothesis_tests import TESTS, mixed_model, paired_t, two_sample_t, wilcoxon
+from worker.type_aliases import FloatArray
 
-Floats = npt.NDArray[np.float64]
-Cells = list[list[Floats]]
+Cells = list[list[FloatArray]]
 """By person and group: ratings; empty where somebody was gone by then."""
 
 RESULTS = Path("docs/results")
@@ -135,7 +135,7 @@ def rates(truth: Truth, studies: int, seed: int = 0) -> list[dict[str, Any]]:
     return [_row(truth, studies, test, tally, sum(differ), len(differ)) for test, tally in tallies.items()]
 
 
-def _row(truth: Truth, studies: int, test: str, tally: Floats, differing: int, comparisons: int) -> dict[str, Any]:
+def _row(truth: Truth, studies: int, test: str, tally: FloatArray, differing: int, comparisons: int) -> dict[str, Any]:
     errors, found, family, found_after, unknown = (float(each) for each in tally)
     same = comparisons - differing
     return {

@@ -45,9 +45,9 @@ from worker.responses import TARGETS
 from worker.scenarios import EVALUATION, first_of
 from worker.sim.costs import preference_rewards, signal_weights
 from worker.tasks import registry
-from worker.trajectory import Array, Trajectory
+from worker.trajectory import Trajectory
+from worker.type_aliases import Float32Array, FloatArray
 
-Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
 POOL_FIRST, UNSEEN_FIRST = 10_800_000, 10_950_000
@@ -159,7 +159,7 @@ class Bench:
         choice = acquisition.choose(count, len(free), rng, rule=rule, scores=scores)
         return free[choice.indices]
 
-    def _scores(self, chain: Chain, free: Indices, model: RewardModel | None) -> Floats | None:
+    def _scores(self, chain: Chain, free: Indices, model: RewardModel | None) -> FloatArray | None:
         if chain.rule == "uniform":
             return None
         members = model.member_probabilities(self.pool.segments(self.pairs[free])) if model else None
@@ -170,7 +170,7 @@ class Bench:
             return acquisition.contested(acquisition.expected_answers(differences)[:, free], members)
         return None if members is None else acquisition.score(chain.rule, members)
 
-    def _fit(self, chain: Chain, rows: Indices, answers: Floats) -> reward_training.FitResult:
+    def _fit(self, chain: Chain, rows: Indices, answers: FloatArray) -> reward_training.FitResult:
         prior = self.prior if chain.pooled else None
         pairs = self.pool.segments(self.pairs[rows])
         return reward_training.fit(
@@ -216,12 +216,12 @@ class Bench:
             fit_seconds=fitted.metrics["fit_seconds"],
         )
 
-    def _promised(self, user: str, mode: Floats) -> tuple[float, float]:
+    def _promised(self, user: str, mode: FloatArray) -> tuple[float, float]:
         """Gain in % and change of success in points by the response surface."""
         changes, success = self.surface.predict(mode)
         return self._percent(user, float(changes @ self._true_weights(user))), 100 * float(success)
 
-    def _driven(self, user: str, mode: Floats) -> tuple[float, float]:
+    def _driven(self, user: str, mode: FloatArray) -> tuple[float, float]:
         """The same in unseen scenarios."""
         name, reference = self.task.name, self.driven_reference
         scenarios = [each.scenario for each in reference]
@@ -239,7 +239,7 @@ class Bench:
     def _percent(self, user: str, change: float) -> float:
         return 100 * change / stake(self.task, _taste(user))
 
-    def _true_weights(self, user: str) -> Floats:
+    def _true_weights(self, user: str) -> FloatArray:
         taste = _taste(user)
         return signal_weights(self.task, taste.omega, taste.per_signal)
 
@@ -257,7 +257,7 @@ class Bench:
             weights.append(reward_training.posterior(features, said)[0])
         return Prior.pooled(weights)
 
-    def rewards(self, user: str, pool: Pool) -> Floats:
+    def rewards(self, user: str, pool: Pool) -> FloatArray:
         """True preference rewards, (C, T)."""
         taste = _taste(user)
         return preference_rewards(self.task, pool.costs, pool.signals, taste.omega, "calibrated", taste.per_signal)
@@ -273,9 +273,9 @@ class Bench:
 class _Clip:
     """What a reward model reads of a clip."""
 
-    signals: Array
-    observations: Array
-    actions: Array
+    signals: Float32Array
+    observations: Float32Array
+    actions: Float32Array
     success: bool = False
 
     def __len__(self) -> int:

@@ -21,8 +21,8 @@ from worker.ml.acquisition import matched_pairs
 from worker.ml.rewards.segments import SegmentPairs
 from worker.sim.rollout import rollout
 from worker.tasks import registry
+from worker.type_aliases import Float32Array
 
-Array = npt.NDArray[np.float32]
 Indices = npt.NDArray[np.int64]
 
 PER_SCENARIO = 4
@@ -34,13 +34,13 @@ DIRECTORY = Path("data/pool_rollouts")
 class Pool:
     """C clips of T steps, four behaviours of each scenario."""
 
-    signals: Array
+    signals: Float32Array
     """(C, T, S)"""
-    observations: Array
+    observations: Float32Array
     """(C, T, D)"""
-    actions: Array
+    actions: Float32Array
     """(C, T, 7)"""
-    costs: Array
+    costs: Float32Array
     """(C, T, 6)"""
     scenarios: Indices
     """(C,)"""

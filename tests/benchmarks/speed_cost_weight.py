@@ -14,9 +14,10 @@ import numpy as np
 from installed_tasks import catalogue
 from worker.compute import simulation
 from worker.sim.costs import BASE_WEIGHTS, cost_items
-from worker.sim.rollout import Act, rollout
+from worker.sim.rollout import rollout
 from worker.tasks import registry
 from worker.trajectory import COSTS
+from worker.type_aliases import Act
 
 FACTORS = (0.8, 0.9, 1.0, 1.1, 1.2)
 FIRST_SCENARIO = 3_000_000

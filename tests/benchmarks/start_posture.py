@@ -9,15 +9,13 @@ import argparse
 import sys
 
 import numpy as np
-import numpy.typing as npt
 
 from installed_tasks import catalogue
 from worker.sim.arm import tool_jacobian
 from worker.sim.assistive import ARM, AssistiveEnv
 from worker.sim.seated_person import PERSON
 from worker.tasks.registry import environment_class
-
-FloatArray = npt.NDArray[np.float64]
+from worker.type_aliases import FloatArray
 
 SCENARIOS = 4
 """Targets of so many scenarios lie on the way."""

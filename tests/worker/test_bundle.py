@@ -187,7 +187,7 @@ def test_the_script_needs_only_numpy_and_onnxruntime() -> None:
         "except SystemExit: pass\n"
         "print([name for name in ('torch', 'safetensors', 'onnx', 'worker', 'app') if name in sys.modules])"
     )
-    root = Path(bundle.__file__).parents[2]
+    root = Path(bundle.__file__).parents[3]
     finished = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=True)
     assert finished.stdout.strip().endswith("[]")
 

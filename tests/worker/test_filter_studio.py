@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from tests.worker import invented
-from worker.ml.filters import filter_problem, mode_search, pbarl, residual, response_surface
+from worker.ml.filters import mode_search, pbarl, residual, response_surface
 from worker.ml.filters.filter_module import FilterWeights
 from worker.ml.filters.filter_problem import FilterConfig, FilterDraft, FilterProblem, act_of, noisy
 from worker.ml.filters.residual import learn_round
@@ -17,6 +17,7 @@ from worker.ml.filters.response_surface import ResponseSurface
 from worker.ml.rewards.reward_models import StructuredReward
 from worker.scenarios import GATE, first_of
 from worker.trajectory import SIGNALS, Trajectory
+from worker.type_aliases import Act
 
 POLICY = invented.small_policy()
 FAMILY = invented.TASK.modes
@@ -40,12 +41,12 @@ class World:
         self.slowest = slowest
         self.asked: list[int] = []
 
-    def collect(self, act: filter_problem.Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
+    def collect(self, act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
         """See filter_problem.Collect."""
         self.asked.append(len(scenarios))
         return [self._episode(noisy(act, noise, seed, scenario), scenario) for scenario in scenarios]
 
-    def _episode(self, act: filter_problem.Act, scenario: int) -> Trajectory:
+    def _episode(self, act: Act, scenario: int) -> Trajectory:
         rng = np.random.default_rng(scenario)
         seen = invented.observations(STEPS + 1, rng)
         actions = np.clip([act(each) for each in seen[:-1]], -1, 1).astype(np.float32)
@@ -79,7 +80,7 @@ def surface() -> ResponseSurface:
     return response_surface.fit(FAMILY, modes, np.array(deltas), np.ones(60))
 
 
-def _mode_act(mode: np.ndarray) -> filter_problem.Act:
+def _mode_act(mode: np.ndarray) -> Act:
     values = mode.astype(np.float32)
 
     def act(observation: np.ndarray) -> np.ndarray:
@@ -150,7 +151,7 @@ def test_a_mode_that_fails_teaches_the_search_to_find_one_that_does_not(
 
 
 def test_a_filter_that_presses_too_hard_is_turned_off(reference: list[Trajectory], surface: ResponseSurface) -> None:
-    def pressing(act: filter_problem.Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
+    def pressing(act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
         episodes = World().collect(act, scenarios, noise, seed)
         return [replace(each, contact_force_n=np.full(STEPS, 30.0, np.float32)) for each in episodes]
 

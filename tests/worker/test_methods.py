@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from tests.worker import invented
-from worker.ml.filters import filter_problem, response_surface
+from worker.ml.filters import response_surface
 from worker.ml.filters.filter_module import load_state
 from worker.ml.filters.filter_problem import FilterConfig, FilterProblem, noisy
 from worker.ml.filters.fitted_q import ActionValue
@@ -22,6 +22,7 @@ from worker.ml.methods.prefft import FineTuning
 from worker.ml.methods.registry import METHODS, MethodConfig, Setting
 from worker.ml.rewards.reward_models import MlpReward, StructuredReward
 from worker.trajectory import SIGNALS, Trajectory
+from worker.type_aliases import Act
 
 POLICY = invented.small_policy()
 SPEED, DISTANCE = SIGNALS.index("speed_m_s"), SIGNALS.index("distance_m")
@@ -49,12 +50,12 @@ class World(gymnasium.Env[Any, Any]):
         return self._seen[self._step], 0.0, False, self._step == STEPS, {"signals": signals}
 
 
-def collect(act: filter_problem.Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
+def collect(act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
     """See filter_problem.Collect; the same world."""
     return [_episode(noisy(act, noise, seed, scenario), scenario) for scenario in scenarios]
 
 
-def _episode(act: filter_problem.Act, scenario: int) -> Trajectory:
+def _episode(act: Act, scenario: int) -> Trajectory:
     rng = np.random.default_rng(scenario)
     seen = invented.observations(STEPS + 1, rng)
     actions = np.clip([act(each) for each in seen[:-1]], -1, 1).astype(np.float32)

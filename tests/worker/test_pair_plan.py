@@ -10,7 +10,8 @@ from app.domain.study_settings import StudySettings
 from tests.worker import invented
 from worker.jobs.learning import query_plan
 from worker.ml.rewards.segments import SegmentPairs, Stretch
-from worker.trajectory import SIGNALS, Array
+from worker.trajectory import SIGNALS
+from worker.type_aliases import Float32Array
 
 WHOLE_STUDY = StudySettings(practice_pairs=2, introduction_pairs=10, repeated_pairs=20, catch_pairs=5)
 DELIVERED_AT = 10
@@ -18,7 +19,7 @@ DELIVERED_AT = 10
 
 def stretch(*, success: bool, delivered: bool, spilled: float = 0.0, shown: int = 20) -> Stretch:
     """A run of 30 steps; only the first ones are shown."""
-    signals: Array = np.zeros((30, len(SIGNALS)), np.float32)
+    signals: Float32Array = np.zeros((30, len(SIGNALS)), np.float32)
     signals[:, SIGNALS.index("undelivered")] = 1.0
     if delivered:
         signals[DELIVERED_AT:, SIGNALS.index("undelivered")] = 0.0

@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 import torch
 
@@ -17,8 +16,8 @@ from worker.ml.rewards.reward_models import StructuredReward
 from worker.ml.rewards.reward_training import fit
 from worker.ml.rewards.segments import SegmentPairs
 from worker.trajectory import SIGNALS
+from worker.type_aliases import FloatArray
 
-Floats = npt.NDArray[np.float64]
 STEPS = 10
 
 
@@ -30,7 +29,7 @@ def of_random_weights(stride: int = 2, layers: int = 2) -> PreferenceTransformer
     return PreferenceTransformer(weights, np.zeros(inputs, np.float32), np.ones(inputs, np.float32), 2, stride)
 
 
-def one_before_the_other(count: int, rng: np.random.Generator) -> tuple[SegmentPairs, Floats]:
+def one_before_the_other(count: int, rng: np.random.Generator) -> tuple[SegmentPairs, FloatArray]:
     """A knock and a ring in every segment, equally loud everywhere; liked is to hear the knock first."""
     segments = np.zeros((count, 2, STEPS, 2), np.float32)
     knock_first = rng.random((count, 2)) < 0.5
@@ -57,7 +56,7 @@ def test_it_learns_a_preference_about_order_that_no_reward_of_single_steps_can()
     ).model
     network = fit(shown, targets, "mlp", 0, mlp=MlpTraining(**training)).model  # type: ignore[arg-type]
 
-    def accuracy(probabilities: Floats) -> float:
+    def accuracy(probabilities: FloatArray) -> float:
         return float(((probabilities > 0.5) == (truth > 0.5)).mean())
 
     assert accuracy(transformer.probability_right(unseen)) > 0.9

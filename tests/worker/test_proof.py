@@ -16,9 +16,10 @@ from worker.compute.pools import Compute
 from worker.ml.export import bundle
 from worker.ml.export.bundle import Provenance
 from worker.ml.filters.filter_module import FilterWeights
-from worker.ml.filters.filter_problem import Act, FilterConfig, FilterDraft
+from worker.ml.filters.filter_problem import FilterConfig, FilterDraft
 from worker.ml.rewards.reward_models import StructuredReward
 from worker.trajectory import SIGNALS, Trajectory
+from worker.type_aliases import Act
 
 
 def measured(low: float, high: float, **worse: float) -> dict[str, Any]:

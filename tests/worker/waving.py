@@ -4,12 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from worker.sim.arm import FloatArray, Tool, transform
+from worker.sim.arm import Tool, transform
 from worker.sim.human import ARM_JOINTS, BODY_SHAPES, RIGHT, arm_points_m
 from worker.sim.jaco import JACO
 from worker.tasks.drinking.environment import CUP
 from worker.tasks.feeding.environment import SPOON
-from worker.trajectory import COSTS, SIGNALS, Array, Trajectory
+from worker.trajectory import COSTS, SIGNALS, Trajectory
+from worker.type_aliases import Float32Array, FloatArray
 
 POSTURE_RAD = np.array([-3.01, 3.73, 0.0, 4.89, 1.43, 1.76, 0.41])
 """The spoon is level between its start and the mouth."""
@@ -65,7 +66,7 @@ def itching_trajectory(steps: int, lift_rad: float = 0.0) -> Trajectory:
     return trajectory
 
 
-def itch_m(arm_rad: Array) -> Array:
+def itch_m(arm_rad: Float32Array) -> Float32Array:
     """(3,) in the middle of the top of the broad body's right forearm, in the world."""
     shape = BODY_SHAPES["broad"]
     _, elbow, wrist, _ = arm_points_m(shape, arm_rad.astype(float), RIGHT)
@@ -77,7 +78,7 @@ def tool_frames(joints_rad: FloatArray, tool: Tool) -> FloatArray:
     return np.asarray(MOUNT @ JACO.link_frames(joints_rad, tool)[:, -1])
 
 
-def carried(frames: FloatArray, seats_m: FloatArray) -> Array:
+def carried(frames: FloatArray, seats_m: FloatArray) -> Float32Array:
     """Particles (T + 1, P, 3) that keep their places (P, 3) in a tool's frames (T + 1, 4, 4)."""
     places = np.einsum("tij,pj->tpi", frames[:, :3, :3], seats_m) + frames[:, None, :3, 3]
     return np.asarray(places, np.float32)

@@ -8,13 +8,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pandas as pd
 
 from worker.analysis.hypothesis_tests import plain
 from worker.analysis.statistics import mean_interval
 
-Floats = npt.NDArray[np.float64]
 Result = dict[str, Any]
 
 

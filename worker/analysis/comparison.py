@@ -13,13 +13,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from worker.analysis.agreement import wilson_interval
 from worker.analysis.evaluation import mean_change, success_change
 from worker.trajectory import COSTS
+from worker.type_aliases import FloatArray
 
-Floats = npt.NDArray[np.float64]
 Row = dict[str, Any]
 
 REFERENCE = "reference"
@@ -35,15 +34,15 @@ class EvaluatedCell:
     seed: int
     labels: int
     """that the user's reward model was trained on"""
-    success: Floats
+    success: FloatArray
     """(N,) 0 or 1"""
-    preference: Floats
+    preference: FloatArray
     """(N,) returns of the user's learned reward"""
-    true_returns: Mapping[str, Floats]
+    true_returns: Mapping[str, FloatArray]
     """by user: (N,) returns of r^H, the true preference"""
-    stakes: Mapping[str, Floats]
+    stakes: Mapping[str, FloatArray]
     """by user: (N,) what they mind and like in these episodes, taken positively (worker.sim.costs.stakes)"""
-    costs: Floats
+    costs: FloatArray
     """(N, 6) summed over the episode"""
     spent: Mapping[str, float]
     """labels, environment_steps, cpu_s and wall_s of this method"""
@@ -69,12 +68,12 @@ class Pooled:
         )
         return Pooled(runs, references)
 
-    def both(self, what: str) -> tuple[Floats, Floats]:
+    def both(self, what: str) -> tuple[FloatArray, FloatArray]:
         """The reference policy's and the method's values per episode, (seeds N,) or (seeds N, 6) each."""
         before, after = (np.concatenate([getattr(run, what) for run in runs]) for runs in (self.references, self.runs))
         return before, after
 
-    def true_of(self, judge: str) -> tuple[Floats, Floats]:
+    def true_of(self, judge: str) -> tuple[FloatArray, FloatArray]:
         """The same for the true returns of somebody."""
         before, after = (
             np.concatenate([run.true_returns[judge] for run in runs]) for runs in (self.references, self.runs)

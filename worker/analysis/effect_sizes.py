@@ -3,12 +3,10 @@
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 from scipy import optimize, stats
 
 from worker.analysis.agreement import Z_95
-
-Floats = npt.NDArray[np.float64]
+from worker.type_aliases import FloatArray
 
 _TAIL = 0.025
 
@@ -35,7 +33,7 @@ def _noncentrality(t: float, degrees_of_freedom: int, share_below: float) -> flo
     return float(optimize.brentq(excess, *sorted((inner, outer)), xtol=1e-9))
 
 
-def rank_biserial(differences: Floats) -> float:
+def rank_biserial(differences: FloatArray) -> float:
     """Matched-pairs rank-biserial correlation: favourable minus unfavourable share of ranks. (P,) -> [-1, 1]
 
     Kerby (2014). Zeros are dropped, as in Wilcoxon's test. Raises ValueError when nothing is left.

@@ -13,8 +13,7 @@ import numpy.typing as npt
 
 from worker.analysis.agreement import Z_95, wilson_interval
 from worker.trajectory import COSTS, SIGNALS, Trajectory
-
-Floats = npt.NDArray[np.float64]
+from worker.type_aliases import FloatArray
 
 
 def evaluate(
@@ -45,12 +44,12 @@ def evaluate(
     }
 
 
-def mean_change(before: Floats, after: Floats) -> dict[str, float]:
+def mean_change(before: FloatArray, after: FloatArray) -> dict[str, float]:
     """Means of both and of their paired difference, with its interval. (N,), (N,)"""
     return {"reference": float(before.mean()), "filter": float(after.mean()), **_with_interval(after - before)}
 
 
-def success_change(before: Floats, after: Floats) -> dict[str, float]:
+def success_change(before: FloatArray, after: FloatArray) -> dict[str, float]:
     """Success rates and their paired difference with its interval. (N,) of 0 and 1, or of means over repetitions.
 
     Method 10 of Newcombe (1998), Statistics in Medicine 17, 2635-2650: Wilson's intervals of the two rates, squared
@@ -68,7 +67,7 @@ def success_change(before: Floats, after: Floats) -> dict[str, float]:
     return {"reference": rates[0], "filter": rates[1], "delta": delta, "low": low, "high": high}
 
 
-def _correlation(before: Floats, after: Floats) -> float:
+def _correlation(before: FloatArray, after: FloatArray) -> float:
     """Newcombe's phi: corrected for continuity when positive, 0 when one of the rates is 0 or 1."""
     both, neither = float((before * after).sum()), float(((1 - before) * (1 - after)).sum())
     lost, won = float((before * (1 - after)).sum()), float(((1 - before) * after).sum())
@@ -92,17 +91,17 @@ def envelope(trajectories: Sequence[Trajectory]) -> dict[str, float]:
     }
 
 
-def _with_interval(differences: Floats) -> dict[str, float]:
+def _with_interval(differences: FloatArray) -> dict[str, float]:
     mean = float(differences.mean())
     margin = Z_95 * float(differences.std(ddof=1)) / len(differences) ** 0.5 if len(differences) > 1 else float("inf")
     return {"delta": mean, "low": mean - margin, "high": mean + margin}
 
 
-def _successes(trajectories: Sequence[Trajectory]) -> Floats:
+def _successes(trajectories: Sequence[Trajectory]) -> FloatArray:
     return np.array([each.success for each in trajectories], np.float64)
 
 
-def _summed(trajectories: Sequence[Trajectory], column: int) -> Floats:
+def _summed(trajectories: Sequence[Trajectory], column: int) -> FloatArray:
     return np.array([each.costs[:, column].sum(dtype=np.float64) for each in trajectories])
 
 

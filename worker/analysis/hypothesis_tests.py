@@ -9,10 +9,10 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy import stats
 
-Floats = npt.NDArray[np.float64]
+from worker.type_aliases import FloatArray
+
 Result = dict[str, Any]
 
 TESTS = ("two_sample_t", "paired_t", "wilcoxon", "mixed_model")
@@ -25,7 +25,7 @@ FEWEST_PAIRED = 3
 """People who rated both groups; with two, one difference decides everything."""
 
 
-def two_sample_t(first: Floats, second: Floats) -> Result:
+def two_sample_t(first: FloatArray, second: FloatArray) -> Result:
     """The paper's test: Student's, equal variances, every rating counted as independent."""
     if min(len(first), len(second)) < FEWEST_RATINGS:
         return not_computable(f"there are {len(first)} and {len(second)} ratings; {FEWEST_RATINGS} of each are needed")
@@ -45,7 +45,7 @@ def two_sample_t(first: Floats, second: Floats) -> Result:
     }
 
 
-def paired_t(differences: Floats) -> Result:
+def paired_t(differences: FloatArray) -> Result:
     """Student's paired t-test on per-person means. (P,)"""
     n = len(differences)
     reason = _why_not(differences)
@@ -64,7 +64,7 @@ def paired_t(differences: Floats) -> Result:
     }
 
 
-def wilcoxon(differences: Floats) -> Result:
+def wilcoxon(differences: FloatArray) -> Result:
     """Wilcoxon's signed-rank test on per-person means, zeros dropped, exact whatever is tied. (P,)"""
     n, moved = len(differences), int(np.count_nonzero(differences))
     if n < FEWEST_PAIRED:
@@ -82,7 +82,7 @@ def wilcoxon(differences: Floats) -> Result:
     }
 
 
-def signed_rank(differences: Floats) -> tuple[float, float]:
+def signed_rank(differences: FloatArray) -> tuple[float, float]:
     """The smaller sum of ranks, and its exact two-sided p given the ties: every sign is as likely as the other. (P,)
 
     The distribution of the sum over all 2^P signs is built up rank by rank, as polynomials are multiplied. Ranks are
@@ -98,7 +98,7 @@ def signed_rank(differences: Floats) -> tuple[float, float]:
     return smaller / 2, float(min(1.0, 2 * chances[: smaller + 1].sum()))
 
 
-def mixed_model(first: Sequence[Floats], second: Sequence[Floats]) -> Result:
+def mixed_model(first: Sequence[FloatArray], second: Sequence[FloatArray]) -> Result:
     """Linear mixed model, rating ~ group + (group | participant), of two groups; by person: their ratings of each.
 
     Estimated in two stages. A person's mean difference d_i scatters by what the groups change for them and by the
@@ -136,7 +136,7 @@ def mixed_model(first: Sequence[Floats], second: Sequence[Floats]) -> Result:
     }
 
 
-def _variance_within(cells: Sequence[Floats]) -> float | None:
+def _variance_within(cells: Sequence[FloatArray]) -> float | None:
     """Pooled over cells; None where no cell has two ratings."""
     degrees_of_freedom = sum(len(cell) - 1 for cell in cells)
     if degrees_of_freedom == 0:
@@ -144,7 +144,7 @@ def _variance_within(cells: Sequence[Floats]) -> float | None:
     return float(sum(((cell - cell.mean()) ** 2).sum() for cell in cells)) / degrees_of_freedom
 
 
-def _why_not(differences: Floats) -> str | None:
+def _why_not(differences: FloatArray) -> str | None:
     n = len(differences)
     if n < FEWEST_PAIRED:
         return too_few(n)

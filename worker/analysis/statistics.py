@@ -22,7 +22,6 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pandas as pd
 from scipy import stats
 
@@ -37,8 +36,8 @@ from worker.analysis.hypothesis_tests import (
     two_sample_t,
     wilcoxon,
 )
+from worker.type_aliases import FloatArray
 
-Floats = npt.NDArray[np.float64]
 Result = dict[str, Any]
 
 SCALES = ("satisfaction", "personalisation")
@@ -124,7 +123,7 @@ def _mean_of(rows: pd.DataFrame, scale: str, group: str) -> Result:
 
 
 def mean_interval(
-    values: Floats, possible: tuple[float, float] = (-np.inf, np.inf)
+    values: FloatArray, possible: tuple[float, float] = (-np.inf, np.inf)
 ) -> tuple[float | None, float | None]:
     """The 95 % t interval of a mean; None for fewer than three values, which can hardly say how they scatter.
 
@@ -152,13 +151,13 @@ def _tests(rows: pd.DataFrame, scale: str, by: str, first: str, second: str) -> 
     return results
 
 
-def _cohens_d_z(test: Result, differences: Floats) -> Result:
+def _cohens_d_z(test: Result, differences: FloatArray) -> Result:
     low, high = d_z_interval(test["statistic"], len(differences))
     d_z = differences.mean() / differences.std(ddof=1)
     return {"d_z": plain(d_z), "d_z_low": plain(low), "d_z_high": plain(high)}
 
 
-def _rank_biserial(differences: Floats) -> Result:
+def _rank_biserial(differences: FloatArray) -> Result:
     correlation = rank_biserial(differences)
     low, high = rank_biserial_interval(correlation, int(np.count_nonzero(differences)))
     return {"rank_biserial": plain(correlation), "rank_biserial_low": plain(low), "rank_biserial_high": plain(high)}
@@ -166,7 +165,7 @@ def _rank_biserial(differences: Floats) -> Result:
 
 def ratings_of_each(
     rows: pd.DataFrame, scale: str, by: str, first: str, second: str
-) -> tuple[list[Floats], list[Floats]]:
+) -> tuple[list[FloatArray], list[FloatArray]]:
     """Everybody's ratings of ``first`` and of ``second``, by participant; only who rated both."""
     cells = {name: _floats(values) for name, values in rows.groupby(["participant", by])[scale]}
     people = [
@@ -175,7 +174,7 @@ def ratings_of_each(
     return [cells[person, first] for person in people], [cells[person, second] for person in people]
 
 
-def paired_differences(rows: pd.DataFrame, scale: str, by: str, first: str, second: str) -> Floats:
+def paired_differences(rows: pd.DataFrame, scale: str, by: str, first: str, second: str) -> FloatArray:
     """Each person's mean rating of ``second`` minus that of ``first``, by participant; only who rated both. (P,)"""
     means = rows.pivot_table(index="participant", columns=by, values=scale, aggfunc="mean")
     if first not in means or second not in means:
@@ -191,5 +190,5 @@ def _correct(results: Sequence[Result]) -> None:
             result["p_holm"], result["corrected_over"] = corrected, len(results)
 
 
-def _floats(values: Any) -> Floats:
+def _floats(values: Any) -> FloatArray:
     return np.asarray(values, np.float64)

@@ -19,7 +19,7 @@ from worker.ml.export.blinded_controller import Blinded
 from worker.ml.export.run_controller import Controller
 from worker.ml.filters import filter_problem
 from worker.ml.filters.filter_module import FilterWeights
-from worker.ml.filters.filter_problem import Act, FilterProblem
+from worker.ml.filters.filter_problem import FilterProblem
 from worker.ml.filters.response_surface import ResponseSurface
 from worker.ml.methods import registry
 from worker.ml.methods.preference_rl import PolicyAct
@@ -31,6 +31,7 @@ from worker.ml.rewards.loading import load_reward_model
 from worker.ml.rewards.reward_models import RewardModel
 from worker.tasks import registry as tasks
 from worker.trajectory import Trajectory
+from worker.type_aliases import Act
 
 COMPARED_EPISODES = 2
 """Episodes of the reference policy in whose observations a controller is compared with the method it was made of."""

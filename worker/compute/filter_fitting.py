@@ -22,7 +22,6 @@ from worker.ml.export.bundle import BundleContents, Provenance, RecordedSteps
 from worker.ml.filters import filter_problem, mode_search, printed_filter, residual
 from worker.ml.filters.filter_module import FilterWeights
 from worker.ml.filters.filter_problem import (
-    Act,
     FilterAct,
     FilterConfig,
     FilterDraft,
@@ -35,6 +34,7 @@ from worker.ml.rewards.loading import load_reward_model
 from worker.scenarios import EVALUATION, RESIDUAL, first_of
 from worker.tasks import registry
 from worker.trajectory import Trajectory
+from worker.type_aliases import Act
 
 CHUNK = 3
 """Scenarios per call of a compute process: small enough to spread evenly, large enough not to matter."""

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from worker.compute.simulation import environment, reference_policy, reference_rollouts, signal_predictor
-from worker.ml.filters.filter_problem import Act, noisy
+from worker.ml.filters.filter_problem import noisy
 from worker.ml.rewards import reward_training
 from worker.ml.rewards.loading import load_reward_model
 from worker.ml.rewards.pooled_prior import prior_of
@@ -16,7 +16,8 @@ from worker.ml.rewards.reward_models import RewardModel
 from worker.ml.rewards.reward_training import SignalScale
 from worker.ml.rewards.segments import SegmentPairs
 from worker.sim.rollout import rollout
-from worker.trajectory import SIGNALS, Array, Trajectory
+from worker.trajectory import SIGNALS, Trajectory
+from worker.type_aliases import Act, Float32Array
 
 
 def warm_up(task: str) -> None:
@@ -36,7 +37,7 @@ def fit_reward(
     task: str,
     kind: str,
     pairs: SegmentPairs,
-    targets: Array,
+    targets: Float32Array,
     scale: SignalScale,
     seed: int,
     earlier: Sequence[bytes] = (),

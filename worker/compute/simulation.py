@@ -6,7 +6,6 @@ loads torch, so that the processes that film start quickly and stay small. Tasks
 """
 
 import io
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from pathlib import Path
@@ -25,12 +24,10 @@ from worker.sim.render.scene import Scene
 from worker.sim.rollout import rollout
 from worker.task import Task
 from worker.tasks.registry import checkpoint, environment_class, filmed_task, task
-from worker.trajectory import Array, Trajectory
+from worker.trajectory import Trajectory
+from worker.type_aliases import Act, Float32Array
 
 REFERENCE_COUNT = 40
-
-Act = Callable[[Array], Array]
-"""observation (D,) -> action (7,)"""
 
 
 class NoPolicy(ValueError):
@@ -123,7 +120,7 @@ def act_as(name: str, behaviour: Behaviour) -> Act:
     base: Act = policy.mean
     if behaviour.temperature:
 
-        def base(observation: Array) -> Array:
+        def base(observation: Float32Array) -> Float32Array:
             return policy.sample(observation, rng, behaviour.temperature)
 
     family = task(name).modes
@@ -134,9 +131,9 @@ def act_as(name: str, behaviour: Behaviour) -> Act:
     return lambda observation: moved(observation) + waves()
 
 
-def _in_mode(of: Task, base: Act, mode: Array) -> Act:
-    def act(observation: Array) -> Array:
-        action: Array = of.modes.speed_factor(observation, mode) * base(of.modes.perceived(observation, mode))
+def _in_mode(of: Task, base: Act, mode: Float32Array) -> Act:
+    def act(observation: Float32Array) -> Float32Array:
+        action: Float32Array = of.modes.speed_factor(observation, mode) * base(of.modes.perceived(observation, mode))
         return action
 
     return act

@@ -22,7 +22,6 @@ from worker.compute import learning, simulation
 from worker.compute.simulation import surface_file
 from worker.experiments.rollout_cache import BEHAVIOURS_PER_SCENARIO, Shelf, policy_mark
 from worker.ml import acquisition
-from worker.ml.filters import filter_problem
 from worker.ml.filters.filter_problem import FilterConfig, FilterProblem
 from worker.ml.filters.response_surface import ResponseSurface
 from worker.ml.methods import registry as methods
@@ -40,6 +39,7 @@ from worker.sim.costs import CostForm, preference_rewards
 from worker.tasks import registry
 from worker.tasks.registry import installed_task
 from worker.trajectory import Trajectory
+from worker.type_aliases import Act, FloatArray
 from worker.whole_files import written_whole
 
 SMALLEST_POOL = 48
@@ -47,7 +47,6 @@ SMALLEST_POOL = 48
 CHOOSE_EVERY = 10
 """labels between two models that choose what is asked, as in a study"""
 PAIRS_PER_SCENARIO = BEHAVIOURS_PER_SCENARIO * (BEHAVIOURS_PER_SCENARIO - 1) // 2
-Floats = npt.NDArray[np.float64]
 
 PAPER_USERS: Mapping[str, Taste] = {user.value: TASTES[user.value] for user in User}
 OPPOSED_USERS: Mapping[str, Taste] = {taste.name: taste for pair in OPPOSED for taste in pair}
@@ -145,7 +144,7 @@ def run_cell(cell: Cell, terms: Terms, work: Path) -> Path:
     return _write(cell.path(terms, work), record, driven, bench.reward.returns(driven))
 
 
-def _write(target: Path, record: dict[str, Any], driven: Sequence[Trajectory], learned: Floats) -> Path:
+def _write(target: Path, record: dict[str, Any], driven: Sequence[Trajectory], learned: FloatArray) -> Path:
     target.parent.mkdir(parents=True, exist_ok=True)
     arrays: dict[str, Any] = {
         "record": np.array(json.dumps(record)),
@@ -190,10 +189,10 @@ class Bench:
             config=self.terms.methods,
         )
 
-    def _collect(self, act: filter_problem.Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
+    def _collect(self, act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
         return learning.run_scenarios(self.cell.task, act, scenarios, noise, seed)
 
-    def _label(self) -> tuple[SegmentPairs, Floats]:
+    def _label(self) -> tuple[SegmentPairs, FloatArray]:
         """What is asked and what the scripted user says about it; the same for every method."""
         rng = np.random.default_rng([self.cell.seed, 7])
         rewards = np.array([self._true_rewards(each)[: self.clip_steps] for each in self.pool])
@@ -213,8 +212,8 @@ class Bench:
         return self._cut(asked), targets
 
     def _scores(
-        self, candidates: npt.NDArray[np.int64], asked: npt.NDArray[np.int64], targets: Floats
-    ) -> tuple[acquisition.Strategy, Floats | None]:
+        self, candidates: npt.NDArray[np.int64], asked: npt.NDArray[np.int64], targets: FloatArray
+    ) -> tuple[acquisition.Strategy, FloatArray | None]:
         """The first labels are chosen at random, later ones by a structured model of those before."""
         if self.terms.rule == "uniform" or not len(asked):
             return "uniform", None
@@ -224,7 +223,7 @@ class Bench:
     def _cut(self, rows: npt.NDArray[np.int64]) -> SegmentPairs:
         return SegmentPairs.cut([(self.pool[left], self.pool[right]) for left, right in rows], 0, self.clip_steps)
 
-    def _true_rewards(self, trajectory: Trajectory) -> Floats:
+    def _true_rewards(self, trajectory: Trajectory) -> FloatArray:
         taste = self.cell.taste
         return preference_rewards(
             self.task, trajectory.costs, trajectory.signals, taste.omega, self.terms.form, taste.per_signal

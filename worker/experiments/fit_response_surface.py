@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from tqdm import tqdm
 
 from worker.compute import simulation
@@ -30,6 +29,7 @@ from worker.sim.rollout import rollout
 from worker.task import Task
 from worker.tasks import registry
 from worker.trajectory import SIGNALS
+from worker.type_aliases import FloatArray
 from worker.whole_files import written_whole
 
 SCENARIOS = 300
@@ -42,20 +42,18 @@ BLOCK = 10
 JITTER = 0.08
 """Standard deviation around a mode that somebody wants, as a share of every axis' range."""
 
-Floats = npt.NDArray[np.float64]
-
 
 @dataclass(frozen=True)
 class Differences:
     """What modes changed, N rollouts each compared with the reference policy's in the same scenario."""
 
-    modes: Floats
+    modes: FloatArray
     """(N, A)"""
-    signals: Floats
+    signals: FloatArray
     """(N, S) of the episode's summed signals"""
-    success: Floats
+    success: FloatArray
     """(N,) in {-1, 0, 1}"""
-    reference_success: Floats
+    reference_success: FloatArray
     """(scenarios,)"""
 
     def fit(self, task: Task) -> ResponseSurface:
@@ -63,7 +61,7 @@ class Differences:
         return response_surface.fit(task.modes, self.modes, self.signals, self.successes)
 
     @property
-    def successes(self) -> Floats:
+    def successes(self) -> FloatArray:
         """(N,) in {0, 1}"""
         return self.reference_success.repeat(MODES_PER_SCENARIO) + self.success
 
@@ -74,7 +72,7 @@ class Block:
 
     task: str
     first: int
-    modes: Floats
+    modes: FloatArray
     """(BLOCK, MODES_PER_SCENARIO, A)"""
     file: Path
 
@@ -125,7 +123,7 @@ def compare_block(block: Block) -> None:
         np.savez(draft, modes=flat, signals=signals, success=success, reference_success=reference_success)
 
 
-def _random_modes(task: Task, first: int) -> Floats:
+def _random_modes(task: Task, first: int) -> FloatArray:
     return np.array(
         [
             task.modes.sample(MODES_PER_SCENARIO, np.random.default_rng([scenario, 2]))

@@ -15,9 +15,10 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
+from worker.type_aliases import FloatArray
+
 Strategy = Literal["uniform", "disagreement", "entropy", "information_gain", "contested"]
 Indices = npt.NDArray[np.int64]
-Floats = npt.NDArray[np.float64]
 
 RANDOM_SHARE = 0.3
 SHARPNESS = 4.0
@@ -32,7 +33,7 @@ class Choice:
 
     indices: Indices
     """(K,) rows of the candidates"""
-    propensities: Floats
+    propensities: FloatArray
     """(K,) probability of each choice at the moment it was made, given the choices before it"""
     swapped: npt.NDArray[np.bool_]
     """(K,) True: the candidate's second clip goes to the left"""
@@ -51,28 +52,28 @@ def matched_pairs(scenarios: npt.ArrayLike, behaviours: npt.ArrayLike | None = N
     return np.stack([first[keep], second[keep]], axis=1).astype(np.int64)
 
 
-def disagreement(member_probabilities: Floats) -> Floats:
+def disagreement(member_probabilities: FloatArray) -> FloatArray:
     """(E, M) P(right) under every member -> (M,) their standard deviation."""
-    spread: Floats = member_probabilities.std(axis=0)
+    spread: FloatArray = member_probabilities.std(axis=0)
     return spread
 
 
-def entropy(member_probabilities: Floats) -> Floats:
+def entropy(member_probabilities: FloatArray) -> FloatArray:
     """(E, M) P(right) under every member -> (M,) nats: how open the answer is, whatever the reason."""
     return _binary_entropy(member_probabilities.mean(axis=0))
 
 
-def information_gain(member_probabilities: Floats) -> Floats:
+def information_gain(member_probabilities: FloatArray) -> FloatArray:
     """(E, M) P(right) under every member -> (M,) nats: what an answer says about which member is right (BALD).
 
     Entropy of the mean minus mean of the entropies (Houlsby et al. 2011): members that are each sure of different
     answers count, members that are all unsure do not.
     """
-    doubt_of_each: Floats = _binary_entropy(member_probabilities).mean(axis=0)
+    doubt_of_each: FloatArray = _binary_entropy(member_probabilities).mean(axis=0)
     return _binary_entropy(member_probabilities.mean(axis=0)) - doubt_of_each
 
 
-def score(rule: str, member_probabilities: Floats) -> Floats:
+def score(rule: str, member_probabilities: FloatArray) -> FloatArray:
     """(E, M) P(right) under every member of one's own model -> (M,) by a rule that needs nothing else."""
     own = {"disagreement": disagreement, "entropy": entropy, "information_gain": information_gain}
     if rule not in own:
@@ -80,7 +81,7 @@ def score(rule: str, member_probabilities: Floats) -> Floats:
     return own[rule](member_probabilities)
 
 
-def contested(others_probabilities: Floats, member_probabilities: Floats | None = None) -> Floats:
+def contested(others_probabilities: FloatArray, member_probabilities: FloatArray | None = None) -> FloatArray:
     """(U, M) P(right) under U other people's models, U at least 2 -> (M,) their standard deviation.
 
     Such pairs tell people apart; pairs on which everybody is unsure do not. With the members of one's own model (E, M):
@@ -93,16 +94,16 @@ def contested(others_probabilities: Floats, member_probabilities: Floats | None 
     return apart if member_probabilities is None else apart * entropy(member_probabilities) / np.log(2.0)
 
 
-def expected_answers(return_differences: Floats) -> Floats:
+def expected_answers(return_differences: FloatArray) -> FloatArray:
     """(U, M) right minus left return of U stand-ins with known tastes -> (U, M) P(right), each in their own unit."""
     unit = np.maximum(np.sqrt((return_differences**2).mean(axis=1, keepdims=True)), 1e-9)
-    probabilities: Floats = 0.5 * (1.0 + np.tanh(0.5 * STAND_IN_RATIONALITY * return_differences / unit))
+    probabilities: FloatArray = 0.5 * (1.0 + np.tanh(0.5 * STAND_IN_RATIONALITY * return_differences / unit))
     return probabilities
 
 
-def _binary_entropy(probability: Floats) -> Floats:
+def _binary_entropy(probability: FloatArray) -> FloatArray:
     sure = np.clip(probability, 1e-12, 1.0 - 1e-12)
-    nats: Floats = -(sure * np.log(sure) + (1.0 - sure) * np.log(1.0 - sure))
+    nats: FloatArray = -(sure * np.log(sure) + (1.0 - sure) * np.log(1.0 - sure))
     return nats
 
 
@@ -112,7 +113,7 @@ def choose(
     rng: np.random.Generator,
     *,
     rule: Strategy = "uniform",
-    scores: Floats | None = None,
+    scores: FloatArray | None = None,
     random_share: float = RANDOM_SHARE,
 ) -> Choice:
     """Draw up to ``count`` of ``candidates`` pairs without replacement and put them on sides.
@@ -144,13 +145,13 @@ def balanced_sides(count: int, rng: np.random.Generator) -> npt.NDArray[np.bool_
     return shuffled
 
 
-def _standardised(scores: Floats) -> Floats:
+def _standardised(scores: FloatArray) -> FloatArray:
     spread = float(np.std(scores))
-    standardised: Floats = (scores - np.mean(scores)) / (spread if spread > 0.0 else 1.0)
+    standardised: FloatArray = (scores - np.mean(scores)) / (spread if spread > 0.0 else 1.0)
     return standardised
 
 
-def _chances(preference: Floats, remaining: npt.NDArray[np.bool_]) -> tuple[Floats, Floats]:
+def _chances(preference: FloatArray, remaining: npt.NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
     """(M,) of a uniform draw and (M,) of one by the rule."""
     pull = np.where(remaining, SHARPNESS * preference, -np.inf)
     sharp = np.exp(pull - pull.max())

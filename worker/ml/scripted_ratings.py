@@ -14,10 +14,10 @@ paper explains its own ratings of PrefFT.
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
+
+from worker.type_aliases import FloatArray
 
 POINTS = 5
-Floats = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class RatingManner:
 class ScriptedRater:
     """One person's ratings."""
 
-    def __init__(self, seen_returns: Floats, manner: RatingManner, rng: np.random.Generator) -> None:
+    def __init__(self, seen_returns: FloatArray, manner: RatingManner, rng: np.random.Generator) -> None:
         """``seen_returns`` (N,): r^H of the episodes of the pool, each summed."""
         self._seen = np.sort(np.asarray(seen_returns, np.float64))
         self._manner, self._rng = manner, rng

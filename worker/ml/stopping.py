@@ -7,17 +7,15 @@ the regret to zero; a regret that is small already is not worth anybody's time.
 """
 
 import numpy as np
-import numpy.typing as npt
 
 from worker.ml.filters.response_surface import CAUTION, SUCCESS_PENALTY, SUCCESS_TOLERANCE, ResponseSurface
-
-Floats = npt.NDArray[np.float64]
+from worker.type_aliases import FloatArray
 
 CANDIDATES = 4_000
 """Modes that are tried, the same for every member and at every retraining."""
 
 
-def expected_regret(surface: ResponseSurface, members: Floats) -> float:
+def expected_regret(surface: ResponseSurface, members: FloatArray) -> float:
     """What knowing the person for certain could gain, in standard deviations of predicted return over all modes.
 
     ``members`` (E, S): the weights of the reward model's members per unit of each signal. The mode for all is chosen

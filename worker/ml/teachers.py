@@ -16,9 +16,7 @@ import numpy.typing as npt
 
 from worker.responses import Response
 from worker.trajectory import COSTS, SIGNALS
-
-Floats = npt.NDArray[np.float64]
-"""The words the database stores."""
+from worker.type_aliases import FloatArray
 
 
 class User(StrEnum):
@@ -155,7 +153,7 @@ class ScriptedTeacher:
         return "right" if names_right else "left"
 
 
-def segment_returns(rewards: Floats, myopia: float = 1.0) -> Floats:
+def segment_returns(rewards: FloatArray, myopia: float = 1.0) -> FloatArray:
     """(..., T) -> (...): summed rewards, later steps counting more when myopia < 1."""
-    returns: Floats = rewards @ myopia ** np.arange(rewards.shape[-1] - 1, -1, -1)
+    returns: FloatArray = rewards @ myopia ** np.arange(rewards.shape[-1] - 1, -1, -1)
     return returns

@@ -27,9 +27,9 @@ from worker.ml.teachers import Manner, ScriptedTeacher, Taste, segment_returns
 from worker.sim.costs import preference_rewards
 from worker.tasks import registry
 from worker.trajectory import Trajectory
+from worker.type_aliases import FloatArray
 
 CALIBRATION_PAIRS = 200
-Floats = npt.NDArray[np.float64]
 Rows = npt.NDArray[np.intp]
 
 
@@ -122,11 +122,11 @@ class ScriptedPerson:
         rewards = [[self._rewards(clip) for clip in pair] for pair in pairs[:CALIBRATION_PAIRS]]
         return ScriptedTeacher.calibrated(self._manner, np.array(rewards))
 
-    def _rewards(self, clip: Clip) -> Floats:
+    def _rewards(self, clip: Clip) -> FloatArray:
         steps = slice(clip.first_step, clip.first_step + clip.step_count)
         return self._true_rewards(dataset.shown(self._store, clip))[steps]
 
-    def _true_rewards(self, shown: Trajectory) -> Floats:
+    def _true_rewards(self, shown: Trajectory) -> FloatArray:
         """r^H of every step."""
         taste = self._taste
         rewards = preference_rewards(

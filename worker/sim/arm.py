@@ -9,12 +9,11 @@ from functools import cache, cached_property
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from worker.sim.bullet import Bullet, Link
 from worker.sim.geometry import IDENTITY, Shape, capsule_between, compose, quaternion_of_euler
+from worker.type_aliases import FloatArray
 
-FloatArray = npt.NDArray[np.float64]
 Point = tuple[float, float, float]
 Rotation = tuple[Point, Point, Point]
 

@@ -11,7 +11,6 @@ from typing import Any, ClassVar, NamedTuple
 
 import gymnasium
 import numpy as np
-import numpy.typing as npt
 
 from worker.sim import human
 from worker.sim.arm import Robot, Start, Tool, start_postures
@@ -24,9 +23,8 @@ from worker.sim.seated_person import HEAD, PERSON, add_person
 from worker.spaces import CONTROL_STEP_S, JOINT_ACTION, Space
 from worker.task import Task
 from worker.trajectory import BODIES
+from worker.type_aliases import Float32Array, FloatArray
 
-Array = npt.NDArray[np.float32]
-FloatArray = npt.NDArray[np.float64]
 Reward = Callable[[StepMeasures], float]
 
 ACTION_UNIT_RAD = 0.05
@@ -57,7 +55,7 @@ class EpisodeState:
     """A moment of an episode: its scenario and every action since its start."""
 
     scenario: int
-    actions: tuple[Array, ...]
+    actions: tuple[Float32Array, ...]
 
 
 class AssistiveEnv(gymnasium.Env[Any, Any]):
@@ -105,7 +103,7 @@ class AssistiveEnv(gymnasium.Env[Any, Any]):
         self._starts = start_postures(self.robot, self.tool, self.start)
         self._world = self._new_world()
         self._scenario: int | None = None
-        self._history: list[Array] = []
+        self._history: list[Float32Array] = []
 
     # What a task says
 
@@ -182,14 +180,16 @@ class AssistiveEnv(gymnasium.Env[Any, Any]):
 
     # Gymnasium
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Float32Array, dict[str, Any]]:
         """Start the scenario ``seed``, or a random one."""
         super().reset(seed=seed)
         scenario = int(self.np_random.integers(2**31)) if seed is None else seed
         self._begin(scenario)
         return self._observe(), {"scenario": scenario}
 
-    def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+    def step(self, action: Float32Array) -> tuple[Float32Array, float, bool, bool, dict[str, Any]]:
         """Move for 0.1 s. ``info`` holds this step's unweighted costs and signals and the counts so far."""
         if self._scenario is None:
             raise gymnasium.error.ResetNeeded("Call reset() before step().")
@@ -242,7 +242,7 @@ class AssistiveEnv(gymnasium.Env[Any, Any]):
             raise gymnasium.error.ResetNeeded("Call reset() before save_state().")
         return EpisodeState(self._scenario, tuple(self._history))
 
-    def restore_state(self, state: EpisodeState) -> Array:
+    def restore_state(self, state: EpisodeState) -> Float32Array:
         """Return to a saved moment and give its observation; what follows is bit-identical.
 
         The engine's own snapshots forget the order of contact points and drift apart, so the episode is replayed:
@@ -276,7 +276,7 @@ class AssistiveEnv(gymnasium.Env[Any, Any]):
         self._read_target()
         self._scenario = scenario
 
-    def _advance(self, executed: Array) -> StepMeasures:
+    def _advance(self, executed: Float32Array) -> StepMeasures:
         action = executed.astype(np.float64)
         target = np.clip(self._command + action * ACTION_UNIT_RAD, self._joints - LEAD_RAD, self._joints + LEAD_RAD)
         self._command = np.clip(target, self.robot.lower_rad, self.robot.upper_rad)
@@ -354,7 +354,7 @@ class AssistiveEnv(gymnasium.Env[Any, Any]):
     def _touched_target(self, contact: Contact) -> None:
         """Called for every contact of the robot near the target, in every physics step."""
 
-    def _observe(self) -> Array:
+    def _observe(self) -> Float32Array:
         base = self.robot.mount_rotation
         shared = (
             self.robot.in_base_frame(self._tool),
@@ -369,7 +369,7 @@ class AssistiveEnv(gymnasium.Env[Any, Any]):
         own = self._own_observation()
         fields = self.task.observation.fields[len(shared) :]
         vector = np.concatenate([*shared, *(own[each.name] for each in fields)]).astype(np.float32)
-        clipped: Array = np.clip(vector, self._limits.low, self._limits.high)
+        clipped: Float32Array = np.clip(vector, self._limits.low, self._limits.high)
         return clipped
 
     def _read_arm(self) -> None:

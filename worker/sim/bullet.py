@@ -11,7 +11,8 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from worker.sim.engine import pybullet
-from worker.sim.geometry import IDENTITY, FloatArray, Shape, Vector
+from worker.sim.geometry import IDENTITY, Shape, Vector
+from worker.type_aliases import FloatArray
 
 GRAVITY_M_S2 = 9.81
 CONTACT_MARGIN_M = 0.001

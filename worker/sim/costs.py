@@ -19,9 +19,8 @@ import numpy.typing as npt
 
 from worker.task import Task
 from worker.trajectory import COSTS, SIGNALS
+from worker.type_aliases import Float32Array, FloatArray
 
-Array = npt.NDArray[np.float32]
-FloatArray = npt.NDArray[np.float64]
 CostForm = Literal["paper", "calibrated"]
 
 BASE_WEIGHTS = {"C_d": 1.0, "C_v": 0.25, "C_f": 0.01, "C_hf": 0.05, "C_fd": 1.0, "C_fdv": 1.0}
@@ -75,7 +74,7 @@ def signal_weights(
     return weights
 
 
-def cost_items(task: Task, costs: Array, signals: Array, form: CostForm = "calibrated") -> FloatArray:
+def cost_items(task: Task, costs: Float32Array, signals: Float32Array, form: CostForm = "calibrated") -> FloatArray:
     """The six unweighted items of a form: costs (..., 6) and signals (..., S) of a trajectory -> (..., 6)."""
     items = np.array(costs, np.float64)
     if form == "calibrated":
@@ -90,8 +89,8 @@ def cost_items(task: Task, costs: Array, signals: Array, form: CostForm = "calib
 
 def preference_rewards(
     task: Task,
-    costs: Array,
-    signals: Array,
+    costs: Float32Array,
+    signals: Float32Array,
     omega: npt.ArrayLike = 1.0,
     form: CostForm = "calibrated",
     per_signal: Mapping[str, float] = MappingProxyType({}),
@@ -109,8 +108,8 @@ def preference_rewards(
 
 def stakes(
     task: Task,
-    costs: Array,
-    signals: Array,
+    costs: Float32Array,
+    signals: Float32Array,
     omega: npt.ArrayLike = 1.0,
     form: CostForm = "calibrated",
     per_signal: Mapping[str, float] = MappingProxyType({}),

@@ -6,11 +6,10 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 
 from worker.sim.engine import pybullet
+from worker.type_aliases import FloatArray
 
-FloatArray = npt.NDArray[np.float64]
 Vector = Sequence[float] | FloatArray
 IDENTITY = (0.0, 0.0, 0.0, 1.0)
 

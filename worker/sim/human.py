@@ -11,12 +11,11 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from worker.sim.geometry import quaternion_of_euler
 from worker.trajectory import BODIES, SKIN_TONES
+from worker.type_aliases import FloatArray
 
-FloatArray = npt.NDArray[np.float64]
 Point = tuple[float, float, float]
 Impairment = Literal["none", "tremor", "weakness", "limits"]
 IMPAIRMENTS: tuple[Impairment, ...] = ("none", "tremor", "weakness", "limits")

@@ -5,10 +5,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
-import numpy as np
-import numpy.typing as npt
-
-FloatArray = npt.NDArray[np.float64]
+from worker.type_aliases import FloatArray
 
 NEAR_M = 0.20
 """Closer than this the speed counts as speed near the person."""

@@ -1,16 +1,10 @@
 """Run one episode with any policy and keep everything about it."""
 
-from collections.abc import Callable
-
 import numpy as np
-import numpy.typing as npt
 
 from worker.sim.assistive import AssistiveEnv
 from worker.trajectory import COSTS, SIGNALS, Trajectory
-
-Array = npt.NDArray[np.float32]
-Act = Callable[[Array], Array]
-"""observation (D,) -> action (7,)"""
+from worker.type_aliases import Act
 
 
 def rollout(env: AssistiveEnv, act: Act, scenario: int, reference: Act | None = None) -> Trajectory:

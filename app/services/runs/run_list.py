@@ -102,4 +102,4 @@ def _present_runs(session: Session, *which: ColumnElement[bool]) -> Sequence[Gla
 def _work_of(run: Run | Glance) -> str:
     """What a later run of the same work makes good."""
     key = run_keys.read(run.workflow_id)
-    return run.workflow_id if key is None else str(key.series)
+    return run.kind if key is None else str(key.series)

@@ -36,7 +36,8 @@ from worker.jobs.clips.stored_video import video_columns
 from worker.jobs.learning.dataset import IMPORTED
 from worker.jobs.runtime.context import NotingStore
 from worker.sim.render.video import PlayableVideo, playable
-from worker.trajectory import Array, Recording
+from worker.trajectory import Recording
+from worker.type_aliases import Float32Array
 
 FORMAT, VERSION = "pbarl-studio-clips", 1
 MANIFEST = "manifest.json"
@@ -215,7 +216,7 @@ def _recording(content: bytes, manifest: ClipManifest, clip: OwnClip) -> Recordi
         raise ClipsInvalid(f"{clip.trajectory}: {str(error).strip(chr(39))}") from error
 
 
-def _from_csv(content: bytes, names: Sequence[str]) -> tuple[Array, Array, Array]:
+def _from_csv(content: bytes, names: Sequence[str]) -> tuple[Float32Array, Float32Array, Float32Array]:
     """A row per step. Columns by name: the signals, and observations obs_0.. and actions act_0.. if there are any."""
     rows = list(csv.reader(io.StringIO(content.decode("utf-8-sig"), newline="")))
     if not rows:
@@ -242,7 +243,7 @@ def _numbered(header: Sequence[str], prefix: str) -> list[int]:
     return [place for _, place in sorted(found)]
 
 
-def _from_npz(content: bytes, names: Sequence[str]) -> tuple[Array, Array, Array]:
+def _from_npz(content: bytes, names: Sequence[str]) -> tuple[Float32Array, Float32Array, Float32Array]:
     """signals (T, S) in the manifest's order, and observations (T or T + 1, D) and actions (T, A) if there are any."""
     with unpacking.opened(io.BytesIO(content), LARGEST_TRAJECTORY_BYTES):
         pass  # what it would unpack to is looked at before numpy does that

@@ -20,7 +20,8 @@ from worker.ml import acquisition
 from worker.ml.rewards.reward_training import SignalScale
 from worker.ml.rewards.segments import SegmentPairs, Stretch
 from worker.responses import TARGETS
-from worker.trajectory import SIGNALS, Array, OutdatedTrajectory, Recorded, Recording, Trajectory
+from worker.trajectory import SIGNALS, OutdatedTrajectory, Recorded, Recording, Trajectory
+from worker.type_aliases import Float32Array
 
 
 class RecordedByAnOlderVersion(AppError):
@@ -42,7 +43,7 @@ class Preferences:
 
     pairs: SegmentPairs | None
     """None while nothing with a target has been said."""
-    targets: Array
+    targets: Float32Array
     """(N,) in {0, 1/2, 1}"""
     label_count: int
     """How many labels were given, those without a target and those that were excluded included."""

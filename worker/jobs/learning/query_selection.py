@@ -24,6 +24,7 @@ from worker.ml.teachers import OMEGA, User
 from worker.sim.costs import preference_rewards
 from worker.task import Task
 from worker.tasks import registry
+from worker.type_aliases import FloatArray
 
 log = logging.getLogger("worker.jobs.learning.query_selection")
 
@@ -133,7 +134,7 @@ def _load(session: Session, participant_id: int, lost: Collection[str]) -> _Know
 
 def _scores(
     context: WorkerContext, known: _Known, pairs: Sequence[tuple[Clip, Clip]], strategy: Strategy
-) -> acquisition.Floats | None:
+) -> FloatArray | None:
     """How much every candidate is worth asking; None when the choice is to be uniform."""
     if strategy is Strategy.UNIFORM:
         return None
@@ -146,7 +147,7 @@ def _scores(
     return None if members is None else acquisition.score(strategy.value, members)
 
 
-def _answers_of_others(context: WorkerContext, known: _Known, pairs: Sequence[tuple[Clip, Clip]]) -> acquisition.Floats:
+def _answers_of_others(context: WorkerContext, known: _Known, pairs: Sequence[tuple[Clip, Clip]]) -> FloatArray:
     """(U, M) what other people would say about each pair: participants, or the paper's users while there are few."""
     if len(known.others) >= 2:
         segments = dataset.segment_pairs(context.store, pairs)
@@ -157,7 +158,7 @@ def _answers_of_others(context: WorkerContext, known: _Known, pairs: Sequence[tu
     return acquisition.expected_answers(np.array([returns[right.id] - returns[left.id] for left, right in pairs]).T)
 
 
-def _stand_ins(context: WorkerContext, task: Task, clip: Clip) -> acquisition.Floats:
+def _stand_ins(context: WorkerContext, task: Task, clip: Clip) -> FloatArray:
     """(3,) what the paper's users would feel about what a clip shows, by their own costs."""
     shown, steps = dataset.shown(context.store, clip), slice(clip.first_step, clip.first_step + clip.step_count)
     costs, signals = shown.costs[steps], shown.signals[steps]

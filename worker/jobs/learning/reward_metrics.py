@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from app.domain.studies import Participant, Study
 from worker.compute.simulation import surface_file
@@ -18,8 +17,8 @@ from worker.ml.rewards.segments import LEFT, SegmentPairs, Stretch
 from worker.ml.stopping import expected_regret
 from worker.tasks import registry
 from worker.trajectory import COSTS
+from worker.type_aliases import FloatArray
 
-Floats = npt.NDArray[np.float64]
 FEWEST_CLIPS = 12
 """Fewer say nothing about six costs."""
 WITHIN_95 = 1.96
@@ -48,7 +47,7 @@ def insight(context: WorkerContext, participant_id: int, stored_model: bytes) ->
     return found
 
 
-def weights_of_costs(sums: Floats, returns: Floats) -> dict[str, Any]:
+def weights_of_costs(sums: FloatArray, returns: FloatArray) -> dict[str, Any]:
     """What the model's returns say about the paper's six costs, whatever it was learned from.
 
     ``sums`` (N, 6): summed costs of every clip, ``returns`` (E, N): every member's return of it. Least squares of
@@ -74,21 +73,21 @@ def weights_of_costs(sums: Floats, returns: Floats) -> dict[str, Any]:
     }
 
 
-def _standardised(values: Floats) -> Floats:
+def _standardised(values: FloatArray) -> FloatArray:
     """Mean 0 and standard deviation 1 along the first axis; what does not vary becomes 0."""
-    standard: Floats = (values - values.mean(axis=0)) / np.maximum(values.std(axis=0), 1e-9)
+    standard: FloatArray = (values - values.mean(axis=0)) / np.maximum(values.std(axis=0), 1e-9)
     return standard
 
 
-def _returns(model: RewardModel, stretches: Sequence[Stretch]) -> Floats:
+def _returns(model: RewardModel, stretches: Sequence[Stretch]) -> FloatArray:
     """Every member's return of what each clip shows, (E, N)."""
     shown = SegmentPairs.of([(stretch, stretch) for stretch in stretches])
     rewards = model.raw_rewards(shown.signals[:, LEFT], shown.observations[:, LEFT], shown.actions[:, LEFT])
-    returns: Floats = rewards.sum(axis=-1, where=shown.shown[:, LEFT]).astype(np.float64)
+    returns: FloatArray = rewards.sum(axis=-1, where=shown.shown[:, LEFT]).astype(np.float64)
     return returns
 
 
-def _ranking(names: Sequence[tuple[int, int]], returns: Floats) -> list[list[float]]:
+def _ranking(names: Sequence[tuple[int, int]], returns: FloatArray) -> list[list[float]]:
     """[scenario, behaviour, return] of every clip of the pool, the best first; in standard deviations over the pool.
 
     Named by scenario and behaviour, since ids change when a study moves to another installation.

@@ -16,7 +16,7 @@ from app.storage import ArtefactMissing, ArtefactStore
 from worker.jobs.learning import dataset
 from worker.ml.rewards.segments import SegmentPairs, Stretch
 from worker.responses import TARGETS
-from worker.trajectory import Array
+from worker.type_aliases import Float32Array
 
 LAYOUT = 1
 """Version of the layout in docs/arrays.md."""
@@ -75,7 +75,7 @@ def _stretches(store: ArtefactStore, label: Label, lost: set[str]) -> tuple[Stre
     return (found[0], found[1]) if len(found) == 2 else None
 
 
-def _last_observations(pairs: Sequence[tuple[Stretch, Stretch]]) -> Array:
+def _last_observations(pairs: Sequence[tuple[Stretch, Stretch]]) -> Float32Array:
     """(N, 2, D) what was observed after the last step that was shown."""
     return np.array(
         [[side.trajectory.observations[side.first_step + side.step_count] for side in pair] for pair in pairs],

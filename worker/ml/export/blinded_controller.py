@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import onnx
 from onnx import ModelProto, NodeProto, TensorProto, helper
 
@@ -23,14 +22,13 @@ from worker.ml.export import run_controller
 from worker.ml.export.bundle import described_space
 from worker.ml.export.run_controller import INPUT, OUTPUT, Controller
 from worker.ml.filters.filter_onnx import LARGEST_DIFFERENCE, ExportDiffers
-from worker.ml.filters.filter_problem import Act, FilterAct
+from worker.ml.filters.filter_problem import FilterAct
 from worker.ml.methods.preference_rl import PolicyAct
 from worker.ml.policies.gaussian import GaussianPolicy
 from worker.ml.policies.policy_onnx import policy_to_onnx
 from worker.spaces import CONTROL_STEP_S, JOINT_ACTION
 from worker.task import Task
-
-Array = npt.NDArray[np.float32]
+from worker.type_aliases import Act, Float32Array
 
 SCHEMA_VERSION = 1
 LENGTH_BYTES = 1 << 20
@@ -52,11 +50,11 @@ class Blinded:
     participant: str
     letter: str
     model: bytes
-    observations: Array
+    observations: Float32Array
     """(N, D) for checking the file elsewhere; the same for every letter"""
 
 
-def of_act(act: Act, observations: Array) -> bytes:
+def of_act(act: Act, observations: Float32Array) -> bytes:
     """A fitted method as one ONNX model, compared with the method itself in these observations, (N, D).
 
     Raises NotExportable for a method that is neither a policy nor a filter around one, and ExportDiffers.
@@ -187,14 +185,14 @@ def _padded(model: ModelProto) -> bytes:
     return stored
 
 
-def _compare(stored: bytes, act: Act, observations: Array) -> None:
+def _compare(stored: bytes, act: Act, observations: Float32Array) -> None:
     expected = np.array([act(each) for each in observations]).clip(-1.0, 1.0)
     difference = float(np.abs(Controller(stored).batch(observations) - expected).max())
     if not difference <= LARGEST_DIFFERENCE:
         raise ExportDiffers(f"{ExportDiffers.__doc__} The largest difference is {difference:.1e}.")
 
 
-def _npy(array: Array) -> bytes:
+def _npy(array: Float32Array) -> bytes:
     target = io.BytesIO()
     np.save(target, np.ascontiguousarray(array, np.float32), allow_pickle=False)
     return target.getvalue()

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-import numpy.typing as npt
 from safetensors.numpy import save
 
 from worker.ml.export import run_filter
@@ -28,8 +27,7 @@ from worker.ml.rewards.reward_models import CLIP, RewardModel
 from worker.spaces import CONTROL_STEP_S, JOINT_ACTION, Space
 from worker.task import Task
 from worker.trajectory import SIGNALS, Trajectory
-
-Array = npt.NDArray[np.float32]
+from worker.type_aliases import Float32Array
 
 SCHEMA_VERSION = 1
 MANIFEST = "manifest.json"
@@ -47,9 +45,9 @@ class BundleDamaged(ValueError):
 class RecordedSteps:
     """Inputs of the filter during N control steps, for checking it elsewhere."""
 
-    observations: Array
+    observations: Float32Array
     """(N, D)"""
-    policy_means: Array
+    policy_means: Float32Array
     """(N, 7)"""
 
     @classmethod
@@ -220,7 +218,7 @@ def _onnx_interface(stored: bytes, observation_size: int) -> dict[str, Any]:
     }
 
 
-def _npy(array: Array) -> bytes:
+def _npy(array: Float32Array) -> bytes:
     target = io.BytesIO()
     np.save(target, np.ascontiguousarray(array, np.float32), allow_pickle=False)
     return target.getvalue()

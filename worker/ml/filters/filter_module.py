@@ -9,7 +9,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Self
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from safetensors.numpy import load, save
 from torch import Tensor, nn
@@ -20,8 +19,8 @@ from worker.ml.policies.gaussian import GaussianPolicy
 from worker.ml.policies.torch_module import FrozenPolicy
 from worker.ml.rewards.reward_models import stored_config
 from worker.modes import ModeFamily
+from worker.type_aliases import Float32Array
 
-Array = npt.NDArray[np.float32]
 Method = Literal["studio", "printed"]
 
 
@@ -35,7 +34,7 @@ class FilterWeights:
     gate: float = 1.0
     residual_share: float = 1.0
     """share of the encoder's residual that is used; 0 means the mode alone"""
-    encoder: Mapping[str, Array] = field(default_factory=dict)
+    encoder: Mapping[str, Float32Array] = field(default_factory=dict)
     """state of ResidualAdapter or PrintedEncoder; empty: none was trained"""
 
     def changed(self, **values: Any) -> Self:
@@ -152,11 +151,11 @@ def build(family: ModeFamily, policy: GaussianPolicy, weights: FilterWeights) ->
     return ActionFilter(transform, weights.gate).eval().requires_grad_(False)
 
 
-def state_of(module: nn.Module) -> dict[str, Array]:
+def state_of(module: nn.Module) -> dict[str, Float32Array]:
     """A module's state as arrays."""
     return {name: tensor.detach().numpy().astype(np.float32) for name, tensor in module.state_dict().items()}
 
 
-def load_state(module: nn.Module, state: Mapping[str, Array]) -> None:
+def load_state(module: nn.Module, state: Mapping[str, Float32Array]) -> None:
     """Put arrays back into a module."""
     module.load_state_dict({name: torch.from_numpy(np.array(array)) for name, array in state.items()})

@@ -17,8 +17,7 @@ import torch
 from onnx_ir.passes.common import ClearMetadataAndDocStringPass
 
 from worker.ml.filters.filter_module import ActionFilter
-
-Array = npt.NDArray[np.float32]
+from worker.type_aliases import Float32Array
 
 INPUTS = ("observation", "policy_mean")
 OUTPUT = "action"
@@ -33,7 +32,7 @@ class ExportDiffers(RuntimeError):
     """The exported filter does not compute what the trained one does; nothing was published."""
 
 
-def to_onnx(module: ActionFilter, observations: Array, policy_means: Array) -> bytes:
+def to_onnx(module: ActionFilter, observations: Float32Array, policy_means: Float32Array) -> bytes:
     """Export with a free batch size, then compare with torch on these inputs, (N, D) and (N, 7).
 
     Tracing takes seconds, so it is done once per structure and process; after that the numbers are put into the traced
@@ -56,7 +55,9 @@ def to_onnx(module: ActionFilter, observations: Array, policy_means: Array) -> b
     return stored
 
 
-def largest_difference(stored: bytes, module: ActionFilter, observations: Array, policy_means: Array) -> float:
+def largest_difference(
+    stored: bytes, module: ActionFilter, observations: Float32Array, policy_means: Float32Array
+) -> float:
     """Between the exported and the torch filter, over these inputs."""
     with torch.no_grad():
         expected = module(torch.from_numpy(observations), torch.from_numpy(policy_means)).numpy()
@@ -70,15 +71,15 @@ class OnnxFilter:
         self.stored = stored
         self._session = _session(stored)
 
-    def __call__(self, observation: Array, policy_mean: Array) -> Array:
+    def __call__(self, observation: Float32Array, policy_mean: Float32Array) -> Float32Array:
         """(D,), (7,) -> (7,)"""
-        action: Array = self.batch(observation[None], policy_mean[None])[0]
+        action: Float32Array = self.batch(observation[None], policy_mean[None])[0]
         return action
 
-    def batch(self, observations: Array, policy_means: Array) -> Array:
+    def batch(self, observations: Float32Array, policy_means: Float32Array) -> Float32Array:
         """(B, D), (B, 7) -> (B, 7)"""
         feed = dict(zip(INPUTS, (_float32(observations), _float32(policy_means)), strict=True))
-        actions: Array = self._session.run([OUTPUT], feed)[0]
+        actions: Float32Array = self._session.run([OUTPUT], feed)[0]
         return actions
 
     @property
@@ -91,7 +92,7 @@ class OnnxFilter:
         return OnnxFilter, (self.stored,)
 
 
-def _float32(array: npt.ArrayLike) -> Array:
+def _float32(array: npt.ArrayLike) -> Float32Array:
     return np.ascontiguousarray(array, np.float32)
 
 
@@ -102,7 +103,7 @@ def _session(stored: bytes) -> Any:
     return onnxruntime.InferenceSession(stored, options, providers=["CPUExecutionProvider"])
 
 
-def _trace(module: ActionFilter, observations: Array, policy_means: Array) -> onnx.ModelProto:
+def _trace(module: ActionFilter, observations: Float32Array, policy_means: Float32Array) -> onnx.ModelProto:
     """The graph, with every parameter and buffer as an initializer of the same name."""
     example = (torch.from_numpy(observations.copy()), torch.from_numpy(policy_means.copy()))
     batch = torch.export.Dim("batch", min=1)

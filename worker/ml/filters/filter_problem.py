@@ -15,7 +15,6 @@ from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
-import numpy.typing as npt
 import torch
 
 from worker.ml.filters.action_encoder import ResidualAdapter
@@ -27,14 +26,10 @@ from worker.modes import ModeFamily
 from worker.scenarios import GATE, RESIDUAL, first_of
 from worker.task import Task
 from worker.trajectory import Trajectory
+from worker.type_aliases import Act, Float32Array
 
-Array = npt.NDArray[np.float32]
 ReportProgress = Callable[[str, float], None]
 """What is being done in human words, and the share of the whole fit that is done."""
-
-
-Act = Callable[[Array], Array]
-"""What a rollout asks for every action: (D,) -> (7,)"""
 
 
 class Collect(Protocol):
@@ -133,7 +128,7 @@ class FilterDraft:
     """A filter between two stages. Plain values and arrays."""
 
     weights: FilterWeights
-    value: Mapping[str, Array] = field(default_factory=dict)
+    value: Mapping[str, Float32Array] = field(default_factory=dict)
     """state of the action value, so that a later round goes on from it"""
     trials: tuple[GateTrial, ...] = ()
     """in their order, except that the chosen mode's comes after the other modes'"""
@@ -160,7 +155,7 @@ class FilterAct:
     gate: float = 1.0
     """an extra gate on top of the exported one, to try gates without exporting again"""
 
-    def __call__(self, observation: Array) -> Array:
+    def __call__(self, observation: Float32Array) -> Float32Array:
         """(D,) -> (7,)"""
         mean = self.policy.mean(observation)
         return mean + np.float32(self.gate) * (self.exported(observation, mean) - mean)
@@ -172,7 +167,7 @@ def noisy(act: Act, noise: float, seed: int, scenario: int) -> Act:
         return act
     rng = np.random.default_rng([seed, scenario])
 
-    def act_with_noise(observation: Array) -> Array:
+    def act_with_noise(observation: Float32Array) -> Float32Array:
         action = act(observation)
         return action + noise * rng.standard_normal(action.shape, np.float32)
 

@@ -16,8 +16,6 @@ from torch.nn import functional
 
 from worker.ml.filters.action_encoder import OBSERVATION_CLIP
 
-Array = npt.NDArray[np.float32]
-
 DISCOUNT = 0.97
 POLYAK = 0.01
 BATCH = 192

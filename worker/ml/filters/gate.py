@@ -3,12 +3,10 @@
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 
-from worker.ml.filters.filter_problem import Act, Collect, FilterProblem, GateTrial
+from worker.ml.filters.filter_problem import Collect, FilterProblem, GateTrial
 from worker.trajectory import Trajectory
-
-Floats = npt.NDArray[np.float64]
+from worker.type_aliases import Act, FloatArray
 
 
 def try_on(
@@ -29,7 +27,7 @@ def try_on(
     return trial, filtered
 
 
-def signal_changes(reference: Sequence[Trajectory], filtered: Sequence[Trajectory]) -> Floats:
+def signal_changes(reference: Sequence[Trajectory], filtered: Sequence[Trajectory]) -> FloatArray:
     """(N, S) of the summed signals, scenario by scenario."""
     pairs = zip(reference, filtered, strict=True)
     return np.array(
@@ -37,7 +35,7 @@ def signal_changes(reference: Sequence[Trajectory], filtered: Sequence[Trajector
     )
 
 
-def successes(trajectories: Sequence[Trajectory]) -> Floats:
+def successes(trajectories: Sequence[Trajectory]) -> FloatArray:
     """(N,) in {0, 1}"""
     return np.array([float(each.success) for each in trajectories])
 

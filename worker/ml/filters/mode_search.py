@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 
 from worker.ml.filters.filter_module import FilterWeights
 from worker.ml.filters.filter_problem import (
@@ -20,8 +19,7 @@ from worker.ml.filters.filter_problem import (
 from worker.ml.filters.gate import acceptable, signal_changes, successes, try_on
 from worker.ml.filters.response_surface import CAUTION, ResponseSurface, best_mode
 from worker.trajectory import Trajectory
-
-Floats = npt.NDArray[np.float64]
+from worker.type_aliases import FloatArray
 
 
 def find_mode(
@@ -42,8 +40,8 @@ def find_mode(
     """
     started = time.perf_counter()
     wishes = problem.reward.signal_weights(pool)
-    tried: list[tuple[GateTrial, Floats]] = []
-    accepted: list[tuple[GateTrial, Floats]] = []
+    tried: list[tuple[GateTrial, FloatArray]] = []
+    accepted: list[tuple[GateTrial, FloatArray]] = []
     for attempt in range(problem.config.mode_attempts):
         if len(accepted) == problem.config.modes_to_choose_from:
             break
@@ -78,7 +76,7 @@ def find_mode(
     return FilterDraft(weights, trials=ordered).timed("mode", started)
 
 
-def _act_in(problem: FilterProblem, mode: Floats) -> FilterAct:
+def _act_in(problem: FilterProblem, mode: FloatArray) -> FilterAct:
     return act_of(problem.task.modes, problem.policy, FilterWeights(mode=problem.task.modes.named(mode)))
 
 

@@ -6,15 +6,12 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
 from worker.ml.filters.action_encoder import ResidualAdapter, kl_divergence
 from worker.ml.filters.filter_module import ModeTransform, load_state, state_of
 from worker.ml.filters.filter_problem import (
-    Act,
     Collect,
     FilterConfig,
     FilterDraft,
@@ -27,8 +24,8 @@ from worker.ml.filters.fitted_q import ActionValue, Transitions, evaluate_filter
 from worker.ml.filters.gate import acceptable, try_on
 from worker.ml.policies.torch_module import FrozenPolicy
 from worker.trajectory import Trajectory
+from worker.type_aliases import Act, FloatArray
 
-Floats = npt.NDArray[np.float64]
 Learn = Callable[[FilterProblem, FilterDraft, Sequence[Sequence[Trajectory]]], FilterDraft]
 """One round of residual learning from all rollouts so far."""
 
@@ -48,7 +45,7 @@ def train_residual(
     """
     rounds: list[list[Trajectory]] = []
     kept = draft
-    earned: Floats | None = None
+    earned: FloatArray | None = None
     for number in range(problem.config.residual_rounds):
         share = 0.35 + 0.35 * number / problem.config.residual_rounds
         progress(f"rolling out the filter, round {number + 1}", share)
@@ -73,7 +70,7 @@ def residual_rollouts(problem: FilterProblem, draft: FilterDraft, number: int) -
     return act, config.residual_block(problem.task, number), config.residual_noise, problem.seed + number
 
 
-def _clearly_below(returns: Floats, earlier: Floats) -> bool:
+def _clearly_below(returns: FloatArray, earlier: FloatArray) -> bool:
     """Whether one mean is below another by more than the standard error of their difference; (N,), (M,)"""
     error = math.hypot(returns.std() / len(returns) ** 0.5, earlier.std() / len(earlier) ** 0.5)
     return float(earlier.mean() - returns.mean()) > error

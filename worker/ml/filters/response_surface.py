@@ -18,8 +18,7 @@ from scipy.special import expit, logit
 from worker.ml.rewards.reward_models import stored_config
 from worker.modes import ModeFamily
 from worker.trajectory import SIGNALS
-
-Floats = npt.NDArray[np.float64]
+from worker.type_aliases import FloatArray
 
 RIDGE = 1.0
 OUTLIER_SHARE = 0.005
@@ -42,20 +41,20 @@ LONGEST_STEP = 3.0
 class ResponseSurface:
     """psi(mode) @ coefficients: change of the summed signals; sigmoid([1, psi(mode)] @ log_odds): chance of success."""
 
-    coefficients: Floats
+    coefficients: FloatArray
     """(M, S)"""
-    gram: Floats
+    gram: FloatArray
     """(M, M) of the rollouts behind the coefficients, ridge included: how sure they are in which direction"""
-    log_odds: Floats
+    log_odds: FloatArray
     """(1 + M,) of success; the first belongs to the reference policy"""
-    precision: Floats
+    precision: FloatArray
     """(1 + M, 1 + M) of the log odds (Laplace approximation of their posterior)"""
-    low: Floats
+    low: FloatArray
     """(A,) range of the modes it was fitted on"""
-    high: Floats
+    high: FloatArray
     axes: tuple[str, ...]
 
-    def predict(self, modes: npt.ArrayLike, caution: float = 0.0) -> tuple[Floats, Floats]:
+    def predict(self, modes: npt.ArrayLike, caution: float = 0.0) -> tuple[FloatArray, FloatArray]:
         """(..., A) -> changes of the summed signals (..., S) and of the chance of success (...).
 
         With ``caution`` the log odds of success are taken so many of their standard deviations lower.
@@ -66,7 +65,7 @@ class ResponseSurface:
         change = features @ self.log_odds[1:] - caution * deviation
         return features @ self.coefficients, expit(self.log_odds[0] + change) - expit(self.log_odds[0])
 
-    def with_observed(self, mode: Floats, signal_deltas: Floats, successes: Floats) -> Self:
+    def with_observed(self, mode: FloatArray, signal_deltas: FloatArray, successes: FloatArray) -> Self:
         """The surface after N more rollouts of one mode (A,): as if it had been fitted with them.
 
         signal_deltas (N, S) and successes (N,) as in fit(). Nearby modes are predicted anew, too; others hardly.
@@ -109,14 +108,14 @@ class ResponseSurface:
         return cls.from_bytes(path.read_bytes(), family)
 
 
-def monomials(modes: Floats) -> Floats:
+def monomials(modes: FloatArray) -> FloatArray:
     """(..., A) -> (..., M): first order, second order with cross terms, pure third order. No constant: 0 maps to 0."""
     columns = [modes[..., axis] for axis in range(modes.shape[-1])]
     products = [first * second for first, second in combinations_with_replacement(columns, 2)]
     return np.stack([*columns, *products, *(column**3 for column in columns)], axis=-1)
 
 
-def fit(family: ModeFamily, modes: Floats, signal_deltas: Floats, successes: Floats) -> ResponseSurface:
+def fit(family: ModeFamily, modes: FloatArray, signal_deltas: FloatArray, successes: FloatArray) -> ResponseSurface:
     """Ridge regression of the signals and logistic regression of success, from N paired rollouts.
 
     modes (N, A); signal_deltas (N, S): summed signals of the rollout with this mode minus those of the reference
@@ -139,11 +138,13 @@ def fit(family: ModeFamily, modes: Floats, signal_deltas: Floats, successes: Flo
     )
 
 
-def _with_one(features: Floats) -> Floats:
+def _with_one(features: FloatArray) -> FloatArray:
     return np.concatenate([np.ones((len(features), 1)), features], axis=1)
 
 
-def _logistic(features: Floats, successes: Floats, mean: Floats, precision: Floats) -> tuple[Floats, Floats]:
+def _logistic(
+    features: FloatArray, successes: FloatArray, mean: FloatArray, precision: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Mode and precision of the posterior of log odds (P,) with the prior N(mean, precision^-1), by Newton's method."""
     weights = mean
     for _ in range(NEWTON_STEPS):
@@ -158,14 +159,14 @@ def _logistic(features: Floats, successes: Floats, mean: Floats, precision: Floa
 
 def best_mode(
     surface: ResponseSurface,
-    weights: Floats,
+    weights: FloatArray,
     seed: int,
     *,
     tolerance: float = SUCCESS_TOLERANCE,
     penalty: float = SUCCESS_PENALTY,
     caution: float = CAUTION,
     success_caution: float = CAUTION,
-) -> Floats:
+) -> FloatArray:
     """(A,) the mode with the best predicted return for these weights on the signals, (S,) or (E, S) for E members.
 
     With members the return counts as their mean less ``caution`` of their standard deviations: what few labels leave
@@ -180,15 +181,15 @@ def best_mode(
     candidates = np.concatenate([reference, rng.uniform(surface.low, surface.high, (DRAWS, len(width)))])
     unit = max(float((surface.predict(candidates)[0] @ members.mean(axis=0)).std()), 1e-9)
 
-    def value(modes: Floats) -> Floats:
+    def value(modes: FloatArray) -> FloatArray:
         signals, success = surface.predict(modes, success_caution)
         returns = signals @ members.T / unit
-        worth: Floats = returns.mean(axis=-1) - caution * returns.std(axis=-1)
+        worth: FloatArray = returns.mean(axis=-1) - caution * returns.std(axis=-1)
         return worth - penalty * np.maximum(-success - tolerance, 0.0)
 
     for spread in (0.2, 0.05):
         best = candidates[np.argsort(value(candidates))[-40:]]
         around = np.repeat(best, 100, axis=0) + spread * width * rng.standard_normal((4000, len(width)))
         candidates = np.concatenate([reference, best, np.clip(around, surface.low, surface.high)])
-    winner: Floats = candidates[np.argmax(value(candidates))]
+    winner: FloatArray = candidates[np.argmax(value(candidates))]
     return winner

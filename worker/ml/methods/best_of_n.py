@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -19,8 +18,7 @@ from worker.ml.policies.gaussian import GaussianPolicy
 from worker.ml.policies.torch_module import FrozenPolicy
 from worker.ml.rewards.reward_models import RewardModel
 from worker.trajectory import Trajectory
-
-Array = npt.NDArray[np.float32]
+from worker.type_aliases import Float32Array
 
 CLIP = 6.0
 
@@ -30,20 +28,20 @@ class BestOfN:
     """observation (D,) -> action (7,). The same observation always gets the same action."""
 
     policy: GaussianPolicy
-    value: Mapping[str, Array]
+    value: Mapping[str, Float32Array]
     """state of an ActionValue"""
     count: int
     seed: int
 
-    def __call__(self, observation: Array) -> Array:
+    def __call__(self, observation: Float32Array) -> Float32Array:
         """See the class."""
         rng = np.random.default_rng([self.seed, zlib.crc32(observation.tobytes())])
         drawn = self.policy.sample(np.repeat(observation[None], self.count, axis=0), rng)
         candidates = np.concatenate([self.policy.mean(observation)[None], drawn])
-        best: Array = candidates[int(np.argmax(self.values(observation, candidates)))]
+        best: Float32Array = candidates[int(np.argmax(self.values(observation, candidates)))]
         return best
 
-    def values(self, observation: Array, candidates: Array) -> Array:
+    def values(self, observation: Float32Array, candidates: Float32Array) -> Float32Array:
         """Q of each candidate, (D,), (N, 7) -> (N,); ActionValue's forward pass in NumPy."""
         seen = np.clip((observation - self.value["offset"]) * self.value["scale"], -CLIP, CLIP)
         hidden = np.concatenate([np.broadcast_to(seen, (len(candidates), len(seen))), candidates], axis=1)
@@ -51,7 +49,7 @@ class BestOfN:
             hidden = hidden @ self.value[f"body.{layer}.weight"].T + self.value[f"body.{layer}.bias"]
             if layer < 4:
                 hidden = hidden / (1.0 + np.exp(-np.clip(hidden, -60.0, 60.0)))
-        values: Array = hidden[:, 0]
+        values: Float32Array = hidden[:, 0]
         return values
 
 

@@ -19,13 +19,13 @@ from worker.ml.policies.gaussian import GaussianPolicy
 from worker.ml.policies.sac import Learner, Replay, SacConfig
 from worker.ml.rewards.reward_models import RewardModel
 from worker.trajectory import SIGNALS
+from worker.type_aliases import Float32Array
 
-Array = npt.NDArray[np.float32]
 Env = gymnasium.Env[Any, Any]
 MakeEnv = Callable[[], Env]
-EpisodeReward = Callable[[Array, Array, Array], npt.NDArray[np.floating]]
+EpisodeReward = Callable[[Float32Array, Float32Array, Float32Array], npt.NDArray[np.floating]]
 """signals (T, S), observations (T, D), actions (T, 7) of one whole episode -> rewards (T,)"""
-FirstActions = Callable[[Array], Array]
+FirstActions = Callable[[Float32Array], Float32Array]
 """observations (N, D) -> actions (N, 7) before the actor takes over"""
 
 TRAINING_SCENARIOS = 1_000_000
@@ -39,7 +39,7 @@ class PolicyAct:
 
     policy: GaussianPolicy
 
-    def __call__(self, observation: Array) -> Array:
+    def __call__(self, observation: Float32Array) -> Float32Array:
         """(D,) -> (7,)"""
         return self.policy.mean(observation)
 
@@ -53,8 +53,8 @@ def learned(reward: RewardModel) -> EpisodeReward:
 class _Episode:
     """What has happened since an environment's last reset."""
 
-    states: list[Array] = field(default_factory=list)
-    actions: list[Array] = field(default_factory=list)
+    states: list[Float32Array] = field(default_factory=list)
+    actions: list[Float32Array] = field(default_factory=list)
     signals: list[list[float]] = field(default_factory=list)
 
 
@@ -72,11 +72,11 @@ class PreferenceRl:
         self.episodes = [_Episode([state]) for state in self.states]
         self.steps = 0
 
-    def warm_up(self, first: FirstActions) -> Array:
+    def warm_up(self, first: FirstActions) -> Float32Array:
         """Make ``random_steps`` steps, or at least one episode, without learning; returns those states, (N, D)."""
         while self.steps < self.config.random_steps or not self.replay.count:
             self._step(first(self.states))
-        finished: Array = self.replay.rows[: self.replay.count, : self.config.observation.size].numpy()
+        finished: Float32Array = self.replay.rows[: self.replay.count, : self.config.observation.size].numpy()
         return finished
 
     def learn(self, learner: Learner, checkpoint: Checkpoint | None = None) -> None:
@@ -89,7 +89,7 @@ class PreferenceRl:
             if checkpoint:
                 self._keep_state(learner, checkpoint)
             with torch.no_grad():
-                actions: Array = learner.actor.sample(torch.from_numpy(self.states))[0].numpy()
+                actions: Float32Array = learner.actor.sample(torch.from_numpy(self.states))[0].numpy()
             self._step(actions)
             learner.set_learning_rate(self.steps / config.total_steps)
             owed += config.updates_per_step * len(self.envs)
@@ -121,7 +121,7 @@ class PreferenceRl:
         for env in self.envs:
             env.close()
 
-    def _step(self, actions: Array) -> None:
+    def _step(self, actions: Float32Array) -> None:
         """One step in every environment."""
         for index, (env, action) in enumerate(zip(self.envs, actions, strict=True)):
             state, _, terminated, truncated, info = env.step(action)
@@ -144,6 +144,6 @@ class PreferenceRl:
         goes_on[-1] = not terminated  # a time limit is not an end: what would have followed still counts
         self.replay.add(states[:-1], actions, np.asarray(rewards, np.float32), goes_on, states[1:])
 
-    def _reset(self, env: Env) -> Array:
-        state: Array = env.reset(seed=int(self.rng.integers(TRAINING_SCENARIOS)))[0]
+    def _reset(self, env: Env) -> Float32Array:
+        state: Float32Array = env.reset(seed=int(self.rng.integers(TRAINING_SCENARIOS)))[0]
         return state

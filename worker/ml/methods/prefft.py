@@ -13,8 +13,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -24,8 +22,6 @@ from worker.ml.policies.gaussian import LAYERS, LOG_STD_HIGH, LOG_STD_LOW, Gauss
 from worker.ml.policies.sac import Actor, Learner, SacConfig
 from worker.ml.policies.torch_module import FrozenPolicy
 from worker.spaces import Space
-
-Array = npt.NDArray[np.float32]
 
 UNIT_EVERY_UPDATES = 400
 """How often the unit of Q is measured anew."""

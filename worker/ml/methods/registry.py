@@ -12,11 +12,9 @@ from functools import partial
 from typing import Any
 
 import gymnasium
-import numpy as np
-import numpy.typing as npt
 
 from worker.ml.filters import filter_problem, pbarl
-from worker.ml.filters.filter_problem import Act, Collect, FilterDraft, FilterProblem
+from worker.ml.filters.filter_problem import Collect, FilterDraft, FilterProblem
 from worker.ml.filters.pbarl_printed import PrintedConfig
 from worker.ml.filters.printed_filter import fit_printed
 from worker.ml.filters.response_surface import ResponseSurface
@@ -29,8 +27,7 @@ from worker.ml.policies.checkpoint import Checkpoint
 from worker.ml.rewards.reward_models import RewardModel
 from worker.scenarios import RESIDUAL, first_of
 from worker.trajectory import Trajectory
-
-Array = npt.NDArray[np.float32]
+from worker.type_aliases import Act
 
 
 @dataclass(frozen=True)

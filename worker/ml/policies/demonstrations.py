@@ -4,18 +4,16 @@ Actor-critic with demonstrations in every batch and a fading imitation loss, in 
 1709.10089). For tasks that are too long to be found by chance, such as pouring.
 """
 
-import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
-Array = npt.NDArray[np.float32]
+from worker.type_aliases import Float32Array
 
 
 class Demonstrations:
     """N transitions like those of the replay, and what the demonstrator wanted to do in each state."""
 
-    def __init__(self, rows: Array, wanted: Array) -> None:
+    def __init__(self, rows: Float32Array, wanted: Float32Array) -> None:
         """``rows`` (N, ...) as in the replay, ``wanted`` (N, A) undisturbed actions in the learner's units."""
         self.rows, self.wanted = torch.from_numpy(rows), torch.from_numpy(wanted)
 

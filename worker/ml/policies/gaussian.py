@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
-import numpy.typing as npt
 from safetensors.numpy import load_file, save_file
+
+from worker.type_aliases import Float32Array
 
 if TYPE_CHECKING:
     pass
 
-Array = npt.NDArray[np.float32]
 
 LOG_STD_LOW, LOG_STD_HIGH = -4.0, 1.0
 ACTION_STD_FLOOR = 0.05
@@ -25,7 +25,7 @@ LAYERS = 3
 class GaussianPolicy:
     """Inference without torch. Every method takes observations (..., D) and works on any leading axes."""
 
-    def __init__(self, weights: dict[str, Array]) -> None:
+    def __init__(self, weights: dict[str, Float32Array]) -> None:
         """``weights``: offset (D,), scale (D,), and per layer i weight_i (in, out) and bias_i (out,); action_limit (1,)
         when actions are to be smaller than the tanh gives."""
         self.weights = {name: np.ascontiguousarray(array, np.float32) for name, array in weights.items()}
@@ -43,12 +43,12 @@ class GaussianPolicy:
         save_file(self.weights, path)
 
     @property
-    def offset(self) -> Array:
+    def offset(self) -> Float32Array:
         """(D,) subtracted from an observation before the first layer."""
         return self.weights["offset"]
 
     @property
-    def scale(self) -> Array:
+    def scale(self) -> Float32Array:
         """(D,) multiplies what is left."""
         return self.weights["scale"]
 
@@ -57,39 +57,41 @@ class GaussianPolicy:
         """Largest absolute action, in (0, 1]."""
         return float(self.weights["action_limit"][0]) if "action_limit" in self.weights else 1.0
 
-    def mean(self, observations: Array) -> Array:
+    def mean(self, observations: Float32Array) -> Float32Array:
         """The deterministic action limit * tanh(mu), (..., 7)."""
-        action: Array = self._limit * np.tanh(self._raw(observations)[..., : self.action_size])
+        action: Float32Array = self._limit * np.tanh(self._raw(observations)[..., : self.action_size])
         return action
 
-    def mean_and_std(self, observations: Array) -> tuple[Array, Array]:
+    def mean_and_std(self, observations: Float32Array) -> tuple[Float32Array, Float32Array]:
         """Deterministic action after the tanh and standard deviation before it, (..., 7) each."""
         raw = self._raw(observations)
         return self._limit * np.tanh(raw[..., : self.action_size]), np.exp(self._log_std(raw))
 
-    def action_std(self, observations: Array) -> Array:
+    def action_std(self, observations: Float32Array) -> Float32Array:
         """How far actions spread around the deterministic one, in action units, (..., 7).
 
         The Gaussian's deviation times the slope of the tanh at its mean, at least ACTION_STD_FLOOR.
         """
         action, deviation = self.mean_and_std(observations)
         slope = self._limit * (1 - (action / self._limit) ** 2)
-        spread: Array = np.maximum(deviation * slope, ACTION_STD_FLOOR)
+        spread: Float32Array = np.maximum(deviation * slope, ACTION_STD_FLOOR)
         return spread
 
-    def sample(self, observations: Array, rng: np.random.Generator, temperature: float = 1.0) -> Array:
+    def sample(self, observations: Float32Array, rng: np.random.Generator, temperature: float = 1.0) -> Float32Array:
         """An action drawn from the policy, (..., 7), its deviation multiplied by a temperature."""
         raw = self._raw(observations)
         centre = raw[..., : self.action_size]
         noise = rng.standard_normal(centre.shape, np.float32)
-        action: Array = self._limit * np.tanh(centre + np.float32(temperature) * np.exp(self._log_std(raw)) * noise)
+        action: Float32Array = self._limit * np.tanh(
+            centre + np.float32(temperature) * np.exp(self._log_std(raw)) * noise
+        )
         return action
 
-    def _log_std(self, raw: Array) -> Array:
+    def _log_std(self, raw: Float32Array) -> Float32Array:
         share = 0.5 * (np.tanh(raw[..., self.action_size :]) + 1)
         return np.asarray(LOG_STD_LOW + (LOG_STD_HIGH - LOG_STD_LOW) * share, np.float32)
 
-    def _raw(self, observations: Array) -> Array:
+    def _raw(self, observations: Float32Array) -> Float32Array:
         hidden = (np.asarray(observations, np.float32) - self.offset) * self.scale
         for matrix, bias in self._layers[:-1]:
             hidden = np.maximum(hidden @ matrix + bias, 0.0)

@@ -5,15 +5,14 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-import numpy.typing as npt
 import torch
 import torch.nn.functional as F
 
 from worker.ml.policies.demonstrations import Demonstrations
 from worker.ml.policies.sac import Actor, SacConfig
+from worker.type_aliases import Float32Array
 
-Array = npt.NDArray[np.float32]
-Demonstrate = Callable[[Array], Array]
+Demonstrate = Callable[[Float32Array], Float32Array]
 """observation (D,) -> action (A,)"""
 
 NOISES = (0.0, 0.15, 0.3)

@@ -22,9 +22,10 @@ from torch import Tensor
 from worker.ml.policies.demonstrations import Demonstrations
 from worker.ml.policies.gaussian import GaussianPolicy
 from worker.ml.policies.imitation import Demonstrate, collect, imitate
-from worker.ml.policies.sac import Actor, Array, Env, Learner, Replay, SacConfig
+from worker.ml.policies.sac import Actor, Env, Learner, Replay, SacConfig
 from worker.scenarios import POLICY_SELECTION, POLICY_TEST, POLICY_TRAINING
 from worker.spaces import Field
+from worker.type_aliases import Float32Array
 from worker.whole_files import written_whole
 
 TrainingProgress = Callable[[int, dict[str, float]], None]
@@ -224,11 +225,11 @@ class _Run:
         self.rng.bit_generator.state = counts["rng"]
         self.best, self.curve, self.earlier_cpu_s = tuple(counts["best"]), counts["curve"], counts["cpu_s"]
 
-    def _actions(self) -> Array:
+    def _actions(self) -> Float32Array:
         if self.learner is None:
             return self.rng.uniform(-1, 1, (len(self.envs), self.actions)).astype(np.float32)
         with torch.no_grad():
-            actions: Array = self.learner.actor.sample(torch.from_numpy(self.states))[0].numpy()
+            actions: Float32Array = self.learner.actor.sample(torch.from_numpy(self.states))[0].numpy()
         return actions
 
     def _scenario(self) -> int:
@@ -256,7 +257,9 @@ class _Run:
         return Learner(self.config, offset, scale, self.actions)
 
 
-def evaluate(env: Env, act: Callable[[Array], Array], first_scenario: int, episodes: int) -> dict[str, float]:
+def evaluate(
+    env: Env, act: Callable[[Float32Array], Float32Array], first_scenario: int, episodes: int
+) -> dict[str, float]:
     """Success rate, mean return, mean of each episode's largest contact force and its 95th percentile, in N."""
     successes, returns, forces = [], [], []
     for scenario in range(first_scenario, first_scenario + episodes):

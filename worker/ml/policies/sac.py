@@ -12,7 +12,6 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-import numpy.typing as npt
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -20,8 +19,8 @@ from torch import Tensor, nn
 from worker.ml.policies.demonstrations import Demonstrations, imitation_loss
 from worker.ml.policies.gaussian import LOG_STD_HIGH, LOG_STD_LOW, GaussianPolicy
 from worker.spaces import Space
+from worker.type_aliases import Float32Array
 
-Array = npt.NDArray[np.float32]
 Env = gymnasium.Env[Any, Any]
 
 
@@ -105,7 +104,7 @@ class Actor(nn.Module):
 
     def policy(self, action_limit: float = 1.0) -> GaussianPolicy:
         """The same policy for NumPy."""
-        weights: dict[str, Array] = {"offset": self.offset.numpy(), "scale": self.scale.numpy()}
+        weights: dict[str, Float32Array] = {"offset": self.offset.numpy(), "scale": self.scale.numpy()}
         weights["action_limit"] = np.array([action_limit], np.float32)
         for index in range(len(self.layers)):
             weights[f"weight_{index}"] = self.get_parameter(f"layers.{index}.weight").detach().numpy().T.copy()
@@ -149,7 +148,14 @@ class Replay:
         self.rows = torch.zeros(capacity, sum(self.splits))
         self.count = 0
 
-    def add(self, states: Array, actions: Array, rewards: Array, goes_on: Array, next_states: Array) -> None:
+    def add(
+        self,
+        states: Float32Array,
+        actions: Float32Array,
+        rewards: Float32Array,
+        goes_on: Float32Array,
+        next_states: Float32Array,
+    ) -> None:
         """Append (N, ...) transitions. The table is made large enough for the whole training."""
         table = np.concatenate([states, actions, rewards[:, None], goes_on[:, None], next_states], 1)
         self.rows[self.count : self.count + len(table)] = torch.from_numpy(table.astype(np.float32))

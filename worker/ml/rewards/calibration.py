@@ -8,11 +8,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from worker.ml.rewards.bradley_terry import probability_of_answer, probability_right
-
-Floats = npt.NDArray[np.float64]
+from worker.type_aliases import FloatArray
 
 FEWEST_ANSWERS = 10
 """Below, nothing is fitted: the temperature stays 1."""
@@ -30,17 +28,17 @@ class HeldOut:
     temperature fitted to it made the whole ensemble too hesitant.
     """
 
-    logits: Floats
+    logits: FloatArray
     """(E, N)"""
-    answers: Floats
+    answers: FloatArray
     """(N,) in {0, 1/2, 1}"""
     allows_for_lapses: bool = False
     """Whether the model was fitted for people who answer at random now and then. Slips then say nothing about how sure
     it should be of what is preferred."""
 
-    def probabilities(self, temperature: float) -> Floats:
+    def probabilities(self, temperature: float) -> FloatArray:
         """P(right), the mean over members, (N,)."""
-        mean: Floats = probability_right(self.logits / temperature).mean(axis=0)
+        mean: FloatArray = probability_right(self.logits / temperature).mean(axis=0)
         return mean
 
     def surprise(self, temperature: float) -> float:
@@ -58,13 +56,13 @@ def fit_temperature(held_out: HeldOut) -> float:
     return float(np.exp(_LOG_TEMPERATURES[int(np.argmin(losses))]))
 
 
-def cross_entropy(probabilities: Floats, answers: Floats) -> float:
+def cross_entropy(probabilities: FloatArray, answers: FloatArray) -> float:
     """Mean of the right form of Eq. (2), in nats."""
     sure = np.clip(probabilities, 1e-6, 1.0 - 1e-6)
     return -float((answers * np.log(sure) + (1.0 - answers) * np.log(1.0 - sure)).mean())
 
 
-def expected_calibration_error(probabilities: Floats, answers: Floats) -> float:
+def expected_calibration_error(probabilities: FloatArray, answers: FloatArray) -> float:
     """How far confidence and accuracy lie apart, in the mean over answers.
 
     Confidence is P of the more probable side, in five equal bins from 1/2 to 1; an answer "equal" is half right.

@@ -21,9 +21,8 @@ from worker.ml.rewards.calibration import HeldOut
 from worker.ml.rewards.preference_transformer import PreferenceTransformer
 from worker.ml.rewards.reward_models import MlpReward, RewardModel
 from worker.ml.rewards.segments import LEFT, RIGHT, SegmentPairs
+from worker.type_aliases import Float32Array, FloatArray
 
-Floats = npt.NDArray[np.float64]
-Array = npt.NDArray[np.float32]
 Logits = Callable[[Tensor, Tensor, int], Tensor]
 """Inputs (B, 2, T, F), which steps were shown (B, 2, T), and the first step to look at -> every member's log odds that
 right is preferred, (E, B)."""
@@ -64,7 +63,9 @@ class TransformerTraining(MlpTraining):
     heads: int = 4
 
 
-def fit_mlp(pairs: SegmentPairs, answers: Floats, seed: int, config: MlpTraining) -> tuple[RewardModel, dict[str, Any]]:
+def fit_mlp(
+    pairs: SegmentPairs, answers: FloatArray, seed: int, config: MlpTraining
+) -> tuple[RewardModel, dict[str, Any]]:
     """The model in raw units, and what is worth knowing about its training."""
     generator = torch.Generator().manual_seed(seed)
     inputs, shown, offset, scale = _standardised(pairs)
@@ -87,7 +88,7 @@ def fit_mlp(pairs: SegmentPairs, answers: Floats, seed: int, config: MlpTraining
 
 
 def fit_transformer(
-    pairs: SegmentPairs, answers: Floats, seed: int, config: TransformerTraining
+    pairs: SegmentPairs, answers: FloatArray, seed: int, config: TransformerTraining
 ) -> tuple[RewardModel, dict[str, Any]]:
     """The model in raw units, and what is worth knowing about its training."""
     generator = torch.Generator().manual_seed(seed)
@@ -120,7 +121,7 @@ class _Trained:
     steps: int
     validation_loss: float | None
 
-    def metrics(self, model: RewardModel, pairs: SegmentPairs, answers: Floats) -> dict[str, Any]:
+    def metrics(self, model: RewardModel, pairs: SegmentPairs, answers: FloatArray) -> dict[str, Any]:
         return {
             "steps": self.steps,
             "validation_loss": self.validation_loss,
@@ -133,7 +134,7 @@ def _train(
     logits: Logits,
     inputs: Tensor,
     shown: Tensor,
-    answers: Floats,
+    answers: FloatArray,
     config: MlpTraining,
     generator: torch.Generator,
 ) -> _Trained:
@@ -172,7 +173,7 @@ def _train(
     return _Trained(best, unseen, steps, best_loss if held_out else None)
 
 
-def _standardised(pairs: SegmentPairs) -> tuple[Tensor, Tensor, Array, Array]:
+def _standardised(pairs: SegmentPairs) -> tuple[Tensor, Tensor, Float32Array, Float32Array]:
     """Inputs (N, 2, T, D + 7) with mean 0 and deviation 1 over the steps shown, which those are (N, 2, T), and the
     offset and scale used."""
     steps = np.concatenate([pairs.observations, pairs.actions], axis=-1)

@@ -12,8 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from worker.ml.rewards.reward_models import RewardModel, StructuredReward
-
-Floats = npt.NDArray[np.float64]
+from worker.type_aliases import FloatArray
 
 DEVIATION = 4.0
 """Of every weight when nobody is known: wide, because a narrow prior spreads what is wanted over all signals that go
@@ -28,9 +27,9 @@ SHARED, OWN, FLOOR = 0.7, 0.3, 0.05
 class Prior:
     """N(mean, covariance) of the weights in log odds per standard deviation of a pair."""
 
-    mean: Floats
+    mean: FloatArray
     """(S,)"""
-    covariance: Floats
+    covariance: FloatArray
     """(S, S)"""
 
     @classmethod
@@ -50,7 +49,7 @@ class Prior:
         return cls(given.mean(axis=0), shrunk)
 
 
-def prior_of(models: Sequence[RewardModel], spread: Floats) -> Prior:
+def prior_of(models: Sequence[RewardModel], spread: FloatArray) -> Prior:
     """The prior that earlier participants' reward models give; ``spread`` (S,) as in SignalScale."""
     known = [each.weights.mean(axis=0) * spread for each in models if isinstance(each, StructuredReward)]
     return Prior.pooled(known) if known else Prior.standard(len(spread))

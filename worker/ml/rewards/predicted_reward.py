@@ -4,14 +4,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
-import numpy as np
-import numpy.typing as npt
-
 from worker.ml.rewards.reward_models import StructuredReward
 from worker.ml.rewards.signal_predictor import SignalPredictor
-
-Array = npt.NDArray[np.float32]
-Floats = npt.NDArray[np.float64]
+from worker.type_aliases import Float32Array, FloatArray
 
 PREFIX = "predictor."
 """of the predictor's tensors: the file of a reward model needs nothing beside it"""
@@ -34,16 +29,16 @@ class PredictedReward(StructuredReward):
             predictor=predictor,
         )
 
-    def known_signals(self, signals: Array, observations: Array, actions: Array) -> Floats:
+    def known_signals(self, signals: Float32Array, observations: Float32Array, actions: Float32Array) -> FloatArray:
         """See StructuredReward."""
         return self.predictor.completed(signals, observations, actions)
 
-    def tensors(self) -> dict[str, Array]:
+    def tensors(self) -> dict[str, Float32Array]:
         """See RewardModel."""
         return super().tensors() | {f"{PREFIX}{name}": each for name, each in self.predictor.tensors().items()}
 
     @classmethod
-    def from_tensors(cls, tensors: Mapping[str, Array], config: Mapping[str, Any]) -> Self:
+    def from_tensors(cls, tensors: Mapping[str, Float32Array], config: Mapping[str, Any]) -> Self:
         """See RewardModel."""
         theirs = {name.removeprefix(PREFIX): each for name, each in tensors.items() if name.startswith(PREFIX)}
         return cls.with_predictor(StructuredReward.from_tensors(tensors, config), SignalPredictor.from_tensors(theirs))

@@ -25,8 +25,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from worker.ml.rewards.reward_models import Array, Floats, RewardModel
+from worker.ml.rewards.reward_models import RewardModel
 from worker.ml.rewards.segments import LEFT, RIGHT, Mask, SegmentPairs
+from worker.type_aliases import Float32Array, FloatArray
 
 Weights = Mapping[str, Tensor]
 """By name, each (E, in, out), or (E, 1, out) for a bias; layers are numbered."""
@@ -43,24 +44,24 @@ class PreferenceTransformer(RewardModel):
     """E members, each a transformer; see the module. Inputs are standardised with ``offset`` and ``scale`` (D + 7,)."""
 
     kind: ClassVar[str] = "preference_transformer"
-    weights: Mapping[str, Array]
-    offset: Array
-    scale: Array
+    weights: Mapping[str, Float32Array]
+    offset: Float32Array
+    scale: Float32Array
     heads: int
     stride: int
 
-    def raw_rewards(self, signals: Array, observations: Array, actions: Array) -> Floats:
+    def raw_rewards(self, signals: Float32Array, observations: Float32Array, actions: Float32Array) -> FloatArray:
         """See RewardModel; the signals are not used. The axis before the last is time, from an episode's start."""
         return self._read(observations, actions)[0]
 
-    def logits(self, pairs: SegmentPairs) -> Floats:
+    def logits(self, pairs: SegmentPairs) -> FloatArray:
         """See RewardModel: here the steps are weighed by preference attention."""
         rewards, weights = self._read(pairs.observations, pairs.actions, pairs.mask)
         returns = (rewards * weights).sum(axis=-1)  # steps that were not shown weigh nothing
-        difference: Floats = returns[..., RIGHT] - returns[..., LEFT]
+        difference: FloatArray = returns[..., RIGHT] - returns[..., LEFT]
         return difference
 
-    def step_weights(self, pairs: SegmentPairs) -> Floats:
+    def step_weights(self, pairs: SegmentPairs) -> FloatArray:
         """How much every step counts in its segment; the mean over shown steps is 1. (E, N, 2, T)"""
         return self._read(pairs.observations, pairs.actions, pairs.mask)[1]
 
@@ -75,7 +76,9 @@ class PreferenceTransformer(RewardModel):
         return {name: torch.from_numpy(np.array(array)) for name, array in self.weights.items()}
 
     @torch.no_grad()
-    def _read(self, observations: Array, actions: Array, mask: Mask | None = None) -> tuple[Floats, Floats]:
+    def _read(
+        self, observations: Float32Array, actions: Float32Array, mask: Mask | None = None
+    ) -> tuple[FloatArray, FloatArray]:
         """Rewards and preference weights, (E, ..., T) each; ``mask`` (..., T): the steps that were shown."""
         leading = np.shape(actions)[:-1]
         shown = None if mask is None else torch.from_numpy(np.array(mask)).reshape(-1, leading[-1])
@@ -91,7 +94,7 @@ class PreferenceTransformer(RewardModel):
                 importance[:, part, begin :: self.stride] = preference_attention(weights, tokens, seen).numpy()
         return rewards.reshape(self.size, *leading), importance.reshape(self.size, *leading)
 
-    def tensors(self) -> dict[str, Array]:
+    def tensors(self) -> dict[str, Float32Array]:
         """See RewardModel."""
         named = {"offset": self.offset, "scale": self.scale, **self.weights}
         return {name: np.ascontiguousarray(array, np.float32) for name, array in named.items()}
@@ -101,7 +104,7 @@ class PreferenceTransformer(RewardModel):
         return {**super().config(), "heads": self.heads, "stride": self.stride}
 
     @classmethod
-    def from_tensors(cls, tensors: Mapping[str, Array], config: Mapping[str, Any]) -> Self:
+    def from_tensors(cls, tensors: Mapping[str, Float32Array], config: Mapping[str, Any]) -> Self:
         """See RewardModel."""
         weights = {name: array for name, array in tensors.items() if name not in {"offset", "scale"}}
         return cls(weights, tensors["offset"], tensors["scale"], int(config["heads"]), int(config["stride"]))

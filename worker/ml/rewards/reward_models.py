@@ -22,9 +22,7 @@ from worker.ml import dense_network
 from worker.ml.rewards.bradley_terry import preference_logits, probability_right
 from worker.ml.rewards.segments import LEFT, RIGHT, SegmentPairs
 from worker.trajectory import Recorded, Trajectory
-
-Array = npt.NDArray[np.float32]
-Floats = npt.NDArray[np.float64]
+from worker.type_aliases import Float32Array, FloatArray
 
 CLIP = 8.0
 """Normalised step rewards are cut here: one broken step must not decide an episode."""
@@ -64,23 +62,23 @@ class RewardModel(ABC):
     """the signal that is above 0 for as long as the task is not done; None: no signal says so"""
 
     @abstractmethod
-    def raw_rewards(self, signals: Array, observations: Array, actions: Array) -> Floats:
+    def raw_rewards(self, signals: Float32Array, observations: Float32Array, actions: Float32Array) -> FloatArray:
         """Unnormalised rewards. (..., S), (..., D), (..., 7) -> (E, ...)"""
 
     @abstractmethod
-    def tensors(self) -> dict[str, Array]:
+    def tensors(self) -> dict[str, Float32Array]:
         """Everything learned, by name."""
 
-    def step_rewards(self, signals: Array, observations: Array, actions: Array) -> Floats:
+    def step_rewards(self, signals: Float32Array, observations: Float32Array, actions: Float32Array) -> FloatArray:
         """Normalised and clipped rewards. (..., S), (..., D), (..., 7) -> (E, ...)"""
         return self.normalised(self.raw_rewards(signals, observations, actions))
 
-    def normalised(self, raw_rewards: Floats) -> Floats:
+    def normalised(self, raw_rewards: FloatArray) -> FloatArray:
         """In units of the reference policy's steps, and clipped. Any shape."""
-        rewards: Floats = (raw_rewards - self.normalisation.offset) / self.normalisation.scale
+        rewards: FloatArray = (raw_rewards - self.normalisation.offset) / self.normalisation.scale
         return np.clip(rewards, -CLIP, CLIP)
 
-    def episode_rewards(self, signals: Array, observations: Array, actions: Array) -> Floats:
+    def episode_rewards(self, signals: Float32Array, observations: Float32Array, actions: Float32Array) -> FloatArray:
         """Normalised and clipped rewards of one whole episode. (T, S), (T, D), (T, 7) -> (E, T)
 
         No step of an episode that ends with the task undone is worth more than a usual step of the reference policy:
@@ -90,35 +88,35 @@ class RewardModel(ABC):
         undone = self.undone_column is not None and signals[-1, self.undone_column] > 0.0
         return np.minimum(rewards, 0.0) if undone else rewards
 
-    def _earned(self, signals: Array, observations: Array, actions: Array) -> Floats:
+    def _earned(self, signals: Float32Array, observations: Float32Array, actions: Float32Array) -> FloatArray:
         """What the episode is worth whether or not the task gets done, as episode_rewards()."""
         return self.step_rewards(signals, observations, actions)
 
-    def returns(self, trajectories: Sequence[Trajectory]) -> Floats:
+    def returns(self, trajectories: Sequence[Trajectory]) -> FloatArray:
         """Mean over members of the summed normalised rewards of each trajectory, (N,)."""
         return np.array([self.rewards_of(trajectory).sum() for trajectory in trajectories])
 
-    def rewards_of(self, trajectory: Trajectory) -> Floats:
+    def rewards_of(self, trajectory: Trajectory) -> FloatArray:
         """Mean over members of the normalised reward of every step, (T,)."""
         steps = len(trajectory)
         rewards = self.episode_rewards(trajectory.signals, trajectory.observations[:steps], trajectory.actions)
-        mean: Floats = rewards.mean(axis=0)
+        mean: FloatArray = rewards.mean(axis=0)
         return mean
 
-    def logits(self, pairs: SegmentPairs) -> Floats:
+    def logits(self, pairs: SegmentPairs) -> FloatArray:
         """Every member's log odds that right is preferred, (E, N). Not normalised, not clipped, not calibrated."""
         rewards = self.raw_rewards(pairs.signals, pairs.observations, pairs.actions)
         returns = rewards.sum(axis=-1, where=pairs.shown)
-        difference: Floats = preference_logits(returns[..., LEFT], returns[..., RIGHT])
+        difference: FloatArray = preference_logits(returns[..., LEFT], returns[..., RIGHT])
         return difference
 
-    def member_probabilities(self, pairs: SegmentPairs) -> Floats:
+    def member_probabilities(self, pairs: SegmentPairs) -> FloatArray:
         """Calibrated P(right preferred) under every member, (E, N)."""
         return probability_right(self.logits(pairs) / self.temperature)
 
-    def probability_right(self, pairs: SegmentPairs) -> Floats:
+    def probability_right(self, pairs: SegmentPairs) -> FloatArray:
         """P(right preferred), the mean over members, (N,)."""
-        mean: Floats = self.member_probabilities(pairs).mean(axis=0)
+        mean: FloatArray = self.member_probabilities(pairs).mean(axis=0)
         return mean
 
     def normalised_over(self, reference: Sequence[Trajectory]) -> Self:
@@ -129,7 +127,7 @@ class RewardModel(ABC):
         ]
         return replace(self, normalisation=Normalisation.over(np.concatenate(raw, axis=1)))
 
-    def signal_weights(self, reference: Sequence[Recorded]) -> Floats:
+    def signal_weights(self, reference: Sequence[Recorded]) -> FloatArray:
         """(E, S) every member's reward per unit of each signal: what the response surface of modes is searched with.
 
         For a model that is not linear in the signals: the ridge regression of each member's episode returns on the
@@ -140,14 +138,14 @@ class RewardModel(ABC):
         features = (sums - sums.mean(axis=0)) / scale
         returns = np.array([self._member_returns(each) for each in reference])
         gram = features.T @ features + np.eye(features.shape[1])
-        weights: Floats = np.linalg.solve(gram, features.T @ (returns - returns.mean(axis=0))).T / scale
+        weights: FloatArray = np.linalg.solve(gram, features.T @ (returns - returns.mean(axis=0))).T / scale
         return np.where(sums.std(axis=0) > 1e-9, weights, 0.0)
 
-    def _member_returns(self, trajectory: Recorded) -> Floats:
+    def _member_returns(self, trajectory: Recorded) -> FloatArray:
         """(E,)"""
         steps = len(trajectory)
         rewards = self.step_rewards(trajectory.signals, trajectory.observations[:steps], trajectory.actions)
-        returns: Floats = rewards.sum(axis=-1)
+        returns: FloatArray = rewards.sum(axis=-1)
         return returns
 
     @property
@@ -172,7 +170,7 @@ class RewardModel(ABC):
 
     @classmethod
     @abstractmethod
-    def from_tensors(cls, tensors: Mapping[str, Array], config: Mapping[str, Any]) -> Self:
+    def from_tensors(cls, tensors: Mapping[str, Float32Array], config: Mapping[str, Any]) -> Self:
         """What tensors() and config() describe, in raw units."""
 
 
@@ -186,34 +184,34 @@ class StructuredReward(RewardModel):
     """
 
     kind: ClassVar[str] = "structured"
-    weights: Floats
+    weights: FloatArray
     """(E, S), reward per unit of each signal"""
-    least_per_step: Floats | None = None
-    most_per_step: Floats | None = None
+    least_per_step: FloatArray | None = None
+    most_per_step: FloatArray | None = None
     """(S,) the smallest and the largest mean of each signal over the steps of what was shown; None: not known, and not
     limited"""
 
-    def raw_rewards(self, signals: Array, observations: Array, actions: Array) -> Floats:
+    def raw_rewards(self, signals: Float32Array, observations: Float32Array, actions: Float32Array) -> FloatArray:
         """See RewardModel."""
         return self._linear(self.known_signals(signals, observations, actions))
 
-    def known_signals(self, signals: Array, observations: Array, actions: Array) -> Floats:
+    def known_signals(self, signals: Float32Array, observations: Float32Array, actions: Float32Array) -> FloatArray:
         """What the weights are multiplied with, (..., S): here the signals as measured."""
         return np.asarray(signals, np.float64)
 
-    def _linear(self, known: Floats) -> Floats:
+    def _linear(self, known: FloatArray) -> FloatArray:
         """(..., S) -> (E, ...)"""
-        rewards: Floats = np.moveaxis(known @ self.weights.T, -1, 0)
+        rewards: FloatArray = np.moveaxis(known @ self.weights.T, -1, 0)
         return rewards
 
-    def _earned(self, signals: Array, observations: Array, actions: Array) -> Floats:
+    def _earned(self, signals: Float32Array, observations: Float32Array, actions: Float32Array) -> FloatArray:
         """See RewardModel; what is beyond the limits over the whole episode is worth nothing more."""
         known = self.known_signals(signals, observations, actions)
         undeserved = self._undeserved(np.cumsum(known, axis=0))
         each_step = np.diff(undeserved, axis=0, prepend=np.zeros((1, self.size)))
         return self.normalised(self._linear(known) - each_step.T)
 
-    def _undeserved(self, totals: Floats) -> Floats:
+    def _undeserved(self, totals: FloatArray) -> FloatArray:
         """What linear rewards pay for being beyond the limits, from the beginning to each step. totals (T, S) -> (T, E)
 
         More than an episode's most is beyond the limit as soon as it is reached; less than the least at any time, and
@@ -229,14 +227,14 @@ class StructuredReward(RewardModel):
             paid += missing @ np.maximum(-self.weights, 0.0).T
         return paid
 
-    def tensors(self) -> dict[str, Array]:
+    def tensors(self) -> dict[str, Float32Array]:
         """See RewardModel."""
         limits = {"least_per_step": self.least_per_step, "most_per_step": self.most_per_step}
         known = {name: limit.astype(np.float32) for name, limit in limits.items() if limit is not None}
         return {"weights": self.weights.astype(np.float32)} | known
 
     @classmethod
-    def from_tensors(cls, tensors: Mapping[str, Array], config: Mapping[str, Any]) -> Self:
+    def from_tensors(cls, tensors: Mapping[str, Float32Array], config: Mapping[str, Any]) -> Self:
         """See RewardModel."""
         least, most = (
             None if limit is None else limit.astype(np.float64)
@@ -244,7 +242,7 @@ class StructuredReward(RewardModel):
         )
         return cls(tensors["weights"].astype(np.float64), least_per_step=least, most_per_step=most)
 
-    def signal_weights(self, reference: Sequence[Recorded] = ()) -> Floats:
+    def signal_weights(self, reference: Sequence[Recorded] = ()) -> FloatArray:
         """(E, S) normalised reward per unit of each signal; exact for this kind."""
         return self.weights / self.normalisation.scale
 
@@ -264,24 +262,24 @@ class MlpReward(RewardModel):
 
     kind: ClassVar[str] = "mlp"
     layers: dense_network.Layers
-    offset: Array
-    scale: Array
+    offset: Float32Array
+    scale: Float32Array
 
-    def raw_rewards(self, signals: Array, observations: Array, actions: Array) -> Floats:
+    def raw_rewards(self, signals: Float32Array, observations: Float32Array, actions: Float32Array) -> FloatArray:
         """See RewardModel; the signals are not used."""
         leading = np.shape(actions)[:-1]
         inputs = np.concatenate([observations, actions], axis=-1).reshape(-1, len(self.offset))
         standard = np.clip((inputs - self.offset) / self.scale, -6.0, 6.0)[None]
-        rewards: Floats = np.tanh(dense_network.run(self.layers, standard))[..., 0].astype(np.float64)
+        rewards: FloatArray = np.tanh(dense_network.run(self.layers, standard))[..., 0].astype(np.float64)
         return rewards.reshape(self.size, *leading)
 
-    def tensors(self) -> dict[str, Array]:
+    def tensors(self) -> dict[str, Float32Array]:
         """See RewardModel."""
         whole = {"offset": self.offset, "scale": self.scale} | dense_network.named(self.layers)
         return {name: np.ascontiguousarray(array, np.float32) for name, array in whole.items()}
 
     @classmethod
-    def from_tensors(cls, tensors: Mapping[str, Array], config: Mapping[str, Any]) -> Self:
+    def from_tensors(cls, tensors: Mapping[str, Float32Array], config: Mapping[str, Any]) -> Self:
         """See RewardModel."""
         return cls(dense_network.of_named(tensors), tensors["offset"], tensors["scale"])
 

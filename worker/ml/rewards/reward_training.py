@@ -19,8 +19,8 @@ from worker.ml.rewards.reward_models import Normalisation, RewardModel, Structur
 from worker.ml.rewards.segments import SegmentPairs
 from worker.ml.rewards.signal_predictor import SignalPredictor
 from worker.trajectory import SIGNALS, Trajectory
+from worker.type_aliases import FloatArray
 
-Floats = npt.NDArray[np.float64]
 RewardKind = Literal["structured", "predicted", "mlp", "preference_transformer"]
 
 MEMBERS = 8
@@ -51,10 +51,10 @@ class FitResult:
 class SignalScale:
     """What the signals are like in the clips of a pool."""
 
-    spread: Floats
+    spread: FloatArray
     """(S,) root mean square of the summed differences of a pair; a column that never differs has 1"""
-    least_per_step: Floats
-    most_per_step: Floats
+    least_per_step: FloatArray
+    most_per_step: FloatArray
     """(S,) the smallest and the largest mean of each signal over the steps of one clip or episode, outliers excepted"""
 
     @classmethod
@@ -71,7 +71,7 @@ class SignalScale:
         return cls(_spread_of(pairs.signal_differences()), least, most)
 
 
-def _usual(means: Floats) -> tuple[Floats, Floats]:
+def _usual(means: FloatArray) -> tuple[FloatArray, FloatArray]:
     low, high = np.quantile(means, [OUTLIER_SHARE, 1.0 - OUTLIER_SHARE], axis=0)
     return low, high
 
@@ -136,12 +136,12 @@ def _wider(measured: SignalScale, foreseen: SegmentPairs) -> SignalScale:
     return replace(measured, spread=np.maximum(measured.spread, differences))
 
 
-def _spread_of(differences: Floats) -> Floats:
+def _spread_of(differences: FloatArray) -> FloatArray:
     spread = np.sqrt((differences**2).mean(axis=0))
     return np.where(spread > _SMALLEST_SPREAD, spread, 1.0)
 
 
-def _checked(pairs: SegmentPairs, targets: npt.ArrayLike) -> Floats:
+def _checked(pairs: SegmentPairs, targets: npt.ArrayLike) -> FloatArray:
     answers = np.asarray(targets, np.float64)
     if answers.shape != (len(pairs),):
         raise ValueError(f"{len(pairs)} pairs need as many targets, got shape {answers.shape}.")
@@ -150,7 +150,7 @@ def _checked(pairs: SegmentPairs, targets: npt.ArrayLike) -> Floats:
     return answers
 
 
-def _accuracy(model: RewardModel, pairs: SegmentPairs, answers: Floats) -> float | None:
+def _accuracy(model: RewardModel, pairs: SegmentPairs, answers: FloatArray) -> float | None:
     decided = answers != 0.5
     if not decided.any():
         return None
@@ -168,7 +168,7 @@ def _normalised_over_segments(model: RewardModel, pairs: SegmentPairs) -> Reward
 
 
 def _fit_structured(
-    pairs: SegmentPairs, answers: Floats, seed: int, scale: SignalScale, prior: Prior, signal_names: Sequence[str]
+    pairs: SegmentPairs, answers: FloatArray, seed: int, scale: SignalScale, prior: Prior, signal_names: Sequence[str]
 ) -> tuple[StructuredReward, dict[str, Any]]:
     features = pairs.signal_differences() / scale.spread
     costs = [column for column, name in enumerate(signal_names) if name in NEVER_WANTED]
@@ -186,7 +186,7 @@ def _fit_structured(
     }
 
 
-def _held_out(features: Floats, answers: Floats, seed: int, prior: Prior, costs: Sequence[int]) -> HeldOut:
+def _held_out(features: FloatArray, answers: FloatArray, seed: int, prior: Prior, costs: Sequence[int]) -> HeldOut:
     """Log odds of every pair under members fitted without its fold."""
     rng = np.random.default_rng(seed)
     fold = rng.permutation(len(answers)) % CALIBRATION_FOLDS
@@ -199,8 +199,8 @@ def _held_out(features: Floats, answers: Floats, seed: int, prior: Prior, costs:
 
 
 def posterior(
-    features: Floats, answers: Floats, prior: Prior | None = None, costs: Sequence[int] = ()
-) -> tuple[Floats, Floats]:
+    features: FloatArray, answers: FloatArray, prior: Prior | None = None, costs: Sequence[int] = ()
+) -> tuple[FloatArray, FloatArray]:
     """Laplace approximation of p(w | labels): its mean (S,) and covariance (S, S). Prior.standard() when missing.
 
     features (N, S) standardised differences right minus left; answers (N,) in {0, 1/2, 1}; ``costs``: columns whose
@@ -216,40 +216,44 @@ def posterior(
         pinned |= wrong
 
 
-def _laplace(features: Floats, answers: Floats, prior: Prior, pinned: Sequence[int]) -> tuple[Floats, Floats]:
+def _laplace(
+    features: FloatArray, answers: FloatArray, prior: Prior, pinned: Sequence[int]
+) -> tuple[FloatArray, FloatArray]:
     """The mode by a trust region, which overshoots neither on separable data nor where somebody may have slipped."""
     precision, mean = np.asarray(np.linalg.inv(prior.covariance), np.float64), prior.mean.copy()
     precision[pinned, pinned] += _PINNED
     mean[pinned] = 0.0
 
-    def loss(weights: Floats) -> tuple[float, Floats]:
+    def loss(weights: FloatArray) -> tuple[float, FloatArray]:
         said = probability_of_answer(probability_right(features @ weights))
         surprise = -(answers * np.log(said) + (1.0 - answers) * np.log(1.0 - said)).sum()
         pull = precision @ (weights - mean)
         gradient = _gradient_and_information(features, answers, weights)[0]
         return float(surprise + 0.5 * pull @ (weights - mean)), gradient + pull
 
-    def curvature(weights: Floats) -> Floats:
+    def curvature(weights: FloatArray) -> FloatArray:
         return _gradient_and_information(features, answers, weights)[1] + precision
 
     found = minimize(loss, mean, jac=True, hess=curvature, method="trust-exact", options={"gtol": LARGEST_GRADIENT})
-    weights: Floats = found.x
+    weights: FloatArray = found.x
     weights[pinned] = 0.0
     return weights, np.asarray(np.linalg.inv(curvature(weights)), np.float64)
 
 
-def _gradient_and_information(features: Floats, answers: Floats, weights: Floats) -> tuple[Floats, Floats]:
+def _gradient_and_information(
+    features: FloatArray, answers: FloatArray, weights: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Of the summed right form of Eq. (2) for people who sometimes answer at random: (S,) and Fisher's (S, S)."""
     preferred = probability_right(features @ weights)
     said, slope = probability_of_answer(preferred), slope_of_answer(preferred)
     variance = said * (1.0 - said)
-    gradient: Floats = features.T @ ((said - answers) * slope / variance)
-    information: Floats = features.T @ (features * (slope**2 / variance)[:, None])
+    gradient: FloatArray = features.T @ ((said - answers) * slope / variance)
+    information: FloatArray = features.T @ (features * (slope**2 / variance)[:, None])
     return gradient, information
 
 
-def _antithetic(mean: Floats, covariance: Floats, rng: np.random.Generator) -> Floats:
+def _antithetic(mean: FloatArray, covariance: FloatArray, rng: np.random.Generator) -> FloatArray:
     """(E, S) posterior samples in mirrored pairs: their mean is the posterior's mean exactly."""
     half = rng.standard_normal((MEMBERS // 2, len(mean))) @ np.linalg.cholesky(covariance).T
-    samples: Floats = mean + np.concatenate([half, -half])
+    samples: FloatArray = mean + np.concatenate([half, -half])
     return samples

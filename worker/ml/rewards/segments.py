@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from worker.trajectory import Recorded
+from worker.type_aliases import Float32Array
 
-Array = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
 LEFT, RIGHT = 0, 1
 
@@ -21,14 +21,14 @@ class Stretch(NamedTuple):
     first_step: int
     step_count: int
 
-    def cut(self, name: str) -> Array:
+    def cut(self, name: str) -> Float32Array:
         """One of the trajectory's arrays, as long as the stretch. Raises ValueError beyond the trajectory's end."""
         stop = self.first_step + self.step_count
         if stop > len(self.trajectory):
             raise ValueError(
                 f"Steps {self.first_step} to {stop} asked for, but a trajectory has only {len(self.trajectory)}."
             )
-        array: Array = getattr(self.trajectory, name)[self.first_step : stop]
+        array: Float32Array = getattr(self.trajectory, name)[self.first_step : stop]
         return array
 
 
@@ -40,11 +40,11 @@ class SegmentPairs:
     Raises ValueError when the arrays disagree about N or T.
     """
 
-    signals: Array
+    signals: Float32Array
     """(N, 2, T, S)"""
-    observations: Array
+    observations: Float32Array
     """(N, 2, T, D) before each step's action"""
-    actions: Array
+    actions: Float32Array
     """(N, 2, T, 7) as executed"""
     mask: Mask | None = None
     """(N, 2, T) True: was shown; None: all steps were"""
@@ -74,7 +74,7 @@ class SegmentPairs:
         counts = np.array([[side.step_count for side in pair] for pair in pairs])
         longest = int(counts.max())
 
-        def stack(name: str) -> Array:
+        def stack(name: str) -> Float32Array:
             return np.stack([[_filled_up(side.cut(name), longest) for side in pair] for pair in pairs])
 
         mask = np.arange(longest) < counts[..., None]
@@ -105,6 +105,6 @@ class SegmentPairs:
         return difference
 
 
-def _filled_up(array: Array, length: int) -> Array:
+def _filled_up(array: Float32Array, length: int) -> Float32Array:
     """(T, F) -> (length, F), zeros at the end."""
     return np.pad(array, ((0, length - len(array)), (0, 0)))

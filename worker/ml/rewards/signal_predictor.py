@@ -12,14 +12,11 @@ from pathlib import Path
 from typing import Self
 
 import numpy as np
-import numpy.typing as npt
 from safetensors.numpy import load, save
 
 from worker.ml import dense_network
 from worker.trajectory import SIGNALS
-
-Array = npt.NDArray[np.float32]
-Floats = npt.NDArray[np.float64]
+from worker.type_aliases import Float32Array, FloatArray
 
 UNSENSED = (
     "force_at_target_n",
@@ -45,15 +42,15 @@ class SignalPredictor:
     """A network on (observation, action); inputs and outputs are standardised over its training's rollouts."""
 
     layers: dense_network.Layers
-    offset: Array
-    scale: Array
+    offset: Float32Array
+    scale: Float32Array
     """(D + 7,)"""
-    mean: Array
-    spread: Array
-    most: Array
+    mean: Float32Array
+    spread: Float32Array
+    most: Float32Array
     """(S,); nothing larger than ``most`` is ever foreseen"""
 
-    def predict(self, observations: Array, actions: Array) -> Floats:
+    def predict(self, observations: Float32Array, actions: Float32Array) -> FloatArray:
         """Expected signals of each step. (..., D), (..., 7) -> (..., S)
 
         The change from the previous action is not known and is therefore what it usually is in this state.
@@ -61,16 +58,16 @@ class SignalPredictor:
         inputs = np.concatenate([observations, actions], axis=-1)
         standard = np.clip((inputs - self.offset) / self.scale, -INPUT_CLIP, INPUT_CLIP).astype(np.float32)
         flat = dense_network.run(self.layers, standard.reshape(-1, standard.shape[-1]))
-        signals: Floats = np.minimum(flat.astype(np.float64) * self.spread + self.mean, self.most)
+        signals: FloatArray = np.minimum(flat.astype(np.float64) * self.spread + self.mean, self.most)
         return signals.reshape(*inputs.shape[:-1], -1)
 
-    def completed(self, signals: Array, observations: Array, actions: Array) -> Floats:
+    def completed(self, signals: Float32Array, observations: Float32Array, actions: Float32Array) -> FloatArray:
         """Measured signals (..., S) with the columns of UNSENSED replaced by what is foreseen."""
         known = np.array(signals, np.float64)
         known[..., _UNSENSED_COLUMNS] = self.predict(observations, actions)[..., _UNSENSED_COLUMNS]
         return known
 
-    def tensors(self) -> dict[str, Array]:
+    def tensors(self) -> dict[str, Float32Array]:
         """Everything learned, by name."""
         whole = {name: getattr(self, name) for name in _STANDARDS}
         return {
@@ -79,7 +76,7 @@ class SignalPredictor:
         }
 
     @classmethod
-    def from_tensors(cls, tensors: Mapping[str, Array]) -> Self:
+    def from_tensors(cls, tensors: Mapping[str, Float32Array]) -> Self:
         """What tensors() gave."""
         return cls(dense_network.of_named(tensors), *(tensors[name] for name in _STANDARDS))
 

@@ -4,7 +4,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import nn
 from torch.nn import functional
@@ -12,8 +11,7 @@ from torch.nn import functional
 from worker.ml import dense_network
 from worker.ml.rewards.signal_predictor import INPUT_CLIP, SignalPredictor
 from worker.trajectory import SIGNALS, Trajectory
-
-Floats = npt.NDArray[np.float64]
+from worker.type_aliases import FloatArray
 
 OUTLIER_SHARE = 0.001
 _SMALLEST_INPUT = 1e-3
@@ -86,9 +84,9 @@ def explained(predictor: SignalPredictor, rollouts: Sequence[Trajectory], steps:
     }
 
 
-def _share(measured: Floats, foreseen: Floats) -> Floats:
+def _share(measured: FloatArray, foreseen: FloatArray) -> FloatArray:
     variance = np.maximum(measured.var(axis=0), _SMALLEST_SPREAD**2)
-    share: Floats = 1.0 - ((measured - foreseen) ** 2).mean(axis=0) / variance
+    share: FloatArray = 1.0 - ((measured - foreseen) ** 2).mean(axis=0) / variance
     return share
 
 

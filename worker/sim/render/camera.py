@@ -11,8 +11,8 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from worker.sim.render.meshes.distance_fields import Array
 from worker.sim.render.task_look import TaskLook
+from worker.type_aliases import FloatArray
 
 Rectangle = tuple[float, float, float, float]
 """left, top, right, bottom in pixels of the whole picture."""
@@ -31,7 +31,7 @@ class Camera:
     far_m: float
 
     @cached_property
-    def view(self) -> Array:
+    def view(self) -> FloatArray:
         """World to camera (4, 4)."""
         eye = np.asarray(self.eye_m)
         back = eye - np.asarray(self.target_m)
@@ -43,7 +43,7 @@ class Camera:
         matrix[:3, 3] = -matrix[:3, :3] @ eye
         return matrix
 
-    def projection(self, rectangle: Rectangle | None = None) -> Array:
+    def projection(self, rectangle: Rectangle | None = None) -> FloatArray:
         """Camera to device coordinates (4, 4), for the whole picture or for an off-centre part of it."""
         left, top, right, bottom = rectangle or (0, 0, self.width, self.height)
         half_height = self.near_m * math.tan(math.radians(self.field_of_view_deg) / 2)
@@ -61,11 +61,13 @@ class Camera:
         )
 
     @cached_property
-    def world_to_device(self) -> Array:
+    def world_to_device(self) -> FloatArray:
         """World to device coordinates of the whole picture (4, 4)."""
         return np.asarray(self.projection() @ self.view)
 
-    def seen_through(self, matrix: Array, rectangle: Rectangle, depth: npt.NDArray[np.floating]) -> list[Array]:
+    def seen_through(
+        self, matrix: FloatArray, rectangle: Rectangle, depth: npt.NDArray[np.floating]
+    ) -> list[FloatArray]:
         """Coordinates after a homogeneous matrix (4, 4) from the world of what is seen in a part of the picture.
 
         ``depth`` (h, w) is that part's device depth in [0, 1]; gives three arrays (h, w).
@@ -82,17 +84,17 @@ class Camera:
         return [row / rows[3] for row in rows[:3]]
 
     @cached_property
-    def device_to_world(self) -> Array:
+    def device_to_world(self) -> FloatArray:
         """Device coordinates of the whole picture to homogeneous world coordinates (4, 4)."""
         return np.asarray(np.linalg.inv(self.world_to_device))
 
-    def pixels(self, points_m: Array) -> Array:
+    def pixels(self, points_m: FloatArray) -> FloatArray:
         """Where world points (..., 3) appear (..., 2)."""
         device = points_m @ self.world_to_device[:, :3].T + self.world_to_device[:, 3]
         device = device[..., :2] / device[..., 3:]
         return np.asarray((device * [1, -1] + 1) / 2 * [self.width, self.height])
 
-    def boxes(self, corners_m: Array) -> Array:
+    def boxes(self, corners_m: FloatArray) -> FloatArray:
         """Boxes (K, 4) in pixels around corners (K, C, 3): the whole picture around what reaches behind the camera,
 
         and nothing around what lies there wholly, or is NaN.
@@ -105,13 +107,13 @@ class Camera:
         boxes[~inside.any(axis=-1)] = 0.0
         return np.asarray(boxes)
 
-    def pixels_per_m(self, point_m: Array) -> float:
+    def pixels_per_m(self, point_m: FloatArray) -> float:
         """How large things appear at a point."""
         distance = -float((self.view @ np.append(point_m, 1.0))[2])
         return self.height / (2 * distance * math.tan(math.radians(self.field_of_view_deg) / 2))
 
 
-def flat(matrix: Array) -> Sequence[float]:
+def flat(matrix: FloatArray) -> Sequence[float]:
     """The 16 numbers of a matrix column by column, as the engine takes them."""
     numbers: list[float] = matrix.T.ravel().tolist()
     return numbers
@@ -129,7 +131,7 @@ CLOSE_UP_DISTANCE_M = 0.9
 """Far enough that nothing between camera and person is cut off, and that a face keeps its proportions."""
 
 
-def close_up_camera(centre_m: Array, towards: Array, span_m: float, width: int, height: int) -> Camera:
+def close_up_camera(centre_m: FloatArray, towards: FloatArray, span_m: float, width: int, height: int) -> Camera:
     """A camera that looks at a point against a direction (unit vector); ``span_m`` is the height of what it shows."""
     x, y, z = (centre_m + CLOSE_UP_DISTANCE_M * towards).tolist()
     field_of_view_deg = 2 * math.degrees(math.atan(span_m / 2 / CLOSE_UP_DISTANCE_M))

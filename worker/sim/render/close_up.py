@@ -8,8 +8,8 @@ from worker.sim.geometry import rotation_of
 from worker.sim.human import RIGHT, arm_points_m
 from worker.sim.render.camera import Camera, close_up_camera
 from worker.sim.render.interpolation import Motion
-from worker.sim.render.meshes.distance_fields import Array
 from worker.sim.render.task_look import TaskLook
+from worker.type_aliases import FloatArray
 
 
 def close_up(look: TaskLook, motion: Motion, width: int, height: int) -> Camera:
@@ -20,7 +20,7 @@ def close_up(look: TaskLook, motion: Motion, width: int, height: int) -> Camera:
     return close_up_camera(target_m + axes @ np.asarray(look.inset_offset_m), towards, look.inset_span_m, width, height)
 
 
-def _skin_axes(motion: Motion) -> Array:
+def _skin_axes(motion: Motion) -> FloatArray:
     """(3, 3) in columns: level and away from the robot, out of the skin at the itch, and up.
 
     All three are the same for every clip of a scenario, so that two clips are seen from the same place.
@@ -32,10 +32,10 @@ def _skin_axes(motion: Motion) -> Array:
     return np.column_stack([_unit(away), _unit(out - (out @ along) * along), [0, 0, 1]])
 
 
-def _distance_m(point_m: Array, start_m: Array, end_m: Array) -> float:
+def _distance_m(point_m: FloatArray, start_m: FloatArray, end_m: FloatArray) -> float:
     share = np.clip((point_m - start_m) @ (end_m - start_m) / ((end_m - start_m) @ (end_m - start_m)), 0.0, 1.0)
     return float(np.linalg.norm(point_m - start_m - share * (end_m - start_m)))
 
 
-def _unit(vector: Array) -> Array:
+def _unit(vector: FloatArray) -> FloatArray:
     return np.asarray(vector / np.linalg.norm(vector))

@@ -15,7 +15,6 @@ from PIL import Image, ImageChops, ImageFilter
 
 from worker.sim.render import skin
 from worker.sim.render.camera import Camera, Rectangle
-from worker.sim.render.meshes.distance_fields import Array
 from worker.sim.render.passes import (
     WATER_LIGHT,
     Colours,
@@ -33,6 +32,7 @@ from worker.sim.render.passes import (
 )
 from worker.sim.render.rectangles import Pixels, cover, on_grid
 from worker.sim.render.stage import Stage
+from worker.type_aliases import FloatArray
 
 STILL_LAMP_SIZE, MOVING_LAMP_SIZE = 640, 176
 
@@ -82,7 +82,7 @@ class View:
         shot.lit[beyond] = shot.shadowed[beyond] = BACKDROP
         return shot
 
-    def start(self, still: Shot, resting: Sequence[Part], itch_m: Array | None, lamp_depth: Depth) -> None:
+    def start(self, still: Shot, resting: Sequence[Part], itch_m: FloatArray | None, lamp_depth: Depth) -> None:
         """Prepare a clip: add what rests during it, cast the still shadows, make the tables for the moving ones."""
         shot = still.copy()
         bright: npt.NDArray[np.bool_] = np.zeros(shot.depth.shape, dtype=np.bool_)
@@ -123,7 +123,7 @@ class View:
         """Supersampled colours as a picture of this view's size."""
         return Image.fromarray(colours).resize((self.width, self.height), Image.Resampling.HAMMING)
 
-    def _add(self, shot: Shot, part: Part, itch_m: Array | None, bright: npt.NDArray[np.bool_]) -> None:
+    def _add(self, shot: Shot, part: Part, itch_m: FloatArray | None, bright: npt.NDArray[np.bool_]) -> None:
         """Draw a part into the still picture, and note in ``bright`` (h, w) where no still shadow falls."""
         boxes = self._camera.boxes(part.corners_m)
         whole = np.concatenate([boxes[:, :2].min(axis=0), boxes[:, 2:].max(axis=0)])

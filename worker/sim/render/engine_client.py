@@ -9,7 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from worker.sim.engine import pybullet
-from worker.sim.geometry import IDENTITY, FloatArray, Vector
+from worker.sim.geometry import IDENTITY, Vector
+from worker.type_aliases import FloatArray
 
 
 class Drawing(NamedTuple):

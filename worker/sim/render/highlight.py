@@ -4,7 +4,8 @@ import numpy as np
 from PIL import Image
 
 from worker.sim.render.camera import Camera
-from worker.sim.render.meshes.distance_fields import Array, smooth_step
+from worker.sim.render.meshes.distance_fields import smooth_step
+from worker.type_aliases import FloatArray
 
 NOTICED_FROM_N, STRONG_FROM_N = 2.0, 15.0
 RADIUS_PX = 34
@@ -19,7 +20,9 @@ class Highlight:
     CALM: Rgb = (255, 255, 255)
     WARM: Rgb = (246, 138, 60)
 
-    def __init__(self, camera: Camera, force_n: Array, tool_m: Array, target_m: Array, scale: float = 1.0) -> None:
+    def __init__(
+        self, camera: Camera, force_n: FloatArray, tool_m: FloatArray, target_m: FloatArray, scale: float = 1.0
+    ) -> None:
         """force_n (N,), where tool and target are in the world (N, 3), and how much larger the ring is drawn."""
         strength = np.clip((force_n - NOTICED_FROM_N) / (STRONG_FROM_N - NOTICED_FROM_N), 0.0, 1.0)
         self._strength = np.where(force_n > NOTICED_FROM_N, 0.25 + 0.75 * np.sqrt(strength), 0.0)

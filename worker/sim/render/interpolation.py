@@ -7,9 +7,10 @@ import numpy as np
 from worker.sim.arm import Robot, Tool, transform
 from worker.sim.geometry import rotation_of
 from worker.sim.human import BODY_SHAPES, FACE_IN_HEAD, BodyShape
-from worker.sim.render.meshes.distance_fields import Array, smooth_step
+from worker.sim.render.meshes.distance_fields import smooth_step
 from worker.spaces import CONTROL_STEP_S
 from worker.trajectory import Trajectory
+from worker.type_aliases import FloatArray
 
 SWALLOWING_S = 0.22
 SWALLOWED_WITHIN_M = 0.06
@@ -24,17 +25,17 @@ class Motion:
 
     body: BodyShape
     skin_tone: int
-    frames: Array
+    frames: FloatArray
     """(N, L, 4, 4) of the robot's links and its tool, in the world"""
-    particles_m: Array
+    particles_m: FloatArray
     """(N, P, 3); NaN when gone"""
-    force_n: Array
+    force_n: FloatArray
     """(N,)"""
-    head_quaternions: Array
+    head_quaternions: FloatArray
     """(N, 4) xyzw"""
-    arms_rad: Array
+    arms_rad: FloatArray
     """(N, 2, 4) right and left arm as in human.py"""
-    target_m: Array
+    target_m: FloatArray
     """(N, 3)"""
 
     def __len__(self) -> int:
@@ -85,21 +86,21 @@ def clip_motion(trajectory: Trajectory, robot: Robot, tool: Tool, first_step: in
     )
 
 
-def _mouth_and_throat(body: BodyShape, heads: Array) -> tuple[Array, Array]:
+def _mouth_and_throat(body: BodyShape, heads: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Where they are at every control step (T + 1, 3)."""
     turns = np.array([rotation_of(quaternion) for quaternion in heads])
     mouth = np.asarray(body.neck_pivot_m) + turns @ np.asarray(body.mouth_from_neck_m)
-    throat: Array = mouth - THROAT_DEPTH_M * turns @ np.asarray(FACE_IN_HEAD)
+    throat: FloatArray = mouth - THROAT_DEPTH_M * turns @ np.asarray(FACE_IN_HEAD)
     return mouth, throat
 
 
-def _same_sign(heads: Array) -> Array:
+def _same_sign(heads: FloatArray) -> FloatArray:
     """A quaternion and its negative are the same turn; neighbours must not differ by their sign."""
     flips = np.where((heads[1:] * heads[:-1]).sum(axis=1) < 0.0, -1.0, 1.0)
     return np.asarray(heads * np.concatenate([[1.0], np.cumprod(flips)])[:, None])
 
 
-def _unit_quaternions(values: Array) -> Array:
+def _unit_quaternions(values: FloatArray) -> FloatArray:
     return np.asarray(values / np.linalg.norm(values, axis=1, keepdims=True))
 
 
@@ -108,7 +109,7 @@ def frame_count(n_steps: int, fps: int) -> int:
     return round(n_steps * CONTROL_STEP_S * fps)
 
 
-def smoothly(values: Array, place: Array) -> Array:
+def smoothly(values: FloatArray, place: FloatArray) -> FloatArray:
     """Values (T, D) at fractional indices place (N,), by Catmull-Rom so that velocity has no kinks."""
     last = len(values) - 1
     index = np.clip(np.floor(place).astype(int), 0, max(last - 1, 0))
@@ -119,7 +120,7 @@ def smoothly(values: Array, place: Array) -> Array:
     )
 
 
-def _particles(positions: Array, place: Array, mouth_m: Array, throat_m: Array) -> Array:
+def _particles(positions: FloatArray, place: FloatArray, mouth_m: FloatArray, throat_m: FloatArray) -> FloatArray:
     """Particles (T + 1, P, 3) at fractional indices (N, P, 3), in straight lines between control steps.
 
     The simulation takes food and water away as soon as they are close to the mouth; here they go on into it.
@@ -127,7 +128,7 @@ def _particles(positions: Array, place: Array, mouth_m: Array, throat_m: Array) 
     last = len(positions) - 1
     index = np.clip(np.floor(place).astype(int), 0, max(last - 1, 0))
     share = np.clip(place - index, 0.0, 1.0)[:, None, None]
-    drawn: Array = positions[index] + share * (positions[np.minimum(index + 1, last)] - positions[index])
+    drawn: FloatArray = positions[index] + share * (positions[np.minimum(index + 1, last)] - positions[index])
     for particle in range(positions.shape[1]):
         seen = np.flatnonzero(~np.isnan(positions[:, particle, 0]))
         if not len(seen) or seen[-1] == last:
@@ -141,7 +142,7 @@ def _particles(positions: Array, place: Array, mouth_m: Array, throat_m: Array) 
     return drawn
 
 
-def quaternions(rotations: Array) -> Array:
+def quaternions(rotations: FloatArray) -> FloatArray:
     """Rotation matrices (..., 3, 3) as xyzw quaternions (..., 4)."""
     m = rotations
     diagonal = np.stack([m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]], axis=-1)

@@ -10,11 +10,11 @@ from worker.sim.human import LEFT, RIGHT
 from worker.sim.render.camera import lamp
 from worker.sim.render.compositing import MOVING_LAMP_SIZE, STILL_LAMP_SIZE
 from worker.sim.render.interpolation import Motion, quaternions
-from worker.sim.render.meshes.distance_fields import Array
 from worker.sim.render.passes import BODY_LIGHT, DEPTH_ONLY, Depth, Part
 from worker.sim.render.scene import UPPER_LINKS, Kit, Sitter
 from worker.sim.render.stage import CUBE, Stage
 from worker.sim.render.task_look import TaskLook
+from worker.type_aliases import FloatArray
 
 HOLD_RAD = 0.0025
 """An arm that has turned by less than this since it was last drawn stays as it is: half a pixel."""
@@ -37,7 +37,7 @@ class Person:
         """Hides everything else on the still stage and poses the first frame."""
         self._shoot, self._stage, sitter, motion = shoot, stage, shoot.sitter, shoot.motion
         self._moving = [side for side in (RIGHT, LEFT) if motion.arm_moves(side)]
-        self._held: Array | None = None
+        self._held: FloatArray | None = None
         self._pose = 0
         stage.hide_all_but(())
         self._arms = [sitter.pose_arm(stage, side, motion.arms_rad[0, side]) for side in (RIGHT, LEFT)]
@@ -51,7 +51,7 @@ class Person:
         """What rests during the clip. Everything else is out of sight from now on."""
         shoot, sitter = self._shoot, self._shoot.sitter
         shown: list[str] = []
-        corners_m: list[Array] = []
+        corners_m: list[FloatArray] = []
         for side in (RIGHT, LEFT):
             if side not in self._moving:
                 shown += sitter.arm_names(side)
@@ -109,7 +109,7 @@ def moving_parts(shoot: Shoot) -> Iterator[list[Part]]:
             yield [upper, Part(kit.forearm, np.concatenate([near_m, particles_m]))]
 
 
-def _around(centres_m: Array, radius_m: float) -> Array:
+def _around(centres_m: FloatArray, radius_m: float) -> FloatArray:
     """Corners (P, 8, 3) of boxes around balls (P, 3), with room for water's blur."""
     return np.asarray(centres_m[:, None] + 1.5 * radius_m * CUBE)
 

@@ -8,8 +8,8 @@ import numpy.typing as npt
 from PIL import Image
 
 from worker.sim.render.camera import Camera, Rectangle, lamp
-from worker.sim.render.meshes.distance_fields import Array
 from worker.sim.render.stage import Lighting, Stage
+from worker.type_aliases import FloatArray
 
 Colours = npt.NDArray[np.uint8]
 Depth = npt.NDArray[np.float32]
@@ -51,7 +51,7 @@ class Part(NamedTuple):
     """A stage with the corners (K, 8, 3) of boxes in the world around what it shows, and how it is drawn."""
 
     stage: Stage
-    corners_m: Array
+    corners_m: FloatArray
     """NaN around what is gone"""
     light: Lighting = MACHINE_LIGHT
     prepare: Callable[[], None] | None = None
@@ -63,7 +63,7 @@ class Part(NamedTuple):
     drops_m: float = 0.0
     """water: the radius of the balls that are drawn as one body"""
     glass: bool = False
-    head_m: Array | None = None
+    head_m: FloatArray | None = None
     """where the person's head is: it receives no still shadow, for that of brows and hair would only look dirty"""
 
 
@@ -72,7 +72,7 @@ class Frame(NamedTuple):
 
     parts: Sequence[Part]
     lamp_depth: Depth
-    itch_m: Array | None
+    itch_m: FloatArray | None
 
 
 class Supersampling(NamedTuple):
@@ -103,7 +103,7 @@ def seen_from_lamp(
     return texel.ravel(), limit.ravel()
 
 
-def distance_m(camera: Camera, rectangle: Rectangle, depth: Depth, point_m: Array) -> Depth:
+def distance_m(camera: Camera, rectangle: Rectangle, depth: Depth, point_m: FloatArray) -> Depth:
     """How far from a point what each pixel (h, w) of a part of the picture shows is."""
     places = camera.seen_through(np.eye(4), rectangle, depth)
     squared = sum((place - np.float32(middle)) ** 2 for place, middle in zip(places, point_m, strict=True))

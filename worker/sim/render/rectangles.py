@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from worker.sim.render.meshes.distance_fields import Array
+from worker.type_aliases import FloatArray
 
 Pixels = tuple[int, int, int, int]
 """left, top, right, bottom"""
@@ -17,14 +17,14 @@ GRID_PX = 4
 """Rectangles start and end on this grid, so that they also fall on whole pixels of a 1.25 or 1.5 times finer one."""
 
 
-def on_grid(box: Array, width: int, height: int) -> Pixels:
+def on_grid(box: FloatArray, width: int, height: int) -> Pixels:
     """The smallest rectangle on the grid around a box (4,), cut to the picture (whose sides are on the grid)."""
     left, top = (np.floor(box[:2] / GRID_PX) * GRID_PX).clip(0, [width, height]).astype(int).tolist()
     right, bottom = (np.ceil(box[2:] / GRID_PX) * GRID_PX).clip(0, [width, height]).astype(int).tolist()
     return left, top, right, bottom
 
 
-def cover(boxes: Array, width: int, height: int) -> list[Pixels]:
+def cover(boxes: FloatArray, width: int, height: int) -> list[Pixels]:
     """At most two rectangles that hold every box (K, 4), split by one straight cut where that saves pixels."""
     boxes = np.clip(boxes, 0, [width, height, width, height])
     boxes = boxes[(boxes[:, 2] > boxes[:, 0] + 0.5) & (boxes[:, 3] > boxes[:, 1] + 0.5)]
@@ -42,7 +42,7 @@ def cover(boxes: Array, width: int, height: int) -> list[Pixels]:
     return [pixels for pixels in found if pixels[2] > pixels[0] and pixels[3] > pixels[1]]
 
 
-def _best_cut(boxes: Array, axis: int) -> tuple[float, list[Array]]:
+def _best_cut(boxes: FloatArray, axis: int) -> tuple[float, list[FloatArray]]:
     """The cut across one axis with the fewest pixels: their number, and the rectangles on both sides."""
     low, high = boxes[:, axis], boxes[:, axis + 2]
     side_low, side_high = boxes[:, 1 - axis], boxes[:, 3 - axis]

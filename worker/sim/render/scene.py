@@ -13,12 +13,13 @@ from worker.sim.human import BodyShape
 from worker.sim.render.interpolation import quaternions
 from worker.sim.render.meshes import arm_mesh, body_mesh, chair_mesh, head_mesh, limb_mesh, room_mesh
 from worker.sim.render.meshes.arm_mesh import Grip
-from worker.sim.render.meshes.distance_fields import Array, union
+from worker.sim.render.meshes.distance_fields import union
 from worker.sim.render.meshes.head_mesh import Mouth
 from worker.sim.render.meshes.mesh import Mesh, ball
 from worker.sim.render.meshes.tool_mesh import plain_look
 from worker.sim.render.stage import Paints, Stage, corners_around
 from worker.sim.render.task_look import TaskLook
+from worker.type_aliases import FloatArray
 
 UPPER_LINKS = 3
 """So many of the robot's links are drawn apart from the rest, which is nearer to the person and smaller."""
@@ -61,7 +62,7 @@ class Sitter:
             self._stages.still.place(name)
         self._skin_tone = skin_tone
 
-    def turn_head(self, stage: Stage, quaternion: Sequence[float] | Array) -> Array:
+    def turn_head(self, stage: Stage, quaternion: Sequence[float] | FloatArray) -> FloatArray:
         """Turn it, and give the corners (1, 8, 3) in the world of a box that holds head and neck."""
         head, neck = self.head_names
         stage.place(head, self.body.neck_pivot_m, quaternion)
@@ -69,7 +70,7 @@ class Sitter:
         turned = stage.corners_m(head) @ rotation_of(quaternion).T + np.array(self.body.neck_pivot_m)
         return corners_around(np.concatenate([turned, stage.corners_m(neck)]))[None]
 
-    def pose_arm(self, stage: Stage, side: int, arm_rad: Array) -> Array:
+    def pose_arm(self, stage: Stage, side: int, arm_rad: FloatArray) -> FloatArray:
         """Pose the right or left arm, and give the corners (2, 8, 3) in the world of boxes around its two segments."""
         boxes = []
         for name, origin, turn in zip(
@@ -123,7 +124,7 @@ class Kit:
         """of the particles as drawn"""
 
     @cached_property
-    def corners_m(self) -> Array:
+    def corners_m(self) -> FloatArray:
         """(L, 8, 3) corners of the moving parts' boxes in their own frames."""
         return np.array([(self.upper if name in self.upper else self.forearm).corners_m(name) for name in self.names])
 
@@ -161,7 +162,7 @@ class Kit:
         if self.glass:
             self.particles.place(self.glass, position_m, quaternion)
 
-    def place_particles(self, positions_m: Array) -> None:
+    def place_particles(self, positions_m: FloatArray) -> None:
         """Put the particles at positions (P, 3), out of sight where NaN."""
         for name, place in zip(self._particles, positions_m.tolist(), strict=True):
             if any(map(math.isnan, place)):

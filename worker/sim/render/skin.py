@@ -6,8 +6,8 @@ import numpy as np
 from PIL import Image, ImageFilter
 
 from worker.sim.render.camera import Camera, Rectangle
-from worker.sim.render.meshes.distance_fields import Array
 from worker.sim.render.passes import Colours, Depth, as_bytes, distance_m
+from worker.type_aliases import FloatArray
 
 IN_SHADOW = 0.75
 """Brightness in full shadow, relative to that in the light."""
@@ -34,7 +34,7 @@ def shade(rgb: Colours, mask: Image.Image, blur_px: float) -> None:
     around -= (around * share // np.uint16(255 / (1.0 - IN_SHADOW))).astype(np.uint8)
 
 
-def mark_itch(rgb: Colours, depth: Depth, camera: Camera, rectangle: Rectangle, itch_m: Array) -> None:
+def mark_itch(rgb: Colours, depth: Depth, camera: Camera, rectangle: Rectangle, itch_m: FloatArray) -> None:
     """Redden the skin around a point in a drawn part of the picture: colours (h, w, 3) and depth (h, w)."""
     height, width = depth.shape
     left, top = rectangle[:2]

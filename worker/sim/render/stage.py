@@ -13,9 +13,9 @@ from worker.sim.geometry import IDENTITY
 from worker.sim.render.camera import Camera, Rectangle, flat
 from worker.sim.render.engine_client import DrawingClient
 from worker.sim.render.meshes.colours import Palette
-from worker.sim.render.meshes.distance_fields import Array
 from worker.sim.render.meshes.mesh import Mesh
 from worker.trajectory import SKIN_TONES
+from worker.type_aliases import FloatArray
 
 GONE_M = (0.0, 0.0, -1000.0)
 """Where food that was eaten or lost is kept, out of sight."""
@@ -63,7 +63,7 @@ class Stage:
         self._client = DrawingClient(paints.textures if with_skin else paints.textures[:1])
         self._palette = paints.palette
         self._shown: set[str] = set()
-        self._corners_m: dict[str, Array] = {}
+        self._corners_m: dict[str, FloatArray] = {}
 
     def add(self, meshes: Mapping[str, Mesh]) -> None:
         """Add meshes that are not there yet, out of sight until they are placed."""
@@ -77,7 +77,7 @@ class Stage:
     def __contains__(self, name: str) -> bool:
         return name in self._corners_m
 
-    def corners_m(self, name: str) -> Array:
+    def corners_m(self, name: str) -> FloatArray:
         """(8, 3) of a mesh's bounding box in its own frame."""
         return self._corners_m[name]
 
@@ -90,7 +90,10 @@ class Stage:
         self._client.repaint(skin_tone)
 
     def place(
-        self, name: str, position_m: Sequence[float] | Array = (0, 0, 0), quaternion: Sequence[float] | Array = IDENTITY
+        self,
+        name: str,
+        position_m: Sequence[float] | FloatArray = (0, 0, 0),
+        quaternion: Sequence[float] | FloatArray = IDENTITY,
     ) -> None:
         """Put a mesh somewhere in sight."""
         self._client.place(name, position_m, quaternion)
@@ -122,6 +125,6 @@ CUBE = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
 """(8, 3) corners of a box from -1 to 1"""
 
 
-def corners_around(points_m: Array) -> Array:
+def corners_around(points_m: FloatArray) -> FloatArray:
     """(8, 3) corners of the box around points (N, 3)."""
     return np.asarray(np.where(CUBE == 1, points_m.max(axis=0), points_m.min(axis=0)))

@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 
 from worker.sim.render.meshes.arm_mesh import Detail, Grip
-from worker.sim.render.meshes.distance_fields import Array, smooth_step
+from worker.sim.render.meshes.distance_fields import smooth_step
 from worker.sim.render.meshes.mesh import Mesh, joined, tube
 from worker.tasks.drinking.environment import CUP_BASE_RADIUS_M, CUP_HEIGHT_M, CUP_RIM_RADIUS_M, HELD_BEFORE_HAND_M
+from worker.type_aliases import FloatArray
 
 CUP_OUTSIDE_M = 0.0040
 """Thickness of the drawn glass."""
@@ -16,7 +17,7 @@ CUP_CENTRE_M = (-CUP_RIM_RADIUS_M, 0.0, 0.0)
 """The middle of the rim: the tool's origin is the point of the rim that is drunk from."""
 
 
-def _wall(detail: Detail, heights: Array, radii: Array, colours: Array, inwards: bool = False) -> Mesh:
+def _wall(detail: Detail, heights: FloatArray, radii: FloatArray, colours: FloatArray, inwards: bool = False) -> Mesh:
     """A wall turned about z that is seen from one side only (R rings; colours (R - 1,))."""
     path = heights[:, None] * np.array([0.0, 0.0, 1.0])
     mesh = tube(path, radii, 2 * detail.sides - 8, colours, closed_ends=False)
@@ -40,7 +41,7 @@ def _cut_out(mesh: Mesh) -> Mesh:
     return replace(mesh, vertices=np.column_stack([x * narrowed, y * narrowed, lowered]))
 
 
-def _cup_radius_m(height_m: Array) -> Array:
+def _cup_radius_m(height_m: FloatArray) -> FloatArray:
     """Of the wall at heights (N,) from -CUP_HEIGHT_M at the bottom to 0 at the rim."""
     return np.asarray(CUP_RIM_RADIUS_M + (CUP_RIM_RADIUS_M - CUP_BASE_RADIUS_M) * height_m / CUP_HEIGHT_M)
 

@@ -6,16 +6,13 @@ It looks at nothing but the observation and remembers nothing, so that a policy 
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from worker.sim.arm import Robot, Tool, tool_jacobian
 from worker.sim.assistive import ACTION_UNIT_RAD
 from worker.sim.jaco import JACO
 from worker.spaces import Space
 from worker.tasks.drinking.environment import CUP, DRINKING
-
-Array = npt.NDArray[np.float32]
-FloatArray = npt.NDArray[np.float64]
+from worker.type_aliases import Float32Array, FloatArray
 
 UP = np.array([0.0, 0.0, 1.0])
 DAMPING = 0.05
@@ -44,7 +41,7 @@ class ScriptedPouring:
     follow: float = 0.4
     """share of the head's turn that the cup follows"""
 
-    def __call__(self, observation: Array) -> Array:
+    def __call__(self, observation: Float32Array) -> Float32Array:
         """See the class."""
         joints = self._field(observation, "joint_positions_rad")
         frames = self.robot.link_frames(joints[None], self.tool)
@@ -78,13 +75,13 @@ class ScriptedPouring:
         limited: FloatArray = np.clip(error, -0.06, 0.06)
         return limited
 
-    def _joint_action(self, frames: FloatArray, joints: FloatArray, twist: FloatArray) -> Array:
+    def _joint_action(self, frames: FloatArray, joints: FloatArray, twist: FloatArray) -> Float32Array:
         jacobian = tool_jacobian(frames)[0]
         change = jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + DAMPING**2 * np.eye(6), twist)
         action = change / self.action_unit_rad
         return np.asarray(action / max(1.0, float(np.abs(action).max()) / self.largest_action), np.float32)
 
-    def _field(self, observation: Array, name: str) -> FloatArray:
+    def _field(self, observation: Float32Array, name: str) -> FloatArray:
         return np.asarray(observation[self.observation.slice_of(name)], np.float64)
 
 

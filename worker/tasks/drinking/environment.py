@@ -10,15 +10,7 @@ import numpy as np
 
 from worker.modes import ApproachModes, Axis
 from worker.sim.arm import Start, Tool, start_postures
-from worker.sim.assistive import (
-    ARM,
-    MOTOR_FORCE_NM,
-    POSITION_GAIN,
-    AssistiveEnv,
-    FloatArray,
-    Motion,
-    Reward,
-)
+from worker.sim.assistive import ARM, MOTOR_FORCE_NM, POSITION_GAIN, AssistiveEnv, Motion, Reward
 from worker.sim.bullet import Bullet
 from worker.sim.geometry import IDENTITY, Vector, rotation_of
 from worker.sim.human import Impairment
@@ -28,6 +20,7 @@ from worker.spaces import SHARED_FIELDS, Field, Space
 from worker.task import Task
 from worker.tasks.drinking.water import CUP_LAYER, IMMOVABLE_LAYER, WATER_LAYER, Cup, Water, heap
 from worker.trajectory import BODIES
+from worker.type_aliases import FloatArray
 
 OBSERVATION = Space(
     (

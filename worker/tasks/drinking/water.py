@@ -11,8 +11,7 @@ import numpy.typing as npt
 from worker.sim.bullet import Bullet
 from worker.sim.geometry import Shape, quaternion_of_euler
 from worker.sim.measures import Outcome
-
-FloatArray = npt.NDArray[np.float64]
+from worker.type_aliases import FloatArray
 
 PELLET_MASS_KG = 0.001
 DRUNK_WITHIN_M = 0.03

@@ -7,7 +7,7 @@ import numpy as np
 
 from worker.modes import ApproachModes, Axis
 from worker.sim.arm import Start, Tool, start_postures
-from worker.sim.assistive import ARM, AssistiveEnv, FloatArray, Motion, Reward
+from worker.sim.assistive import ARM, AssistiveEnv, Motion, Reward
 from worker.sim.bullet import Bullet
 from worker.sim.geometry import Shape, rotation_of
 from worker.sim.jaco import JACO, PI
@@ -15,6 +15,7 @@ from worker.sim.measures import Outcome, TaskReward
 from worker.spaces import SHARED_FIELDS, Field, Space
 from worker.task import Task
 from worker.tasks.feeding.food import BALL_RADIUS_M, BALLS, PORTION_NEEDED, Portion
+from worker.type_aliases import FloatArray
 
 OBSERVATION = Space(
     (

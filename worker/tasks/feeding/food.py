@@ -1,12 +1,10 @@
 """The portion of food: eight balls on a spoon, each on it, eaten, fallen, or resting on the person."""
 
 import numpy as np
-import numpy.typing as npt
 
 from worker.sim.bullet import Bullet
 from worker.sim.measures import Outcome
-
-FloatArray = npt.NDArray[np.float64]
+from worker.type_aliases import FloatArray
 
 BALLS = 8
 BALL_RADIUS_M, BALL_MASS_KG = 0.006, 0.001

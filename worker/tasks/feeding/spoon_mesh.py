@@ -3,8 +3,8 @@
 import numpy as np
 
 from worker.sim.render.meshes.arm_mesh import Detail
-from worker.sim.render.meshes.distance_fields import Array
 from worker.sim.render.meshes.mesh import Mesh, curve, joined, tube
+from worker.type_aliases import FloatArray
 
 
 def spoon(detail: Detail) -> Mesh:
@@ -58,7 +58,7 @@ def _bowl(detail: Detail) -> Mesh:
     return joined(inside, outside, edge)
 
 
-def _sheet(grid: Array, colour: float, upwards: bool) -> Mesh:
+def _sheet(grid: FloatArray, colour: float, upwards: bool) -> Mesh:
     """A surface from rings (R, S, 3) around a centre, seen from above or from below."""
     around = np.roll(grid, -1, axis=1) - np.roll(grid, 1, axis=1)
     outwards = np.gradient(grid, axis=0)

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from worker.modes import ApproachModes, Axis
 from worker.sim import human
@@ -22,8 +21,7 @@ from worker.spaces import SHARED_FIELDS, Field, Space
 from worker.task import Task
 from worker.tasks.scratching.yielding_arm import FOREARM, UPPER_ARM, YieldingArm, add_placeholder
 from worker.trajectory import BODIES
-
-FloatArray = npt.NDArray[np.float64]
+from worker.type_aliases import FloatArray
 
 OBSERVATION = Space(
     (

@@ -9,8 +9,8 @@ import numpy as np
 
 from worker.sim.arm import Joint, Robot, rotation
 from worker.sim.render.meshes.colours import Palette
-from worker.sim.render.meshes.distance_fields import Array
 from worker.sim.render.meshes.mesh import Mesh, joined, tube
+from worker.type_aliases import FloatArray
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,9 @@ def base_mesh(detail: Detail, robot: Robot) -> Mesh:
     return _turned_profile(detail, heights, radii, names).moved(rotation(robot.mount_rpy), robot.mount_m)
 
 
-def _limb(detail: Detail, start: Array, end: Array, start_radius: float, end_radius: float, ring: bool = True) -> Mesh:
+def _limb(
+    detail: Detail, start: FloatArray, end: FloatArray, start_radius: float, end_radius: float, ring: bool = True
+) -> Mesh:
     """A link along a line; a light ring marks the start of links that roll about their own length."""
     length = float(np.linalg.norm(end - start))
     ahead = (end - start) / length
@@ -175,7 +177,9 @@ def _fingers(detail: Detail, pinch_m: float, grip: Grip) -> list[Mesh]:
     return meshes
 
 
-def _segment(detail: Detail, start: Array, end: Array, start_radius: float, end_radius: float, name: str) -> Mesh:
+def _segment(
+    detail: Detail, start: FloatArray, end: FloatArray, start_radius: float, end_radius: float, name: str
+) -> Mesh:
     length = float(np.linalg.norm(end - start))
     ahead = (end - start) / length
     stops = [(-start_radius * np.sin(a), start_radius * np.cos(a)) for a in np.radians([80, 45])]
@@ -187,7 +191,7 @@ def _segment(detail: Detail, start: Array, end: Array, start_radius: float, end_
     )
 
 
-def _knuckle(detail: Detail, centre: Array) -> Mesh:
+def _knuckle(detail: Detail, centre: FloatArray) -> Mesh:
     """A light disc across the finger joint."""
     half, radius = 0.0118, 0.0075
     path = centre + np.array([-half, -half + 0.001, half - 0.001, half])[:, None] * np.array([1.0, 0.0, 0.0])

@@ -7,10 +7,10 @@ polynomial smooth minimum of Quilez; a blend of width k rounds the seam over abo
 from collections.abc import Callable, Sequence
 
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
-Field = Callable[[Array], Array]
+from worker.type_aliases import FloatArray
+
+Field = Callable[[FloatArray], FloatArray]
 Point = Sequence[float]
 
 
@@ -19,11 +19,11 @@ def sphere(centre: Point, radius: float) -> Field:
     return lambda points: _length(points - middle) - radius
 
 
-def ellipsoid(centre: Point, radii: Point, turn: Array | None = None) -> Field:
+def ellipsoid(centre: Point, radii: Point, turn: FloatArray | None = None) -> Field:
     """An ellipsoid; distances are first-order estimates, exact on the surface. `turn` (3, 3) holds its axes."""
     middle, size = np.asarray(centre, dtype=float), np.asarray(radii, dtype=float)
 
-    def distance(points: Array) -> Array:
+    def distance(points: FloatArray) -> FloatArray:
         local = points - middle
         if turn is not None:
             local = local @ turn
@@ -40,7 +40,7 @@ def cone(start: Point, end: Point, start_radius: float, end_radius: float | None
     change = (start_radius if end_radius is None else end_radius) - start_radius
     along = last - first
 
-    def distance(points: Array) -> Array:
+    def distance(points: FloatArray) -> FloatArray:
         offset = points - first
         share = np.clip(offset @ along / (along @ along), 0.0, 1.0)
         return np.asarray(_length(offset - share[:, None] * along) - (start_radius + change * share))
@@ -54,11 +54,11 @@ def chain(points: Sequence[Point], radii: Sequence[float]) -> Field:
     return union(*pieces)
 
 
-def box(centre: Point, half_extents: Point, rounding: float = 0.0, turn: Array | None = None) -> Field:
+def box(centre: Point, half_extents: Point, rounding: float = 0.0, turn: FloatArray | None = None) -> Field:
     """A box with rounded edges; the half extents include the rounding."""
     middle, half = np.asarray(centre, dtype=float), np.asarray(half_extents, dtype=float) - rounding
 
-    def distance(points: Array) -> Array:
+    def distance(points: FloatArray) -> FloatArray:
         local = points - middle
         if turn is not None:
             local = local @ turn
@@ -76,7 +76,7 @@ def cylinder(start: Point, end: Point, radius: float, rounding: float = 0.0) -> 
     axis = (last - first) / height
     middle = (first + last) / 2
 
-    def distance(points: Array) -> Array:
+    def distance(points: FloatArray) -> FloatArray:
         offset = points - middle
         along = offset @ axis
         across = _length(offset - along[:, None] * axis)
@@ -86,12 +86,12 @@ def cylinder(start: Point, end: Point, radius: float, rounding: float = 0.0) -> 
     return distance
 
 
-def torus(centre: Point, radii: Point, thickness: float, turn: Array | None = None) -> Field:
+def torus(centre: Point, radii: Point, thickness: float, turn: FloatArray | None = None) -> Field:
     """An elliptical ring in the local x-z plane; `radii` are its half width and half height."""
     middle = np.asarray(centre, dtype=float)
     half_width, half_height = radii
 
-    def distance(points: Array) -> Array:
+    def distance(points: FloatArray) -> FloatArray:
         local = points - middle
         if turn is not None:
             local = local @ turn
@@ -114,7 +114,7 @@ def half_space(origin: Point, outward: Point) -> Field:
 def union(*fields: Field, blend: float = 0.0) -> Field:
     """The sum of solids, with their seams rounded over `blend` metres."""
 
-    def distance(points: Array) -> Array:
+    def distance(points: FloatArray) -> FloatArray:
         result = fields[0](points)
         for field in fields[1:]:
             result = smooth_minimum(result, field(points), blend)
@@ -138,7 +138,7 @@ def mirrored(field: Field) -> Field:
     return lambda points: field(np.column_stack([np.abs(points[:, 0]), points[:, 1], points[:, 2]]))
 
 
-def smooth_minimum(first: Array, second: Array, blend: float) -> Array:
+def smooth_minimum(first: FloatArray, second: FloatArray, blend: float) -> FloatArray:
     """The smaller of two distances, rounded where they differ by less than `blend` (N,)."""
     if blend <= 0.0:
         return np.minimum(first, second)
@@ -146,11 +146,11 @@ def smooth_minimum(first: Array, second: Array, blend: float) -> Array:
     return np.asarray(np.minimum(first, second) - overlap * overlap * blend / 4.0)
 
 
-def smooth_step(values: Array, start: float, end: float) -> Array:
+def smooth_step(values: FloatArray, start: float, end: float) -> FloatArray:
     """0 before `start`, 1 after `end`, and an S-curve between (N,)."""
     share = np.clip((values - start) / (end - start), 0.0, 1.0)
     return np.asarray(share * share * (3.0 - 2.0 * share))
 
 
-def _length(vectors: Array) -> Array:
+def _length(vectors: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(np.einsum("ij,ij->i", vectors, vectors)))

@@ -3,7 +3,6 @@
 import numpy as np
 
 from worker.sim.render.meshes.distance_fields import (
-    Array,
     Field,
     carve,
     chain,
@@ -16,6 +15,7 @@ from worker.sim.render.meshes.distance_fields import (
     union,
 )
 from worker.sim.render.meshes.mesh import turned
+from worker.type_aliases import FloatArray
 
 
 def short_hair() -> Field:
@@ -45,13 +45,13 @@ def short_hair() -> Field:
 def _combed(field: Field) -> Field:
     """Shallow grooves along the strands."""
 
-    def distance(points: Array) -> Array:
+    def distance(points: FloatArray) -> FloatArray:
         return np.asarray(field(points) + 0.0009 * strands(points))
 
     return distance
 
 
-def strands(points: Array) -> Array:
+def strands(points: FloatArray) -> FloatArray:
     """A smooth wave in [-1, 1] (N,) that is constant along hairs: across the head in front, downwards behind."""
     crown = np.array([0.030, 0.035, 0.235])
     way = points - crown

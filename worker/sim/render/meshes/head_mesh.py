@@ -10,7 +10,6 @@ import numpy as np
 from worker.sim.human import BROAD, BodyShape
 from worker.sim.render.meshes.colours import Palette
 from worker.sim.render.meshes.distance_fields import (
-    Array,
     Field,
     carve,
     chain,
@@ -36,6 +35,7 @@ from worker.sim.render.meshes.mesh import (
     turned,
     without_hidden,
 )
+from worker.type_aliases import FloatArray
 
 MOUTH = np.asarray(BROAD.mouth_from_neck_m)
 LIPS = MOUTH + np.array([0.0, -0.0005, 0.0])
@@ -122,7 +122,7 @@ def _lips(mouth: Mouth) -> Field:
     """The upper lip dips in the middle and is thinner than the lower one."""
     ring = torus((LIPS[0], LIPS[1], LIPS[2]), (mouth.half_width_m, mouth.half_height_m), 0.0)
 
-    def distance(points: Array) -> Array:
+    def distance(points: FloatArray) -> FloatArray:
         height = points[:, 2] - LIPS[2]
         dip = np.exp(-((points[:, 0] / 0.0045) ** 2)) * smooth_step(height, 0.0, 0.012)
         thickness = 0.0074 - 0.0012 * smooth_step(height, -0.008, 0.008) - 0.0012 * dip
@@ -135,7 +135,7 @@ def _lips(mouth: Mouth) -> Field:
 def _smiling(field: Field) -> Field:
     """The same with the corners of the mouth lifted and drawn back around the face."""
 
-    def distance(points: Array) -> Array:
+    def distance(points: FloatArray) -> FloatArray:
         bend = points[:, 0] ** 2
         return field(points - np.column_stack([0 * bend, 4.5 * bend, 9.0 * bend]))
 
@@ -178,7 +178,7 @@ def head_mesh(body: BodyShape, mouth: Mouth, palette: Palette) -> Mesh:
     return joined(*parts).scaled(body.head_scale)
 
 
-def _complexion(points: Array, mouth: Mouth) -> Array:
+def _complexion(points: FloatArray, mouth: Mouth) -> FloatArray:
     """Where each point of the skin lies on the ramp from skin over blush and lips to the inside of the mouth (N,)."""
     lips = 0.66 * (1.0 - smooth_step(_lips(mouth)(points), 0.0012, 0.0032))
     depth = points[:, 1] - LIPS[1] - 4.5 * points[:, 0] ** 2
@@ -190,12 +190,12 @@ def _complexion(points: Array, mouth: Mouth) -> Array:
     return np.asarray(np.maximum(np.maximum(blush, lips), inside))
 
 
-def _spot(points: Array, centre: tuple[float, float, float], radius: float) -> Array:
+def _spot(points: FloatArray, centre: tuple[float, float, float], radius: float) -> FloatArray:
     """A soft round spot (N,)."""
     return np.asarray(np.exp(-(((points - np.array(centre)) ** 2).sum(axis=1)) / radius**2))
 
 
-def _cavity_light(points: Array, mouth: Mouth) -> Array:
+def _cavity_light(points: FloatArray, mouth: Mouth) -> FloatArray:
     """The mouth gets dark with depth (N,)."""
     depth = smooth_step(points[:, 1], LIPS[1] - 0.001, LIPS[1] + 0.022)
     return np.where(mouth_cavity(mouth)(points) < 0.004, 1.0 - 0.8 * depth, 1.0)
@@ -230,7 +230,7 @@ def _eyes(palette: Palette, lashes: float) -> list[Mesh]:
     return meshes
 
 
-def _eyeball(palette: Palette, centre: Array, gaze: Array) -> Mesh:
+def _eyeball(palette: Palette, centre: FloatArray, gaze: FloatArray) -> Mesh:
     angles = np.radians([178, 120, 80, 60, 45, 34, 32, 25, 20, 14.5, 13.5, 8, 2])
     names = ["eye"] * 6 + ["iris"] * 4 + ["pupil"] * 2
     shares = [0.0] * 6 + [1.0, 0.6, 0.3, 0.1] + [0.0] * 2
@@ -247,7 +247,7 @@ UPPER_LID = (np.array([0.0, 0.34, -1.0]), 0.0046)
 """Outward normal of the plane that ends the lid, and how far above the middle of the eye's front it lies."""
 
 
-def _lid(palette: Palette, centre: Array, lashes: float) -> list[Mesh]:
+def _lid(palette: Palette, centre: FloatArray, lashes: float) -> list[Mesh]:
     """The upper lid as a cap of a slightly larger ball, and the line of the lashes along its edge."""
     direction, height = UPPER_LID
     normal, radius = _unit(direction), EYE_RADIUS + 0.0015
@@ -259,7 +259,9 @@ def _lid(palette: Palette, centre: Array, lashes: float) -> list[Mesh]:
     return [cap, _lashes(palette, centre, normal, float((front - centre) @ normal) - 0.0006, radius, lashes)]
 
 
-def _lashes(palette: Palette, centre: Array, normal: Array, offset: float, radius: float, thick: float) -> Mesh:
+def _lashes(
+    palette: Palette, centre: FloatArray, normal: FloatArray, offset: float, radius: float, thick: float
+) -> Mesh:
     """A dark line along the circle in which a plane cuts the eye."""
     across = _unit(np.cross(normal, [0, 1.0, 0]))
     front = _unit(np.cross(across, normal))
@@ -289,11 +291,11 @@ def _brows(palette: Palette, features: Features, mouth: Mouth) -> list[Mesh]:
     return meshes
 
 
-def _onto(field: Field, points: Array) -> Array:
+def _onto(field: Field, points: FloatArray) -> FloatArray:
     for _ in range(6):
         points = points - field(points)[:, None] * gradient(field, points)
     return points
 
 
-def _unit(vector: Array) -> Array:
+def _unit(vector: FloatArray) -> FloatArray:
     return np.asarray(vector / np.linalg.norm(vector))

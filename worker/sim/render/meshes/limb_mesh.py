@@ -13,7 +13,6 @@ from worker.sim import human
 from worker.sim.human import BodyShape
 from worker.sim.render.meshes.colours import Palette
 from worker.sim.render.meshes.distance_fields import (
-    Array,
     Field,
     chain,
     common,
@@ -25,6 +24,7 @@ from worker.sim.render.meshes.distance_fields import (
     union,
 )
 from worker.sim.render.meshes.mesh import Mesh, curve, joined, softly_lit, surface, tube
+from worker.type_aliases import FloatArray
 
 SLEEVE_SHARE = 0.50
 """Down to here, as a share of the upper arm, the arm is in its sleeve."""
@@ -40,7 +40,7 @@ _PHALANGES = ((0.45, 0.24), (0.31, 0.52), (0.24, 0.34))
 """Share of the finger's length, and how far each joint is bent in rad."""
 
 
-def placed(field: Field, rotation: Array, origin_m: Array) -> Field:
+def placed(field: Field, rotation: FloatArray, origin_m: FloatArray) -> Field:
     """A solid given in a segment's frame, in the world."""
     return lambda points: field((points - origin_m) @ rotation)
 
@@ -120,7 +120,7 @@ def _fingers(body: BodyShape, palette: Palette) -> list[Mesh]:
     return meshes
 
 
-def _finger(palette: Palette, points: Array, radii: Array) -> Mesh:
+def _finger(palette: Palette, points: FloatArray, radii: FloatArray) -> Mesh:
     """A tube through the joints with a round tip, a little thicker at each joint and rosier towards the tip."""
     count = 8
     path = curve(points.tolist(), count)
@@ -135,7 +135,7 @@ def _finger(palette: Palette, points: Array, radii: Array) -> Mesh:
     return tube(path, thick, 7, rosy)
 
 
-def _hem(end_m: float) -> Callable[[Array], Array]:
+def _hem(end_m: float) -> Callable[[FloatArray], FloatArray]:
     return lambda points: smooth_step(-points[:, 2], end_m - 0.017, end_m - 0.014)
 
 
@@ -160,7 +160,7 @@ def arm_meshes(body: BodyShape, palette: Palette, cloth: str, around: Field) -> 
     }
 
 
-def _lit_at_rest(mesh: Mesh, whole: Field, turn: Array, origin: Array) -> Mesh:
+def _lit_at_rest(mesh: Mesh, whole: Field, turn: FloatArray, origin: FloatArray) -> Mesh:
     """The mesh with the light that reaches it in the resting pose."""
     return mesh.shaded(softly_lit(whole, mesh.moved(turn, origin), 0.045).paint[:, 1])
 
@@ -188,7 +188,7 @@ def _lower_mesh(body: BodyShape, palette: Palette) -> Mesh:
     return joined(skin, *_fingers(body, palette))
 
 
-def rest_frames(body: BodyShape, side: int) -> tuple[list[Array], list[Array]]:
+def rest_frames(body: BodyShape, side: int) -> tuple[list[FloatArray], list[FloatArray]]:
     """Origins (3,) and rotations (3, 3) of upper arm and forearm in the middle of the resting poses."""
     return segment_frames(body, REST_RAD, side)
 
@@ -196,7 +196,7 @@ def rest_frames(body: BodyShape, side: int) -> tuple[list[Array], list[Array]]:
 REST_RAD = np.radians([6.0, 4.0, 11.0, 88.0])
 
 
-def segment_frames(body: BodyShape, arm_rad: Array, side: int) -> tuple[list[Array], list[Array]]:
+def segment_frames(body: BodyShape, arm_rad: FloatArray, side: int) -> tuple[list[FloatArray], list[FloatArray]]:
     """Origins (3,) and rotations (3, 3) of upper arm and forearm in the world."""
     shoulder, elbow = human.arm_points_m(body, arm_rad, side)[:2]
     return [shoulder, elbow], [human.upper_arm_rotation(arm_rad, side), human.forearm_rotation(arm_rad, side)]

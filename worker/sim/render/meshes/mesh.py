@@ -10,10 +10,11 @@ from itertools import combinations
 import numpy as np
 import numpy.typing as npt
 
-from worker.sim.render.meshes.distance_fields import Array, Field
+from worker.sim.render.meshes.distance_fields import Field
+from worker.type_aliases import FloatArray
 
 Faces = npt.NDArray[np.int32]
-Paint = Callable[[Array], Array]
+Paint = Callable[[FloatArray], FloatArray]
 
 _COARSE = 4
 """Grid cells per side of a block that is skipped when the surface cannot pass through it."""
@@ -25,16 +26,16 @@ _NORMAL_STEP_M = 4e-4
 class Mesh:
     """Triangles with smooth normals. V vertices, F faces, counter-clockwise seen from outside."""
 
-    vertices: Array
+    vertices: FloatArray
     """(V, 3) m"""
-    normals: Array
+    normals: FloatArray
     """(V, 3) unit length, pointing outwards"""
-    paint: Array
+    paint: FloatArray
     """(V, 2) in [0, 1]: the position in the palette and how much light reaches the vertex"""
     faces: Faces
     """(F, 3)"""
 
-    def moved(self, rotation: Array, translation: Sequence[float] | Array) -> "Mesh":
+    def moved(self, rotation: FloatArray, translation: Sequence[float] | FloatArray) -> "Mesh":
         """The mesh turned by rotation (3, 3), then shifted."""
         return replace(
             self,
@@ -51,7 +52,7 @@ class Mesh:
         """The mesh made larger or smaller about its origin."""
         return replace(self, vertices=self.vertices * factor)
 
-    def shaded(self, light: Array) -> "Mesh":
+    def shaded(self, light: FloatArray) -> "Mesh":
         """The same mesh with light (V,) in [0, 1] reaching its vertices."""
         return replace(self, paint=np.column_stack([self.paint[:, 0], light]))
 
@@ -92,7 +93,7 @@ def without_hidden(mesh: Mesh, cover: Field, depth_m: float) -> Mesh:
     return Mesh(mesh.vertices[kept], mesh.normals[kept], mesh.paint[kept], numbers.reshape(-1, 3).astype(np.int32))
 
 
-def gradient(field: Field, points: Array) -> Array:
+def gradient(field: Field, points: FloatArray) -> FloatArray:
     """Unit direction of steepest increase (N, 3), by the four-point stencil of a tetrahedron."""
     corners = np.array([[1, -1, -1], [-1, -1, 1], [-1, 1, -1], [1, 1, 1]], dtype=float)
     total = sum(
@@ -101,7 +102,7 @@ def gradient(field: Field, points: Array) -> Array:
     return np.asarray(total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12))
 
 
-def openness(field: Field, mesh: Mesh, reach_m: float, strength: float) -> Array:
+def openness(field: Field, mesh: Mesh, reach_m: float, strength: float) -> FloatArray:
     """How open the surroundings of each vertex are (V,) in [0, 1]: 1 in the open, less in folds and corners.
 
     Ambient occlusion from a distance field: walking out along the normal, the distance to the nearest surface grows
@@ -124,7 +125,7 @@ def softly_lit(field: Field, mesh: Mesh, reach_m: float, strength: float = 0.75)
     return mesh.shaded(openness(field, mesh, reach_m, strength) * (0.80 + 0.20 * towards_sky))
 
 
-def tube(path: Array, radii: Array, sides: int, colours: Array, closed_ends: bool = True) -> Mesh:
+def tube(path: FloatArray, radii: FloatArray, sides: int, colours: FloatArray, closed_ends: bool = True) -> Mesh:
     """A round tube along a path.
 
     path (R, 3), radii (R,) or (R, 2) half width and half height, colours (R,) or (R - 1,): with one colour per piece
@@ -166,13 +167,13 @@ def ball(radius_m: float, colour: float, halvings: int = 1) -> Mesh:
     return Mesh(vertices * radius_m, vertices, paint, numbers.reshape(-1, 3).astype(np.int32))
 
 
-def _quartered(a: Array, b: Array, c: Array) -> list[Array]:
+def _quartered(a: FloatArray, b: FloatArray, c: FloatArray) -> list[FloatArray]:
     """A triangle on the unit ball as four."""
     ab, bc, ca = _unit(a + b), _unit(b + c), _unit(c + a)
     return [np.array(piece) for piece in ((a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca))]
 
 
-def _unit(vector: Array) -> Array:
+def _unit(vector: FloatArray) -> FloatArray:
     return np.asarray(vector / np.linalg.norm(vector))
 
 
@@ -190,14 +191,14 @@ def panel(corners: Sequence[Sequence[float]], columns: int, rows: int, colour: f
     return Mesh(vertices, normals, np.column_stack([colours, np.ones(len(vertices))]), _triangles(quads))
 
 
-def turned(axis: Sequence[float], angle_rad: float) -> Array:
+def turned(axis: Sequence[float], angle_rad: float) -> FloatArray:
     """Rotation matrix (3, 3) about an axis (Rodrigues)."""
     x, y, z = np.asarray(axis, dtype=float) / np.linalg.norm(axis)
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return np.asarray(np.eye(3) + np.sin(angle_rad) * cross + (1 - np.cos(angle_rad)) * cross @ cross)
 
 
-def curve(points: Sequence[Sequence[float]], count: int) -> Array:
+def curve(points: Sequence[Sequence[float]], count: int) -> FloatArray:
     """A smooth path (count, 3) through the points (Catmull-Rom)."""
     knots = np.asarray(points, dtype=float)
     padded = np.concatenate([[2 * knots[0] - knots[1]], knots, [2 * knots[-1] - knots[-2]]])
@@ -210,7 +211,7 @@ def curve(points: Sequence[Sequence[float]], count: int) -> Array:
     )
 
 
-def _sampled(field: Field, lower: Array, upper: Array, cell_m: float) -> Array:
+def _sampled(field: Field, lower: FloatArray, upper: FloatArray, cell_m: float) -> FloatArray:
     """Field values on a grid of points, exact near the surface and only signed elsewhere."""
     blocks = np.ceil((upper - lower) / cell_m / _COARSE).astype(int)
     step = cell_m * _COARSE
@@ -231,7 +232,7 @@ _CORNERS = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
 _EDGES = [(a, b) for a in range(8) for b in range(a + 1, 8) if np.abs(_CORNERS[a] - _CORNERS[b]).sum() == 1]
 
 
-def _cell_vertices(values: Array, inside: npt.NDArray[np.bool_]) -> tuple[Array, Faces]:
+def _cell_vertices(values: FloatArray, inside: npt.NDArray[np.bool_]) -> tuple[FloatArray, Faces]:
     """One vertex per crossed cell, in grid units (V, 3), and the vertex number of every cell (-1 where none)."""
     nx, ny, nz = (n - 1 for n in values.shape)
     count = sum(inside[i : i + nx, j : j + ny, k : k + nz].astype(np.int8) for i, j, k in _CORNERS)
@@ -273,7 +274,7 @@ def _triangles(quads: npt.NDArray[np.integer]) -> Faces:
     return np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]).astype(np.int32)
 
 
-def _frames_along(path: Array) -> Array:
+def _frames_along(path: FloatArray) -> FloatArray:
     """Two directions across the path at each point (R, 3, 2), turning as little as possible."""
     ahead = np.diff(path, axis=0)
     length = np.linalg.norm(ahead, axis=1)
@@ -294,7 +295,7 @@ def _frames_along(path: Array) -> Array:
 _SHARP_RAD = 0.7
 
 
-def _tube_normals(rings: Array) -> list[Array]:
+def _tube_normals(rings: FloatArray) -> list[FloatArray]:
     """Normals of both ends of every band (R-1 of (2, S, 3)), shared with the neighbour unless the edge is sharp."""
     around = np.roll(rings, -1, axis=1) - np.roll(rings, 1, axis=1)
     flat = []
@@ -315,7 +316,7 @@ def _tube_normals(rings: Array) -> list[Array]:
     return result
 
 
-def _band(rings: Array, normals: Array, colours: Sequence[float]) -> Mesh:
+def _band(rings: FloatArray, normals: FloatArray, colours: Sequence[float]) -> Mesh:
     sides = rings.shape[1]
     here = np.arange(sides)
     after = (here + 1) % sides
@@ -324,7 +325,7 @@ def _band(rings: Array, normals: Array, colours: Sequence[float]) -> Mesh:
     return Mesh(rings.reshape(-1, 3), normals.reshape(-1, 3), paint, _triangles(quads))
 
 
-def _cap(ring: Array, centre: Array, colour: float, at_start: bool) -> Mesh:
+def _cap(ring: FloatArray, centre: FloatArray, colour: float, at_start: bool) -> Mesh:
     sides = len(ring)
     vertices = np.concatenate([ring, centre[None]])
     here = np.arange(sides)

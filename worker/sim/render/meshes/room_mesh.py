@@ -1,8 +1,9 @@
 """A calm, light room: nothing behind the path of the spoon that draws the eye."""
 
 from worker.sim.render.meshes.colours import Palette
-from worker.sim.render.meshes.distance_fields import Array, Field, cone, smooth_step, union
+from worker.sim.render.meshes.distance_fields import Field, cone, smooth_step, union
 from worker.sim.render.meshes.mesh import Mesh, joined, panel, softly_lit
+from worker.type_aliases import FloatArray
 
 LEFT, RIGHT, FRONT, BACK, CEILING = -2.2, 1.6, -2.6, 1.5, 3.0
 
@@ -10,10 +11,10 @@ LEFT, RIGHT, FRONT, BACK, CEILING = -2.2, 1.6, -2.6, 1.5, 3.0
 def room_meshes(palette: Palette, furniture: Field) -> dict[str, Mesh]:
     """Floor, three walls and skirting boards."""
 
-    def wall(points: Array) -> Array:
+    def wall(points: FloatArray) -> FloatArray:
         return palette.along("wall", smooth_step(points[:, 2], 1.9, 0.2))
 
-    def side_wall(points: Array) -> Array:
+    def side_wall(points: FloatArray) -> FloatArray:
         return palette.along("side_wall", smooth_step(points[:, 2], 1.9, 0.2))
 
     floor = panel(
