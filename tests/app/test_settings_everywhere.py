@@ -13,6 +13,7 @@ from app.domain.described import bounds_of, settings_of
 from app.domain.protocol import EvaluationSettings
 from app.domain.study_settings import PAPER_PROTOCOL, StudySettings
 from app.services.studies import locking
+from app.web.api.openapi import described
 from app.web.experimenter.form_fields import BY_NAME, FIELDS, Kind
 from app.web.experimenter.study_form import FormInvalid, StudyForm, form_of, form_with_defaults, typed_study
 from installed_tasks import catalogue
@@ -99,12 +100,18 @@ def test_the_api_describes_the_settings_as_they_are(client: TestClient) -> None:
     schemas = client.get("/api/v1/openapi.json").json()["components"]["schemas"]
     assert schemas["StudyAnswer"]["properties"]["settings"] == {"$ref": "#/components/schemas/StudySettings"}
     for model in (StudySettings, EvaluationSettings):
-        described = schemas[model.__name__]["properties"]
+        shown = schemas[model.__name__]["properties"]
         own = model.model_json_schema(mode="serialization", ref_template="#/components/schemas/{model}")["properties"]
         for each in own.values():
             if each.get("default", ...) is None:
                 del each["default"]  # the document leaves out what is null
-        assert described == own
+        assert shown == own
+
+
+def test_the_example_in_the_api_s_documentation_are_settings_that_a_study_can_have(client: TestClient) -> None:
+    operations = described(client.get("/api/v1/openapi.json").json(), "")
+    (gives,) = (each["gives"] for each in operations if (each["method"], each["path"]) == ("GET", "/studies/{slug}"))
+    assert StudySettings.model_validate(gives["settings"]).evaluation == EvaluationSettings()
 
 
 def test_whatever_can_be_chosen_has_a_name_for_people() -> None:

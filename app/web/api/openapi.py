@@ -32,12 +32,12 @@ def _schema(body: Mapping[str, Any]) -> Mapping[str, Any] | None:
 
 
 def _example(document: Mapping[str, Any], schema: Mapping[str, Any] | None) -> Any:
-    """Something that the schema allows: its own examples where it has some."""
+    """Something that the schema allows: its own examples where it has some, else its default."""
     if schema is None:
         return None
     if "$ref" in schema:
         return _example(document, document["components"]["schemas"][schema["$ref"].rpartition("/")[2]])
-    for known in (schema.get("example"), *schema.get("examples", [])):
+    for known in (schema.get("example"), *schema.get("examples", []), schema.get("default")):
         if known is not None:
             return known
     if "anyOf" in schema:

@@ -101,7 +101,10 @@ _BEFORE: Mapping[str, Sequence[FormField]] = {
 def _kind(annotation: Any) -> Kind:
     if annotation in _KINDS:
         return _KINDS[annotation]
-    return Kind.CHOICE if annotation is _choice(annotation) else Kind.SEVERAL
+    chosen = _choice(annotation)
+    if chosen is None:
+        raise TypeError(f"The form has no kind of field for {annotation}.")
+    return Kind.CHOICE if annotation is chosen else Kind.SEVERAL
 
 
 def _choice(annotation: Any) -> type[Choice] | None:
