@@ -5,7 +5,6 @@ WORKDIR /studio
 COPY Makefile pyproject.toml requirements.lock README.md alembic.ini ./
 COPY install install
 COPY app app
-COPY installed_tasks installed_tasks
 COPY worker worker
 COPY migrations migrations
 COPY templates templates

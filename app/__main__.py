@@ -14,6 +14,7 @@ from app import upgrading
 from app.db import Database
 from app.domain.studies import Study
 from app.errors import EXPLAINED, AppError, in_words
+from app.installed_tasks import catalogue
 from app.paths import DOCS
 from app.programs import Programs, say
 from app.services import audit
@@ -25,7 +26,6 @@ from app.services.monitoring import damage
 from app.services.participants import enrolment
 from app.settings import Settings
 from app.storage import ArtefactStore, keep_private
-from installed_tasks import catalogue
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -20,9 +20,9 @@ from app.db import Database
 from app.domain.models import ModelKind
 from app.domain.protocol import Language
 from app.domain.study_settings import StudySettings
+from app.installed_tasks import catalogue
 from app.services.studies import studies
 from app.web.texts import wording
-from installed_tasks import catalogue
 from tests import factories
 from tests.app.conftest import agree
 from worker.compute import simulation

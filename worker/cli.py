@@ -12,10 +12,10 @@ from app.db import Database
 from app.domain.choices import ClipQuality, Strategy
 from app.domain.protocol import EvaluationSettings
 from app.domain.study_settings import PAPER_PROTOCOL, StudySettings
+from app.installed_tasks import catalogue
 from app.services.archives import demo_archive
 from app.settings import Settings
 from app.storage import ArtefactStore, keep_private
-from installed_tasks import catalogue
 from worker import options
 from worker.experiments import benchmark, fit_response_surface, pretrain_policy, train_signal_predictor
 from worker.experiments.benchmark_cell import INDIRECT_USERS, OPPOSED_USERS, PAPER_USERS

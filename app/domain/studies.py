@@ -10,7 +10,7 @@ from sqlalchemy.orm import Mapped, mapped_column, relationship
 
 from app.db import Base, now
 from app.domain.study_settings import USUAL_CLIP_STEPS, StudySettings
-from installed_tasks import catalogue
+from app.installed_tasks import catalogue
 
 NAME_LENGTH = 120
 SEED_LIMIT = 2**31

@@ -16,7 +16,7 @@ from app.domain.protocol import (
     Language,
     PlannedTest,
 )
-from installed_tasks.description import LONGEST_CLIP_STEPS, SHORTEST_CLIP_STEPS
+from app.installed_tasks.description import LONGEST_CLIP_STEPS, SHORTEST_CLIP_STEPS
 
 USUAL_CLIP_STEPS = 60
 """Of a task that is not installed here."""

@@ -13,10 +13,10 @@ from app.__main__ import _first_start, main, migrate
 from app.db import Database
 from app.domain.clips import Clip
 from app.domain.studies import Participant, Study, usual_clip_steps
+from app.installed_tasks import catalogue
 from app.services.archives import demo_archive
 from app.settings import Settings
 from app.storage import ArtefactStore
-from installed_tasks import catalogue
 
 MOST_BYTES = 6_000_000
 """Everybody who clones the repository loads every version of it."""

@@ -12,11 +12,11 @@ from app.domain.choices import Choice
 from app.domain.described import bounds_of, settings_of
 from app.domain.protocol import EvaluationSettings
 from app.domain.study_settings import PAPER_PROTOCOL, StudySettings
+from app.installed_tasks import catalogue
 from app.services.studies import locking
 from app.web.api.openapi import described
 from app.web.experimenter.form_fields import BY_NAME, FIELDS, Kind
 from app.web.experimenter.study_form import FormInvalid, StudyForm, form_of, form_with_defaults, typed_study
-from installed_tasks import catalogue
 
 NOT_ON_THE_FORM: dict[str, str] = {}
 """Settings that the form leaves out, each with the reason; all are on it so far."""

@@ -10,10 +10,10 @@ from fluent.syntax import ast
 
 from app.domain.protocol import Language
 from app.domain.study_settings import StudySettings
+from app.installed_tasks import catalogue
 from app.paths import ROOT, WORDING
 from app.web.texts import wording
 from app.web.texts.wording import Wording, built_in_texts, variables_of, wording_for
-from installed_tasks import catalogue
 
 TEMPLATES = sorted(
     [*(ROOT / "templates" / "participant").rglob("*.html"), ROOT / "templates" / "pieces" / "player.html"]

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from app.domain.protocol import Language
+from app.installed_tasks import catalogue
 from app.web.texts.task_words import words_of
-from installed_tasks import catalogue
 from worker.tasks import registry
 from worker.trajectory import COSTS, SIGNALS
 
@@ -16,7 +16,7 @@ NAMES = tuple(re.findall(r"^(\w+) = worker\.tasks\.", catalogue.OUR_ENTRY_POINTS
 ELSEWHERE = {
     "app/demo/feeding.zip": "the archive of the demo study, which is of a task",
     "app/paths.py": "its file",
-    "installed_tasks/entry_points.txt": "declares them",
+    "app/installed_tasks/entry_points.txt": "declares them",
     "worker/rehearsal/demo_study.py": "makes it",
     "worker/analysis/published.py": "the numbers that the paper prints, by its names of tasks",
 }
@@ -25,7 +25,7 @@ ELSEWHERE = {
 def test_only_its_folder_names_a_task() -> None:
     folders = [ROOT / "worker" / "tasks" / name for name in NAMES]
     named = set()
-    for place in ("app", "installed_tasks", "worker", "templates", "static"):
+    for place in ("app", "worker", "templates", "static"):
         for file in (ROOT / place).rglob("*"):
             if not file.is_file() or "__pycache__" in file.parts or any(file.is_relative_to(each) for each in folders):
                 continue

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import torch
 
-from installed_tasks import catalogue
+from app.installed_tasks import catalogue
 from tests.benchmarks.chosen_modes import FIRST_SEED, UnkeptBench, stake
 from worker.compute.simulation import surface_file
 from worker.experiments.benchmark_cell import PAPER_USERS, Cell, Terms

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from tqdm import tqdm
 
-from installed_tasks import catalogue
+from app.installed_tasks import catalogue
 from worker.compute import simulation
 from worker.ml.acquisition import matched_pairs
 from worker.ml.teachers import OMEGA, OPPOSED, User

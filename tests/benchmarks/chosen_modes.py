@@ -26,7 +26,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from installed_tasks import catalogue
+from app.installed_tasks import catalogue
 from worker.analysis import result_pages
 from worker.compute import simulation
 from worker.compute.pools import Compute, Lane

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from installed_tasks import catalogue
+from app.installed_tasks import catalogue
 from tests.benchmarks.films import films
 from worker.sim.human import BODY_SHAPES
 from worker.sim.render.clip import ClipRenderer

@@ -26,7 +26,7 @@ import numpy.typing as npt
 import torch
 from tqdm import tqdm
 
-from installed_tasks import catalogue
+from app.installed_tasks import catalogue
 from tests.benchmarks import feedback_report
 from tests.benchmarks.chosen_modes import stake
 from tests.benchmarks.feedback_report import LINEAR, NAMED, Row

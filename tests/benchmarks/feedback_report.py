@@ -16,7 +16,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from installed_tasks import catalogue
+from app.installed_tasks import catalogue
 from worker.analysis import result_pages
 from worker.analysis.figures import LINE_COLOURS, MARKERS, STYLE, rendered
 

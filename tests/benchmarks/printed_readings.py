@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from installed_tasks import catalogue
+from app.installed_tasks import catalogue
 from worker.analysis import result_pages
 from worker.analysis.comparison import Row
 from worker.analysis.evaluation import success_change

@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable
 from functools import partial
 
-from installed_tasks import catalogue
+from app.installed_tasks import catalogue
 from tests.benchmarks.films import films
 from worker.sim.render.clip import STYLES, ClipRenderer
 from worker.tasks.registry import filmed_task

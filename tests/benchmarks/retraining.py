@@ -21,7 +21,7 @@ import numpy as np
 from tqdm import tqdm
 
 from app.domain.study_settings import StudySettings
-from installed_tasks import catalogue
+from app.installed_tasks import catalogue
 from worker.analysis import result_pages
 from worker.compute import learning
 from worker.compute.filter_fitting import FilterFit

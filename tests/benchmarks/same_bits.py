@@ -22,7 +22,7 @@ from typing import get_args
 import numpy as np
 import torch
 
-from installed_tasks import catalogue
+from app.installed_tasks import catalogue
 from worker.compute import simulation
 from worker.experiments.benchmark_cell import Bench, Cell, Terms
 from worker.experiments.rollout_cache import Shelf

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from installed_tasks import catalogue
+from app.installed_tasks import catalogue
 from worker.ml.policies.gaussian import GaussianPolicy
 from worker.sim.assistive import AssistiveEnv
 from worker.tasks.drinking.environment import DrinkingEnv

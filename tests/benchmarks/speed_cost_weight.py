@@ -11,7 +11,7 @@ import sys
 
 import numpy as np
 
-from installed_tasks import catalogue
+from app.installed_tasks import catalogue
 from worker.compute import simulation
 from worker.sim.costs import BASE_WEIGHTS, cost_items
 from worker.sim.rollout import rollout

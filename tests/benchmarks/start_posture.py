@@ -10,7 +10,7 @@ import sys
 
 import numpy as np
 
-from installed_tasks import catalogue
+from app.installed_tasks import catalogue
 from worker.sim.arm import tool_jacobian
 from worker.sim.assistive import ARM, AssistiveEnv
 from worker.sim.seated_person import PERSON

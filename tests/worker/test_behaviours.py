@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from installed_tasks import catalogue
+from app.installed_tasks import catalogue
 from worker.compute import simulation
 from worker.compute.behaviours import DIFFERENT_ENOUGH, Behaviour, draw_behaviours
 from worker.tasks import registry

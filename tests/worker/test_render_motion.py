@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from installed_tasks import catalogue
+from app.installed_tasks import catalogue
 from tests.worker.waving import MOUNT, itching_trajectory, waving_trajectory
 from worker.sim.human import BROAD, LEFT, RIGHT
 from worker.sim.jaco import JACO

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from installed_tasks import catalogue
+from app.installed_tasks import catalogue
 from worker.sim import human
 from worker.sim.arm import Tool
 from worker.sim.geometry import Shape

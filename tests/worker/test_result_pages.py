@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from installed_tasks import catalogue
+from app.installed_tasks import catalogue
 from tests.benchmarks import error_rates, feedback_report, printed_readings
 from worker.analysis import comparison_page, result_pages
 

@@ -8,7 +8,7 @@ import numpy.typing as npt
 import pytest
 import torch
 
-from installed_tasks import catalogue
+from app.installed_tasks import catalogue
 from tests.worker import invented
 from worker.compute import learning, simulation
 from worker.experiments import train_signal_predictor

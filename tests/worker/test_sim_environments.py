@@ -12,7 +12,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_for_sb3
 
-from installed_tasks import catalogue
+from app.installed_tasks import catalogue
 from worker.ml.policies.gaussian import GaussianPolicy
 from worker.sim import human
 from worker.sim.arm import start_postures

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from installed_tasks import catalogue
+from app.installed_tasks import catalogue
 from worker.compute.behaviours import Behaviour, SlowWaves, draw_behaviours
 from worker.ml.policies.gaussian import GaussianPolicy
 from worker.ml.rewards.signal_predictor import SignalPredictor

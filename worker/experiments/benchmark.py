@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from installed_tasks import catalogue
+from app.installed_tasks import catalogue
 from worker.analysis import comparison_page
 from worker.analysis.comparison import Cells, EvaluatedCell, Row, compared, pooled, table_rows
 from worker.analysis.pareto import pareto_svg

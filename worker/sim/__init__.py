@@ -6,7 +6,7 @@ Importing this package registers every installed task with Gymnasium: the task `
 
 import gymnasium
 
-from installed_tasks import catalogue
+from app.installed_tasks import catalogue
 
 
 def register_tasks() -> None:

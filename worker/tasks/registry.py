@@ -5,8 +5,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from installed_tasks import catalogue
-from installed_tasks.description import InstalledTask
+from app.installed_tasks import catalogue
+from app.installed_tasks.description import InstalledTask
 from worker.sim.assistive import AssistiveEnv
 from worker.sim.render.clip import FilmedTask
 from worker.sim.render.task_look import TaskLook

@@ -14,8 +14,8 @@ from app.domain.clips import Clip, Rollout
 from app.domain.studies import SEED_LIMIT, Study, longest_clip_steps
 from app.domain.study_settings import StudySettings
 from app.errors import AppError
+from app.installed_tasks import catalogue
 from app.services import audit
-from installed_tasks import catalogue
 
 _Row = TypeVar("_Row", bound=Base)
 

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from app.domain.study_settings import StudySettings
-from installed_tasks import catalogue
+from app.installed_tasks import catalogue
 
 Link = Annotated[str, Field(examples=["http://localhost:8000/p/3mZ0c1..."])]
 

@@ -12,6 +12,7 @@ from sqlalchemy.orm import Session
 from app.domain.people import Experimenter
 from app.domain.protocol import Language
 from app.domain.studies import NAME_LENGTH, Study
+from app.installed_tasks import catalogue
 from app.services.accounts import browser_sessions
 from app.services.participants import enrolment
 from app.services.studies import locking, preregistration, studies
@@ -32,7 +33,6 @@ from app.web.http.deps import (
 from app.web.texts import task_words
 from app.web.texts.templating import page
 from app.web.texts.wording import built_in_texts, plain_text
-from installed_tasks import catalogue
 
 router = APIRouter(prefix="/studies")
 

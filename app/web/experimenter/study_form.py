@@ -11,11 +11,11 @@ from pydantic import ConfigDict, Field, ValidationError, create_model
 from app.domain.protocol import FormItem
 from app.domain.studies import NAME_LENGTH, SEED_LIMIT, longest_clip_steps, usual_clip_steps
 from app.domain.study_settings import PAPER_PROTOCOL, StudySettings
+from app.installed_tasks import catalogue
 from app.web.experimenter import form_lines
 from app.web.experimenter.form_fields import BY_NAME, FIELDS, FormField, Kind
 from app.web.texts.own_texts import CONSENT
 from app.web.texts.wording import broken_texts
-from installed_tasks import catalogue
 
 _Value = TypeVar("_Value")
 _Text = Annotated[str, Field(max_length=500)]

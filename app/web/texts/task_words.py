@@ -6,8 +6,8 @@ What all tasks share is worded here, with a task's own nouns; the rest its folde
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from installed_tasks import catalogue
-from installed_tasks.description import Words
+from app.installed_tasks import catalogue
+from app.installed_tasks.description import Words
 
 _NEUTRAL = Words(tool="tool", target="target", carried="food or water")
 

@@ -17,8 +17,8 @@ from jinja2.runtime import Context
 
 from app.domain.protocol import CONSENT_FACTS, Language
 from app.domain.study_settings import StudySettings
+from app.installed_tasks import catalogue
 from app.paths import WORDING
-from installed_tasks import catalogue
 
 log = logging.getLogger("app.wording")
 

@@ -16,7 +16,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import NamedTuple
 
-from installed_tasks.description import InstalledTask, TaskRefused, read
+from app.installed_tasks.description import InstalledTask, TaskRefused, read
 
 GROUP = "pbarl_studio.tasks"
 OURS, OUR_ENTRY_POINTS = "pbarl-studio", Path(__file__).with_name("entry_points.txt")
