@@ -1,4 +1,4 @@
-"""The tasks that are installed, as their folders describe them: what web server and worker both know of a task.
+"""Installed tasks, as their folders describe them.
 
-Nothing here imports a task, the simulator or either program.
+Both programs read this. Nothing here imports a task, the simulator or another room of either program.
 """

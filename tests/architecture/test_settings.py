@@ -21,7 +21,7 @@ from app.web.experimenter import results
 from worker import responses
 from worker.analysis import figures, hypothesis_tests, statistics
 from worker.experiments import benchmark_cell, rollout_cache
-from worker.experiments.benchmark_cell import Terms
+from worker.experiments.benchmark_cell import BenchmarkConfig
 from worker.ml import acquisition
 from worker.ml.filters import filter_module
 from worker.ml.filters.filter_problem import FilterConfig
@@ -46,10 +46,10 @@ def default(config: type, name: str) -> Any:
         (default(FilterConfig, "success_tolerance"), USUAL.success_tolerance),
         (default(FilterConfig, "evaluation_scenarios"), USUAL.evaluation_scenarios),
         (default(FineTuning, "steps"), EVALUATION.fine_tuning_steps),
-        (default(Terms, "labels"), USUAL.labels_per_participant),
-        (default(Terms, "rule"), USUAL.strategy),
-        (default(Terms, "reward"), USUAL.reward_kind),
-        (default(Terms, "smallest_pool"), USUAL.pool_scenarios),
+        (default(BenchmarkConfig, "labels"), USUAL.labels_per_participant),
+        (default(BenchmarkConfig, "rule"), USUAL.strategy),
+        (default(BenchmarkConfig, "reward"), USUAL.reward_kind),
+        (default(BenchmarkConfig, "smallest_pool"), USUAL.pool_scenarios),
         (acquisition.RANDOM_SHARE, USUAL.random_share),
         (benchmark_cell.CHOOSE_EVERY, USUAL.retrain_every_labels),
         (rollout_cache.BEHAVIOURS_PER_SCENARIO, USUAL.behaviours_per_scenario),

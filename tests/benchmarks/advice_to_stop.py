@@ -16,8 +16,8 @@ import torch
 from app.installed_tasks import catalogue
 from tests.benchmarks.chosen_modes import FIRST_SEED, UnkeptBench, stake
 from worker.compute.simulation import surface_file
-from worker.experiments.benchmark_cell import PAPER_USERS, Cell, Terms
-from worker.experiments.rollout_cache import Shelf
+from worker.experiments.benchmark_cell import PAPER_USERS, BenchmarkConfig, Cell
+from worker.experiments.rollout_cache import RolloutCache
 from worker.ml.filters.response_surface import ResponseSurface, best_mode
 from worker.ml.stopping import expected_regret
 from worker.ml.teachers import Taste
@@ -48,7 +48,9 @@ def _regrets(name: str, taste: Taste) -> list[str]:
     most = float(surface.predict(best_mode(surface, wish, 0))[0] @ wish)
     found = []
     for count in COUNTS:
-        bench = UnkeptBench(Cell(name, taste, "pbarl", FIRST_SEED), Terms(labels=count), Shelf(name, WORK), WORK)
+        bench = UnkeptBench(
+            Cell(name, taste, "pbarl", FIRST_SEED), BenchmarkConfig(labels=count), RolloutCache(name, WORK), WORK
+        )
         members = bench.reward.signal_weights([])
         gained = float(surface.predict(best_mode(surface, members, FIRST_SEED))[0] @ wish)
         found.append(f"{expected_regret(surface, members):.2f} / {(most - gained) / unit:.1f} %")

@@ -31,8 +31,8 @@ from worker.analysis import result_pages
 from worker.compute import simulation
 from worker.compute.pools import Compute, Lane
 from worker.compute.simulation import surface_file
-from worker.experiments.benchmark_cell import Bench, Cell, Terms
-from worker.experiments.rollout_cache import Shelf
+from worker.experiments.benchmark_cell import BenchmarkConfig, BenchmarkUser, Cell
+from worker.experiments.rollout_cache import RolloutCache
 from worker.ml import acquisition
 from worker.ml.filters.response_surface import CAUTION, ResponseSurface, best_mode
 from worker.ml.rewards import bradley_terry, pooled_prior
@@ -61,7 +61,7 @@ class Choice:
     deviation: float = pooled_prior.DEVIATION
     lapses: float = bradley_terry.LAPSES
     caution: float = CAUTION
-    rule: acquisition.Strategy = Terms.rule
+    rule: acquisition.Strategy = BenchmarkConfig.rule
 
     @property
     def name(self) -> str:
@@ -97,7 +97,7 @@ class Question:
     seed: int
 
 
-class UnkeptBench(Bench):
+class UnkeptBench(BenchmarkUser):
     """A user's labels and a reward model of this very moment: none that is kept from another choice."""
 
     def _kept_reward(self, path: Path) -> RewardModel:
@@ -112,12 +112,14 @@ def answer(question: Question, work: Path) -> dict[str, Any]:
     surface = ResponseSurface.load(surface_file(task.name), task.modes)
     wishes = np.array([signal_weights(task, TASTES[user].omega, TASTES[user].per_signal) for user in USERS])
     unit = np.array([stake(task, TASTES[user]) for user in USERS]) / 100
-    terms = Terms(labels=question.labels, rule=question.choice.rule)
+    terms = BenchmarkConfig(labels=question.labels, rule=question.choice.rule)
     if question.hesitant:
         terms = replace(terms, manner=HESITANT)
     gains, lost, regrets = [], [], []
     for row, user in enumerate(USERS):
-        bench = UnkeptBench(Cell(task.name, TASTES[user], "pbarl", question.seed), terms, Shelf(task.name, work), work)
+        bench = UnkeptBench(
+            Cell(task.name, TASTES[user], "pbarl", question.seed), terms, RolloutCache(task.name, work), work
+        )
         learned = bench.reward.signal_weights([])
         mode = best_mode(surface, learned, question.seed, caution=question.choice.caution)
         change, success = surface.predict(mode)

@@ -25,7 +25,7 @@ from app.services.participants import enrolment
 from app.services.studies import studies
 from app.storage import ArtefactStore
 from worker.ml.teachers import TASTES, Manner
-from worker.rehearsal.browser import Visitor
+from worker.rehearsal.browser import FormBrowser
 from worker.rehearsal.participant_steps import ScriptedPerson
 from worker.rehearsal.server import OwnStudio, wait_until
 
@@ -61,7 +61,7 @@ def main() -> None:
         for participant, token in tokens:
             store = ArtefactStore(Path(directory) / "artefacts")
             person = ScriptedPerson(database, store, study, TASTES["cautious"], Manner(), participant.number)
-            with Visitor(studio.settings.base_url, f"/p/{token}") as visitor:
+            with FormBrowser(studio.settings.base_url, f"/p/{token}") as visitor:
                 visitor.come_in()
                 for _ in range(study.settings.practice_pairs + study.settings.question_count):
                     query_id = wait_until(PATIENCE_S, "no pair to label", visitor.query_id)
@@ -72,7 +72,7 @@ def main() -> None:
         database.dispose()
 
 
-def _wait(database: Database, visitor: Visitor, participant_id: int) -> None:
+def _wait(database: Database, visitor: FormBrowser, participant_id: int) -> None:
     """Look at the waiting page until there is a robot to rate, then see when the rest is there."""
     began = time.monotonic()
     told: list[tuple[float, float]] = []

@@ -25,8 +25,8 @@ from worker.analysis.comparison import Row
 from worker.analysis.evaluation import success_change
 from worker.analysis.table_files import to_csv
 from worker.compute import learning
-from worker.experiments.benchmark_cell import PAPER_USERS, Bench, Cell, Terms
-from worker.experiments.rollout_cache import Shelf
+from worker.experiments.benchmark_cell import PAPER_USERS, BenchmarkConfig, BenchmarkUser, Cell
+from worker.experiments.rollout_cache import RolloutCache
 from worker.ml.filters.filter_problem import act_of
 from worker.ml.filters.gate import successes
 from worker.ml.filters.pbarl_printed import PrintedConfig
@@ -96,16 +96,16 @@ def main() -> None:
 
 
 def _measured(task: str, name: str, options: argparse.Namespace) -> dict[str, Any]:
-    shelf = Shelf(task, options.work_directory / "rollouts")
+    rollout_cache = RolloutCache(task, options.work_directory / "rollouts")
     cell = Cell(task, PAPER_USERS[options.user], "pbarl_printed", 0)
-    bench = Bench(cell, Terms(), shelf, options.work_directory)
+    bench = BenchmarkUser(cell, BenchmarkConfig(), rollout_cache, options.work_directory)
     setting = bench.setting()
     problem = replace(setting.problem, reward=setting.action_reward())
     config = READINGS[name].config(task, options.steps)
-    draft = fit_printed(problem, shelf.reference(first_of(RESIDUAL, setting.config.printed_rollouts)), config)
+    draft = fit_printed(problem, rollout_cache.reference(first_of(RESIDUAL, setting.config.printed_rollouts)), config)
     act = act_of(problem.task.modes, problem.policy, draft.weights)
     scenarios = first_of(EVALUATION, options.scenarios)
-    before, after = shelf.reference(scenarios), learning.run_scenarios(task, act, scenarios, 0.0, 0)
+    before, after = rollout_cache.reference(scenarios), learning.run_scenarios(task, act, scenarios, 0.0, 0)
     success = success_change(successes(before), successes(after))
     return {
         "task": task,
@@ -122,7 +122,7 @@ def _measured(task: str, name: str, options: argparse.Namespace) -> dict[str, An
     }
 
 
-def _true_change(bench: Bench, before: Sequence[Trajectory], after: Sequence[Trajectory]) -> float:
+def _true_change(bench: BenchmarkUser, before: Sequence[Trajectory], after: Sequence[Trajectory]) -> float:
     """Of r^H, as a share of what the user minds and likes under the frozen policy."""
     task, omega = bench.task, bench.cell.taste.omega
     unit = np.mean([stakes(task, each.costs, each.signals, omega).sum() for each in before])

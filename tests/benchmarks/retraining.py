@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 from tqdm import tqdm
+from worker.experiments.rollout_cache import RolloutCache
 
 from app.domain.study_settings import StudySettings
 from app.installed_tasks import catalogue
@@ -26,8 +27,7 @@ from worker.analysis import result_pages
 from worker.compute import learning
 from worker.compute.filter_fitting import FilterFit
 from worker.compute.pools import Compute, Lane
-from worker.experiments.benchmark_cell import Bench, Cell, Terms
-from worker.experiments.rollout_cache import Shelf
+from worker.experiments.benchmark_cell import BenchmarkConfig, BenchmarkUser, Cell
 from worker.jobs.learning.reference_rollouts import make_ready
 from worker.ml.export.bundle import Provenance
 from worker.ml.filters.filter_problem import FilterConfig
@@ -59,8 +59,8 @@ def main() -> None:
 
 
 def _measured(task: str, user: str, options: argparse.Namespace) -> list[dict[str, Any]]:
-    shelf = Shelf(task, options.work_directory / "rollouts")
-    bench = Bench(Cell(task, TASTES[user], "pbarl", 0), Terms(), shelf, options.work_directory)
+    cached = RolloutCache(task, options.work_directory / "rollouts")
+    bench = BenchmarkUser(Cell(task, TASTES[user], "pbarl", 0), BenchmarkConfig(), cached, options.work_directory)
     compute = Compute(options.processes)
     references: dict[tuple[str, range], list[Trajectory]] = {}
     try:
@@ -78,7 +78,7 @@ def _measured(task: str, user: str, options: argparse.Namespace) -> list[dict[st
 def _run(
     task: str,
     user: str,
-    bench: Bench,
+    bench: BenchmarkUser,
     compute: Compute,
     references: dict[tuple[str, range], list[Trajectory]],
 ) -> dict[str, Any]:

@@ -24,8 +24,8 @@ import torch
 
 from app.installed_tasks import catalogue
 from worker.compute import simulation
-from worker.experiments.benchmark_cell import Bench, Cell, Terms
-from worker.experiments.rollout_cache import Shelf
+from worker.experiments.benchmark_cell import BenchmarkConfig, BenchmarkUser, Cell
+from worker.experiments.rollout_cache import RolloutCache
 from worker.ml.filters import pbarl
 from worker.ml.filters.filter_problem import FilterConfig, act_of
 from worker.ml.methods import registry
@@ -52,7 +52,7 @@ FILTER = FilterConfig(
     adapter_steps=20,
 )
 FINE_TUNING = FineTuning(steps=400, warm_up_steps=200, critic_first_updates=20, cloning_steps=50)
-TERMS = Terms(labels=20, smallest_pool=4, filter=FILTER, methods=MethodConfig(fine_tuning=FINE_TUNING))
+TERMS = BenchmarkConfig(labels=20, smallest_pool=4, filter=FILTER, methods=MethodConfig(fine_tuning=FINE_TUNING))
 
 
 def main() -> None:
@@ -86,7 +86,9 @@ def made(task: str, work: Path) -> Iterator[tuple[str, Iterable[bytes]]]:
     frozen = [policy, *(simulation.reference_policy(task, early) for early in simulation.early_policies(task))]
     yield "actions of the frozen policies", (each.mean(seen).tobytes() for each in frozen)
 
-    bench = Bench(Cell(task, TASTES[User.CAUTIOUS], "pbarl", SEED), TERMS, Shelf(task, work / "rollouts"), work)
+    bench = BenchmarkUser(
+        Cell(task, TASTES[User.CAUTIOUS], "pbarl", SEED), TERMS, RolloutCache(task, work / "rollouts"), work
+    )
     yield "behaviours of a pool", (part for each in bench.pool for part in arrays_of(each))
     yield "stored trajectories", (stored(each) for each in bench.pool)
     filmed, renderer = bench.pool[0], simulation.renderer("sharp")
@@ -101,7 +103,7 @@ def made(task: str, work: Path) -> Iterator[tuple[str, Iterable[bytes]]]:
     yield from learned(bench)
 
 
-def learned(bench: Bench) -> Iterator[tuple[str, Iterable[bytes]]]:
+def learned(bench: BenchmarkUser) -> Iterator[tuple[str, Iterable[bytes]]]:
     """What is learned with rollouts."""
     setting = bench.setting()
     gate = setting.reference(FILTER.gate_block(bench.task))

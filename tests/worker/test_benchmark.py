@@ -10,7 +10,7 @@ from worker import cli, options
 from worker.analysis.comparison import compared
 from worker.experiments import benchmark, benchmark_cell
 from worker.experiments.benchmark import PROFILES, Selection
-from worker.experiments.benchmark_cell import OPPOSED_USERS, PAPER_USERS, Cell, Terms
+from worker.experiments.benchmark_cell import OPPOSED_USERS, PAPER_USERS, BenchmarkConfig, Cell
 from worker.ml.filters.filter_problem import FilterConfig
 from worker.ml.methods.registry import METHODS
 from worker.ml.teachers import Taste
@@ -42,7 +42,7 @@ def rows(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(handle))
 
 
-def report(work: Path, output: Path, terms: Terms = TINY) -> int:
+def report(work: Path, output: Path, terms: BenchmarkConfig = TINY) -> int:
     """Write the tables and run nothing."""
     return benchmark.benchmark(Selection(), terms, work, output, 1, "the command", run=False)
 
@@ -102,7 +102,7 @@ def test_an_interrupted_benchmark_runs_what_is_missing_and_nothing_else(work: Pa
 
 
 def test_every_seed_is_judged_in_scenarios_of_its_own() -> None:
-    terms = Terms(scenarios=30)
+    terms = BenchmarkConfig(scenarios=30)
     assert len({scenario for seed in range(3) for scenario in terms.unseen(seed)}) == 3 * 30
 
 

@@ -18,8 +18,8 @@ from worker.sim.render.clip import INSET_MARGIN_PX, STYLES, ClipRenderer, Filmed
 from worker.sim.render.close_up import close_up
 from worker.sim.render.highlight import Highlight
 from worker.sim.render.interpolation import clip_motion
+from worker.sim.render.mesh_set import MeshSet
 from worker.sim.render.passes import Shot
-from worker.sim.render.stage import Stage
 from worker.sim.render.task_look import TaskLook
 from worker.tasks.feeding.environment import SPOON
 from worker.tasks.registry import filmed_task, look
@@ -160,7 +160,7 @@ def test_two_skin_tones_differ_in_the_face_only_and_share_the_still_picture(
     drawn: list[int] = []
     still = compositing.View.still
 
-    def noted(view: compositing.View, stage: Stage) -> Shot:
+    def noted(view: compositing.View, stage: MeshSet) -> Shot:
         drawn.append(view.width)
         return still(view, stage)
 

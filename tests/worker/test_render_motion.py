@@ -8,7 +8,7 @@ from tests.worker.waving import MOUNT, itching_trajectory, waving_trajectory
 from worker.sim.human import BROAD, LEFT, RIGHT
 from worker.sim.jaco import JACO
 from worker.sim.render.camera import lamp, scene_camera
-from worker.sim.render.interpolation import Motion, clip_motion, quaternions, smoothly
+from worker.sim.render.interpolation import ClipMotion, clip_motion, quaternions, smoothly
 from worker.sim.render.rectangles import GRID_PX, cover, on_grid
 from worker.sim.render.task_look import TaskLook
 from worker.tasks.feeding.environment import SPOON
@@ -18,7 +18,7 @@ from worker.trajectory import Trajectory
 MOUTH_M = np.array(BROAD.neck_pivot_m) + BROAD.mouth_from_neck_m
 
 
-def motion_of(trajectory: Trajectory, first: int, count: int, fps: int = 15) -> Motion:
+def motion_of(trajectory: Trajectory, first: int, count: int, fps: int = 15) -> ClipMotion:
     return clip_motion(trajectory, JACO, SPOON, first, count, fps)
 
 

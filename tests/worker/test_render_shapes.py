@@ -12,9 +12,20 @@ from worker.sim.geometry import Shape
 from worker.sim.human import BODY_SHAPES, BROAD, BodyShape
 from worker.sim.jaco import JACO
 from worker.sim.render.camera import Camera
+from worker.sim.render.mesh_set import MeshSet, Paints
 from worker.sim.render.meshes import arm_mesh, body_mesh, chair_mesh, head_mesh, limb_mesh, tool_mesh
 from worker.sim.render.meshes.colours import COMPLEXIONS, Palette, ramps
-from worker.sim.render.meshes.distance_fields import Field, box, carve, cone, cylinder, ellipsoid, sphere, torus, union
+from worker.sim.render.meshes.distance_fields import (
+    DistanceField,
+    box,
+    carve,
+    cone,
+    cylinder,
+    ellipsoid,
+    sphere,
+    torus,
+    union,
+)
 from worker.sim.render.meshes.mesh import (
     Mesh,
     ball,
@@ -28,7 +39,6 @@ from worker.sim.render.meshes.mesh import (
     without_hidden,
 )
 from worker.sim.render.passes import MACHINE_LIGHT
-from worker.sim.render.stage import Paints, Stage
 from worker.tasks.drinking import cup_mesh
 from worker.tasks.drinking.environment import PELLETS, pellet_radius_m, resting_places_m
 from worker.tasks.feeding.spoon_mesh import spoon
@@ -67,7 +77,7 @@ def test_what_was_drawn_before_changes_no_pixel() -> None:
     rough = smooth.normals[corners] + np.random.default_rng(0).normal(0, 0.2, (len(corners), 3))
     apart = np.arange(len(corners), dtype=np.int32).reshape(-1, 3)  # a normal of two faces is looked at twice
     paints = Paints()
-    stage = Stage(paints)
+    stage = MeshSet(paints)
     stage.add({"ball": Mesh(smooth.vertices[corners], rough, smooth.paint[corners], apart)})
     camera = Camera((0.0, -0.5, 0.1), (0.0, 0.0, 0.0), 30.0, 1200, 1200, 0.1, 2.0)
     different = 0
@@ -100,7 +110,7 @@ def test_every_edge_of_a_surface_is_shared_by_two_faces() -> None:
     ],
 )
 def test_a_field_is_negative_inside_and_positive_outside(
-    field: Field, inside: tuple[float, ...], outside: tuple[float, ...]
+    field: DistanceField, inside: tuple[float, ...], outside: tuple[float, ...]
 ) -> None:
     assert field(np.array([inside]))[0] < 0 < field(np.array([outside]))[0]
 

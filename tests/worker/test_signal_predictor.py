@@ -12,7 +12,7 @@ from app.installed_tasks import catalogue
 from tests.worker import invented
 from worker.compute import learning, simulation
 from worker.experiments import train_signal_predictor
-from worker.experiments.rollout_cache import Shelf
+from worker.experiments.rollout_cache import RolloutCache
 from worker.ml.rewards import reward_training, signal_training
 from worker.ml.rewards.action_ranking import ranker_at
 from worker.ml.rewards.loading import load_reward_model
@@ -168,7 +168,7 @@ def test_the_command_keeps_its_rollouts_and_says_how_well_signals_are_foreseen(t
     )
     assert json.loads(target.with_suffix(".json").read_text()) == record
     assert record["explained_share"]["distance_m"]["step"] > 0.3
-    kept = list(Shelf("feeding", tmp_path).directory.glob("behaviour-*.npz"))
+    kept = list(RolloutCache("feeding", tmp_path).directory.glob("behaviour-*.npz"))
     made = {path: path.stat().st_mtime_ns for path in kept}
     again = train_signal_predictor.foresee("feeding", tmp_path, 1, scenarios=2, tested=1, training=QUICK, target=target)
     assert again == record

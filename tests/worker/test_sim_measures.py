@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from worker.sim.costs import base_weights, cost_items, preference_rewards, signal_weights, stakes
-from worker.sim.measures import Outcome, StepMeasures, TaskReward
+from worker.sim.measures import StepMeasures, StepOutcome, TaskReward
 from worker.tasks.feeding.environment import FEEDING
 from worker.tasks.scratching.environment import SCRATCHING
 from worker.trajectory import COSTS, SIGNALS
@@ -26,7 +26,7 @@ STILL = StepMeasures(
     previous_action=np.zeros(7),
     turn_speed_rad_s=0.0,
     force_squared_n2=0.0,
-    outcome=Outcome(),
+    outcome=StepOutcome(),
     undelivered=True,
 )
 
@@ -72,8 +72,8 @@ def test_force_away_from_the_target_is_the_force_cost() -> None:
 
 
 def test_food_on_the_person_and_intake_speed_are_costs() -> None:
-    assert cost("C_fd", outcome=Outcome(on_person=2)) == 2.0
-    assert cost("C_fdv", outcome=Outcome(delivered=1, intake_speed_m_s=0.5)) == 0.5
+    assert cost("C_fd", outcome=StepOutcome(on_person=2)) == 2.0
+    assert cost("C_fdv", outcome=StepOutcome(delivered=1, intake_speed_m_s=0.5)) == 0.5
 
 
 @pytest.mark.parametrize(
@@ -109,7 +109,7 @@ def test_acceleration_and_action_change_are_squared() -> None:
 
 def test_turning_strokes_and_the_square_of_the_force_are_signals() -> None:
     assert signal("turn_speed_squared_rad2_s2", turn_speed_rad_s=3.0) == 9.0
-    assert signal("strokes", outcome=Outcome(strokes=2)) == 2.0
+    assert signal("strokes", outcome=StepOutcome(strokes=2)) == 2.0
     assert signal("force_squared_n2", force_at_target_n=2.0, force_squared_n2=5.0) == 5.0
 
 
@@ -126,7 +126,7 @@ def test_the_task_reward_adds_up() -> None:
         force_at_target_n=1.0,
         force_away_n=3.0,
         action=np.array([0.6, 0.8, 0, 0, 0, 0, 0]),
-        outcome=Outcome(delivered=3, spilled=2, strokes=4),
+        outcome=StepOutcome(delivered=3, spilled=2, strokes=4),
     )
     by_hand = -0.4 - 0.01 + 6.0 - 2.0 + 2.0 - 0.05 * 0.2 - 0.03 * 4.0 - 0.3 * (1 - half)
     reward = TaskReward(per_delivered=2.0, per_spilled=-1.0, per_stroke=0.5, tilt=-0.3)

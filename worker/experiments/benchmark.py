@@ -26,8 +26,8 @@ from worker.analysis.pareto import pareto_svg
 from worker.analysis.table_files import tables, to_csv
 from worker.compute.pools import Compute, Lane
 from worker.experiments import benchmark_cell
-from worker.experiments.benchmark_cell import INDIRECT_USERS, OPPOSED_USERS, PAPER_USERS, Cell, Terms
-from worker.experiments.rollout_cache import Shelf, policy_mark
+from worker.experiments.benchmark_cell import INDIRECT_USERS, OPPOSED_USERS, PAPER_USERS, BenchmarkConfig, Cell
+from worker.experiments.rollout_cache import RolloutCache, policy_mark
 from worker.ml.filters.filter_problem import FilterConfig
 from worker.ml.methods.pbrl_hri import FromScratch
 from worker.ml.methods.prefft import FineTuning
@@ -47,8 +47,8 @@ CLOSE_POINTS = 0.2
 """The second picture leaves out methods that lose more success than this."""
 
 PROFILES = {
-    "full": Terms(),
-    "quick": Terms(
+    "full": BenchmarkConfig(),
+    "quick": BenchmarkConfig(
         labels=40,
         scenarios=20,
         smallest_pool=8,
@@ -101,7 +101,13 @@ def population(count: int) -> list[Taste]:
 
 
 def benchmark(
-    selection: Selection, terms: Terms, work: Path, output: Path, processes: int, command: str, run: bool = True
+    selection: Selection,
+    terms: BenchmarkConfig,
+    work: Path,
+    output: Path,
+    processes: int,
+    command: str,
+    run: bool = True,
 ) -> int:
     """Run what is missing (unless ``run`` is False) and write the tables; returns the exit code.
 
@@ -117,7 +123,7 @@ def benchmark(
     if run and missing:
         compute = Compute(processes)
         try:
-            _fill_shelves(compute, processes, missing, terms, work)
+            _fill_caches(compute, processes, missing, terms, work)
             failures = _run_cells(compute, processes, missing, terms, work, report)
         except KeyboardInterrupt:
             sys.stderr.write("Interrupted. The same command goes on from here.\n")
@@ -133,7 +139,7 @@ def benchmark(
 # -- running -----------------------------------------------------------------------------------------------------------
 
 
-def _fill_shelves(compute: Compute, processes: int, missing: Sequence[Cell], terms: Terms, work: Path) -> None:
+def _fill_caches(compute: Compute, processes: int, missing: Sequence[Cell], terms: BenchmarkConfig, work: Path) -> None:
     """Rollouts that all cells of a task share, first and in parallel."""
     jobs = []
     for task in dict.fromkeys(cell.task for cell in missing):
@@ -146,15 +152,15 @@ def _fill_shelves(compute: Compute, processes: int, missing: Sequence[Cell], ter
 
 def fill_shelf(task: str, work: Path, what: str, scenarios: Sequence[int]) -> None:
     """Make what is missing of a stretch of shared rollouts."""
-    shelf = Shelf(task, work / "rollouts")
+    rollout_cache = RolloutCache(task, work / "rollouts")
     if what == "behaviours":
-        shelf.behaviours(scenarios)
+        rollout_cache.behaviours(scenarios)
     else:
-        shelf.reference(scenarios)
+        rollout_cache.reference(scenarios)
 
 
 def _run_cells(
-    compute: Compute, processes: int, missing: Sequence[Cell], terms: Terms, work: Path, report: Any
+    compute: Compute, processes: int, missing: Sequence[Cell], terms: BenchmarkConfig, work: Path, report: Any
 ) -> list[str]:
     return _in_parallel(
         compute, processes, "cells", benchmark_cell.run_cell, [(cell, terms, work) for cell in missing], report
@@ -200,7 +206,7 @@ def _chunks(scenarios: range) -> list[range]:
 # -- reporting ---------------------------------------------------------------------------------------------------------
 
 
-def _report(terms: Terms, work: Path, output: Path, command: str) -> None:
+def _report(terms: BenchmarkConfig, work: Path, output: Path, command: str) -> None:
     """All files, from the cells there are."""
     found = list(_finished(terms, work))
     tastes = {taste.name: taste for _, _, taste in found}
@@ -225,7 +231,7 @@ def _report(terms: Terms, work: Path, output: Path, command: str) -> None:
         _replace(output / f"pareto-{task}-close.svg", pareto_svg(task, close, list(METHODS)))
 
 
-def _finished(terms: Terms, work: Path) -> Iterator[tuple[dict[str, Any], dict[str, Any], Taste]]:
+def _finished(terms: BenchmarkConfig, work: Path) -> Iterator[tuple[dict[str, Any], dict[str, Any], Taste]]:
     """Every cell under these terms that was run with the present policies."""
     present = {
         f"{task}-{policy_mark(task)}"
@@ -242,7 +248,9 @@ def _finished(terms: Terms, work: Path) -> Iterator[tuple[dict[str, Any], dict[s
         yield record, arrays, taste
 
 
-def _run(record: dict[str, Any], arrays: dict[str, Any], terms: Terms, tastes: dict[str, Taste]) -> EvaluatedCell:
+def _run(
+    record: dict[str, Any], arrays: dict[str, Any], terms: BenchmarkConfig, tastes: dict[str, Taste]
+) -> EvaluatedCell:
     """r^H is linear in the measured sums, so every user can judge every run."""
     task = registry.task(record["task"])
     true, at_stake = (
@@ -287,7 +295,7 @@ def _by_task(rows: Sequence[Row]) -> list[tuple[str, list[Row]]]:
 
 
 def _made(
-    terms: Terms, cells: Cells, command: str, groups: Sequence[Sequence[str]], states: Counter[str]
+    terms: BenchmarkConfig, cells: Cells, command: str, groups: Sequence[Sequence[str]], states: Counter[str]
 ) -> dict[str, Any]:
     """How the tables were made. Cells do not run again when the code changes, so its states are counted."""
     return {

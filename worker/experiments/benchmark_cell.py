@@ -20,7 +20,7 @@ import torch
 import worker
 from worker.compute import learning, simulation
 from worker.compute.simulation import surface_file
-from worker.experiments.rollout_cache import BEHAVIOURS_PER_SCENARIO, Shelf, policy_mark
+from worker.experiments.rollout_cache import BEHAVIOURS_PER_SCENARIO, RolloutCache, policy_mark
 from worker.ml import acquisition
 from worker.ml.filters.filter_problem import FilterConfig, FilterProblem
 from worker.ml.filters.response_surface import ResponseSurface
@@ -54,7 +54,7 @@ INDIRECT_USERS: Mapping[str, Taste] = {taste.name: taste for taste in INDIRECT}
 
 
 @dataclass(frozen=True)
-class Terms:
+class BenchmarkConfig:
     """What all cells of a benchmark share. Cells made under other terms are never mixed."""
 
     labels: int = 200
@@ -94,7 +94,7 @@ class Cell:
     method: str
     seed: int
 
-    def path(self, terms: Terms, work: Path) -> Path:
+    def path(self, terms: BenchmarkConfig, work: Path) -> Path:
         """The finished cell's file."""
         mark = hashlib.sha256(json.dumps(asdict(self.taste), sort_keys=True).encode()).hexdigest()[:6]
         folder = terms.directory(work) / f"{self.task}-{policy_mark(self.task)}" / f"{self.taste.name}-{mark}"
@@ -114,17 +114,17 @@ def code_mark() -> str:
     return digest.hexdigest()[:8]
 
 
-def run_cell(cell: Cell, terms: Terms, work: Path) -> Path:
+def run_cell(cell: Cell, terms: BenchmarkConfig, work: Path) -> Path:
     """Label, fit, evaluate; the result is written to a file that is either complete or absent."""
     torch.set_num_threads(1)
-    shelf = Shelf(cell.task, work / "rollouts")
-    bench = Bench(cell, terms, shelf, work)
+    rollout_cache = RolloutCache(cell.task, work / "rollouts")
+    bench = BenchmarkUser(cell, terms, rollout_cache, work)
     started = time.perf_counter()
     fitted = methods.fit(cell.method, bench.setting())
     wall_s = time.perf_counter() - started
     unseen = terms.unseen(cell.seed)
     if cell.method == "reference":
-        driven = shelf.reference(unseen)
+        driven = rollout_cache.reference(unseen)
     else:
         driven = learning.run_scenarios(cell.task, fitted.act, unseen, 0.0, 0)
     record = {
@@ -159,13 +159,13 @@ def _write(target: Path, record: dict[str, Any], driven: Sequence[Trajectory], l
     return target
 
 
-class Bench:
+class BenchmarkUser:
     """A user's labels, what was learned from them, and everything that a method may ask for."""
 
-    def __init__(self, cell: Cell, terms: Terms, shelf: Shelf, work: Path) -> None:
-        self.cell, self.terms, self.shelf = cell, terms, shelf
+    def __init__(self, cell: Cell, terms: BenchmarkConfig, rollout_cache: RolloutCache, work: Path) -> None:
+        self.cell, self.terms, self.rollout_cache = cell, terms, rollout_cache
         self.task = registry.task(cell.task)
-        self.pool = shelf.behaviours(terms.pool)
+        self.pool = rollout_cache.behaviours(terms.pool)
         self.clip_steps = installed_task(cell.task).description.usual_clip_steps
         self.rows = acquisition.matched_pairs([each.scenario for each in self.pool])
         episode_means = [each.signals.mean(axis=0, dtype=np.float64) for each in self.pool]
@@ -183,7 +183,7 @@ class Bench:
             pool=self.pool,
             surface=lambda: ResponseSurface.load(surface_file(self.cell.task), self.task.modes),
             action_reward=self._action_reward,
-            reference=self.shelf.reference,
+            reference=self.rollout_cache.reference,
             collect=self._collect,
             make_env=registry.environment_class(self.cell.task),
             config=self.terms.methods,

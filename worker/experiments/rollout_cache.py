@@ -16,7 +16,7 @@ BEHAVIOURS_PER_SCENARIO = 6
 """As in a study (StudySettings.behaviours_per_scenario)."""
 
 
-class Shelf:
+class RolloutCache:
     """The rollouts of one task and one frozen policy."""
 
     def __init__(self, task: str, directory: Path) -> None:

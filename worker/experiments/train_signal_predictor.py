@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 from worker.compute import simulation
 from worker.compute.pools import Compute, Lane
-from worker.experiments.rollout_cache import BEHAVIOURS_PER_SCENARIO, Shelf
+from worker.experiments.rollout_cache import BEHAVIOURS_PER_SCENARIO, RolloutCache
 from worker.ml.rewards import signal_training
 from worker.ml.rewards.signal_training import PredictorTraining
 from worker.scenarios import SIGNAL_PREDICTOR, SIGNAL_PREDICTOR_TEST, first_of
@@ -44,9 +44,9 @@ def foresee(
     learned_from = first_of(SIGNAL_PREDICTOR, scenarios)
     tested_on = first_of(SIGNAL_PREDICTOR_TEST, tested)
     _roll_out(task, work_directory, processes, [*learned_from, *tested_on])
-    shelf, config = Shelf(task, work_directory), training or PredictorTraining()
+    cached, config = RolloutCache(task, work_directory), training or PredictorTraining()
     with tqdm(total=config.steps, unit="step", desc="training") as bar:
-        predictor = signal_training.fit(shelf.behaviours(learned_from), 0, config, lambda step: _moved(bar, step))
+        predictor = signal_training.fit(cached.behaviours(learned_from), 0, config, lambda step: _moved(bar, step))
     clip_steps = registry.installed_task(task).description.usual_clip_steps
     file = target or simulation.predictor_file(task)
     predictor.save(file)
@@ -57,7 +57,7 @@ def foresee(
         "tested_scenarios": [tested_on.start, tested_on.stop - 1],
         "steps": config.steps,
         "clip_steps": clip_steps,
-        "explained_share": signal_training.explained(predictor, shelf.behaviours(tested_on), clip_steps),
+        "explained_share": signal_training.explained(predictor, cached.behaviours(tested_on), clip_steps),
         "versions": {"python": platform.python_version(), "numpy": np.__version__, "torch": torch.__version__},
     }
     file.with_suffix(".json").write_text(json.dumps(record, indent=2) + "\n")
@@ -66,7 +66,7 @@ def foresee(
 
 def keep_behaviours(task: str, directory: Path, scenarios: Sequence[int]) -> None:
     """Make the rollouts of these scenarios that are not there yet."""
-    Shelf(task, directory).behaviours(scenarios)
+    RolloutCache(task, directory).behaviours(scenarios)
 
 
 def _roll_out(task: str, directory: Path, processes: int, scenarios: Sequence[int]) -> None:

@@ -25,7 +25,7 @@ class WentAstray(AppError):
     """A page was not what a visitor expects."""
 
 
-class Visitor:
+class FormBrowser:
     """One visitor with cookies of their own; a context that closes the connection at its end."""
 
     def __init__(self, base_url: str, path: str) -> None:

@@ -9,7 +9,7 @@ from app.domain.models import Report
 from app.domain.studies import Study
 from app.services.runs import reports
 from worker.jobs.publishing import report_files
-from worker.rehearsal.browser import Visitor
+from worker.rehearsal.browser import FormBrowser
 from worker.rehearsal.server import PATIENCE_S, wait_until
 
 FINAL_FIGURE = "ratings"
@@ -29,12 +29,12 @@ class Conclusion:
     """from unblinding to the final figure"""
 
 
-def lock(experimenter: Visitor, study: Study) -> None:
+def lock(experimenter: FormBrowser, study: Study) -> None:
     """Lock the study before anybody comes."""
     experimenter.fill_in(f"/studies/{study.slug}/lock", typed=study.slug)
 
 
-def conclude(experimenter: Visitor, database: Database, study: Study) -> Conclusion:
+def conclude(experimenter: FormBrowser, database: Database, study: Study) -> Conclusion:
     """Unblind, wait for the report that knows everything, and download its figures and the tables."""
     started = time.monotonic()
     if study.settings.evaluation is not None:

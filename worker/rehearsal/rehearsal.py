@@ -33,7 +33,7 @@ from app.storage import ArtefactStore
 from worker.jobs.runtime import records
 from worker.ml.teachers import Manner, Taste
 from worker.rehearsal import experimenter_steps as conclusion
-from worker.rehearsal.browser import Visitor
+from worker.rehearsal.browser import FormBrowser
 from worker.rehearsal.experimenter_steps import Conclusion
 from worker.rehearsal.participant_steps import Insight, Rated, ScriptedPerson
 from worker.rehearsal.server import PATIENCE_S, wait_until
@@ -152,7 +152,7 @@ class Rehearsal:
             study.key_secret = hashlib.sha256(f"rehearsal/{seed}".encode()).hexdigest()  # nobody rates who could cheat
             enrolled = [enrolment.add_participant(session, study, scripted_as=taste.name) for taste in tastes]
             password = accounts.create_first_experimenter(session)
-        with Visitor(self.base_url, "/login") as experimenter:
+        with FormBrowser(self.base_url, "/login") as experimenter:
             experimenter.log_in(accounts.FIRST_EXPERIMENTER, password or "")
             conclusion.lock(experimenter, study)
             if self.unhurried:
@@ -163,7 +163,7 @@ class Rehearsal:
                 person = ScriptedPerson(self.database, self.store, study, taste, manner, seed + participant.number)
                 persons.append(person)
                 outcome = RehearsedPerson(participant.id, participant.code, taste)
-                with Visitor(self.base_url, f"/p/{token}") as visitor:
+                with FormBrowser(self.base_url, f"/p/{token}") as visitor:
                     self._answer_everything(visitor, person, outcome, settings)
                 outcome.finished_at = time.monotonic()
                 outcomes.append(outcome)
@@ -171,14 +171,14 @@ class Rehearsal:
                 self._await_bundle(outcome, study, experimenter)
                 outcome.insight = person.insight(outcome.participant_id)
             for (_, token), person, outcome in zip(enrolled, persons, outcomes, strict=True):
-                with Visitor(self.base_url, f"/p/{token}") as visitor:
+                with FormBrowser(self.base_url, f"/p/{token}") as visitor:
                     self._rate_robots(visitor, person, outcome, settings)
                     visitor.go_to_the_end()
             ending = conclusion.conclude(experimenter, self.database, study)
         return Rehearsed(outcomes, ending, time.monotonic() - began)
 
     def _rate_robots(
-        self, visitor: Visitor, person: ScriptedPerson, outcome: RehearsedPerson, settings: StudySettings
+        self, visitor: FormBrowser, person: ScriptedPerson, outcome: RehearsedPerson, settings: StudySettings
     ) -> None:
         """Everything between the last pair and the last rating; a physical robot needs an operator, who is not here."""
         evaluation = settings.evaluation
@@ -194,7 +194,7 @@ class Rehearsal:
             outcome.rated.append(rated)
 
     def _answer_everything(
-        self, visitor: Visitor, person: ScriptedPerson, outcome: RehearsedPerson, settings: StudySettings
+        self, visitor: FormBrowser, person: ScriptedPerson, outcome: RehearsedPerson, settings: StudySettings
     ) -> None:
         visitor.come_in()
         came = time.monotonic()
@@ -243,7 +243,7 @@ class Rehearsal:
             )
         return bool(trained)
 
-    def _await_bundle(self, outcome: RehearsedPerson, study: Study, experimenter: Visitor) -> None:
+    def _await_bundle(self, outcome: RehearsedPerson, study: Study, experimenter: FormBrowser) -> None:
         def finished() -> tuple[Model, Bundle] | None:
             with self.database.reading() as session:
                 row = session.execute(

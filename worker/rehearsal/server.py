@@ -16,7 +16,7 @@ from app.errors import AppError
 from app.programs import GRACE_S, end_with_parent
 from app.settings import Settings
 
-Found = TypeVar("Found")
+Answered = TypeVar("Answered")
 
 PATIENCE_S = 900.0
 POLL_S = 0.25
@@ -102,7 +102,7 @@ class OwnStudio:
             ).result()
 
 
-def wait_until(patience_s: float, missing: str, look: Callable[[], Found | None]) -> Found:
+def wait_until(patience_s: float, missing: str, look: Callable[[], Answered | None]) -> Answered:
     """What ``look`` finds in the end. Raises StandsStill when it has found nothing for too long."""
     deadline = time.monotonic() + patience_s
     while (found := look()) is None:

@@ -46,7 +46,7 @@ class Tool:
 
 
 @dataclass(frozen=True)
-class Robot:
+class RobotArm:
     """An arm of J revolute joints on a fixed base."""
 
     name: str
@@ -150,12 +150,12 @@ def transform(origin_m: Point, rpy: Point) -> FloatArray:
 
 
 @cache
-def _base_shapes(robot: Robot) -> tuple[Shape, ...]:
+def _base_shapes(robot: RobotArm) -> tuple[Shape, ...]:
     return (capsule_between((0, 0, 0), (0, 0, robot.base_height_m), robot.base_radius_m),)
 
 
 @cache
-def _links(robot: Robot, tool: Tool) -> tuple[Link, ...]:
+def _links(robot: RobotArm, tool: Tool) -> tuple[Link, ...]:
     moving = [
         Link(
             joint.link,
@@ -188,7 +188,7 @@ class Start:
 
 
 @cache
-def start_postures(robot: Robot, tool: Tool, start: Start) -> FloatArray:
+def start_postures(robot: RobotArm, tool: Tool, start: Start) -> FloatArray:
     """(count, J) rad: postures with the tool in its start orientation, spread over the start's cube."""
     rng = np.random.default_rng(1)
     offsets = rng.uniform(-start.range_m, start.range_m, (start.count, 3))

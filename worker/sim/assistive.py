@@ -13,12 +13,12 @@ import gymnasium
 import numpy as np
 
 from worker.sim import human
-from worker.sim.arm import Robot, Start, Tool, start_postures
+from worker.sim.arm import RobotArm, Start, Tool, start_postures
 from worker.sim.bullet import Bullet, Contact
 from worker.sim.geometry import rotation_of
 from worker.sim.human import Impairment, Person
 from worker.sim.jaco import JACO
-from worker.sim.measures import Outcome, StepMeasures, TaskReward
+from worker.sim.measures import StepMeasures, StepOutcome, TaskReward
 from worker.sim.seated_person import HEAD, PERSON, add_person
 from worker.spaces import CONTROL_STEP_S, JOINT_ACTION, Space
 from worker.task import Task
@@ -38,7 +38,7 @@ TREMOR_RESPONSE = 0.3
 ARM = "arm"
 
 
-class Motion(NamedTuple):
+class StepMotion(NamedTuple):
     """What the physics of one control step was like: means over its sub-steps."""
 
     speed_m_s: float
@@ -70,7 +70,7 @@ class AssistiveEnv(gymnasium.Env[Any, Any]):
     task: ClassVar[Task]
     tool: ClassVar[Tool]
     start: ClassVar[Start]
-    robot: ClassVar[Robot] = JACO
+    robot: ClassVar[RobotArm] = JACO
     task_reward: ClassVar[Reward] = TaskReward()
     head_range_deg: ClassVar[float] = human.HEAD_RANGE_DEG
     right_arm: ClassVar[human.ArmRange] = human.ARMREST
@@ -112,7 +112,7 @@ class AssistiveEnv(gymnasium.Env[Any, Any]):
         """Place whatever the task needs besides person and arm, which are already there. The target is read next."""
 
     @abstractmethod
-    def _outcome(self, motion: Motion) -> Outcome:
+    def _outcome(self, motion: StepMotion) -> StepOutcome:
         """What happened to the task's objects during the control step that has just been simulated."""
 
     @abstractmethod
@@ -313,7 +313,7 @@ class AssistiveEnv(gymnasium.Env[Any, Any]):
         self._force = motion.force_at_target_n + motion.force_away_n
         return measures
 
-    def _simulate(self) -> Motion:
+    def _simulate(self) -> StepMotion:
         side = 1.0 if len(self._history) % 2 else -1.0
         self._tremor_before = self._tremor
         self._tremor += TREMOR_RESPONSE * (side - self._tremor)
@@ -331,7 +331,9 @@ class AssistiveEnv(gymnasium.Env[Any, Any]):
             at_target += on_target
             squared += on_target * on_target
             away += elsewhere
-        return Motion(speed * share, speed_squared * share, at_target * share, squared * share, away * share, touching)
+        return StepMotion(
+            speed * share, speed_squared * share, at_target * share, squared * share, away * share, touching
+        )
 
     def _forces(self, touching: set[str]) -> tuple[float, float]:
         """Normal force on the person at the target and elsewhere, N; adds to ``touching`` who else touches them."""

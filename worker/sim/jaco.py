@@ -5,12 +5,12 @@ Link shapes are our own capsules. The arm is mounted beside the person's right k
 
 import math
 
-from worker.sim.arm import Joint, Robot
+from worker.sim.arm import Joint, RobotArm
 
 PI = math.pi
 TAU = 2 * math.pi
 
-JACO = Robot(
+JACO = RobotArm(
     name="jaco",
     joints=(
         Joint("link_1", (0, 0, 0.15675), (0, PI, 0), -TAU, TAU, 0.7477, (0, 0.0016, -0.11875), 0.043),

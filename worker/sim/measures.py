@@ -18,7 +18,7 @@ LOW_ENTRY_M = 0.08
 HIGH_FORCE_N = 10.0
 
 
-class Outcome(NamedTuple):
+class StepOutcome(NamedTuple):
     """What happened to the task's objects during one control step. Counts are of this step alone."""
 
     delivered: int = 0
@@ -61,7 +61,7 @@ class StepMeasures:
     """summed normal force everywhere else"""
     action: FloatArray
     previous_action: FloatArray
-    outcome: Outcome
+    outcome: StepOutcome
     undelivered: bool
     """whether the task has not succeeded so far"""
 

@@ -20,7 +20,7 @@ from app.services.archives import study_import
 from app.services.archives.archive import ArchiveInvalid
 from app.services.archives.study_import import Imported
 from app.web.http.deps import CurrentExperimenter, Studio, StudioDep, experimenter_asking
-from app.web.http.new_links import Link
+from app.web.http.new_links import NewLink
 from app.web.texts.templating import page
 
 router = APIRouter()
@@ -89,7 +89,7 @@ async def import_study(
         return page(request, "experimenter/import.html", context, HTTPStatus.UNPROCESSABLE_ENTITY)
     base = (studio.settings.public_url or str(request.base_url)).rstrip("/")
     links = [
-        Link(code, f"{base}{request.app.url_path_for('open_link', token=token)}") for code, token in imported.tokens
+        NewLink(code, f"{base}{request.app.url_path_for('open_link', token=token)}") for code, token in imported.tokens
     ]
     slug = imported.study.slug
     if not links:

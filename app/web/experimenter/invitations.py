@@ -23,7 +23,7 @@ from app.web.http.deps import (
     StudioDep,
     WritingSession,
 )
-from app.web.http.new_links import Link
+from app.web.http.new_links import NewLink
 from app.web.texts.templating import page
 
 router = APIRouter(prefix="/studies")
@@ -44,7 +44,7 @@ def add_participants(
     """Add people to the study and lead to their links."""
     study = studies.find_study(session, slug)
     added = [enrolment.add_participant(session, study, experimenter.name) for _ in range(count)]
-    links = [Link(participant.code, link_of(request, studio, token)) for participant, token in added]
+    links = [NewLink(participant.code, link_of(request, studio, token)) for participant, token in added]
     return _see(request, "show_links", slug=slug, key=studio.new_links.leave(experimenter.id, links))
 
 
@@ -61,7 +61,7 @@ def renew_link(
     study = studies.find_study(session, slug)
     participant = enrolment.find_by_code(session, study, code)
     token = enrolment.renew_link(session, study, participant, experimenter.name)
-    links = [Link(participant.code, link_of(request, studio, token))]
+    links = [NewLink(participant.code, link_of(request, studio, token))]
     return _see(request, "show_links", slug=slug, key=studio.new_links.leave(experimenter.id, links))
 
 
@@ -182,7 +182,7 @@ def _qr_code(url: str) -> Markup:
     return Markup(drawn)  # noqa: S704  (drawn by us from an address that we made)
 
 
-def _as_csv(links: Sequence[Link]) -> str:
+def _as_csv(links: Sequence[NewLink]) -> str:
     return "".join([csv_line(("participant", "link")), *(csv_line((link.code, link.url)) for link in links)])
 
 

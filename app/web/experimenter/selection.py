@@ -20,7 +20,7 @@ from app.services.runs import publishing
 from app.services.studies import studies
 from app.web.experimenter.invitations import link_of
 from app.web.http.deps import ActingExperimenter, Slug, StudioDep, WritingSession
-from app.web.http.new_links import Link
+from app.web.http.new_links import NewLink
 
 router = APIRouter(prefix="/studies/{slug}/selection")
 
@@ -55,7 +55,7 @@ def renew_links(
     links = []
     for participant in _ticked(session, study, code):
         token = enrolment.renew_link(session, study, participant, experimenter.name)
-        links.append(Link(participant.code, link_of(request, studio, token)))
+        links.append(NewLink(participant.code, link_of(request, studio, token)))
     key = studio.new_links.leave(experimenter.id, links)
     address = request.app.url_path_for("show_links", slug=slug, key=key)
     return RedirectResponse(address, HTTPStatus.SEE_OTHER)

@@ -10,7 +10,7 @@ KEPT_S = 600.0
 
 
 @dataclass(frozen=True)
-class Link:
+class NewLink:
     """A participant's code and personal link."""
 
     code: str
@@ -22,9 +22,9 @@ class NewLinks:
 
     def __init__(self) -> None:
         self._lock = Lock()
-        self._waiting: dict[str, tuple[int, float, Sequence[Link]]] = {}
+        self._waiting: dict[str, tuple[int, float, Sequence[NewLink]]] = {}
 
-    def leave(self, experimenter_id: int, links: Sequence[Link]) -> str:
+    def leave(self, experimenter_id: int, links: Sequence[NewLink]) -> str:
         """Keep the links for their experimenter; returns the key that picks them up."""
         key, moment = secrets.token_urlsafe(16), time.monotonic()
         with self._lock:
@@ -32,7 +32,7 @@ class NewLinks:
             self._waiting[key] = (experimenter_id, moment + KEPT_S, links)
         return key
 
-    def pick_up(self, experimenter_id: int, key: str) -> Sequence[Link]:
+    def pick_up(self, experimenter_id: int, key: str) -> Sequence[NewLink]:
         """The links left under this key; nothing for others, and nothing after ten minutes."""
         with self._lock:
             owner, expires, links = self._waiting.get(key, (0, 0.0, ()))

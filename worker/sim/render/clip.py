@@ -9,14 +9,14 @@ from typing import NamedTuple
 import numpy as np
 from PIL import Image
 
-from worker.sim.arm import Robot, Tool
+from worker.sim.arm import RobotArm, Tool
 from worker.sim.render import video
 from worker.sim.render.camera import Camera, scene_camera
 from worker.sim.render.close_up import close_up
 from worker.sim.render.compositing import View
 from worker.sim.render.highlight import Highlight
 from worker.sim.render.interpolation import clip_motion, frame_count
-from worker.sim.render.moving_parts import Person, Shoot, moving_lamp_depth, moving_parts, still_lamp_depth
+from worker.sim.render.moving_parts import FilmedPerson, Shoot, moving_lamp_depth, moving_parts, still_lamp_depth
 from worker.sim.render.passes import Depth, Frame, Shot, Supersampling
 from worker.sim.render.scene import Scene
 from worker.sim.render.task_look import TaskLook
@@ -82,7 +82,7 @@ class Still(NamedTuple):
 class FilmedTask(NamedTuple):
     """What a renderer has to know of a task."""
 
-    robot: Robot
+    robot: RobotArm
     tool: Tool
     look: TaskLook
 
@@ -135,7 +135,7 @@ class ClipRenderer:
         main, still = self._main_view(camera, task, shoot.sitter.body.name)
         inset = View(close_up(shoot.look, motion, *style.inset_size), style.supersampling) if style.inset else None
         inset_still = inset.still(self._scene.stages.still) if inset else None
-        person = Person(shoot, self._scene.stages.still)
+        person = FilmedPerson(shoot, self._scene.stages.still)
         lamp_depth = np.minimum(still.lamp_depth, person.lamp_depth())
         resting, itch_m = person.resting(), motion.target_m[0] if shoot.look.itch else None
         main.start(still.picture, resting, itch_m, lamp_depth)

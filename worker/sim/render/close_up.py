@@ -7,12 +7,12 @@ import numpy as np
 from worker.sim.geometry import rotation_of
 from worker.sim.human import RIGHT, arm_points_m
 from worker.sim.render.camera import Camera, close_up_camera
-from worker.sim.render.interpolation import Motion
+from worker.sim.render.interpolation import ClipMotion
 from worker.sim.render.task_look import TaskLook
 from worker.type_aliases import FloatArray
 
 
-def close_up(look: TaskLook, motion: Motion, width: int, height: int) -> Camera:
+def close_up(look: TaskLook, motion: ClipMotion, width: int, height: int) -> Camera:
     """The camera of a clip's close-up. It stays where it is while the person moves."""
     target_m = motion.target_m[0]
     axes = _skin_axes(motion) if look.itch else rotation_of(motion.head_quaternions[0])
@@ -20,7 +20,7 @@ def close_up(look: TaskLook, motion: Motion, width: int, height: int) -> Camera:
     return close_up_camera(target_m + axes @ np.asarray(look.inset_offset_m), towards, look.inset_span_m, width, height)
 
 
-def _skin_axes(motion: Motion) -> FloatArray:
+def _skin_axes(motion: ClipMotion) -> FloatArray:
     """(3, 3) in columns: level and away from the robot, out of the skin at the itch, and up.
 
     All three are the same for every clip of a scenario, so that two clips are seen from the same place.

@@ -15,6 +15,7 @@ from PIL import Image, ImageChops, ImageFilter
 
 from worker.sim.render import skin
 from worker.sim.render.camera import Camera, Rectangle
+from worker.sim.render.mesh_set import MeshSet
 from worker.sim.render.passes import (
     WATER_LIGHT,
     Colours,
@@ -31,7 +32,6 @@ from worker.sim.render.passes import (
     seen_from_lamp,
 )
 from worker.sim.render.rectangles import Pixels, cover, on_grid
-from worker.sim.render.stage import Stage
 from worker.type_aliases import FloatArray
 
 STILL_LAMP_SIZE, MOVING_LAMP_SIZE = 640, 176
@@ -74,7 +74,7 @@ class View:
         self._pixels_per_m = camera.pixels_per_m(np.asarray(camera.target_m))
         self._portraits: dict[Rectangle, Portrait] = {}
 
-    def still(self, stage: Stage) -> Shot:
+    def still(self, stage: MeshSet) -> Shot:
         """What never moves, drawn to be kept for many clips."""
         share = self._supersampling.still
         shot = photograph(stage, self._camera, self._whole, round(self.width * share), round(self.height * share))

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from worker.sim.arm import Robot, Tool, transform
+from worker.sim.arm import RobotArm, Tool, transform
 from worker.sim.geometry import rotation_of
 from worker.sim.human import BODY_SHAPES, FACE_IN_HEAD, BodyShape
 from worker.sim.render.meshes.distance_fields import smooth_step
@@ -20,7 +20,7 @@ STILL_RAD = 2e-3
 
 
 @dataclass(frozen=True)
-class Motion:
+class ClipMotion:
     """Everything that changes during a clip of N frames, with L moving parts and P pieces of food or water."""
 
     body: BodyShape
@@ -51,7 +51,9 @@ class Motion:
         return float(np.abs(self.arms_rad[:, side] - self.arms_rad[0, side]).max()) > STILL_RAD
 
 
-def clip_motion(trajectory: Trajectory, robot: Robot, tool: Tool, first_step: int, n_steps: int, fps: int) -> Motion:
+def clip_motion(
+    trajectory: Trajectory, robot: RobotArm, tool: Tool, first_step: int, n_steps: int, fps: int
+) -> ClipMotion:
     """The motion of steps first_step to first_step + n_steps.
 
     Raises ValueError when the trajectory does not hold these steps.
@@ -74,7 +76,7 @@ def clip_motion(trajectory: Trajectory, robot: Robot, tool: Tool, first_step: in
     )
     force = np.concatenate([[0.0], np.asarray(trajectory.contact_force_n, dtype=float)])
     body = BODY_SHAPES[trajectory.body]
-    return Motion(
+    return ClipMotion(
         body=body,
         skin_tone=trajectory.skin_tone,
         frames=np.asarray(transform(robot.mount_m, robot.mount_rpy) @ robot.link_frames(smoothly(joints, place), tool)),

@@ -9,10 +9,10 @@ import numpy as np
 from worker.sim.human import LEFT, RIGHT
 from worker.sim.render.camera import lamp
 from worker.sim.render.compositing import MOVING_LAMP_SIZE, STILL_LAMP_SIZE
-from worker.sim.render.interpolation import Motion, quaternions
+from worker.sim.render.interpolation import ClipMotion, quaternions
+from worker.sim.render.mesh_set import CUBE, MeshSet
 from worker.sim.render.passes import BODY_LIGHT, DEPTH_ONLY, Depth, Part
 from worker.sim.render.scene import UPPER_LINKS, Kit, Sitter
-from worker.sim.render.stage import CUBE, Stage
 from worker.sim.render.task_look import TaskLook
 from worker.type_aliases import FloatArray
 
@@ -27,13 +27,13 @@ class Shoot:
     look: TaskLook
     kit: Kit
     sitter: Sitter
-    motion: Motion
+    motion: ClipMotion
 
 
-class Person:
+class FilmedPerson:
     """The person's head and arms during one clip: each rests in the still picture, or moves frame by frame."""
 
-    def __init__(self, shoot: Shoot, stage: Stage) -> None:
+    def __init__(self, shoot: Shoot, stage: MeshSet) -> None:
         """Hides everything else on the still stage and poses the first frame."""
         self._shoot, self._stage, sitter, motion = shoot, stage, shoot.sitter, shoot.motion
         self._moving = [side for side in (RIGHT, LEFT) if motion.arm_moves(side)]
@@ -120,7 +120,7 @@ def moving_lamp_depth(kit: Kit) -> Depth:
     return kit.casters.draw_raw(lamp(MOVING_LAMP_SIZE), None, MOVING_LAMP_SIZE, MOVING_LAMP_SIZE, DEPTH_ONLY)[1]
 
 
-def still_lamp_depth(stage: Stage) -> Depth:
+def still_lamp_depth(stage: MeshSet) -> Depth:
     """Depth of a still stage as the lamp sees it."""
     size = STILL_LAMP_SIZE
     return stage.draw(lamp(size), None, size, size, DEPTH_ONLY).depth

@@ -8,7 +8,7 @@ import numpy.typing as npt
 from PIL import Image
 
 from worker.sim.render.camera import Camera, Rectangle, lamp
-from worker.sim.render.stage import Lighting, Stage
+from worker.sim.render.mesh_set import Lighting, MeshSet
 from worker.type_aliases import FloatArray
 
 Colours = npt.NDArray[np.uint8]
@@ -50,7 +50,7 @@ class Shot(NamedTuple):
 class Part(NamedTuple):
     """A stage with the corners (K, 8, 3) of boxes in the world around what it shows, and how it is drawn."""
 
-    stage: Stage
+    stage: MeshSet
     corners_m: FloatArray
     """NaN around what is gone"""
     light: Lighting = MACHINE_LIGHT
@@ -82,7 +82,7 @@ class Supersampling(NamedTuple):
     moving: float
 
 
-def photograph(stage: Stage, camera: Camera, rectangle: Rectangle, width: int, height: int) -> Shot:
+def photograph(stage: MeshSet, camera: Camera, rectangle: Rectangle, width: int, height: int) -> Shot:
     """Draw a stage with and without the key light's full strength."""
     ambient = stage.draw(camera, rectangle, width, height, Lighting(TOWARDS_KEY_LIGHT, 1.0, 0.0))
     key = stage.draw(camera, rectangle, width, height, Lighting(TOWARDS_KEY_LIGHT, 0.0, 1.0, 0.06))

@@ -7,17 +7,17 @@ from functools import cached_property
 import numpy as np
 
 from worker.sim import human
-from worker.sim.arm import Robot, Tool
+from worker.sim.arm import RobotArm, Tool
 from worker.sim.geometry import rotation_of
 from worker.sim.human import BodyShape
 from worker.sim.render.interpolation import quaternions
+from worker.sim.render.mesh_set import MeshSet, Paints, corners_around
 from worker.sim.render.meshes import arm_mesh, body_mesh, chair_mesh, head_mesh, limb_mesh, room_mesh
 from worker.sim.render.meshes.arm_mesh import Grip
 from worker.sim.render.meshes.distance_fields import union
 from worker.sim.render.meshes.head_mesh import Mouth
 from worker.sim.render.meshes.mesh import Mesh, ball
 from worker.sim.render.meshes.tool_mesh import plain_look
-from worker.sim.render.stage import Paints, Stage, corners_around
 from worker.sim.render.task_look import TaskLook
 from worker.type_aliases import FloatArray
 
@@ -62,7 +62,7 @@ class Sitter:
             self._stages.still.place(name)
         self._skin_tone = skin_tone
 
-    def turn_head(self, stage: Stage, quaternion: Sequence[float] | FloatArray) -> FloatArray:
+    def turn_head(self, stage: MeshSet, quaternion: Sequence[float] | FloatArray) -> FloatArray:
         """Turn it, and give the corners (1, 8, 3) in the world of a box that holds head and neck."""
         head, neck = self.head_names
         stage.place(head, self.body.neck_pivot_m, quaternion)
@@ -70,7 +70,7 @@ class Sitter:
         turned = stage.corners_m(head) @ rotation_of(quaternion).T + np.array(self.body.neck_pivot_m)
         return corners_around(np.concatenate([turned, stage.corners_m(neck)]))[None]
 
-    def pose_arm(self, stage: Stage, side: int, arm_rad: FloatArray) -> FloatArray:
+    def pose_arm(self, stage: MeshSet, side: int, arm_rad: FloatArray) -> FloatArray:
         """Pose the right or left arm, and give the corners (2, 8, 3) in the world of boxes around its two segments."""
         boxes = []
         for name, origin, turn in zip(
@@ -85,7 +85,7 @@ class Sitter:
         prefix = f"{self.body.name}_{('right', 'left')[side]}"
         return f"{prefix}_upper_arm", f"{prefix}_forearm"
 
-    def alive(self, names: Sequence[str]) -> Stage:
+    def alive(self, names: Sequence[str]) -> MeshSet:
         """The stage for what moves of persons during a clip, with these parts on it."""
         stage, parts = self._stages.alive, {**self._arms, **self._heads}
         stage.add({name: parts[name] for name in names})
@@ -96,7 +96,7 @@ class Sitter:
 class Kit:
     """The robot with the tool of one task and what the tool carries."""
 
-    def __init__(self, task: str, robot: Robot, tool: Tool, look: TaskLook, stages: "Stages") -> None:
+    def __init__(self, task: str, robot: RobotArm, tool: Tool, look: TaskLook, stages: "Stages") -> None:
         self._task, self._look, held = task, look, look.tool or plain_look(tool.shapes)
         self._palette = stages.paints.palette
         detail, coarse = arm_mesh.Detail(self._palette, sides=14), arm_mesh.Detail(self._palette, sides=6)
@@ -176,36 +176,36 @@ class Stages:
 
     def __init__(self) -> None:
         self.paints = Paints()
-        self._made: dict[str, Stage] = {}
+        self._made: dict[str, MeshSet] = {}
         room = room_mesh.room_meshes(self.paints.palette, chair_mesh.chair(human.BROAD))
         self.room = tuple(room)
         self.still.add(room)
 
     @property
-    def still(self) -> Stage:
+    def still(self) -> MeshSet:
         """Room, robot bases, chairs and persons: what is drawn at the start of a clip."""
         return self._stage("still", with_skin=True)
 
     @property
-    def alive(self) -> Stage:
+    def alive(self) -> MeshSet:
         """Arms and heads of persons that move during a clip."""
         return self._stage("alive", with_skin=True)
 
     @property
-    def upper(self) -> Stage:
+    def upper(self) -> MeshSet:
         """The thick links of robots."""
         return self._stage("upper")
 
     @property
-    def small(self) -> Stage:
+    def small(self) -> MeshSet:
         """What is quickly drawn: coarse robots and tools for the shadows they cast; water, and what holds it."""
         return self._stage("small")
 
-    def if_made(self, name: str) -> list[Stage]:
+    def if_made(self, name: str) -> list[MeshSet]:
         """A stage by name, or nothing if no clip has needed it yet."""
         return [self._made[name]] if name in self._made else []
 
-    def forearm(self, robot: Robot, grip: Grip) -> Stage:
+    def forearm(self, robot: RobotArm, grip: Grip) -> MeshSet:
         """The thin links of one robot, its hand in one grip, and every tool that is held with it."""
         return self._stage(f"forearm of {robot.name}, {grip}")
 
@@ -215,9 +215,9 @@ class Stages:
             stage.close()
         self.paints.close()
 
-    def _stage(self, name: str, with_skin: bool = False) -> Stage:
+    def _stage(self, name: str, with_skin: bool = False) -> MeshSet:
         if name not in self._made:
-            self._made[name] = Stage(self.paints, with_skin)
+            self._made[name] = MeshSet(self.paints, with_skin)
         return self._made[name]
 
 
@@ -235,7 +235,7 @@ class Scene:
             self._sitters[body.name] = Sitter(body, self.stages)
         return self._sitters[body.name]
 
-    def kit(self, task: str, robot: Robot, tool: Tool, look: TaskLook) -> Kit:
+    def kit(self, task: str, robot: RobotArm, tool: Tool, look: TaskLook) -> Kit:
         """The robot as it is equipped for a task."""
         if task not in self._kits:
             self._kits[task] = Kit(task, robot, tool, look, self.stages)

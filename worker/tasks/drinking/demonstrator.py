@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from worker.sim.arm import Robot, Tool, tool_jacobian
+from worker.sim.arm import RobotArm, Tool, tool_jacobian
 from worker.sim.assistive import ACTION_UNIT_RAD
 from worker.sim.jaco import JACO
 from worker.spaces import Space
@@ -23,7 +23,7 @@ class ScriptedPouring:
     """observation (D,) -> action (7,). In words: come from the front, touch the lips with the rim, tip the cup."""
 
     observation: Space
-    robot: Robot
+    robot: RobotArm
     tool: Tool
     action_unit_rad: float
     largest_action: float = 0.7

@@ -10,12 +10,12 @@ import numpy as np
 
 from worker.modes import ApproachModes, Axis
 from worker.sim.arm import Start, Tool, start_postures
-from worker.sim.assistive import ARM, MOTOR_FORCE_NM, POSITION_GAIN, AssistiveEnv, Motion, Reward
+from worker.sim.assistive import ARM, MOTOR_FORCE_NM, POSITION_GAIN, AssistiveEnv, Reward, StepMotion
 from worker.sim.bullet import Bullet
 from worker.sim.geometry import IDENTITY, Vector, rotation_of
 from worker.sim.human import Impairment
 from worker.sim.jaco import JACO, PI
-from worker.sim.measures import Outcome, StepMeasures, TaskReward
+from worker.sim.measures import StepMeasures, StepOutcome, TaskReward
 from worker.spaces import SHARED_FIELDS, Field, Space
 from worker.task import Task
 from worker.tasks.drinking.water import CUP_LAYER, IMMOVABLE_LAYER, WATER_LAYER, Cup, Water, heap
@@ -191,7 +191,7 @@ class DrinkingEnv(AssistiveEnv):
         if reached := self._water.at_mouth(self._target):
             self._water.drink(reached, self._target, cup_m, rotation_of(quaternion))
 
-    def _outcome(self, motion: Motion) -> Outcome:
+    def _outcome(self, motion: StepMotion) -> StepOutcome:
         self._water.drink(self._water.at_mouth(self._target), self._target, self._tool, self._tool_rotation)
         return self._water.update(self._tool, self._tool_rotation, motion.touching)
 

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from worker.sim.bullet import Bullet
 from worker.sim.geometry import Shape, quaternion_of_euler
-from worker.sim.measures import Outcome
+from worker.sim.measures import StepOutcome
 from worker.type_aliases import FloatArray
 
 PELLET_MASS_KG = 0.001
@@ -124,12 +124,12 @@ class Water:
                 del self._to_drink[name]
                 self._remove(name)
 
-    def update(self, cup_m: FloatArray, rotation: FloatArray, touching: set[str]) -> Outcome:
+    def update(self, cup_m: FloatArray, rotation: FloatArray, touching: set[str]) -> StepOutcome:
         """Count what was drunk, spilled or fell on the person during the last control step."""
         newly_touching = (touching - self._touched) & set(self.names)
         self._touched |= newly_touching
         spilled = self._look(cup_m, rotation)
-        outcome = Outcome(self._newly_drunk, self._intake_speed, spilled, len(newly_touching))
+        outcome = StepOutcome(self._newly_drunk, self._intake_speed, spilled, len(newly_touching))
         self.drunk += self._newly_drunk
         self.spilled += spilled
         self._newly_drunk, self._intake_speed = 0, 0.0

@@ -7,11 +7,11 @@ import numpy as np
 
 from worker.modes import ApproachModes, Axis
 from worker.sim.arm import Start, Tool, start_postures
-from worker.sim.assistive import ARM, AssistiveEnv, Motion, Reward
+from worker.sim.assistive import ARM, AssistiveEnv, Reward, StepMotion
 from worker.sim.bullet import Bullet
 from worker.sim.geometry import Shape, rotation_of
 from worker.sim.jaco import JACO, PI
-from worker.sim.measures import Outcome, TaskReward
+from worker.sim.measures import StepOutcome, TaskReward
 from worker.spaces import SHARED_FIELDS, Field, Space
 from worker.task import Task
 from worker.tasks.feeding.food import BALL_RADIUS_M, BALLS, PORTION_NEEDED, Portion
@@ -103,7 +103,7 @@ class FeedingEnv(AssistiveEnv):
     def _lay_out(self, rng: np.random.Generator) -> None:
         self._portion.serve(self._tool + resting_places_m() @ self._tool_rotation.T)
 
-    def _outcome(self, motion: Motion) -> Outcome:
+    def _outcome(self, motion: StepMotion) -> StepOutcome:
         return self._portion.update(self._tool, self._target, motion.touching)
 
     def _own_observation(self) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 import numpy as np
 
 from worker.sim.bullet import Bullet
-from worker.sim.measures import Outcome
+from worker.sim.measures import StepOutcome
 from worker.type_aliases import FloatArray
 
 BALLS = 8
@@ -45,7 +45,7 @@ class Portion:
         nowhere = (np.nan, np.nan, np.nan)
         return np.array([self._world.position(name) if name in self.present else nowhere for name in self.names])
 
-    def update(self, spoon_m: FloatArray, mouth_m: FloatArray, touching: set[str]) -> Outcome:
+    def update(self, spoon_m: FloatArray, mouth_m: FloatArray, touching: set[str]) -> StepOutcome:
         """Count what was eaten, spilled or fell on the person during the last control step."""
         newly_touching = touching - self.touched
         self.touched |= newly_touching
@@ -65,7 +65,7 @@ class Portion:
                 self._remove(name)
         self.eaten += eaten
         self.spilled += spilled
-        return Outcome(eaten, intake, spilled, len(newly_touching))
+        return StepOutcome(eaten, intake, spilled, len(newly_touching))
 
     def _remove(self, name: str) -> None:
         self.on_spoon.discard(name)

@@ -10,12 +10,12 @@ import numpy as np
 from worker.modes import ApproachModes, Axis
 from worker.sim import human
 from worker.sim.arm import Start, Tool
-from worker.sim.assistive import ARM, MOTOR_FORCE_NM, POSITION_GAIN, AssistiveEnv, Motion, Reward
+from worker.sim.assistive import ARM, MOTOR_FORCE_NM, POSITION_GAIN, AssistiveEnv, Reward, StepMotion
 from worker.sim.bullet import Bullet, Contact
 from worker.sim.geometry import Shape, capsule_between, rotation_of
 from worker.sim.human import ArmRange, Impairment
 from worker.sim.jaco import PI
-from worker.sim.measures import HIGH_FORCE_N, Outcome, StepMeasures, TaskReward
+from worker.sim.measures import HIGH_FORCE_N, StepMeasures, StepOutcome, TaskReward
 from worker.sim.seated_person import PERSON
 from worker.spaces import SHARED_FIELDS, Field, Space
 from worker.task import Task
@@ -266,11 +266,11 @@ class ScratchingEnv(AssistiveEnv):
     def _touched_target(self, contact: Contact) -> None:
         self._touch_m = contact.position_m
 
-    def _outcome(self, motion: Motion) -> Outcome:
+    def _outcome(self, motion: StepMotion) -> StepOutcome:
         touch, self._touch_m, self._driven_from = self._touch_m, None, self._command
         by_the_tip = touch is not None and math.dist(touch, self._tool) < 2 * TIP_RADIUS_M
         place = (np.array(touch) - self._joint_m) @ self._limb if by_the_tip else None
-        return Outcome(strokes=int(self._scratch.rub(place, motion.force_at_target_n)))
+        return StepOutcome(strokes=int(self._scratch.rub(place, motion.force_at_target_n)))
 
     def _own_observation(self) -> dict[str, Any]:
         base, last = self.robot.mount_rotation, self._scratch.last_m

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from worker.sim.arm import Joint, Robot, rotation
+from worker.sim.arm import Joint, RobotArm, rotation
 from worker.sim.render.meshes.colours import Palette
 from worker.sim.render.meshes.mesh import Mesh, joined, tube
 from worker.type_aliases import FloatArray
@@ -43,7 +43,7 @@ class Grip:
     """how far beyond the hand's origin the middle of what they hold lies"""
 
 
-def arm_meshes(detail: Detail, robot: Robot, grip: Grip) -> dict[str, Mesh]:
+def arm_meshes(detail: Detail, robot: RobotArm, grip: Grip) -> dict[str, Mesh]:
     """One mesh per moving link, in the link's own frame."""
     if robot.name == "jaco":
         return _jaco_meshes(detail, robot, grip)
@@ -55,7 +55,7 @@ def _plain_link(detail: Detail, joint: Joint) -> Mesh:
     return _limb(detail, np.zeros(3), np.array(joint.end_m, float), joint.radius_m, joint.radius_m)
 
 
-def _jaco_meshes(detail: Detail, robot: Robot, grip: Grip) -> dict[str, Mesh]:
+def _jaco_meshes(detail: Detail, robot: RobotArm, grip: Grip) -> dict[str, Mesh]:
     return {
         "link_1": _limb(detail, np.zeros(3), np.array([0.0, 0.0, -0.118]), 0.045, 0.044),
         "link_2": joined(
@@ -76,7 +76,7 @@ def _jaco_meshes(detail: Detail, robot: Robot, grip: Grip) -> dict[str, Mesh]:
     }
 
 
-def base_mesh(detail: Detail, robot: Robot) -> Mesh:
+def base_mesh(detail: Detail, robot: RobotArm) -> Mesh:
     """The fixed base of the arm in the world, with the stand down to the floor."""
     floor = -robot.mount_m[2]
     heights = [

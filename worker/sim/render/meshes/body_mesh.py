@@ -8,7 +8,7 @@ from worker.sim import human
 from worker.sim.human import BodyShape
 from worker.sim.render.meshes.colours import Palette
 from worker.sim.render.meshes.distance_fields import (
-    Field,
+    DistanceField,
     carve,
     chain,
     common,
@@ -55,7 +55,7 @@ class Region:
     cell_m: float
 
 
-def shirt(body: BodyShape) -> Field:
+def shirt(body: BodyShape) -> DistanceField:
     """The shirt without its sleeves, whose shoulders are balls around the joints that the sleeves turn about."""
     build, (x, y, z) = BUILDS[body.name], body.shoulder_m
     ridge, thick = build.shoulders_m
@@ -76,19 +76,19 @@ def shirt(body: BodyShape) -> Field:
     return carve(solid, collar_hole, blend=0.006)
 
 
-def collar(body: BodyShape) -> Field:
+def collar(body: BodyShape) -> DistanceField:
     """The seam around the neck."""
     (width, height), turn = BUILDS[body.name].neckline_m, turned((1, 0, 0), np.pi / 2 + 0.30)
     return torus((0.0, 0.046, body.shoulder_m[2] + height), (width, width + 0.0005), 0.0095, turn)
 
 
-def neck(body: BodyShape) -> Field:
+def neck(body: BodyShape) -> DistanceField:
     """The neck up to the chin."""
     radius, pivot = BUILDS[body.name].neck_radius_m, body.neck_pivot_m[2]
     return cone((0, 0.062, pivot - 0.12), (0, 0.036, pivot - 0.007), radius + 0.0075, radius)
 
 
-def trousers(body: BodyShape) -> Field:
+def trousers(body: BodyShape) -> DistanceField:
     """Thighs as thick as in human.py, shins hanging down."""
     hips = BUILDS[body.name].hips_m
     leg = chain(
@@ -98,7 +98,7 @@ def trousers(body: BodyShape) -> Field:
     return union(mirrored(leg), ellipsoid((0, 0.08, 0.57), (hips, 0.14, 0.10)), blend=0.03)
 
 
-def shoes() -> Field:
+def shoes() -> DistanceField:
     """Both shoes, flat on the floor."""
     shoe = union(
         ellipsoid((0.115, -0.535, 0.060), (0.044, 0.105, 0.042)),
@@ -108,18 +108,18 @@ def shoes() -> Field:
     return mirrored(common(shoe, half_space((0, 0, 0.02), (0, 0, -1)), blend=0.01))
 
 
-def trunk(body: BodyShape) -> Field:
+def trunk(body: BodyShape) -> DistanceField:
     """Everything that this module draws of the person but the shoes."""
     return union(shirt(body), neck(body), trousers(body), collar(body))
 
 
-def trunk_mesh(body: BodyShape, palette: Palette, around: Field) -> Mesh:
+def trunk_mesh(body: BodyShape, palette: Palette, around: DistanceField) -> Mesh:
     """Shirt, trousers and shoes as one mesh; `around` is what else keeps light away (the chair)."""
     origins, turns = rest_frames(body, human.LEFT)
     arm = placed(union(sleeve(body), upper_arm(body)), turns[0], origins[0])
     whole = union(trunk(body), mirrored(arm), around)
     cloth, z = BUILDS[body.name].cloth, body.shoulder_m[2]
-    parts: list[tuple[Field, Region, str]] = [
+    parts: list[tuple[DistanceField, Region, str]] = [
         (shirt(body), Region((-0.29, -0.10, 0.56), (0.29, 0.20, z + 0.13), 0.015), cloth),
         (collar(body), Region((-0.08, -0.04, z + 0.04), (0.08, 0.13, z + 0.15), 0.0055), f"{cloth}_trim"),
         (trousers(body), Region((-0.22, -0.56, 0.04), (0.22, 0.24, 0.68), 0.028), "trousers"),

@@ -4,7 +4,7 @@ import numpy as np
 
 from worker.sim.human import BodyShape
 from worker.sim.render.meshes.colours import Palette
-from worker.sim.render.meshes.distance_fields import Field, box, mirrored, union
+from worker.sim.render.meshes.distance_fields import DistanceField, box, mirrored, union
 from worker.sim.render.meshes.mesh import Mesh, joined, softly_lit, surface, tube, turned
 
 
@@ -13,7 +13,7 @@ def rest_top_m(body: BodyShape) -> float:
     return body.shoulder_m[2] - 0.995 * body.upper_arm_length_m - body.forearm_radius_m
 
 
-def chair(body: BodyShape) -> Field:
+def chair(body: BodyShape) -> DistanceField:
     """Seat, back and armrests of the wheelchair, without its wheels."""
     top = rest_top_m(body)
     seat = box((0, 0.02, 0.425), (0.23, 0.25, 0.035), 0.02)
@@ -22,7 +22,7 @@ def chair(body: BodyShape) -> Field:
     return union(seat, back, rest)
 
 
-def chair_mesh(body: BodyShape, palette: Palette, around: Field) -> Mesh:
+def chair_mesh(body: BodyShape, palette: Palette, around: DistanceField) -> Mesh:
     """The chair as one mesh; `around` is the person who sits in it."""
     solid = chair(body)
     whole = union(solid, around)

@@ -10,16 +10,16 @@ import numpy as np
 
 from worker.type_aliases import FloatArray
 
-Field = Callable[[FloatArray], FloatArray]
+DistanceField = Callable[[FloatArray], FloatArray]
 Point = Sequence[float]
 
 
-def sphere(centre: Point, radius: float) -> Field:
+def sphere(centre: Point, radius: float) -> DistanceField:
     middle = np.asarray(centre, dtype=float)
     return lambda points: _length(points - middle) - radius
 
 
-def ellipsoid(centre: Point, radii: Point, turn: FloatArray | None = None) -> Field:
+def ellipsoid(centre: Point, radii: Point, turn: FloatArray | None = None) -> DistanceField:
     """An ellipsoid; distances are first-order estimates, exact on the surface. `turn` (3, 3) holds its axes."""
     middle, size = np.asarray(centre, dtype=float), np.asarray(radii, dtype=float)
 
@@ -34,7 +34,7 @@ def ellipsoid(centre: Point, radii: Point, turn: FloatArray | None = None) -> Fi
     return distance
 
 
-def cone(start: Point, end: Point, start_radius: float, end_radius: float | None = None) -> Field:
+def cone(start: Point, end: Point, start_radius: float, end_radius: float | None = None) -> DistanceField:
     """A capsule whose radius runs linearly from one end to the other (a limb, a finger)."""
     first, last = np.asarray(start, dtype=float), np.asarray(end, dtype=float)
     change = (start_radius if end_radius is None else end_radius) - start_radius
@@ -48,13 +48,13 @@ def cone(start: Point, end: Point, start_radius: float, end_radius: float | None
     return distance
 
 
-def chain(points: Sequence[Point], radii: Sequence[float]) -> Field:
+def chain(points: Sequence[Point], radii: Sequence[float]) -> DistanceField:
     """Cones end to end through the given points."""
     pieces = [cone(a, b, ra, rb) for a, b, ra, rb in zip(points[:-1], points[1:], radii[:-1], radii[1:], strict=True)]
     return union(*pieces)
 
 
-def box(centre: Point, half_extents: Point, rounding: float = 0.0, turn: FloatArray | None = None) -> Field:
+def box(centre: Point, half_extents: Point, rounding: float = 0.0, turn: FloatArray | None = None) -> DistanceField:
     """A box with rounded edges; the half extents include the rounding."""
     middle, half = np.asarray(centre, dtype=float), np.asarray(half_extents, dtype=float) - rounding
 
@@ -69,7 +69,7 @@ def box(centre: Point, half_extents: Point, rounding: float = 0.0, turn: FloatAr
     return distance
 
 
-def cylinder(start: Point, end: Point, radius: float, rounding: float = 0.0) -> Field:
+def cylinder(start: Point, end: Point, radius: float, rounding: float = 0.0) -> DistanceField:
     """A cylinder with flat, rounded ends."""
     first, last = np.asarray(start, dtype=float), np.asarray(end, dtype=float)
     height = float(np.linalg.norm(last - first))
@@ -86,7 +86,7 @@ def cylinder(start: Point, end: Point, radius: float, rounding: float = 0.0) -> 
     return distance
 
 
-def torus(centre: Point, radii: Point, thickness: float, turn: FloatArray | None = None) -> Field:
+def torus(centre: Point, radii: Point, thickness: float, turn: FloatArray | None = None) -> DistanceField:
     """An elliptical ring in the local x-z plane; `radii` are its half width and half height."""
     middle = np.asarray(centre, dtype=float)
     half_width, half_height = radii
@@ -104,14 +104,14 @@ def torus(centre: Point, radii: Point, thickness: float, turn: FloatArray | None
     return distance
 
 
-def half_space(origin: Point, outward: Point) -> Field:
+def half_space(origin: Point, outward: Point) -> DistanceField:
     """Everything behind a plane."""
     start, normal = np.asarray(origin, dtype=float), np.asarray(outward, dtype=float)
     normal = normal / np.linalg.norm(normal)
     return lambda points: (points - start) @ normal
 
 
-def union(*fields: Field, blend: float = 0.0) -> Field:
+def union(*fields: DistanceField, blend: float = 0.0) -> DistanceField:
     """The sum of solids, with their seams rounded over `blend` metres."""
 
     def distance(points: FloatArray) -> FloatArray:
@@ -123,17 +123,17 @@ def union(*fields: Field, blend: float = 0.0) -> Field:
     return distance
 
 
-def carve(solid: Field, cutter: Field, blend: float = 0.0) -> Field:
+def carve(solid: DistanceField, cutter: DistanceField, blend: float = 0.0) -> DistanceField:
     """The solid without the cutter, the edge rounded over `blend` metres."""
     return lambda points: -smooth_minimum(-solid(points), cutter(points), blend)
 
 
-def common(first: Field, second: Field, blend: float = 0.0) -> Field:
+def common(first: DistanceField, second: DistanceField, blend: float = 0.0) -> DistanceField:
     """What two solids share."""
     return lambda points: -smooth_minimum(-first(points), -second(points), blend)
 
 
-def mirrored(field: Field) -> Field:
+def mirrored(field: DistanceField) -> DistanceField:
     """The solid and its mirror image in the plane x = 0."""
     return lambda points: field(np.column_stack([np.abs(points[:, 0]), points[:, 1], points[:, 2]]))
 

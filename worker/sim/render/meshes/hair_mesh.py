@@ -3,7 +3,7 @@
 import numpy as np
 
 from worker.sim.render.meshes.distance_fields import (
-    Field,
+    DistanceField,
     carve,
     chain,
     common,
@@ -18,7 +18,7 @@ from worker.sim.render.meshes.mesh import turned
 from worker.type_aliases import FloatArray
 
 
-def short_hair() -> Field:
+def short_hair() -> DistanceField:
     """Short hair with a side parting, swept over the forehead."""
     shell = union(
         ellipsoid((0, 0.018, 0.1480), (0.0825, 0.1005, 0.0870)),
@@ -42,7 +42,7 @@ def short_hair() -> Field:
     return _combed(union(shell, sweep, blend=0.026))
 
 
-def _combed(field: Field) -> Field:
+def _combed(field: DistanceField) -> DistanceField:
     """Shallow grooves along the strands."""
 
     def distance(points: FloatArray) -> FloatArray:
@@ -60,7 +60,7 @@ def strands(points: FloatArray) -> FloatArray:
     return np.asarray(0.66 * np.sin(19 * wave) + 0.34 * np.sin(41 * wave + 1.0))
 
 
-def bun() -> Field:
+def bun() -> DistanceField:
     """Hair combed back from a high forehead over the ears and tied in a bun at the back."""
     shell = union(
         ellipsoid((0, 0.017, 0.1460), (0.0815, 0.1010, 0.0850)),

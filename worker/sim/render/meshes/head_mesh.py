@@ -10,7 +10,7 @@ import numpy as np
 from worker.sim.human import BROAD, BodyShape
 from worker.sim.render.meshes.colours import Palette
 from worker.sim.render.meshes.distance_fields import (
-    Field,
+    DistanceField,
     carve,
     chain,
     common,
@@ -85,7 +85,7 @@ FEATURES = {
 HAIR = {"broad": short_hair, "slim": bun}
 
 
-def skull(features: Features) -> Field:
+def skull(features: Features) -> DistanceField:
     """The smooth mass of the head, without features."""
     return union(
         ellipsoid((0, 0.012, 0.138), (0.077, 0.097, 0.084)),
@@ -95,7 +95,7 @@ def skull(features: Features) -> Field:
     )
 
 
-def face(features: Features, mouth: Mouth) -> Field:
+def face(features: Features, mouth: Mouth) -> DistanceField:
     """The skin of the head with nose, ears, lips and what is behind them."""
     solid = union(
         skull(features),
@@ -111,14 +111,14 @@ def face(features: Features, mouth: Mouth) -> Field:
     return carve(solid, mouth_cavity(mouth), blend=0.004)
 
 
-def mouth_cavity(mouth: Mouth) -> Field:
+def mouth_cavity(mouth: Mouth) -> DistanceField:
     """What is carved out between the lips."""
     x, y, z = LIPS
     radii = (mouth.half_width_m - 0.0022, 0.050, mouth.half_height_m - 0.0020)
     return _smiling(ellipsoid((x, y + 0.022, z), radii))
 
 
-def _lips(mouth: Mouth) -> Field:
+def _lips(mouth: Mouth) -> DistanceField:
     """The upper lip dips in the middle and is thinner than the lower one."""
     ring = torus((LIPS[0], LIPS[1], LIPS[2]), (mouth.half_width_m, mouth.half_height_m), 0.0)
 
@@ -132,7 +132,7 @@ def _lips(mouth: Mouth) -> Field:
     return _smiling(distance)
 
 
-def _smiling(field: Field) -> Field:
+def _smiling(field: DistanceField) -> DistanceField:
     """The same with the corners of the mouth lifted and drawn back around the face."""
 
     def distance(points: FloatArray) -> FloatArray:
@@ -142,7 +142,7 @@ def _smiling(field: Field) -> Field:
     return distance
 
 
-def _nose(thick: float) -> Field:
+def _nose(thick: float) -> DistanceField:
     bridge = [(0, -0.0870, 0.1230), (0, -0.0985, 0.1000), (0, -0.1075, 0.0865)]
     return union(
         chain(bridge, [0.0055 * thick, 0.0072 * thick, 0.0102 * thick]),
@@ -151,7 +151,7 @@ def _nose(thick: float) -> Field:
     )
 
 
-def _ear() -> Field:
+def _ear() -> DistanceField:
     turn = turned((0, 0, 1), 0.35) @ turned((1, 0, 0), -0.18)
     lobe = ellipsoid((0.0790, 0.0150, 0.1000), (0.0065, 0.0185, 0.0300), turn)
     return carve(lobe, ellipsoid((0.0870, 0.0110, 0.1010), (0.0065, 0.0110, 0.0190), turn), blend=0.006)
@@ -291,7 +291,7 @@ def _brows(palette: Palette, features: Features, mouth: Mouth) -> list[Mesh]:
     return meshes
 
 
-def _onto(field: Field, points: FloatArray) -> FloatArray:
+def _onto(field: DistanceField, points: FloatArray) -> FloatArray:
     for _ in range(6):
         points = points - field(points)[:, None] * gradient(field, points)
     return points

@@ -13,7 +13,7 @@ from worker.sim import human
 from worker.sim.human import BodyShape
 from worker.sim.render.meshes.colours import Palette
 from worker.sim.render.meshes.distance_fields import (
-    Field,
+    DistanceField,
     chain,
     common,
     cone,
@@ -40,12 +40,12 @@ _PHALANGES = ((0.45, 0.24), (0.31, 0.52), (0.24, 0.34))
 """Share of the finger's length, and how far each joint is bent in rad."""
 
 
-def placed(field: Field, rotation: FloatArray, origin_m: FloatArray) -> Field:
+def placed(field: DistanceField, rotation: FloatArray, origin_m: FloatArray) -> DistanceField:
     """A solid given in a segment's frame, in the world."""
     return lambda points: field((points - origin_m) @ rotation)
 
 
-def sleeve(body: BodyShape) -> Field:
+def sleeve(body: BodyShape) -> DistanceField:
     """The sleeve in the upper arm's frame; its ball around the shoulder joint lies inside the shirt."""
     end = body.upper_arm_length_m * SLEEVE_SHARE
     shoulder, hem = body.upper_arm_radius_m + 0.0125, body.upper_arm_radius_m + 0.0085
@@ -56,7 +56,7 @@ def sleeve(body: BodyShape) -> Field:
     )
 
 
-def upper_arm(body: BodyShape) -> Field:
+def upper_arm(body: BodyShape) -> DistanceField:
     """Bare upper arm in its own frame, ending in a ball around the elbow."""
     length, radius = body.upper_arm_length_m, body.upper_arm_radius_m
     return chain(
@@ -65,7 +65,7 @@ def upper_arm(body: BodyShape) -> Field:
     )
 
 
-def forearm(body: BodyShape) -> Field:
+def forearm(body: BodyShape) -> DistanceField:
     """Forearm and palm in the forearm's frame, beginning with a ball around the elbow."""
     length, radius = body.forearm_length_m, body.forearm_radius_m
     arm = chain(
@@ -85,7 +85,7 @@ def _size(body: BodyShape) -> float:
     return body.hand_length_m / human.BROAD.hand_length_m
 
 
-def _palm(body: BodyShape) -> Field:
+def _palm(body: BodyShape) -> DistanceField:
     size, wrist = _size(body), -body.forearm_length_m
     middle = ellipsoid((0.0, 0.002, wrist - 0.052 * size), (0.0375 * size, 0.0145 * size, 0.046 * size))
     bones = [
@@ -139,7 +139,7 @@ def _hem(end_m: float) -> Callable[[FloatArray], FloatArray]:
     return lambda points: smooth_step(-points[:, 2], end_m - 0.017, end_m - 0.014)
 
 
-def arm_meshes(body: BodyShape, palette: Palette, cloth: str, around: Field) -> dict[str, Mesh]:
+def arm_meshes(body: BodyShape, palette: Palette, cloth: str, around: DistanceField) -> dict[str, Mesh]:
     """Upper arm and forearm of both sides by name, each in its segment's frame.
 
     ``around`` is what keeps light away from the left arm at rest: the trunk and the chair.
@@ -160,7 +160,7 @@ def arm_meshes(body: BodyShape, palette: Palette, cloth: str, around: Field) -> 
     }
 
 
-def _lit_at_rest(mesh: Mesh, whole: Field, turn: FloatArray, origin: FloatArray) -> Mesh:
+def _lit_at_rest(mesh: Mesh, whole: DistanceField, turn: FloatArray, origin: FloatArray) -> Mesh:
     """The mesh with the light that reaches it in the resting pose."""
     return mesh.shaded(softly_lit(whole, mesh.moved(turn, origin), 0.045).paint[:, 1])
 

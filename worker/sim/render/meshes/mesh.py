@@ -10,7 +10,7 @@ from itertools import combinations
 import numpy as np
 import numpy.typing as npt
 
-from worker.sim.render.meshes.distance_fields import Field
+from worker.sim.render.meshes.distance_fields import DistanceField
 from worker.type_aliases import FloatArray
 
 Faces = npt.NDArray[np.int32]
@@ -69,7 +69,7 @@ def joined(*meshes: Mesh) -> Mesh:
 
 
 def surface(
-    field: Field, lower: Sequence[float], upper: Sequence[float], cell_m: float, colour: float | Paint = 0.0
+    field: DistanceField, lower: Sequence[float], upper: Sequence[float], cell_m: float, colour: float | Paint = 0.0
 ) -> Mesh:
     """The zero surface of a distance field inside a box, by naive surface nets (Gibson 1998).
 
@@ -85,7 +85,7 @@ def surface(
     return Mesh(vertices, gradient(field, vertices), np.column_stack([colours, np.ones(len(vertices))]), faces)
 
 
-def without_hidden(mesh: Mesh, cover: Field, depth_m: float) -> Mesh:
+def without_hidden(mesh: Mesh, cover: DistanceField, depth_m: float) -> Mesh:
     """The mesh without the faces that lie deeper than this inside another solid."""
     hidden = cover(mesh.vertices) < -depth_m
     faces = mesh.faces[~hidden[mesh.faces].all(axis=1)]
@@ -93,7 +93,7 @@ def without_hidden(mesh: Mesh, cover: Field, depth_m: float) -> Mesh:
     return Mesh(mesh.vertices[kept], mesh.normals[kept], mesh.paint[kept], numbers.reshape(-1, 3).astype(np.int32))
 
 
-def gradient(field: Field, points: FloatArray) -> FloatArray:
+def gradient(field: DistanceField, points: FloatArray) -> FloatArray:
     """Unit direction of steepest increase (N, 3), by the four-point stencil of a tetrahedron."""
     corners = np.array([[1, -1, -1], [-1, -1, 1], [-1, 1, -1], [1, 1, 1]], dtype=float)
     total = sum(
@@ -102,7 +102,7 @@ def gradient(field: Field, points: FloatArray) -> FloatArray:
     return np.asarray(total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12))
 
 
-def openness(field: Field, mesh: Mesh, reach_m: float, strength: float) -> FloatArray:
+def openness(field: DistanceField, mesh: Mesh, reach_m: float, strength: float) -> FloatArray:
     """How open the surroundings of each vertex are (V,) in [0, 1]: 1 in the open, less in folds and corners.
 
     Ambient occlusion from a distance field: walking out along the normal, the distance to the nearest surface grows
@@ -119,7 +119,7 @@ def openness(field: Field, mesh: Mesh, reach_m: float, strength: float) -> Float
 SKY = np.array([-0.55, -0.45, 0.70])
 
 
-def softly_lit(field: Field, mesh: Mesh, reach_m: float, strength: float = 0.75) -> Mesh:
+def softly_lit(field: DistanceField, mesh: Mesh, reach_m: float, strength: float = 0.75) -> Mesh:
     """The mesh with baked ambient light: less in folds, a little more where it faces a bright sky."""
     towards_sky = 0.5 + 0.5 * (mesh.normals @ (SKY / np.linalg.norm(SKY)))
     return mesh.shaded(openness(field, mesh, reach_m, strength) * (0.80 + 0.20 * towards_sky))
@@ -211,7 +211,7 @@ def curve(points: Sequence[Sequence[float]], count: int) -> FloatArray:
     )
 
 
-def _sampled(field: Field, lower: FloatArray, upper: FloatArray, cell_m: float) -> FloatArray:
+def _sampled(field: DistanceField, lower: FloatArray, upper: FloatArray, cell_m: float) -> FloatArray:
     """Field values on a grid of points, exact near the surface and only signed elsewhere."""
     blocks = np.ceil((upper - lower) / cell_m / _COARSE).astype(int)
     step = cell_m * _COARSE

@@ -52,7 +52,7 @@ class Paints:
         self._folder.cleanup()
 
 
-class Stage:
+class MeshSet:
     """A set of meshes that is drawn together, in a client of its own.
 
     A client takes 29 MB before the first mesh, and a mesh that is not in sight still costs half of its drawing time:
