@@ -19,7 +19,6 @@ from typing import Any
 
 import numpy as np
 from tqdm import tqdm
-from worker.experiments.rollout_cache import RolloutCache
 
 from app.domain.study_settings import StudySettings
 from app.installed_tasks import catalogue
@@ -28,6 +27,7 @@ from worker.compute import learning
 from worker.compute.filter_fitting import FilterFit
 from worker.compute.pools import Compute, Lane
 from worker.experiments.benchmark_cell import BenchmarkConfig, BenchmarkUser, Cell
+from worker.experiments.rollout_cache import RolloutCache
 from worker.jobs.learning.reference_rollouts import make_ready
 from worker.ml.export.bundle import Provenance
 from worker.ml.filters.filter_problem import FilterConfig
