@@ -34,7 +34,7 @@ from worker.ml.rewards.loading import load_reward_model
 from worker.ml.rewards.reward_models import StructuredReward
 from worker.sim.render.video import encode_mp4, playable
 
-DOCS = Path(__file__).resolve().parents[2] / "docs"
+DOCS = Path(__file__).resolve().parents[3] / "docs"
 WAYS = ("slow_far", "slow_near", "fast_far", "fast_near")
 
 

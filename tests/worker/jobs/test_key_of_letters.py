@@ -27,7 +27,7 @@ from app.storage import ArtefactStore
 from tests import factories
 from tests.worker.at_hand import AtHand
 from tests.worker.invented import job_of
-from tests.worker.test_evaluation_work import done, due, learn, settle
+from tests.worker.jobs.test_evaluation_films import done, due, learn, settle
 from worker.jobs.clips import evaluation_films
 from worker.jobs.clips.evaluation_films import make_films
 from worker.jobs.publishing import export_files

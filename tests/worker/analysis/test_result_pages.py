@@ -9,7 +9,7 @@ from app.installed_tasks import catalogue
 from tests.benchmarks import error_rates, feedback_report, printed_readings
 from worker.analysis import comparison_page, result_pages
 
-RESULTS = Path(__file__).resolve().parents[2] / "docs/results"
+RESULTS = Path(__file__).resolve().parents[3] / "docs/results"
 
 
 def rows(name: str) -> list[dict[str, str]]:

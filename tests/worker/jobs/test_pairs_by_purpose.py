@@ -241,7 +241,7 @@ def test_models_are_due_by_labels_alone(
 def test_only_labels_are_predicted(
     context: WorkerContext, study: Study, participant: Participant, settle: Callable[..., None]
 ) -> None:
-    from tests.worker.test_querying import save_reward_model
+    from tests.worker.jobs.test_query_selection import save_reward_model
 
     settle(practice_pairs=1, introduction_pairs=3, repeated_pairs=4, catch_pairs=2)
     fill_pool(context, study)

@@ -108,7 +108,7 @@ def test_the_same_seed_replays_bit_identically_after_other_episodes(env: Assisti
 
 def test_the_same_seed_replays_bit_identically_in_a_fresh_process(env: AssistiveEnv) -> None:
     program = (
-        "import sys; from tests.worker.test_sim_environments import *;"
+        "import sys; from tests.worker.sim.test_environments import *;"
         f"o = episode(environment_class({env.task.name!r})(), 5);"
         "sys.stdout.buffer.write(b'BEGIN' + o.tobytes())"
     )

@@ -35,7 +35,7 @@ from worker.jobs.runtime import records
 from worker.jobs.runtime.context import WorkerContext
 from worker.trajectory import SIGNALS
 
-DOCS = Path(__file__).resolve().parents[2] / "docs"
+DOCS = Path(__file__).resolve().parents[3] / "docs"
 AddClips = Callable[..., list[Clip]]
 Answer = Callable[[Clip, Clip, Response], Query]
 SAID = (Response.LEFT, Response.RIGHT, Response.EQUAL, Response.SKIP)

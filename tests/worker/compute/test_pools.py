@@ -193,7 +193,7 @@ def test_stopping_interrupts_whoever_waits_with_nothing_that_could_be_recorded_a
 def test_compute_processes_die_with_a_worker_that_is_killed() -> None:
     program = (
         "import os, sys\n"
-        "from tests.worker.test_compute import nothing, own_pid\n"
+        "from tests.worker.compute.test_pools import nothing, own_pid\n"
         "from worker.compute.pools import Compute, Lane\n"
         "if __name__ == '__main__':\n"
         "    print(Compute(1).run(Lane.LEARNING, nothing, own_pid), flush=True)\n"
@@ -211,7 +211,7 @@ def test_compute_processes_die_with_a_worker_that_is_killed() -> None:
 
 def test_processes_with_nothing_left_to_do_leave_without_a_word() -> None:
     program = (
-        "from tests.worker.test_compute import nothing, show_progress\n"
+        "from tests.worker.compute.test_pools import nothing, show_progress\n"
         "from worker.compute.pools import Compute, Lane\n"
         "if __name__ == '__main__':\n"
         "    compute = Compute(1)\n"

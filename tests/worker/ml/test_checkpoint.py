@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.worker import invented
-from tests.worker.test_methods import POLICY, REWARD, World
+from tests.worker.ml.test_methods import POLICY, REWARD, World
 from worker.ml.methods import preference_rl, prefft
 from worker.ml.methods.prefft import FineTuning
 from worker.ml.policies import checkpoint

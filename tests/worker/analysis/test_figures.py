@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from tests.worker.test_statistics import METHODS, ratings
+from tests.worker.analysis.test_statistics import METHODS, ratings
 from worker.analysis import figures
 from worker.analysis.answers import answer_report, change_report
 from worker.analysis.report import Tables, make_report

@@ -10,7 +10,7 @@ from app.domain.choices import Strategy
 from app.domain.clips import Clip
 from app.domain.studies import Participant
 from app.storage import ArtefactStore
-from tests.worker import test_querying
+from tests.worker.jobs import test_query_selection
 from worker.compute.pools import Compute
 from worker.compute.simulation import surface_file
 from worker.jobs.learning import dataset, query_selection, reward_metrics
@@ -110,11 +110,11 @@ def test_a_share_of_the_pairs_is_drawn_at_random_and_stored_as_such(
     context: WorkerContext, participant: Participant, add_clips: AddClips
 ) -> None:
     """Only these measure a model without bias."""
-    test_querying.settle_on(context, Strategy.CONTESTED)
+    test_query_selection.settle_on(context, Strategy.CONTESTED)
     for scenario in (1, 2, 3, 4):
         add_clips(scenario)
     query_selection.refill_queries(context, participant.id)
-    queries = test_querying.queries_of(context.database, participant)
+    queries = test_query_selection.queries_of(context.database, participant)
     uniform = [query for query in queries if query.strategy == Strategy.UNIFORM]
     chosen = [query for query in queries if query.strategy == Strategy.CONTESTED]
     assert uniform
