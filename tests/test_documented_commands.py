@@ -73,6 +73,7 @@ RUN: dict[str, str | Elsewhere | OnlyParsed] = {
         "test_the_first_start_prints_all_that_is_needed_and_ctrl_c_stops_both_programs"
     ),
     "worker --help": "",
+    "worker behaviours": "--tasks feeding --scenarios 1 --axis-scenarios 1",
     "worker benchmark": Elsewhere("tests/worker/experiments/test_benchmark.py::test_the_command_can_only_report"),
     "worker demo-study": OnlyParsed(
         "takes minutes; what it made is looked at by tests/worker/rehearsal/test_demo_study.py"
@@ -85,9 +86,10 @@ RUN: dict[str, str | Elsewhere | OnlyParsed] = {
     "worker pretrain": OnlyParsed("trains for ten minutes at least; tests/worker/ml/test_sac.py trains small policies"),
     "worker rehearse": OnlyParsed("takes minutes; tests/worker/jobs/test_loop.py rehearses a study"),
     "worker run": Elsewhere("tests/worker/jobs/test_stop.py::test_while_it_films"),
+    "worker speed-weight": "--scenarios 1",
+    "worker start-posture": "--restarts 50",
     "advice_to_stop": ROLLOUTS,
     "api_pages": "--people 1 --answers 20",
-    "behaviours": "--task feeding --scenarios 1 --axis-scenarios 1",
     "chosen_modes": ROLLOUTS,
     "comparison_report": "results/paper_form",
     "contact_sheet": "sheets feeding --films 1 --steps 5 --no-people",
@@ -108,8 +110,6 @@ RUN: dict[str, str | Elsewhere | OnlyParsed] = {
     "same_bits": "--tasks feeding",
     "save_latency": "52 1",  # beyond the first break
     "sim_speed": "--resets 1 --episodes 1",
-    "speed_cost_weight": "--scenarios 1",
-    "start_posture": "--restarts 50",
 }
 """What runs small enough, by program."""
 TOOLS = {

@@ -17,7 +17,15 @@ from app.services.archives import demo_archive
 from app.settings import Settings
 from app.storage import ArtefactStore, keep_private
 from worker import options
-from worker.experiments import benchmark, fit_response_surface, pretrain_policy, train_signal_predictor
+from worker.experiments import (
+    behaviour_differences,
+    benchmark,
+    fit_response_surface,
+    pretrain_policy,
+    speed_cost_weight,
+    start_posture,
+    train_signal_predictor,
+)
 from worker.experiments.benchmark_cell import INDIRECT_USERS, OPPOSED_USERS, PAPER_USERS
 from worker.jobs import service
 from worker.jobs.clips import import_clips
@@ -43,6 +51,7 @@ def parser() -> argparse.ArgumentParser:
     commands = whole.add_subparsers(dest="command", required=True)
     _add_service(commands)
     _add_training(commands)
+    _add_new_task(commands)
     _add_benchmark(commands)
     _add_rehearsal(commands)
     _add_demo_study(commands)
@@ -92,6 +101,41 @@ def _add_training(commands: _Commands) -> None:
     )
     _add_processes(foresee)
     foresee.set_defaults(act=_foresee)
+
+
+def _add_new_task(commands: _Commands) -> None:
+    """What somebody who adds a task needs (docs/new_task.md)."""
+    posture = commands.add_parser("start-posture", help=start_posture.find_start_posture.__doc__)
+    _add_task(posture)
+    posture.add_argument("--restarts", type=int, default=start_posture.RESTARTS, help="of inverse kinematics")
+    posture.set_defaults(act=lambda said: start_posture.find_start_posture(said.task, said.restarts))
+
+    speed = commands.add_parser("speed-weight", help=speed_cost_weight.weigh_speed.__doc__)
+    _add_task(speed)
+    speed.add_argument("--scenarios", type=int, default=speed_cost_weight.SCENARIOS)
+    speed.set_defaults(act=lambda said: speed_cost_weight.weigh_speed(said.task, said.scenarios))
+
+    differences = commands.add_parser("behaviours", help=behaviour_differences.tell_behaviours_apart.__doc__)
+    differences.add_argument("--tasks", nargs="+", choices=catalogue.names(), default=list(catalogue.names()))
+    differences.add_argument("--scenarios", type=int, default=behaviour_differences.SCENARIOS)
+    differences.add_argument(
+        "--axis-scenarios",
+        type=int,
+        default=behaviour_differences.AXIS_SCENARIOS,
+        help="in which the ends of the axes are tried",
+    )
+    differences.add_argument(
+        "--steps",
+        type=int,
+        nargs="+",
+        default=list(behaviour_differences.SHOWN_STEPS),
+        help="control steps shown, from the start",
+    )
+    differences.set_defaults(
+        act=lambda said: behaviour_differences.tell_behaviours_apart(
+            said.tasks, said.scenarios, said.axis_scenarios, said.steps
+        )
+    )
 
 
 OF_TERMS: options.Table = {

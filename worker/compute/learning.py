@@ -48,7 +48,7 @@ def fit_reward(
     ``scale``: what the signals are like in the study's pool; ``earlier``: models of others for
     a pooled prior; ``recorded_signals``: what the signals are called when the clips were recorded elsewhere. Then there
     is no reference policy to normalise over, and what the person was shown takes its place.
-    Raises ValueError for a kind there is not, and laboratory.NoPredictor where the task's signals cannot be foreseen.
+    Raises ValueError for a kind there is not, and simulation.NoPredictor where the task's signals cannot be foreseen.
     """
     if kind not in get_args(reward_training.RewardKind):
         raise ValueError(f"There is no reward model of the kind {kind!r}.")

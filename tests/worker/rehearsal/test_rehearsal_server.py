@@ -14,11 +14,11 @@ from tests.waiting import PATIENCE_S, gone, hear_hangups, until
 PROGRAM = """
 import sys
 from pathlib import Path
-from worker import stopping
-from worker.own_studio import OwnStudio
+from worker import stop_signals
+from worker.rehearsal.server import OwnStudio
 
 if __name__ == "__main__":
-    stopping.any_signal_is_ctrl_c()
+    stop_signals.any_signal_is_ctrl_c()
     try:
         with OwnStudio(Path(sys.argv[1])):
             sys.stdin.read()

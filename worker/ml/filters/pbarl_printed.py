@@ -123,7 +123,7 @@ def train(
 ) -> tuple[PrintedEncoder, dict[str, float]]:
     """Minimise Eq. (8), the weighted sum of the four losses, on transitions of the frozen policy.
 
-    ``ranker_at`` ranks actions that were never executed (see candidate_ranking); its rows are those of ``data``.
+    ``ranker_at`` ranks actions that were never executed (see action_ranking); its rows are those of ``data``.
     Returns the encoder and the last values of the losses.
     """
     generator = torch.Generator().manual_seed(seed)

@@ -1,7 +1,7 @@
 """Soft actor-critic (Haarnoja et al. 2018, arXiv 1812.05905): actor, critics, replay, and one gradient step.
 
 Twin critics with layer normalisation, entropy temperature tuned to a target, one update per two environment steps. The
-reference policies are trained by reference_training, rivals by preference_rl.
+reference policies are trained by pretraining, baselines by preference_rl.
 """
 
 import math

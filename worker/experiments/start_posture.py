@@ -1,16 +1,12 @@
 """Search for a task's start posture: which elbow configuration keeps clear of the person all the way to the target.
 
-    python -m tests.benchmarks.start_posture --task feeding
-
-prints candidates for the task's Start in seconds.
+Random restarts of inverse kinematics, scored by manipulability, clearance and margins of the joints.
 """
 
-import argparse
 import sys
 
 import numpy as np
 
-from app.installed_tasks import catalogue
 from worker.sim.arm import tool_jacobian
 from worker.sim.assistive import ARM, AssistiveEnv
 from worker.sim.seated_person import PERSON
@@ -19,16 +15,13 @@ from worker.type_aliases import FloatArray
 
 SCENARIOS = 4
 """Targets of so many scenarios lie on the way."""
+RESTARTS = 4000
 LIMITED_JOINTS = [1, 3, 5]
 
 
-def main() -> None:
-    """Score random restarts by manipulability, clearance and joint margins; print the best."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--task", choices=catalogue.names(), default="feeding")
-    parser.add_argument("--restarts", type=int, default=4000)
-    options = parser.parse_args()
-    kind, restarts = environment_class(options.task), options.restarts
+def find_start_posture(task: str, restarts: int) -> int:
+    """Print the five best postures for the task's Start: score, clearance in m, angles in rad. Takes seconds."""
+    kind = environment_class(task)
     rng, robot = np.random.default_rng(1), kind.robot
     orientation = robot.mount_rotation.T @ np.array(kind.start.tool_axes).T
     low, high = np.maximum(robot.lower_rad, -np.pi), np.minimum(robot.upper_rad, 1.5 * np.pi)
@@ -48,6 +41,7 @@ def main() -> None:
         angles = ", ".join(f"{angle:.4f}" for angle in chain[0][index])
         sys.stdout.write(f"{_score(env, ways[index]):.3f}  {_clearance_m(env, ways[index]):.3f} m  ({angles})\n")
     env.close()
+    return 0
 
 
 def _targets(kind: type[AssistiveEnv]) -> list[FloatArray]:
@@ -76,7 +70,3 @@ def _score(env: AssistiveEnv, postures: list[FloatArray]) -> float:
     travel = np.abs(stack[1:] - stack[0]).sum(1).max()
     clearance = _clearance_m(env, postures)
     return float(10 * min(manipulability, 0.06) + 2 * min(clearance, 0.10) + 0.5 * min(margin, 0.5) - 0.05 * travel)
-
-
-if __name__ == "__main__":
-    main()

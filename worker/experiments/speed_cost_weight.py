@@ -2,17 +2,14 @@
 
 All actions are scaled by one factor (where motion near the target is the service, only those of the approach). The
 weight is chosen so that the mean preference return of omega = 1 does not change to first order at factor 1.
-
-    python -m tests.benchmarks.speed_cost_weight --task feeding                                       (about a minute)
 """
 
-import argparse
 import sys
 
 import numpy as np
 
-from app.installed_tasks import catalogue
 from worker.compute import simulation
+from worker.scenarios import RESIDUAL, first_of
 from worker.sim.costs import BASE_WEIGHTS, cost_items
 from worker.sim.rollout import rollout
 from worker.tasks import registry
@@ -20,16 +17,15 @@ from worker.trajectory import COSTS
 from worker.type_aliases import Act
 
 FACTORS = (0.8, 0.9, 1.0, 1.1, 1.2)
-FIRST_SCENARIO = 3_000_000
+SCENARIOS = 200
 
 
-def main() -> None:
-    """Print each item's mean sum per factor, its slope over the logarithm of the factor, and the weight."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--task", choices=catalogue.names(), default="feeding")
-    parser.add_argument("--scenarios", type=int, default=200)
-    options = parser.parse_args()
-    task, scenarios = options.task, range(FIRST_SCENARIO, FIRST_SCENARIO + options.scenarios)
+def weigh_speed(task: str, count: int) -> int:
+    """Print each item's mean sum per factor, its slope over the logarithm of the factor, and the weight of speed.
+
+    ``count`` scenarios; 200 take about a minute.
+    """
+    scenarios = first_of(RESIDUAL, count)
     env = simulation.environment(task)
     sums = np.zeros((len(FACTORS), len(COSTS)))
     for row, factor in enumerate(FACTORS):
@@ -50,6 +46,7 @@ def main() -> None:
         f"\nweight  {-others / slopes[speed]:.3f}  ({-distance_only / slopes[speed]:.3f} from distance alone)\n"
     )
     env.close()
+    return 0
 
 
 def scaled(task: str, factor: float) -> Act:
@@ -60,7 +57,3 @@ def scaled(task: str, factor: float) -> Act:
         return lambda seen: factor * policy.mean(seen)
     mode = described.modes.vector({"speed_far": float(np.log(factor)), "speed_near": float(np.log(factor))})
     return simulation.act_in_mode(task, np.array(mode))
-
-
-if __name__ == "__main__":
-    main()

@@ -1,53 +1,50 @@
 """Do the behaviours of a pool differ in ways people have opinions on?
 
-    python -m tests.benchmarks.behaviours --task drinking --scenarios 100    (one to three minutes per task)
-
 For every task: success of the behaviours a study's pool would show, what each end of each mode axis does, and how often
 two users prefer the same clip of a matched pair. Users are the paper's three with the calibrated and the paper's cost
 form, and opposed pairs of worker/ml/teachers.py. Prints Markdown for docs/results/behaviours.md.
 """
 
-import argparse
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import combinations
 
 import numpy as np
 import numpy.typing as npt
 from tqdm import tqdm
 
-from app.installed_tasks import catalogue
 from worker.compute import simulation
 from worker.ml.acquisition import matched_pairs
 from worker.ml.teachers import OMEGA, OPPOSED, User
+from worker.scenarios import POOL
 from worker.sim.costs import CostForm, preference_rewards
 from worker.sim.rollout import rollout
 from worker.task import Task
 from worker.tasks import registry
 from worker.trajectory import SIGNALS, Trajectory
 
-FIRST_SCENARIO = 10_700_000
+FIRST_SCENARIO = POOL.start + 700_000
+SCENARIOS, AXIS_SCENARIOS, SHOWN_STEPS = 100, 20, (60, 100)
 PER_SCENARIO = 4
 REACHED_M = 0.06
 
 
-def main() -> None:
-    """Print one section per task."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--task", nargs="+", choices=catalogue.names(), default=catalogue.names())
-    parser.add_argument("--scenarios", type=int, default=100)
-    parser.add_argument("--axis-scenarios", type=int, default=20, help="in which the ends of the axes are tried")
-    parser.add_argument("--steps", type=int, nargs="+", default=[60, 100], help="control steps shown, from the start")
-    options = parser.parse_args()
-    for name in options.task:
-        task, pool = registry.task(name), _pool(name, options.scenarios)
-        sys.stdout.write(f"## {task.title}\n\n{_successes(name, pool)}\n\n{_axes(name, options.axis_scenarios)}\n\n")
-        found = [_agreements(task, pool, steps) for steps in options.steps]
-        sys.stdout.write("| prefer the same clip | " + " | ".join(f"first {steps / 10:g} s" for steps in options.steps))
+def tell_behaviours_apart(tasks: Sequence[str], scenarios: int, axis_scenarios: int, shown_steps: Sequence[int]) -> int:
+    """Print success, the effect of every mode axis, and how often users prefer the same clip: a section per task.
+
+    A hundred scenarios take one to three minutes per task. ``axis_scenarios``: in which the ends of the axes are tried;
+    ``shown_steps``: control steps that users see, from the start.
+    """
+    for name in tasks:
+        task, pool = registry.task(name), _pool(name, scenarios)
+        sys.stdout.write(f"## {task.title}\n\n{_successes(name, pool)}\n\n{_axes(name, axis_scenarios)}\n\n")
+        found = [_agreements(task, pool, steps) for steps in shown_steps]
+        sys.stdout.write("| prefer the same clip | " + " | ".join(f"first {steps / 10:g} s" for steps in shown_steps))
         sys.stdout.write(" |\n" + "|---" * (1 + len(found)) + "|\n")
         for pair in found[0]:
             sys.stdout.write(f"| {pair} | " + " | ".join(f"{100 * each[pair]:.0f} %" for each in found) + " |\n")
         sys.stdout.write("\n")
+    return 0
 
 
 def _pool(name: str, scenarios: int) -> list[Trajectory]:
@@ -127,7 +124,3 @@ def _agreements(task: Task, pool: list[Trajectory], steps: int) -> dict[str, flo
         one, other = (wants(taste.omega, "calibrated", taste.per_signal) for taste in pair)
         found[f"{pair[0].name}-{pair[1].name}"] = float((one == other).mean())
     return found
-
-
-if __name__ == "__main__":
-    main()
