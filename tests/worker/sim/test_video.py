@@ -58,7 +58,7 @@ def test_the_same_frames_give_the_same_bytes(video: bytes) -> None:
 ENCODED = """
 import hashlib
 import numpy as np
-from worker.sim.video import encode_mp4
+from worker.sim.render.video import encode_mp4
 
 ground = np.random.default_rng(0).integers(0, 256, (30, 40, 3), dtype=np.uint8).repeat(8, 0).repeat(8, 1)
 frames = [np.roll(ground, (2 * index, 3 * index), (0, 1)) for index in range(12)]
