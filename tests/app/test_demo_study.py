@@ -38,6 +38,15 @@ def test_the_archive_that_is_shipped_is_small() -> None:
     assert demo_archive.ARCHIVE.stat().st_size < MOST_BYTES
 
 
+def test_a_program_is_not_suspected_of_answering_without_the_page_s_script(
+    minute_one: str, database: Database, experimenter: TestClient
+) -> None:
+    page = experimenter.get(f"/studies/{the_study(database).slug}").text
+    assert "3 scripted participants are not people" in page
+    assert "without the page" not in page
+    assert "<strong>0</strong> needing attention" in page
+
+
 def test_everybody_but_the_visitor_is_scripted_and_through(minute_one: str, database: Database) -> None:
     with database.reading() as session:
         *scripted, visitor = session.scalars(select(Participant).order_by(Participant.number)).all()

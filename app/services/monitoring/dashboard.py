@@ -80,9 +80,10 @@ class ParticipantRow:
 
     @property
     def flags(self) -> Sequence[str]:
-        """What deserves a look: of the model first, then of the answers."""
+        """What deserves a look: of the model first, then of the answers. A program never runs the page's script."""
         of_model = ["guessing"] if self.curve.foresight is accuracy.Foresight.GUESSING else []
-        return [*of_model, *self.watched.consistency.flags]
+        expected = {"without_script"} if self.participant.scripted_as else set()
+        return [*of_model, *(flag for flag in self.watched.consistency.flags if flag not in expected)]
 
 
 @dataclass(frozen=True)
