@@ -19,13 +19,15 @@ import grimp
 ROOT = Path(__file__).resolve().parents[2]
 PICTURE = ROOT / "docs/pictures/rooms.svg"
 PROGRAMS = ("app", "worker")
+EVERYBODY_S = "app.installed_tasks"
+"""Made for both programs, so that its readers say nothing."""
 LIBRARIES = ("fastapi", "dbos", "torch", "pybullet", "statsmodels")
 """Of which a reader wants to know who loads them."""
 
 COLUMN, MARGIN = 402, 18
 WIDTH = 2 * COLUMN + 3 * MARGIN
 ROW, HEAD, PAD, GAP = 22, 24, 9, 5
-NAME_WIDTH = 96
+NAME_WIDTH, CHARACTER = 96, 7.2
 LONGEST_LINE, LONGEST_TITLE, LONGEST_MODULES = 48, 70, 57
 """Characters that fit into the box of a package, below the name of a program, and into a row of modules."""
 
@@ -85,7 +87,10 @@ def loaded_by(library: str) -> Iterator[str]:
     for name in rooms:
         inside = (name, *graph().find_descendants(name))
         imported = {found for each in inside for found in graph().find_modules_directly_imported_by(each)}
-        if any(found.partition(".")[0] == library for found in imported) and not name.endswith("__main__"):
+        theirs = {
+            found for found in imported if found.partition(".")[0] == library and not found.startswith(EVERYBODY_S)
+        }
+        if theirs and not name.endswith("__main__"):
             yield name
 
 
@@ -114,7 +119,8 @@ def draw(each: Room, left: float, top: float, depth: int) -> Iterator[str]:
     kind = "name ink" if each.line else "name modules muted"
     yield f'<text class="{kind}" x="{left + PAD:g}" y="{middle:g}">{escape(each.name)}</text>'
     if each.line:
-        yield f'<text class="muted" x="{left + PAD + NAME_WIDTH:g}" y="{middle:g}">{escape(each.line)}</text>'
+        start = left + PAD + max(NAME_WIDTH, CHARACTER * (len(each.name) + 1))
+        yield f'<text class="muted" x="{start:g}" y="{middle:g}">{escape(each.line)}</text>'
     top += HEAD
     for layer in each.layers:
         yield from _draw_box(layer, left + PAD, top, depth + 1)
