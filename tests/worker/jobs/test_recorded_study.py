@@ -73,9 +73,8 @@ def filter_of(context: WorkerContext, model: Model) -> FilterAct:
 def test_the_same_answers_give_the_same_reward_model(context: WorkerContext, user: str) -> None:
     with context.database.writing() as session:
         recorded = newest(session, user, ModelKind.REWARD)
-        key = RunKey(
-            RunKind.REWARD, participant_id=recorded.participant_id, labels=recorded.label_count, answers="answer-1"
-        )
+        person_id, count = recorded.participant_id, recorded.label_count
+        key = RunKey(RunKind.REWARD, participant_id=person_id, labels=count, answers="answer-1")
         person = session.get_one(Participant, person_id)
         run_id = records.begin_run(session, Job(key, person.study_id), person.seed)
     reward_models._fit(context, run_id, person_id)
