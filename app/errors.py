@@ -53,9 +53,14 @@ def in_words(error: Exception) -> str | None:
     if isinstance(error, AppError):
         return error.message
     if isinstance(error, ValidationError):
-        wrong = "; ".join(f"{'.'.join(map(str, each['loc'])).upper()}: {each['msg']}" for each in error.errors())
-        said = f"A setting is not valid. {wrong}. Settings come from the environment and from the file .env."
-        return said if error.title == "Settings" else None
+        named = [(".".join(map(str, each["loc"])), each["msg"]) for each in error.errors()]
+        wrong = "; ".join(f"{name}: {said}" for name, said in named)
+        ours = "; ".join(f"{name.upper()}: {said}" for name, said in named)
+        return {
+            "Settings": f"A setting is not valid. {ours}. Settings come from the environment and from the file .env.",
+            "StudySettings": f"A study cannot have these settings. {wrong}.",
+            "EvaluationSettings": f"An evaluation cannot have these settings. {wrong}.",
+        }.get(error.title)
     if isinstance(error, OSError):
         reason = _OF_FILES.get(error.errno or 0)
         advice = "Mend that, or choose another place: DATA_DIR=/some/directory"

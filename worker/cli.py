@@ -286,13 +286,14 @@ def _foresee(said: argparse.Namespace) -> int:
 
 def _rehearse(said: argparse.Namespace) -> int:
     """Send scripted participants through the real pages and print what came out."""
+    settings = _settings(said)
     with tempfile.TemporaryDirectory(prefix="rehearsal-") as temporary:
         directory = said.directory or Path(temporary)
         with OwnStudio(directory) as studio:
             database = Database(studio.settings.sqlalchemy_url)
             store = ArtefactStore(directory / "artefacts")
             rehearsed = rehearsal.Rehearsal(database, store, studio.settings.base_url, said.pace)
-            done = rehearsed.run(said.task, _tastes(said), _settings(said), _manner(said), said.seed)
+            done = rehearsed.run(said.task, _tastes(said), settings, _manner(said), said.seed)
             database.dispose()
         rehearsal.write(done, directory / "rehearsed")
         sys.stdout.write(rehearsal.summary(done) + "\n")

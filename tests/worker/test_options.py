@@ -9,7 +9,8 @@ import pytest
 
 from app.domain.protocol import EvaluationSettings
 from app.domain.study_settings import StudySettings
-from worker import cli, options
+from worker import cli, options, stop_signals
+from worker.__main__ import main
 from worker.experiments.benchmark import PROFILES
 from worker.ml.teachers import Manner
 
@@ -136,3 +137,18 @@ def test_no_share_is_more_than_everything(option: str, capsys: pytest.CaptureFix
     with pytest.raises(SystemExit):
         cli.parser().parse_args(["rehearse", option, "1.5"])
     assert "from 0 to 1" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("said", "name"),
+    [(["--labels", "0"], "labels_per_participant"), (["--paper", "--fine-tuning-steps", "0"], "fine_tuning_steps")],
+)
+def test_settings_that_no_study_can_have_are_refused_in_words_before_anything_starts(
+    said: list[str], name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(cli, "OwnStudio", None)  # a server that was started would fail otherwise
+    monkeypatch.setattr(stop_signals, "any_signal_is_ctrl_c", lambda: None)  # the suite keeps its own
+    assert main(["rehearse", *said]) == 1
+    told = capsys.readouterr().err
+    assert "cannot have these settings" in told
+    assert name in told
