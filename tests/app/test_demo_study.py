@@ -41,10 +41,14 @@ def test_the_archive_that_is_shipped_is_small() -> None:
 def test_a_program_is_not_suspected_of_answering_without_the_page_s_script(
     minute_one: str, database: Database, experimenter: TestClient
 ) -> None:
-    page = experimenter.get(f"/studies/{the_study(database).slug}").text
+    study = f"/studies/{the_study(database).slug}"
+    page = experimenter.get(study).text
     assert "3 scripted participants are not people" in page
-    assert "without the page" not in page
     assert "<strong>0</strong> needing attention" in page
+    for with_their_answers in (page, experimenter.get(f"{study}/participants/P02").text):
+        assert "plain form, because" not in with_their_answers
+    listed = experimenter.get(f"{study}/answers").text
+    assert '<span class="flag">without the page' not in listed
 
 
 def test_everybody_but_the_visitor_is_scripted_and_through(minute_one: str, database: Database) -> None:

@@ -173,10 +173,16 @@ def _marked(mark: Mark) -> ColumnElement[bool]:
         Mark.MISSED_CATCH: and_(Query.expected.is_not(None), LabelEvent.response.in_(_SIDES))
         & (LabelEvent.response != Query.expected),
         Mark.QUICK: _quick(),
-        Mark.WITHOUT_SCRIPT: LabelEvent.by_script.is_(False),
+        Mark.WITHOUT_SCRIPT: LabelEvent.by_script.is_(False) & _is_by_a_person(),
         Mark.EXCLUDED: is_excluded(),
     }
     return func.coalesce(conditions[mark], False)  # what is not known is not marked
+
+
+def _is_by_a_person() -> ColumnElement[bool]:
+    """A program never runs the page's script, and is marked as one elsewhere."""
+    scripted = select(Participant.id).where(Participant.scripted_as.is_not(None))
+    return Query.participant_id.not_in(scripted)
 
 
 def _mispredicted() -> ColumnElement[bool]:
