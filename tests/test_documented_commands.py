@@ -19,6 +19,7 @@ import pytest
 from app.db import Database
 from app.services.accounts import accounts
 from app.settings import Settings
+from worker import stop_signals
 from worker.compute import simulation
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -180,6 +181,8 @@ def run(program: str, arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> 
     """Run it in this process, which has loaded most of it already; the exit code."""
     file = file_of(program)
     monkeypatch.setattr(sys, "argv", [str(file), *arguments])
+    monkeypatch.setattr(os, "_exit", sys.exit)  # the worker's way to end would end the suite
+    monkeypatch.setattr(stop_signals, "any_signal_is_ctrl_c", lambda: None)
     try:
         runpy.run_path(str(file), run_name="__main__")
     except SystemExit as end:

@@ -22,7 +22,7 @@ class Task:
     modes: ModeFamily
     calibrated_speed_weight: float
     """Weight of the calibrated speed cost with which the reference person (omega = 1) is content with the shipped
-    policy's own speed; measured by python -m worker speed-weight, to be repeated for a new policy."""
+    policy's own speed; the worker's command speed-weight measures it, to be repeated for a new policy."""
     speed_counts_near: bool = True
     """Whether the calibrated speed cost counts within 20 cm of the target; not where motion there is the service."""
     printed_betas: tuple[float, float, float, float] = field(default=(1.0, 1.5, 0.1, 1.0), repr=False)

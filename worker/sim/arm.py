@@ -183,7 +183,7 @@ class Start:
     tool_axes: Rotation
     """rows: the tool's x, y and z axis in the world"""
     posture_rad: tuple[float, ...]
-    """a solution nearby, from python -m worker start-posture"""
+    """a solution nearby; the worker's command start-posture finds some"""
     count: int = 256
 
 
