@@ -16,6 +16,7 @@ from sqlalchemy import func, select
 
 from app.__main__ import import_study
 from app.db import Base, Database
+from app.domain import run_keys
 from app.domain.models import Run, RunStatus
 from app.domain.participation import ConsentRecord, FormAnswer, ParticipantEvent
 from app.domain.preferences import Query
@@ -123,6 +124,17 @@ def test_what_was_done_is_not_done_again_and_what_was_at_work_is(
     assert person.id != 1, "else this test says nothing"
     assert any(name.startswith(f"reward/participant-{person.id}/labels-10/answer-") for name in runs)
     assert runs[f"clips/study-{imported.study.id}/scenario-7"].status == RunStatus.FAILED
+
+
+def test_a_run_whose_key_is_not_ours_keeps_its_name(elsewhere: FastAPI, study: Study, packed: Path) -> None:
+    with elsewhere.state.studio.database.reading() as session:
+        assert session.scalars(select(Run.workflow_id)).all() == []
+    imported = bring(elsewhere, packed)
+    with elsewhere.state.studio.database.reading() as session:
+        names = session.scalars(select(Run.workflow_id).where(Run.study_id == imported.study.id)).all()
+    foreign = [name for name in names if run_keys.read(name) is None]
+    assert foreign, "else this test says nothing"
+    assert all(name.startswith("run/") for name in foreign), foreign
 
 
 def test_no_link_works_that_worked_before_and_new_ones_do(

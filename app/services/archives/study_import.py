@@ -180,7 +180,8 @@ def _name_runs(session: Session, runs: Iterator[Mapping[str, Any]], ids: Ids) ->
     """Runs keep their keys with new numbers, so that the worker finds done what was done."""
     for run in runs:
         key = run_keys.read(run["workflow_id"])
-        name = str(run_keys.renumbered(key, lambda table, old: ids.get(table, {}).get(old, 0))) if key else ""
+        moved = run_keys.renumbered(key, lambda table, old: ids.get(table, {}).get(old, 0)) if key else None
+        name = str(moved or run["workflow_id"])
         if not key or session.scalar(select(Run.id).where(Run.workflow_id == name)) is not None:
             name += f"/imported-{uuid.uuid4()}"
         session.get_one(Run, ids["run"][run["id"]]).workflow_id = name
