@@ -134,4 +134,5 @@ def _action_reward(baseline: Baseline) -> RewardModel:
 
 
 def _no_surface() -> ResponseSurface:
+    """Only the participant's own filter asks for the surface, and that is never a baseline here."""
     raise NotImplementedError("The participant's own filter is trained by worker.jobs.learning.filters.")
