@@ -31,7 +31,7 @@ from app.web.experimenter import (
     studies,
     translations,
 )
-from app.web.http.deps import Studio
+from app.web.http.deps import Studio, StudioDep
 from app.web.http.rate_limit import LoginAttempts
 from app.web.http.readiness import Readiness
 from app.web.http.security import Guard
@@ -78,37 +78,52 @@ PARTICIPANT_PARTS = (
 def create_app(settings: Settings | None = None) -> FastAPI:
     """The web server for these settings, by default those of the environment. Migrates nothing."""
     settings = settings or Settings()
+    app = create_routes(https=settings.secure_cookies)
+    serve(app, make_studio(settings))
+    return app
+
+
+def make_studio(settings: Settings) -> Studio:
+    """What every request shares."""
     database = Database(settings.sqlalchemy_url)
-    studio = Studio(
+    return Studio(
         settings=settings,
         database=database,
         store=ArtefactStore(settings.data_dir / "artefacts"),
+        readiness=Readiness(database, settings.data_dir),
         session_queue=SessionQueue(database),
         login_attempts=LoginAttempts(settings.login_attempts_per_minute),
         token_attempts=LoginAttempts(settings.login_attempts_per_minute, WRONG_TOKENS, WRONG_TOKENS),
         shared_pages=SharedPages(database),
     )
 
-    readiness = Readiness(database, settings.data_dir)
+
+def serve(app: FastAPI, studio: Studio) -> None:
+    """From now on, requests are about this studio."""
+    app.state.studio = app.state.api.state.studio = studio
+
+
+def create_routes(https: bool) -> FastAPI:
+    """Every page, and what guards them."""
 
     @asynccontextmanager
-    async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
+    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        studio: Studio = app.state.studio
         with live.closing_on_signals(studio.closing):
             yield
         studio.hashing.close()
         studio.hashing_for_known.close()
-        database.dispose()
+        studio.database.dispose()
 
     app = FastAPI(
         title="PbARL Studio", openapi_url=None, lifespan=lifespan, max_body_size=MAX_BODY_BYTES, redirect_slashes=False
     )
-    app.state.studio = studio
     app.state.templates = make_environment(app.url_path_for)
-    app.add_middleware(Guard, https=settings.secure_cookies, refuse=error_page)
+    app.add_middleware(Guard, https=https, refuse=error_page)
     add_error_pages(app)
     for part in (*EXPERIMENTER_PARTS, *PARTICIPANT_PARTS):
         app.include_router(part.router)
-    app.state.api = routes.create_api(studio, app.url_path_for, MAX_BODY_BYTES)
+    app.state.api = routes.create_api(app.url_path_for, MAX_BODY_BYTES)
     app.mount(routes.PREFIX, app.state.api)
     app.mount("/static", StaticFiles(directory=STATIC), name="static")
 
@@ -118,9 +133,9 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         return RedirectResponse(app.url_path_for("show_studies"), HTTPStatus.SEE_OTHER)
 
     @app.get("/health", name="show_health")
-    async def show_health() -> PlainTextResponse:
+    async def show_health(studio: StudioDep) -> PlainTextResponse:
         """Whether answers can be kept: 200, or 503 with the reason. For load balancers and whoever watches."""
-        complaint = await readiness.complaint()
+        complaint = await studio.readiness.complaint()
         status = HTTPStatus.OK if complaint is None else HTTPStatus.SERVICE_UNAVAILABLE
         return PlainTextResponse(complaint or "ok", status)
 

@@ -4,6 +4,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from datetime import timedelta
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -20,12 +21,13 @@ import app.domain.participation
 import app.domain.people
 import app.domain.preferences
 import app.domain.studies  # noqa: F401  (all of them fill Base.metadata)
-from app.db import Base, Database
+from app.db import Database
 from app.domain.people import Experimenter
-from app.main import create_app
+from app.main import create_routes, make_studio, serve
 from app.services.accounts import accounts, browser_sessions
 from app.settings import Settings
 from app.storage import ArtefactStore
+from tests.databases import make_tables
 
 PASSWORD = "a password of my own"
 
@@ -36,12 +38,19 @@ def settings(tmp_path: Path) -> Settings:
     return Settings(_env_file=None, data_dir=tmp_path, public_url=None)
 
 
+@cache
+def the_routes() -> FastAPI:
+    """Routes and compiled templates of all studios of this process: making them takes longer than most tests."""
+    return create_routes(https=False)
+
+
 @pytest.fixture
 def studio_app(settings: Settings) -> FastAPI:
     """The web server, on an empty database of the newest schema."""
-    application = create_app(settings)
-    Base.metadata.create_all(application.state.studio.database.writer)
-    return application
+    studio = make_studio(settings)
+    make_tables(studio.database)
+    serve(the_routes(), studio)
+    return the_routes()
 
 
 @pytest.fixture

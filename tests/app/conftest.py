@@ -12,7 +12,7 @@ from fastapi.testclient import TestClient
 from httpx2 import Response as Answer
 from sqlalchemy import select
 
-from app.db import Base, Database
+from app.db import Database
 from app.domain.preferences import LabelEvent, Query
 from app.domain.studies import Participant, Study
 from app.main import create_app
@@ -20,6 +20,7 @@ from app.services.archives import study_import
 from app.settings import Settings
 from app.storage import ArtefactStore
 from tests import factories
+from tests.databases import make_tables
 
 JSON = {"Accept": "application/json"}
 
@@ -81,7 +82,7 @@ def elsewhere(tmp_path: Path) -> Iterator[FastAPI]:
     application = create_app(Settings(_env_file=None, data_dir=tmp_path / "elsewhere", public_url=None))
     (tmp_path / "elsewhere").mkdir()
     there: Database = application.state.studio.database
-    Base.metadata.create_all(there.writer)
+    make_tables(there)
     with there.writing() as session:
         study = factories.make_study(session, "Something else")
         person, _ = factories.make_participant(session, study)

@@ -22,6 +22,7 @@ from app.services.archives import archive, archive_reading, study_import, unpack
 from app.services.archives.archive import ArchiveInvalid
 from app.services.studies import locking
 from app.storage import ArtefactStore
+from tests.databases import make_tables
 from tests.finished_study import make_finished_study
 
 Row = dict[str, Any]
@@ -36,7 +37,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The archive of a locked study with everything in it, from another installation."""
     folder = tmp_path_factory.mktemp("elsewhere")
     there = Database(f"sqlite:///{folder / 'elsewhere.sqlite3'}")
-    Base.metadata.create_all(there.writer)
+    make_tables(there)
     with there.writing() as session:
         store = ArtefactStore(folder / "artefacts")
         study = make_finished_study(session, store, people=2, labels=3)

@@ -7,13 +7,14 @@ from fastapi import FastAPI
 from fastapi.testclient import TestClient
 from sqlalchemy import select, update
 
-from app.db import Base, Database, now
+from app.db import Database, now
 from app.domain.people import AuditEvent, BrowserSession, Experimenter
 from app.main import create_app
 from app.services.accounts import accounts
 from app.settings import Settings
 from tests.app.conftest import TakingPart
 from tests.conftest import PASSWORD
+from tests.databases import make_tables
 
 NAME = accounts.FIRST_EXPERIMENTER
 
@@ -65,7 +66,7 @@ def test_passwords_are_stored_as_argon2(password: str, database: Database) -> No
 def test_too_many_attempts_have_to_wait_even_with_the_right_password(settings: Settings) -> None:
     application = create_app(settings.model_copy(update={"login_attempts_per_minute": 3}))
     studio = application.state.studio
-    Base.metadata.create_all(studio.database.writer)
+    make_tables(studio.database)
     with studio.database.writing() as session:
         password = accounts.create_first_experimenter(session)
     assert password is not None

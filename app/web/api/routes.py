@@ -367,7 +367,7 @@ def _export(session: Session, study: Study, export: Export) -> answers.ExportAns
     )
 
 
-def create_api(studio: Studio, path_for: Any, max_body_bytes: int) -> FastAPI:
+def create_api(path_for: Any, max_body_bytes: int) -> FastAPI:
     """The application to mount at PREFIX. ``path_for``: gives paths of the web's own routes."""
     api = FastAPI(
         title="PbARL Studio API",
@@ -381,7 +381,7 @@ def create_api(studio: Studio, path_for: Any, max_body_bytes: int) -> FastAPI:
         max_body_size=max_body_bytes,
         redirect_slashes=False,
     )
-    api.state.studio, api.state.path_for = studio, path_for
+    api.state.path_for = path_for
     add_problems(api)
     api.include_router(router)
     return api

@@ -23,6 +23,7 @@ from app.web.http.hashing import Hashing
 from app.web.http.import_limit import ImportLimit
 from app.web.http.new_links import NewLinks
 from app.web.http.rate_limit import LoginAttempts
+from app.web.http.readiness import Readiness
 from app.web.http.session_queue import SessionQueue
 from app.web.http.shared_pages import SharedPages
 
@@ -64,6 +65,7 @@ class Studio:
     settings: Settings
     database: Database
     store: ArtefactStore
+    readiness: Readiness
     session_queue: SessionQueue
     login_attempts: LoginAttempts
     shared_pages: SharedPages
