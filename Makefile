@@ -47,7 +47,7 @@ contracts: $(VENV)/dev.stamp ## Who may import whom
 	$(VENV)/bin/lint-imports
 
 pytest: $(VENV)/dev.stamp browser ## The test suite
-	$(PY) -m pytest -n 2 --dist loadfile
+	$(PY) -m pytest -n 3 --dist loadfile --no-loadscope-reorder
 
 browser: ## Chromium for the browser tests (Debian package)
 	@command -v chromium >/dev/null || { \

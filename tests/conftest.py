@@ -32,6 +32,12 @@ from tests.databases import make_tables
 PASSWORD = "a password of my own"
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Files with slow tests come first, so that none of them begins when everything else has ended."""
+    slow = {item.path for item in items if item.get_closest_marker("slow")}
+    items.sort(key=lambda item: item.path not in slow)
+
+
 @pytest.fixture
 def settings(tmp_path: Path) -> Settings:
     """Settings of a studio that lives in a temporary directory."""

@@ -18,8 +18,8 @@ def _empty() -> bytes:
 
 
 def make_tables(database: Database) -> None:
-    """Give a new database its tables."""
+    """Give a database its tables, unless it has them."""
     path = file_of(database.url)
     assert path is not None
-    assert not path.exists()
-    path.write_bytes(_empty())
+    if not path.exists():
+        path.write_bytes(_empty())

@@ -69,10 +69,7 @@ RUN: dict[str, str | Elsewhere | OnlyParsed] = {
     "app migrate": "",
     "app reset-password": "",
     "app scrub": "",
-    "app up": Elsewhere(
-        "tests/app/test_start_and_stop.py::"
-        "test_the_first_start_prints_all_that_is_needed_and_ctrl_c_stops_both_programs"
-    ),
+    "app up": Elsewhere("tests/app/test_start_and_stop.py::test_the_first_start_prints_all_that_is_needed"),
     "worker --help": "",
     "worker behaviours": "--tasks feeding --scenarios 1 --axis-scenarios 1",
     "worker benchmark": Elsewhere("tests/worker/experiments/test_benchmark.py::test_the_command_can_only_report"),
@@ -108,7 +105,7 @@ RUN: dict[str, str | Elsewhere | OnlyParsed] = {
     "retraining": ROLLOUTS,
     "rooms": Elsewhere("tests/architecture/test_rooms.py::test_the_picture_of_the_rooms_is_up_to_date"),
     "rounds": "1",
-    "same_bits": "--tasks feeding",
+    "same_bits": OnlyParsed("trains every method; docs/results/same_bits.txt is what it prints"),
     "save_latency": "52 1",  # beyond the first break
     "sim_speed": "--resets 1 --episodes 1",
 }

@@ -187,12 +187,12 @@ class TestHostileCursors:
         assert answer.status_code == 422
         assert "Begin again without a cursor" in answer.json()["detail"]
 
-    @pytest.mark.parametrize("table", ALL_TABLES)
     @pytest.mark.parametrize("after", [[1], [-5], [2**63 - 1] * 5, [-(2**63)] * 3, [1, 1, 1, 1, 1, 1]])
-    def test_keys_of_any_length_and_size_do_no_harm(self, get: Get, study: Study, table: str, after: list[int]) -> None:
-        made_of = {each.__tablename__: 2**63 - 1 for each in export_tables.BY_NAME[table].made_of}
-        cursor = self.forged(of=f"1/{table}", after=after, newest=made_of)
-        assert get(f"{address(study, table)}&cursor={cursor}").status_code == 200
+    def test_keys_of_any_length_and_size_do_no_harm(self, get: Get, study: Study, after: list[int]) -> None:
+        for table in ALL_TABLES:
+            made_of = {each.__tablename__: 2**63 - 1 for each in export_tables.BY_NAME[table].made_of}
+            cursor = self.forged(of=f"1/{table}", after=after, newest=made_of)
+            assert get(f"{address(study, table)}&cursor={cursor}").status_code == 200, table
 
     @pytest.mark.parametrize("cursor", ["x", "%00", "AAAA", "e30", "W10", "_" * 999, "x" * 2000, "eyJ%ff"])
     def test_rubbish_is_refused(self, get: Get, study: Study, cursor: str) -> None:

@@ -16,6 +16,8 @@ import pytest
 from app.falls import noted
 from tests.waiting import PATIENCE_S, free_port, gone, until
 
+pytestmark = pytest.mark.slow
+
 Start = Callable[[], "Studio"]
 
 
@@ -78,6 +80,15 @@ def start(tmp_path: Path) -> Iterator[Start]:
             studio.stop(signal.SIGTERM)
 
 
+@pytest.fixture(scope="module")
+def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Studio]:
+    """Started for the first time, and at work; tests that leave it so share it."""
+    studio = Studio(tmp_path_factory.mktemp("running"), free_port())
+    assert until(lambda: "worker-1 is ready" in studio.said and answers(studio.address))
+    yield studio
+    studio.stop(signal.SIGTERM)
+
+
 def answers(address: str) -> bool:
     try:
         with urlopen(f"{address}/login", timeout=5) as response:  # noqa: S310  (our own server)
@@ -86,14 +97,17 @@ def answers(address: str) -> bool:
         return False
 
 
-def test_the_first_start_prints_all_that_is_needed_and_ctrl_c_stops_both_programs(start: Start) -> None:
+def test_the_first_start_prints_all_that_is_needed(running: Studio) -> None:
+    link = re.search(r"Participant link\s+(\S+)", running.said)
+    assert link is not None
+    assert link[1].startswith(f"{running.address}/p/")
+    assert re.search(r"One-time password \S{12,}", running.said)
+    assert f"{running.address}/studies" in running.said
+
+
+def test_ctrl_c_stops_both_programs(start: Start) -> None:
     studio = start()
     assert until(lambda: "worker-1 is ready" in studio.said and answers(studio.address))
-    link = re.search(r"Participant link\s+(\S+)", studio.said)
-    assert link is not None
-    assert link[1].startswith(f"{studio.address}/p/")
-    assert re.search(r"One-time password \S{12,}", studio.said)
-    assert f"{studio.address}/studies" in studio.said
     programs = [studio.child("uvicorn"), studio.child("worker")]
     assert studio.stop() == 0
     assert "Stopped." in studio.said
@@ -111,12 +125,11 @@ def test_a_second_start_makes_no_second_demo_study_and_no_new_password(start: St
     assert "/p/" not in second.said
 
 
-def test_a_worker_that_is_killed_is_started_again(start: Start) -> None:
-    studio = start()
-    assert until(lambda: "worker-1 is ready" in studio.said)
-    os.kill(studio.child("worker"), signal.SIGKILL)
-    assert until(lambda: studio.said.count("worker-1 is ready") == 2)
-    assert "The worker stopped by itself (exit code -9); starting it again." in studio.said
+def test_a_worker_that_is_killed_is_started_again(running: Studio) -> None:
+    starts = running.said.count("worker-1 is ready")
+    os.kill(running.child("worker"), signal.SIGKILL)
+    assert until(lambda: running.said.count("worker-1 is ready") == starts + 1)
+    assert "The worker stopped by itself (exit code -9); starting it again." in running.said
 
 
 def test_a_worker_that_keeps_falling_leaves_the_web_server_alone_and_is_tried_until_it_can_run(
@@ -135,14 +148,12 @@ def test_a_worker_that_keeps_falling_leaves_the_web_server_alone_and_is_tried_un
     assert studio.stop() == 0
 
 
-def test_a_web_server_that_falls_is_started_again_and_the_worker_keeps_its_work(start: Start) -> None:
-    studio = start()
-    assert until(lambda: "worker-1 is ready" in studio.said and answers(studio.address))
-    worker, web = studio.child("worker"), studio.child("uvicorn")
+def test_a_web_server_that_falls_is_started_again_and_the_worker_keeps_its_work(running: Studio) -> None:
+    worker, web = running.child("worker"), running.child("uvicorn")
     os.kill(web, signal.SIGKILL)
-    assert until(lambda: "The web stopped by itself" in studio.said)
-    assert until(lambda: answers(studio.address))
-    assert studio.child("worker") == worker
+    assert until(lambda: "The web stopped by itself" in running.said)
+    assert until(lambda: answers(running.address))
+    assert running.child("worker") == worker
 
 
 def test_a_damaged_file_of_the_engine_is_set_aside_and_the_studio_starts(start: Start, tmp_path: Path) -> None:
@@ -160,10 +171,8 @@ def test_killing_the_supervisor_leaves_nothing_running(start: Start) -> None:
     assert until(lambda: all(gone(pid) for pid in programs))
 
 
-def test_a_port_in_use_is_explained(start: Start) -> None:
-    first = start()
-    assert until(lambda: answers(first.address))
-    second = start()
+def test_a_port_in_use_is_explained(running: Studio, tmp_path: Path) -> None:
+    second = Studio(tmp_path, int(running.address.rpartition(":")[2]))
     assert second.ended() == 1
     assert "choose another: PORT=8001 make run" in second.said
     assert "Traceback" not in second.said

@@ -13,6 +13,7 @@ from sqlalchemy.orm import Session
 
 from app.__main__ import migrate
 from app.db import Database
+from app.domain.choices import ClipQuality
 from app.domain.clips import Clip, Rollout
 from app.domain.preferences import LabelEvent, Query, Response
 from app.domain.studies import Participant, Study
@@ -89,6 +90,7 @@ def study(database: Database) -> Study:
         clip_steps=STEPS,
         pool_scenarios=4,
         behaviours_per_scenario=4,
+        clip_quality=ClipQuality.QUICK,
     )
     with database.writing() as session:
         study = Study(slug="study", name="Study", stored_settings=wanted.model_dump(mode="json"), seed=3)

@@ -5,21 +5,21 @@ import json
 import subprocess
 import sys
 import threading
-import time
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from sqlalchemy import func, select
 
 from app.db import Database
+from app.domain.choices import ClipQuality
 from app.domain.clips import Clip, Rollout
 from app.domain.models import Model, ModelKind, Run, RunKind, RunStatus
 from app.domain.preferences import LabelEvent
 from app.domain.study_settings import StudySettings
 from app.storage import ArtefactStore
-from tests.waiting import PATIENCE_S
+from tests.waiting import until
 from worker.jobs.learning import dataset
 from worker.ml.export import bundle
 from worker.ml.teachers import TASTES, Manner
@@ -55,6 +55,7 @@ def outcome(studio: OwnStudio, database: Database) -> RehearsedPerson:
         pool_scenarios=SCENARIOS,
         behaviours_per_scenario=BEHAVIOURS,
         evaluation_scenarios=10,
+        clip_quality=ClipQuality.QUICK,
     )
     killers = [_Killer(studio, database, RunKind.CLIPS), _Killer(studio, database, RunKind.FILTER)]
     for killer in killers:
@@ -63,8 +64,9 @@ def outcome(studio: OwnStudio, database: Database) -> RehearsedPerson:
     rehearsal = Rehearsal(database, store, studio.settings.base_url)
     manner = Manner(mistakes=0.1, equal_share=0.1, skip_share=0.1)
     (outcome,) = rehearsal.run("feeding", [TASTES["cautious"]], settings, manner, seed=1).outcomes
-    assert wait_for(lambda: _has_films(database)), "nobody was filmed before and after"
+    assert until(lambda: _has_films(database)), "nobody was filmed before and after"
     for killer in killers:
+        killer.rehearsal_is_over.set()
         killer.join()
         assert killer.killed, f"the worker was never caught in the middle of {killer.kind}"
     return outcome
@@ -83,26 +85,20 @@ class _Killer(threading.Thread):
         super().__init__(daemon=True)
         self.studio, self.database, self.kind = studio, database, kind
         self.killed = False
+        self.rehearsal_is_over = threading.Event()
 
     def run(self) -> None:
-        if wait_for(self._in_the_middle):
-            self.studio.kill("worker")
-            self.studio.start_worker()
-            self.killed = True
+        while not self.rehearsal_is_over.wait(0.05):
+            if self._in_the_middle():
+                self.studio.kill("worker")
+                self.studio.start_worker()
+                self.killed = True
+                return
 
     def _in_the_middle(self) -> bool:
         running = select(Run.id).where(Run.kind == self.kind, Run.status == RunStatus.RUNNING, Run.progress > 0.1)
         with self.database.reading() as session:
             return session.scalar(running) is not None
-
-
-def wait_for(true: Callable[[], bool]) -> bool:
-    deadline = time.monotonic() + PATIENCE_S
-    while time.monotonic() < deadline:
-        if true():
-            return True
-        threading.Event().wait(0.05)
-    return False
 
 
 def test_every_answer_is_stored_exactly_once(outcome: RehearsedPerson, database: Database) -> None:

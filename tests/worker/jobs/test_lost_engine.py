@@ -31,6 +31,8 @@ from worker.jobs.runtime.context import Step, WorkerContext
 from worker.jobs.runtime.records import Job, as_arguments, from_arguments
 from worker.jobs.workflows import JobRunner
 
+pytestmark = pytest.mark.slow
+
 Damage = Callable[[Path], None]
 
 

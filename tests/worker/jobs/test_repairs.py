@@ -28,6 +28,8 @@ from worker.jobs.runtime.context import WorkerContext
 from worker.jobs.runtime.records import Job
 from worker.trajectory import Trajectory
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def context(database: Database, store: ArtefactStore) -> WorkerContext:
@@ -37,6 +39,9 @@ def context(database: Database, store: ArtefactStore) -> WorkerContext:
 @pytest.fixture
 def clips(context: WorkerContext, study: Study) -> list[Clip]:
     """Of one scenario, really simulated and filmed."""
+    with context.database.writing() as session:
+        settings = study.settings.model_copy(update={"behaviours_per_scenario": 2, "pool_scenarios": 20})
+        session.get_one(Study, study.id).stored_settings = settings.model_dump(mode="json")
     job = next(job for job in due(context) if job.kind == RunKind.CLIPS)
     assert not repairs.is_about(job)
     work(context, job)
@@ -91,9 +96,9 @@ def test_a_damaged_clip_is_rendered_again(context: WorkerContext, clips: list[Cl
 
 def test_what_was_never_looked_at_is_found_by_a_scrub_and_made_again(context: WorkerContext, clips: list[Clip]) -> None:
     damage(context.store.path(clips[0].video_sha256))
-    context.store.path(clips[2].poster_sha256).unlink()
+    context.store.path(clips[1].poster_sha256).unlink()
     assert to_mend(context) == []
-    assert not any(context.store.scrub(sha256) for sha256 in (clips[0].video_sha256, clips[2].poster_sha256))
+    assert not any(context.store.scrub(sha256) for sha256 in (clips[0].video_sha256, clips[1].poster_sha256))
     for job in to_mend(context):
         work(context, job)
     with context.database.reading() as session:

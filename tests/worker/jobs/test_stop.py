@@ -20,6 +20,8 @@ from app.services.studies import studies
 from app.settings import Settings
 from tests.waiting import PATIENCE_S, gone, hear_hangups, until
 
+pytestmark = pytest.mark.slow
+
 AT_MOST_S = 60.0
 """Ten and what a busy machine adds. One that did not stop would film for minutes, or wait for as long as it is held."""
 
@@ -74,7 +76,7 @@ def stops(process: Worker, number: int = signal.SIGTERM) -> bool:
 
 
 def test_while_it_starts(worker: Worker, settings: Settings) -> None:
-    assert until((settings.data_dir / "worker-1.lock").exists)
+    assert until((settings.data_dir / "worker-1.lock").exists)  # and now it loads what it needs
     assert stops(worker)
 
 
