@@ -177,7 +177,7 @@ def _add_benchmark(commands: _Commands) -> None:
         "--work-directory", type=Path, help="finished cells; default: benchmark/ in the data directory"
     )
     command.add_argument(
-        "--output", type=Path, help="tables; default: docs/results, or inside the work directory if quick"
+        "--output", type=Path, help="tables; default: docs/results/all_methods, or inside the work directory if quick"
     )
     command.add_argument("--report-only", action="store_true", help="run nothing, write the tables from what there is")
     command.set_defaults(act=_benchmark)
@@ -193,7 +193,7 @@ def _benchmark(said: argparse.Namespace) -> int:
     tastes = {taste.name: taste for taste in [*said.users, *others]}
     selection = benchmark.Selection(said.methods, said.tasks, tuple(tastes.values()), said.seeds)
     work = said.work_directory or Settings().data_dir / "benchmark"
-    output = said.output or (work / "quick" if said.profile == "quick" else Path("docs/results"))
+    output = said.output or (work / "quick" if said.profile == "quick" else Path("docs/results/all_methods"))
     command = "python -m worker " + " ".join(sys.argv[1:] or ["benchmark"])
     return benchmark.benchmark(selection, terms, work, output, said.processes, command, not said.report_only)
 

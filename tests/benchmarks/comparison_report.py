@@ -1,6 +1,6 @@
 """The page of a comparison, from the CSV files beside it: nothing is measured anew.
 
-    python -m tests.benchmarks.comparison_report docs/results
+    python -m tests.benchmarks.comparison_report docs/results/all_methods
 
 ``python -m worker benchmark`` writes the same page when its cells are at hand.
 """

@@ -112,7 +112,7 @@ def one_by_one(cells: Cells) -> dict[int, Cells]:
 
 
 def table_rows(cells: Cells) -> list[Row]:
-    """The columns of docs/results/table1.csv."""
+    """The columns of docs/results/all_methods/table1.csv."""
     return [_table_row(task, user, method, cell) for (task, user, method), cell in cells.items()]
 
 
@@ -184,7 +184,7 @@ def against(cells: Cells, method: str, baseline: str) -> list[Row]:
 
 
 def personalisation_rows(cells: Cells, method: str, groups: Sequence[Sequence[str]]) -> list[Row]:
-    """The columns of docs/results/personalisation.csv: whose filter serves whom.
+    """The columns of docs/results/all_methods/personalisation.csv: whose filter serves whom.
 
     ``groups``: users who are compared with each other. A user's own advantage is over the best filter of somebody else
     in the group, chosen on the very same scenarios, which favours the others, and in the seeds that all of them have.

@@ -1,7 +1,7 @@
 """The comparison as files: CSV tables, how they were made, and a page for people that follows from both.
 
 Everything on the page is read back from the files beside it, so the two cannot disagree, and a changed layout needs no
-new measurement (``python -m tests.benchmarks.comparison_report docs/results``).
+new measurement (``python -m tests.benchmarks.comparison_report docs/results/all_methods``).
 """
 
 import csv
