@@ -5,16 +5,18 @@ import logging
 import socket
 import sys
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
-from app import upgrading
+from app import logs, upgrading
 from app.db import Database
 from app.domain.studies import Study
 from app.errors import EXPLAINED, AppError, in_words
 from app.installed_tasks import catalogue
+from app.logs import LogFormat
 from app.paths import DOCS
 from app.programs import Programs, say
 from app.services import audit
@@ -139,23 +141,33 @@ def up(settings: Settings) -> int:
         greeting,
         settings.data_dir,
         {
-            "web": web_server(settings),
+            "web": ["-m", "app", "web"],
             "worker": ["-m", "worker", "run"],
         },
     ).run()
 
 
-def web_server(settings: Settings) -> list[str]:
-    """What Python is to run. Nobody is believed about where a request comes from, except the proxies of the settings.
+def web(settings: Settings) -> int:
+    """Run the web server alone, on a database that is already of this version."""
+    import uvicorn  # these two take longer to load than most commands take
 
-    Left alone, uvicorn believes whoever asks from this machine.
-    """
-    trusted = settings.trusted_proxies
-    return [
-        *("-m", "uvicorn", "app.main:create_app", "--factory", "--no-access-log", "--log-level", "warning"),
-        *("--host", settings.host, "--port", str(settings.port), "--timeout-graceful-shutdown", "5"),
-        *(("--forwarded-allow-ips", trusted) if trusted else ("--no-proxy-headers",)),
-    ]
+    from app.main import create_app
+
+    _require_free_port(settings)
+    in_json = settings.log_format is LogFormat.JSON
+    logs.write_to_stderr(settings.log_format, logging.INFO if in_json else logging.WARNING)
+    uvicorn.run(
+        partial(create_app, settings),
+        factory=True,
+        host=settings.host,
+        port=settings.port,
+        log_config=None,
+        access_log=False,  # it would tell personal links; ours tells routes
+        proxy_headers=bool(settings.trusted_proxies),  # left alone, uvicorn believes whoever asks from this machine
+        forwarded_allow_ips=settings.trusted_proxies or None,
+        timeout_graceful_shutdown=5,
+    )
+    return 0
 
 
 def _database(settings: Settings) -> Database:
@@ -203,6 +215,7 @@ def _demo(session: Session, settings: Settings) -> tuple[str, Sequence[str]]:
 
 _COMMANDS: dict[str, Callable[[Settings], int]] = {
     "up": up,
+    "web": web,
     "migrate": migrate,
     "reset-password": reset_password,
     "link": participant_link,

@@ -7,12 +7,13 @@ from http import HTTPStatus
 from fastapi import FastAPI
 from fastapi.responses import PlainTextResponse, RedirectResponse
 from fastapi.staticfiles import StaticFiles
+from prometheus_client import CollectorRegistry
 
 from app.db import Database
 from app.paths import STATIC
 from app.settings import Settings
 from app.storage import ArtefactStore
-from app.web import media
+from app.web import media, metrics
 from app.web.api import pages, routes
 from app.web.error_pages import add_error_pages, error_page
 from app.web.experimenter import (
@@ -34,6 +35,7 @@ from app.web.experimenter import (
 from app.web.http.deps import Studio, StudioDep
 from app.web.http.rate_limit import LoginAttempts
 from app.web.http.readiness import Readiness
+from app.web.http.request_log import RequestLog
 from app.web.http.security import Guard
 from app.web.http.session_queue import SessionQueue
 from app.web.http.shared_pages import SharedPages
@@ -60,6 +62,7 @@ EXPERIMENTER_PARTS = (
     imports,
     pages,
     media,
+    metrics,
 )
 PARTICIPANT_PARTS = (
     joining,
@@ -119,7 +122,9 @@ def create_routes(https: bool) -> FastAPI:
         title="PbARL Studio", openapi_url=None, lifespan=lifespan, max_body_size=MAX_BODY_BYTES, redirect_slashes=False
     )
     app.state.templates = make_environment(app.url_path_for)
+    app.state.metrics = CollectorRegistry()
     app.add_middleware(Guard, https=https, refuse=error_page)
+    app.add_middleware(RequestLog, registry=app.state.metrics)
     add_error_pages(app)
     for part in (*EXPERIMENTER_PARTS, *PARTICIPANT_PARTS):
         app.include_router(part.router)

@@ -6,6 +6,8 @@ from pathlib import Path
 from pydantic import Field, field_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
+from app.logs import LogFormat
+
 
 class Settings(BaseSettings):
     """Settings of web server and worker. Every program is handed one instance; there is no global."""
@@ -23,6 +25,8 @@ class Settings(BaseSettings):
     login_attempts_per_minute: int = Field(default=10, ge=1, description="Password attempts per address.")
     trusted_proxies: str = Field(default="", description="Addresses or networks whose X-Forwarded-For is believed.")
     worker_name: str = Field(default="worker-1", description="Stable name: a restart resumes its own work.")
+    log_format: LogFormat = Field(default=LogFormat.TEXT, description="json: one object per line, with ids.")
+    metrics_token: str | None = Field(default=None, min_length=16, description="Bearer token for /metrics.")
     compute_processes: int = Field(default=2, ge=1, description="Processes for simulation and training.")
 
     @field_validator("trusted_proxies")

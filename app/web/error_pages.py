@@ -12,6 +12,7 @@ from starlette.exceptions import HTTPException
 
 from app.db import complaints
 from app.errors import AppError
+from app.web.http import request_log
 from app.web.http.deps import EXPERIMENTER_COOKIE, PARTICIPANT_COOKIE, LoginNeeded, NotYet, PasswordChangeDue
 from app.web.http.security import HEADERS
 from app.web.texts import languages
@@ -98,8 +99,9 @@ def add_error_pages(app: FastAPI) -> None:
     def unforeseen(request: Request, _error: Exception) -> Response:
         # The server logs the traceback; this tells the person that nothing they did was lost silently.
         message = "This is our fault, and it is in the log. Nothing was saved by this step; please try again."
-        # made outside of the guard, so it brings the headers itself
-        return _answer(request, HTTPStatus.INTERNAL_SERVER_ERROR, message, HEADERS, "Unforeseen")
+        # made outside of what adds these headers to every other answer
+        headers = {**HEADERS, request_log.HEADER: request.scope.get(request_log.HEADER, "")}
+        return _answer(request, HTTPStatus.INTERNAL_SERVER_ERROR, message, headers, "Unforeseen")
 
 
 def _answer(

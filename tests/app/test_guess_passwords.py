@@ -17,7 +17,6 @@ from httpx2 import Response as Answer
 from pydantic import ValidationError
 from sqlalchemy import select
 
-from app.__main__ import web_server
 from app.db import Database
 from app.domain.people import BrowserSession, Experimenter
 from app.services.accounts import accounts, api_tokens, known_browsers
@@ -256,10 +255,11 @@ class TestProxies:
 @contextmanager
 def _server(directory: Path, trusted_proxies: str) -> Iterator[str]:
     """The web server as ``python -m app up`` starts it, three attempts per minute; gives its address."""
-    settings = Settings(_env_file=None, port=free_port(), trusted_proxies=trusted_proxies)
+    settings = Settings(_env_file=None, port=free_port())
     environment = {name: value for name, value in os.environ.items() if name != "DATABASE_URL"}
     environment |= {"DATA_DIR": str(directory), "LOGIN_ATTEMPTS_PER_MINUTE": "3", "FORWARDED_ALLOW_IPS": "127.0.0.1"}
-    server = subprocess.Popen([sys.executable, *web_server(settings)], env=environment)
+    environment |= {"PORT": str(settings.port), "TRUSTED_PROXIES": trusted_proxies}
+    server = subprocess.Popen([sys.executable, "-m", "app", "web"], env=environment)
     try:
         while True:
             try:

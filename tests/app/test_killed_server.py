@@ -53,18 +53,16 @@ def tokens(settings: Settings, database: Database) -> list[str]:
 
 
 class Server:
-    """Uvicorn as a process of its own, which can be killed outright."""
+    """The web server as a process of its own, which can be killed outright."""
 
     def __init__(self, settings: Settings) -> None:
         self.address = settings.base_url
         environment = {name: value for name, value in os.environ.items() if name != "DATABASE_URL"}
-        self._environment = {**environment, "DATA_DIR": str(settings.data_dir)}
-        self._command = ["-m", "uvicorn", "app.main:create_app", "--factory", "--no-access-log", "--log-level", "error"]
-        self._command += ["--port", str(settings.port)]
+        self._environment = {**environment, "DATA_DIR": str(settings.data_dir), "PORT": str(settings.port)}
         self.start()
 
     def start(self) -> None:
-        self.process = subprocess.Popen([sys.executable, *self._command], env=self._environment)
+        self.process = subprocess.Popen([sys.executable, "-m", "app", "web"], env=self._environment)
 
     def kill(self) -> None:
         self.process.kill()

@@ -108,7 +108,7 @@ def test_the_first_start_prints_all_that_is_needed(running: Studio) -> None:
 def test_ctrl_c_stops_both_programs(start: Start) -> None:
     studio = start()
     assert until(lambda: "worker-1 is ready" in studio.said and answers(studio.address))
-    programs = [studio.child("uvicorn"), studio.child("worker")]
+    programs = [studio.child("app\0web"), studio.child("worker")]
     assert studio.stop() == 0
     assert "Stopped." in studio.said
     assert "Traceback" not in studio.said
@@ -149,7 +149,7 @@ def test_a_worker_that_keeps_falling_leaves_the_web_server_alone_and_is_tried_un
 
 
 def test_a_web_server_that_falls_is_started_again_and_the_worker_keeps_its_work(running: Studio) -> None:
-    worker, web = running.child("worker"), running.child("uvicorn")
+    worker, web = running.child("worker"), running.child("app\0web")
     os.kill(web, signal.SIGKILL)
     assert until(lambda: "The web stopped by itself" in running.said)
     assert until(lambda: answers(running.address))
@@ -166,7 +166,7 @@ def test_a_damaged_file_of_the_engine_is_set_aside_and_the_studio_starts(start: 
 def test_killing_the_supervisor_leaves_nothing_running(start: Start) -> None:
     studio = start()
     assert until(lambda: "worker-1 is ready" in studio.said and answers(studio.address))
-    programs = [studio.child("uvicorn"), studio.child("worker")]
+    programs = [studio.child("app\0web"), studio.child("worker")]
     studio.stop(signal.SIGKILL)
     assert until(lambda: all(gone(pid) for pid in programs))
 

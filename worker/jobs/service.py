@@ -15,6 +15,7 @@ from pathlib import Path
 from dbos import DBOS, SetWorkflowID
 from sqlalchemy.exc import OperationalError
 
+from app import logs
 from app.db import Database, Watch, complaints, now
 from app.domain.study_settings import StudySettings
 from app.errors import AppError, OncePerMinute
@@ -56,7 +57,7 @@ class KeepsFelling(AppError):
 
 def run(settings: Settings) -> int:
     """Keep studies supplied with clips, queries, models and bundles until told to stop."""
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
+    logs.write_to_stderr(settings.log_format, logging.INFO)
     engine_log = logging.getLogger("dbos")
     engine_log.setLevel(logging.ERROR)
     engine_log.addFilter(OncePerMinute())

@@ -14,6 +14,7 @@ from dbos import DBOS, DBOSConfiguredInstance
 from sqlalchemy.exc import OperationalError
 from sqlalchemy.orm import Session
 
+from app import logs
 from app.domain.models import RunKind
 from app.domain.studies import Participant, Study
 from app.errors import AppError
@@ -64,6 +65,10 @@ class JobRunner(DBOSConfiguredInstance):
     def work(self, arguments: dict[str, Any]) -> None:
         """Do one job; what goes wrong is kept with the run and in the log, never raised."""
         job = from_arguments(arguments)
+        with logs.about(job=job.key):
+            self._do(job, arguments)
+
+    def _do(self, job: Job, arguments: dict[str, Any]) -> None:
         self.in_hand.add(job.key)
         started = time.monotonic()
         try:

@@ -67,10 +67,7 @@ class OwnStudio:
 
     def start_web(self) -> None:
         """Start the web server and wait until it answers."""
-        address = ["--host", self.settings.host, "--port", str(self.settings.port)]
-        self._start(
-            "web", "uvicorn", "app.main:create_app", "--factory", "--no-access-log", "--no-proxy-headers", *address
-        )
+        self._start("web", "app", "web")
         wait_until(PATIENCE_S, "no web server", self._answers)
 
     def start_worker(self) -> None:
