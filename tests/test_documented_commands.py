@@ -70,6 +70,7 @@ RUN: dict[str, str | Elsewhere | OnlyParsed] = {
     "app reset-password": "",
     "app scrub": "",
     "app up": Elsewhere("tests/app/test_start_and_stop.py::test_the_first_start_prints_all_that_is_needed"),
+    "app web": Elsewhere("tests/app/test_logs.py::test_the_web_server_alone_writes_nothing_but_json"),
     "worker --help": "",
     "worker behaviours": "--tasks feeding --scenarios 1 --axis-scenarios 1",
     "worker benchmark": Elsewhere("tests/worker/experiments/test_benchmark.py::test_the_command_can_only_report"),
