@@ -10,7 +10,7 @@ from pathlib import Path
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
-from app import upgrading
+from app import signing, upgrading
 from app.db import Database
 from app.domain.studies import Study
 from app.errors import EXPLAINED, AppError, in_words
@@ -100,6 +100,7 @@ def import_study(settings: Settings, file: Path, seal_key: str = "") -> int:
     with study_import.unpack(store, file, seal_key) as unpacked, _database(settings).writing() as session:
         imported = study_import.bring_in(session, store, unpacked, audit.SYSTEM)
         say(f"Imported: {settings.base_url}/studies/{imported.study.slug}")
+        say(signing.in_words(imported.signer, settings))
     for code, token in imported.tokens:
         say(f"{code},{settings.base_url}/p/{token}")
     return 0

@@ -22,6 +22,7 @@ from typing import IO, Any
 from pydantic import ValidationError
 from sqlalchemy import Table
 
+from app import signing
 from app.db import Base, UtcDateTime
 from app.services.archives import sealing, unpacking
 from app.services.archives.archive import (
@@ -151,7 +152,10 @@ def _manifest(archive: zipfile.ZipFile) -> Manifest:
             "Update the older of the two installations."
         )
     try:
-        return Manifest.model_validate(stored)
+        signer = signing.signer_of(stored)
+        return Manifest.model_validate(stored).model_copy(update={"signer": signer})
+    except signing.SignatureBroken as error:
+        raise ArchiveInvalid(f"The signature of this archive is broken. {error} Nothing was imported.") from error
     except ValidationError as error:
         place = ".".join(str(part) for part in error.errors()[0]["loc"])
         raise ArchiveInvalid(f"The manifest of this archive is damaged: {place[:80]}. Nothing was imported.") from error
