@@ -10,7 +10,7 @@ from pathlib import Path
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
-from app import signing, upgrading
+from app import audit_commands, signing, upgrading
 from app.db import Database
 from app.domain.studies import Study
 from app.errors import EXPLAINED, AppError, in_words
@@ -34,6 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     commands = parser.add_subparsers(dest="command", required=True)
     for name, act in _COMMANDS.items():
         commands.add_parser(name, help=act.__doc__).set_defaults(act=act)
+    audit_commands.add_to(commands)
     demo = commands.add_parser("demo", help=demo_study.__doc__)
     demo.add_argument("--task", choices=catalogue.names(), default=catalogue.usual())
     demo.set_defaults(act=demo_study)

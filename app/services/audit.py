@@ -22,6 +22,8 @@ SYSTEM = "studio"
 """The actor when no person is logged in, such as at the first start."""
 PARTICIPANT = "participant"
 """The actor when participants act for themselves; which of them is in the subject, as long as it may be known."""
+STRANGER = "somebody unknown"
+"""The actor while nobody has shown who they are."""
 ERASED = "personal data erased"
 """The action of rows that bring a receipt into the chain."""
 

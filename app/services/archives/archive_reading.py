@@ -82,8 +82,11 @@ def checked(
         yield ready
 
 
-def verify(path: Path, workspace: Path, seal_key: str) -> None:
-    """Read back what was written, as another installation would. Raises ArchiveInvalid."""
+def verify(path: Path, workspace: Path, seal_key: str) -> str | None:
+    """Read back what was written, as another installation would. Returns whose key has signed it, if it is signed.
+
+    Raises ArchiveInvalid.
+    """
 
     def take(sha256: str, pieces: Iterator[bytes]) -> None:
         digest = hashlib.sha256()
@@ -92,8 +95,8 @@ def verify(path: Path, workspace: Path, seal_key: str) -> None:
         if digest.hexdigest() != sha256:
             raise ArchiveInvalid("A file in this archive is damaged.")
 
-    with checked(path, workspace, seal_key, take, lambda _sha256: False):
-        pass
+    with checked(path, workspace, seal_key, take, lambda _sha256: False) as ready:
+        return ready.manifest.signer
 
 
 @contextmanager

@@ -31,7 +31,6 @@ from worker.type_aliases import Float32Array
 
 SCHEMA_VERSION = 1
 MANIFEST, SIGNATURE = "manifest.json", "signature.json"
-SIGNATURE_FORMAT = "pbarl-studio-bundle-signature"
 LARGEST_BYTES = 256 << 20
 """Of all files of a bundle together; those written so far have a hundredth of it."""
 _TIMESTAMP = (1980, 1, 1, 0, 0, 0)
@@ -119,7 +118,7 @@ def signed(stored: bytes, sign: Callable[[Mapping[str, Any]], dict[str, Any]]) -
     """The bundle with one file more: a signed document that names the hash of the manifest, and so of every file."""
     with zipfile.ZipFile(io.BytesIO(stored)) as archive:
         files = {name: archive.read(name) for name in archive.namelist()}
-    document = sign({"format": SIGNATURE_FORMAT, "manifest_sha256": _sha256(files[MANIFEST])})
+    document = sign({"format": run_filter.SIGNATURE_FORMAT, "manifest_sha256": _sha256(files[MANIFEST])})
     files[SIGNATURE] = (json.dumps(document, indent=2, sort_keys=True) + "\n").encode()
     return _zipped(files)
 

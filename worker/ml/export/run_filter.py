@@ -47,6 +47,7 @@ except ImportError as missing:
 TOLERANCE = 1e-4
 """Largest accepted difference from the recorded actions: other processors round differently."""
 TIMED_STEPS = 300
+SIGNATURE_FORMAT = "pbarl-studio-bundle-signature"
 
 
 class Problem(Exception):
@@ -58,9 +59,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n", maxsplit=1)[0])
     parser.add_argument("--observations", type=Path, help="(N, D) .npy file of observations to filter")
     parser.add_argument("--policy-means", type=Path, help="(N, A) .npy file of another policy's mean actions")
-    parser.add_argument(
-        "--key", metavar="FINGERPRINT", help="refuse what was not signed with the key of this fingerprint"
-    )
+    parser.add_argument("--key", metavar="FINGERPRINT", help="refuse what this key has not signed")
     parser.add_argument("--output", type=Path, help="where to write the (N, A) filtered actions, as .npy")
     options = parser.parse_args(arguments)
     directory = Path(__file__).resolve().parent
@@ -134,6 +133,8 @@ def signer_of(path: Path, manifest: Path) -> str:
         public = bytes.fromhex(signature["public_key"])
         written = json.dumps(document, sort_keys=True, separators=(",", ":")).encode()
         Ed25519PublicKey.from_public_bytes(public).verify(bytes.fromhex(signature["value"]), written)
+        if document["format"] != SIGNATURE_FORMAT:
+            raise KeyError("format")
         named = document["manifest_sha256"]
     except (InvalidSignature, AttributeError, KeyError, TypeError, ValueError):
         raise Problem("signature.json holds no good signature; unzip the bundle again, or do not use it.") from None
