@@ -75,10 +75,8 @@ def add(session: Session, whom: Study | Participant, step: str, erased: Erased) 
     """Keep the receipt of one step, and chain it."""
     person = whom if isinstance(whom, Participant) else None
     of = "study" if person is None else "preview" if person.is_preview else "participant"
-    study_id = whom.id if person is None else person.study_id
-    receipt = ErasureReceipt(
-        at=now(), study_id=study_id, participant_id=person.id if person is not None else None, contents={}
-    )
+    study_id, participant_id = _ids(whom)
+    receipt = ErasureReceipt(at=now(), study_id=study_id, participant_id=participant_id, contents={})
     receipt.contents = {
         "of": of,
         "study": study_id,
@@ -91,6 +89,11 @@ def add(session: Session, whom: Study | Participant, step: str, erased: Erased) 
     session.add(receipt)
     session.flush()
     audit.record(session, audit.SYSTEM, audit.ERASED, f"receipt {receipt.id}: {hash_of(receipt.contents)}")
+
+
+def are_there(session: Session, whom: Study | Participant) -> bool:
+    """Whether anything of them was erased before."""
+    return bool(_steps(session, *_ids(whom)))
 
 
 def hash_of(contents: Mapping[str, Any]) -> str:
@@ -130,6 +133,10 @@ def document(session: Session, erasure: Erasure) -> dict[str, Any]:
         "steps": [{"receipt": step.id, "sha256": hash_of(step.contents), **step.contents} for step in erasure.steps],
         "audit_head": {"row": head.row, "hash": head.hash},
     }
+
+
+def _ids(whom: Study | Participant) -> tuple[int, int | None]:
+    return (whom.study_id, whom.id) if isinstance(whom, Participant) else (whom.id, None)
 
 
 def _steps(session: Session, study_id: int, participant_id: int | None) -> Sequence[ErasureReceipt]:

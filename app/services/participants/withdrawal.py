@@ -70,7 +70,7 @@ def erase(session: Session, store: ArtefactStore, participant: Participant) -> N
     session.expire_all()  # what the session remembers of those rows is gone as well
     _erase_files(session, store, artefacts, erased)
     shutil.rmtree(store.unfinished(participant.id), ignore_errors=True)
-    if erased:
+    if erased or not receipts.are_there(session, participant):
         receipts.add(session, participant, ROWS_AND_FILES, erased)
 
 
@@ -97,7 +97,7 @@ def erase_study(session: Session, store: ArtefactStore, study: Study) -> None:
     _erase_files(session, store, artefacts, erased)
     for participant_id in session.scalars(select(Participant.id).where(Participant.study_id == study.id)):
         shutil.rmtree(store.unfinished(participant_id), ignore_errors=True)
-    if erased:
+    if erased or not receipts.are_there(session, study):
         receipts.add(session, study, ROWS_AND_FILES, erased)
 
 
