@@ -245,7 +245,7 @@ class TestForgetting:
     def test_the_receipt_says_how_much_went_and_nothing_of_whom(
         self, withdrawn: TakingPart, experimenter: TestClient
     ) -> None:
-        assert "Receipts of erasures" in experimenter.get("/audit/receipts").text
+        assert "Receipts of erasures" in experimenter.get("/audit/proof").text
         answer = experimenter.get("/audit/receipts/1.json")
         document = answer.json()
         (step,) = document["steps"]

@@ -18,7 +18,7 @@ from app.services.auditing.lookup import PAGE_SIZE
 from app.settings import Settings
 from tests import factories
 
-ADDRESSES = ["/audit", "/audit/log.csv", "/audit/log.jsonl", "/audit/head.json", "/audit/receipts"]
+ADDRESSES = ["/audit", "/audit/log.csv", "/audit/log.jsonl", "/audit/head.json", "/audit/proof"]
 
 
 def rows(page: str) -> list[int]:
@@ -97,6 +97,6 @@ def test_files_hold_every_row_and_the_head_is_the_last_one(
     assert outcome.rows >= len(in_csv) > 170
     assert [int(row["id"]) for row in in_csv] == list(range(1, len(in_csv) + 1))
     assert in_csv[-1]["row_hash"] in long_log.get("/audit/log.jsonl").text
-    page = long_log.get("/audit").text
+    page = long_log.get("/audit/proof").text
     assert outcome.head.hash in page
     assert signing.load(settings).fingerprint in page

@@ -68,7 +68,7 @@ NOT_PERSONAL = {
     "show_tokens": "names of one's own tokens",
     "show_video": "a robot",
     "show_poster": "a robot",
-    "show_receipts": "numbers, of nobody",
+    "show_proof": "hashes and numbers, of nobody",
     "show_start": "leads to show_studies",
     "show_health": "whether answers can be kept",
     "show_life": "whether the server answers",

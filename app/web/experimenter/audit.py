@@ -60,8 +60,6 @@ def show_audit(
         "actors": lookup.actors(session),
         "actions": lookup.actions(session),
         "slugs": lookup.slugs(session),
-        "head": audit.head(session),
-        "key": signing.load(studio.settings),
         "address": _address,
         "on_page": lookup.on_page,
     }
@@ -92,16 +90,18 @@ def download_head(owner: CurrentOwner, session: ReadingSession, studio: StudioDe
     return _file(signing.load(studio.settings).signed(document), f"audit-head-{head.row}.json")
 
 
-@router.get("/receipts", name="show_receipts")
-def show_receipts(request: Request, owner: CurrentOwner, session: ReadingSession) -> Response:
-    """What was erased, the newest first."""
+@router.get("/proof", name="show_proof")
+def show_proof(request: Request, owner: CurrentOwner, session: ReadingSession, studio: StudioDep) -> Response:
+    """The head of the log, the key that signs, and what was erased, the newest first."""
     context = {
         "experimenter": owner,
+        "head": audit.head(session),
+        "key": signing.load(studio.settings),
         "erasures": receipts.erasures(session, MOST_RECEIPTS),
         "most": MOST_RECEIPTS,
         "slugs": lookup.slugs(session),
     }
-    return page(request, "experimenter/receipts.html", context)
+    return page(request, "experimenter/proof.html", context)
 
 
 @router.get("/receipts/{number}.json", name="download_receipt")
