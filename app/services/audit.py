@@ -89,6 +89,8 @@ def note_reading(
 
     ``session`` only reads. Seldom enough that the writing need not wait for its turn in the event loop.
     """
+    if participant is not None and participant.withdrawn_at is not None:
+        subject = _GONE  # as it is recorded, or every look would be the first
     if is_worth_noting(session, actor, action, subject):
         with database.writing() as writing:
             record(writing, actor, action, subject, study=study, participant=participant)
