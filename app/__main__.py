@@ -11,7 +11,7 @@ from pathlib import Path
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
-from app import logs, upgrading
+from app import audit_commands, logs, signing, upgrading
 from app.db import Database
 from app.domain.studies import Study
 from app.errors import EXPLAINED, AppError, in_words
@@ -36,6 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     commands = parser.add_subparsers(dest="command", required=True)
     for name, act in _COMMANDS.items():
         commands.add_parser(name, help=act.__doc__).set_defaults(act=act)
+    audit_commands.add_to(commands)
     demo = commands.add_parser("demo", help=demo_study.__doc__)
     demo.add_argument("--task", choices=catalogue.names(), default=catalogue.usual())
     demo.set_defaults(act=demo_study)
@@ -102,6 +103,7 @@ def import_study(settings: Settings, file: Path, seal_key: str = "") -> int:
     with study_import.unpack(store, file, seal_key) as unpacked, _database(settings).writing() as session:
         imported = study_import.bring_in(session, store, unpacked, audit.SYSTEM)
         say(f"Imported: {settings.base_url}/studies/{imported.study.slug}")
+        say(signing.in_words(imported.signer, settings))
     for code, token in imported.tokens:
         say(f"{code},{settings.base_url}/p/{token}")
     return 0

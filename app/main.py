@@ -19,6 +19,7 @@ from app.web.error_pages import add_error_pages, error_page
 from app.web.experimenter import (
     accounts,
     answers,
+    audit,
     help_page,
     imports,
     invitations,
@@ -50,6 +51,7 @@ EXPERIMENTER_PARTS = (
     login,
     accounts,
     answers,
+    audit,
     planning,
     translations,
     invitations,

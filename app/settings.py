@@ -1,5 +1,6 @@
 """Everything an operator may set, from the environment or a .env file, with units in the names."""
 
+import re
 from ipaddress import ip_network
 from pathlib import Path
 
@@ -24,6 +25,8 @@ class Settings(BaseSettings):
     login_hours: int = Field(default=12, ge=1, description="How long an experimenter stays logged in.")
     login_attempts_per_minute: int = Field(default=10, ge=1, description="Password attempts per address.")
     trusted_proxies: str = Field(default="", description="Addresses or networks whose X-Forwarded-For is believed.")
+    signing_key_file: Path | None = Field(default=None, description="Private key; default: signing.key in DATA_DIR.")
+    trusted_keys: str = Field(default="", description="Fingerprints of other studios' keys, separated by commas.")
     worker_name: str = Field(default="worker-1", description="Stable name: a restart resumes its own work.")
     log_format: LogFormat = Field(default=LogFormat.TEXT, description="json: one object per line, with ids.")
     metrics_token: str | None = Field(default=None, min_length=16, description="Bearer token for /metrics.")
@@ -42,6 +45,26 @@ class Settings(BaseSettings):
             if network.prefixlen == 0:
                 raise ValueError(f"{each} is everybody. Name the proxy's own address.")
         return ",".join(named)
+
+    @field_validator("trusted_keys")
+    @classmethod
+    def _only_fingerprints(cls, text: str) -> str:
+        """A wrong letter would silently trust nobody."""
+        named = [part.strip().lower() for part in text.split(",") if part.strip()]
+        for each in named:
+            if not re.fullmatch(r"[0-9a-f]{64}", each):
+                raise ValueError(f"{each} is no fingerprint: 64 characters from 0 to 9 and a to f.")
+        return ",".join(named)
+
+    @property
+    def trusted_fingerprints(self) -> frozenset[str]:
+        """Of the keys of other studios that this one knows."""
+        return frozenset(self.trusted_keys.split(",")) - {""}
+
+    @property
+    def signing_key_path(self) -> Path:
+        """Where the private key of this installation lies."""
+        return self.signing_key_file or self.data_dir / "signing.key"
 
     @property
     def sqlalchemy_url(self) -> str:

@@ -60,17 +60,22 @@ REAL_TIME = OnlyParsed("lets a real worker learn while somebody waits, which tak
 SHIPPED = "would overwrite what ships with the studio; the same function runs small in "
 
 RUN: dict[str, str | Elsewhere | OnlyParsed] = {
+    "app audit-head": "",
+    "app check-signature": Elsewhere("tests/app/test_signing.py::test_commands_show_the_key_and_check_files"),
     "app demo": "--task drinking",
     "app dictionary": Elsewhere(
         "tests/app/test_export_data.py::test_the_dictionary_in_the_documentation_is_up_to_date"
     ),
+    "app erasure-receipts": "",
     "app import-study": Elsewhere("tests/app/test_archive.py::test_a_study_is_imported_by_a_command"),
     "app link": "",
     "app migrate": "",
     "app reset-password": "",
     "app scrub": "",
+    "app signing-key": "",
     "app up": Elsewhere("tests/app/test_start_and_stop.py::test_the_first_start_prints_all_that_is_needed"),
     "app web": Elsewhere("tests/app/test_logs.py::test_the_web_server_alone_writes_nothing_but_json"),
+    "app verify-audit": Elsewhere("tests/app/test_audit_chain.py::test_the_command_says_which_row"),
     "worker --help": "",
     "worker behaviours": "--tasks feeding --scenarios 1 --axis-scenarios 1",
     "worker benchmark": Elsewhere("tests/worker/experiments/test_benchmark.py::test_the_command_can_only_report"),

@@ -1,9 +1,10 @@
-"""Experimenters, browser sessions of everybody, and the record of who did what."""
+"""Experimenters, browser sessions of everybody, the record of who did what, and receipts of what was erased."""
 
 from datetime import datetime
 from enum import StrEnum
+from typing import Any
 
-from sqlalchemy import CheckConstraint, ForeignKey, String
+from sqlalchemy import CheckConstraint, ForeignKey, Index, String
 from sqlalchemy.orm import Mapped, mapped_column
 
 from app.db import Base, now
@@ -64,12 +65,39 @@ class BrowserSession(Base):
 
 
 class AuditEvent(Base):
-    """One act worth remembering; append-only."""
+    """One act worth remembering; append-only, and chained: app.services.audit says how."""
 
     __tablename__ = "audit_event"
+    __table_args__ = (
+        Index("ix_audit_event_actor_action_subject", "actor", "action", "subject"),
+        Index("ix_audit_event_action", "action"),
+    )
 
     id: Mapped[int] = mapped_column(primary_key=True)
+    """One more than the newest row's; part of what is hashed, so two writers cannot both follow the same row."""
     at: Mapped[datetime] = mapped_column(default=now)
     actor: Mapped[str] = mapped_column(String(80))
     action: Mapped[str] = mapped_column(String(80))
-    subject: Mapped[str] = mapped_column(String(200))
+    subject: Mapped[str | None] = mapped_column(String(200))
+    """None: it told of somebody whose data are erased."""
+    study_id: Mapped[int | None] = mapped_column(index=True)
+    participant_id: Mapped[int | None] = mapped_column(index=True)
+    """Whom the subject tells of. No foreign keys: rows outlive what they tell of."""
+    subject_salt: Mapped[str | None] = mapped_column(String(32))
+    """Erased with the subject: without it nobody can find the subject by trying likely ones against its hash."""
+    subject_hash: Mapped[str] = mapped_column(String(64))
+    previous_hash: Mapped[str] = mapped_column(String(64))
+    row_hash: Mapped[str] = mapped_column(String(64))
+
+
+class ErasureReceipt(Base):
+    """One step of erasing a person or a study: what went, by kind and number. Nothing in it identifies anybody."""
+
+    __tablename__ = "erasure_receipt"
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    at: Mapped[datetime] = mapped_column(default=now)
+    study_id: Mapped[int] = mapped_column(index=True)
+    participant_id: Mapped[int | None]
+    """Leads to the tombstone, and is not in what is handed out. None: the whole study, with everybody in it."""
+    contents: Mapped[dict[str, Any]]

@@ -45,9 +45,11 @@ def test_it_is_noted_once(database: Database) -> None:
     with database.writing() as session:
         study = factories.make_study(session, "Pilot")
         participant, _ = factories.make_participant(session, study)
-        for labels in (10, 20, 30, 40):
-            metrics = {"advice": {"expected_regret": 0.05}}
+    for labels in (10, 20, 30, 40):
+        metrics = {"advice": {"expected_regret": 0.05}}
+        with database.writing() as session:
             factories.make_model(session, study, participant, ModelKind.REWARD, metrics, labels=labels)
             stopping_advice.note(session, study, participant)
+    with database.reading() as session:
         noted = session.scalars(select(AuditEvent.subject).where(AuditEvent.action.startswith("more answers"))).all()
     assert noted == ["pilot/P01 after 30 answers"]

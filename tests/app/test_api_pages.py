@@ -218,7 +218,7 @@ def test_what_has_replaced_the_offset_is_said(get: Get, study: Study) -> None:
 
 
 class TestRecord:
-    def readings(self, database: Database) -> list[tuple[str, str]]:
+    def readings(self, database: Database) -> list[tuple[str, str | None]]:
         with database.reading() as session:
             rows = session.execute(
                 select(AuditEvent.actor, AuditEvent.subject)

@@ -119,6 +119,7 @@ def place(studio_app: FastAPI, database: Database, store: ArtefactStore, passwor
             "table": "labels",
             "name": "ratings",
             "key": "x" * 20,
+            "number": "1",
         }
         join_token = recruitment_panel.open_joining(session, study, "pat")
         token = api_tokens.create(session, session.scalars(select(Experimenter)).one(), "a notebook")[1]

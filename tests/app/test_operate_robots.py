@@ -62,8 +62,8 @@ class Laboratory:
         """What was logged about robots, oldest first."""
         with self.database.reading() as session:
             events = session.scalars(select(AuditEvent).order_by(AuditEvent.id)).all()
-        words = ("trial", "controller", "unblinded")
-        return [f"{each.action}: {each.subject}" for each in events if any(word in each.action for word in words)]
+        words = ("trial started", "trial done", "trial repeated", "controller", "study unblinded")
+        return [f"{each.action}: {each.subject}" for each in events if each.action.startswith(words)]
 
 
 @pytest.fixture

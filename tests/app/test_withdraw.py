@@ -165,7 +165,7 @@ def test_a_tombstone_stays_and_says_that_but_not_what(traced: TakingPart, databa
     assert person.withdrawn_at is not None
     forgotten = (person.panel_id, person.panel_parameters, person.consented_at, person.language, person.last_seen_at)
     assert forgotten == (None,) * 5
-    assert [(event.actor, event.subject) for event in events] == [(code, f"{traced.study.slug}/{code}")]
+    assert [(event.actor, event.subject) for event in events] == [("participant", traced.study.slug)]
 
 
 def test_what_others_still_need_is_kept(traced: TakingPart, database: Database, store: ArtefactStore) -> None:

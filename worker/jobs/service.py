@@ -15,7 +15,7 @@ from pathlib import Path
 from dbos import DBOS, SetWorkflowID
 from sqlalchemy.exc import OperationalError
 
-from app import logs
+from app import logs, signing
 from app.db import Database, Watch, complaints, now
 from app.domain.study_settings import StudySettings
 from app.errors import AppError, OncePerMinute
@@ -67,7 +67,9 @@ def run(settings: Settings) -> int:
         database = Database(settings.sqlalchemy_url)
         compute = Compute(settings.compute_processes, stop.asked)
         stop.at_once = compute.kill
-        context = WorkerContext(database, ArtefactStore(settings.data_dir / "artefacts"), compute)
+        context = WorkerContext(
+            database, ArtefactStore(settings.data_dir / "artefacts"), compute, signing.load(settings)
+        )
         runner = JobRunner(context, Lanes(compute))
         try:
             compute.warm_up(Lane.CLIPS, simulation.warm_up)

@@ -83,6 +83,6 @@ def _say(session: Session, study: Study, event: LabelEvent, *, excluded: bool, r
     if (known is not None and known.excluded) == excluded:
         return
     session.add(Exclusion(label_event_id=event.id, excluded=excluded, reason=reason, actor=actor))
-    code = session.get_one(Participant, query.participant_id).code
+    person = session.get_one(Participant, query.participant_id)
     action = "answer excluded" if excluded else "answer taken in again"
-    audit.record(session, actor, action, f"{study.slug}/{code}/{query.ordinal}")
+    audit.record(session, actor, action, f"{study.slug}/{person.code}/{query.ordinal}", participant=person)

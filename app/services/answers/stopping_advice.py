@@ -49,12 +49,12 @@ def note(session: Session, study: Study, participant: Participant) -> None:
     """Keep in the audit log, once per person, when more answers hardly paid any more."""
     theirs = select(Model).where(Model.participant_id == participant.id, Model.kind == ModelKind.REWARD)
     advice = advice_of(session.scalars(theirs.order_by(Model.label_count, Model.id)).all())
-    subject = f"{study.slug}/{participant.code}"
     if advice is None or advice.enough_since is None:
         return
-    noted = select(AuditEvent.id).where(AuditEvent.action == _ACT, AuditEvent.subject.startswith(f"{subject} "))
+    noted = select(AuditEvent.id).where(AuditEvent.action == _ACT, AuditEvent.participant_id == participant.id)
     if session.scalar(noted.limit(1)) is None:
-        audit.record(session, audit.SYSTEM, _ACT, f"{subject} after {advice.enough_since} answers")
+        subject = f"{study.slug}/{participant.code} after {advice.enough_since} answers"
+        audit.record(session, audit.SYSTEM, _ACT, subject, participant=participant)
 
 
 def _regret(metrics: dict[str, Any]) -> float | None:

@@ -1,6 +1,6 @@
 """A whole study as one file that another installation imports: rows, files, and the hashes of all of them.
 
-    manifest.json          format, version, and what every other file must hash to
+    manifest.json          format, version, what every other file must hash to, and a signature (app.signing)
     rows/<table>.jsonl     rows with the ids they had; of links of participants and of joining nothing
     files/<sha256>         artefacts under the hash of their content
 
@@ -37,6 +37,7 @@ from app.services.archives import sealing
 from app.services.evaluation import unblinding
 from app.services.exports import export_formats
 from app.services.participants.withdrawal import ARTEFACT_COLUMNS
+from app.signing import SigningKey
 from app.storage import ArtefactStore, hash_of_file
 
 FORMAT, VERSION = "pbarl-studio-archive", 2
@@ -79,6 +80,8 @@ class Manifest(BaseModel):
     files: dict[str, int] = {}
     missing: list[str] = []
     """Files that rows name and that could not be put in."""
+    signer: str | None = Field(default=None, exclude=True)
+    """Whose key has signed this, by its fingerprint; found when it is read, and believed of no file."""
 
 
 def tables_of(study_id: int) -> Iterator[tuple[Table, ColumnElement[bool]]]:
@@ -104,13 +107,18 @@ def artefacts(table_name: str, row: Mapping[str, Any]) -> Iterator[tuple[str, st
             yield column.key, row[column.key]
 
 
-def write(session: Session, store: ArtefactStore, study: Study, path: Path) -> Mapping[str, list[str]]:
-    """Write the study to a zip file. Returns the files that are missing or damaged, by what names them."""
+def write(
+    session: Session, store: ArtefactStore, study: Study, path: Path, key: SigningKey | None = None
+) -> Mapping[str, list[str]]:
+    """Write the study to a zip file. Returns the files that are missing or damaged, by what names them.
+
+    ``key``: signs the manifest, and by the hashes in it everything else.
+    """
     if not unblinding.is_blinded(study):
-        return _write_plain(session, store, study, path)
+        return _write_plain(session, store, study, path, key)
     with tempfile.TemporaryDirectory(dir=path.parent) as folder:
         plain = Path(folder) / "plain.zip"
-        missing = _write_plain(session, store, study, plain)
+        missing = _write_plain(session, store, study, plain, key)
         with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as archive, plain.open("rb") as source:
             archive.writestr(MANIFEST, _head(sealed=True).model_dump_json(indent=2, include=_OUTSIDE))
             with archive.open(SEALED, "w", force_zip64=True) as target:
@@ -126,7 +134,9 @@ def _head(**more: Any) -> Manifest:
     return Manifest(format=FORMAT, version=VERSION, software_version=software, written_at=moment, **more)
 
 
-def _write_plain(session: Session, store: ArtefactStore, study: Study, path: Path) -> Mapping[str, list[str]]:
+def _write_plain(
+    session: Session, store: ArtefactStore, study: Study, path: Path, key: SigningKey | None
+) -> Mapping[str, list[str]]:
     tables: dict[str, Rows] = {}
     named: dict[str, str] = {}
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -141,7 +151,8 @@ def _write_plain(session: Session, store: ArtefactStore, study: Study, path: Pat
                 files[sha256] = size
         lost = [sha256 for each in missing.values() for sha256 in each]
         manifest = _head(lock_hash=study.lock_hash, tables=tables, files=files, missing=lost)
-        archive.writestr(MANIFEST, manifest.model_dump_json(indent=2))
+        document = manifest.model_dump(mode="json")
+        archive.writestr(MANIFEST, json.dumps(document if key is None else key.signed(document), indent=2))
     return missing
 
 

@@ -22,6 +22,7 @@ from typing import IO, Any
 from pydantic import ValidationError
 from sqlalchemy import Table
 
+from app import signing
 from app.db import Base, UtcDateTime
 from app.services.archives import sealing, unpacking
 from app.services.archives.archive import (
@@ -81,8 +82,11 @@ def checked(
         yield ready
 
 
-def verify(path: Path, workspace: Path, seal_key: str) -> None:
-    """Read back what was written, as another installation would. Raises ArchiveInvalid."""
+def verify(path: Path, workspace: Path, seal_key: str) -> str | None:
+    """Read back what was written, as another installation would. Returns whose key has signed it, if it is signed.
+
+    Raises ArchiveInvalid.
+    """
 
     def take(sha256: str, pieces: Iterator[bytes]) -> None:
         digest = hashlib.sha256()
@@ -91,8 +95,8 @@ def verify(path: Path, workspace: Path, seal_key: str) -> None:
         if digest.hexdigest() != sha256:
             raise ArchiveInvalid("A file in this archive is damaged.")
 
-    with checked(path, workspace, seal_key, take, lambda _sha256: False):
-        pass
+    with checked(path, workspace, seal_key, take, lambda _sha256: False) as ready:
+        return ready.manifest.signer
 
 
 @contextmanager
@@ -151,7 +155,10 @@ def _manifest(archive: zipfile.ZipFile) -> Manifest:
             "Update the older of the two installations."
         )
     try:
-        return Manifest.model_validate(stored)
+        signer = signing.signer_of(stored)
+        return Manifest.model_validate(stored).model_copy(update={"signer": signer})
+    except signing.SignatureBroken as error:
+        raise ArchiveInvalid(f"The signature of this archive is broken. {error} Nothing was imported.") from error
     except ValidationError as error:
         place = ".".join(str(part) for part in error.errors()[0]["loc"])
         raise ArchiveInvalid(f"The manifest of this archive is damaged: {place[:80]}. Nothing was imported.") from error

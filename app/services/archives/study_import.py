@@ -15,6 +15,7 @@ from sqlalchemy.orm import Session
 
 from app.domain import run_keys
 from app.domain.models import Run, RunStatus
+from app.domain.people import AuditEvent
 from app.domain.studies import Participant, Study
 from app.errors import AppError
 from app.services import audit
@@ -26,6 +27,7 @@ from app.services.participants.withdrawal import in_use
 from app.services.studies import studies
 from app.storage import ArtefactStore
 
+SIGNATURE_CHECKED, NOT_SIGNED = "signature of archive checked", "not signed"
 _ROWS_AT_ONCE = 500
 Ids = dict[str, dict[int, int]]
 """By table the new id of every old one."""
@@ -37,6 +39,8 @@ class Imported:
 
     study: Study
     tokens: Sequence[tuple[str, str]]
+    signer: str | None
+    """The fingerprint of the key that had signed the archive; None: it was not signed."""
 
 
 @dataclass(frozen=True)
@@ -129,8 +133,18 @@ def _insert(session: Session, checked: Checked, actor: str) -> Imported:
     _name_runs(session, checked.rows(Run.__tablename__), ids)
     study = session.get_one(Study, next(iter(ids["study"].values())))
     locked = f" (locked, hash {study.lock_hash} recomputed)" if study.lock_hash else ""
-    audit.record(session, actor, "study imported", f"{study.slug}{locked}")
-    return Imported(study, _new_links(session, study, actor))
+    audit.record(session, actor, "study imported", f"{study.slug}{locked}", study=study)
+    signer = checked.manifest.signer
+    audit.record(session, actor, SIGNATURE_CHECKED, f"{study.slug}: {signer or NOT_SIGNED}", study=study)
+    return Imported(study, _new_links(session, study, actor), signer)
+
+
+def signer_of(session: Session, study: Study) -> tuple[bool, str | None]:
+    """Whether the study was imported since signatures are checked, and who had signed its archive."""
+    checks = select(AuditEvent.subject).where(AuditEvent.study_id == study.id, AuditEvent.action == SIGNATURE_CHECKED)
+    subject = session.scalar(checks.limit(1)) or ""
+    signer = subject.rpartition(": ")[2]
+    return bool(subject), None if signer == NOT_SIGNED else signer
 
 
 def _insert_rows(

@@ -122,7 +122,9 @@ def repeat(session: Session, study: Study, participant: Participant, ordinal: in
     if trial.started_at is None:
         return
     trial.started_at = trial.finished_at = trial.shown_at = None
-    audit.record(session, actor, "trial repeated", f"{_subject(study, participant, trial)}: {words}")
+    audit.record(
+        session, actor, "trial repeated", f"{_subject(study, participant, trial)}: {words}", participant=participant
+    )
 
 
 def find_controller(session: Session, store: ArtefactStore, participant: Participant, letter: str) -> Controller:
@@ -151,7 +153,7 @@ def _current(session: Session, participant: Participant, ordinal: int) -> Trial:
 
 
 def _record(session: Session, actor: str, action: str, study: Study, participant: Participant, trial: Trial) -> None:
-    audit.record(session, actor, action, _subject(study, participant, trial))
+    audit.record(session, actor, action, _subject(study, participant, trial), participant=participant)
 
 
 def _subject(study: Study, participant: Participant, trial: Trial) -> str:

@@ -58,7 +58,7 @@ def unblind(session: Session, study: Study, typed: str, actor: str) -> None:
     if study.unblinded_at is None:
         study.unblinded_at = now()
         rated, wanted = rated_and_wanted(session, study)
-        audit.record(session, actor, "study unblinded", f"{study.slug} ({rated} of {wanted} trials rated)")
+        audit.record(session, actor, "study unblinded", f"{study.slug} ({rated} of {wanted} trials rated)", study=study)
 
 
 def rated_and_wanted(session: Session, study: Study) -> tuple[int, int]:

@@ -39,7 +39,7 @@ def request(session: Session, study: Study, kind: ExportKind, actor: str) -> Exp
     export = Export(study_id=study.id, kind=kind, requested_by=actor)
     session.add(export)
     session.flush()
-    audit.record(session, actor, f"{kind} export requested", study.slug)
+    audit.record(session, actor, f"{kind} export requested", study.slug, study=study)
     return export
 
 

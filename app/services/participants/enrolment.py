@@ -65,7 +65,7 @@ def _add(session: Session, study: Study, actor: str, *, preview: bool) -> tuple[
     session.add(participant)
     session.flush()
     act = "preview opened" if preview else "participant added"
-    audit.record(session, actor, act, f"{study.slug}/{participant.code}")
+    audit.record(session, actor, act, f"{study.slug}/{participant.code}", participant=participant)
     return participant, token
 
 
@@ -74,7 +74,7 @@ def renew_link(session: Session, study: Study, participant: Participant, actor: 
     token = _new_token()
     participant.token_sha256 = _hash(token)
     session.execute(delete(BrowserSession).where(BrowserSession.participant_id == participant.id))
-    audit.record(session, actor, "link renewed", f"{study.slug}/{participant.code}")
+    audit.record(session, actor, "link renewed", f"{study.slug}/{participant.code}", participant=participant)
     return token
 
 

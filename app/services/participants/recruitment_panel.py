@@ -41,7 +41,7 @@ def open_joining(session: Session, study: Study, actor: str) -> str:
     """Let anybody join by an address with this token, from now on."""
     if study.join_token is None:
         study.join_token = secrets.token_urlsafe(24)
-        audit.record(session, actor, "joining opened", study.slug)
+        audit.record(session, actor, "joining opened", study.slug, study=study)
     return study.join_token
 
 
@@ -49,7 +49,7 @@ def close_joining(session: Session, study: Study, actor: str) -> None:
     """Nobody new by the open address; those who are in go on by it no more, but by their own links."""
     if study.join_token is not None:
         study.join_token = None
-        audit.record(session, actor, "joining closed", study.slug)
+        audit.record(session, actor, "joining closed", study.slug, study=study)
 
 
 def find_study(session: Session, join_token: str) -> Study:

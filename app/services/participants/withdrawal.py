@@ -5,7 +5,7 @@ What the worker keeps for itself (its engine's notes, results of work that was s
 """
 
 import shutil
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import Any
 
 from sqlalchemy import ColumnElement, Table, delete, func, select, update
@@ -19,6 +19,8 @@ from app.domain.models import Bundle, Export, Model, Report, Run, RunKind
 from app.domain.studies import Participant, Study
 from app.domain.study_settings import StudySettings
 from app.services import audit
+from app.services.auditing import receipts
+from app.services.auditing.receipts import ROWS_AND_FILES, Erased
 from app.storage import ArtefactStore
 
 ARTEFACT_COLUMNS: tuple[InstrumentedAttribute[Any], ...] = (
@@ -51,7 +53,7 @@ def withdraw(session: Session, store: ArtefactStore, participant: Participant, a
     study = session.get_one(Study, participant.study_id)
     if participant.withdrawn_at is None:
         participant.withdrawn_at = now()
-        audit.record(session, actor, "participant withdrew", f"{study.slug}/{participant.code}")
+        audit.record(session, actor, "participant withdrew", study.slug, study=study)
     erase(session, store, participant)
 
 
@@ -62,13 +64,14 @@ def erase(session: Session, store: ArtefactStore, participant: Participant) -> N
             setattr(participant, column.name, None)
     session.flush()
     artefacts = set(_artefacts(session, participant))
+    erased = Erased(audit_rows=audit.forget(session, participant_id=participant.id))
     _erase_made_of_everybody(session, participant.study_id)
-    for table, theirs in reversed(list(personal_rows(participant.id))):
-        session.execute(delete(table).where(theirs))
+    _erase_rows(session, personal_rows(participant.id), erased)
     session.expire_all()  # what the session remembers of those rows is gone as well
-    for sha256 in artefacts - in_use(session, artefacts):
-        store.delete(sha256)
+    _erase_files(session, store, artefacts, erased)
     shutil.rmtree(store.unfinished(participant.id), ignore_errors=True)
+    if erased or not receipts.are_there(session, participant):
+        receipts.add(session, participant, ROWS_AND_FILES, erased)
 
 
 def erase_study(session: Session, store: ArtefactStore, study: Study) -> None:
@@ -79,8 +82,8 @@ def erase_study(session: Session, store: ArtefactStore, study: Study) -> None:
     rows = dict(_rows_below(Study.__tablename__, study.id))
     artefacts = set(_artefacts_in(session, rows))
     people = rows.pop(Base.metadata.tables[Participant.__tablename__])
-    for table, theirs in reversed(list(rows.items())):
-        session.execute(delete(table).where(theirs))
+    erased = Erased(audit_rows=audit.forget(session, study_id=study.id))
+    _erase_rows(session, rows.items(), erased)
     nothing = {column.name: None for column in Participant.__table__.columns if column.name not in KEPT_COLUMNS}
     withdrawn_at = func.coalesce(Participant.withdrawn_at, study.deleted_at)
     session.execute(update(Participant).where(people).values(nothing | {"withdrawn_at": withdrawn_at}))
@@ -91,10 +94,23 @@ def erase_study(session: Session, store: ArtefactStore, study: Study) -> None:
     study.stored_settings = StudySettings(language=study.settings.language).model_dump(mode="json")
     session.flush()
     session.expire_all()
-    for sha256 in artefacts - in_use(session, artefacts):
-        store.delete(sha256)
+    _erase_files(session, store, artefacts, erased)
     for participant_id in session.scalars(select(Participant.id).where(Participant.study_id == study.id)):
         shutil.rmtree(store.unfinished(participant_id), ignore_errors=True)
+    if erased or not receipts.are_there(session, study):
+        receipts.add(session, study, ROWS_AND_FILES, erased)
+
+
+def _erase_rows(session: Session, found: Iterable[tuple[Table, ColumnElement[bool]]], erased: Erased) -> None:
+    for table, theirs in reversed(list(found)):
+        count = session.execute(delete(table).where(theirs)).rowcount  # type: ignore[attr-defined]
+        erased.rows[table.name] = count
+
+
+def _erase_files(session: Session, store: ArtefactStore, artefacts: Collection[str], erased: Erased) -> None:
+    for sha256 in set(artefacts) - in_use(session, artefacts):
+        store.delete(sha256)
+        erased.files += 1
 
 
 def personal_rows(participant_id: int) -> Iterator[tuple[Table, ColumnElement[bool]]]:

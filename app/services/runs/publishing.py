@@ -49,5 +49,6 @@ def retry_run(session: Session, study: Study, run_id: int, actor: str) -> Run:
         raise RunNotFound
     if run.status == RunStatus.FAILED:
         run.status = RunStatus.RETRY
-        audit.record(session, actor, "run retried", run.workflow_id)
+        whose = session.get(Participant, run.participant_id) if run.participant_id is not None else None
+        audit.record(session, actor, "run retried", run.workflow_id, study=study, participant=whose)
     return run

@@ -106,7 +106,7 @@ def change(
         _note_deviation(session, study, before, after, changed, actor, reason)
     study.name, study.task, study.seed = name, task, seed
     study.stored_settings = settings.model_dump(mode="json")
-    audit.record(session, actor, "settings changed", f"{study.slug}: {', '.join(changed)}")
+    audit.record(session, actor, "settings changed", f"{study.slug}: {', '.join(changed)}", study=study)
     if FIXED_BY.keys() & {*changed}:
         _end_previews(session, store, study, actor)
     return changed
@@ -154,7 +154,7 @@ def lock(session: Session, study: Study, typed: str, actor: str) -> str:
     study.lock_document = document(study)
     study.lock_hash = hash_of(study.lock_document)
     study.locked_at = now()
-    audit.record(session, actor, "study locked", f"{study.slug} {study.lock_hash}")
+    audit.record(session, actor, "study locked", f"{study.slug} {study.lock_hash}", study=study)
     return study.lock_hash
 
 

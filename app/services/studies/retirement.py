@@ -34,14 +34,14 @@ def put_away(session: Session, study: Study, actor: str) -> None:
     """Out of the list and out of work; nothing is deleted. Doing it again changes nothing."""
     if study.put_away_at is None:
         study.put_away_at = now()
-        audit.record(session, actor, "study put away", study.slug)
+        audit.record(session, actor, "study put away", study.slug, study=study)
 
 
 def take_out(session: Session, study: Study, actor: str) -> None:
     """Back into the list and to work. Doing it again changes nothing."""
     if study.put_away_at is not None:
         study.put_away_at = None
-        audit.record(session, actor, "study taken out again", study.slug)
+        audit.record(session, actor, "study taken out again", study.slug, study=study)
 
 
 def delete(session: Session, store: ArtefactStore, study: Study, typed: str, actor: str) -> None:
@@ -51,6 +51,6 @@ def delete(session: Session, store: ArtefactStore, study: Study, typed: str, act
     """
     if typed.strip() != study.slug:
         raise DeletionNotConfirmed
-    audit.record(session, actor, "study deleted", study.slug)
     study.deleted_at = now()
     withdrawal.erase_study(session, store, study)
+    audit.record(session, actor, "study deleted", study.slug)  # by now that is its number

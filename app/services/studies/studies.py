@@ -56,7 +56,7 @@ def create_study(
     )
     session.add(study)
     session.flush()
-    audit.record(session, actor, "study created", study.slug)
+    audit.record(session, actor, "study created", study.slug, study=study)
     return study
 
 

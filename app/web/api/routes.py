@@ -15,10 +15,10 @@ from sqlalchemy.orm import Session
 
 from app.domain.models import Bundle, Export, Model
 from app.domain.people import Experimenter, Role
-from app.domain.studies import Study
+from app.domain.studies import Participant, Study
 from app.errors import AppError
 from app.services import audit
-from app.services.accounts import api_tokens, roles
+from app.services.accounts import api_tokens, failed_logins, roles
 from app.services.accounts.api_tokens import TokenInvalid
 from app.services.evaluation import unblinding
 from app.services.exports import export_formats, export_requests, export_tables, paging
@@ -86,6 +86,11 @@ def _caller(
     try:
         token, experimenter = api_tokens.find(session, credentials.credentials)
     except TokenInvalid:
+        count = studio.failed_logins.count(failed_logins.WRONG_TOKEN)
+        if count is not None:
+            with studio.database.writing() as writing:
+                subject = failed_logins.in_words(failed_logins.WRONG_TOKEN, count)
+                audit.record(writing, audit.STRANGER, "login failed", subject)
         address = request.client.host if request.client else "unknown"
         if not studio.token_attempts.allow(address):
             raise TooManyWrongTokens from None
@@ -161,7 +166,7 @@ def list_participants(
 ) -> list[answers.ParticipantAnswer]:
     """Everybody in the study, tombstones included."""
     study = studies.find_study(session, slug)
-    _note_reading(studio, session, caller, "participants", slug)
+    _note_reading(studio, session, caller, "participants", study, slug)
     provenance = export_formats.provenance_of(session, study)
     rows = export_formats.records(export_tables.BY_NAME["participants"], session, study, provenance)
     return [answers.ParticipantAnswer.model_validate(row) for row in rows]
@@ -188,8 +193,9 @@ def list_bundles(
     slug: Slug, code: Code, caller: Caller, session: ReadingSession, studio: StudioDep
 ) -> list[answers.BundleAnswer]:
     """Every published filter of a participant, the newest first."""
-    person = enrolment.find_by_code(session, studies.find_study(session, slug), code)
-    _note_reading(studio, session, caller, "bundles", f"{slug}/{code}")
+    study = studies.find_study(session, slug)
+    person = enrolment.find_by_code(session, study, code)
+    _note_reading(studio, session, caller, "bundles", study, f"{slug}/{code}", person)
     rows = session.execute(
         select(Bundle, Model.label_count)
         .join(Model, Model.id == Bundle.model_id)
@@ -221,7 +227,7 @@ def download_bundle(
     """A filter that runs without this project."""
     person = enrolment.find_by_code(session, studies.find_study(session, slug), code)
     bundle = publishing.find_bundle(session, studio.store, person, version)
-    audit.record(session, caller.name, "bundle downloaded", f"{slug}/{code}/{version}")
+    audit.record(session, caller.name, "bundle downloaded", f"{slug}/{code}/{version}", participant=person)
     return FileResponse(studio.store.path(bundle.artefact_sha256), media_type="application/zip")
 
 
@@ -232,7 +238,7 @@ def show_report(slug: Slug, caller: Caller, session: ReadingSession, studio: Stu
     report = reports.newest(session, study)
     if report is None:
         raise NoReportYet
-    _note_reading(studio, session, caller, "report", slug)
+    _note_reading(studio, session, caller, "report", study, slug)
     figures = {
         name: {kind: f"{PREFIX}/studies/{slug}/report/figures/{name}.{kind}" for kind in formats}
         for name, formats in report.figures.items()
@@ -258,12 +264,13 @@ def show_figure(
     slug: Slug,
     name: Annotated[str, Path(pattern=r"^[a-z_]{1,60}$")],
     kind: Literal["svg", "png"],
-    _caller: Caller,
+    caller: Caller,
     session: ReadingSession,
     studio: StudioDep,
 ) -> Response:
     """One figure of the newest report."""
     study = studies.find_study(session, slug)
+    _note_reading(studio, session, caller, "report", study, slug)
     return Response(reports.figure(session, studio.store, study, name, kind), media_type=reports.FORMATS[kind])
 
 
@@ -311,7 +318,7 @@ def read_table(
     provenance = export_formats.provenance_of(session, study)
     rows = export_formats.keyed_records(wanted, session, study, provenance, window)
     found = list(islice(rows, limit + 1))
-    _note_reading(studio, session, caller, "table", f"{slug}/{table}")
+    _note_reading(studio, session, caller, "table", study, f"{slug}/{table}")
     following = None
     if len(found) > limit:
         place = paging.cursor_of(whose, window, found[limit - 1][0])
@@ -319,12 +326,18 @@ def read_table(
     return answers.Page(table=table, rows=[row for _, row in found[:limit]], next=following)
 
 
-def _note_reading(studio: Studio, session: Session, caller: Experimenter, what: str, subject: str) -> None:
-    """Kept before anything is given away. Seldom enough that it need not wait for its turn in the event loop."""
+def _note_reading(
+    studio: Studio,
+    session: Session,
+    caller: Experimenter,
+    what: str,
+    study: Study,
+    subject: str,
+    person: Participant | None = None,
+) -> None:
+    """Kept before anything is given away."""
     action = f"{what} read by the API"
-    if audit.is_worth_noting(session, caller.name, action, subject):
-        with studio.database.writing() as writing:
-            audit.record(writing, caller.name, action, subject)
+    audit.note_reading(studio.database, session, caller.name, action, subject, study=study, participant=person)
 
 
 @router.get("/studies/{slug}/exports", tags=["exports"])
@@ -348,8 +361,9 @@ def download_export(
     slug: Slug, export_id: RowId, caller: ActingCaller, session: WritingSession, studio: StudioDep
 ) -> Response:
     """A finished file."""
-    export = export_requests.find(session, studio.store, studies.find_study(session, slug), export_id)
-    audit.record(session, caller.name, f"{export.kind} export downloaded", f"{slug}/{export_id}")
+    study = studies.find_study(session, slug)
+    export = export_requests.find(session, studio.store, study, export_id)
+    audit.record(session, caller.name, f"{export.kind} export downloaded", f"{slug}/{export_id}", study=study)
     return FileResponse(studio.store.path(export.artefact_sha256 or ""), media_type="application/zip")
 
 

@@ -6,15 +6,28 @@ from urllib.parse import urlencode
 
 from fastapi import APIRouter, Depends, Form, Query, Request
 from fastapi.responses import RedirectResponse, Response
+from sqlalchemy.orm import Session
 
+from app.domain.people import Experimenter
 from app.domain.preferences import Purpose
 from app.domain.preferences import Response as Said
+from app.domain.studies import Participant, Study
+from app.services import audit
 from app.services.answers import answers, exclusions
 from app.services.answers.answers import Mark, Wanted
 from app.services.exports import export_rows
 from app.services.participants import enrolment
 from app.services.studies import studies
-from app.web.http.deps import ActingExperimenter, CurrentExperimenter, ReadingSession, RowId, Slug, WritingSession
+from app.web.http.deps import (
+    ActingExperimenter,
+    CurrentExperimenter,
+    ReadingSession,
+    RowId,
+    Slug,
+    Studio,
+    StudioDep,
+    WritingSession,
+)
 from app.web.texts.templating import page
 
 router = APIRouter(prefix="/studies/{slug}/answers")
@@ -39,17 +52,25 @@ WantedAnswers = Annotated[Wanted, Depends(_wanted)]
 
 @router.get("", name="show_answers")
 def show_answers(
-    request: Request, slug: Slug, wanted: WantedAnswers, experimenter: CurrentExperimenter, session: ReadingSession
+    request: Request,
+    slug: Slug,
+    wanted: WantedAnswers,
+    experimenter: CurrentExperimenter,
+    session: ReadingSession,
+    studio: StudioDep,
 ) -> Response:
     """The answers that are wanted, page by page."""
     study = studies.find_study(session, slug)
+    people = export_rows.everybody(session, study)
+    person = next((each for each in people if each.code == wanted.code), None)
+    _note_looking(studio, session, experimenter, study, person)
     context = {
         "study": study,
         "settings": study.settings,
         "experimenter": experimenter,
         "found": answers.find(session, study, wanted),
         "wanted": wanted,
-        "people": [each.code for each in export_rows.everybody(session, study) if each.withdrawn_at is None],
+        "people": [each.code for each in people if each.withdrawn_at is None],
         "purposes": list(Purpose),
         "responses": list(Said),
         "marks": list(Mark),
@@ -67,14 +88,17 @@ def show_answer(
     wanted: WantedAnswers,
     experimenter: CurrentExperimenter,
     session: ReadingSession,
+    studio: StudioDep,
 ) -> Response:
     """One answer: both clips to play, how they were watched, everything that was ever said of the pair."""
     study = studies.find_study(session, slug)
+    looked = answers.look(session, study, query_id, wanted)
+    _note_looking(studio, session, experimenter, study, looked.given.participant)
     context = {
         "study": study,
         "settings": study.settings,
         "experimenter": experimenter,
-        "looked": answers.look(session, study, query_id, wanted),
+        "looked": looked,
         "wanted": wanted,
         "query_string": query_string,
         "longest_reason": exclusions.LONGEST_REASON,
@@ -109,6 +133,15 @@ def include_answer(
     """Take the answer in again."""
     exclusions.include(session, studies.find_study(session, slug), query_id, experimenter.name)
     return _back(request, slug, query_id, wanted)
+
+
+def _note_looking(
+    studio: Studio, session: Session, experimenter: Experimenter, study: Study, person: Participant | None
+) -> None:
+    subject = study.slug if person is None else f"{study.slug}/{person.code}"
+    audit.note_reading(
+        studio.database, session, experimenter.name, "answers viewed", subject, study=study, participant=person
+    )
 
 
 def query_string(wanted: Wanted, page: int = 1) -> str:

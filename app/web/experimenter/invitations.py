@@ -8,8 +8,14 @@ import segno
 from fastapi import APIRouter, Form, Path, Request
 from fastapi.responses import RedirectResponse, Response
 from markupsafe import Markup
+from sqlalchemy.orm import Session
 from starlette.background import BackgroundTask
 
+from app import signing
+from app.domain.people import Experimenter
+from app.domain.studies import Study
+from app.services import audit
+from app.services.archives import study_import
 from app.services.exports.csv_cells import csv_line
 from app.services.participants import enrolment, recruitment_panel, withdrawal
 from app.services.studies import studies
@@ -75,10 +81,15 @@ def show_links(
     studio: StudioDep,
 ) -> Response:
     """New links, for as long as the desk keeps them."""
+    study = studies.find_study(session, slug)
+    links = studio.new_links.pick_up(experimenter.id, key)
+    _note_looking(studio, session, experimenter, study, links)
+    imported, signer = study_import.signer_of(session, study)
     context = {
-        "study": studies.find_study(session, slug),
+        "study": study,
         "experimenter": experimenter,
-        "links": studio.new_links.pick_up(experimenter.id, key),
+        "signature": signing.in_words(signer, studio.settings) if imported else None,
+        "links": links,
         "key": key,
     }
     return page(request, "experimenter/links.html", context)
@@ -95,8 +106,10 @@ def show_sheet(
 ) -> Response:
     """A card for each participant, with code, link and QR code: to print and to cut."""
     links = studio.new_links.pick_up(experimenter.id, key)
+    study = studies.find_study(session, slug)
+    _note_looking(studio, session, experimenter, study, links)
     context = {
-        "study": studies.find_study(session, slug),
+        "study": study,
         "cards": [(link, _qr_code(link.url)) for link in links],
         "key": key,
     }
@@ -104,10 +117,13 @@ def show_sheet(
 
 
 @router.get("/{slug}/links/{key}/links.csv", name="download_links")
-def download_links(slug: Slug, key: LinkKey, experimenter: CurrentExperimenter, studio: StudioDep) -> Response:
+def download_links(
+    slug: Slug, key: LinkKey, experimenter: CurrentExperimenter, session: ReadingSession, studio: StudioDep
+) -> Response:
     """Codes and links as a file that spreadsheets and mail programs read."""
     headers = {"content-disposition": f'attachment; filename="{slug}-links.csv"'}
     links = studio.new_links.pick_up(experimenter.id, key)
+    _note_looking(studio, session, experimenter, studies.find_study(session, slug), links)
     return Response(_as_csv(links), media_type="text/csv; charset=utf-8", headers=headers)
 
 
@@ -184,6 +200,15 @@ def _qr_code(url: str) -> Markup:
 
 def _as_csv(links: Sequence[NewLink]) -> str:
     return "".join([csv_line(("participant", "link")), *(csv_line((link.code, link.url)) for link in links)])
+
+
+def _note_looking(
+    studio: Studio, session: Session, experimenter: Experimenter, study: Study, links: Sequence[NewLink]
+) -> None:
+    """Whoever has a personal link can answer in that person's name."""
+    action = "personal links viewed"
+    if links:
+        audit.note_reading(studio.database, session, experimenter.name, action, study.slug, study=study)
 
 
 def _base(request: Request, studio: Studio) -> str:

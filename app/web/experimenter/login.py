@@ -8,11 +8,12 @@ from fastapi import APIRouter, Form, Request
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import RedirectResponse, Response
 from sqlalchemy.orm import Session
+from starlette.background import BackgroundTask
 
 from app.domain.people import Experimenter
 from app.errors import AppError
 from app.services import audit
-from app.services.accounts import accounts, browser_sessions, known_browsers
+from app.services.accounts import accounts, browser_sessions, failed_logins, known_browsers
 from app.web.http.deps import (
     EXPERIMENTER_COOKIE,
     KNOWN_BROWSER_COOKIE,
@@ -56,13 +57,20 @@ async def log_in(
     except (accounts.WrongNameOrPassword, TooManyAttempts) as error:
         context = {"next": _inside(next), "name": name, "error": error.message}
         status = error.status if isinstance(error, TooManyAttempts) else HTTPStatus.UNAUTHORIZED
-        return page(request, "experimenter/login.html", context, status)
+        response = page(request, "experimenter/login.html", context, status)
+        # After the response, so that the time taken does not tell which names exist.
+        response.background = BackgroundTask(_note_failure, studio, name)
+        return response
 
 
 @router.post("/logout", name="log_out")
 def log_out(request: Request, session: WritingSession) -> Response:
     """End this login for good: the cookie is worthless afterwards."""
-    browser_sessions.close(session, request.cookies.get(EXPERIMENTER_COOKIE, ""))
+    cookie = request.cookies.get(EXPERIMENTER_COOKIE, "")
+    experimenter = browser_sessions.experimenter_of(session, cookie)
+    if experimenter is not None:
+        audit.record(session, experimenter.name, "logged out", experimenter.name)
+    browser_sessions.close(session, cookie)
     response = RedirectResponse(request.app.url_path_for("show_login"), HTTPStatus.SEE_OTHER)
     response.delete_cookie(EXPERIMENTER_COOKIE)
     return response
@@ -92,7 +100,10 @@ async def change_password(
     except (accounts.WrongNameOrPassword, accounts.PasswordUnacceptable, TooManyAttempts) as error:
         status = error.status if isinstance(error, TooManyAttempts) else HTTPStatus.UNPROCESSABLE_ENTITY
         context = {"experimenter": experimenter, "error": error.message}
-        return page(request, "experimenter/password.html", context, status)
+        response = page(request, "experimenter/password.html", context, status)
+        if not isinstance(error, accounts.PasswordUnacceptable):  # whoever sits here may not be who has logged in
+            response.background = BackgroundTask(_note_failure, studio, experimenter.name)
+        return response
     async with studio.session_queue.writing() as session:
         changed = await run_in_threadpool(accounts.set_password, session, experimenter, password_hash)
     return await _enter(request, studio, changed, _inside(""), "logged in with the new password")
@@ -106,6 +117,18 @@ async def _verified(request: Request, studio: Studio, name: str, password: str) 
     _count_attempt(request, studio, name, browser)
     hashing = studio.hashing if browser is None else studio.hashing_for_known
     return await hashing.run(accounts.verify, account, password)
+
+
+async def _note_failure(studio: Studio, name: str) -> None:
+    """For the audit log; never what was typed, unless an account has that name."""
+    async with studio.session_queue.reading() as session:
+        account = await run_in_threadpool(accounts.by_name, session, name)
+    known = failed_logins.UNKNOWN_NAME if account is None else account.name
+    count = studio.failed_logins.count(known)
+    if count is not None:
+        async with studio.session_queue.writing() as session:
+            subject = failed_logins.in_words(known, count)
+            await run_in_threadpool(audit.record, session, audit.STRANGER, "login failed", subject)
 
 
 def _count_attempt(request: Request, studio: Studio, account: str, browser: str | None) -> None:

@@ -47,7 +47,10 @@ def operate(
     studio: StudioDep,
 ) -> Response:
     """The next trial, the list of all, and the controllers."""
-    return _desk_page(request, session, studio, _found(session, slug, code), experimenter)
+    study, participant = _found(session, slug, code)
+    subject = f"{slug}/{code}"
+    audit.note_reading(studio.database, session, experimenter.name, "trials viewed", subject, participant=participant)
+    return _desk_page(request, session, studio, (study, participant), experimenter)
 
 
 @router.post("/participants/{code}/trials/{ordinal}/start", name="start_trial")
@@ -112,7 +115,9 @@ def download_controller(
     """The robot of a letter as a zip file that runs without this project."""
     study, participant = _found(session, slug, code)
     controller = robot_operation.find_controller(session, studio.store, participant, letter)
-    audit.record(session, experimenter.name, "controller downloaded", f"{study.slug}/{code}/{letter}")
+    audit.record(
+        session, experimenter.name, "controller downloaded", f"{study.slug}/{code}/{letter}", participant=participant
+    )
     path = studio.store.path(controller.artefact_sha256)
     headers = {"etag": f'"{controller.artefact_sha256}"', "last-modified": AT_NO_TIME}
     return FileResponse(path, media_type="application/zip", filename=f"{slug}-{code}-{letter}.zip", headers=headers)
@@ -120,10 +125,13 @@ def download_controller(
 
 @router.get("/unblind", name="show_unblinding")
 def show_unblinding(
-    request: Request, slug: Slug, experimenter: CurrentExperimenter, session: ReadingSession
+    request: Request, slug: Slug, experimenter: CurrentExperimenter, session: ReadingSession, studio: StudioDep
 ) -> Response:
     """What unblinding means, and the form; afterwards the key."""
-    return _unblinding_page(request, session, studies.find_study(session, slug), experimenter)
+    study = studies.find_study(session, slug)
+    if study.unblinded_at is not None:
+        audit.note_reading(studio.database, session, experimenter.name, "key of letters viewed", slug, study=study)
+    return _unblinding_page(request, session, study, experimenter)
 
 
 @router.post("/unblind", name="unblind_study")

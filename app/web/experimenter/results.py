@@ -8,13 +8,14 @@ from fastapi import APIRouter, Path, Request
 from fastapi.responses import FileResponse, RedirectResponse, Response, StreamingResponse
 from sqlalchemy.orm import Session
 
+from app import signing
 from app.domain.people import Experimenter, Role
 from app.domain.studies import Study
 from app.errors import AppError
 from app.services import audit
 from app.services.accounts import roles
 from app.services.answers import exclusions
-from app.services.archives import sealing
+from app.services.archives import sealing, study_import
 from app.services.evaluation import evaluation_plan, unblinding
 from app.services.exports import export_formats, export_requests, export_tables
 from app.services.exports.export_requests import ExportKind
@@ -29,6 +30,7 @@ from app.web.http.deps import (
     ReadingSession,
     RowId,
     Slug,
+    Studio,
     StudioDep,
     WritingSession,
 )
@@ -77,6 +79,7 @@ def show_results(
 ) -> Response:
     """Tables, tests and figures of the newest report."""
     study = studies.find_study(session, slug)
+    audit.note_reading(studio.database, session, experimenter.name, "results viewed", slug, study=study)
     context = results_context(session, study) | {"experimenter": experimenter}
     return page(request, "experimenter/results.html", context)
 
@@ -113,12 +116,13 @@ def show_figure(
     slug: Slug,
     name: Annotated[str, Path(pattern=r"^[a-z_]{1,60}$")],
     kind: Literal["svg", "png"],
-    _experimenter: CurrentExperimenter,
+    experimenter: CurrentExperimenter,
     session: ReadingSession,
     studio: StudioDep,
 ) -> Response:
     """One figure of the newest report."""
     study = studies.find_study(session, slug)
+    audit.note_reading(studio.database, session, experimenter.name, "results viewed", slug, study=study)
     content = reports.figure(session, studio.store, study, name, kind)
     # An SVG file styles itself; opened by itself it must not be able to do anything else.
     policy = "default-src 'none'; style-src 'unsafe-inline'; sandbox"
@@ -145,7 +149,7 @@ def show_seal_key(request: Request, slug: Slug, experimenter: ActingExperimenter
     """The key of this study's sealed archives; who has asked for it is kept."""
     roles.require(experimenter, Role.EXPERIMENTER)
     study = studies.find_study(session, slug)
-    audit.record(session, experimenter.name, "seal key shown", slug)
+    audit.record(session, experimenter.name, "seal key shown", slug, study=study)
     return _exports_page(request, study, experimenter, session, sealing.key_of(study))
 
 
@@ -153,9 +157,13 @@ def _exports_page(
     request: Request, study: Study, experimenter: Experimenter, session: Session, seal_key: str | None = None
 ) -> Response:
     exports = [(export, export_requests.run_of(session, export)) for export in export_requests.of_study(session, study)]
+    studio: Studio = request.app.state.studio
+    imported, signer = study_import.signer_of(session, study)
     context = {
         "study": study,
         "experimenter": experimenter,
+        "fingerprint": signing.load(studio.settings).fingerprint,
+        "signature": signing.in_words(signer, studio.settings) if imported else None,
         "deviations": len(locking.deviations(session, study)),
         "waiting": any(export.finished_at is None for export, _ in exports),
         "exports": exports,
@@ -187,7 +195,7 @@ def download_export(
     roles.require(experimenter, Role.EXPERIMENTER)
     study = studies.find_study(session, slug)
     export = export_requests.find(session, studio.store, study, export_id)
-    audit.record(session, experimenter.name, f"{export.kind} export downloaded", f"{slug}/{export_id}")
+    audit.record(session, experimenter.name, f"{export.kind} export downloaded", f"{slug}/{export_id}", study=study)
     filename = f"{slug}-{export.kind}-{export.requested_at:%Y%m%dT%H%M}.zip"
     path = studio.store.path(export.artefact_sha256 or "")
     return FileResponse(path, media_type="application/zip", filename=filename)
@@ -207,7 +215,7 @@ def download_table(
     study = studies.find_study(session, slug)
     if table not in export_tables.BY_NAME:
         raise TableNotFound
-    audit.record(session, experimenter.name, "table exported", f"{slug}/{table}.{kind}")
+    audit.record(session, experimenter.name, "table exported", f"{slug}/{table}.{kind}", study=study)
     provenance = export_formats.provenance_of(session, study)
     lock = "not-locked" if study.lock_hash is None else study.lock_hash[:8]
     name = f"{slug}-{table}-{lock}-{provenance.exported_at:%Y%m%dT%H%M%S}.{kind}"

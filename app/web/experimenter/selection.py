@@ -76,7 +76,8 @@ def download_bundles(
         raise NoBundles
     files = []
     for participant, bundle in found:
-        audit.record(session, experimenter.name, "bundle downloaded", f"{slug}/{participant.code}/{bundle.version}")
+        subject = f"{slug}/{participant.code}/{bundle.version}"
+        audit.record(session, experimenter.name, "bundle downloaded", subject, participant=participant)
         name = f"{slug}-{participant.code}-v{bundle.version}.zip"
         files.append((name, studio.store.path(bundle.artefact_sha256)))
     headers = {"content-disposition": f'attachment; filename="{slug}-bundles.zip"'}

@@ -6,11 +6,13 @@ from http import HTTPStatus
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Request
+from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import FileResponse, RedirectResponse, Response
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 from jinja2 import Environment
 from sqlalchemy.orm import Session
 
+from app.domain.people import Experimenter
 from app.services import audit
 from app.services.monitoring import dashboard, form_summaries, study_state
 from app.services.participants import debrief, enrolment
@@ -140,6 +142,7 @@ def show_participant(
     studio: StudioDep,
 ) -> Response:
     """One participant: what they said, what was learned, and what it changes."""
+    _note_looking(studio, session, experimenter, slug, code)
     context = _participant_context(session, studio, slug, code)
     context |= {"experimenter": experimenter, "parts": PARTICIPANT_PARTS}
     return page(request, "experimenter/participant.html", context)
@@ -150,6 +153,7 @@ async def stream_participant(
     request: Request, slug: Slug, code: Code, studio: StudioDep, _allowed: MayStream
 ) -> AsyncIterator[ServerSentEvent]:
     """One participant as it changes."""
+    await run_in_threadpool(_note_streaming, request, studio, slug, code)
     templates = request.app.state.templates  # and nothing else of the request: what is drawn is for all who look
 
     def draw(session: Session) -> Mapping[str, str]:
@@ -172,9 +176,22 @@ def download_bundle(
     study = studies.find_study(session, slug)
     participant = enrolment.find_by_code(session, study, code)
     bundle = publishing.find_bundle(session, studio.store, participant, version)
-    audit.record(session, experimenter.name, "bundle downloaded", f"{slug}/{code}/{version}")
+    audit.record(session, experimenter.name, "bundle downloaded", f"{slug}/{code}/{version}", participant=participant)
     filename = f"{slug}-{code}-v{version}.zip"
     return FileResponse(studio.store.path(bundle.artefact_sha256), media_type="application/zip", filename=filename)
+
+
+def _note_looking(studio: Studio, session: Session, experimenter: Experimenter, slug: str, code: str) -> None:
+    person = enrolment.find_by_code(session, studies.find_study(session, slug), code)
+    subject = f"{slug}/{code}"
+    audit.note_reading(
+        studio.database, session, experimenter.name, "participant's page viewed", subject, participant=person
+    )
+
+
+def _note_streaming(request: Request, studio: Studio, slug: str, code: str) -> None:
+    with studio.database.reading() as session:
+        _note_looking(studio, session, experimenter_asking(request, session), slug, code)
 
 
 def _list_context(session: Session, studio: Studio, put_away: bool) -> dict[str, Any]:

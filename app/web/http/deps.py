@@ -16,6 +16,7 @@ from app.domain.people import Experimenter, Role
 from app.domain.studies import Participant
 from app.errors import AppError
 from app.services.accounts import browser_sessions, roles
+from app.services.accounts.failed_logins import FailedLogins
 from app.services.monitoring.tallies import Tallies
 from app.settings import Settings
 from app.storage import ArtefactStore
@@ -76,6 +77,7 @@ class Studio:
     """For people whose browser is known or who are logged in: they do not queue behind strangers who guess."""
     new_links: NewLinks = field(default_factory=NewLinks)
     imports: ImportLimit = field(default_factory=ImportLimit)
+    failed_logins: FailedLogins = field(default_factory=FailedLogins)
     tallies: Tallies = field(default_factory=Tallies)
     closing: Event = field(default_factory=Event)
     """Set when the server is asked to stop, so that open event streams end by themselves."""

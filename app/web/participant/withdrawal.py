@@ -6,6 +6,7 @@ from fastapi import APIRouter, Request
 from fastapi.responses import RedirectResponse, Response
 from starlette.background import BackgroundTask
 
+from app.services import audit
 from app.services.participants import withdrawal
 from app.web.http.deps import PARTICIPANT_COOKIE, CurrentParticipant, StudioDep, WritingSession
 from app.web.participant.pages import participant_page
@@ -31,7 +32,7 @@ def withdraw(
 ) -> Response:
     """Erase everything about this person; the bytes that a database keeps of what was erased go right afterwards."""
     language = languages.wording_of(request, participant).language
-    withdrawal.withdraw(session, studio.store, participant, actor=participant.code)
+    withdrawal.withdraw(session, studio.store, participant, audit.PARTICIPANT)
     address = request.app.url_path_for("show_withdrawn")
     response = RedirectResponse(address, HTTPStatus.SEE_OTHER)
     languages.remember(response, studio.settings, language)

@@ -12,6 +12,7 @@ from dbos import DBOS, SetWorkflowID
 from app.db import Database, now
 from app.domain.models import ModelKind, RunKind
 from app.domain.studies import Participant, Study
+from app.services.auditing import chain_check, receipts
 from app.services.participants import withdrawal
 from app.services.studies import retirement
 from app.settings import Settings
@@ -119,6 +120,13 @@ def test_work_under_way_is_abandoned_and_neither_draft_nor_late_result_nor_note_
     with context.database.reading() as session:
         assert erasure.unfinished(session) == []
         assert session.get_one(Participant, participant.id).erased_at is not None
+        (erasure_of_them,) = receipts.erasures(session)
+        late = [step.contents for step in erasure_of_them.steps if step.contents["step"] == receipts.LATE_RESULTS]
+        assert erasure_of_them.is_complete
+        assert [(each["rows"], each["files"]) for each in late] == [({"notes of the engine": 1}, 2)], (
+            "the draft and the result"
+        )
+        assert chain_check.check(session).faults == []
 
 
 def test_drafts_of_work_under_way_are_known_as_long_as_it_is_under_way(

@@ -14,7 +14,9 @@ from typing import get_args
 import numpy as np
 import onnxruntime
 import pytest
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
+from app.signing import SigningKey
 from tests.waiting import PATIENCE_S
 from tests.worker import invented
 from worker.analysis.evaluation import evaluate
@@ -293,3 +295,77 @@ def _rewritten(written: bytes, changes: dict[str, bytes | None], *, relist: bool
             manifest["files"][name] = {"bytes": len(stored or b""), "sha256": bundle._sha256(stored or b"")}
         files["manifest.json"] = json.dumps(manifest).encode()
     return bundle._zipped({name: stored for name, stored in files.items() if stored is not None})
+
+
+@pytest.fixture(scope="module")
+def key() -> SigningKey:
+    return SigningKey(Ed25519PrivateKey.from_private_bytes(bytes(32)))
+
+
+@pytest.fixture(scope="module")
+def signed(written: bytes, key: SigningKey) -> bytes:
+    return bundle.signed(written, key.signed)
+
+
+class TestSignature:
+    """Signed bundles say which studio they come from; the script checks it where it can, and says when it cannot."""
+
+    def unpacked(self, stored: bytes, folder: Path) -> Path:
+        with zipfile.ZipFile(io.BytesIO(stored)) as archive:
+            archive.extractall(folder)
+        return folder
+
+    def test_it_adds_one_file_and_changes_nothing_else(self, written: bytes, signed: bytes, key: SigningKey) -> None:
+        assert bundle.signed(written, key.signed) == signed
+        assert set(_names(signed)) - set(_names(written)) == {"signature.json"}
+        with zipfile.ZipFile(io.BytesIO(written)) as before, zipfile.ZipFile(io.BytesIO(signed)) as after:
+            assert all(before.read(name) == after.read(name) for name in before.namelist())
+        assert bundle.verify(signed) == bundle.verify(written)
+
+    def test_the_script_names_the_key_and_can_insist_on_it(
+        self, signed: bytes, key: SigningKey, tmp_path: Path
+    ) -> None:
+        directory = self.unpacked(signed, tmp_path)
+        finished = run(directory)
+        assert finished.returncode == 0, finished.stderr
+        assert f"Signature: good, made with the key {key.fingerprint}" in finished.stdout
+        assert run(directory, "--key", key.fingerprint.upper()).returncode == 0
+        other = run(directory, "--key", "ab" * 32)
+        assert other.returncode == 1
+        assert f"signed with another key, whose fingerprint is {key.fingerprint}" in other.stderr
+
+    def test_a_manifest_that_was_not_signed_is_refused(self, signed: bytes, tmp_path: Path) -> None:
+        """Whoever changes a file lists its new hash, too."""
+        directory = self.unpacked(_rewritten(signed, {"MODEL_CARD.md": b"Safe."}, relist=True), tmp_path)
+        finished = run(directory)
+        assert finished.returncode == 1
+        assert "manifest.json is not the one that was signed" in finished.stderr
+
+    @pytest.mark.parametrize("stored", [b"", b"[]", b"{}", b'{"signature": {"public_key": "00", "value": ""}}'])
+    def test_a_broken_signature_is_refused(self, signed: bytes, stored: bytes, tmp_path: Path) -> None:
+        finished = run(self.unpacked(_rewritten(signed, {"signature.json": stored}), tmp_path))
+        assert finished.returncode == 1
+        assert "no good signature" in finished.stderr
+        assert "Traceback" not in finished.stderr
+
+    def test_older_bundles_run_and_are_said_to_be_unsigned(self, unzipped: Path) -> None:
+        finished = run(unzipped)
+        assert finished.returncode == 0
+        assert "Signature: not signed" in finished.stdout
+        assert run(unzipped, "--key", "ab" * 32).returncode == 1
+
+    def test_without_cryptography_hashes_are_checked_and_the_signature_is_said_not_to_be(
+        self, signed: bytes, key: SigningKey, tmp_path: Path
+    ) -> None:
+        directory = self.unpacked(signed, tmp_path)
+        code = (
+            "import sys, runpy; sys.modules['cryptography'] = None\n"
+            "runpy.run_path('run_filter.py', run_name='__main__')"
+        )
+        without = [sys.executable, "-I", "-c", code]
+        finished = subprocess.run(without, cwd=directory, capture_output=True, text=True, check=False)
+        assert finished.returncode == 0, finished.stderr
+        assert "9 files match" in finished.stdout
+        assert "Signature: not checked" in finished.stdout
+        insisting = [*without, "--key", key.fingerprint]
+        assert subprocess.run(insisting, cwd=directory, capture_output=True, check=False).returncode == 1

@@ -337,5 +337,5 @@ def _save(
         session.add(known)
         session.flush()
         session.add(Clip(rollout_id=known.id, **each.clip))
-    audit.record(session, actor, "clips imported", f"{study.slug} ({len(ready)} clips)")
+    audit.record(session, actor, "clips imported", f"{study.slug} ({len(ready)} clips)", study=study)
     return study

@@ -19,6 +19,7 @@ from worker.jobs.learning import dataset
 from worker.jobs.runtime import due_work, records
 from worker.jobs.runtime.context import Step, WorkerContext
 from worker.jobs.runtime.records import Job
+from worker.ml.export import bundle
 from worker.ml.export.bundle import Provenance
 from worker.ml.filters.filter_problem import FilterConfig, FilterDraft
 
@@ -137,10 +138,11 @@ def _publish(context: WorkerContext, run_id: int, job: Job, reward: str, draft: 
     )
     learned = {**(model.metrics if model else {}), "foresight_notes": notes}
     finished = fitting.finish(_draft(context, draft), provenance, learned)
-    model_artefact, bundle_artefact = context.store.put(finished.filter_weights), context.store.put(finished.bundle)
+    packed = finished.bundle if context.key is None else bundle.signed(finished.bundle, context.key.signed)
+    model_artefact, bundle_artefact = context.store.put(finished.filter_weights), context.store.put(packed)
     with context.database.writing() as session:
         saved = records.save_model(session, run_id, ModelKind.FILTER, model_artefact, finished.metrics)
-        records.save_bundle(session, saved, version, bundle_artefact, len(finished.bundle))
+        records.save_bundle(session, saved, version, bundle_artefact, len(packed))
 
 
 def notes_on_script(participant: Participant) -> Sequence[str]:

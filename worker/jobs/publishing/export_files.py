@@ -87,7 +87,7 @@ def _made(context: WorkerContext, export_id: int, run_id: int) -> str | None:
 
 def _write_archive(session: Session, context: WorkerContext, study: Study, path: Path) -> Missing:
     """Written, and read back as another installation would: nobody is to find out when it is needed."""
-    missing = archive.write(session, context.store, study, path)
+    missing = archive.write(session, context.store, study, path, context.key)
     archive_reading.verify(path, path.parent, sealing.key_of(study))
     return missing
 

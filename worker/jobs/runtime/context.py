@@ -10,6 +10,7 @@ from typing import Any, Protocol
 from sqlalchemy.exc import OperationalError
 
 from app.db import Database
+from app.signing import SigningKey
 from app.storage import ArtefactStore, hash_of_file
 from worker.compute.pools import Computing
 from worker.jobs.runtime import records
@@ -52,6 +53,8 @@ class WorkerContext:
     database: Database
     store: ArtefactStore
     compute: Computing
+    key: SigningKey | None = None
+    """signs bundles and archives; None: they stay unsigned"""
     references: dict[tuple[str, range], list[Trajectory]] = field(default_factory=dict)
     """rollouts of the frozen policy by scenarios: the same for everybody, so each worker makes them once"""
 

@@ -18,6 +18,8 @@ from app import upgrading
 from app.db import file_of, now, rewrite
 from app.domain.models import RunKind
 from app.domain.studies import Participant, Study
+from app.services.auditing import receipts
+from app.services.auditing.receipts import Erased
 from app.services.participants import withdrawal
 from worker.jobs.runtime import engine
 from worker.jobs.runtime.context import WorkerContext
@@ -70,14 +72,17 @@ def erase_traces(
         of_study = job.kind in _OF_WHOLE_STUDIES and job.study_id == study_id
         return job.participant_id == participant_id or of_study
 
+    def whom(session: Session) -> Participant:
+        return session.get_one(Participant, participant_id)
+
     def erase(session: Session) -> None:
-        withdrawal.erase(session, context.store, session.get_one(Participant, participant_id))
+        withdrawal.erase(session, context.store, whom(session))
 
     def finish(session: Session) -> None:
         session.get_one(Participant, participant_id).erased_at = now()
         log.info("participant %d has withdrawn: the last traces are erased", participant_id)
 
-    return _erase(context, concerns, erase, finish, in_hand, stored, engine_file)
+    return _erase(context, concerns, whom, erase, finish, in_hand, stored, engine_file)
 
 
 def erase_traces_of_study(
@@ -92,15 +97,18 @@ def erase_traces_of_study(
     def concerns(job: Job) -> bool:
         return job.study_id == study_id
 
+    def whom(session: Session) -> Study:
+        return session.get_one(Study, study_id)
+
     def erase(session: Session) -> None:
-        withdrawal.erase_study(session, context.store, session.get_one(Study, study_id))
+        withdrawal.erase_study(session, context.store, whom(session))
 
     def finish(session: Session) -> None:
         session.get_one(Study, study_id).erased_at = now()
         session.execute(update(Participant).where(Participant.study_id == study_id).values(erased_at=now()))
         log.info("study %d was deleted: the last traces are erased", study_id)
 
-    return _erase(context, concerns, erase, finish, in_hand, stored, engine_file)
+    return _erase(context, concerns, whom, erase, finish, in_hand, stored, engine_file)
 
 
 Erase = Callable[
@@ -112,6 +120,7 @@ Erase = Callable[
 def _erase(
     context: WorkerContext,
     concerns: Callable[[Job], bool],
+    whom: Callable[[Session], Participant | Study],
     erase: Callable[[Session], None],
     finish: Callable[[Session], None],
     in_hand: Collection[str],
@@ -129,8 +138,12 @@ def _erase(
         left_over |= stored.pop(job.key, set())
     with context.database.writing() as session:
         erase(session)
-        for sha256 in left_over - withdrawal.in_use(session, left_over):
+        unused = left_over - withdrawal.in_use(session, left_over)
+        for sha256 in unused:
             context.store.delete(sha256)
+        late = Erased(rows={"notes of the engine": len(jobs)}, files=len(unused))
+        if late:
+            receipts.add(session, whom(session), receipts.LATE_RESULTS, late)
     DBOS.delete_workflows(list(jobs))
     if not context.database.forget_erased() or (engine_file is not None and not rewrite(engine_file)):
         return ErasureProgress(
@@ -143,6 +156,7 @@ def _erase(
         upgrading.forget_copies(database_file)
     with context.database.writing() as session:
         finish(session)
+        receipts.add(session, whom(session), receipts.LAST_TRACES, Erased())
     return ErasureProgress(finished=True, forgotten=frozenset(jobs))
 
 

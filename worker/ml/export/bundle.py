@@ -8,7 +8,7 @@ import io
 import json
 import platform
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -30,7 +30,7 @@ from worker.trajectory import SIGNALS, Trajectory
 from worker.type_aliases import Float32Array
 
 SCHEMA_VERSION = 1
-MANIFEST = "manifest.json"
+MANIFEST, SIGNATURE = "manifest.json", "signature.json"
 LARGEST_BYTES = 256 << 20
 """Of all files of a bundle together; those written so far have a hundredth of it."""
 _TIMESTAMP = (1980, 1, 1, 0, 0, 0)
@@ -114,6 +114,15 @@ def write(contents: BundleContents) -> bytes:
     return _zipped(files)
 
 
+def signed(stored: bytes, sign: Callable[[Mapping[str, Any]], dict[str, Any]]) -> bytes:
+    """The bundle with one file more: a signed document that names the hash of the manifest, and so of every file."""
+    with zipfile.ZipFile(io.BytesIO(stored)) as archive:
+        files = {name: archive.read(name) for name in archive.namelist()}
+    document = sign({"format": run_filter.SIGNATURE_FORMAT, "manifest_sha256": _sha256(files[MANIFEST])})
+    files[SIGNATURE] = (json.dumps(document, indent=2, sort_keys=True) + "\n").encode()
+    return _zipped(files)
+
+
 def verify(stored: bytes) -> dict[str, Any]:
     """The manifest of an undamaged bundle. Raises BundleDamaged when a file is missing, changed or was never listed."""
     try:
@@ -123,6 +132,7 @@ def verify(stored: bytes) -> dict[str, Any]:
             files = {name: archive.read(name) for name in archive.namelist()}
         manifest: dict[str, Any] = json.loads(files.pop(MANIFEST))
         listed: dict[str, dict[str, Any]] = manifest["files"]
+        files.pop(SIGNATURE, None)  # whose key it is made with, run_filter.py and app.services.auditing.signatures say
     except (zipfile.BadZipFile, KeyError, ValueError) as error:
         raise BundleDamaged(f"{BundleDamaged.__doc__} ({error})") from error
     changed = [

@@ -2,7 +2,10 @@
 
     python run_filter.py
         Check every file of this directory against the manifest, run the filter over the recording in recorded/, and
-        compare its actions with the recorded ones.
+        compare its actions with the recorded ones. With the package cryptography, the signature is checked as well.
+
+    python run_filter.py --key FINGERPRINT
+        The same, and nothing but a bundle signed with this key will do. The studio shows the fingerprint of its key.
 
     python run_filter.py --observations observations.npy --output actions.npy
         Filter your own recording of (N, D) observations. The reference policy's mean actions in them come from
@@ -27,6 +30,14 @@ from pathlib import Path
 from typing import Any
 
 try:
+    from cryptography.exceptions import InvalidSignature
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
+
+    CAN_CHECK_SIGNATURES = True
+except ImportError:
+    CAN_CHECK_SIGNATURES = False
+
+try:
     import numpy as np
     import onnxruntime
 except ImportError as missing:
@@ -36,6 +47,7 @@ except ImportError as missing:
 TOLERANCE = 1e-4
 """Largest accepted difference from the recorded actions: other processors round differently."""
 TIMED_STEPS = 300
+SIGNATURE_FORMAT = "pbarl-studio-bundle-signature"
 
 
 class Problem(Exception):
@@ -47,6 +59,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n", maxsplit=1)[0])
     parser.add_argument("--observations", type=Path, help="(N, D) .npy file of observations to filter")
     parser.add_argument("--policy-means", type=Path, help="(N, A) .npy file of another policy's mean actions")
+    parser.add_argument("--key", metavar="FINGERPRINT", help="refuse what this key has not signed")
     parser.add_argument("--output", type=Path, help="where to write the (N, A) filtered actions, as .npy")
     options = parser.parse_args(arguments)
     directory = Path(__file__).resolve().parent
@@ -54,6 +67,7 @@ def main(arguments: list[str] | None = None) -> int:
         if bool(options.observations) != bool(options.output) or (options.policy_means and not options.output):
             raise Problem("--observations and --output belong together; give both, or neither and no --policy-means.")
         manifest = verified_manifest(directory)
+        check_signature(directory, options.key)
         session, policy = load(directory / "filter.onnx"), load(directory / "policy.onnx")
         if options.output:
             means = options.policy_means or policy
@@ -84,6 +98,49 @@ def verified_manifest(directory: Path) -> dict[str, Any]:
             raise Problem(f"{name} is not the file that was exported (its sha256 differs); unzip the bundle again.")
     sys.stdout.write(f"{len(listed)} files match the manifest.\n")
     return manifest
+
+
+def check_signature(directory: Path, wanted: str | None) -> None:
+    """Say whether the manifest is signed and by which key. Raises Problem when it is not as it should be.
+
+    ``wanted``: the fingerprint that it must be; None: any key, or none at all.
+    """
+    path = directory / "signature.json"
+    if not path.is_file():
+        report_signature("not signed: nothing proves which studio these files come from.", wanted)
+    elif not CAN_CHECK_SIGNATURES:
+        report_signature("not checked. To check it: python -m pip install cryptography", wanted)
+    else:
+        signer = signer_of(path, directory / "manifest.json")
+        if wanted is not None and "".join(wanted.lower().replace(":", "").split()) != signer:
+            raise Problem(f"the bundle was signed with another key, whose fingerprint is {signer}.")
+        known = "the key that was asked for" if wanted is not None else "compare it with the one that the studio shows"
+        sys.stdout.write(f"Signature: good, made with the key {signer} ({known}).\n")
+
+
+def report_signature(words: str, wanted: str | None) -> None:
+    """Without a good signature a bundle is accepted unless one was asked for."""
+    if wanted is not None:
+        raise Problem(f"the signature is {words}")
+    sys.stdout.write(f"Signature: {words}\n")
+
+
+def signer_of(path: Path, manifest: Path) -> str:
+    """The fingerprint of the key that has signed the manifest: SHA-256 of the public key."""
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+        signature = document.pop("signature")
+        public = bytes.fromhex(signature["public_key"])
+        written = json.dumps(document, sort_keys=True, separators=(",", ":")).encode()
+        Ed25519PublicKey.from_public_bytes(public).verify(bytes.fromhex(signature["value"]), written)
+        if document["format"] != SIGNATURE_FORMAT:
+            raise KeyError("format")
+        named = document["manifest_sha256"]
+    except (InvalidSignature, AttributeError, KeyError, TypeError, ValueError):
+        raise Problem("signature.json holds no good signature; unzip the bundle again, or do not use it.") from None
+    if hashlib.sha256(manifest.read_bytes()).hexdigest() != named:
+        raise Problem("manifest.json is not the one that was signed; do not use this bundle.")
+    return hashlib.sha256(public).hexdigest()
 
 
 def load(path: Path) -> Any:

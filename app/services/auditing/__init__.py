@@ -1,0 +1,1 @@
+"""The audit log: check, look up, receipts."""
