@@ -8,6 +8,7 @@ from fastapi import FastAPI
 from fastapi.responses import PlainTextResponse, RedirectResponse
 from fastapi.staticfiles import StaticFiles
 
+from app import data_directory
 from app.db import Database
 from app.paths import STATIC
 from app.settings import Settings
@@ -109,7 +110,7 @@ def create_routes(https: bool) -> FastAPI:
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         studio: Studio = app.state.studio
-        with live.closing_on_signals(studio.closing):
+        with data_directory.shared(studio.settings.data_dir), live.closing_on_signals(studio.closing):
             yield
         studio.hashing.close()
         studio.hashing_for_known.close()

@@ -25,6 +25,10 @@ class Settings(BaseSettings):
     worker_name: str = Field(default="worker-1", description="Stable name: a restart resumes its own work.")
     compute_processes: int = Field(default=2, ge=1, description="Processes for simulation and training.")
 
+    backup_dir: Path | None = Field(default=None, description="Where the worker puts backups; default: it makes none.")
+    backup_every_hours: int = Field(default=24, ge=1, description="Time between two backups of the worker.")
+    backups_kept: int = Field(default=7, ge=1, description="So many backups stay in BACKUP_DIR, the newest.")
+
     @field_validator("trusted_proxies")
     @classmethod
     def _only_addresses(cls, text: str) -> str:

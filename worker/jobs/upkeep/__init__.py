@@ -1,1 +1,1 @@
-"""Erasure after a withdrawal, unused files."""
+"""Erasure after a withdrawal, unused files, backups."""

@@ -18,6 +18,7 @@ from app import upgrading
 from app.db import file_of, now, rewrite
 from app.domain.models import RunKind
 from app.domain.studies import Participant, Study
+from app.services.backups import restoring
 from app.services.participants import withdrawal
 from worker.jobs.runtime import engine
 from worker.jobs.runtime.context import WorkerContext
@@ -141,6 +142,7 @@ def _erase(
     database_file = file_of(context.database.url)
     if database_file is not None:
         upgrading.forget_copies(database_file)
+    restoring.forget_replaced(context.store.root.parent)
     with context.database.writing() as session:
         finish(session)
     return ErasureProgress(finished=True, forgotten=frozenset(jobs))
