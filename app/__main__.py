@@ -168,11 +168,10 @@ def restore(settings: Settings, backup: Path, into: Path | None, replace: bool) 
 
 
 def _contents(backup: layout.Backup) -> str:
-    rows, size = backup.manifest.rows, backup.byte_count / 1e6
-    counted = ", ".join(f"{rows.get(table, 0)} {words}" for table, words in _COUNTED.items())
-    return (
-        f"{counted}, {len(backup.manifest.artefacts)} files, {size:.1f} MB, made {backup.manifest.made_at:%F %T} UTC."
-    )
+    manifest = backup.manifest
+    counted = ", ".join(f"{words}: {manifest.rows.get(table, 0)}" for table, words in _COUNTED.items())
+    size = f"files: {len(manifest.artefacts)}, {backup.byte_count / 1e6:.1f} MB"
+    return f"made {manifest.made_at:%Y-%m-%d %H:%M:%S} UTC; {counted}, {size}"
 
 
 def demo_study(settings: Settings, task: str) -> int:

@@ -24,7 +24,7 @@ from sqlalchemy import URL, make_url
 from app.db import copy, file_of, now
 from app.errors import AppError
 from app.services.backups import layout, snapshots, withdrawals
-from app.services.backups.layout import BESIDE, DATABASE, DRAFT, MANIFEST, Backup, File, Manifest
+from app.services.backups.layout import ARTEFACTS, BESIDE, DATABASE, DRAFT, MANIFEST, Backup, File, Manifest
 from app.services.exports import export_formats
 from app.settings import Settings
 from app.storage import ArtefactStore, hash_of_file
@@ -168,9 +168,10 @@ class _Draft:
         """Sizes by hash, and what the studio does not have any more. Raises _Outdated."""
         store = ArtefactStore(self.settings.data_dir / "artefacts")
         sizes: dict[str, int] = {}
+        (self.folder / ARTEFACTS).mkdir(mode=0o700)
         for sha256 in sorted(named):
             target = self.folder / layout.artefact(sha256)
-            target.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            target.parent.mkdir(mode=0o700, exist_ok=True)
             if (
                 any(_linked(each, target, sha256) for each in self.earlier[:1])
                 or _copied(store.path(sha256), target, sha256)

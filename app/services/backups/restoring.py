@@ -116,9 +116,10 @@ def _opened(settings: Settings, folder: Path) -> Backup:
 
 def _lay_out(backup: Backup, prepared: Path) -> None:
     """Copy the files, each compared with what it must be, to where a studio has them."""
+    (prepared / layout.ARTEFACTS).mkdir(mode=0o700)
     for place, file in layout.files(backup.manifest):
         target = prepared / place.removeprefix(f"{BESIDE}/")
-        target.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        target.parent.mkdir(mode=0o700, exist_ok=True)
         with making.new_file(target) as stream:
             for piece in layout.pieces(backup.folder / place, file):
                 stream.write(piece)
