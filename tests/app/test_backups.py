@@ -11,6 +11,7 @@ from collections import namedtuple
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from functools import partial
+from itertools import count
 from pathlib import Path
 
 import pytest
@@ -73,22 +74,38 @@ def in_a_process(act: Callable[[], object]) -> int:
     return process.exitcode
 
 
-def die_at(number: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Be killed outright before the flush to disk, or the renaming, of this number."""
-    seen = 0
+def before_each_step(monkeypatch: pytest.MonkeyPatch, act: Callable[[], None]) -> None:
+    """A step is a flush to disk, or a file that gets its name."""
 
-    def counted(function: Callable[..., object]) -> Callable[..., object]:
-        def count(*arguments: object) -> object:
-            nonlocal seen
-            seen += 1
-            if seen == number:
-                os.kill(os.getpid(), signal.SIGKILL)
+    def noticed(function: Callable[..., object]) -> Callable[..., object]:
+        def notice(*arguments: object) -> object:
+            act()
             return function(*arguments)
 
-        return count
+        return notice
 
-    monkeypatch.setattr(os, "fsync", counted(os.fsync))
-    monkeypatch.setattr(Path, "rename", counted(Path.rename))
+    monkeypatch.setattr(os, "fsync", noticed(os.fsync))
+    monkeypatch.setattr(Path, "rename", noticed(Path.rename))
+
+
+def die_at(number: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Be killed outright before the step of this number."""
+    steps = count(1)
+
+    def die() -> None:
+        if next(steps) == number:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    before_each_step(monkeypatch, die)
+
+
+def counted_steps(act: Callable[[], object]) -> int:
+    """How many steps it takes, undisturbed."""
+    steps: list[None] = []
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        before_each_step(monkeypatch, lambda: steps.append(None))
+        act()
+    return len(steps)
 
 
 def test_a_backup_holds_every_row_and_every_file_and_is_for_its_owner_alone(
@@ -190,15 +207,15 @@ def test_a_backup_that_is_killed_anywhere_leaves_nothing_that_looks_whole_and_th
             die_at(number, monkeypatch)
             making.make(settings, directory)
 
-    kills = 0
-    for number in range(1, 10_000, 9):
-        if in_a_process(partial(make_and_die, number)) == 0:
-            break
-        kills += 1
-        for folder in layout.folders_in(directory):
-            restoring.verify(settings, folder)
-        assert len(list(directory.glob(".making-*"))) == 1
-    assert kills > 5
+    steps = counted_steps(lambda: making.make(settings, directory))
+    for number in (*range(1, steps, steps // 10), *range(steps - 3, steps + 1)):
+        making.erase(layout.folders_in(directory)[-1])  # so that files are copied, not shared
+        if in_a_process(partial(make_and_die, number)) != 0:
+            assert len(list(directory.glob(".making-*"))) == 1 or number == steps
+            assert len(layout.folders_in(directory)) == (number == steps)
+        making.make(settings, directory)
+    for folder in layout.folders_in(directory):
+        restoring.verify(settings, folder)
     making.make(settings, directory)
     assert list(directory.glob(".making-*")) == []
 

@@ -157,7 +157,7 @@ def pieces(path: Path, expected: File | None, most_bytes: int | None = None) -> 
     except OSError as error:
         raise BackupRefused(f"{path} cannot be read: {error.strerror}.") from error
     digest = hashlib.sha256()
-    with os.fdopen(descriptor, "rb", buffering=0) as stream:
+    try:
         found = os.fstat(descriptor)
         if not stat.S_ISREG(found.st_mode):
             raise BackupRefused(f"{path} is no ordinary file, which no backup has. Nothing was restored.")
@@ -166,12 +166,21 @@ def pieces(path: Path, expected: File | None, most_bytes: int | None = None) -> 
         if expected is not None and found.st_size != expected.byte_count:
             raise BackupRefused(f"{path} is damaged: its size differs. This backup is not whole; take another one.")
         left = found.st_size
-        while left and (piece := stream.read(min(left, _PIECE_BYTES))):
+        while left and (piece := _read(path, descriptor, min(left, _PIECE_BYTES))):
             left -= len(piece)
             digest.update(piece)
             yield piece
+    finally:
+        os.close(descriptor)
     if expected is not None and (left or digest.hexdigest() != expected.sha256):
         raise BackupRefused(f"{path} is damaged. This backup is not whole; take another one.")
+
+
+def _read(path: Path, descriptor: int, byte_count: int) -> bytes:
+    try:
+        return os.read(descriptor, byte_count)
+    except OSError as error:  # a disk that dies
+        raise BackupRefused(f"{path} cannot be read: {error.strerror}.") from error
 
 
 def beside_in(data_dir: Path) -> Iterator[Path]:
