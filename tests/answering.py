@@ -35,16 +35,25 @@ class Server:
 class Labeller(threading.Thread):
     """Answers everything; what was not acknowledged is sent again with the same UUID, as the page's script does."""
 
-    def __init__(self, address: str, token: str, acknowledged: Counter[str], everybody: threading.Semaphore) -> None:
+    def __init__(
+        self,
+        address: str,
+        token: str,
+        acknowledged: Counter[str],
+        everybody: threading.Semaphore,
+        pause_s: float = 0.0,
+    ) -> None:
         super().__init__()
         self.address, self.token = address, token
         self.acknowledged, self.everybody = acknowledged, everybody
+        self.pause_s = pause_s
+        self.enough = threading.Event()
 
     def run(self) -> None:
         with httpx2.Client(base_url=self.address, headers={"Accept": "application/json"}, timeout=PATIENCE_S) as client:
             self._persist(client, "GET", f"/p/{self.token}", {})
             path = self._persist(client, "GET", "/p/next", {}).json()["pair"]["label_path"]
-            while path:
+            while path and not self.enough.wait(self.pause_s):
                 uuid = str(uuid4())
                 reply = self._persist(client, "POST", path, {"response": "left", "client_uuid": uuid}).json()
                 self.acknowledged[uuid] += 1
