@@ -191,6 +191,7 @@ def test_a_running_worker_erases_somebody_from_studio_and_backups(
     monkeypatch.setattr(backups, "LOOK_S", 0.2)
     monkeypatch.setattr(service.reconcile, "due", lambda _session, _lost: [])
     monkeypatch.setattr(service.reconcile, "short_of_queries", lambda _session: [])
+    monkeypatch.setattr(service.reconcile, "studies_with_answers", lambda _session: [])
     replaced = settings.data_dir / "replaced-20260101T000000Z"
     replaced.mkdir()
     (replaced / "studio.sqlite3").write_text(backed_up.mark_of(people[0]))
