@@ -60,6 +60,7 @@ REAL_TIME = OnlyParsed("lets a real worker learn while somebody waits, which tak
 SHIPPED = "would overwrite what ships with the studio; the same function runs small in "
 
 RUN: dict[str, str | Elsewhere | OnlyParsed] = {
+    "app backup": "../backups",
     "app demo": "--task drinking",
     "app dictionary": Elsewhere(
         "tests/app/test_export_data.py::test_the_dictionary_in_the_documentation_is_up_to_date"
@@ -68,11 +69,13 @@ RUN: dict[str, str | Elsewhere | OnlyParsed] = {
     "app link": "",
     "app migrate": "",
     "app reset-password": "",
+    "app restore": Elsewhere("tests/app/test_backups.py::test_the_commands_say_what_was_done"),
     "app scrub": "",
     "app up": Elsewhere(
         "tests/app/test_start_and_stop.py::"
         "test_the_first_start_prints_all_that_is_needed_and_ctrl_c_stops_both_programs"
     ),
+    "app verify": Elsewhere("tests/app/test_backups.py::test_the_commands_say_what_was_done"),
     "worker --help": "",
     "worker behaviours": "--tasks feeding --scenarios 1 --axis-scenarios 1",
     "worker benchmark": Elsewhere("tests/worker/experiments/test_benchmark.py::test_the_command_can_only_report"),
@@ -90,6 +93,7 @@ RUN: dict[str, str | Elsewhere | OnlyParsed] = {
     "worker speed-weight": "--scenarios 1",
     "worker start-posture": "--restarts 50",
     "advice_to_stop": ROLLOUTS,
+    "backups": "--trials 1 --people 1 --answers 10",
     "api_pages": "--people 1 --answers 20",
     "chosen_modes": ROLLOUTS,
     "comparison_report": "results/paper_form",

@@ -284,9 +284,9 @@ def _commands_for_postgresql(settings: Settings) -> str:
     return (
         f"{OfPostgresql().message} First the database, then the files that it names:\n"
         f"  pg_dump --format=custom --file=studio.dump {address}\n"
-        f"  rsync -a {artefacts}/ studio-artefacts/\n"
+        f"  mkdir -p studio-artefacts && cp -au {artefacts}/. studio-artefacts/\n"
         "To restore them while the studio is stopped, into an empty database:\n"
         f"  pg_restore --no-owner --exit-on-error --dbname={address} studio.dump\n"
-        f"  rsync -a studio-artefacts/ {artefacts}/\n"
+        f"  mkdir -p {artefacts} && cp -au studio-artefacts/. {artefacts}/\n"
         "docs/backups.md says more, also about pg_basebackup and going back to any moment."
     )
