@@ -55,6 +55,7 @@ class Drill:
         self.tally = Tally()
         self._tokens = self._fill(answers)
         self._pause_s = pause_s
+        self._given = threading.Semaphore(0)
 
     def _fill(self, answers: int) -> list[str]:
         migrate(self.settings)
@@ -76,13 +77,14 @@ class Drill:
     @contextmanager
     def under_load(self) -> Iterator[Server]:
         """People answer, and clips that nobody is asked about are made and removed again."""
-        server, given, stop = Server(self.settings), threading.Semaphore(0), threading.Event()
-        labellers = [Labeller(server.address, token, self.acknowledged, given, self._pause_s) for token in self._tokens]
+        server, stop = Server(self.settings), threading.Event()
+        labellers = [
+            Labeller(server.address, token, self.acknowledged, self._given, self._pause_s) for token in self._tokens
+        ]
         remaking = threading.Thread(target=self._remake, args=(stop,))
         threads = [*labellers, remaking]
         for thread in threads:
             thread.start()
-        assert given.acquire(timeout=PATIENCE_S)
         try:
             yield server
         finally:
@@ -115,6 +117,9 @@ class Drill:
 
     def trial(self, server: Server, *, kill_server: bool, kill_backup: bool) -> None:
         """One backup, restored elsewhere. Raises when it is not whole; counts what is lost."""
+        while self._given.acquire(blocking=False):
+            pass
+        assert self._given.acquire(timeout=PATIENCE_S), "people answer at this moment, also after a kill"
         before = set(self.acknowledged)
         killer = threading.Timer(self.random.uniform(0.0, 0.3), server.kill) if kill_server else None
         if killer is not None:

@@ -1,1 +1,1 @@
-"""Erasure after a withdrawal, unused files, backups."""
+"""Erasure, unused files, backups."""
