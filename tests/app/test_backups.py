@@ -7,6 +7,7 @@ import shutil
 import signal
 import sqlite3
 import stat
+import threading
 from collections import namedtuple
 from collections.abc import Callable, Iterator
 from contextlib import closing
@@ -26,6 +27,7 @@ from app.services.participants import withdrawal
 from app.settings import Settings
 from app.storage import ArtefactStore
 from tests import backed_up
+from tests.waiting import PATIENCE_S
 
 
 @pytest.fixture
@@ -188,6 +190,36 @@ def test_somebody_who_withdraws_while_the_files_are_copied_is_not_in_the_backup(
     assert all(backed_up.traces(directory, backed_up.mark_of(each)) for each in staying)
     assert backup.manifest.missing == []
     assert layout.folders_in(directory) == [backup.folder]
+
+
+def test_a_file_whose_row_is_just_being_deleted_is_not_said_to_be_lost(
+    settings: Settings,
+    database: Database,
+    store: ArtefactStore,
+    people: list[Participant],
+    directory: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    deleted, copy = threading.Event(), making._copied
+
+    def withdraw_slowly() -> None:
+        with database.writing() as session:
+            withdrawal.withdraw(session, store, session.get_one(Participant, people[0].id), "P01")
+            deleted.set()
+            threading.Event().wait(0.5)
+
+    def after_the_files_are_gone(source: Path, target: Path, sha256: str) -> bool:
+        if not withdrawing.is_alive() and not deleted.is_set():
+            withdrawing.start()
+        assert deleted.wait(PATIENCE_S)
+        return copy(source, target, sha256)
+
+    withdrawing = threading.Thread(target=withdraw_slowly)
+    monkeypatch.setattr(making, "_copied", after_the_files_are_gone)
+    backup = making.make(settings, directory)
+    withdrawing.join()
+    assert backup.manifest.missing == []
+    assert store.lost() == {}
 
 
 def test_rows_that_were_deleted_are_in_no_free_page_of_the_copy(

@@ -55,6 +55,8 @@ def _trials(directory: Path, count: int, seed: int) -> None:
     with drill.under_load() as server:
         for number in range(count):
             drill.trial(server, kill_server=number % 4 == 1, kill_backup=number % 4 == 3)
+            if (number + 1) % 10 == 0:
+                _say(f"{number + 1} trials after {time.perf_counter() - started:.0f} s")
     tally = drill.tally
     _say(
         f"{tally.whole} of {count} backups whole and restored; {tally.lost} of {tally.answers} acknowledged answers "

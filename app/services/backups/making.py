@@ -180,7 +180,7 @@ class _Draft:
                 sizes[sha256] = target.stat().st_size
         missing = sorted(named - sizes.keys())
         if missing:
-            with snapshots.reading(self.source) as connection:
+            with snapshots.reading_after_writers(self.source) as connection:
                 if not snapshots.artefacts(connection).issuperset(missing):
                     raise _Outdated
             for sha256 in missing:

@@ -29,6 +29,16 @@ def reading(path: Path, *, still: bool = False) -> Iterator[sqlite3.Connection]:
         yield connection
 
 
+@contextmanager
+def reading_after_writers(path: Path) -> Iterator[sqlite3.Connection]:
+    """What holds once everybody who is writing now has ended: files are deleted before the rows that name them."""
+    address = f"{path.resolve().as_uri()}?mode=rw"
+    with closing(sqlite3.connect(address, uri=True, timeout=BUSY_TIMEOUT_S, isolation_level=None)) as connection:
+        connection.execute("BEGIN IMMEDIATE")
+        yield connection
+        connection.execute("ROLLBACK")
+
+
 def revision(connection: sqlite3.Connection) -> str:
     """Of the schema; empty without one."""
     if not _columns(connection, "alembic_version"):

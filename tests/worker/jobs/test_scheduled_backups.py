@@ -17,7 +17,7 @@ from tests import backed_up
 from tests.waiting import until
 from tests.worker.conftest import the_job_runner
 from worker.compute.pools import Compute
-from worker.jobs import service
+from worker.jobs import reconcile, service
 from worker.jobs.runtime import engine
 from worker.jobs.runtime.context import WorkerContext
 from worker.jobs.upkeep import backups
@@ -189,9 +189,9 @@ def test_a_running_worker_erases_somebody_from_studio_and_backups(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(backups, "LOOK_S", 0.2)
-    monkeypatch.setattr(service.reconcile, "due", lambda _session, _lost: [])
-    monkeypatch.setattr(service.reconcile, "short_of_queries", lambda _session: [])
-    monkeypatch.setattr(service.reconcile, "studies_with_answers", lambda _session: [])
+    monkeypatch.setattr(reconcile, "due", lambda _session, _lost: [])
+    monkeypatch.setattr(reconcile, "short_of_queries", lambda _session: [])
+    monkeypatch.setattr(reconcile, "studies_with_answers", lambda _session: [])
     replaced = settings.data_dir / "replaced-20260101T000000Z"
     replaced.mkdir()
     (replaced / "studio.sqlite3").write_text(backed_up.mark_of(people[0]))
