@@ -154,7 +154,7 @@ def test_a_restore_that_is_killed_anywhere_leaves_the_old_studio_or_one_that_say
             restoring.restore(settings, backup.folder, replace=True)
 
     steps = counted_steps(lambda: restoring.restore(settings, backup.folder, tmp_path / "undisturbed"))
-    early, late = range(1, steps - 5, steps // 4), range(steps - 5, steps + 9)  # where files move, at every step
+    early, late = range(3, steps - 5, steps // 4), range(steps - 5, steps + 9)  # where files move, at every step
     unfinished = 0
     for number in (*early, *late):
         shutil.copytree(pristine, settings.data_dir)

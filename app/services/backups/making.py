@@ -6,6 +6,7 @@ another snapshot is taken. The engine's file and unfinished trainings are left o
 and a file of the engine from another moment than the database would be set aside anyway (decision 58).
 """
 
+import ctypes
 import errno
 import fcntl
 import hashlib
@@ -33,6 +34,7 @@ SPARE_BYTES = 64 << 20
 """Left free on the backup's disk."""
 _SNAPSHOTS = 5
 _PIECE_BYTES = 1 << 20
+_LIBC = ctypes.CDLL(None, use_errno=True)
 
 
 class BackupFailed(AppError):
@@ -154,8 +156,7 @@ class _Draft:
             people=sorted(people),
         )
         self._write_manifest(manifest)
-        for folder, _, _ in os.walk(self.folder):
-            sync(Path(folder))
+        flush(self.folder)
         if withdrawals.known_to(self.source) & people.keys() - gone.keys():
             raise _Outdated
         withdrawals.note(directory, withdrawals.known_to(self.source))
@@ -178,14 +179,18 @@ class _Draft:
                 or any(_linked(each, target, sha256) for each in self.earlier[1:])
             ):
                 sizes[sha256] = target.stat().st_size
-        missing = sorted(named - sizes.keys())
-        if missing:
-            with snapshots.reading_after_writers(self.source) as connection:
+        if missing := sorted(named - sizes.keys()):
+            with snapshots.reading_after_writers(self.source) as connection:  # nobody deletes files now
                 if not snapshots.artefacts(connection).issuperset(missing):
                     raise _Outdated
-            for sha256 in missing:
-                store.has(sha256)  # which notes for the dashboard that it is lost
-        return sizes, missing
+                for sha256 in missing:
+                    target = self.folder / layout.artefact(sha256)
+                    if _copied(store.path(sha256), target, sha256):  # it was made again meanwhile
+                        sizes[sha256] = target.stat().st_size
+        lost = [sha256 for sha256 in missing if sha256 not in sizes]
+        for sha256 in lost:
+            store.has(sha256)  # which notes for the dashboard that it is lost
+        return sizes, lost
 
     def _copy_beside(self) -> dict[str, File]:
         target = self.folder / BESIDE
@@ -229,8 +234,6 @@ def _copied(source: Path, target: Path, sha256: str) -> bool:
             digest.update(piece)
             copy_of_it.write(piece)
         if digest.hexdigest() == sha256:
-            copy_of_it.flush()
-            os.fsync(copy_of_it.fileno())
             return True
     target.unlink()
     return False
@@ -252,6 +255,17 @@ def _write(path: Path, content: bytes) -> None:
 
 def _file(path: Path) -> File:
     return File(sha256=hash_of_file(path), byte_count=path.stat().st_size)
+
+
+def flush(folder: Path) -> None:
+    """Have the disk know everything that was written to it. File by file that takes twenty times as long."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        if _LIBC.syncfs(descriptor) != 0:
+            number = ctypes.get_errno()
+            raise OSError(number, os.strerror(number), str(folder))
+    finally:
+        os.close(descriptor)
 
 
 def sync(folder: Path) -> None:

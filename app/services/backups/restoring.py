@@ -5,7 +5,6 @@ inside it, and what was prepared takes its place, the database last. Until the f
 starts there (app.data_directory), so a restore that is killed leaves nothing that looks whole and is not.
 """
 
-import os
 import shutil
 import sqlite3
 import tempfile
@@ -123,10 +122,7 @@ def _lay_out(backup: Backup, prepared: Path) -> None:
         with making.new_file(target) as stream:
             for piece in layout.pieces(backup.folder / place, file):
                 stream.write(piece)
-            stream.flush()
-            os.fsync(stream.fileno())
-    for folder, _, _ in os.walk(prepared):
-        making.sync(Path(folder))
+    making.flush(prepared)
 
 
 def _check_database(backup: Backup, path: Path) -> None:
