@@ -258,7 +258,7 @@ def _file(path: Path) -> File:
 
 
 def flush(folder: Path) -> None:
-    """Have the disk know everything that was written to it. File by file that takes twenty times as long."""
+    """Have the disk know everything that was written to it. File by file it takes 20 ms each on a busy disk."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         if _LIBC.syncfs(descriptor) != 0:
