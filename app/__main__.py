@@ -11,7 +11,7 @@ from pathlib import Path
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
-from app import audit_commands, logs, signing, upgrading
+from app import audit_commands, data_directory, logs, signing, upgrading
 from app.db import Database
 from app.domain.studies import Study
 from app.errors import EXPLAINED, AppError, in_words
@@ -23,6 +23,7 @@ from app.services import audit
 from app.services.accounts import accounts
 from app.services.archives import demo_archive as demo
 from app.services.archives import study_import
+from app.services.backups import layout, making, restoring, schedule
 from app.services.exports import export_formats, export_tables
 from app.services.monitoring import damage
 from app.services.participants import enrolment
@@ -44,6 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     importing.add_argument("file", type=Path, help="the archive")
     importing.add_argument("--seal-key", default="", help="of the archive of a study that is still blinded")
     importing.set_defaults(act=import_study)
+    _add_backups(commands)
     chosen = vars(parser.parse_args(arguments))
     act, _ = chosen.pop("act"), chosen.pop("command")
     try:
@@ -57,6 +59,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise
         say(f"Error: {words}")
         return 1
+
+
+def _add_backups(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    making = commands.add_parser("backup", help=back_up.__doc__)
+    making.add_argument("target", type=Path, nargs="?", help="directory of backups; default: BACKUP_DIR")
+    making.set_defaults(act=back_up)
+    restoring = commands.add_parser("restore", help=restore.__doc__)
+    restoring.add_argument("backup", type=Path, help="the folder of one backup")
+    restoring.add_argument("--into", type=Path, help="another data directory; default: DATA_DIR")
+    restoring.add_argument("--replace", action="store_true", help="move aside what is there")
+    restoring.set_defaults(act=restore)
+    verifying = commands.add_parser("verify", help=verify.__doc__)
+    verifying.add_argument("backup", type=Path, help="the folder of one backup")
+    verifying.set_defaults(act=verify)
 
 
 def migrate(settings: Settings) -> int:
@@ -122,6 +138,46 @@ def scrub(settings: Settings) -> int:
     return 1 if broken else 0
 
 
+def back_up(settings: Settings, target: Path | None = None) -> int:
+    """Copy the whole studio into a directory of backups, while it runs or not."""
+    directory = target or settings.backup_dir
+    if directory is None:
+        raise AppError("Say into which directory, best on another disk, or set BACKUP_DIR.")
+    backup = making.make(settings, directory)
+    say(f"{backup.folder}: {_contents(backup)}")
+    if lost := len(backup.manifest.missing):
+        say(f"{lost} stored files are lost in the studio and not in the backup. To see which: python -m app scrub")
+    for folder in schedule.with_somebody_erased(settings, directory):
+        say(f"Somebody who is in {folder} has withdrawn since. Erase that backup.")
+    return 0
+
+
+def verify(settings: Settings, backup: Path) -> int:
+    """Read everything in a backup and compare it with its manifest."""
+    found = restoring.verify(settings, backup)
+    say(f"{backup} is whole: {_contents(found)}")
+    return 0
+
+
+def restore(settings: Settings, backup: Path, into: Path | None, replace: bool) -> int:
+    """Verify a backup and put it in place, while the studio is stopped."""
+    done = restoring.restore(settings, backup, into, replace=replace)
+    say(f"Restored into {done.data_dir}. What was in progress begins anew at the next start.")
+    if done.replaced is not None:
+        say(f"What was there before is in {done.replaced}; it is erased when somebody withdraws.")
+    if done.erased_again:
+        say(f"Erased again, as they have withdrawn since: {done.erased_again} participants or studies.")
+    say("Accounts, passwords, API tokens and links are those of the backup: what was revoked since, revoke again.")
+    return 0
+
+
+def _contents(backup: layout.Backup) -> str:
+    manifest = backup.manifest
+    counted = ", ".join(f"{words}: {manifest.rows.get(table, 0)}" for table, words in _COUNTED.items())
+    size = f"files: {len(manifest.artefacts)}, {backup.byte_count / 1e6:.1f} MB"
+    return f"made {manifest.made_at:%Y-%m-%d %H:%M:%S} UTC; {counted}, {size}"
+
+
 def demo_study(settings: Settings, task: str) -> int:
     """Make a demo study of a task with one participant and print the personal link."""
     migrate(settings)
@@ -135,18 +191,19 @@ def up(settings: Settings) -> int:
     """Migrate, import the demo study on the first start, and run web server and worker until Ctrl-C."""
     _require_free_port(settings)
     migrate(settings)
-    database = _database(settings)
-    with database.writing() as session:
-        greeting = _first_start(session, settings)
-    database.dispose()
-    return Programs(
-        greeting,
-        settings.data_dir,
-        {
-            "web": ["-m", "app", "web"],
-            "worker": ["-m", "worker", "run"],
-        },
-    ).run()
+    with data_directory.shared(settings.data_dir):
+        database = _database(settings)
+        with database.writing() as session:
+            greeting = _first_start(session, settings)
+        database.dispose()
+        return Programs(
+            greeting,
+            settings.data_dir,
+            {
+                "web": ["-m", "app", "web"],
+                "worker": ["-m", "worker", "run"],
+            },
+        ).run()
 
 
 def web(settings: Settings) -> int:
@@ -215,6 +272,7 @@ def _demo(session: Session, settings: Settings) -> tuple[str, Sequence[str]]:
         return token, ["", f"  {instead}", f"  {error}"]
 
 
+_COUNTED = {"study": "studies", "participant": "participants", "label_event": "answers"}
 _COMMANDS: dict[str, Callable[[Settings], int]] = {
     "up": up,
     "web": web,

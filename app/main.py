@@ -9,6 +9,7 @@ from fastapi.responses import PlainTextResponse, RedirectResponse
 from fastapi.staticfiles import StaticFiles
 from prometheus_client import CollectorRegistry
 
+from app import data_directory
 from app.db import Database
 from app.paths import STATIC
 from app.settings import Settings
@@ -114,7 +115,7 @@ def create_routes(https: bool) -> FastAPI:
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         studio: Studio = app.state.studio
-        with live.closing_on_signals(studio.closing):
+        with data_directory.shared(studio.settings.data_dir), live.closing_on_signals(studio.closing):
             yield
         studio.hashing.close()
         studio.hashing_for_known.close()

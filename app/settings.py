@@ -32,6 +32,10 @@ class Settings(BaseSettings):
     metrics_token: str | None = Field(default=None, min_length=16, description="Bearer token for /metrics.")
     compute_processes: int = Field(default=2, ge=1, description="Processes for simulation and training.")
 
+    backup_dir: Path | None = Field(default=None, description="Where the worker puts backups; default: it makes none.")
+    backup_every_hours: int = Field(default=24, ge=1, description="Time between two backups of the worker.")
+    backups_kept: int = Field(default=7, ge=1, description="So many backups stay in BACKUP_DIR, the newest.")
+
     @field_validator("trusted_proxies")
     @classmethod
     def _only_addresses(cls, text: str) -> str:

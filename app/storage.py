@@ -18,7 +18,10 @@ from app.settings import Settings
 log = logging.getLogger("app.storage")
 
 _OTHERS = 0o077
-_OURS = ("engine.sqlite3*", "*.lock", "artefacts", "unfinished", "backup*", "signing.key")
+_OURS = (
+    *("engine.sqlite3*", "*.lock", "artefacts", "unfinished", "backup*", "replaced-*", "restoring-*"),
+    "signing.key",
+)
 """In the data directory, beside the database. Closing a directory closes what is in it."""
 _WRITING = ".writing-"
 _SHA256 = re.compile(r"[0-9a-f]{64}")

@@ -2,11 +2,10 @@
 
 import fcntl
 import logging
-import os
 import shutil
 import sqlite3
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 
 from alembic import command
@@ -15,7 +14,8 @@ from alembic.script import ScriptDirectory
 from sqlalchemy import create_engine, inspect, text
 from sqlalchemy.exc import DatabaseError, OperationalError
 
-from app.db import BUSY_TIMEOUT_S, file_of, now
+from app.data_directory import require_whole
+from app.db import copy, file_of, now
 from app.errors import AppError, in_words
 from app.paths import MIGRATIONS
 from app.settings import Settings
@@ -53,6 +53,7 @@ class DamagedDatabase(AppError):
 def upgrade(settings: Settings) -> None:
     """Bring the database to the newest schema; whoever comes second finds it done."""
     settings.data_dir.mkdir(parents=True, exist_ok=True)
+    require_whole(settings.data_dir)
     config = _config(settings)
     newest = ScriptDirectory.from_config(config).get_current_head() or ""
     with _one_at_a_time(settings):
@@ -70,17 +71,23 @@ def upgrade(settings: Settings) -> None:
             raise UpgradeFailed(f"{_words(UpgradeFailed)} The database says: {error.orig}.") from error
 
 
+def require_known(settings: Settings, revision: str) -> None:
+    """Raises NewerDatabase for a schema that this version cannot bring to its own."""
+    if revision not in _known(_config(settings)):
+        raise NewerDatabase(f"{_words(NewerDatabase)} (It is of revision {revision[:20]}.)")
+
+
 def forget_copies(path: Path) -> None:
     """Erase the copies made before upgrades: somebody who has withdrawn is still in them."""
-    for copy in [*copies(path), _draft(path)]:
-        if copy.exists():
-            copy.unlink()
-            log.warning("%s is erased: somebody who is in it has withdrawn", copy.name)
+    for each in [*copies(path), _draft(path)]:
+        if each.exists():
+            each.unlink()
+            log.warning("%s is erased: somebody who is in it has withdrawn", each.name)
 
 
 def copies(path: Path) -> list[Path]:
     """The copies made before upgrades, the oldest first."""
-    return sorted(path.parent.glob(f"{path.name}{_COPY}*"), key=lambda copy: copy.stat().st_mtime_ns)
+    return sorted(path.parent.glob(f"{path.name}{_COPY}*"), key=lambda each: each.stat().st_mtime_ns)
 
 
 def _draft(path: Path) -> Path:
@@ -118,8 +125,7 @@ def _revision(settings: Settings, config: Config) -> str | None:
         raise DamagedDatabase from error
     finally:
         engine.dispose()
-    known = {script.revision for script in ScriptDirectory.from_config(config).walk_revisions()}
-    if found is not None and found not in known:
+    if found is not None and found not in _known(config):
         raise NewerDatabase(f"{_words(NewerDatabase)} (It is of revision {found}.)")
     if found is None and tables - {_VERSIONS}:
         raise UnfinishedDatabase(
@@ -127,6 +133,10 @@ def _revision(settings: Settings, config: Config) -> str | None:
             "start again."
         )
     return found
+
+
+def _known(config: Config) -> set[str]:
+    return {script.revision for script in ScriptDirectory.from_config(config).walk_revisions()}
 
 
 def _copy(path: Path, newest: str) -> None:
@@ -138,12 +148,8 @@ def _copy(path: Path, newest: str) -> None:
     target = path.with_name(f"{path.name}{_COPY}{newest}-{now():%Y%m%dT%H%M%S.%f}")
     draft = _draft(path)
     draft.unlink(missing_ok=True)
-    os.close(os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600))  # SQLite fills an empty file as it is
     try:
-        with closing(sqlite3.connect(path, timeout=BUSY_TIMEOUT_S, isolation_level=None)) as connection:
-            connection.execute("VACUUM INTO ?", (str(draft),))
-        with draft.open("rb") as stream:
-            os.fsync(stream.fileno())
+        copy(path, draft)
         draft.replace(target)
     except sqlite3.DatabaseError as error:
         if error.sqlite_errorcode & 0xFF in {sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB}:

@@ -62,6 +62,7 @@ SHIPPED = "would overwrite what ships with the studio; the same function runs sm
 RUN: dict[str, str | Elsewhere | OnlyParsed] = {
     "app audit-head": "",
     "app check-signature": Elsewhere("tests/app/test_signing.py::test_commands_show_the_key_and_check_files"),
+    "app backup": "../backups",
     "app demo": "--task drinking",
     "app dictionary": Elsewhere(
         "tests/app/test_export_data.py::test_the_dictionary_in_the_documentation_is_up_to_date"
@@ -71,11 +72,13 @@ RUN: dict[str, str | Elsewhere | OnlyParsed] = {
     "app link": "",
     "app migrate": "",
     "app reset-password": "",
+    "app restore": Elsewhere("tests/app/test_backups.py::test_the_commands_say_what_was_done"),
     "app scrub": "",
     "app signing-key": "",
     "app up": Elsewhere("tests/app/test_start_and_stop.py::test_the_first_start_prints_all_that_is_needed"),
     "app web": Elsewhere("tests/app/test_logs.py::test_the_web_server_alone_writes_nothing_but_json"),
     "app verify-audit": Elsewhere("tests/app/test_audit_chain.py::test_the_command_says_which_row"),
+    "app verify": Elsewhere("tests/app/test_backups.py::test_the_commands_say_what_was_done"),
     "worker --help": "",
     "worker behaviours": "--tasks feeding --scenarios 1 --axis-scenarios 1",
     "worker benchmark": Elsewhere("tests/worker/experiments/test_benchmark.py::test_the_command_can_only_report"),
@@ -93,6 +96,7 @@ RUN: dict[str, str | Elsewhere | OnlyParsed] = {
     "worker speed-weight": "--scenarios 1",
     "worker start-posture": "--restarts 50",
     "advice_to_stop": ROLLOUTS,
+    "backups": "--trials 1 --people 1 --answers 10",
     "api_pages": "--people 1 --answers 20",
     "chosen_modes": ROLLOUTS,
     "comparison_report": "results/paper_form",

@@ -1,15 +1,10 @@
 """A server killed under load has forgotten no answer that it said was saved, and doubles none on the way back."""
 
-import os
-import subprocess
-import sys
 import threading
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
-from uuid import uuid4
 
-import httpx2
 import pytest
 from sqlalchemy import select
 
@@ -19,6 +14,7 @@ from app.domain.preferences import LabelEvent
 from app.settings import Settings
 from app.storage import ArtefactStore
 from tests import factories
+from tests.answering import Labeller, Server
 from tests.waiting import PATIENCE_S, free_port
 
 PEOPLE = 4
@@ -50,55 +46,6 @@ def tokens(settings: Settings, database: Database) -> list[str]:
             factories.make_queries(session, store, participant, LABELS)
             tokens.append(token)
     return tokens
-
-
-class Server:
-    """The web server as a process of its own, which can be killed outright."""
-
-    def __init__(self, settings: Settings) -> None:
-        self.address = settings.base_url
-        environment = {name: value for name, value in os.environ.items() if name != "DATABASE_URL"}
-        self._environment = {**environment, "DATA_DIR": str(settings.data_dir), "PORT": str(settings.port)}
-        self.start()
-
-    def start(self) -> None:
-        self.process = subprocess.Popen([sys.executable, "-m", "app", "web"], env=self._environment)
-
-    def kill(self) -> None:
-        self.process.kill()
-        self.process.wait()
-
-
-class Labeller(threading.Thread):
-    """Answers everything; what was not acknowledged is sent again with the same UUID, as the page's script does."""
-
-    def __init__(self, address: str, token: str, acknowledged: Counter[str], everybody: threading.Semaphore) -> None:
-        super().__init__()
-        self.address, self.token = address, token
-        self.acknowledged, self.everybody = acknowledged, everybody
-
-    def run(self) -> None:
-        with httpx2.Client(base_url=self.address, headers={"Accept": "application/json"}, timeout=PATIENCE_S) as client:
-            self._persist(client, "GET", f"/p/{self.token}", {})
-            path = self._persist(client, "GET", "/p/next", {}).json()["pair"]["label_path"]
-            while path:
-                uuid = str(uuid4())
-                reply = self._persist(client, "POST", path, {"response": "left", "client_uuid": uuid}).json()
-                self.acknowledged[uuid] += 1
-                self.everybody.release()
-                path = reply["pair"]["label_path"] if reply["state"] == "pair" else None
-
-    def _persist(self, client: httpx2.Client, method: str, path: str, fields: dict[str, str]) -> httpx2.Response:
-        for _ in range(600):
-            try:
-                response = client.request(method, path, data=fields or None)
-            except httpx2.TransportError:
-                threading.Event().wait(0.05)
-                continue
-            if response.status_code < 400:
-                return response
-            threading.Event().wait(0.05)
-        raise AssertionError(f"{method} {path} was never accepted")
 
 
 def test_no_acknowledged_answer_is_lost_and_none_is_doubled_when_the_server_is_killed(

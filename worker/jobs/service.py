@@ -15,7 +15,7 @@ from pathlib import Path
 from dbos import DBOS, SetWorkflowID
 from sqlalchemy.exc import OperationalError
 
-from app import logs, signing
+from app import data_directory, logs, signing
 from app.db import Database, Watch, complaints, now
 from app.domain.study_settings import StudySettings
 from app.errors import AppError, OncePerMinute
@@ -31,6 +31,7 @@ from worker.jobs.runtime.lanes import Lanes
 from worker.jobs.runtime.records import Job, as_arguments
 from worker.jobs.runtime.urgency import Level, WhoWaits
 from worker.jobs.upkeep import erasure, unused_files
+from worker.jobs.upkeep.backups import Backups
 from worker.jobs.workflows import JobRunner
 from worker.stop_signals import Stop
 
@@ -62,7 +63,7 @@ def run(settings: Settings) -> int:
     engine_log.setLevel(logging.ERROR)
     engine_log.addFilter(OncePerMinute())
     keep_private(settings)
-    with _only_one(settings):
+    with data_directory.shared(settings.data_dir), _only_one(settings):
         stop = Stop()
         database = Database(settings.sqlalchemy_url)
         compute = Compute(settings.compute_processes, stop.asked)
@@ -117,6 +118,7 @@ class _Rounds:
         self._rested_at = -math.inf
         self._prepared: set[int] = set()
         self._refused: set[int] = set()
+        self._backups = Backups(settings)
 
     def until(self, stop: threading.Event) -> None:
         """One round after the other; a database that is away for a while is waited for."""
@@ -132,6 +134,7 @@ class _Rounds:
                 self._round()
                 self._rested_at = time.monotonic() + REST * (time.monotonic() - started)
             self._clear_away()
+            self._backups.look()
         except OperationalError as error:
             complaints.warning("the database could not be reached, trying again: %s", error.orig)
 

@@ -20,6 +20,7 @@ from app.domain.protocol import Stage
 from app.domain.studies import Awaited, Participant, Study
 from app.falls import Falls, noted
 from app.services.answers import accuracy
+from app.services.backups import schedule
 from app.services.evaluation import robot_preparation
 from app.services.monitoring import damage, participant_status
 from app.services.monitoring.tallies import Tallies
@@ -45,6 +46,8 @@ class Machine:
     damage: damage.Damage
     falls: Sequence[Falls]
     """Programs that have stopped by themselves of late."""
+    backups: schedule.Standing | None
+    """How the scheduled backups do; None without a schedule."""
 
 
 @dataclass(frozen=True)
@@ -139,7 +142,8 @@ def machine(session: Session, data_dir: Path) -> Machine:
     free = shutil.disk_usage(data_dir).free
     alive = seen_at is not None and now() - seen_at <= WORKER_SILENCE
     broken = damage.standing(session, ArtefactStore(data_dir / "artefacts"))
-    return Machine(seen_at, alive, free, free < DISK_LOW_BYTES, broken, noted(data_dir))
+    falls, backups = noted(data_dir), schedule.standing(data_dir)
+    return Machine(seen_at, alive, free, free < DISK_LOW_BYTES, broken, falls, backups)
 
 
 def fingerprint(session: Session) -> str:

@@ -1,1 +1,1 @@
-"""Erasure after a withdrawal, unused files."""
+"""Erasure, unused files, backups."""

@@ -20,6 +20,7 @@ from app.domain.models import RunKind
 from app.domain.studies import Participant, Study
 from app.services.auditing import receipts
 from app.services.auditing.receipts import Erased
+from app.services.backups import restoring
 from app.services.participants import withdrawal
 from worker.jobs.runtime import engine
 from worker.jobs.runtime.context import WorkerContext
@@ -154,6 +155,7 @@ def _erase(
     database_file = file_of(context.database.url)
     if database_file is not None:
         upgrading.forget_copies(database_file)
+    restoring.forget_replaced(context.store.root.parent)
     with context.database.writing() as session:
         finish(session)
         receipts.add(session, whom(session), receipts.LAST_TRACES, Erased())

@@ -1,0 +1,71 @@
+"""A real web server that can be killed, and people who answer whatever happens to it."""
+
+import os
+import subprocess
+import sys
+import threading
+from collections import Counter
+from uuid import uuid4
+
+import httpx2
+
+from app.settings import Settings
+from tests.waiting import PATIENCE_S
+
+
+class Server:
+    """The web server as a process of its own, which can be killed outright."""
+
+    def __init__(self, settings: Settings) -> None:
+        self.address = settings.base_url
+        environment = {name: value for name, value in os.environ.items() if name != "DATABASE_URL"}
+        self._environment = {**environment, "DATA_DIR": str(settings.data_dir), "PORT": str(settings.port)}
+        self.start()
+
+    def start(self) -> None:
+        self.process = subprocess.Popen([sys.executable, "-m", "app", "web"], env=self._environment)
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.process.wait()
+
+
+class Labeller(threading.Thread):
+    """Answers everything; what was not acknowledged is sent again with the same UUID, as the page's script does."""
+
+    def __init__(
+        self,
+        address: str,
+        token: str,
+        acknowledged: Counter[str],
+        everybody: threading.Semaphore,
+        pause_s: float = 0.0,
+    ) -> None:
+        super().__init__()
+        self.address, self.token = address, token
+        self.acknowledged, self.everybody = acknowledged, everybody
+        self.pause_s = pause_s
+        self.enough = threading.Event()
+
+    def run(self) -> None:
+        with httpx2.Client(base_url=self.address, headers={"Accept": "application/json"}, timeout=PATIENCE_S) as client:
+            self._persist(client, "GET", f"/p/{self.token}", {})
+            path = self._persist(client, "GET", "/p/next", {}).json()["pair"]["label_path"]
+            while path and not self.enough.wait(self.pause_s):
+                uuid = str(uuid4())
+                reply = self._persist(client, "POST", path, {"response": "left", "client_uuid": uuid}).json()
+                self.acknowledged[uuid] += 1
+                self.everybody.release()
+                path = reply["pair"]["label_path"] if reply["state"] == "pair" else None
+
+    def _persist(self, client: httpx2.Client, method: str, path: str, fields: dict[str, str]) -> httpx2.Response:
+        for _ in range(600):
+            try:
+                response = client.request(method, path, data=fields or None)
+            except httpx2.TransportError:
+                threading.Event().wait(0.05)
+                continue
+            if response.status_code < 400:
+                return response
+            threading.Event().wait(0.05)
+        raise AssertionError(f"{method} {path} was never accepted")
