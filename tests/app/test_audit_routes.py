@@ -45,6 +45,7 @@ class Act:
 
 NOT_PERSONAL = {
     "show_login": "an empty form",
+    "show_metrics": "numbers of the whole studio, for the operator's token",
     "show_password": "an empty form",
     "show_accounts": "who has an account; every change of it is recorded",
     "show_new_study": "a form",

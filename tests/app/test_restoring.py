@@ -20,6 +20,7 @@ from app.db import Database, now
 from app.domain.preferences import LabelEvent
 from app.domain.studies import Participant, Study
 from app.main import create_app
+from app.services.auditing import chain_check
 from app.services.backups import layout, making, restoring, withdrawals
 from app.services.backups.layout import Backup
 from app.services.backups.restoring import DirectoryNotEmpty, RestoreFailed
@@ -202,6 +203,7 @@ def test_somebody_who_has_withdrawn_since_is_not_brought_back_to_the_byte(
     restored = Database(settings.model_copy(update={"data_dir": new}).sqlalchemy_url)
     with restored.reading() as session:
         assert session.get_one(Participant, leaving.id).withdrawn_at is not None
+        assert chain_check.check(session).faults == []
     restored.dispose()
     assert {path.name for path in new.iterdir()} == {"studio.sqlite3", "artefacts", "studio.lock"}
 
@@ -230,6 +232,10 @@ def test_a_study_that_was_deleted_since_is_not_brought_back(
     assert restoring.restore(settings, backup.folder, new).erased_again == 1 + len(people)
     assert not any(backed_up.traces(new, backed_up.mark_of(each)) for each in people)
     assert all(backed_up.traces(new, backed_up.mark_of(each)) for each in others)
+    restored = Database(settings.model_copy(update={"data_dir": new}).sqlalchemy_url)
+    with restored.reading() as session:
+        assert chain_check.check(session).faults == []
+    restored.dispose()
 
 
 def test_the_withdrawal_of_somebody_else_with_the_same_row_id_erases_nobody(

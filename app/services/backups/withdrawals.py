@@ -93,6 +93,6 @@ def _erase(session: Session, store: ArtefactStore, identity: Identity, row_id: i
         withdrawal.withdraw(session, store, session.get_one(Participant, row_id), audit.SYSTEM)
         return
     study = session.get_one(Study, row_id)
-    audit.record(session, audit.SYSTEM, "study deleted", study.slug)
     study.deleted_at = now()
     withdrawal.erase_study(session, store, study)
+    audit.record(session, audit.SYSTEM, "study deleted", study.slug)  # by now that is its number
