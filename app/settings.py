@@ -25,6 +25,19 @@ class Settings(BaseSettings):
     worker_name: str = Field(default="worker-1", description="Stable name: a restart resumes its own work.")
     compute_processes: int = Field(default=2, ge=1, description="Processes for simulation and training.")
 
+    @field_validator("database_url")
+    @classmethod
+    def _known_database(cls, url: str | None) -> str | None:
+        """SQLite, or PostgreSQL by the driver that is installed, however its address is spelt."""
+        if not url:
+            return None
+        scheme, colon, rest = url.partition("://")
+        if scheme in {"postgres", "postgresql"}:
+            scheme = "postgresql+psycopg"
+        if not colon or scheme not in {"postgresql+psycopg", "sqlite", "sqlite+pysqlite"}:
+            raise ValueError("Write postgresql+psycopg://user:password@host/database, or leave it out for SQLite.")
+        return f"{scheme}://{rest}"
+
     @field_validator("trusted_proxies")
     @classmethod
     def _only_addresses(cls, text: str) -> str:

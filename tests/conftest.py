@@ -27,9 +27,32 @@ from app.main import create_routes, make_studio, serve
 from app.services.accounts import accounts, browser_sessions
 from app.settings import Settings
 from app.storage import ArtefactStore
+from tests import databases
 from tests.databases import make_tables
 
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Tell the tests that work on a studio's database, and skip what makes no sense on the one they are given."""
+    for item in items:
+        if "settings" in getattr(item, "fixturenames", ()):
+            item.add_marker("database")
+        about_sqlite = item.get_closest_marker("sqlite")
+        if databases.SERVER is not None and about_sqlite is not None:
+            item.add_marker(pytest.mark.skip(reason=about_sqlite.args[0]))
+
+
 PASSWORD = "a password of my own"
+
+
+@pytest.fixture(autouse=databases.SERVER is not None)
+def own_database(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """On a PostgreSQL server, a database of its own for each test that writes anything, and programs it starts."""
+    if "tmp_path" not in request.fixturenames:
+        yield
+        return
+    with databases.lent(request.getfixturevalue("tmp_path")) as url:
+        monkeypatch.setenv("DATABASE_URL", url)
+        yield
 
 
 @pytest.fixture

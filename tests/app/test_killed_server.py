@@ -1,6 +1,5 @@
 """A server killed under load has forgotten no answer that it said was saved, and doubles none on the way back."""
 
-import os
 import subprocess
 import sys
 import threading
@@ -18,7 +17,7 @@ from app.db import Database
 from app.domain.preferences import LabelEvent
 from app.settings import Settings
 from app.storage import ArtefactStore
-from tests import factories
+from tests import databases, factories
 from tests.waiting import PATIENCE_S, free_port
 
 PEOPLE = 4
@@ -57,8 +56,7 @@ class Server:
 
     def __init__(self, settings: Settings) -> None:
         self.address = settings.base_url
-        environment = {name: value for name, value in os.environ.items() if name != "DATABASE_URL"}
-        self._environment = {**environment, "DATA_DIR": str(settings.data_dir)}
+        self._environment = databases.environment(settings.data_dir)
         self._command = ["-m", "uvicorn", "app.main:create_app", "--factory", "--no-access-log", "--log-level", "error"]
         self._command += ["--port", str(settings.port)]
         self.start()

@@ -13,6 +13,7 @@ from app import __main__ as studio
 from app.errors import AppError, in_words
 from app.settings import Settings
 from app.storage import ArtefactStore, keep_private
+from tests import databases
 from worker import __main__ as worker
 from worker.jobs.runtime import engine
 
@@ -26,7 +27,8 @@ Run = Callable[..., tuple[int, str]]
 def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Run:
     """Runs a command of the studio; gives exit code and what it said."""
     monkeypatch.chdir(tmp_path)  # where there is no .env
-    monkeypatch.delenv("DATABASE_URL", raising=False)
+    if databases.SERVER is None:
+        monkeypatch.delenv("DATABASE_URL", raising=False)
 
     def run(main: Callable[[Sequence[str]], int], arguments: Sequence[str], **environment: str) -> tuple[int, str]:
         for name, value in environment.items():

@@ -47,7 +47,7 @@ BEGINS_WITHIN_S = 30.0
 
 
 class WorkerAlreadyRunning(AppError):
-    """A worker of this name is already running on this data directory. Stop it first, or set WORKER_NAME."""
+    """A worker of this name is already running on this data directory or database. Stop it, or set WORKER_NAME."""
 
 
 class KeepsFelling(AppError):
@@ -61,9 +61,11 @@ def run(settings: Settings) -> int:
     engine_log.setLevel(logging.ERROR)
     engine_log.addFilter(OncePerMinute())
     keep_private(settings)
-    with _only_one(settings):
+    database = Database(settings.sqlalchemy_url)
+    with _only_one(settings), database.claiming(settings.worker_name) as claimed:
+        if not claimed:
+            raise WorkerAlreadyRunning
         stop = Stop()
-        database = Database(settings.sqlalchemy_url)
         compute = Compute(settings.compute_processes, stop.asked)
         stop.at_once = compute.kill
         context = WorkerContext(database, ArtefactStore(settings.data_dir / "artefacts"), compute)
