@@ -14,7 +14,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, ClassVar
 
-from psycopg.types.string import StrDumperUnknown
 from sqlalchemy import (
     JSON,
     DateTime,
@@ -35,12 +34,8 @@ from sqlalchemy.orm import DeclarativeBase, Session, sessionmaker
 from app.errors import OncePerMinute
 
 BUSY_TIMEOUT_S = 15
-WRITING = 1_347_310_157
-"""The advisory lock of whoever writes to a PostgreSQL database. Any number that no other program uses there."""
-NAMES = 1_347_310_158
-"""The same for names that only one process may have at a time."""
-POOL_SIZE, POOL_OVERFLOW = 15, 5
-"""Connections to PostgreSQL that one process keeps, and how many more it may open."""
+WRITING, NAMES = 1_347_310_157, 1_347_310_158
+"""Advisory locks of PostgreSQL: of whoever writes, and of names. Any numbers that no other program uses there."""
 
 complaints = logging.getLogger("app.database")
 """For whoever could not reach the database and will try again, perhaps twice a second."""
@@ -103,7 +98,9 @@ class Database:
         if self.is_sqlite:
             self.writer, self.reader = _sqlite(url, "BEGIN IMMEDIATE"), _sqlite(url, "BEGIN")
         else:
-            self.writer = _postgresql(url)
+            from app import postgresql  # its driver takes a tenth of a second to load
+
+            self.writer = postgresql.engine(url, BUSY_TIMEOUT_S)
             self.reader = self.writer.execution_options(isolation_level="REPEATABLE READ")
         self._write = sessionmaker(self.writer, expire_on_commit=False)
         self._read = sessionmaker(self.reader, expire_on_commit=False)
@@ -133,7 +130,11 @@ class Database:
         PostgreSQL's own log forgets them later, when it is recycled; its archive and backups when they are deleted.
         """
         path = file_of(self.url)
-        return _rewrite_tables(self.writer) if path is None else rewrite(path)
+        if path is None:
+            from app import postgresql
+
+            return postgresql.rewrite_tables(self.writer, BUSY_TIMEOUT_S)
+        return rewrite(path)
 
     @contextmanager
     def claiming(self, name: str) -> Iterator[bool]:
@@ -227,16 +228,6 @@ def rewrite(path: Path) -> bool:
     return not busy
 
 
-def _rewrite_tables(engine: Engine) -> bool:
-    """The same for PostgreSQL, the engine's tables included: VACUUM FULL copies what is alive to new files."""
-    try:
-        with engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
-            connection.execute(text("VACUUM FULL"))
-    except OperationalError:
-        return False
-    return True
-
-
 def _sqlite(url: str, begin: str) -> Engine:
     engine = create_engine(url, connect_args={"timeout": BUSY_TIMEOUT_S, "check_same_thread": False})
 
@@ -251,27 +242,3 @@ def _sqlite(url: str, begin: str) -> Engine:
         connection.exec_driver_sql(begin)
 
     return engine
-
-
-def _postgresql(url: str) -> Engine:
-    engine = create_engine(url, pool_pre_ping=True, pool_size=POOL_SIZE, max_overflow=POOL_OVERFLOW)
-
-    @event.listens_for(engine, "connect")
-    def prepare(connection: Any, _record: Any) -> None:
-        connection.adapters.register_dumper(str, _TextDumper)
-        connection.autocommit = True
-        connection.execute(f"SET lock_timeout = '{BUSY_TIMEOUT_S}s'")
-        # A machine that vanishes in the middle of a transaction must not keep its locks for two hours.
-        connection.execute("SET tcp_keepalives_idle = 20")
-        connection.execute("SET tcp_keepalives_interval = 10")
-        connection.execute("SET tcp_keepalives_count = 3")
-        connection.autocommit = False
-
-    return engine
-
-
-class _TextDumper(StrDumperUnknown):
-    """Sends text to PostgreSQL, which refuses the character NUL: it becomes the replacement character, as in HTML."""
-
-    def dump(self, obj: str) -> Any:
-        return super().dump(obj.replace("\0", "\N{REPLACEMENT CHARACTER}"))

@@ -22,7 +22,9 @@ class Settings(BaseSettings):
     login_hours: int = Field(default=12, ge=1, description="How long an experimenter stays logged in.")
     login_attempts_per_minute: int = Field(default=10, ge=1, description="Password attempts per address.")
     trusted_proxies: str = Field(default="", description="Addresses or networks whose X-Forwarded-For is believed.")
-    worker_name: str = Field(default="worker-1", description="Stable name: a restart resumes its own work.")
+    worker_name: str = Field(
+        default="worker-1", max_length=80, description="Stable name: a restart goes on with its work."
+    )
     compute_processes: int = Field(default=2, ge=1, description="Processes for simulation and training.")
 
     @field_validator("database_url")

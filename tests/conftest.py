@@ -33,7 +33,12 @@ from tests.databases import make_tables
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Tell the tests that work on a studio's database, and skip what makes no sense on the one they are given."""
+    seen = set()
     for item in items:
+        name = item.nodeid.partition("[")[0]
+        if name not in seen:
+            item.add_marker("first_case")
+        seen.add(name)
         if "settings" in getattr(item, "fixturenames", ()):
             item.add_marker("database")
         about_sqlite = item.get_closest_marker("sqlite")

@@ -5,7 +5,7 @@ They are files of SQLite, or databases on the PostgreSQL server that TEST_DATABA
 
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
@@ -61,6 +61,28 @@ def lent(folder: Path, *, with_tables: bool = True) -> Iterator[str]:
     finally:
         with _administering() as connection:
             connection.execute(text(f"DROP DATABASE {name} WITH (FORCE)"))
+
+
+def tables_with(marks: Sequence[bytes], url: str) -> list[str]:
+    """Tables and indices of a PostgreSQL database whose files hold one of these, as they lie on the server's disk."""
+    if file_of(url) is not None:
+        return []
+    found = []
+    engine = create_engine(url, isolation_level="AUTOCOMMIT")
+    with engine.connect() as connection:
+        connection.execute(text("CHECKPOINT"))
+        for name, content in connection.execute(text(_CONTENTS)):
+            if any(mark in bytes(content) for mark in marks):
+                found.append(str(name))
+    engine.dispose()
+    return found
+
+
+_CONTENTS = """
+    SELECT oid::regclass::text, pg_read_binary_file(pg_relation_filepath(oid)) FROM pg_class
+    WHERE relkind IN ('r', 'i', 't', 'm') AND relnamespace <> 'pg_catalog'::regnamespace AND NOT relisshared
+    AND pg_relation_filepath(oid) IS NOT NULL
+"""
 
 
 @cache

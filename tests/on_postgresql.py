@@ -1,6 +1,6 @@
 """Runs tests on a PostgreSQL server of their own, started for them in a temporary directory and gone afterwards.
 
-python -m tests.on_postgresql                                what continuous integration runs there
+python -m tests.on_postgresql                                what continuous integration runs there: no case twice
 python -m tests.on_postgresql tests/app tests/worker/jobs    any other choice, in pytest's own words
 """
 
@@ -17,7 +17,7 @@ import psycopg
 
 from tests.waiting import until
 
-USUAL = ("-n", "2", "--dist", "loadfile", "-q", "-m", "database and not slow and not browser")
+USUAL = ("-n", "2", "--dist", "loadfile", "-q", "-m", "database and first_case and not slow and not browser")
 SERVER_USER = "postgres"
 """Whom Debian's package makes: PostgreSQL refuses to run as root."""
 FAST = {

@@ -32,6 +32,7 @@ from worker.jobs.runtime.records import Job, as_arguments, from_arguments
 from worker.jobs.workflows import JobRunner
 
 Damage = Callable[[Path], None]
+pytestmark = pytest.mark.sqlite("about the engine's own file")
 
 
 class Work:
