@@ -9,7 +9,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -53,7 +53,7 @@ def find_programs() -> Path | None:
 
 
 @contextmanager
-def serving(programs: Path) -> Iterator[str]:
+def serving(programs: Path, configuration: Mapping[str, str] = FAST) -> Iterator[str]:
     """A server that only this machine's processes reach; gives the address of its first database."""
     with tempfile.TemporaryDirectory(prefix="studio-postgresql-", ignore_cleanup_errors=True) as folder:
         if os.geteuid() == 0:
@@ -61,7 +61,7 @@ def serving(programs: Path) -> Iterator[str]:
         data = f"{folder}/data"
         making = [f"{programs}/initdb", "-D", data, "-U", "studio", "-E", "UTF8", "--locale=C.UTF-8", "--no-sync"]
         _run([*making, "--auth=trust"], folder)
-        settings = {**FAST, "listen_addresses": "", "unix_socket_directories": folder}
+        settings = {**configuration, "listen_addresses": "", "unix_socket_directories": folder}
         options = [word for name, setting in settings.items() for word in ("-c", f"{name}={setting}")]
         with open(f"{folder}/log", "w") as log:  # noqa: PTH123  (ours, while the directory is the server's)
             server = subprocess.Popen(
