@@ -112,7 +112,7 @@ def _race(addresses: Sequence[str], tokens: list[str], answers: int) -> tuple[li
     with ThreadPoolExecutor(len(tokens)) as pool:
         started = time.perf_counter()
         places = zip(cycle(addresses), tokens, strict=False)
-        times = list(pool.map(lambda place: _label(*place, answers, together), places))
+        times = list(pool.map(lambda place: _label(place[0], place[1], answers, together), places))
         return [each for theirs in times for each in theirs], time.perf_counter() - started
 
 
