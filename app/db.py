@@ -145,8 +145,10 @@ class Database:
         with self.writer.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
             key = (NAMES, func.hashtext(name))
             claimed = connection.scalar(select(func.pg_try_advisory_lock(*key)))
-            yield bool(claimed)
-            connection.execute(select(func.pg_advisory_unlock_all()))
+            try:
+                yield bool(claimed)
+            finally:
+                connection.invalidate()  # which lets go of the name, even if the server has gone meanwhile
 
     def watch(self) -> "Watch":
         """Tells from now on whether anybody has written."""

@@ -57,7 +57,8 @@ def own_database(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
         return
     with databases.lent(request.getfixturevalue("tmp_path")) as url:
         monkeypatch.setenv("DATABASE_URL", url)
-        yield
+        with databases.all_closed():
+            yield
 
 
 @pytest.fixture

@@ -9,9 +9,11 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
+from typing import Any
 from uuid import uuid4
 
-from sqlalchemy import Connection, create_engine, make_url, text
+import psycopg
+from sqlalchemy import Connection, Pool, create_engine, event, make_url, text
 
 from app import upgrading
 from app.db import Base, Database, file_of
@@ -83,6 +85,22 @@ _CONTENTS = """
     WHERE relkind IN ('r', 'i', 't', 'm') AND relnamespace <> 'pg_catalog'::regnamespace AND NOT relisshared
     AND pg_relation_filepath(oid) IS NOT NULL
 """
+
+
+@contextmanager
+def all_closed() -> Iterator[None]:
+    """In the end, closes connections that programs run in this process have left, as their own end would have done."""
+    left: list[psycopg.Connection[Any]] = []
+
+    def note(connection: Any, _record: object) -> None:
+        if isinstance(connection, psycopg.Connection):
+            left.append(connection)
+
+    event.listen(Pool, "connect", note)
+    yield
+    event.remove(Pool, "connect", note)
+    for connection in left:
+        connection.close()
 
 
 @cache

@@ -216,8 +216,10 @@ def directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
         monkeypatch.setenv("DATA_DIR", str(directory / "data"))
         monkeypatch.chdir(directory)
         assert run("app demo", ["demo"], monkeypatch) == 0
-        with Database(Settings().sqlalchemy_url).writing() as session:
+        database = Database(Settings().sqlalchemy_url)
+        with database.writing() as session:
             accounts.create_first_experimenter(session)  # as the first start does
+        database.dispose()
     results = directory / "results"
     results.mkdir()
     for file in (ROOT / "docs/results").glob("feedback_efficiency-*.csv"):

@@ -8,7 +8,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from functools import partial
 from pathlib import Path
 
@@ -61,9 +61,10 @@ def run(settings: Settings) -> int:
     engine_log.setLevel(logging.ERROR)
     engine_log.addFilter(OncePerMinute())
     keep_private(settings)
-    database = Database(settings.sqlalchemy_url)
-    with _only_one(settings), database.claiming(settings.worker_name) as claimed:
-        if not claimed:
+    with _only_one(settings), ExitStack() as stack:
+        database = Database(settings.sqlalchemy_url)
+        stack.callback(database.dispose)
+        if not stack.enter_context(database.claiming(settings.worker_name)):
             raise WorkerAlreadyRunning
         stop = Stop()
         compute = Compute(settings.compute_processes, stop.asked)
@@ -80,7 +81,6 @@ def run(settings: Settings) -> int:
         finally:
             compute.close()
             DBOS.destroy()
-            database.dispose()
     return 0
 
 
