@@ -4,6 +4,7 @@ python -m tests.on_postgresql                                what continuous int
 python -m tests.on_postgresql tests/app tests/worker/jobs    any other choice, in pytest's own words
 """
 
+import argparse
 import os
 import shutil
 import subprocess
@@ -32,8 +33,11 @@ FAST = {
 """Nothing here outlives the run, so nothing has to reach a disk."""
 
 
-def main(arguments: Sequence[str]) -> int:
+def main() -> int:
     """Run pytest; returns its exit code."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("arguments", nargs=argparse.REMAINDER, help="of pytest, paths first")
+    arguments = parser.parse_args().arguments
     programs = find_programs()
     if programs is None:
         sys.stderr.write("These tests need PostgreSQL 15 or later: install your system's package 'postgresql'.\n")
@@ -98,4 +102,4 @@ def _answers(folder: str) -> bool:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(main())
