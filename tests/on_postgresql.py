@@ -18,7 +18,17 @@ import psycopg
 
 from tests.waiting import until
 
-USUAL = ("-n", "2", "--dist", "loadfile", "-q", "-m", "database and first_case and not slow and not browser")
+USUAL = (
+    "tests/app",
+    "tests/worker/jobs/test_erasure.py",
+    "-n",
+    "2",
+    "--dist",
+    "loadfile",
+    "-q",
+    "-m",
+    "database and first_case and not slow and not browser",
+)
 SERVER_USER = "postgres"
 """Whom Debian's package makes: PostgreSQL refuses to run as root."""
 FAST = {
