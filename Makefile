@@ -9,7 +9,7 @@ VENV := .venv
 PY := $(VENV)/bin/python
 PIP := $(PY) -m pip --disable-pip-version-check --quiet
 
-.PHONY: help run link demo rehearse test lint types contracts pytest browser migrate reset-password benchmark clean
+.PHONY: help run link demo rehearse test lint types contracts pytest pytest-postgresql browser postgresql migrate reset-password benchmark clean
 
 help: ## List the commands
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-16s %s\n", $$1, $$2}'
@@ -32,7 +32,7 @@ reset-password: $(VENV)/run.stamp ## Print a new one-time password for the exper
 migrate: $(VENV)/run.stamp ## Bring the database to the newest schema
 	@$(PY) -m app migrate
 
-test: lint types contracts pytest ## Everything that continuous integration runs
+test: lint types contracts pytest pytest-postgresql ## Everything that continuous integration runs
 
 lint: $(VENV)/dev.stamp ## Style of Python and templates, schema of the compose file
 	$(VENV)/bin/ruff check .
@@ -48,6 +48,14 @@ contracts: $(VENV)/dev.stamp ## Who may import whom
 
 pytest: $(VENV)/dev.stamp browser ## The test suite
 	$(PY) -m pytest -n 3 --dist loadfile --no-loadscope-reorder
+
+pytest-postgresql: $(VENV)/dev.stamp postgresql ## Tests that use a database, on PostgreSQL (ARGS="tests/app -n 2": others)
+	$(PY) -m tests.on_postgresql $(ARGS)
+
+postgresql: ## PostgreSQL for the tests (Debian package)
+	@command -v initdb >/dev/null || ls /usr/lib/postgresql/*/bin/initdb >/dev/null 2>&1 || { \
+	  [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null && apt-get update -qq && apt-get install -y -qq postgresql; } || { \
+	  echo "The tests on PostgreSQL need its server: install your system's package 'postgresql'."; exit 1; }
 
 browser: ## Chromium for the browser tests (Debian package)
 	@command -v chromium >/dev/null || { \

@@ -4,7 +4,8 @@ import argparse
 import logging
 import socket
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
@@ -84,7 +85,7 @@ def migrate(settings: Settings) -> int:
 def reset_password(settings: Settings) -> int:
     """Give the first experimenter a new one-time password."""
     migrate(settings)
-    with _database(settings).writing() as session:
+    with _database(settings) as database, database.writing() as session:
         password = accounts.reset_password(session, accounts.FIRST_EXPERIMENTER)
     say(f"New one-time password of {accounts.FIRST_EXPERIMENTER}: {password}")
     return 0
@@ -93,7 +94,7 @@ def reset_password(settings: Settings) -> int:
 def participant_link(settings: Settings) -> int:
     """Add a participant to the newest study and print the personal link."""
     migrate(settings)
-    with _database(settings).writing() as session:
+    with _database(settings) as database, database.writing() as session:
         study = session.scalar(select(Study).where(Study.deleted_at.is_(None)).order_by(Study.id.desc()))
         if study is None:
             raise AppError("There is no study yet. Start the studio once, or create a study on the dashboard.")
@@ -116,7 +117,11 @@ def import_study(settings: Settings, file: Path, seal_key: str = "") -> int:
     store = ArtefactStore(settings.data_dir / "artefacts")
     if not file.is_file():
         raise AppError(f"There is no file {file}.")
-    with study_import.unpack(store, file, seal_key) as unpacked, _database(settings).writing() as session:
+    with (
+        study_import.unpack(store, file, seal_key) as unpacked,
+        _database(settings) as database,
+        database.writing() as session,
+    ):
         imported = study_import.bring_in(session, store, unpacked, audit.SYSTEM)
         say(f"Imported: {settings.base_url}/studies/{imported.study.slug}")
         say(signing.in_words(imported.signer, settings))
@@ -128,7 +133,7 @@ def import_study(settings: Settings, file: Path, seal_key: str = "") -> int:
 def scrub(settings: Settings) -> int:
     """Read every stored file; list what is damaged or missing, by study, and set it aside to be made again."""
     migrate(settings)
-    with _database(settings).reading() as session:
+    with _database(settings) as database, database.reading() as session:
         broken = damage.scrub(session, ArtefactStore(settings.data_dir / "artefacts"))
     for study, uses in sorted(broken.items()):
         say(f"{study}:")
@@ -181,7 +186,7 @@ def _contents(backup: layout.Backup) -> str:
 def demo_study(settings: Settings, task: str) -> int:
     """Make a demo study of a task with one participant and print the personal link."""
     migrate(settings)
-    with _database(settings).writing() as session:
+    with _database(settings) as database, database.writing() as session:
         token = demo.make_empty(session, task)
     say(f"{settings.base_url}/p/{token}")
     return 0
@@ -192,10 +197,8 @@ def up(settings: Settings) -> int:
     _require_free_port(settings)
     migrate(settings)
     with data_directory.shared(settings.data_dir):
-        database = _database(settings)
-        with database.writing() as session:
+        with _database(settings) as database, database.writing() as session:
             greeting = _first_start(session, settings)
-        database.dispose()
         return Programs(
             greeting,
             settings.data_dir,
@@ -229,8 +232,13 @@ def web(settings: Settings) -> int:
     return 0
 
 
-def _database(settings: Settings) -> Database:
-    return Database(settings.sqlalchemy_url)
+@contextmanager
+def _database(settings: Settings) -> Iterator[Database]:
+    database = Database(settings.sqlalchemy_url)
+    try:
+        yield database
+    finally:
+        database.dispose()
 
 
 def _require_free_port(settings: Settings) -> None:

@@ -31,6 +31,10 @@ _OF_DATABASES = {
     "is locked": "another program keeps it locked. Stop whatever else uses it, then try again.",
     "not a database": "the file is not a database, or is damaged. Restore it from a backup.",
     "malformed": "the file is damaged. Restore it from a backup.",
+    "lock timeout": "somebody else has been writing to it for too long. Try again, and see who does.",
+    "connection refused": "its server does not answer. Check that it runs, and DATABASE_URL.",
+    "connection failed": "its server does not let us in. Check DATABASE_URL, and what the server allows.",
+    "permission denied": "this account may not do that there. Let it own the database.",
 }
 
 

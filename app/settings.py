@@ -27,7 +27,9 @@ class Settings(BaseSettings):
     trusted_proxies: str = Field(default="", description="Addresses or networks whose X-Forwarded-For is believed.")
     signing_key_file: Path | None = Field(default=None, description="Private key; default: signing.key in DATA_DIR.")
     trusted_keys: str = Field(default="", description="Fingerprints of other studios' keys, separated by commas.")
-    worker_name: str = Field(default="worker-1", description="Stable name: a restart resumes its own work.")
+    worker_name: str = Field(
+        default="worker-1", max_length=80, description="Stable name: a restart goes on with its work."
+    )
     log_format: LogFormat = Field(default=LogFormat.TEXT, description="json: one object per line, with ids.")
     metrics_token: str | None = Field(default=None, min_length=16, description="Bearer token for /metrics.")
     compute_processes: int = Field(default=2, ge=1, description="Processes for simulation and training.")
@@ -35,6 +37,19 @@ class Settings(BaseSettings):
     backup_dir: Path | None = Field(default=None, description="Where the worker puts backups; default: it makes none.")
     backup_every_hours: int = Field(default=24, ge=1, description="Time between two backups of the worker.")
     backups_kept: int = Field(default=7, ge=1, description="So many backups stay in BACKUP_DIR, the newest.")
+
+    @field_validator("database_url")
+    @classmethod
+    def _known_database(cls, url: str | None) -> str | None:
+        """SQLite, or PostgreSQL by the driver that is installed, however its address is spelt."""
+        if not url:
+            return None
+        scheme, colon, rest = url.partition("://")
+        if scheme in {"postgres", "postgresql"}:
+            scheme = "postgresql+psycopg"
+        if not colon or scheme not in {"postgresql+psycopg", "sqlite", "sqlite+pysqlite"}:
+            raise ValueError("Write postgresql+psycopg://user:password@host/database, or leave it out for SQLite.")
+        return f"{scheme}://{rest}"
 
     @field_validator("trusted_proxies")
     @classmethod

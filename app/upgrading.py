@@ -63,9 +63,11 @@ def upgrade(settings: Settings) -> None:
             return
         if present is not None and path is not None:
             _copy(path, newest)
+        elif present is not None:
+            log.warning("the database is upgraded to revision %s; pg_dump makes copies of what it is", newest)
         try:
             command.upgrade(config, "head")
-        except OperationalError as error:
+        except DatabaseError as error:
             if in_words(error) is not None:  # nothing to do with what is in the database
                 raise
             raise UpgradeFailed(f"{_words(UpgradeFailed)} The database says: {error.orig}.") from error
@@ -120,7 +122,7 @@ def _revision(settings: Settings, config: Config) -> str | None:
         with engine.connect() as connection:
             found = connection.scalar(text("SELECT version_num FROM alembic_version")) if _VERSIONS in tables else None
     except DatabaseError as error:
-        if isinstance(error, OperationalError):  # away or locked, which is not damaged
+        if path is None or isinstance(error, OperationalError):  # away, locked or forbidden, which is not damaged
             raise
         raise DamagedDatabase from error
     finally:

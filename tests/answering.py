@@ -1,6 +1,5 @@
 """A real web server that can be killed, and people who answer whatever happens to it."""
 
-import os
 import subprocess
 import sys
 import threading
@@ -10,6 +9,7 @@ from uuid import uuid4
 import httpx2
 
 from app.settings import Settings
+from tests import databases
 from tests.waiting import PATIENCE_S
 
 
@@ -18,8 +18,7 @@ class Server:
 
     def __init__(self, settings: Settings) -> None:
         self.address = settings.base_url
-        environment = {name: value for name, value in os.environ.items() if name != "DATABASE_URL"}
-        self._environment = {**environment, "DATA_DIR": str(settings.data_dir), "PORT": str(settings.port)}
+        self._environment = databases.environment(settings.data_dir, PORT=str(settings.port))
         self.start()
 
     def start(self) -> None:

@@ -27,15 +27,43 @@ from app.main import create_routes, make_studio, serve
 from app.services.accounts import accounts, browser_sessions
 from app.settings import Settings
 from app.storage import ArtefactStore
+from tests import databases
 from tests.databases import make_tables
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Tell the tests that work on a studio's database, and skip what makes no sense on the one they are given.
+
+    Files with slow tests come first, so that none of them begins when everything else has ended.
+    """
+    slow = {item.path for item in items if item.get_closest_marker("slow")}
+    items.sort(key=lambda item: item.path not in slow)
+    seen = set()
+    for item in items:
+        name = item.nodeid.partition("[")[0]
+        if name not in seen:
+            item.add_marker("first_case")
+        seen.add(name)
+        if "settings" in getattr(item, "fixturenames", ()):
+            item.add_marker("database")
+        about_sqlite = item.get_closest_marker("sqlite")
+        if databases.SERVER is not None and about_sqlite is not None:
+            item.add_marker(pytest.mark.skip(reason=about_sqlite.args[0]))
+
 
 PASSWORD = "a password of my own"
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Files with slow tests come first, so that none of them begins when everything else has ended."""
-    slow = {item.path for item in items if item.get_closest_marker("slow")}
-    items.sort(key=lambda item: item.path not in slow)
+@pytest.fixture(autouse=databases.SERVER is not None)
+def own_database(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """On a PostgreSQL server, a database of its own for each test that writes anything, and programs it starts."""
+    if "tmp_path" not in request.fixturenames:
+        yield
+        return
+    with databases.lent(request.getfixturevalue("tmp_path")) as url:
+        monkeypatch.setenv("DATABASE_URL", url)
+        with databases.all_closed():
+            yield
 
 
 @pytest.fixture

@@ -1,10 +1,25 @@
-"""Empty databases of the newest schema, made once and copied: making the tables takes longer than most tests."""
+"""Empty databases of the newest schema, made once and copied: making the tables takes longer than most tests.
 
+They are files of SQLite, or databases on the PostgreSQL server that TEST_DATABASE_URL names (tests/on_postgresql.py).
+"""
+
+import os
 import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
+from typing import Any
+from uuid import uuid4
 
+import psycopg
+from sqlalchemy import Connection, Pool, create_engine, event, make_url, text
+
+from app import upgrading
 from app.db import Base, Database, file_of
+from app.settings import Settings
+
+SERVER = os.environ.get("TEST_DATABASE_URL")
 
 
 @cache
@@ -18,8 +33,92 @@ def _empty() -> bytes:
 
 
 def make_tables(database: Database) -> None:
-    """Give a database its tables, unless it has them."""
+    """Give a database its tables, unless it has them, as those on PostgreSQL do."""
     path = file_of(database.url)
-    assert path is not None
-    if not path.exists():
+    if path is not None and not path.exists():
         path.write_bytes(_empty())
+
+
+def environment(directory: Path, **settings: str) -> dict[str, str]:
+    """That of a program with its files there, and its database there or on the server that the test was lent one on."""
+    ours = {name: value for name, value in os.environ.items() if name != "DATABASE_URL" or SERVER is not None}
+    return {**ours, "DATA_DIR": str(directory), **settings}
+
+
+@contextmanager
+def lent(folder: Path, *, with_tables: bool = True) -> Iterator[str]:
+    """The address of a database that nobody has used: in the folder, or on the PostgreSQL server and dropped after."""
+    if SERVER is None:
+        yield f"sqlite:///{folder / 'studio.sqlite3'}"
+        return
+    template = _template() if with_tables else "template0"
+    name = f"studio_{uuid4().hex}"
+    with _administering() as connection:
+        # Faster than copying by way of the log, as long as the template is small and nothing is synced.
+        connection.execute(text(f"CREATE DATABASE {name} TEMPLATE {template} STRATEGY file_copy"))
+    try:
+        yield _address(name)
+    finally:
+        with _administering() as connection:
+            connection.execute(text(f"DROP DATABASE {name} WITH (FORCE)"))
+
+
+def tables_with(marks: Sequence[bytes], url: str) -> list[str]:
+    """Tables and indices of a PostgreSQL database whose files hold one of these, as they lie on the server's disk."""
+    if file_of(url) is not None:
+        return []
+    found = []
+    engine = create_engine(url, isolation_level="AUTOCOMMIT")
+    with engine.connect() as connection:
+        connection.execute(text("CHECKPOINT"))
+        for name, content in connection.execute(text(_CONTENTS)):
+            if any(mark in bytes(content) for mark in marks):
+                found.append(str(name))
+    engine.dispose()
+    return found
+
+
+_CONTENTS = """
+    SELECT oid::regclass::text, pg_read_binary_file(pg_relation_filepath(oid)) FROM pg_class
+    WHERE relkind IN ('r', 'i', 't', 'm') AND relnamespace <> 'pg_catalog'::regnamespace AND NOT relisshared
+    AND pg_relation_filepath(oid) IS NOT NULL
+"""
+
+
+@contextmanager
+def all_closed() -> Iterator[None]:
+    """In the end, closes connections that programs run in this process have left, as their own end would have done."""
+    left: list[psycopg.Connection[Any]] = []
+
+    def note(connection: Any, _record: object) -> None:
+        if isinstance(connection, psycopg.Connection):
+            left.append(connection)
+
+    event.listen(Pool, "connect", note)
+    yield
+    event.remove(Pool, "connect", note)
+    for connection in left:
+        connection.close()
+
+
+@cache
+def _template() -> str:
+    """A database with all tables, one for each process of the suite, so that none waits for another's."""
+    name = f"template_{uuid4().hex}"
+    with _administering() as connection:
+        connection.execute(text(f"CREATE DATABASE {name} TEMPLATE template0"))
+    with tempfile.TemporaryDirectory() as folder:
+        upgrading.upgrade(Settings(_env_file=None, data_dir=Path(folder), database_url=_address(name)))
+    return name
+
+
+@contextmanager
+def _administering() -> Iterator[Connection]:
+    engine = create_engine(SERVER or "", isolation_level="AUTOCOMMIT")
+    with engine.connect() as connection:
+        yield connection
+    engine.dispose()
+
+
+def _address(name: str) -> str:
+    return make_url(SERVER or "").set(database=name).render_as_string(hide_password=False)

@@ -30,7 +30,7 @@ PROGRAMS = [
     for each in sorted((ROOT / part).rglob("*.py"))
 ]
 OTHERS = [*sorted((ROOT / "templates").rglob("*.html")), *sorted((ROOT / "install").glob("*.sh"))]
-OURS = r"(?:-m (?:app|worker|tests\.(?:benchmarks|pictures)\.\w+)|tests/benchmarks/\w+\.py)"
+OURS = r"(?:-m (?:app|worker|tests\.(?:on_postgresql|(?:benchmarks|pictures)\.\w+))|tests/benchmarks/\w+\.py)"
 VARIABLES = r"(?:[A-Z_]+=\S+ )"
 MAKE = rf"(?:{VARIABLES}+|(?<=[`>])|(?<=: )|(?<=^    ))make\b(?= |`|<|$)(?! them)"
 COMMAND = re.compile(
@@ -106,6 +106,7 @@ RUN: dict[str, str | Elsewhere | OnlyParsed] = {
     "feedback_report": "results",
     "first_robot": REAL_TIME,
     "in_imitation": OnlyParsed("needs the library imitation, in an environment of its own"),
+    "on_postgresql": OnlyParsed("runs the suite itself, and needs a PostgreSQL server"),
     "onlookers": "--people 1 --labels 40 --labellers 1 --dashboards 1 --seconds 1 --thought 0.1",
     "pages": OnlyParsed("photographs a real studio, which takes minutes, and writes to docs/pictures"),
     "pool_rollouts": "--first 10800000 --scenarios 1 --directory pool",
@@ -181,7 +182,7 @@ def file_of(program: str) -> Path:
     part = program.split()[0]
     if part in ("app", "worker"):
         return ROOT / part / "__main__.py"
-    return next((ROOT / "tests").glob(f"*/{program}.py"))
+    return next((ROOT / "tests").rglob(f"{program}.py"))
 
 
 def run(program: str, arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> int:
@@ -223,8 +224,10 @@ def directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
         monkeypatch.setenv("DATA_DIR", str(directory / "data"))
         monkeypatch.chdir(directory)
         assert run("app demo", ["demo"], monkeypatch) == 0
-        with Database(Settings().sqlalchemy_url).writing() as session:
+        database = Database(Settings().sqlalchemy_url)
+        with database.writing() as session:
             accounts.create_first_experimenter(session)  # as the first start does
+        database.dispose()
     results = directory / "results"
     results.mkdir()
     for file in (ROOT / "docs/results").glob("feedback_efficiency-*.csv"):

@@ -74,7 +74,10 @@ def _import_clips(said: argparse.Namespace) -> int:
     settings = Settings()
     keep_private(settings)
     database = Database(settings.sqlalchemy_url)
-    slug = import_clips.import_clips(database, ArtefactStore(settings.data_dir / "artefacts"), said.path)
+    try:
+        slug = import_clips.import_clips(database, ArtefactStore(settings.data_dir / "artefacts"), said.path)
+    finally:
+        database.dispose()
     sys.stdout.write(f"Imported: {settings.base_url}/studies/{slug}\n")
     return 0
 

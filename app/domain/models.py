@@ -4,7 +4,7 @@ from datetime import datetime
 from enum import StrEnum
 from typing import Any
 
-from sqlalchemy import ForeignKey, String, Text, UniqueConstraint
+from sqlalchemy import BigInteger, ForeignKey, Integer, String, Text, UniqueConstraint
 from sqlalchemy.orm import Mapped, mapped_column
 
 from app.db import Base, now
@@ -126,7 +126,7 @@ class Export(Base):
     finished_at: Mapped[datetime | None]
     artefact_sha256: Mapped[str | None] = mapped_column(String(64))
     """None of a finished one: taken back, because somebody withdrew who was in it."""
-    byte_count: Mapped[int | None]
+    byte_count: Mapped[int | None] = mapped_column(BigInteger().with_variant(Integer, "sqlite"))  # videos of thousands
     missing: Mapped[dict[str, Any] | None]
     """What could not be put in, by what it is: {"video of a clip": [sha256, ...]}; None: nothing."""
 

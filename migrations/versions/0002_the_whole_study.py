@@ -54,7 +54,7 @@ def upgrade() -> None:
         sa.Column("requested_at", sa.DateTime(timezone=True), nullable=False),
         sa.Column("finished_at", sa.DateTime(timezone=True), nullable=True),
         sa.Column("artefact_sha256", sa.String(length=64), nullable=True),
-        sa.Column("byte_count", sa.Integer(), nullable=True),
+        sa.Column("byte_count", sa.BigInteger().with_variant(sa.Integer(), "sqlite"), nullable=True),
         sa.ForeignKeyConstraint(["study_id"], ["study.id"], name=op.f("fk_export_study_id_study")),
         sa.PrimaryKeyConstraint("id", name=op.f("pk_export")),
     )

@@ -19,7 +19,7 @@ from app.main import create_app
 from app.services.archives import study_import
 from app.settings import Settings
 from app.storage import ArtefactStore
-from tests import factories
+from tests import databases, factories
 from tests.databases import make_tables
 
 JSON = {"Accept": "application/json"}
@@ -79,16 +79,18 @@ def taking_part(database: Database, store: ArtefactStore, new_browser: Callable[
 @pytest.fixture
 def elsewhere(tmp_path: Path) -> Iterator[FastAPI]:
     """Another installation, which already holds something: ids there are others."""
-    application = create_app(Settings(_env_file=None, data_dir=tmp_path / "elsewhere", public_url=None))
-    (tmp_path / "elsewhere").mkdir()
-    there: Database = application.state.studio.database
-    make_tables(there)
-    with there.writing() as session:
-        study = factories.make_study(session, "Something else")
-        person, _ = factories.make_participant(session, study)
-        factories.make_queries(session, application.state.studio.store, person, 3)
-    yield application
-    there.dispose()
+    folder = tmp_path / "elsewhere"
+    folder.mkdir()
+    with databases.lent(folder) as url:
+        application = create_app(Settings(_env_file=None, data_dir=folder, database_url=url, public_url=None))
+        there: Database = application.state.studio.database
+        make_tables(there)
+        with there.writing() as session:
+            study = factories.make_study(session, "Something else")
+            person, _ = factories.make_participant(session, study)
+            factories.make_queries(session, application.state.studio.store, person, 3)
+        yield application
+        there.dispose()
 
 
 def bring(application: FastAPI, path: Path, seal_key: str = "") -> study_import.Imported:

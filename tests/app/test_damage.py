@@ -11,6 +11,7 @@ from app.db import Database
 from app.domain.clips import Clip, Rollout
 from app.domain.models import ModelKind
 from app.domain.studies import Study
+from app.settings import Settings
 from app.storage import ArtefactStore
 from tests import factories
 from tests.app.conftest import TakingPart
@@ -104,7 +105,7 @@ def test_a_scrub_reads_everything_and_says_what_is_wrong(
     data_dir: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     main(["migrate"])
-    database, store = Database(f"sqlite:///{data_dir / 'studio.sqlite3'}"), ArtefactStore(data_dir / "artefacts")
+    database, store = Database(Settings(_env_file=None).sqlalchemy_url), ArtefactStore(data_dir / "artefacts")
     with database.writing() as session:
         study = factories.make_study(session, "Pilot")
         person, _ = factories.make_participant(session, study)

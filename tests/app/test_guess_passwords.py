@@ -1,7 +1,6 @@
 """Guessing passwords and tokens: slow for whoever guesses, harmless for everybody else."""
 
 import asyncio
-import os
 import subprocess
 import sys
 import threading
@@ -23,6 +22,7 @@ from app.services.accounts import accounts, api_tokens, known_browsers
 from app.settings import Settings
 from app.web.http.hashing import Hashing
 from app.web.http.rate_limit import WINDOW_S, LoginAttempts
+from tests import databases
 from tests.app.conftest import TakingPart
 from tests.waiting import PATIENCE_S, free_port
 
@@ -256,8 +256,7 @@ class TestProxies:
 def _server(directory: Path, trusted_proxies: str) -> Iterator[str]:
     """The web server as ``python -m app up`` starts it, three attempts per minute; gives its address."""
     settings = Settings(_env_file=None, port=free_port())
-    environment = {name: value for name, value in os.environ.items() if name != "DATABASE_URL"}
-    environment |= {"DATA_DIR": str(directory), "LOGIN_ATTEMPTS_PER_MINUTE": "3", "FORWARDED_ALLOW_IPS": "127.0.0.1"}
+    environment = databases.environment(directory, LOGIN_ATTEMPTS_PER_MINUTE="3", FORWARDED_ALLOW_IPS="127.0.0.1")
     environment |= {"PORT": str(settings.port), "TRUSTED_PROXIES": trusted_proxies}
     server = subprocess.Popen([sys.executable, "-m", "app", "web"], env=environment)
     try:

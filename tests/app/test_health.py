@@ -15,6 +15,7 @@ from app.db import Database, complaints
 from app.main import create_app
 from app.services.monitoring import health
 from app.settings import Settings
+from tests import databases
 from tests.app.conftest import TakingPart
 
 
@@ -38,7 +39,10 @@ def test_all_is_well_on_a_fresh_database(browser: TestClient) -> None:
 
 
 def test_a_database_that_cannot_be_written_is_not_well(browser: TestClient, settings: Settings) -> None:
-    read_only = Database(f"sqlite:///file:{settings.data_dir}/studio.sqlite3?mode=ro&uri=true")
+    address = f"sqlite:///file:{settings.data_dir}/studio.sqlite3?mode=ro&uri=true"
+    if databases.SERVER is not None:
+        address = f"{settings.sqlalchemy_url}&options=-cdefault_transaction_read_only%3Don"
+    read_only = Database(address)
     assert health.complaint(read_only, settings.data_dir) == health.NOT_WRITABLE
     read_only.dispose()
 

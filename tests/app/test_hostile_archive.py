@@ -22,6 +22,7 @@ from app.services.archives import archive, archive_reading, study_import, unpack
 from app.services.archives.archive import ArchiveInvalid
 from app.services.studies import locking
 from app.storage import ArtefactStore
+from tests import databases
 from tests.databases import make_tables
 from tests.finished_study import make_finished_study
 
@@ -36,8 +37,15 @@ MOST_MEMORY = 24 * MEGABYTE
 def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The archive of a locked study with everything in it, from another installation."""
     folder = tmp_path_factory.mktemp("elsewhere")
-    there = Database(f"sqlite:///{folder / 'elsewhere.sqlite3'}")
-    make_tables(there)
+    with databases.lent(folder) as url:
+        there = Database(url)
+        make_tables(there)
+        _fill(there, folder)
+        there.dispose()
+    return folder / "study.zip"
+
+
+def _fill(there: Database, folder: Path) -> None:
     with there.writing() as session:
         store = ArtefactStore(folder / "artefacts")
         study = make_finished_study(session, store, people=2, labels=3)
@@ -45,8 +53,6 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
         study.join_token = "somebody"
         session.flush()
         archive.write(session, store, study, folder / "study.zip")
-    there.dispose()
-    return folder / "study.zip"
 
 
 @pytest.fixture

@@ -18,14 +18,16 @@ import app.domain.people
 import app.domain.preferences
 import app.domain.studies  # noqa: F401  (all of them fill Base.metadata)
 from app.db import Base
+from tests import databases
 
 
 @pytest.fixture
-def config(tmp_path: Path) -> Config:
+def config(tmp_path: Path) -> Iterator[Config]:
     config = Config()
     config.set_main_option("script_location", "migrations")
-    config.set_main_option("sqlalchemy.url", f"sqlite:///{tmp_path / 'migrated.sqlite3'}")
-    return config
+    with databases.lent(tmp_path, with_tables=False) as url:
+        config.set_main_option("sqlalchemy.url", url.replace("%", "%%"))
+        yield config
 
 
 @pytest.fixture

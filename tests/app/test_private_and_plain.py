@@ -13,6 +13,7 @@ from app import __main__ as studio
 from app.errors import AppError, in_words
 from app.settings import Settings
 from app.storage import ArtefactStore, keep_private
+from tests import databases
 from worker import __main__ as worker
 from worker.jobs.runtime import engine
 
@@ -26,7 +27,8 @@ Run = Callable[..., tuple[int, str]]
 def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Run:
     """Runs a command of the studio; gives exit code and what it said."""
     monkeypatch.chdir(tmp_path)  # where there is no .env
-    monkeypatch.delenv("DATABASE_URL", raising=False)
+    if databases.SERVER is None:
+        monkeypatch.delenv("DATABASE_URL", raising=False)
 
     def run(main: Callable[[Sequence[str]], int], arguments: Sequence[str], **environment: str) -> tuple[int, str]:
         for name, value in environment.items():
@@ -56,11 +58,13 @@ class TestSentences:
         (tmp_path / "data").write_text("A file of this name is in the way.")
         assert says_what_to_do(run(studio.main, arguments, DATA_DIR=str(tmp_path / "data"), PORT="0"), "DATA_DIR=")
 
+    @pytest.mark.sqlite("about its files")
     def test_a_database_that_can_only_be_read(self, run: Run, tmp_path: Path) -> None:
         run(studio.main, ["demo"], DATA_DIR=str(tmp_path))
         url = f"sqlite:///file:{tmp_path}/studio.sqlite3?mode=ro&uri=true"
         assert says_what_to_do(run(studio.main, ["link"], DATABASE_URL=url), "can only be read")
 
+    @pytest.mark.sqlite("about its files")
     def test_a_database_that_is_none(self, run: Run, tmp_path: Path) -> None:
         (tmp_path / "studio.sqlite3").write_bytes(b"no database " * 1000)
         assert says_what_to_do(run(studio.main, ["migrate"], DATA_DIR=str(tmp_path)), "Restore it from a backup")
@@ -69,6 +73,11 @@ class TestSentences:
         url = f"sqlite:///{tmp_path}/nowhere/studio.sqlite3"
         done = run(studio.main, ["migrate"], DATA_DIR=str(tmp_path), DATABASE_URL=url)
         assert says_what_to_do(done, "cannot be opened")
+
+    def test_a_server_that_is_not_there(self, run: Run, tmp_path: Path) -> None:
+        url = "postgresql://studio@127.0.0.1:1/studio"
+        done = run(studio.main, ["migrate"], DATA_DIR=str(tmp_path), DATABASE_URL=url)
+        assert says_what_to_do(done, "its server does not answer")
 
     def test_the_worker_says_the_same(self, run: Run, tmp_path: Path) -> None:
         (tmp_path / "data").write_text("A file of this name is in the way.")
@@ -101,6 +110,7 @@ class TestSentences:
         assert in_words(error) is None
 
 
+@pytest.mark.sqlite("about its files")
 class TestFiles:
     def open_to_others(self, directory: Path) -> list[str]:
         return [

@@ -14,6 +14,7 @@ from urllib.request import urlopen
 import pytest
 
 from app.falls import noted
+from tests import databases
 from tests.waiting import PATIENCE_S, free_port, gone, until
 
 pytestmark = pytest.mark.slow
@@ -26,14 +27,12 @@ class Studio:
 
     def __init__(self, directory: Path, port: int) -> None:
         self.address = f"http://127.0.0.1:{port}"
-        environment = {name: value for name, value in os.environ.items() if name != "DATABASE_URL"}
-        environment.update(DATA_DIR=str(directory), PORT=str(port), HOST="127.0.0.1", COMPUTE_PROCESSES="1")
         self.process = subprocess.Popen(
             [sys.executable, "-m", "app", "up"],
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
-            env=environment,
+            env=databases.environment(directory, PORT=str(port), HOST="127.0.0.1", COMPUTE_PROCESSES="1"),
         )
         self.lines: list[str] = []
         self._reader = threading.Thread(target=self._read, daemon=True)

@@ -28,6 +28,9 @@ Rows = dict[str, list[tuple[Any, ...]]]
 OLDEST = "0001"
 
 
+pytestmark = pytest.mark.sqlite("about the file and the copies made of it")
+
+
 @pytest.fixture
 def settings(tmp_path: Path) -> Settings:
     return Settings(_env_file=None, data_dir=tmp_path, database_url=None)

@@ -1,10 +1,8 @@
 """Who waits for changes sees everybody's, and nothing else."""
 
-import sqlite3
 from contextlib import closing
-from pathlib import Path
 
-from sqlalchemy import select
+from sqlalchemy import create_engine, select, update
 
 from app.db import Database
 from app.domain.studies import Study
@@ -43,8 +41,10 @@ def test_another_process_s_changes_count(database: Database, settings: Settings)
         factories.make_study(session)
     with closing(database.watch()) as watch:
         watch.changed()
-        with closing(sqlite3.connect(Path(settings.data_dir) / "studio.sqlite3")) as other, other:
-            other.execute("UPDATE study SET name = 'Renamed'")
+        other = create_engine(settings.sqlalchemy_url)
+        with other.begin() as connection:
+            connection.execute(update(Study).values(name="Renamed"))
+        other.dispose()
         assert watch.changed()
 
 

@@ -38,7 +38,7 @@ def leave_traces(database: Database, store: ArtefactStore, participant_id: int) 
         person.panel_id, person.panel_parameters = marked("panel"), {"SESSION_ID": marked("session")}
         left, right = (factories.make_clip(session, store, study) for _ in range(2))
         query = factories.make_query(session, person, left, right)
-        label = factories.make_label(session, query, reason=marked("reason"))
+        label = factories.make_label(session, query, reason=marked("reason")[:40])
         session.add(Exclusion(label_event_id=label.id, excluded=True, reason=marked("exclusion"), actor="pat"))
         factories.make_run(session, study, person, error=marked("error"), stage=marked("stage"))
         model = factories.make_model(session, study, person, ModelKind.FILTER, {"notes": [marked("metrics")]})

@@ -65,7 +65,7 @@ def make_trajectory(scenario: int, behaviour: int, steps: int = STEPS) -> Trajec
 
 @pytest.fixture
 def settings(tmp_path: Path) -> Settings:
-    return Settings(data_dir=tmp_path / "data", database_url=None, port=0)
+    return Settings(_env_file=None, data_dir=tmp_path / "data", port=0)
 
 
 @pytest.fixture

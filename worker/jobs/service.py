@@ -8,7 +8,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from functools import partial
 from pathlib import Path
 
@@ -49,7 +49,7 @@ BEGINS_WITHIN_S = 30.0
 
 
 class WorkerAlreadyRunning(AppError):
-    """A worker of this name is already running on this data directory. Stop it first, or set WORKER_NAME."""
+    """A worker of this name is already running on this data directory or database. Stop it, or set WORKER_NAME."""
 
 
 class KeepsFelling(AppError):
@@ -63,9 +63,12 @@ def run(settings: Settings) -> int:
     engine_log.setLevel(logging.ERROR)
     engine_log.addFilter(OncePerMinute())
     keep_private(settings)
-    with data_directory.shared(settings.data_dir), _only_one(settings):
-        stop = Stop()
+    with data_directory.shared(settings.data_dir), _only_one(settings), ExitStack() as stack:
         database = Database(settings.sqlalchemy_url)
+        stack.callback(database.dispose)
+        if not stack.enter_context(database.claiming(settings.worker_name)):
+            raise WorkerAlreadyRunning
+        stop = Stop()
         compute = Compute(settings.compute_processes, stop.asked)
         stop.at_once = compute.kill
         context = WorkerContext(
@@ -82,7 +85,6 @@ def run(settings: Settings) -> int:
         finally:
             compute.close()
             DBOS.destroy()
-            database.dispose()
     return 0
 
 

@@ -30,14 +30,18 @@ def open_for_experimenter(session: Session, experimenter: Experimenter, lifetime
     return cookie
 
 
-def participant_of(session: Session, cookie: str) -> Participant | None:
-    """The participant the cookie stands for, study loaded; None when it stands for nobody (any more)."""
-    return session.scalar(
+def participant_of(session: Session, cookie: str, *, lock: bool = False) -> Participant | None:
+    """The participant the cookie stands for, study loaded; None when it stands for nobody (any more).
+
+    ``lock``: until the transaction ends, nobody else changes the participant's row or locks it.
+    """
+    theirs = (
         select(Participant)
         .join(BrowserSession, BrowserSession.participant_id == Participant.id)
         .where(BrowserSession.cookie_sha256 == _hash(cookie), BrowserSession.expires_at > now())
         .options(joinedload(Participant.study))
     )
+    return session.scalar(theirs.with_for_update(of=Participant) if lock else theirs)
 
 
 def experimenter_of(session: Session, cookie: str) -> Experimenter | None:

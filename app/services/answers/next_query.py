@@ -180,12 +180,13 @@ def _ready(session: Session, store: ArtefactStore, participant: Participant) -> 
         .order_by(Query.ordinal)
         .execution_options(yield_per=2)  # the rest of the list is of no interest
     )
-    for query in session.scalars(waiting):
-        clips = (query.left_clip, query.right_clip)
-        if all(store.has(sha256) for clip in clips for sha256 in (clip.video_sha256, clip.poster_sha256)):
-            yield query
-        else:
-            log.warning("query %d of participant %d has lost its files and is passed over", query.id, participant.id)
+    with session.scalars(waiting) as queries:
+        for query in queries:
+            clips = (query.left_clip, query.right_clip)
+            if all(store.has(sha256) for clip in clips for sha256 in (clip.video_sha256, clip.poster_sha256)):
+                yield query
+            else:
+                log.warning("query %d of participant %d has lost its files: passed over", query.id, participant.id)
 
 
 def _pace_s(times: Sequence[datetime]) -> float | None:

@@ -166,10 +166,11 @@ def _write_rows(
 ) -> Rows:
     """Write the rows, and note which files they name."""
     count, digest = 0, hashlib.sha256()
-    found = session.execute(
-        select(table).where(condition).order_by(table.c.id).execution_options(yield_per=_ROWS_AT_ONCE)
-    )
-    with archive.open(f"rows/{table.name}.jsonl", "w", force_zip64=True) as target:
+    wanted = select(table).where(condition).order_by(table.c.id).execution_options(yield_per=_ROWS_AT_ONCE)
+    with (
+        session.execute(wanted) as found,
+        archive.open(f"rows/{table.name}.jsonl", "w", force_zip64=True) as target,
+    ):
         for each in found.mappings():
             row = _as_stored(study, table, each)
             line = json.dumps(row).encode() + b"\n"  # ASCII: no reader can take anything in it for the end of a line

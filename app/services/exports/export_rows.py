@@ -307,29 +307,30 @@ def evaluations(session: Session, study: Study, window: Window = EVERYTHING) -> 
 def clips(session: Session, study: Study, window: Window = EVERYTHING) -> KeyedRows:
     rollout = aliased(Rollout)
     place = (rollout.scenario, rollout.behaviour, Clip.first_step, Clip.step_count, Clip.id)
-    rows = session.execute(
+    wanted = (
         select(Clip, rollout)
         .join(rollout, Clip.rollout_id == rollout.id)
         .where(rollout.study_id == study.id, window.beyond(*place), window.known(Clip))
         .order_by(*place)
         .execution_options(yield_per=AT_ONCE)
     )
-    for clip, run in rows:
-        yield (
-            (run.scenario, run.behaviour, clip.first_step, clip.step_count, clip.id),
-            (
-                clip.video_sha256,
-                run.scenario,
-                run.behaviour,
-                run.mode,
-                run.success,
-                clip.first_step,
-                clip.step_count,
-                clip.duration_ms,
-                clip.fps,
-                run.trajectory_sha256,
-            ),
-        )
+    with session.execute(wanted) as rows:  # whoever wants a page only stops in the middle
+        for clip, run in rows:
+            yield (
+                (run.scenario, run.behaviour, clip.first_step, clip.step_count, clip.id),
+                (
+                    clip.video_sha256,
+                    run.scenario,
+                    run.behaviour,
+                    run.mode,
+                    run.success,
+                    clip.first_step,
+                    clip.step_count,
+                    clip.duration_ms,
+                    clip.fps,
+                    run.trajectory_sha256,
+                ),
+            )
 
 
 def deviations(session: Session, study: Study, window: Window = EVERYTHING) -> KeyedRows:

@@ -13,7 +13,7 @@ from http import HTTPStatus
 from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
-from sqlalchemy import ColumnElement, and_, func, select, true, tuple_
+from sqlalchemy import BigInteger, BindParameter, ColumnElement, and_, func, literal, select, true, tuple_
 from sqlalchemy.orm import InstrumentedAttribute, Session
 
 from app.db import Base
@@ -43,15 +43,15 @@ class Window:
     def known(self, *entities: type[Base]) -> ColumnElement[bool]:
         """That rows of these were there when the first page was read."""
         bounds = ((each, self.newest.get(each.__tablename__)) for each in entities)
-        return and_(true(), *(each.__table__.c.id <= bound for each, bound in bounds if bound is not None))
+        return and_(true(), *(each.__table__.c.id <= _any(bound) for each, bound in bounds if bound is not None))
 
     def beyond(self, *columns: InstrumentedAttribute[int]) -> ColumnElement[bool]:
         """That a row comes after the key, which consists of these columns."""
-        return tuple_(*columns) > tuple_(*self.after) if len(self.after) == len(columns) else true()
+        return tuple_(*columns) > tuple_(*map(_any, self.after)) if len(self.after) == len(columns) else true()
 
     def reaches(self, first: InstrumentedAttribute[int]) -> ColumnElement[bool]:
         """That some row whose key begins with this column may come after the key."""
-        return first >= self.after[0] if self.after else true()
+        return first >= _any(self.after[0]) if self.after else true()
 
     def within(self, first: int) -> "Window":
         """The part that is wanted of the rows whose keys begin with this number, by the rest of their keys."""
@@ -59,6 +59,12 @@ class Window:
 
 
 EVERYTHING = Window()
+
+
+def _any(number: int) -> BindParameter[int]:
+    """To be compared with a column, although PostgreSQL could not store it there."""
+    return literal(number, BigInteger)
+
 
 _Number = Annotated[int, Field(strict=True, ge=-(2**63), lt=2**63)]
 

@@ -27,7 +27,7 @@ def complaint(database: Database, data_dir: Path) -> str | None:
     try:
         if shutil.disk_usage(data_dir).free < LEAST_FREE_BYTES:
             return DISK_FULL
-        with database.writing() as session:
+        with database.writing(own_rows=True) as session:
             revision = session.scalar(text("SELECT version_num FROM alembic_version"))
             session.execute(text("UPDATE alembic_version SET version_num = version_num"))
     except (SQLAlchemyError, OSError) as error:

@@ -102,22 +102,29 @@ async def _writing_session(studio: StudioDep) -> AsyncIterator[Session]:
         yield session
 
 
+async def _own_rows_session(studio: StudioDep) -> AsyncIterator[Session]:
+    async with studio.session_queue.writing(own_rows=True) as session:
+        yield session
+
+
 # scope="function": the transaction ends before the response leaves. With the default scope a commit that fails
 # would come after a response that says "saved".
 ReadingSession = Annotated[Session, Depends(_reading_session, scope="function")]
 WritingSession = Annotated[Session, Depends(_writing_session, scope="function")]
+OwnRowsSession = Annotated[Session, Depends(_own_rows_session, scope="function")]
+"""To write nothing with but rows of an AnsweringParticipant; on PostgreSQL, others do so at the same time."""
 
 
-def participant_or_nobody(request: Request, session: Session) -> Participant | None:
+def participant_or_nobody(request: Request, session: Session, *, lock: bool = False) -> Participant | None:
     """The participant whose browser this is, study loaded."""
     cookie = request.cookies.get(PARTICIPANT_COOKIE)
-    participant = browser_sessions.participant_of(session, cookie) if cookie else None
+    participant = browser_sessions.participant_of(session, cookie, lock=lock) if cookie else None
     return None if participant is None or participant.withdrawn_at is not None else participant
 
 
-def participant_asking(request: Request, session: Session) -> Participant:
+def participant_asking(request: Request, session: Session, *, lock: bool = False) -> Participant:
     """The participant whose browser this is, study loaded. Raises LinkNeeded."""
-    participant = participant_or_nobody(request, session)
+    participant = participant_or_nobody(request, session, lock=lock)
     if participant is None:
         raise LinkNeeded
     return participant
@@ -142,6 +149,10 @@ def experimenter_logged_in(request: Request, session: Session) -> Experimenter:
 
 def _participant(request: Request, session: WritingSession) -> Participant:
     return participant_asking(request, session)
+
+
+def _answering_participant(request: Request, session: OwnRowsSession) -> Participant:
+    return participant_asking(request, session, lock=True)
 
 
 def _experimenter(request: Request, session: ReadingSession) -> Experimenter:
@@ -176,6 +187,8 @@ def _own_account(request: Request, session: WritingSession) -> Experimenter:
 
 CurrentParticipant = Annotated[Participant, Depends(_participant, scope="function")]
 """In the request's writing session: whatever a participant does leaves a trace, if only that they were here."""
+AnsweringParticipant = Annotated[Participant, Depends(_answering_participant, scope="function")]
+"""The same in the request's OwnRowsSession: requests of one person wait for each other, those of others do not."""
 CurrentExperimenter = Annotated[Experimenter, Depends(_experimenter, scope="function")]
 """Whoever is logged in, readers included: for looking."""
 ActingExperimenter = Annotated[Experimenter, Depends(_acting_experimenter, scope="function")]

@@ -17,7 +17,7 @@ from app.db import Database
 
 READERS = 6
 WRITERS = 8
-"""Both together stay below SQLAlchemy's default of 15 connections."""
+"""Both together stay below the connections that there may be."""
 
 
 class SessionQueue:
@@ -25,7 +25,7 @@ class SessionQueue:
 
     def __init__(self, database: Database) -> None:
         self._database = database
-        self._writers = 1 if database.url.startswith("sqlite") else WRITERS
+        self._writers = 1 if database.is_sqlite else WRITERS
         # A semaphore belongs to one event loop. A server has one; the test client makes one per request.
         self._queues: WeakKeyDictionary[asyncio.AbstractEventLoop, tuple[asyncio.Semaphore, asyncio.Semaphore]]
         self._queues = WeakKeyDictionary()
@@ -37,9 +37,10 @@ class SessionQueue:
             yield session
 
     @asynccontextmanager
-    async def writing(self) -> AsyncIterator[Session]:
-        """A session to write with, committed when the block ends."""
-        async with self._of_this_loop()[1], contextmanager_in_threadpool(self._database.writing()) as session:
+    async def writing(self, *, own_rows: bool = False) -> AsyncIterator[Session]:
+        """A session to write with, committed when the block ends. ``own_rows``: see app.db.Database.writing()."""
+        transaction = self._database.writing(own_rows=own_rows)
+        async with self._of_this_loop()[1], contextmanager_in_threadpool(transaction) as session:
             yield session
 
     def _of_this_loop(self) -> tuple[asyncio.Semaphore, asyncio.Semaphore]:

@@ -14,7 +14,15 @@ from app.services.answers import next_query
 from app.services.participants import enrolment, stages
 from app.services.studies.retirement import StudyDeleted, StudyPutAway
 from app.web.error_pages import wants_json
-from app.web.http.deps import PARTICIPANT_COOKIE, CurrentParticipant, StudioDep, Token, WritingSession, set_cookie
+from app.web.http.deps import (
+    PARTICIPANT_COOKIE,
+    AnsweringParticipant,
+    OwnRowsSession,
+    StudioDep,
+    Token,
+    WritingSession,
+    set_cookie,
+)
 from app.web.participant import pairs
 from app.web.participant.pages import ADDRESSES, back_from, go, has_reached, participant_page
 from app.web.texts import languages
@@ -26,7 +34,7 @@ AtInstructions = Annotated[Participant, has_reached(Stage.INSTRUCTIONS)]
 
 @router.get("/next", name="show_next")
 def show_next(
-    request: Request, participant: CurrentParticipant, session: WritingSession, studio: StudioDep
+    request: Request, participant: AnsweringParticipant, session: OwnRowsSession, studio: StudioDep
 ) -> Response:
     """Where this person should be: the pair to compare now, or on to the page of their stage."""
     next_query.seen(participant)

@@ -21,7 +21,7 @@ from app.services.participants import time_left
 from app.services.participants.time_left import TimeLeft
 from app.services.runs import estimates
 from app.web.error_pages import wants_json
-from app.web.http.deps import CurrentParticipant, RowId, Studio, StudioDep, WritingSession
+from app.web.http.deps import AnsweringParticipant, OwnRowsSession, RowId, Studio, StudioDep
 from app.web.participant.pages import go, participant_page
 from app.web.texts.languages import wording_of
 from app.web.texts.wording import Wording
@@ -102,8 +102,8 @@ def label_query(
     request: Request,
     query_id: RowId,
     form: Annotated[LabelForm, Form()],
-    participant: CurrentParticipant,
-    session: WritingSession,
+    participant: AnsweringParticipant,
+    session: OwnRowsSession,
     studio: StudioDep,
 ) -> Response:
     """Record the answer; the transaction is committed before this response leaves."""
@@ -118,8 +118,8 @@ def undo_label(
     request: Request,
     query_id: RowId,
     client_uuid: Annotated[UUID, Form()],
-    participant: CurrentParticipant,
-    session: WritingSession,
+    participant: AnsweringParticipant,
+    session: OwnRowsSession,
     studio: StudioDep,
 ) -> Response:
     """Take the newest answer back; its pair is the next to be shown."""
@@ -128,7 +128,7 @@ def undo_label(
 
 
 @router.post("/break", name="end_break")
-def end_break(request: Request, participant: CurrentParticipant, session: WritingSession) -> Response:
+def end_break(request: Request, participant: AnsweringParticipant, session: OwnRowsSession) -> Response:
     """Go on after a break."""
     next_query.seen(participant)
     next_query.end_break(session, participant)
@@ -137,7 +137,7 @@ def end_break(request: Request, participant: CurrentParticipant, session: Writin
 
 @router.post("/events", name="note_event", status_code=HTTPStatus.NO_CONTENT)
 def note_event(
-    form: Annotated[EventForm, Form()], participant: CurrentParticipant, session: WritingSession
+    form: Annotated[EventForm, Form()], participant: AnsweringParticipant, session: OwnRowsSession
 ) -> Response:
     """Keep what the script noticed; sent as a beacon, so nobody waits for an answer."""
     if form.kind not in (EventKind.BREAK_BEGUN, EventKind.BREAK_OVER):

@@ -4,7 +4,6 @@ import base64
 import hashlib
 import threading
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 from dbos import DBOS, SetWorkflowID
@@ -17,6 +16,7 @@ from app.services.participants import withdrawal
 from app.services.studies import retirement
 from app.settings import Settings
 from app.storage import ArtefactStore
+from tests import databases
 from tests.waiting import PATIENCE_S, until
 from tests.worker.conftest import the_job_runner
 from tests.worker.invented import job_of
@@ -92,14 +92,15 @@ def erase(runner: JobRunner, settings: Settings, participant_id: int) -> bool:
     return erasure.erase_traces(context, participant_id, runner.in_hand, runner.stored, file).finished
 
 
-def traces(folder: Path) -> list[str]:
-    """Files that hold the mark, as it is or as the engine writes it."""
+def traces(settings: Settings) -> list[str]:
+    """Files, and tables on a server, that hold the mark, as it is or as the engine writes it."""
     written = [MARK, *(base64.b64encode(b"x" * offset + MARK)[4:-4] for offset in range(3))]
-    return [
-        str(path.relative_to(folder))
-        for path in sorted(folder.rglob("*"))
+    files = [
+        str(path.relative_to(settings.data_dir))
+        for path in sorted(settings.data_dir.rglob("*"))
         if path.is_file() and any(each in path.read_bytes() for each in written)
     ]
+    return files + databases.tables_with(written, settings.sqlalchemy_url)
 
 
 def test_work_under_way_is_abandoned_and_neither_draft_nor_late_result_nor_note_is_left(
@@ -108,14 +109,14 @@ def test_work_under_way_is_abandoned_and_neither_draft_nor_late_result_nor_note_
     context = runner.context
     start(runner, job)
     assert work.waits.wait(PATIENCE_S)
-    assert any("engine" in name for name in traces(settings.data_dir)), "the engine keeps inputs: something to erase"
+    assert any(name.startswith(("engine", "dbos")) for name in traces(settings)), "the engine keeps inputs"
     withdraw(context.database, context.store, participant.id)
     assert not erase(runner, settings, participant.id), "it is still being worked on"
     with context.database.reading() as session:
         assert erasure.unfinished(session) == [participant.id]
     work.may_go_on.set()
     assert until(lambda: erase(runner, settings, participant.id))
-    assert traces(settings.data_dir) == []
+    assert traces(settings) == []
     assert DBOS.list_workflows() == []
     with context.database.reading() as session:
         assert erasure.unfinished(session) == []
@@ -147,11 +148,12 @@ def test_finished_work_is_forgotten_and_its_drafts_are_erased(
     start(runner, job)
     assert until(lambda: [each.status for each in DBOS.list_workflows()] == ["SUCCESS"])
     withdraw(context.database, context.store, participant.id)
-    assert traces(settings.data_dir) != [], "the draft is known to the engine alone"
+    assert traces(settings) != [], "the draft is known to the engine alone"
     assert until(lambda: erase(runner, settings, participant.id))
-    assert traces(settings.data_dir) == []
+    assert traces(settings) == []
 
 
+@pytest.mark.sqlite("about copies of its files")
 def test_copies_made_before_upgrades_and_engine_s_files_that_were_set_aside_go_as_well(
     runner: JobRunner, participant: Participant, settings: Settings
 ) -> None:
@@ -160,10 +162,10 @@ def test_copies_made_before_upgrades_and_engine_s_files_that_were_set_aside_go_a
         (settings.data_dir / name).write_bytes(MARK)
     for name in ("engine.sqlite3.set-aside-20260101T000000", "engine.sqlite3-journal.set-aside-20260101T000000"):
         (settings.data_dir / name).write_bytes(MARK)
-    assert len(traces(settings.data_dir)) == 4
+    assert len(traces(settings)) == 4
     withdraw(context.database, context.store, participant.id)
     assert until(lambda: erase(runner, settings, participant.id))
-    assert traces(settings.data_dir) == []
+    assert traces(settings) == []
 
 
 def test_work_that_begins_after_the_withdrawal_does_nothing(
@@ -174,7 +176,7 @@ def test_work_that_begins_after_the_withdrawal_does_nothing(
     start(runner, job)
     assert until(lambda: erase(runner, settings, participant.id))
     assert not work.waits.is_set()
-    assert traces(settings.data_dir) == []
+    assert traces(settings) == []
 
 
 def test_what_the_worker_keeps_of_others_stays(
@@ -190,7 +192,9 @@ def test_what_the_worker_keeps_of_others_stays(
     withdraw(context.database, context.store, participant.id)
     assert until(lambda: erase(runner, settings, participant.id))
     assert [each.workflow_id for each in DBOS.list_workflows()] == [f"filter/participant-{other.id}/labels-10#1"]
-    assert len(traces(settings.data_dir)) == 3, "the other's draft, model, and row"
+    files = [name for name in traces(settings) if name.startswith("artefacts")]
+    assert len(files) == 2, "the other's draft and model"
+    assert len(traces(settings)) > 2, "and their row"
 
 
 def test_of_a_deleted_study_neither_drafts_nor_late_results_nor_notes_are_left_and_others_keep_theirs(
@@ -213,7 +217,7 @@ def test_of_a_deleted_study_neither_drafts_nor_late_results_nor_notes_are_left_a
     assert not erase_study(), "it is still being worked on"
     work.may_go_on.set()
     assert until(erase_study)
-    assert traces(settings.data_dir) == []
+    assert traces(settings) == []
     assert DBOS.list_workflows() == []
     with context.database.reading() as session:
         assert erasure.unfinished_studies(session) == []

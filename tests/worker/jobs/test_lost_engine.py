@@ -34,6 +34,7 @@ from worker.jobs.workflows import JobRunner
 pytestmark = pytest.mark.slow
 
 Damage = Callable[[Path], None]
+pytestmark = pytest.mark.sqlite("about the engine's own file")
 
 
 class Work:

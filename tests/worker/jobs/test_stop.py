@@ -18,6 +18,7 @@ from app.domain.models import Run, RunStatus, WorkerPresence
 from app.domain.study_settings import StudySettings
 from app.services.studies import studies
 from app.settings import Settings
+from tests import databases
 from tests.waiting import PATIENCE_S, gone, hear_hangups, until
 
 pytestmark = pytest.mark.slow
@@ -33,8 +34,7 @@ def worker(settings: Settings, database: Database) -> Iterator[Worker]:
     """A worker that has only just been started, with work at hand."""
     with database.writing() as session:
         studies.create_study(session, "Study", StudySettings(labels_per_participant=20, pool_scenarios=2))
-    environment = {name: value for name, value in os.environ.items() if name != "DATABASE_URL"}
-    environment.update(DATA_DIR=str(settings.data_dir), COMPUTE_PROCESSES="1")
+    environment = databases.environment(settings.data_dir, COMPUTE_PROCESSES="1")
     process = subprocess.Popen([sys.executable, "-m", "worker", "run"], env=environment, preexec_fn=hear_hangups)
     yield process
     for pid in (*descendants(process.pid), process.pid):

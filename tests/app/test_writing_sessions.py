@@ -1,0 +1,60 @@
+"""Who waits for whom: everybody for a writer, and only on PostgreSQL not participants for each other."""
+
+from collections.abc import Iterator
+
+import pytest
+from sqlalchemy import select
+from sqlalchemy.exc import OperationalError
+
+from app.db import Database
+from app.settings import Settings
+from tests import databases
+
+
+@pytest.fixture
+def impatient(database: Database, settings: Settings, monkeypatch: pytest.MonkeyPatch) -> Iterator[Database]:
+    """Another program's way to the database; it gives up at once."""
+    monkeypatch.setattr("app.db.BUSY_TIMEOUT_S", 0.05)
+    other = Database(settings.sqlalchemy_url)
+    yield other
+    other.dispose()
+
+
+def may_write(database: Database, *, own_rows: bool) -> bool:
+    try:
+        with database.writing(own_rows=own_rows) as session:
+            session.scalar(select(1))
+    except OperationalError:
+        return False
+    return True
+
+
+@pytest.mark.parametrize("own_rows", [False, True])
+def test_nobody_writes_beside_a_writer(database: Database, impatient: Database, own_rows: bool) -> None:
+    with database.writing() as session:
+        session.scalar(select(1))  # SQLite takes its lock with the first statement
+        assert not may_write(impatient, own_rows=own_rows)
+    assert may_write(impatient, own_rows=own_rows)
+
+
+def test_a_writer_waits_for_those_who_write_their_own_rows(database: Database, impatient: Database) -> None:
+    with database.writing(own_rows=True) as session:
+        session.scalar(select(1))
+        assert not may_write(impatient, own_rows=False)
+    assert may_write(impatient, own_rows=False)
+
+
+@pytest.mark.skipif(databases.SERVER is None, reason="SQLite has one writer at a time")
+def test_those_who_write_their_own_rows_do_not_wait_for_each_other(database: Database, impatient: Database) -> None:
+    with database.writing(own_rows=True) as session:
+        session.scalar(select(1))
+        assert may_write(impatient, own_rows=True)
+
+
+def test_a_name_is_claimed_by_one_at_a_time(database: Database, settings: Settings) -> None:
+    other = Database(settings.sqlalchemy_url)
+    with database.claiming("worker-1") as first, other.claiming("worker-1") as second, other.claiming("other") as third:
+        assert (first, second, third) == (True, database.is_sqlite, True)
+    with other.claiming("worker-1") as again:
+        assert again
+    other.dispose()
