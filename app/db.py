@@ -35,8 +35,8 @@ from sqlalchemy.orm import DeclarativeBase, Session, sessionmaker
 from app.errors import OncePerMinute
 
 BUSY_TIMEOUT_S = 15
-WRITING, NAMES = 1_347_310_157, 1_347_310_158
-"""Advisory locks of PostgreSQL: of whoever writes, and of names. Any numbers that no other program uses there."""
+WRITING, NAMES, AUDITING = 1_347_310_157, 1_347_310_158, 1_347_310_159
+"""Advisory locks of PostgreSQL: of whoever writes, of names, of the audit log. Numbers that no other program uses."""
 
 complaints = logging.getLogger("app.database")
 """For whoever could not reach the database and will try again, perhaps twice a second."""

@@ -14,7 +14,7 @@ from typing import NamedTuple
 from sqlalchemy import event, select, text, update
 from sqlalchemy.orm import Session, SessionTransaction
 
-from app.db import Database, now
+from app.db import AUDITING, Database, now
 from app.domain.people import AuditEvent
 from app.domain.studies import Participant, Study
 
@@ -34,8 +34,6 @@ BEGINNING = "0" * 64
 """What the first row has for the hash of the row before it."""
 _GONE = "somebody whose data are erased"
 _PENDING = "audit_events"
-_APPENDING = 1_347_310_157
-"""The number of a lock on PostgreSQL; any that no other program on the server uses."""
 
 
 class Head(NamedTuple):
@@ -145,15 +143,15 @@ def _sha256(canonical: list[str | int | None]) -> str:
 def _append(session: Session) -> None:
     """Chain what was recorded, as the last thing the transaction does: the lock is held for as short as can be.
 
-    On SQLite every writing transaction holds the lock anyway. On PostgreSQL writers of the audit log wait for each
-    other here and nowhere else, and hold nothing that they have yet to ask for.
+    Whoever writes is alone anyway, except participants who write rows of their own on PostgreSQL: should they be
+    recorded one day, they wait for each other here, and hold nothing that they have yet to ask for.
     """
     if session.in_nested_transaction() or not session.info[_PENDING]:
         return
     waiting, session.info[_PENDING] = session.info[_PENDING], []
     session.flush()
     if session.get_bind().dialect.name == "postgresql":
-        session.execute(text("SELECT pg_advisory_xact_lock(:key)"), {"key": _APPENDING})
+        session.execute(text("SELECT pg_advisory_xact_lock(:key)"), {"key": AUDITING})
     last = head(session)
     for _, new in waiting:
         new.id, new.previous_hash, new.subject_salt = last.row + 1, last.hash, secrets.token_hex(16)
