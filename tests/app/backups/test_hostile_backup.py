@@ -44,11 +44,6 @@ def folder(pristine: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(pristine, tmp_path / "backups" / pristine.name))
 
 
-@pytest.fixture
-def settings(tmp_path: Path) -> Settings:
-    return Settings(_env_file=None, data_dir=tmp_path / "data", database_url=None, backup_dir=None)
-
-
 def an_artefact(folder: Path) -> Path:
     return min(folder.glob("artefacts/*/*"))
 

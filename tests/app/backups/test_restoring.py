@@ -3,7 +3,6 @@
 import os
 import shutil
 import sqlite3
-from collections.abc import Iterator
 from contextlib import closing
 from functools import partial
 from pathlib import Path
@@ -14,7 +13,6 @@ from fastapi.testclient import TestClient
 from sqlalchemy import select
 
 from app import data_directory, upgrading
-from app.__main__ import migrate
 from app.data_directory import DirectoryBeingRestored, DirectoryInUse, RestoreInterrupted
 from app.db import Database, now
 from app.domain.preferences import LabelEvent
@@ -30,31 +28,7 @@ from app.settings import Settings
 from app.storage import ArtefactStore
 from tests import backed_up
 from tests.app import test_upgrading
-from tests.app.test_backups import counted_steps, die_at, in_a_process
-
-
-@pytest.fixture
-def settings(tmp_path: Path) -> Settings:
-    return Settings(_env_file=None, data_dir=tmp_path / "data", database_url=None, backup_dir=None)
-
-
-@pytest.fixture
-def database(settings: Settings) -> Iterator[Database]:
-    migrate(settings)
-    database = Database(settings.sqlalchemy_url)
-    yield database
-    database.dispose()
-
-
-@pytest.fixture
-def store(settings: Settings) -> ArtefactStore:
-    return ArtefactStore(settings.data_dir / "artefacts")
-
-
-@pytest.fixture
-def people(database: Database, store: ArtefactStore) -> list[Participant]:
-    with database.writing() as session:
-        return backed_up.fill(session, store)
+from tests.app.backups.test_backups import counted_steps, die_at, in_a_process
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ import sqlite3
 import stat
 import threading
 from collections import namedtuple
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import closing
 from functools import partial
 from itertools import count
@@ -18,7 +18,7 @@ from pathlib import Path
 import pytest
 from sqlalchemy import text
 
-from app.__main__ import main, migrate
+from app.__main__ import main
 from app.db import Database, now
 from app.domain.studies import Participant
 from app.services.backups import layout, making, restoring
@@ -28,30 +28,6 @@ from app.settings import Settings
 from app.storage import ArtefactStore
 from tests import backed_up
 from tests.waiting import PATIENCE_S
-
-
-@pytest.fixture
-def settings(tmp_path: Path) -> Settings:
-    return Settings(_env_file=None, data_dir=tmp_path / "data", database_url=None, backup_dir=None)
-
-
-@pytest.fixture
-def database(settings: Settings) -> Iterator[Database]:
-    migrate(settings)
-    database = Database(settings.sqlalchemy_url)
-    yield database
-    database.dispose()
-
-
-@pytest.fixture
-def store(settings: Settings) -> ArtefactStore:
-    return ArtefactStore(settings.data_dir / "artefacts")
-
-
-@pytest.fixture
-def people(database: Database, store: ArtefactStore) -> list[Participant]:
-    with database.writing() as session:
-        return backed_up.fill(session, store)
 
 
 @pytest.fixture
