@@ -49,6 +49,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     _add_backups(commands)
     chosen = vars(parser.parse_args(arguments))
     act, _ = chosen.pop("act"), chosen.pop("command")
+    if act is not web:  # which writes its log in its own way
+        logging.basicConfig(level=logging.WARNING, format="%(message)s")
     try:
         settings = Settings()
         keep_private(settings)
@@ -292,5 +294,4 @@ _COMMANDS: dict[str, Callable[[Settings], int]] = {
 }
 
 if __name__ == "__main__":
-    logging.basicConfig(level=logging.WARNING, format="%(message)s")
     sys.exit(main())

@@ -10,7 +10,7 @@ import os
 import sqlite3
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, ClassVar
@@ -149,7 +149,10 @@ class Database:
             try:
                 yield bool(claimed)
             finally:
-                connection.invalidate()  # which lets go of the name, even if the server has gone meanwhile
+                if claimed:
+                    with suppress(OperationalError):  # the server has gone meanwhile, and the name with it
+                        connection.execute(select(func.pg_advisory_unlock(*key)))
+                connection.invalidate()
 
     def watch(self) -> "Watch":
         """Tells from now on whether anybody has written."""

@@ -40,7 +40,7 @@ def write_to_stderr(form: LogFormat, level: int) -> None:
     handler.setFormatter(
         JsonLines() if form is LogFormat.JSON else logging.Formatter("%(asctime)s %(message)s", "%H:%M:%S")
     )
-    logging.basicConfig(level=level, handlers=[handler], force=True)
+    logging.basicConfig(level=level, handlers=[handler])
 
 
 class JsonLines(logging.Formatter):

@@ -96,7 +96,10 @@ RUN: dict[str, str | Elsewhere | OnlyParsed] = {
     "worker speed-weight": "--scenarios 1",
     "worker start-posture": "--restarts 50",
     "advice_to_stop": ROLLOUTS,
-    "backups": "--trials 1 --people 1 --answers 10",
+    "backups": Elsewhere(
+        "tests/app/test_backup_drill.py::"
+        "test_a_restored_studio_has_every_answer_that_was_acknowledged_before_the_backup_began"
+    ),
     "api_pages": "--people 1 --answers 20",
     "chosen_modes": ROLLOUTS,
     "comparison_report": "results/paper_form",

@@ -155,7 +155,7 @@ def stamp(settings: Settings) -> None:
     """The tables are there without migrations; commands migrate first."""
     config = Config()
     config.set_main_option("script_location", "migrations")
-    config.set_main_option("sqlalchemy.url", settings.sqlalchemy_url)
+    config.set_main_option("sqlalchemy.url", settings.sqlalchemy_url.replace("%", "%%"))
     command.stamp(config, "head")
 
 
