@@ -46,11 +46,12 @@ types: $(VENV)/dev.stamp ## Static types, strict
 contracts: $(VENV)/dev.stamp ## Who may import whom
 	$(VENV)/bin/lint-imports
 
+# One thread each: processes whose libraries take every core spend their time waiting for each other.
 pytest: $(VENV)/dev.stamp browser ## The test suite
-	$(PY) -m pytest -n 3 --dist loadfile --no-loadscope-reorder
+	OMP_NUM_THREADS=1 $(PY) -m pytest -n 3 --dist loadfile --no-loadscope-reorder
 
 pytest-postgresql: $(VENV)/dev.stamp postgresql ## Tests that use a database, on PostgreSQL (ARGS="tests/app -n 2": others)
-	$(PY) -m tests.on_postgresql $(ARGS)
+	OMP_NUM_THREADS=1 $(PY) -m tests.on_postgresql $(ARGS)
 
 postgresql: ## PostgreSQL for the tests (Debian package)
 	@command -v initdb >/dev/null || ls /usr/lib/postgresql/*/bin/initdb >/dev/null 2>&1 || { \
