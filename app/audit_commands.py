@@ -21,6 +21,8 @@ from app.settings import Settings
 LARGEST_BUNDLE_BYTES = 256 << 20
 MOST_FAULTS_SAID = 20
 _BUNDLE_FORMAT = "pbarl-studio-bundle-signature"
+_MALFORMED = (*unpacking.UNREADABLE, ValueError, TypeError, AttributeError, RecursionError)
+"""What a file raises that is of no form of ours, such as a manifest that is a list."""
 
 
 class FileUnreadable(AppError):
@@ -105,7 +107,7 @@ def signing_key(settings: Settings) -> int:
 
 
 def check_signature(settings: Settings, file: Path, seal_key: str) -> int:
-    """Say whether a bundle, an archive, a receipt or a head is unchanged, and whose key has signed it."""
+    """Say whether a bundle, archive, receipt or head is unchanged and whose key signed it; 0 for trusted keys only."""
     if not file.is_file():
         raise AppError(f"There is no file {file}.")
     try:
@@ -113,10 +115,10 @@ def check_signature(settings: Settings, file: Path, seal_key: str) -> int:
     except signing.SignatureBroken as error:
         say(f"The signature is broken. {error}")
         return 1
-    except (*unpacking.UNREADABLE, ValueError, RecursionError) as error:
+    except _MALFORMED as error:
         raise FileUnreadable from error
     say(signing.in_words(signer, settings))
-    return 0
+    return 0 if signing.is_trusted(signer, settings) else 1
 
 
 def _of_document(stored: bytes) -> str | None:

@@ -108,6 +108,11 @@ def fingerprint_of(public_hex: str) -> str:
     return hashlib.sha256(bytes.fromhex(public_hex)).hexdigest()
 
 
+def is_trusted(signer: str | None, settings: Settings) -> bool:
+    """Whether it is this installation's own key, or one that its operator has named."""
+    return signer is not None and signer in {load(settings).fingerprint, *settings.trusted_fingerprints}
+
+
 def in_words(signer: str | None, settings: Settings) -> str:
     """What a fingerprint, or that there is none, means here."""
     if signer is None:

@@ -318,8 +318,9 @@ def test_an_export_is_checked_without_the_database(chain: Rows, database: Databa
     changed = [line.replace("answers viewed", "answers vjewed", 1) for line in lines]
     assert len(lookup.check_lines(changed).faults) == 14
     assert lookup.check_lines([line for line in lines if '"receipt"' not in line]).faults
-    with pytest.raises(lookup.LogUnreadable):
-        lookup.check_lines(["{}\n"])
+    for malformed in ("{}", "[]", "3", "[" * 100_000):
+        with pytest.raises(lookup.LogUnreadable):
+            lookup.check_lines([malformed])
 
 
 def test_rows_of_before_are_chained_and_name_nobody_who_is_gone(tmp_path: Path) -> None:

@@ -195,3 +195,48 @@ def test_commands_show_the_key_and_check_files(
     for stored in (b"", b"[]", b"{}", b"PK\x03\x04"):
         receipt.write_bytes(stored)
         assert run(settings, "check-signature", str(receipt)) == 1
+
+
+def test_nobody_s_signature_and_a_stranger_s_are_no_success(
+    settings: Settings, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Strip the signature, or sign with a key of your own: a script that asks must not take it for good."""
+    stranger = signing.load(settings.model_copy(update={"data_dir": tmp_path / "elsewhere"}))
+    document = {"format": "pbarl-studio-erasure-receipt", "files": 3}
+    file = tmp_path / "receipt.json"
+    for stored, said in ((document, "It is not signed"), (stranger.signed(document), "does not know")):
+        file.write_text(json.dumps(stored))
+        assert run(settings, "check-signature", str(file)) == 1
+        assert said in capsys.readouterr().out
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("TRUSTED_KEYS", stranger.fingerprint)
+        assert run(settings, "check-signature", str(file)) == 0
+
+
+DEEP = "[" * 100_000
+
+
+@pytest.mark.parametrize(
+    "members",
+    [
+        {"manifest.json": "[]"},
+        {"manifest.json": '"x"'},
+        {"manifest.json": DEEP},
+        {"manifest.json": '{"files": []}'},
+        {"manifest.json": '{"files": 3}'},
+        {"manifest.json": '{"files": {"a": 3}}', "a": "x"},
+        {"manifest.json": '{"files": {}}', "signature.json": "[]"},
+        {"manifest.json": '{"files": {}}', "signature.json": "3"},
+        {"manifest.json": '{"files": {}}', "signature.json": DEEP},
+        {},
+    ],
+)
+def test_a_malformed_file_is_told_in_words(
+    settings: Settings, tmp_path: Path, members: dict[str, str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "bundle.zip"
+    with zipfile.ZipFile(file, "w") as packed_by_hand:
+        for name, content in members.items():
+            packed_by_hand.writestr(name, content)
+    assert run(settings, "check-signature", str(file)) == 1
+    assert "it is damaged" in capsys.readouterr().out

@@ -116,7 +116,7 @@ def check_lines(lines: Iterable[str], noted_hash: str | None = None) -> Outcome:
             else:
                 rows.append(AuditEvent(**{**read, "at": datetime.fromisoformat(read["at"])}))
         return chain_check.check_rows(rows, kept, noted_hash)
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         raise LogUnreadable from error
 
 
