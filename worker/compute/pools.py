@@ -33,6 +33,10 @@ _LOOK_S = 0.5
 _PARENT_CHECK_S = 1.0
 
 
+_FORKS = multiprocessing.get_context("forkserver")
+_FORKS.set_forkserver_preload(["worker.compute.fork_server"])
+
+
 class Lane(StrEnum):
     """Which processes do the work."""
 
@@ -218,15 +222,17 @@ class _Seat:
 
     def _at_work(self) -> tuple[multiprocessing.process.BaseProcess, Connection]:
         if self._process is None or self._pipe is None or not self._process.is_alive():
-            with self._changing:  # nobody is started once all have been told to leave
-                if self._closing.is_set():
-                    raise EOFError
-                spawn = multiprocessing.get_context("spawn")
-                ours, theirs = spawn.Pipe()
-                with theirs:
-                    process = spawn.Process(target=_serve, args=(theirs, os.getpid(), self._niceness))
-                    process.start()
+            if self._closing.is_set():
+                raise EOFError
+            ours, theirs = _FORKS.Pipe()
+            with theirs:
+                process = _FORKS.Process(target=_serve, args=(theirs, self._niceness))
+                process.start()  # waits for seconds while the server that forks is new
+            with self._changing:
                 self._process, self._pipe = process, ours
+                if self._closing.is_set():  # all have been told to leave meanwhile
+                    process.kill()
+                    raise EOFError
         return self._process, self._pipe
 
     def leave(self) -> None:
@@ -245,9 +251,9 @@ class _Seat:
             self._process.kill()
 
 
-def _serve(pipe: Connection, parent: int, niceness: int) -> None:
+def _serve(pipe: Connection, niceness: int) -> None:
     """The life of a compute process: one call after the other until nobody asks any more."""
-    _settle_in(parent, niceness)
+    _settle_in(niceness)
     while True:
         try:
             request = pipe.recv_bytes()
@@ -276,17 +282,15 @@ def _as_bytes(error: BaseException) -> bytes:
     return pickle.dumps(outcome)
 
 
-def _settle_in(parent: int, niceness: int) -> None:
+def _settle_in(niceness: int) -> None:
     """Run once in each new process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's business
-    threading.Thread(target=_leave_with, args=(parent,), daemon=True).start()
+    threading.Thread(target=_leave_with, args=(os.getppid(),), daemon=True).start()
     os.nice(niceness)
-    for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ[variable] = "1"
 
 
-def _leave_with(parent: int) -> None:
-    """End this process when its parent is gone (prctl's death signal would follow the thread that started us)."""
-    while os.getppid() == parent:
+def _leave_with(fork_server: int) -> None:
+    """End this process when the server that forked it is gone, which goes with the worker, even one that was killed."""
+    while os.getppid() == fork_server:
         threading.Event().wait(_PARENT_CHECK_S)
     os._exit(1)

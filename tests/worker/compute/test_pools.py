@@ -50,6 +50,13 @@ def die_by_the_end_of(number: int, started: Path) -> int:
     return number
 
 
+def at_the_start() -> tuple[bool, int, int]:
+    """Whether torch is there already, the threads it computes in, and the memory that this process has for itself."""
+    loaded = sys.modules.get("torch")
+    rows = dict(line.split(":", 1) for line in Path("/proc/self/smaps_rollup").read_text().splitlines()[1:])
+    return loaded is not None, loaded.get_num_threads() if loaded else 0, int(rows["Private_Dirty"].split()[0]) * 1024
+
+
 def fail_with_a_lock() -> None:
     raise RuntimeError("no use", threading.Lock())
 
@@ -103,6 +110,14 @@ def test_only_the_job_whose_process_died_is_lost(compute: Compute, tmp_path: Pat
     assert outcomes[1] == 1
 
 
+def test_processes_begin_with_everything_loaded_in_one_thread_and_share_its_memory(compute: Compute) -> None:
+    for lane in (Lane.CLIPS, Lane.LEARNING):
+        is_loaded, threads, own_memory_bytes = compute.run(lane, nothing, at_the_start)
+        assert is_loaded
+        assert threads == 1
+        assert own_memory_bytes < 160 * 2**20, "torch alone is more"
+
+
 def test_a_process_that_cannot_be_started_is_reported_and_tried_again_by_the_next_job(
     compute: Compute, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -110,7 +125,7 @@ def test_a_process_that_cannot_be_started_is_reported_and_tried_again_by_the_nex
         raise OSError(errno.ENOMEM, "Cannot allocate memory")
 
     with monkeypatch.context() as machine:
-        machine.setattr("multiprocessing.context.SpawnProcess.start", no_memory)
+        machine.setattr("multiprocessing.context.ForkServerProcess.start", no_memory)
         with pytest.raises(ComputeLost):
             compute.run(Lane.LEARNING, nothing, square, 2)
     assert compute.run(Lane.LEARNING, nothing, square, 3) == 9

@@ -37,19 +37,28 @@ def worker(settings: Settings, database: Database) -> Iterator[Worker]:
     environment = databases.environment(settings.data_dir, COMPUTE_PROCESSES="1")
     process = subprocess.Popen([sys.executable, "-m", "worker", "run"], env=environment, preexec_fn=hear_hangups)
     yield process
-    for pid in (*descendants(process.pid), process.pid):
+    for pid in (*compute_processes(process.pid), *fork_servers(process.pid), process.pid):
         if not gone(pid):
             os.kill(pid, signal.SIGKILL)
     process.wait()
 
 
-def descendants(pid: int) -> list[int]:
-    """Its compute processes, whichever of its threads has started them."""
+def fork_servers(pid: int) -> list[int]:
+    """The process that forks its compute processes, if it has begun."""
+    return [child for child in children(pid) if "forkserver" in Path(f"/proc/{child}/cmdline").read_text()]
+
+
+def compute_processes(pid: int) -> list[int]:
+    """Those it has had forked."""
+    return [child for server in fork_servers(pid) for child in children(server)]
+
+
+def children(pid: int) -> list[int]:
+    """Whichever of its threads has started them."""
     found = []
     for stat in Path("/proc").glob("[0-9]*/stat"):
         with suppress(OSError):
-            mine = int(stat.read_text().rsplit(")", 1)[1].split()[1]) == pid
-            if mine and "spawn_main" in stat.with_name("cmdline").read_text():
+            if int(stat.read_text().rsplit(")", 1)[1].split()[1]) == pid:
                 found.append(int(stat.parent.name))
     return found
 
@@ -65,8 +74,8 @@ def is_present(database: Database) -> bool:
 
 
 def stops(process: Worker, number: int = signal.SIGTERM) -> bool:
-    """Whether it has ended in time, its compute processes as well."""
-    computing = descendants(process.pid)
+    """Whether it has ended in time, its compute processes and what forks them as well."""
+    computing = [*fork_servers(process.pid), *compute_processes(process.pid)]
     process.send_signal(number)
     try:
         process.wait(AT_MOST_S)
@@ -88,16 +97,26 @@ def test_while_it_films(worker: Worker, database: Database, number: int) -> None
 
 
 def test_while_its_compute_processes_are_stopped(worker: Worker, database: Database) -> None:
-    assert until(lambda: is_filming(database) and len(descendants(worker.pid)) > 0)
-    for pid in descendants(worker.pid):
+    assert until(lambda: is_filming(database) and len(compute_processes(worker.pid)) > 0)
+    for pid in compute_processes(worker.pid):
         os.kill(pid, signal.SIGSTOP)
     assert stops(worker)
 
 
 def test_while_its_compute_processes_are_killed(worker: Worker, database: Database) -> None:
-    assert until(lambda: is_filming(database) and len(descendants(worker.pid)) > 0)
-    for pid in descendants(worker.pid):
+    assert until(lambda: is_filming(database) and len(compute_processes(worker.pid)) > 0)
+    for pid in compute_processes(worker.pid):
         os.kill(pid, signal.SIGKILL)
+    assert stops(worker)
+
+
+def test_while_what_forks_its_compute_processes_is_killed(worker: Worker, database: Database) -> None:
+    assert until(lambda: is_filming(database) and len(compute_processes(worker.pid)) > 0)
+    (server,) = fork_servers(worker.pid)
+    orphans = compute_processes(worker.pid)
+    os.kill(server, signal.SIGKILL)
+    assert until(lambda: all(gone(pid) for pid in orphans))
+    assert until(lambda: len(compute_processes(worker.pid)) > 0), "there is another, and it goes on"
     assert stops(worker)
 
 

@@ -35,7 +35,7 @@ def programs_in(directory: Path) -> dict[str, int]:
             command, environment = (process / "cmdline").read_text(), (process / "environ").read_text()
         except OSError:
             continue
-        name = next((name for name in ("app\0web", "worker\0run", "spawn_main") if name in command), None)
+        name = next((name for name in ("app\0web", "worker\0run", "forkserver") if name in command), None)
         if name is not None and f"DATA_DIR={directory}\0" in environment:
             found[name] = int(process.name)
     return found
@@ -77,7 +77,7 @@ def test_a_signal_that_ends_the_command_ends_its_web_server_and_its_worker(
 def test_a_rehearsal_that_is_told_to_stop_takes_its_studio_along(
     command: "subprocess.Popen[bytes]", tmp_path: Path
 ) -> None:
-    assert until(lambda: programs_in(tmp_path).keys() >= {"app\0web", "worker\0run", "spawn_main"}), "it films by now"
+    assert until(lambda: programs_in(tmp_path).keys() >= {"app\0web", "worker\0run", "forkserver"}), "it films by now"
     command.terminate()
     assert command.wait(PATIENCE_S) == 130
     assert until(lambda: programs_in(tmp_path) == {})
