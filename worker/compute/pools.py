@@ -110,7 +110,7 @@ class Compute:
         return False
 
     def warm_up(self, lane: Lane, function: Callable[[], object]) -> None:
-        """Have every process of a lane import what it will need, without waiting for it."""
+        """Have every process of a lane make what it will need, without waiting for it."""
         for _ in range(self._sizes[lane]):
             self._submit(lane, function)
 

@@ -178,8 +178,7 @@ class _Rounds:
         for study in answered:
             if study.id not in self._prepared:
                 self._prepared.add(study.id)
-                for lane in (Lane.REWARDS, Lane.LEARNING):
-                    lanes.compute.warm_up(lane, partial(learning.warm_up, study.task))
+                lanes.compute.warm_up(Lane.REWARDS, partial(learning.warm_up, study.task))
                 threading.Thread(target=self._make_references, args=(study.task, study.settings), daemon=True).start()
 
     def _make_references(self, task: str, settings: StudySettings) -> None:
