@@ -13,7 +13,7 @@ from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from app import audit_commands, data_directory, logs, signing, upgrading
-from app.db import Database
+from app.db import Database, now
 from app.domain.studies import Study
 from app.errors import EXPLAINED, AppError, in_words
 from app.installed_tasks import catalogue
@@ -22,6 +22,7 @@ from app.paths import DOCS
 from app.programs import Programs, say
 from app.services import audit
 from app.services.accounts import accounts
+from app.services.alerting import messages
 from app.services.archives import demo_archive as demo
 from app.services.archives import study_import
 from app.services.backups import layout, making, restoring, schedule
@@ -185,6 +186,14 @@ def _contents(backup: layout.Backup) -> str:
     return f"made {manifest.made_at:%Y-%m-%d %H:%M:%S} UTC; {counted}, {size}"
 
 
+def test_alert(settings: Settings) -> int:
+    """Send a message to ALERT_WEBHOOK and ALERT_MAIL_TO, to see whether it comes."""
+    words = "This is a test: messages about troubles come this way."
+    messages.send(settings, messages.Message(settings.base_url, [messages.Line("test", words, now())]))
+    say("Sent.")
+    return 0
+
+
 def demo_study(settings: Settings, task: str) -> int:
     """Make a demo study of a task with one participant and print the personal link."""
     migrate(settings)
@@ -291,6 +300,7 @@ _COMMANDS: dict[str, Callable[[Settings], int]] = {
     "link": participant_link,
     "dictionary": dictionary,
     "scrub": scrub,
+    "test-alert": test_alert,
 }
 
 if __name__ == "__main__":

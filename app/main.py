@@ -12,6 +12,7 @@ from prometheus_client import CollectorRegistry
 from app import data_directory
 from app.db import Database
 from app.paths import STATIC
+from app.services.alerting import alerts
 from app.settings import Settings
 from app.storage import ArtefactStore
 from app.web import media, metrics
@@ -115,7 +116,11 @@ def create_routes(https: bool) -> FastAPI:
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         studio: Studio = app.state.studio
-        with data_directory.shared(studio.settings.data_dir), live.closing_on_signals(studio.closing):
+        with (
+            data_directory.shared(studio.settings.data_dir),
+            live.closing_on_signals(studio.closing),
+            alerts.watching(studio.settings, studio.database, studio.store),
+        ):
             yield
         studio.hashing.close()
         studio.hashing_for_known.close()

@@ -3,6 +3,7 @@
 import re
 from ipaddress import ip_network
 from pathlib import Path
+from urllib.parse import urlsplit
 
 from pydantic import Field, field_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
@@ -34,6 +35,11 @@ class Settings(BaseSettings):
     metrics_token: str | None = Field(default=None, min_length=16, description="Bearer token for /metrics.")
     compute_processes: int = Field(default=2, ge=1, description="Processes for simulation and training.")
 
+    alert_webhook: str | None = Field(default=None, description="Address that gets troubles as JSON.")
+    alert_mail_to: str | None = Field(default=None, description="Who gets troubles by mail, separated by commas.")
+    alert_mail_from: str = Field(default="pbarl-studio@localhost", description="Sender of those mails.")
+    smtp_url: str = Field(default="smtp://localhost", description="Mail server: smtps://user:password@host:port.")
+
     backup_dir: Path | None = Field(default=None, description="Where the worker puts backups; default: it makes none.")
     backup_every_hours: int = Field(default=24, ge=1, description="Time between two backups of the worker.")
     backups_kept: int = Field(default=7, ge=1, description="So many backups stay in BACKUP_DIR, the newest.")
@@ -50,6 +56,22 @@ class Settings(BaseSettings):
         if not colon or scheme not in {"postgresql+psycopg", "sqlite", "sqlite+pysqlite"}:
             raise ValueError("Write postgresql+psycopg://user:password@host/database, or leave it out for SQLite.")
         return f"{scheme}://{rest}"
+
+    @field_validator("alert_webhook")
+    @classmethod
+    def _address_of_webhook(cls, url: str | None) -> str | None:
+        if url and urlsplit(url).scheme not in {"http", "https"}:
+            raise ValueError("Write https://host/path.")
+        return url or None
+
+    @field_validator("smtp_url")
+    @classmethod
+    def _address_of_mail_server(cls, url: str) -> str:
+        """A wrong port is told now, not when something is wrong."""
+        parts = urlsplit(url)
+        if parts.scheme not in {"smtp", "smtps"} or not parts.hostname or parts.port == 0:
+            raise ValueError("Write smtps://user:password@host:port, or smtp:// for a server that offers STARTTLS.")
+        return url
 
     @field_validator("trusted_proxies")
     @classmethod

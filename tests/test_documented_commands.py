@@ -75,6 +75,7 @@ RUN: dict[str, str | Elsewhere | OnlyParsed] = {
     "app restore": Elsewhere("tests/app/backups/test_backups.py::test_the_commands_say_what_was_done"),
     "app scrub": "",
     "app signing-key": "",
+    "app test-alert": Elsewhere("tests/app/test_alerts.py::test_a_test_message_shows_whether_it_comes"),
     "app up": Elsewhere("tests/app/test_start_and_stop.py::test_the_first_start_prints_all_that_is_needed"),
     "app web": Elsewhere("tests/app/test_logs.py::test_the_web_server_alone_writes_nothing_but_json"),
     "app verify-audit": Elsewhere("tests/app/test_audit_chain.py::test_the_command_says_which_row"),

@@ -138,3 +138,17 @@ class WorkerPresence(Base):
 
     name: Mapped[str] = mapped_column(String(80), primary_key=True)
     last_seen_at: Mapped[datetime] = mapped_column(default=now)
+
+
+class Alert(Base):
+    """A trouble of the installation that its operator is told of; deleted when they know that it is over."""
+
+    __tablename__ = "alert"
+
+    trouble: Mapped[str] = mapped_column(String(80), primary_key=True)
+    words: Mapped[str] = mapped_column(Text)
+    began_at: Mapped[datetime]
+    told_at: Mapped[datetime | None]
+    over_at: Mapped[datetime | None]
+    due_at: Mapped[datetime]
+    """When it is to be told, for the first time or again."""

@@ -1,0 +1,1 @@
+"""Tells the operator what is wrong."""
