@@ -9,7 +9,7 @@ VENV := .venv
 PY := $(VENV)/bin/python
 PIP := $(PY) -m pip --disable-pip-version-check --quiet
 
-.PHONY: help run link demo rehearse test lint types contracts pytest pytest-postgresql browser postgresql migrate reset-password benchmark clean
+.PHONY: help run link demo rehearse test lint types contracts pytest pytest-postgresql validate browser postgresql migrate reset-password benchmark clean
 
 help: ## List the commands
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-16s %s\n", $$1, $$2}'
@@ -52,6 +52,11 @@ pytest: $(VENV)/dev.stamp browser ## The test suite
 
 pytest-postgresql: $(VENV)/dev.stamp postgresql ## Tests that use a database, on PostgreSQL (ARGS="tests/app -n 2": others)
 	OMP_NUM_THREADS=1 $(PY) -m tests.on_postgresql $(ARGS)
+
+validate: $(VENV)/dev.stamp browser ## Run the suite and write build/validation.html: what is promised, and what was shown
+	@mkdir -p build
+	-OMP_NUM_THREADS=1 $(PY) -m pytest -n 3 --dist loadfile --no-loadscope-reorder --junitxml=build/validation.xml
+	$(PY) -m tests.validation build/validation.xml build/validation.html
 
 postgresql: ## PostgreSQL for the tests (Debian package)
 	@command -v initdb >/dev/null || ls /usr/lib/postgresql/*/bin/initdb >/dev/null 2>&1 || { \
