@@ -193,7 +193,9 @@ body { font: 11pt/1.4 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto
 table { border-collapse: collapse; width: 100%; margin: .5rem 0 1.5rem; }
 th, td { text-align: left; vertical-align: top; padding: .3rem .6rem; border-bottom: 1px solid #ccc; }
 td { overflow-wrap: anywhere; }
-td:last-child { white-space: nowrap; overflow-wrap: normal; }
+td:first-child, td:last-child { overflow-wrap: normal; }
+td:nth-child(4) { white-space: nowrap; }
+td:nth-child(3) { min-width: 20rem; }
 td:nth-child(n+3) { font-size: 9.5pt; }
 tr { break-inside: avoid; }
 h2 { margin-top: 2rem; }
