@@ -95,7 +95,7 @@ def make_studio(settings: Settings) -> Studio:
     return Studio(
         settings=settings,
         database=database,
-        store=ArtefactStore(settings.data_dir / "artefacts"),
+        store=ArtefactStore.of(settings),
         readiness=Readiness(database, settings.data_dir),
         session_queue=SessionQueue(database),
         login_attempts=LoginAttempts(settings.login_attempts_per_minute),

@@ -13,7 +13,7 @@ from app.domain.models import ModelKind
 from app.domain.studies import Study
 from app.settings import Settings
 from app.storage import ArtefactStore
-from tests import factories
+from tests import factories, stored_files
 from tests.app.conftest import TakingPart
 
 
@@ -21,11 +21,6 @@ from tests.app.conftest import TakingPart
 def clip(taking_part: TakingPart) -> Clip:
     with taking_part.database.reading() as session:
         return session.get_one(Clip, taking_part.queries[0].left_clip_id)
-
-
-def damage(path: Path) -> None:
-    """Another content of the same length."""
-    path.write_bytes(path.read_bytes()[::-1])
 
 
 def text_of(page: str) -> str:
@@ -38,7 +33,7 @@ def test_a_damaged_clip_is_never_served_and_never_kept(
 ) -> None:
     for sha256, kind in ((clip.video_sha256, "mp4"), (clip.poster_sha256, "jpg")):
         assert taking_part.browser.get(f"/media/{sha256}.{kind}").status_code == 200
-        damage(store.path(sha256))
+        stored_files.damage(store, sha256)
         answer = taking_part.browser.get(f"/media/{sha256}.{kind}")
         assert (answer.status_code, answer.headers["cache-control"]) == (404, "no-store")
 
@@ -48,7 +43,7 @@ def test_a_participant_goes_on_with_the_next_pair_and_loses_no_answer(
 ) -> None:
     first, second, third = taking_part.queries[:3]
     assert taking_part.turn().json()["pair"]["query_id"] == first.id
-    damage(store.path(clip.video_sha256))
+    stored_files.damage(store, clip.video_sha256)
     assert taking_part.turn().json()["pair"]["query_id"] == second.id
     assert taking_part.answer(first).status_code == 200, "whoever had seen it may still say so"
     assert taking_part.answer(second).json()["pair"]["query_id"] == third.id
@@ -60,11 +55,11 @@ def test_an_experimenter_reads_what_is_damaged_and_what_to_do(
 ) -> None:
     slug = taking_part.study.slug
     assert "damaged" not in experimenter.get(f"/studies/{slug}").text
-    damage(store.path(clip.video_sha256))
+    stored_files.damage(store, clip.video_sha256)
     taking_part.turn()
     told = text_of(experimenter.get(f"/studies/{slug}").text)
     assert "1 stored file is damaged or missing. The worker makes it again by itself" in told
-    damage(store.path(study_bundle))
+    stored_files.damage(store, study_bundle)
     answer = experimenter.get(f"/studies/{slug}/participants/P01/bundles/1.zip")
     assert answer.status_code == 404
     told = text_of(experimenter.get("/studies").text)
@@ -74,11 +69,11 @@ def test_an_experimenter_reads_what_is_damaged_and_what_to_do(
 def test_the_banner_goes_when_the_file_is_back(
     experimenter: TestClient, taking_part: TakingPart, clip: Clip, store: ArtefactStore
 ) -> None:
-    content = store.path(clip.video_sha256).read_bytes()
-    store.path(clip.video_sha256).unlink()
+    content = store.read(clip.video_sha256)
+    stored_files.lose(store, clip.video_sha256)
     taking_part.turn()
     assert "damaged or missing" in experimenter.get("/studies").text
-    store.path(clip.video_sha256).write_bytes(content)
+    stored_files.overwrite(store, clip.video_sha256, content)
     assert "damaged or missing" not in experimenter.get("/studies").text
     assert taking_part.turn().json()["pair"]["query_id"] == taking_part.queries[0].id
 
@@ -117,9 +112,9 @@ def test_a_scrub_reads_everything_and_says_what_is_wrong(
         bundle = factories.make_bundle(session, store, model)
     assert main(["scrub"]) == 0
     assert "All files are whole." in capsys.readouterr().out
-    damage(store.path(clips[0].video_sha256))
-    store.path(clips[1].poster_sha256).unlink()
-    damage(store.path(bundle.artefact_sha256))
+    stored_files.damage(store, clips[0].video_sha256)
+    stored_files.lose(store, clips[1].poster_sha256)
+    stored_files.damage(store, bundle.artefact_sha256)
     for _ in range(2):  # a second scrub says the same
         assert main(["scrub"]) == 1
         said = capsys.readouterr().out

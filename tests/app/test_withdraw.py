@@ -101,7 +101,7 @@ def leave_traces(database: Database, store: ArtefactStore, participant_id: int) 
                 ),
             ]
         )
-        unfinished = store.unfinished(person.id)
+        unfinished = store.unfinished.folder(person.id)
         unfinished.mkdir(parents=True)
         (unfinished / "checkpoint").write_text(marked("checkpoint"))
 

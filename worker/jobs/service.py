@@ -19,6 +19,7 @@ from app import data_directory, logs, signing
 from app.db import Database, Watch, complaints, now
 from app.domain.study_settings import StudySettings
 from app.errors import AppError, OncePerMinute
+from app.files.interface import StorageUnavailable
 from app.settings import Settings
 from app.storage import ArtefactStore, keep_private
 from worker.compute import learning, simulation
@@ -71,9 +72,9 @@ def run(settings: Settings) -> int:
         stop = Stop()
         compute = Compute(settings.compute_processes, stop.asked)
         stop.at_once = compute.kill
-        context = WorkerContext(
-            database, ArtefactStore(settings.data_dir / "artefacts"), compute, signing.load(settings)
-        )
+        store = ArtefactStore.of(settings)
+        store.files.require_usable()
+        context = WorkerContext(database, store, compute, signing.load(settings))
         runner = JobRunner(context, Lanes(compute))
         try:
             compute.warm_up(Lane.CLIPS, simulation.warm_up)
@@ -139,6 +140,8 @@ class _Rounds:
             self._backups.look()
         except OperationalError as error:
             complaints.warning("the database could not be reached, trying again: %s", error.orig)
+        except StorageUnavailable as error:
+            complaints.warning("stored files could not be reached, trying again: %s", error.__cause__)
 
     def _sign(self) -> None:
         if time.monotonic() - self._signed_at >= PRESENCE_S:
@@ -199,6 +202,8 @@ class _Rounds:
     def _refill(self, participant_id: int) -> None:
         try:
             query_selection.refill_queries(self._context, participant_id)
+        except StorageUnavailable:
+            raise
         except AppError as refusal:  # one study that cannot go on must not stop the others
             log.warning("participant %d gets no further pairs: %s", participant_id, refusal.message)
             self._refused.add(participant_id)

@@ -8,6 +8,7 @@ import errno
 import logging
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 from dbos import DBOS, DBOSConfiguredInstance
@@ -18,6 +19,8 @@ from app import logs
 from app.domain.models import RunKind
 from app.domain.studies import Participant, Study
 from app.errors import AppError
+from app.files.interface import StorageUnavailable
+from app.services.participants import withdrawal
 from worker.jobs.clips.evaluation_films import make_films
 from worker.jobs.clips.pool_clips import build_clips
 from worker.jobs.learning.baselines import train_method
@@ -82,10 +85,11 @@ class JobRunner(DBOSConfiguredInstance):
             log.info("%s done in %.1f s", job.key, time.monotonic() - started)
         except AppError as refusal:  # foreseen, and already in words for people
             log.warning("%s: %s", job.key, refusal.message)
-            _step("fail", self._fail, job.key, refusal.message)
+            _step("fail", self._fail, job.key, refusal.message, not isinstance(refusal, StorageUnavailable))
         except Exception as error:  # the worker's edge: one failed job must not stop the others
             if self._is_pointless(job):
                 log.info("%s is abandoned: the participant has withdrawn, or the study was deleted", job.key)
+                self._leave_nothing(job)
                 return
             log.exception("%s failed", job.key)
             _step("fail", self._fail, job.key, f"{type(error).__name__}: {error}", not _is_the_machine_s(error))
@@ -95,6 +99,16 @@ class JobRunner(DBOSConfiguredInstance):
     def _is_pointless(self, job: Job) -> bool:
         with self.context.database.reading() as session:
             return _has_withdrawn(session, job)
+
+    def _leave_nothing(self, job: Job) -> None:
+        """Another worker may have erased the person's last traces while this one was still at work for them."""
+        stored, store = self.stored.pop(job.key, set()), self.context.store
+        with suppress(StorageUnavailable):  # what is left then goes after a day, as what nobody refers to
+            with self.context.database.writing() as session:
+                for sha256 in stored - withdrawal.in_use(session, stored):
+                    store.delete(sha256)
+            if job.participant_id is not None:
+                store.unfinished.forget(store.unfinished.folder(job.participant_id))
 
     def _begin(self, arguments: dict[str, Any]) -> int | None:
         """The run's id; None when there is nothing to be done, because an earlier life of this job has finished it."""
