@@ -56,7 +56,7 @@ class Settings(BaseSettings):
     @classmethod
     def _known_storage(cls, url: str | None) -> str | None:
         """A bucket of an S3-compatible server; which server, and with which keys, AWS's usual variables say."""
-        if url and not re.fullmatch(r"s3://[a-z0-9][a-z0-9.-]{1,61}[a-z0-9](/[A-Za-z0-9._-]+)*/?", url):
+        if url and not re.fullmatch(r"s3://[a-z0-9][a-z0-9.-]{1,61}[a-z0-9](/[A-Za-z0-9_-][A-Za-z0-9._-]*)*/?", url):
             raise ValueError("Write s3://bucket or s3://bucket/prefix, or leave it out for the data directory.")
         return url.rstrip("/") if url else None
 

@@ -9,6 +9,7 @@ from app.files.interface import Stat
 from app.settings import Settings
 from app.storage import ArtefactDamaged, ArtefactMissing, ArtefactStore
 from tests import stored_files
+from tests.waiting import until
 
 
 @pytest.fixture
@@ -68,7 +69,7 @@ def test_what_is_damaged_is_set_aside_and_can_be_made_anew(store: ArtefactStore)
     assert store.put(b"a clip") == name
     assert store.read(name) == b"a clip"
     stored_files.overwrite(store, other, b"another clip")  # from a backup
-    assert store.lost() == {}
+    assert until(lambda: store.lost() == {})
 
 
 def test_what_is_damaged_does_not_keep_the_same_from_being_stored(store: ArtefactStore) -> None:

@@ -15,6 +15,7 @@ from app.settings import Settings
 from app.storage import ArtefactStore
 from tests import factories, stored_files
 from tests.app.conftest import TakingPart
+from tests.waiting import until
 
 
 @pytest.fixture
@@ -44,6 +45,7 @@ def test_a_participant_goes_on_with_the_next_pair_and_loses_no_answer(
     first, second, third = taking_part.queries[:3]
     assert taking_part.turn().json()["pair"]["query_id"] == first.id
     stored_files.damage(store, clip.video_sha256)
+    assert taking_part.browser.get(f"/media/{clip.video_sha256}.mp4").status_code == 404
     assert taking_part.turn().json()["pair"]["query_id"] == second.id
     assert taking_part.answer(first).status_code == 200, "whoever had seen it may still say so"
     assert taking_part.answer(second).json()["pair"]["query_id"] == third.id
@@ -56,7 +58,7 @@ def test_an_experimenter_reads_what_is_damaged_and_what_to_do(
     slug = taking_part.study.slug
     assert "damaged" not in experimenter.get(f"/studies/{slug}").text
     stored_files.damage(store, clip.video_sha256)
-    taking_part.turn()
+    taking_part.browser.get(f"/media/{clip.video_sha256}.mp4")
     told = text_of(experimenter.get(f"/studies/{slug}").text)
     assert "1 stored file is damaged or missing. The worker makes it again by itself" in told
     stored_files.damage(store, study_bundle)
@@ -71,10 +73,10 @@ def test_the_banner_goes_when_the_file_is_back(
 ) -> None:
     content = store.read(clip.video_sha256)
     stored_files.lose(store, clip.video_sha256)
-    taking_part.turn()
+    taking_part.browser.get(f"/media/{clip.video_sha256}.mp4")
     assert "damaged or missing" in experimenter.get("/studies").text
     stored_files.overwrite(store, clip.video_sha256, content)
-    assert "damaged or missing" not in experimenter.get("/studies").text
+    assert until(lambda: "damaged or missing" not in experimenter.get("/studies").text)
     assert taking_part.turn().json()["pair"]["query_id"] == taking_part.queries[0].id
 
 
@@ -100,7 +102,8 @@ def test_a_scrub_reads_everything_and_says_what_is_wrong(
     data_dir: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     main(["migrate"])
-    database, store = Database(Settings(_env_file=None).sqlalchemy_url), ArtefactStore(data_dir / "artefacts")
+    settings = Settings(_env_file=None)
+    database, store = Database(settings.sqlalchemy_url), ArtefactStore.of(settings)
     with database.writing() as session:
         study = factories.make_study(session, "Pilot")
         person, _ = factories.make_participant(session, study)

@@ -19,6 +19,7 @@ from app.services.runs import publishing
 from app.services.studies import studies
 from app.storage import Artefact
 from app.web.experimenter.invitations import link_of
+from app.web.http import new_links
 from app.web.http.deps import ActingExperimenter, Slug, StudioDep, WritingSession
 from app.web.http.new_links import NewLink
 
@@ -56,7 +57,7 @@ def renew_links(
     for participant in _ticked(session, study, code):
         token = enrolment.renew_link(session, study, participant, experimenter.name)
         links.append(NewLink(participant.code, link_of(request, studio, token)))
-    key = studio.new_links.leave(experimenter.id, links)
+    key = new_links.leave(session, experimenter.id, links)
     address = request.app.url_path_for("show_links", slug=slug, key=key)
     return RedirectResponse(address, HTTPStatus.SEE_OTHER)
 

@@ -316,6 +316,7 @@ def test_a_database_on_a_server_is_explained_with_the_commands_and_without_the_p
     assert "secret" not in said
 
 
+@pytest.mark.sqlite("PostgreSQL is backed up with its own tools")
 def test_the_commands_say_what_was_done(
     settings: Settings,
     database: Database,
