@@ -138,12 +138,12 @@ def test_a_run_whose_key_is_not_ours_keeps_its_name(elsewhere: FastAPI, study: S
 
 
 def test_no_link_works_that_worked_before_and_new_ones_do(
-    database: Database, elsewhere: FastAPI, study: Study, packed: Path, tmp_path: Path
+    database: Database, elsewhere: FastAPI, study: Study, packed: Path, settings: Settings
 ) -> None:
     with database.writing() as session:
         person = session.get_one(Participant, 1)
         old = enrolment.renew_link(session, study, person, "x")
-        archive.write(session, ArtefactStore(tmp_path / "artefacts"), session.get_one(Study, study.id), packed)
+        archive.write(session, ArtefactStore.of(settings), session.get_one(Study, study.id), packed)
     with zipfile.ZipFile(packed) as file:
         text = b"".join(file.read(name) for name in file.namelist() if name.startswith("rows/")).decode()
     assert "token" not in text

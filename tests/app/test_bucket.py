@@ -180,11 +180,7 @@ class TestOnline:
         video = taking_part.browser.get(f"/media/{clip.video_sha256}.mp4")
         assert video.status_code == 503
         assert "Nothing that was answered is lost" in video.text
-        said = taking_part.browser.post(
-            f"/p/queries/{query.id}/label",
-            data={"response": "left", "client_uuid": str(uuid4())},
-            headers={"accept": "application/json"},
-        )
+        said = taking_part.answer(query)
         assert said.json()["pair"]["query_id"] != query.id, "and the next pair is there as well"
         with database.reading() as session:
             assert list(count_labels(session, select(Participant.id)).values()) == [1]
