@@ -85,10 +85,12 @@ def migrate(settings: Settings) -> int:
 
 
 def reset_password(settings: Settings) -> int:
-    """Give the first experimenter a new one-time password."""
+    """Give the first experimenter a new one-time password, and an account if there is none at all."""
     migrate(settings)
     with _database(settings) as database, database.writing() as session:
-        password = accounts.reset_password(session, accounts.FIRST_EXPERIMENTER)
+        password = accounts.create_first_experimenter(session)
+        if password is None:
+            password = accounts.reset_password(session, accounts.FIRST_EXPERIMENTER)
     say(f"New one-time password of {accounts.FIRST_EXPERIMENTER}: {password}")
     return 0
 
