@@ -16,11 +16,8 @@ from tests.waiting import free_port, until
 
 BUCKET = "studio"
 USUAL = (
-    *(
-        f"tests/app/test_{name}.py"
-        for name in ("artefacts", "archive", "damage", "next_pair", "uploads", "watch_clip", "withdraw")
-    ),
-    *(f"tests/worker/jobs/test_{name}.py" for name in ("exports", "own_clips", "repairs", "reports", "unused_files")),
+    *(f"tests/app/test_{name}.py" for name in ("artefacts", "archive", "damage", "watch_clip", "withdraw")),
+    *(f"tests/worker/jobs/test_{name}.py" for name in ("exports", "repairs", "unused_files")),
     "-n",
     "2",
     "--dist",

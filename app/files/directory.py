@@ -4,6 +4,7 @@ import os
 import tempfile
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import ClassVar
 
@@ -77,8 +78,9 @@ class Directory(Files):
         """See Files."""
         base = self.root / folder
         for path in base.rglob("*"):
-            if path.is_file() and not path.name.startswith(WRITING):
-                yield str(path.relative_to(base)), _stat(path)
+            with suppress(FileNotFoundError):  # deleted meanwhile
+                if path.is_file() and not path.name.startswith(WRITING):
+                    yield str(path.relative_to(base)), _stat(path)
 
     def rename(self, name: str, other: str) -> None:
         """See Files."""

@@ -224,6 +224,16 @@ def test_a_wrong_name_or_key_is_refused_at_the_start_and_a_server_that_is_away_i
         store.put(b"a clip")
 
 
+def test_only_the_person_s_own_folder_is_forgotten(store: ArtefactStore) -> None:
+    for participant_id in (7, 70):
+        folder = store.unfinished.folder(participant_id) / "run-1"
+        folder.mkdir(parents=True)
+        (folder / "state.safetensors").write_bytes(b"half way")
+        store.unfinished.keep(folder)
+    store.unfinished.forget(store.unfinished.folder(7))
+    assert [name for name, _ in store.files.found("unfinished")] == ["participant-70/run-1/state.safetensors"]
+
+
 def test_a_training_goes_on_at_another_machine(store: ArtefactStore, other: ArtefactStore) -> None:
     here, there = store.unfinished.folder(7) / "run-3", other.unfinished.folder(7) / "run-3"
     for folder in (here, there):
