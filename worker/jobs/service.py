@@ -154,6 +154,7 @@ class _Rounds:
                 self._round()
                 self._rested_at = time.monotonic() + REST * (time.monotonic() - started)
             self._clear_away()
+            self._runner.leave_nothing_of_erased()
             self._backups.look()
         except OperationalError as error:
             complaints.warning("the database could not be reached, trying again: %s", error.orig)

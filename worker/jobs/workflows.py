@@ -8,7 +8,6 @@ import errno
 import logging
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from typing import Any
 
 from dbos import DBOS, DBOSConfiguredInstance
@@ -16,7 +15,9 @@ from sqlalchemy.exc import OperationalError
 from sqlalchemy.orm import Session
 
 from app import logs
+from app.domain import run_keys
 from app.domain.models import RunKind
+from app.domain.run_keys import RunKey
 from app.domain.studies import Participant, Study
 from app.errors import AppError
 from app.files.interface import StorageUnavailable
@@ -89,7 +90,6 @@ class JobRunner(DBOSConfiguredInstance):
         except Exception as error:  # the worker's edge: one failed job must not stop the others
             if self._is_pointless(job):
                 log.info("%s is abandoned: the participant has withdrawn, or the study was deleted", job.key)
-                self._leave_nothing(job)
                 return
             log.exception("%s failed", job.key)
             _step("fail", self._fail, job.key, f"{type(error).__name__}: {error}", not _is_the_machine_s(error))
@@ -100,15 +100,18 @@ class JobRunner(DBOSConfiguredInstance):
         with self.context.database.reading() as session:
             return _has_withdrawn(session, job)
 
-    def _leave_nothing(self, job: Job) -> None:
-        """Another worker may have erased the person's last traces while this one was still at work for them."""
-        stored, store = self.stored.pop(job.key, set()), self.context.store
-        with suppress(StorageUnavailable):  # what is left then goes after a day, as what nobody refers to
+    def leave_nothing_of_erased(self) -> None:
+        """Another worker may have erased somebody's last traces while this one was still at work for them."""
+        for key in [each for each in self.stored if each not in self.in_hand]:
+            about, store = run_keys.read(key), self.context.store
             with self.context.database.writing() as session:
+                if about is None or not _is_erased(session, about):
+                    continue
+                stored = self.stored.pop(key)
                 for sha256 in stored - withdrawal.in_use(session, stored):
                     store.delete(sha256)
-            if job.participant_id is not None:
-                store.unfinished.forget(store.unfinished.folder(job.participant_id))
+            if about.participant_id is not None:
+                store.unfinished.forget(store.unfinished.folder(about.participant_id))
 
     def _begin(self, arguments: dict[str, Any]) -> int | None:
         """The run's id; None when there is nothing to be done, because an earlier life of this job has finished it."""
@@ -146,6 +149,12 @@ def _has_withdrawn(session: Session, job: Job) -> bool:
     return job.participant_id is not None and (
         session.get_one(Participant, job.participant_id).withdrawn_at is not None
     )
+
+
+def _is_erased(session: Session, about: RunKey) -> bool:
+    if about.participant_id is not None:
+        return session.get_one(Participant, about.participant_id).erased_at is not None
+    return about.study_id is not None and session.get_one(Study, about.study_id).erased_at is not None
 
 
 def _seed(session: Session, job: Job) -> int:
