@@ -126,5 +126,6 @@ def test_a_scrub_reads_everything_and_says_what_is_wrong(
         assert f"clip 2, first picture ({clips[1].poster_sha256[:12]}): the worker makes it again" in said
         assert f"bundle v1 of P01, file ({bundle.artefact_sha256[:12]}): restore it from a backup" in said
         assert "3 stored files are damaged or missing." in said
-    assert store.lost().keys() == {clips[0].video_sha256, clips[1].poster_sha256, bundle.artefact_sha256}
+    broken = {clips[0].video_sha256, clips[1].poster_sha256, bundle.artefact_sha256}
+    assert until(lambda: store.lost().keys() == broken)
     database.dispose()

@@ -121,6 +121,11 @@ def test_only_the_worker_s_image_has_the_learning_stack() -> None:
     assert "requirements.lock" in last
 
 
+def test_the_bucket_is_there() -> None:
+    assert CLUSTER["web"]["environment"]["STORAGE_URL"] == "s3://studio"
+    assert CLUSTER["s3"]["volumes"] == ["s3-data:/gw/studio"]
+
+
 def test_settings_in_the_compose_file_exist() -> None:
     known = {name.upper() for name in Settings.model_fields}
     for service in COMPOSE["services"].values():
