@@ -68,6 +68,7 @@ def main() -> int:
             "feeding", list(PAPER_USERS.values())[:1], _settings(options.labels), Manner(), seed=0
         )
         killing.join(timeout=1.0)
+        wait_until(PATIENCE_S, "still work to do", partial(_is_idle, database))
         _say(summary(studied))
         cluster.report(database)
     return 0
@@ -154,8 +155,7 @@ class Cluster:
             bundles = session.scalars(select(Bundle.artefact_sha256)).all()
             executors = Counter(session.execute(text("SELECT executor_id FROM dbos.workflow_status")).scalars())
         store = ArtefactStore.of(self.settings)
-        undone = sum(each != RunStatus.SUCCEEDED for each in runs)
-        _say(f"runs                    {len(runs)}, of which {undone} not done")
+        _say(f"runs                    {', '.join(f'{count} {status}' for status, count in Counter(runs).items())}")
         _say(f"ended at worker         {', '.join(f'{name}: {count}' for name, count in sorted(executors.items()))}")
         _say(f"bundles                 {len(bundles)}, whole in the bucket: {sum(map(store.has, bundles))}")
         for name in sorted(each.name for each in self.folder.iterdir() if each.is_dir()):
@@ -189,6 +189,12 @@ def _at_work(database: Database, kind: RunKind) -> tuple[str, str] | None:
             if name is not None:
                 return key, name
     return None
+
+
+def _is_idle(database: Database) -> bool | None:
+    with database.reading() as session:
+        at_work = session.scalar(select(Run.id).where(Run.status == RunStatus.RUNNING).limit(1))
+    return at_work is None or None
 
 
 def _goes_on(database: Database, key: str, last: object) -> bool | None:
