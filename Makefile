@@ -9,7 +9,7 @@ VENV := .venv
 PY := $(VENV)/bin/python
 PIP := $(PY) -m pip --disable-pip-version-check --quiet
 
-.PHONY: help run link demo rehearse test lint types contracts pytest pytest-postgresql validate browser postgresql migrate reset-password benchmark clean
+.PHONY: help run link demo rehearse test lint types contracts pytest pytest-postgresql pytest-s3 validate browser postgresql migrate reset-password benchmark clean
 
 help: ## List the commands
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-16s %s\n", $$1, $$2}'
@@ -32,7 +32,7 @@ reset-password: $(VENV)/run.stamp ## Print a new one-time password for the exper
 migrate: $(VENV)/run.stamp ## Bring the database to the newest schema
 	@$(PY) -m app migrate
 
-test: lint types contracts pytest pytest-postgresql ## Everything that continuous integration runs
+test: lint types contracts pytest pytest-postgresql pytest-s3 ## Everything that continuous integration runs
 
 lint: $(VENV)/dev.stamp ## Style of Python and templates, schema of the compose file
 	$(VENV)/bin/ruff check .
@@ -52,6 +52,9 @@ pytest: $(VENV)/dev.stamp browser ## The test suite
 
 pytest-postgresql: $(VENV)/dev.stamp postgresql ## Tests that use a database, on PostgreSQL (ARGS="tests/app -n 2": others)
 	OMP_NUM_THREADS=1 $(PY) -m tests.on_postgresql $(ARGS)
+
+pytest-s3: $(VENV)/dev.stamp ## Tests of stored files, on an S3-compatible server (ARGS="tests/app -n 2": others)
+	OMP_NUM_THREADS=1 $(PY) -m tests.on_s3 $(ARGS)
 
 validate: $(VENV)/dev.stamp browser ## Run the suite and write build/validation.html: what is promised, and what was shown
 	@mkdir -p build

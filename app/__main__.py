@@ -86,10 +86,12 @@ def migrate(settings: Settings) -> int:
 
 
 def reset_password(settings: Settings) -> int:
-    """Give the first experimenter a new one-time password."""
+    """Give the first experimenter a new one-time password, and an account if there is none at all."""
     migrate(settings)
     with _database(settings) as database, database.writing() as session:
-        password = accounts.reset_password(session, accounts.FIRST_EXPERIMENTER)
+        password = accounts.create_first_experimenter(session)
+        if password is None:
+            password = accounts.reset_password(session, accounts.FIRST_EXPERIMENTER)
     say(f"New one-time password of {accounts.FIRST_EXPERIMENTER}: {password}")
     return 0
 
@@ -117,7 +119,7 @@ def dictionary(_settings: Settings) -> int:
 def import_study(settings: Settings, file: Path, seal_key: str = "") -> int:
     """Import an archive of a study and print new personal links of its participants."""
     migrate(settings)
-    store = ArtefactStore(settings.data_dir / "artefacts")
+    store = ArtefactStore.of(settings)
     if not file.is_file():
         raise AppError(f"There is no file {file}.")
     with (
@@ -137,7 +139,7 @@ def scrub(settings: Settings) -> int:
     """Read every stored file; list what is damaged or missing, by study, and set it aside to be made again."""
     migrate(settings)
     with _database(settings) as database, database.reading() as session:
-        broken = damage.scrub(session, ArtefactStore(settings.data_dir / "artefacts"))
+        broken = damage.scrub(session, ArtefactStore.of(settings))
     for study, uses in sorted(broken.items()):
         say(f"{study}:")
         for use in uses:
@@ -227,6 +229,9 @@ def web(settings: Settings) -> int:
     from app.main import create_app
 
     _require_free_port(settings)
+    store = ArtefactStore.of(settings)
+    store.files.require_usable()
+    store.unfinished.clear_workspaces(_DAY_S)
     in_json = settings.log_format is LogFormat.JSON
     logs.write_to_stderr(settings.log_format, logging.INFO if in_json else logging.WARNING)
     uvicorn.run(
@@ -284,13 +289,14 @@ def _first_start(session: Session, settings: Settings) -> str:
 def _demo(session: Session, settings: Settings) -> tuple[str, Sequence[str]]:
     """The token of the participant's link in the demo study, and what is to be said of it."""
     try:
-        return demo.import_finished(session, ArtefactStore(settings.data_dir / "artefacts")), []
+        return demo.import_finished(session, ArtefactStore.of(settings)), []
     except AppError as error:
         token = demo.make_empty(session, catalogue.usual())
         instead = "An empty demo study was made instead of the finished one; its first clips take a few minutes."
         return token, ["", f"  {instead}", f"  {error}"]
 
 
+_DAY_S = 24 * 3600.0
 _COUNTED = {"study": "studies", "participant": "participants", "label_event": "answers"}
 _COMMANDS: dict[str, Callable[[Settings], int]] = {
     "up": up,

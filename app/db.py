@@ -11,7 +11,7 @@ import sqlite3
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -35,6 +35,7 @@ from sqlalchemy.orm import DeclarativeBase, Session, sessionmaker
 from app.errors import OncePerMinute
 
 BUSY_TIMEOUT_S = 15
+SAME_TIME = timedelta(seconds=1)
 WRITING, NAMES, AUDITING = 1_347_310_157, 1_347_310_158, 1_347_310_159
 """Advisory locks of PostgreSQL: of whoever writes, of names, of the audit log. Numbers that no other program uses."""
 
@@ -85,9 +86,29 @@ def file_of(url: str) -> Path | None:
     return Path(parts.database) if parts.get_backend_name() == "sqlite" and parts.database else None
 
 
+class _Clock:
+    """The database's clock on PostgreSQL, else this machine's: leases of different machines are compared.
+
+    Asked of the server whenever somebody begins to write, which is many times a minute. Small differences are none:
+    time should not jump to and fro.
+    """
+
+    def __init__(self) -> None:
+        self.ahead = timedelta()
+
+    def follow(self, theirs: datetime) -> None:
+        """Note what the server's clock says at this moment."""
+        ahead = theirs - datetime.now(UTC)
+        if abs(ahead - self.ahead) > SAME_TIME:
+            self.ahead = timedelta() if abs(ahead) <= SAME_TIME else ahead
+
+
+_clock = _Clock()
+
+
 def now() -> datetime:
-    """The current time, aware, in UTC."""
-    return datetime.now(UTC)
+    """The current time by the clock that all machines of this studio share, aware, in UTC."""
+    return datetime.now(UTC) + _clock.ahead
 
 
 class Database:
@@ -116,7 +137,14 @@ class Database:
         with self._write() as session, session.begin():
             if not self.is_sqlite:
                 lock = func.pg_advisory_xact_lock_shared if own_rows else func.pg_advisory_xact_lock
-                session.execute(select(lock(WRITING)))
+                _, theirs = session.execute(select(lock(WRITING), func.clock_timestamp())).one()
+                _clock.follow(theirs)
+            yield session
+
+    @contextmanager
+    def alongside(self) -> Iterator[Session]:
+        """One transaction that may write, while others do: for rows that nothing else depends on. Not on SQLite."""
+        with self._write() as session, session.begin():
             yield session
 
     @contextmanager

@@ -36,7 +36,7 @@ from app.web.experimenter import (
     translations,
 )
 from app.web.http.deps import Studio, StudioDep
-from app.web.http.rate_limit import LoginAttempts
+from app.web.http.rate_limit import SharedAttempts
 from app.web.http.readiness import Readiness
 from app.web.http.request_log import RequestLog
 from app.web.http.security import Guard
@@ -96,11 +96,13 @@ def make_studio(settings: Settings) -> Studio:
     return Studio(
         settings=settings,
         database=database,
-        store=ArtefactStore(settings.data_dir / "artefacts"),
+        store=ArtefactStore.of(settings),
         readiness=Readiness(database, settings.data_dir),
         session_queue=SessionQueue(database),
-        login_attempts=LoginAttempts(settings.login_attempts_per_minute),
-        token_attempts=LoginAttempts(settings.login_attempts_per_minute, WRONG_TOKENS, WRONG_TOKENS),
+        login_attempts=SharedAttempts(database, "password", settings.login_attempts_per_minute),
+        token_attempts=SharedAttempts(
+            database, "token", settings.login_attempts_per_minute, WRONG_TOKENS, WRONG_TOKENS
+        ),
         shared_pages=SharedPages(database),
     )
 

@@ -18,6 +18,7 @@ class Settings(BaseSettings):
 
     data_dir: Path = Field(default=Path("data"), description="The one directory that everything is written to.")
     database_url: str | None = Field(default=None, description="SQLAlchemy URL; default: SQLite in the data dir.")
+    storage_url: str | None = Field(default=None, description="s3://bucket/prefix; default: files in the data dir.")
     host: str = Field(default="127.0.0.1", description="Address the web server listens on.")
     port: int = Field(default=8000, ge=0, le=65535, description="Port the web server listens on.")
     public_url: str | None = Field(default=None, description="URL participants reach the server by, for links.")
@@ -72,6 +73,14 @@ class Settings(BaseSettings):
         if parts.scheme not in {"smtp", "smtps"} or not parts.hostname or parts.port == 0:
             raise ValueError("Write smtps://user:password@host:port, or smtp:// for a server that offers STARTTLS.")
         return url
+
+    @field_validator("storage_url")
+    @classmethod
+    def _known_storage(cls, url: str | None) -> str | None:
+        """A bucket of an S3-compatible server; which server, and with which keys, AWS's usual variables say."""
+        if url and not re.fullmatch(r"s3://[a-z0-9][a-z0-9.-]{1,61}[a-z0-9](/[A-Za-z0-9_-][A-Za-z0-9._-]*)*/?", url):
+            raise ValueError("Write s3://bucket or s3://bucket/prefix, or leave it out for the data directory.")
+        return url.rstrip("/") if url else None
 
     @field_validator("trusted_proxies")
     @classmethod

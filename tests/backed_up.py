@@ -64,4 +64,4 @@ def traces(folder: Path, mark: str) -> list[str]:
 
 def open_studio(settings: Settings) -> tuple[Database, ArtefactStore]:
     """Database and files."""
-    return Database(settings.sqlalchemy_url), ArtefactStore(settings.data_dir / "artefacts")
+    return Database(settings.sqlalchemy_url), ArtefactStore.of(settings)

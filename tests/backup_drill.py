@@ -59,7 +59,7 @@ class Drill:
 
     def _fill(self, answers: int) -> list[str]:
         migrate(self.settings)
-        database, store = Database(self.settings.sqlalchemy_url), ArtefactStore(self.settings.data_dir / "artefacts")
+        database, store = Database(self.settings.sqlalchemy_url), ArtefactStore.of(self.settings)
         tokens = []
         with database.writing() as session:
             study = factories.make_study(session, labels_per_participant=answers, pool_scenarios=500, break_every=0)
@@ -97,7 +97,7 @@ class Drill:
             self.tally.answers = len(self.acknowledged)
 
     def _remake(self, stop: threading.Event) -> None:
-        database, store = Database(self.settings.sqlalchemy_url), ArtefactStore(self.settings.data_dir / "artefacts")
+        database, store = Database(self.settings.sqlalchemy_url), ArtefactStore.of(self.settings)
         while not stop.wait(0.5):
             with database.writing() as session:
                 clip = factories.make_clip(session, store, session.get_one(Study, 1))

@@ -6,6 +6,7 @@ from contextlib import AbstractContextManager, contextmanager
 from datetime import timedelta
 from functools import cache
 from pathlib import Path
+from uuid import uuid4
 
 import pytest
 import uvicorn
@@ -27,7 +28,7 @@ from app.main import create_routes, make_studio, serve
 from app.services.accounts import accounts, browser_sessions
 from app.settings import Settings
 from app.storage import ArtefactStore
-from tests import databases
+from tests import buckets, databases
 from tests.databases import make_tables
 
 
@@ -46,9 +47,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         seen.add(name)
         if "settings" in getattr(item, "fixturenames", ()):
             item.add_marker("database")
-        about_sqlite = item.get_closest_marker("sqlite")
-        if databases.SERVER is not None and about_sqlite is not None:
-            item.add_marker(pytest.mark.skip(reason=about_sqlite.args[0]))
+        elsewhere = {"sqlite": databases.SERVER, "directory": buckets.BUCKET}
+        for name, address in elsewhere.items():
+            about = item.get_closest_marker(name)
+            if address is not None and about is not None:
+                item.add_marker(pytest.mark.skip(reason=about.args[0]))
 
 
 PASSWORD = "a password of my own"
@@ -64,6 +67,12 @@ def own_database(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
         monkeypatch.setenv("DATABASE_URL", url)
         with databases.all_closed():
             yield
+
+
+@pytest.fixture(autouse=buckets.BUCKET is not None)
+def own_files(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On an S3-compatible server, a part of the bucket for each test, and for programs it starts."""
+    monkeypatch.setenv("STORAGE_URL", f"{buckets.BUCKET}/{uuid4().hex}")
 
 
 @pytest.fixture

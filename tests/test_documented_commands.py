@@ -30,7 +30,7 @@ PROGRAMS = [
     for each in sorted((ROOT / part).rglob("*.py"))
 ]
 OTHERS = [*sorted((ROOT / "templates").rglob("*.html")), *sorted((ROOT / "install").glob("*.sh"))]
-OURS = r"(?:-m (?:app|worker|tests\.(?:on_postgresql|(?:benchmarks|pictures)\.\w+))|tests/benchmarks/\w+\.py)"
+OURS = r"(?:-m (?:app|worker|tests\.(?:on_postgresql|on_s3|(?:benchmarks|pictures)\.\w+))|tests/benchmarks/\w+\.py)"
 VARIABLES = r"(?:[A-Z_]+=\S+ )"
 MAKE = rf"(?:{VARIABLES}+|(?<=[`>])|(?<=: )|(?<=^    ))make\b(?= |`|<|$)(?! them)"
 COMMAND = re.compile(
@@ -111,6 +111,8 @@ RUN: dict[str, str | Elsewhere | OnlyParsed] = {
     "first_robot": REAL_TIME,
     "in_imitation": OnlyParsed("needs the library imitation, in an environment of its own"),
     "on_postgresql": OnlyParsed("runs the suite itself, and needs a PostgreSQL server"),
+    "on_s3": OnlyParsed("runs the suite itself"),
+    "cluster": REAL_TIME,
     "onlookers": "--people 1 --labels 40 --labellers 1 --dashboards 1 --seconds 1 --thought 0.1",
     "pages": OnlyParsed("photographs a real studio, which takes minutes, and writes to docs/pictures"),
     "pool_rollouts": "--first 10800000 --scenarios 1 --directory pool",

@@ -75,7 +75,7 @@ def _import_clips(said: argparse.Namespace) -> int:
     keep_private(settings)
     database = Database(settings.sqlalchemy_url)
     try:
-        slug = import_clips.import_clips(database, ArtefactStore(settings.data_dir / "artefacts"), said.path)
+        slug = import_clips.import_clips(database, ArtefactStore.of(settings), said.path)
     finally:
         database.dispose()
     sys.stdout.write(f"Imported: {settings.base_url}/studies/{slug}\n")

@@ -4,7 +4,7 @@ from datetime import datetime
 from enum import StrEnum
 from typing import Any
 
-from sqlalchemy import CheckConstraint, ForeignKey, Index, String
+from sqlalchemy import CheckConstraint, ForeignKey, Index, String, Text
 from sqlalchemy.orm import Mapped, mapped_column
 
 from app.db import Base, now
@@ -62,6 +62,34 @@ class BrowserSession(Base):
     experimenter_id: Mapped[int | None] = mapped_column(ForeignKey("experimenter.id"), index=True)
     created_at: Mapped[datetime] = mapped_column(default=now)
     expires_at: Mapped[datetime]
+
+
+class NewLinks(Base):
+    """Personal links between the form that made them and the page that shows them, for some minutes.
+
+    Sealed with a key that is in the address of that page and nowhere else, so the database alone knows no link.
+    """
+
+    __tablename__ = "new_links"
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    key_sha256: Mapped[str] = mapped_column(String(64), unique=True)
+    experimenter_id: Mapped[int] = mapped_column(ForeignKey("experimenter.id"))
+    sealed: Mapped[str] = mapped_column(Text)
+    expires_at: Mapped[datetime]
+
+
+class LoginAttempt(Base):
+    """One attempt to get in that was let through, for a minute: several web servers share their limits."""
+
+    __tablename__ = "login_attempt"
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    at: Mapped[datetime] = mapped_column(default=now)
+    kind: Mapped[str] = mapped_column(String(20))
+    address_sha256: Mapped[str] = mapped_column(String(64))
+    account_sha256: Mapped[str] = mapped_column(String(64))
+    browser_sha256: Mapped[str | None] = mapped_column(String(64))
 
 
 class AuditEvent(Base):

@@ -5,7 +5,7 @@ from http import HTTPStatus
 from typing import Annotated
 
 from fastapi import APIRouter, Depends, Request
-from fastapi.responses import FileResponse, Response
+from fastapi.responses import Response
 from sqlalchemy import or_, select
 from sqlalchemy.orm import Session
 
@@ -14,6 +14,7 @@ from app.domain.evaluation import Film
 from app.errors import AppError
 from app.services.accounts import browser_sessions
 from app.storage import ArtefactStore
+from app.web.http import stored_file
 from app.web.http.deps import EXPERIMENTER_COOKIE, PARTICIPANT_COOKIE, ReadingSession, Sha256, StudioDep
 
 router = APIRouter()
@@ -73,5 +74,4 @@ def _artefact(request: Request, store: ArtefactStore, sha256: str, media_type: s
     known = request.headers.get("if-none-match", "")
     if known == "*" or sha256 in known:
         return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=headers)
-    path = store.verified(sha256)  # what is kept for ever must be what it is called
-    return FileResponse(path, headers=headers, media_type=media_type, stat_result=path.stat())
+    return stored_file.send(store, sha256, media_type, headers=headers)

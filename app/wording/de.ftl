@@ -217,6 +217,7 @@ error-foreign-form = Diese Anfrage kam von einer anderen Website und wurde abgel
 error-page-not-found = Unter dieser Adresse gibt es keine Seite. Wenn ein Link Sie hierher geführt hat, prüfen Sie bitte, ob er vollständig ist.
 error-not-understood = In diesem Formular fehlt etwas, oder etwas ist nicht gültig. Bitte gehen Sie zurück und prüfen Sie es.
 error-database-busy = Der Server ist beschäftigt oder noch nicht bereit. Es wurde nichts gespeichert; bitte versuchen Sie es gleich noch einmal.
+error-storage-unavailable = Gespeicherte Dateien sind im Augenblick nicht erreichbar. Nichts, was Sie geantwortet haben, ist verloren; bitte versuchen Sie es in einer Minute noch einmal.
 error-unforeseen = Das ist unser Fehler, und er wurde festgehalten. Bei diesem Schritt wurde nichts gespeichert; bitte versuchen Sie es noch einmal.
 
 ## Paare (Vorsilbe pair-)

@@ -219,6 +219,7 @@ error-foreign-form = This request came from another website and was refused. Ple
 error-page-not-found = There is no page at this address. If a link brought you here, please check that it is complete.
 error-not-understood = Something on this form is missing or not valid. Please go back and check it.
 error-database-busy = The server is busy or not ready yet. Nothing was saved; please try again in a moment.
+error-storage-unavailable = Stored files cannot be reached at the moment. Nothing that you have answered is lost; please try again in a minute.
 error-unforeseen = This is our fault, and we have a record of it. Nothing was saved in this step; please try again.
 
 ## Pairs (prefix pair-)

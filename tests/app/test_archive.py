@@ -27,7 +27,7 @@ from app.services.exports import export_formats, export_tables
 from app.services.participants import enrolment, withdrawal
 from app.settings import Settings
 from app.storage import ArtefactStore
-from tests import factories
+from tests import factories, stored_files
 from tests.app.conftest import bring
 from tests.finished_study import make_finished_study
 
@@ -138,12 +138,12 @@ def test_a_run_whose_key_is_not_ours_keeps_its_name(elsewhere: FastAPI, study: S
 
 
 def test_no_link_works_that_worked_before_and_new_ones_do(
-    database: Database, elsewhere: FastAPI, study: Study, packed: Path, tmp_path: Path
+    database: Database, elsewhere: FastAPI, study: Study, packed: Path, settings: Settings
 ) -> None:
     with database.writing() as session:
         person = session.get_one(Participant, 1)
         old = enrolment.renew_link(session, study, person, "x")
-        archive.write(session, ArtefactStore(tmp_path / "artefacts"), session.get_one(Study, study.id), packed)
+        archive.write(session, ArtefactStore.of(settings), session.get_one(Study, study.id), packed)
     with zipfile.ZipFile(packed) as file:
         text = b"".join(file.read(name) for name in file.namelist() if name.startswith("rows/")).decode()
     assert "token" not in text
@@ -209,10 +209,10 @@ def test_what_is_damaged_leaves_nothing_behind(
     elsewhere: FastAPI, packed: Path, edit: Callable[[str, bytes], bytes | None]
 ) -> None:
     studio = elsewhere.state.studio
-    before = count(studio.database), sorted(studio.store.root.glob("??/*"))
+    before = count(studio.database), stored_files.names(studio.store)
     with pytest.raises(ArchiveInvalid):
         bring(elsewhere, _edited(packed, edit))
-    assert (count(studio.database), sorted(studio.store.root.glob("??/*"))) == before
+    assert (count(studio.database), stored_files.names(studio.store)) == before
 
 
 def test_any_other_file_is_refused_in_words(elsewhere: FastAPI, tmp_path: Path) -> None:

@@ -1,17 +1,20 @@
 """Artefacts are whole or absent, and are what their name says."""
 
 import hashlib
-from pathlib import Path
 
 import pytest
 
-from app import storage
+from app.files import lost
+from app.files.interface import Stat
+from app.settings import Settings
 from app.storage import ArtefactDamaged, ArtefactMissing, ArtefactStore
+from tests import stored_files
+from tests.waiting import until
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> ArtefactStore:
-    return ArtefactStore(tmp_path / "artefacts")
+def store(settings: Settings) -> ArtefactStore:
+    return ArtefactStore.of(settings)
 
 
 def test_an_artefact_is_named_by_its_content_and_comes_back_unchanged(store: ArtefactStore) -> None:
@@ -19,12 +22,12 @@ def test_an_artefact_is_named_by_its_content_and_comes_back_unchanged(store: Art
     assert name == hashlib.sha256(b"a clip").hexdigest()
     assert store.read(name) == b"a clip"
     assert store.put(b"a clip") == name
-    assert [path.name for path in store.root.rglob("*") if path.is_file()] == [name]
+    assert stored_files.names(store) == {name}
 
 
 def test_a_damaged_artefact_is_never_handed_out(store: ArtefactStore) -> None:
     name = store.put(b"a model")
-    store.path(name).write_bytes(b"another model")
+    stored_files.overwrite(store, name, b"another model")
     for _ in range(2):
         with pytest.raises(ArtefactDamaged, match="damaged"):
             store.read(name)
@@ -35,8 +38,8 @@ def test_a_damaged_artefact_is_never_handed_out(store: ArtefactStore) -> None:
 
 def test_damage_after_the_first_look_is_found(store: ArtefactStore) -> None:
     name = store.put(b"a clip")
-    assert store.verified(name).read_bytes() == b"a clip"
-    store.path(name).write_bytes(b"a crap")
+    assert b"".join(store.verified(name).pieces()) == b"a clip"
+    stored_files.overwrite(store, name, b"a crap")
     with pytest.raises(ArtefactDamaged):
         store.verified(name)
 
@@ -45,13 +48,13 @@ def test_a_file_is_read_through_once_and_not_at_every_request(
     store: ArtefactStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     name = store.put(b"a clip")
-    read: list[Path] = []
+    read: list[str] = []
 
-    def counted(path: Path) -> str:
-        read.append(path)
-        return name
+    def counted(name: str, _known: Stat) -> str:
+        read.append(name)
+        return hashlib.sha256(b"a clip").hexdigest()
 
-    monkeypatch.setattr(storage, "hash_of_file", counted)
+    monkeypatch.setattr(store.files, "sha256", counted)
     for _ in range(5):
         store.verified(name)
     assert len(read) == 1
@@ -59,19 +62,19 @@ def test_a_file_is_read_through_once_and_not_at_every_request(
 
 def test_what_is_damaged_is_set_aside_and_can_be_made_anew(store: ArtefactStore) -> None:
     name, other = store.put(b"a clip"), store.put(b"another clip")
-    store.path(name).write_bytes(b"a crap")
-    store.path(other).unlink()
+    stored_files.overwrite(store, name, b"a crap")
+    stored_files.lose(store, other)
     assert (store.has(name), store.has(other)) == (False, False)
     assert store.lost().keys() == {name, other}
     assert store.put(b"a clip") == name
     assert store.read(name) == b"a clip"
-    store.path(other).write_bytes(b"another clip")  # from a backup
-    assert store.lost() == {}
+    stored_files.overwrite(store, other, b"another clip")  # from a backup
+    assert until(lambda: store.lost() == {})
 
 
 def test_what_is_damaged_does_not_keep_the_same_from_being_stored(store: ArtefactStore) -> None:
     name = store.put(b"a clip")
-    store.path(name).write_bytes(b"a crap")
+    stored_files.overwrite(store, name, b"a crap")
     assert store.put(b"a clip") == name
     assert store.read(name) == b"a clip"
 
@@ -79,9 +82,15 @@ def test_what_is_damaged_does_not_keep_the_same_from_being_stored(store: Artefac
 def test_a_scrub_finds_damage_that_left_no_trace(store: ArtefactStore, monkeypatch: pytest.MonkeyPatch) -> None:
     name = store.put(b"a clip")
     assert store.has(name)
-    signature = storage._signature(store.path(name))
-    store.path(name).write_bytes(b"a crap")
-    monkeypatch.setattr(storage, "_signature", lambda _path: signature)  # as a decaying disk changes bytes
+    known, stat = store.files.stat(lost.place(name)), store.files.stat
+
+    def as_before(place: str, *, fresh: bool = False) -> Stat | None:
+        """A decaying disk changes bytes and nothing else."""
+        found = stat(place, fresh=fresh)
+        return known if found is not None and place == lost.place(name) else found
+
+    stored_files.overwrite(store, name, b"a crap")
+    monkeypatch.setattr(store.files, "stat", as_before)
     assert store.has(name)
     assert not store.scrub(name)
     assert store.lost().keys() == {name}
@@ -89,16 +98,16 @@ def test_a_scrub_finds_damage_that_left_no_trace(store: ArtefactStore, monkeypat
 
 def test_nothing_of_a_deleted_artefact_is_kept(store: ArtefactStore) -> None:
     name = store.put(b"a diary")
-    store.path(name).write_bytes(b"a dairy")
+    stored_files.overwrite(store, name, b"a dairy")
     assert not store.has(name)
     store.delete(name)
-    assert not [path for path in store.root.parent.rglob("*") if path.is_file()]
+    assert list(stored_files.everything(store)) == []
 
 
 @pytest.mark.parametrize("name", ["", "..", "../../etc/passwd", "A" * 64, "0" * 63, "0" * 64 + "\n"])
 def test_only_hashes_are_names(store: ArtefactStore, name: str) -> None:
     with pytest.raises(ArtefactMissing):
-        store.path(name)
+        store.verified(name)
 
 
 def test_a_missing_artefact_says_what_to_do(store: ArtefactStore) -> None:

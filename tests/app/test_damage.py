@@ -13,19 +13,15 @@ from app.domain.models import ModelKind
 from app.domain.studies import Study
 from app.settings import Settings
 from app.storage import ArtefactStore
-from tests import factories
+from tests import factories, stored_files
 from tests.app.conftest import TakingPart
+from tests.waiting import until
 
 
 @pytest.fixture
 def clip(taking_part: TakingPart) -> Clip:
     with taking_part.database.reading() as session:
         return session.get_one(Clip, taking_part.queries[0].left_clip_id)
-
-
-def damage(path: Path) -> None:
-    """Another content of the same length."""
-    path.write_bytes(path.read_bytes()[::-1])
 
 
 def text_of(page: str) -> str:
@@ -38,7 +34,7 @@ def test_a_damaged_clip_is_never_served_and_never_kept(
 ) -> None:
     for sha256, kind in ((clip.video_sha256, "mp4"), (clip.poster_sha256, "jpg")):
         assert taking_part.browser.get(f"/media/{sha256}.{kind}").status_code == 200
-        damage(store.path(sha256))
+        stored_files.damage(store, sha256)
         answer = taking_part.browser.get(f"/media/{sha256}.{kind}")
         assert (answer.status_code, answer.headers["cache-control"]) == (404, "no-store")
 
@@ -48,7 +44,8 @@ def test_a_participant_goes_on_with_the_next_pair_and_loses_no_answer(
 ) -> None:
     first, second, third = taking_part.queries[:3]
     assert taking_part.turn().json()["pair"]["query_id"] == first.id
-    damage(store.path(clip.video_sha256))
+    stored_files.damage(store, clip.video_sha256)
+    assert taking_part.browser.get(f"/media/{clip.video_sha256}.mp4").status_code == 404
     assert taking_part.turn().json()["pair"]["query_id"] == second.id
     assert taking_part.answer(first).status_code == 200, "whoever had seen it may still say so"
     assert taking_part.answer(second).json()["pair"]["query_id"] == third.id
@@ -60,11 +57,11 @@ def test_an_experimenter_reads_what_is_damaged_and_what_to_do(
 ) -> None:
     slug = taking_part.study.slug
     assert "damaged" not in experimenter.get(f"/studies/{slug}").text
-    damage(store.path(clip.video_sha256))
-    taking_part.turn()
+    stored_files.damage(store, clip.video_sha256)
+    taking_part.browser.get(f"/media/{clip.video_sha256}.mp4")
     told = text_of(experimenter.get(f"/studies/{slug}").text)
     assert "1 stored file is damaged or missing. The worker makes it again by itself" in told
-    damage(store.path(study_bundle))
+    stored_files.damage(store, study_bundle)
     answer = experimenter.get(f"/studies/{slug}/participants/P01/bundles/1.zip")
     assert answer.status_code == 404
     told = text_of(experimenter.get("/studies").text)
@@ -74,12 +71,12 @@ def test_an_experimenter_reads_what_is_damaged_and_what_to_do(
 def test_the_banner_goes_when_the_file_is_back(
     experimenter: TestClient, taking_part: TakingPart, clip: Clip, store: ArtefactStore
 ) -> None:
-    content = store.path(clip.video_sha256).read_bytes()
-    store.path(clip.video_sha256).unlink()
-    taking_part.turn()
+    content = store.read(clip.video_sha256)
+    stored_files.lose(store, clip.video_sha256)
+    taking_part.browser.get(f"/media/{clip.video_sha256}.mp4")
     assert "damaged or missing" in experimenter.get("/studies").text
-    store.path(clip.video_sha256).write_bytes(content)
-    assert "damaged or missing" not in experimenter.get("/studies").text
+    stored_files.overwrite(store, clip.video_sha256, content)
+    assert until(lambda: "damaged or missing" not in experimenter.get("/studies").text)
     assert taking_part.turn().json()["pair"]["query_id"] == taking_part.queries[0].id
 
 
@@ -105,7 +102,8 @@ def test_a_scrub_reads_everything_and_says_what_is_wrong(
     data_dir: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     main(["migrate"])
-    database, store = Database(Settings(_env_file=None).sqlalchemy_url), ArtefactStore(data_dir / "artefacts")
+    settings = Settings(_env_file=None)
+    database, store = Database(settings.sqlalchemy_url), ArtefactStore.of(settings)
     with database.writing() as session:
         study = factories.make_study(session, "Pilot")
         person, _ = factories.make_participant(session, study)
@@ -117,9 +115,9 @@ def test_a_scrub_reads_everything_and_says_what_is_wrong(
         bundle = factories.make_bundle(session, store, model)
     assert main(["scrub"]) == 0
     assert "All files are whole." in capsys.readouterr().out
-    damage(store.path(clips[0].video_sha256))
-    store.path(clips[1].poster_sha256).unlink()
-    damage(store.path(bundle.artefact_sha256))
+    stored_files.damage(store, clips[0].video_sha256)
+    stored_files.lose(store, clips[1].poster_sha256)
+    stored_files.damage(store, bundle.artefact_sha256)
     for _ in range(2):  # a second scrub says the same
         assert main(["scrub"]) == 1
         said = capsys.readouterr().out
@@ -128,5 +126,6 @@ def test_a_scrub_reads_everything_and_says_what_is_wrong(
         assert f"clip 2, first picture ({clips[1].poster_sha256[:12]}): the worker makes it again" in said
         assert f"bundle v1 of P01, file ({bundle.artefact_sha256[:12]}): restore it from a backup" in said
         assert "3 stored files are damaged or missing." in said
-    assert store.lost().keys() == {clips[0].video_sha256, clips[1].poster_sha256, bundle.artefact_sha256}
+    broken = {clips[0].video_sha256, clips[1].poster_sha256, bundle.artefact_sha256}
+    assert until(lambda: store.lost().keys() == broken)
     database.dispose()

@@ -22,7 +22,7 @@ from app.services.archives import archive, archive_reading, study_import, unpack
 from app.services.archives.archive import ArchiveInvalid
 from app.services.studies import locking
 from app.storage import ArtefactStore
-from tests import databases
+from tests import databases, stored_files
 from tests.databases import make_tables
 from tests.finished_study import make_finished_study
 
@@ -89,13 +89,13 @@ def bring(database: Database, store: ArtefactStore, path: Path) -> study_import.
         return study_import.read(session, store, path, "experimenter")
 
 
-def everything(database: Database, store: ArtefactStore) -> tuple[dict[str, int], list[Path]]:
+def everything(database: Database, store: ArtefactStore) -> tuple[dict[str, int], set[str]]:
     with database.reading() as session:
         counted = {
             table.name: session.scalar(select(func.count()).select_from(table)) or 0
             for table in Base.metadata.sorted_tables
         }
-    return counted, sorted(each for each in store.root.parent.rglob("*") if "artefacts" in each.parts)
+    return counted, stored_files.names(store)
 
 
 def test_what_nobody_has_changed_is_brought_in(database: Database, store: ArtefactStore, packed: Path) -> None:

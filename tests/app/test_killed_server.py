@@ -37,7 +37,7 @@ def database(settings: Settings) -> Iterator[Database]:
 
 @pytest.fixture
 def tokens(settings: Settings, database: Database) -> list[str]:
-    store = ArtefactStore(settings.data_dir / "artefacts")
+    store = ArtefactStore.of(settings)
     tokens = []
     with database.writing() as session:
         study = factories.make_study(session, labels_per_participant=LABELS, pool_scenarios=20)

@@ -2,7 +2,6 @@
 
 import json
 import logging
-import os
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -16,6 +15,7 @@ from fastapi.testclient import TestClient
 from app import logs
 from app.__main__ import main, migrate
 from app.settings import Settings
+from tests import databases
 from tests.app.conftest import TakingPart
 from tests.waiting import PATIENCE_S, free_port, until
 
@@ -97,8 +97,7 @@ def test_no_line_has_a_personal_link(taking_part: TakingPart, lines: list[dict[s
 def test_the_web_server_alone_writes_nothing_but_json(tmp_path: Path) -> None:
     settings = Settings(_env_file=None, data_dir=tmp_path, port=free_port())
     migrate(settings)
-    environment = {name: value for name, value in os.environ.items() if name != "DATABASE_URL"}
-    environment |= {"DATA_DIR": str(tmp_path), "PORT": str(settings.port), "LOG_FORMAT": "json"}
+    environment = databases.environment(tmp_path, PORT=str(settings.port), LOG_FORMAT="json")
     server = subprocess.Popen(
         [sys.executable, "-m", "app", "web"],
         env=environment,

@@ -4,6 +4,7 @@ import threading
 from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from datetime import UTC, datetime, timedelta, tzinfo
 from itertools import chain
 from uuid import uuid4
 
@@ -11,12 +12,17 @@ import httpx2
 import pytest
 from sqlalchemy import select
 
-from app.db import Database
+from app import db
+from app.db import Database, now
+from app.domain.people import Experimenter, NewLinks
 from app.domain.preferences import LabelEvent
 from app.domain.studies import Participant, Study
 from app.settings import Settings
 from app.storage import ArtefactStore
-from tests import factories
+from app.web.http import new_links
+from app.web.http.new_links import NewLink
+from app.web.http.rate_limit import SharedAttempts
+from tests import databases, factories
 from tests.answering import Server
 from tests.waiting import PATIENCE_S, free_port, until
 
@@ -47,6 +53,47 @@ def study(database: Database) -> Study:
         study = factories.make_study(session, labels_per_participant=LABELS, pool_scenarios=20)
         study.join_token = "everybody-is-welcome-here"
     return study
+
+
+@pytest.mark.skipif(databases.SERVER is None, reason="with SQLite there is one web server")
+def test_attempts_to_log_in_are_limited_for_all_of_them_together(database: Database) -> None:
+    servers = [SharedAttempts(database, "password", 3) for _ in range(3)]
+    assert [server.allow("192.0.2.1", "ana") for server in servers * 2] == [True] * 3 + [False] * 3
+    assert servers[0].allow("192.0.2.2", "ana"), "from elsewhere"
+    assert SharedAttempts(database, "token", 3).allow("192.0.2.1"), "of another kind"
+
+
+def test_new_links_are_shown_by_another_server_and_the_database_alone_knows_none(
+    database: Database, password: str
+) -> None:
+    with database.writing() as session:
+        owner = session.scalars(select(Experimenter)).one()
+        key = new_links.leave(session, owner.id, [NewLink("P01", "https://studio/p/secret")])
+    with database.reading() as session:
+        assert new_links.pick_up(session, owner.id, key) == [NewLink("P01", "https://studio/p/secret")]
+        assert list(new_links.pick_up(session, owner.id + 1, key)) == []
+        assert list(new_links.pick_up(session, owner.id, key + "x")) == []
+        row = session.scalars(select(NewLinks)).one()
+        assert not any(word in f"{row.sealed} {row.key_sha256}" for word in ("secret", "P01", key))
+    with database.writing() as session:
+        session.scalars(select(NewLinks)).one().expires_at = now() - timedelta(seconds=1)
+    with database.reading() as session:
+        assert list(new_links.pick_up(session, owner.id, key)) == []
+
+
+@pytest.mark.skipif(databases.SERVER is None, reason="SQLite has no clock of its own")
+def test_all_machines_go_by_the_clock_of_the_database(database: Database, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Wrong(datetime):
+        @classmethod
+        def now(cls, tz: tzinfo | None = None) -> "Wrong":
+            return super().now(tz) - timedelta(minutes=7)
+
+    monkeypatch.setattr("app.db.datetime", Wrong)
+    monkeypatch.setattr("app.db._clock", type(db._clock)())
+    assert abs(now() - datetime.now(UTC)) > timedelta(minutes=6)
+    with database.writing():
+        pass
+    assert abs(now() - datetime.now(UTC)) < timedelta(seconds=30)
 
 
 def test_an_answer_sent_to_all_of_them_at_once_is_kept_once(

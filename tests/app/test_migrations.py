@@ -56,7 +56,9 @@ def test_every_study_of_the_second_version_gets_a_secret_of_its_own(config: Conf
     study = "INSERT INTO study (slug, name, task, stored_settings, seed, created_at)"
     with engine.begin() as connection:
         for slug in ("one", "other"):
-            connection.execute(text(f"{study} VALUES (:slug, 'x', 'feeding', '{{}}', 7, '2026')"), {"slug": slug})
+            connection.execute(
+                text(f"{study} VALUES (:slug, 'x', 'feeding', '{{}}', 7, '2026-01-02 03:04:05+00:00')"), {"slug": slug}
+            )
     command.upgrade(config, "head")
     with engine.connect() as connection:
         secrets = connection.execute(text("SELECT key_secret FROM study")).scalars().all()

@@ -27,6 +27,7 @@ def test_a_pair_whose_files_are_missing_is_passed_over(
     with database.reading() as session:
         clip = session.get_one(Clip, taking_part.queries[0].left_clip_id)
     store.delete(getattr(clip, kind))
+    taking_part.browser.get(f"/media/{getattr(clip, kind)}.mp4")
     assert taking_part.turn().json()["pair"]["query_id"] == taking_part.queries[1].id
     assert "lost its files" in caplog.text
 

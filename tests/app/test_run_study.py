@@ -17,7 +17,7 @@ from app.domain.studies import Participant, Study
 from app.services.participants import enrolment
 from app.settings import Settings
 from app.storage import ArtefactStore
-from tests import factories
+from tests import factories, stored_files
 from tests.app.conftest import agree
 from tests.app.study_pages import typed
 
@@ -353,9 +353,8 @@ class TestDownload:
         assert client.get(path).headers["location"].startswith("/login")
 
     def test_a_lost_file_is_said_to_be_missing(self, experimenter: TestClient, path: str, store: ArtefactStore) -> None:
-        for file in store.root.rglob("*"):
-            if file.is_file():
-                file.unlink()
+        for name in stored_files.names(store):
+            stored_files.lose(store, name)
         answer = experimenter.get(path)
         assert answer.status_code == 404
         assert "missing from the data directory" in answer.text

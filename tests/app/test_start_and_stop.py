@@ -155,6 +155,7 @@ def test_a_web_server_that_falls_is_started_again_and_the_worker_keeps_its_work(
     assert running.child("worker") == worker
 
 
+@pytest.mark.sqlite("about the engine's own file")
 def test_a_damaged_file_of_the_engine_is_set_aside_and_the_studio_starts(start: Start, tmp_path: Path) -> None:
     (tmp_path / "engine.sqlite3").write_bytes(os.urandom(30_000))
     studio = start()

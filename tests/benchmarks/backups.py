@@ -90,7 +90,7 @@ def _cost(directory: Path, people: int, answers: int) -> None:
 def _fill(settings: Settings, people: int, answers: int) -> None:
     """A study as large as a finished one, its files filled with noise of the usual sizes."""
     migrate(settings)
-    database, store = Database(settings.sqlalchemy_url), ArtefactStore(settings.data_dir / "artefacts")
+    database, store = Database(settings.sqlalchemy_url), ArtefactStore.of(settings)
     with database.writing() as session:
         study = factories.make_study(session, labels_per_participant=answers, pool_scenarios=500, break_every=0)
         clips = [factories.make_clip(session, store, study) for _ in range(POOL)]

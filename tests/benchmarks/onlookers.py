@@ -68,7 +68,7 @@ def main() -> None:
 
 def _study(settings: Settings, options: argparse.Namespace) -> tuple[list[str], str]:
     """People with all their answers, and labellers with pairs waiting; the links of these, a cookie."""
-    database, store = Database(settings.sqlalchemy_url), ArtefactStore(settings.data_dir / "artefacts")
+    database, store = Database(settings.sqlalchemy_url), ArtefactStore.of(settings)
     rng = random.Random(1)  # noqa: S311
     with database.writing() as session:
         study = factories.make_study(

@@ -90,7 +90,7 @@ def _start(settings: Settings, port: int) -> "subprocess.Popen[bytes]":
 
 
 def _participants(settings: Settings, count: int, answers: int) -> list[str]:
-    database, store = Database(settings.sqlalchemy_url), ArtefactStore(settings.data_dir / "artefacts")
+    database, store = Database(settings.sqlalchemy_url), ArtefactStore.of(settings)
     with database.writing() as session:
         study = factories.make_study(
             session, labels_per_participant=max(10, answers), pool_scenarios=500, break_every=0

@@ -7,7 +7,7 @@ from sqlalchemy import select
 from app.domain.clips import Clip
 from app.domain.preferences import Query
 from app.storage import ArtefactStore
-from tests import factories
+from tests import factories, stored_files
 from tests.browser.conftest import Invited, NewPage, serious_findings, the_only, wait_ready
 
 pytestmark = pytest.mark.browser
@@ -246,7 +246,7 @@ def test_a_pair_whose_clip_is_damaged_gives_way_to_the_next(
     with invited.database.reading() as session:
         first, second = session.scalars(select(Query).order_by(Query.ordinal).limit(2))
         clip = session.get_one(Clip, first.left_clip_id)
-    store.path(clip.video_sha256).write_bytes(b"no video")
+    stored_files.overwrite(store, clip.video_sha256, b"no video")
     page.unroute("**/media/*.mp4")
     page.get_by_role("button", name="Load them again").click()
     wait_ready(page, 0)

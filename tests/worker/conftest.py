@@ -78,7 +78,7 @@ def database(settings: Settings) -> Iterator[Database]:
 
 @pytest.fixture
 def store(settings: Settings) -> ArtefactStore:
-    return ArtefactStore(settings.data_dir / "artefacts")
+    return ArtefactStore.of(settings)
 
 
 @pytest.fixture

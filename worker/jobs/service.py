@@ -19,6 +19,7 @@ from app import data_directory, logs, signing
 from app.db import Database, Watch, complaints, now
 from app.domain.study_settings import StudySettings
 from app.errors import AppError, OncePerMinute
+from app.files.interface import StorageUnavailable
 from app.settings import Settings
 from app.storage import ArtefactStore, keep_private
 from worker.compute import learning, simulation
@@ -41,6 +42,8 @@ ROUND_S = 0.5
 REST = 9.0
 """Times as long as the last round took: a tenth of a core at most, however large the studies are."""
 PRESENCE_S = 5.0
+MOST_WORKERS = 1000
+"""that find a name by themselves"""
 CLEARING_S = 24 * 3600.0
 LOOK_AGAIN_S = 10.0
 """What is still due after this long may have been forgotten by the engine, or given up."""
@@ -63,17 +66,17 @@ def run(settings: Settings) -> int:
     engine_log.setLevel(logging.ERROR)
     engine_log.addFilter(OncePerMinute())
     keep_private(settings)
-    with data_directory.shared(settings.data_dir), _only_one(settings), ExitStack() as stack:
+    with data_directory.shared(settings.data_dir), ExitStack() as stack:
         database = Database(settings.sqlalchemy_url)
         stack.callback(database.dispose)
-        if not stack.enter_context(database.claiming(settings.worker_name)):
-            raise WorkerAlreadyRunning
+        settings = _named(settings, database, stack)
+        stack.enter_context(_only_one(settings))
         stop = Stop()
         compute = Compute(settings.compute_processes, stop.asked)
         stop.at_once = compute.kill
-        context = WorkerContext(
-            database, ArtefactStore(settings.data_dir / "artefacts"), compute, signing.load(settings)
-        )
+        store = ArtefactStore.of(settings)
+        store.files.require_usable()
+        context = WorkerContext(database, store, compute, signing.load(settings))
         runner = JobRunner(context, Lanes(compute))
         try:
             compute.warm_up(Lane.CLIPS, simulation.warm_up)
@@ -86,6 +89,21 @@ def run(settings: Settings) -> int:
             compute.close()
             DBOS.destroy()
     return 0
+
+
+def _named(settings: Settings, database: Database, stack: ExitStack) -> Settings:
+    """The settings with a name that no other worker of this database has, until the stack is closed.
+
+    Whoever is given no name takes the first that is free: copies of one container can be told nothing of their own.
+    """
+    given = "worker_name" in settings.model_fields_set or database.is_sqlite
+    for name in [settings.worker_name] if given else (f"worker-{number}" for number in range(1, MOST_WORKERS + 1)):
+        claim = ExitStack()
+        if claim.enter_context(database.claiming(name)):
+            stack.enter_context(claim)
+            return settings.model_copy(update={"worker_name": name})
+        claim.close()
+    raise WorkerAlreadyRunning
 
 
 @contextmanager
@@ -136,9 +154,12 @@ class _Rounds:
                 self._round()
                 self._rested_at = time.monotonic() + REST * (time.monotonic() - started)
             self._clear_away()
+            self._runner.leave_nothing_of_erased()
             self._backups.look()
         except OperationalError as error:
             complaints.warning("the database could not be reached, trying again: %s", error.orig)
+        except StorageUnavailable as error:
+            complaints.warning("stored files could not be reached, trying again: %s", error.__cause__)
 
     def _sign(self) -> None:
         if time.monotonic() - self._signed_at >= PRESENCE_S:
@@ -147,6 +168,7 @@ class _Rounds:
                 return
             with self._context.database.writing() as session:
                 records.sign_presence(session, self._worker_name, moment)
+                records.beat_all(session, list(self._runner.in_hand))
             self._bond.signed(moment)
             self._signed_at = time.monotonic()
 
@@ -198,6 +220,8 @@ class _Rounds:
     def _refill(self, participant_id: int) -> None:
         try:
             query_selection.refill_queries(self._context, participant_id)
+        except StorageUnavailable:
+            raise
         except AppError as refusal:  # one study that cannot go on must not stop the others
             log.warning("participant %d gets no further pairs: %s", participant_id, refusal.message)
             self._refused.add(participant_id)

@@ -15,9 +15,13 @@ from sqlalchemy.exc import OperationalError
 from sqlalchemy.orm import Session
 
 from app import logs
+from app.domain import run_keys
 from app.domain.models import RunKind
+from app.domain.run_keys import RunKey
 from app.domain.studies import Participant, Study
 from app.errors import AppError
+from app.files.interface import StorageUnavailable
+from app.services.participants import withdrawal
 from worker.jobs.clips.evaluation_films import make_films
 from worker.jobs.clips.pool_clips import build_clips
 from worker.jobs.learning.baselines import train_method
@@ -82,7 +86,7 @@ class JobRunner(DBOSConfiguredInstance):
             log.info("%s done in %.1f s", job.key, time.monotonic() - started)
         except AppError as refusal:  # foreseen, and already in words for people
             log.warning("%s: %s", job.key, refusal.message)
-            _step("fail", self._fail, job.key, refusal.message)
+            _step("fail", self._fail, job.key, refusal.message, not isinstance(refusal, StorageUnavailable))
         except Exception as error:  # the worker's edge: one failed job must not stop the others
             if self._is_pointless(job):
                 log.info("%s is abandoned: the participant has withdrawn, or the study was deleted", job.key)
@@ -95,6 +99,19 @@ class JobRunner(DBOSConfiguredInstance):
     def _is_pointless(self, job: Job) -> bool:
         with self.context.database.reading() as session:
             return _has_withdrawn(session, job)
+
+    def leave_nothing_of_erased(self) -> None:
+        """Another worker may have erased somebody's last traces while this one was still at work for them."""
+        for key in [each for each in self.stored if each not in self.in_hand]:
+            about, store = run_keys.read(key), self.context.store
+            with self.context.database.writing() as session:
+                if about is None or not _is_erased(session, about):
+                    continue
+                stored = self.stored.pop(key)
+                for sha256 in stored - withdrawal.in_use(session, stored):
+                    store.delete(sha256)
+            if about.participant_id is not None:
+                store.unfinished.forget(store.unfinished.folder(about.participant_id))
 
     def _begin(self, arguments: dict[str, Any]) -> int | None:
         """The run's id; None when there is nothing to be done, because an earlier life of this job has finished it."""
@@ -132,6 +149,12 @@ def _has_withdrawn(session: Session, job: Job) -> bool:
     return job.participant_id is not None and (
         session.get_one(Participant, job.participant_id).withdrawn_at is not None
     )
+
+
+def _is_erased(session: Session, about: RunKey) -> bool:
+    if about.participant_id is not None:
+        return session.get_one(Participant, about.participant_id).erased_at is not None
+    return about.study_id is not None and session.get_one(Study, about.study_id).erased_at is not None
 
 
 def _seed(session: Session, job: Job) -> int:

@@ -31,10 +31,10 @@ class OwnStudio:
 
     def __init__(self, directory: Path) -> None:
         directory.mkdir(parents=True, exist_ok=True)
-        self.settings = Settings(data_dir=directory, port=_free_port(), database_url=None)
+        self.settings = Settings(data_dir=directory, port=_free_port(), database_url=None, storage_url=None)
         self.log = directory / "rehearsal.log"
         self._environment = {
-            **{name: value for name, value in os.environ.items() if name != "DATABASE_URL"},
+            **{name: value for name, value in os.environ.items() if name not in ("DATABASE_URL", "STORAGE_URL")},
             "DATA_DIR": str(directory),
             "HOST": self.settings.host,
             "PORT": str(self.settings.port),

@@ -183,7 +183,7 @@ def _ready(session: Session, store: ArtefactStore, participant: Participant) -> 
     with session.scalars(waiting) as queries:
         for query in queries:
             clips = (query.left_clip, query.right_clip)
-            if all(store.has(sha256) for clip in clips for sha256 in (clip.video_sha256, clip.poster_sha256)):
+            if all(store.seems_whole(sha256) for clip in clips for sha256 in (clip.video_sha256, clip.poster_sha256)):
                 yield query
             else:
                 log.warning("query %d of participant %d has lost its files: passed over", query.id, participant.id)

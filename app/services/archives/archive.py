@@ -15,7 +15,6 @@ an archive that comes in is in app.services.archives.archive_reading.
 import hashlib
 import json
 import re
-import shutil
 import tempfile
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -38,7 +37,7 @@ from app.services.evaluation import unblinding
 from app.services.exports import export_formats
 from app.services.participants.withdrawal import ARTEFACT_COLUMNS
 from app.signing import SigningKey
-from app.storage import ArtefactStore, hash_of_file
+from app.storage import ArtefactStore
 
 FORMAT, VERSION = "pbarl-studio-archive", 2
 MANIFEST, SEALED = "manifest.json", "sealed"
@@ -195,13 +194,14 @@ def _as_stored(study: Study, table: Table, row: Mapping[Any, Any]) -> dict[str, 
 
 def _write_file(archive: zipfile.ZipFile, store: ArtefactStore, sha256: str) -> int | None:
     """The size of the file; None when it is missing or damaged."""
-    if not re.fullmatch(_SHA256, sha256) or not store.has(sha256) or hash_of_file(store.path(sha256)) != sha256:
+    if not re.fullmatch(_SHA256, sha256) or not store.scrub(sha256):
         return None
-    with store.path(sha256).open("rb") as source:
-        entry = zipfile.ZipInfo(f"files/{sha256}")  # one moment for all of them; videos do not get any smaller
-        with archive.open(entry, "w", force_zip64=True) as target:
-            shutil.copyfileobj(source, target)
-        return source.tell()
+    artefact = store.verified(sha256)
+    entry = zipfile.ZipInfo(f"files/{sha256}")  # one moment for all of them; videos do not get any smaller
+    with archive.open(entry, "w", force_zip64=True) as target:
+        for piece in artefact.pieces():
+            target.write(piece)
+    return artefact.stat.byte_count
 
 
 def _not_left_out(table: Table) -> Sequence[ColumnElement[bool]]:

@@ -77,7 +77,7 @@ class _Shelf:
 
     def __init__(self, store: ArtefactStore) -> None:
         self._store = store
-        self.workspace = store.unfinished(0).parent
+        self.workspace = store.unfinished.root
         self.put: list[str] = []
 
     def take(self, sha256: str, pieces: Iterator[bytes]) -> None:
@@ -105,7 +105,7 @@ def bring_in(session: Session, store: ArtefactStore, unpacked: Unpacked, actor: 
     """Add the rows; if that fails, the files go as well. Raises ArchiveInvalid."""
     try:
         with session.begin_nested():
-            if not all(store.has(sha256) for sha256 in unpacked.checked.manifest.files):
+            if not all(store.holds(sha256) for sha256 in unpacked.checked.manifest.files):
                 raise ArchiveInvalid("A file was removed while the archive was read. Import it again.")
             return _insert(session, unpacked.checked, actor)
     except Exception as error:  # whatever a stranger's rows break, the files that came with them go

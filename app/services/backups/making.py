@@ -49,6 +49,10 @@ class OfPostgresql(AppError):
     """The database is on a PostgreSQL server, whose own tools copy it."""
 
 
+class OfBucket(AppError):
+    """The stored files are in a bucket, whose own tools copy it (docs/deploy.md). No backup was made."""
+
+
 class _Outdated(Exception):
     """Something that the snapshot names has been removed since."""
 
@@ -72,10 +76,12 @@ def in_words(error: OSError | sqlite3.Error) -> str:
 
 
 def database_file(settings: Settings) -> Path:
-    """The database to copy. Raises OfPostgresql, which says how to copy any other."""
+    """The database to copy. Raises OfPostgresql, which says how to copy any other, and OfBucket."""
     path = file_of(settings.sqlalchemy_url)
     if path is None:
         raise OfPostgresql(_commands_for_postgresql(settings))
+    if settings.storage_url is not None:
+        raise OfBucket
     return path
 
 
@@ -175,7 +181,7 @@ class _Draft:
             target.parent.mkdir(mode=0o700, exist_ok=True)
             if (
                 any(_linked(each, target, sha256) for each in self.earlier[:1])
-                or _copied(store.path(sha256), target, sha256)
+                or _copied(self.settings.data_dir / layout.artefact(sha256), target, sha256)
                 or any(_linked(each, target, sha256) for each in self.earlier[1:])
             ):
                 sizes[sha256] = target.stat().st_size
@@ -184,8 +190,8 @@ class _Draft:
                 if not snapshots.artefacts(connection).issuperset(missing):
                     raise _Outdated
                 for sha256 in missing:
-                    target = self.folder / layout.artefact(sha256)
-                    if _copied(store.path(sha256), target, sha256):  # it was made again meanwhile
+                    source, target = (each / layout.artefact(sha256) for each in (self.settings.data_dir, self.folder))
+                    if _copied(source, target, sha256):  # it was made again meanwhile
                         sizes[sha256] = target.stat().st_size
         lost = [sha256 for sha256 in missing if sha256 not in sizes]
         for sha256 in lost:
@@ -294,13 +300,25 @@ def _commands_for_postgresql(settings: Settings) -> str:
     url = make_url(settings.sqlalchemy_url)
     server = URL.create("postgresql", url.username, None, url.host, url.port, url.database, url.query)
     address = server.render_as_string()
-    artefacts = settings.data_dir / "artefacts"
+    to_copy, to_restore = _commands_for_files(settings)
     return (
         f"{OfPostgresql().message} First the database, then the files that it names:\n"
         f"  pg_dump --format=custom --file=studio.dump {address}\n"
-        f"  mkdir -p studio-artefacts && cp -au {artefacts}/. studio-artefacts/\n"
+        f"  {to_copy}\n"
         "To restore them while the studio is stopped, into an empty database:\n"
         f"  pg_restore --no-owner --exit-on-error --dbname={address} studio.dump\n"
-        f"  mkdir -p {artefacts} && cp -au studio-artefacts/. {artefacts}/\n"
+        f"  {to_restore}\n"
         "docs/backups.md says more, also about pg_basebackup and going back to any moment."
+    )
+
+
+def _commands_for_files(settings: Settings) -> tuple[str, str]:
+    """To copy the stored files, and to restore them."""
+    if settings.storage_url is not None:
+        there = f"{settings.storage_url}/artefacts"
+        return f"aws s3 sync {there} studio-artefacts", f"aws s3 sync studio-artefacts {there}"
+    there = str(settings.data_dir / "artefacts")
+    return (
+        f"mkdir -p studio-artefacts && cp -au {there}/. studio-artefacts/",
+        f"mkdir -p {there} && cp -au studio-artefacts/. {there}/",
     )

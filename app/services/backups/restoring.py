@@ -61,6 +61,8 @@ def restore(settings: Settings, folder: Path, into: Path | None = None, *, repla
             "DATABASE_URL says that the database is not in the data directory. Restore with --into a new directory and "
             "move the database from there to its place. For PostgreSQL, docs/backups.md has the commands."
         )
+    if into is None and settings.storage_url is not None:
+        raise RestoreFailed("STORAGE_URL says that files are in a bucket. Restore with --into a new directory.")
     backup = _opened(settings, folder)
     target = into or settings.data_dir
     try:

@@ -197,7 +197,7 @@ def is_ready(
     """Whether the trial's robot can be shown: its film is there (others may still be made), or all controllers."""
     if settings.mode is EvaluationMode.PHYSICAL:
         return len(controllers_of(session, participant_id)) >= len(settings.methods)
-    return trial.film is not None and store.has(trial.film.video_sha256)
+    return trial.film is not None and store.seems_whole(trial.film.video_sha256)
 
 
 def controllers_of(session: Session, participant_id: int) -> dict[str, Controller]:

@@ -136,12 +136,12 @@ class ParticipantDetail:
     stage_times: Sequence[participant_status.StageTime]
 
 
-def machine(session: Session, data_dir: Path) -> Machine:
+def machine(session: Session, data_dir: Path, store: ArtefactStore) -> Machine:
     """The state of the worker and of the disk."""
     seen_at = session.scalar(select(WorkerPresence.last_seen_at).order_by(WorkerPresence.last_seen_at.desc()).limit(1))
     free = shutil.disk_usage(data_dir).free
     alive = seen_at is not None and now() - seen_at <= WORKER_SILENCE
-    broken = damage.standing(session, ArtefactStore(data_dir / "artefacts"))
+    broken = damage.standing(session, store)
     falls, backups = noted(data_dir), schedule.standing(data_dir)
     return Machine(seen_at, alive, free, free < DISK_LOW_BYTES, broken, falls, backups)
 

@@ -4,7 +4,6 @@ What the worker keeps for itself (its engine's notes, results of work that was s
 ``withdrawn_at`` without ``erased_at``.
 """
 
-import shutil
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import Any
 
@@ -69,7 +68,7 @@ def erase(session: Session, store: ArtefactStore, participant: Participant) -> N
     _erase_rows(session, personal_rows(participant.id), erased)
     session.expire_all()  # what the session remembers of those rows is gone as well
     _erase_files(session, store, artefacts, erased)
-    shutil.rmtree(store.unfinished(participant.id), ignore_errors=True)
+    store.unfinished.forget(store.unfinished.folder(participant.id))
     if erased or not receipts.are_there(session, participant):
         receipts.add(session, participant, ROWS_AND_FILES, erased)
 
@@ -96,7 +95,7 @@ def erase_study(session: Session, store: ArtefactStore, study: Study) -> None:
     session.expire_all()
     _erase_files(session, store, artefacts, erased)
     for participant_id in session.scalars(select(Participant.id).where(Participant.study_id == study.id)):
-        shutil.rmtree(store.unfinished(participant_id), ignore_errors=True)
+        store.unfinished.forget(store.unfinished.folder(participant_id))
     if erased or not receipts.are_there(session, study):
         receipts.add(session, study, ROWS_AND_FILES, erased)
 

@@ -28,6 +28,7 @@ from app.services.runs import publishing, reports
 from app.services.studies import studies
 from app.web.api import schemas as answers
 from app.web.api.problems import add_problems, only_known_parameters
+from app.web.http import stored_file
 from app.web.http.deps import Code, ReadingSession, RowId, Slug, Studio, StudioDep, WritingSession
 
 PREFIX = "/api/v1"
@@ -228,7 +229,7 @@ def download_bundle(
     person = enrolment.find_by_code(session, studies.find_study(session, slug), code)
     bundle = publishing.find_bundle(session, studio.store, person, version)
     audit.record(session, caller.name, "bundle downloaded", f"{slug}/{code}/{version}", participant=person)
-    return FileResponse(studio.store.path(bundle.artefact_sha256), media_type="application/zip")
+    return stored_file.send(studio.store, bundle.artefact_sha256, "application/zip")
 
 
 @router.get("/studies/{slug}/report", tags=["reports"])
@@ -364,7 +365,7 @@ def download_export(
     study = studies.find_study(session, slug)
     export = export_requests.find(session, studio.store, study, export_id)
     audit.record(session, caller.name, f"{export.kind} export downloaded", f"{slug}/{export_id}", study=study)
-    return FileResponse(studio.store.path(export.artefact_sha256 or ""), media_type="application/zip")
+    return stored_file.send(studio.store, export.artefact_sha256 or "", "application/zip")
 
 
 def _export(session: Session, study: Study, export: Export) -> answers.ExportAnswer:

@@ -19,6 +19,7 @@ from app.services.accounts import roles
 from app.services.archives import study_import
 from app.services.archives.archive import ArchiveInvalid
 from app.services.archives.study_import import Imported
+from app.web.http import new_links
 from app.web.http.deps import CurrentExperimenter, Studio, StudioDep, experimenter_asking
 from app.web.http.new_links import NewLink
 from app.web.texts.templating import page
@@ -94,7 +95,8 @@ async def import_study(
     slug = imported.study.slug
     if not links:
         return RedirectResponse(request.app.url_path_for("show_study", slug=slug), HTTPStatus.SEE_OTHER)
-    key = studio.new_links.leave(experimenter.id, links)
+    async with studio.session_queue.writing() as session:
+        key = await run_in_threadpool(new_links.leave, session, experimenter.id, links)
     return RedirectResponse(request.app.url_path_for("show_links", slug=slug, key=key), HTTPStatus.SEE_OTHER)
 
 

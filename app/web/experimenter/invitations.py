@@ -19,6 +19,7 @@ from app.services.archives import study_import
 from app.services.exports.csv_cells import csv_line
 from app.services.participants import enrolment, recruitment_panel, withdrawal
 from app.services.studies import studies
+from app.web.http import new_links
 from app.web.http.deps import (
     ActingExperimenter,
     Code,
@@ -51,7 +52,7 @@ def add_participants(
     study = studies.find_study(session, slug)
     added = [enrolment.add_participant(session, study, experimenter.name) for _ in range(count)]
     links = [NewLink(participant.code, link_of(request, studio, token)) for participant, token in added]
-    return _see(request, "show_links", slug=slug, key=studio.new_links.leave(experimenter.id, links))
+    return _see(request, "show_links", slug=slug, key=new_links.leave(session, experimenter.id, links))
 
 
 @router.post("/{slug}/participants/{code}/link", name="renew_link")
@@ -68,7 +69,7 @@ def renew_link(
     participant = enrolment.find_by_code(session, study, code)
     token = enrolment.renew_link(session, study, participant, experimenter.name)
     links = [NewLink(participant.code, link_of(request, studio, token))]
-    return _see(request, "show_links", slug=slug, key=studio.new_links.leave(experimenter.id, links))
+    return _see(request, "show_links", slug=slug, key=new_links.leave(session, experimenter.id, links))
 
 
 @router.get("/{slug}/links/{key}", name="show_links")
@@ -82,7 +83,7 @@ def show_links(
 ) -> Response:
     """New links, for as long as the desk keeps them."""
     study = studies.find_study(session, slug)
-    links = studio.new_links.pick_up(experimenter.id, key)
+    links = new_links.pick_up(session, experimenter.id, key)
     _note_looking(studio, session, experimenter, study, links)
     imported, signer = study_import.signer_of(session, study)
     context = {
@@ -105,7 +106,7 @@ def show_sheet(
     studio: StudioDep,
 ) -> Response:
     """A card for each participant, with code, link and QR code: to print and to cut."""
-    links = studio.new_links.pick_up(experimenter.id, key)
+    links = new_links.pick_up(session, experimenter.id, key)
     study = studies.find_study(session, slug)
     _note_looking(studio, session, experimenter, study, links)
     context = {
@@ -122,7 +123,7 @@ def download_links(
 ) -> Response:
     """Codes and links as a file that spreadsheets and mail programs read."""
     headers = {"content-disposition": f'attachment; filename="{slug}-links.csv"'}
-    links = studio.new_links.pick_up(experimenter.id, key)
+    links = new_links.pick_up(session, experimenter.id, key)
     _note_looking(studio, session, experimenter, studies.find_study(session, slug), links)
     return Response(_as_csv(links), media_type="text/csv; charset=utf-8", headers=headers)
 

@@ -93,7 +93,7 @@ async def change_password(
 ) -> Response:
     """Change the password; every other login of this account ends."""
     try:
-        _count_attempt(request, studio, experimenter.name, browser=f"logged in/{experimenter.id}")
+        await run_in_threadpool(_count_attempt, request, studio, experimenter.name, f"logged in/{experimenter.id}")
         if new != again:
             raise accounts.PasswordUnacceptable("The two new passwords differ. Please type the same one twice.")
         password_hash = await studio.hashing_for_known.run(accounts.hash_of_new, experimenter, current=current, new=new)
@@ -114,7 +114,7 @@ async def _verified(request: Request, studio: Studio, name: str, password: str) 
     async with studio.session_queue.reading() as session:
         account = await run_in_threadpool(accounts.by_name, session, name)
     browser = known_browsers.name_in(request.cookies.get(KNOWN_BROWSER_COOKIE, ""), account)
-    _count_attempt(request, studio, name, browser)
+    await run_in_threadpool(_count_attempt, request, studio, name, browser)
     hashing = studio.hashing if browser is None else studio.hashing_for_known
     return await hashing.run(accounts.verify, account, password)
 

@@ -7,7 +7,7 @@ from http import HTTPStatus
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Form, Path, Request
-from fastapi.responses import FileResponse, RedirectResponse, Response
+from fastapi.responses import RedirectResponse, Response
 from sqlalchemy.orm import Session
 
 from app.domain.people import Experimenter
@@ -18,6 +18,7 @@ from app.services.evaluation.robot_operation import LONGEST_REASON, RepetitionRe
 from app.services.evaluation.unblinding import NAMES, ConfirmationDiffers
 from app.services.participants import enrolment
 from app.services.studies import studies
+from app.web.http import stored_file
 from app.web.http.deps import (
     ActingExperimenter,
     Code,
@@ -118,9 +119,9 @@ def download_controller(
     audit.record(
         session, experimenter.name, "controller downloaded", f"{study.slug}/{code}/{letter}", participant=participant
     )
-    path = studio.store.path(controller.artefact_sha256)
-    headers = {"etag": f'"{controller.artefact_sha256}"', "last-modified": AT_NO_TIME}
-    return FileResponse(path, media_type="application/zip", filename=f"{slug}-{code}-{letter}.zip", headers=headers)
+    filename, sha256 = f"{slug}-{code}-{letter}.zip", controller.artefact_sha256
+    headers = {"etag": f'"{sha256}"', "last-modified": AT_NO_TIME}
+    return stored_file.send(studio.store, sha256, "application/zip", filename=filename, headers=headers)
 
 
 @router.get("/unblind", name="show_unblinding")

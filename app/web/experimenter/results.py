@@ -5,7 +5,7 @@ from http import HTTPStatus
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Path, Request
-from fastapi.responses import FileResponse, RedirectResponse, Response, StreamingResponse
+from fastapi.responses import RedirectResponse, Response, StreamingResponse
 from sqlalchemy.orm import Session
 
 from app import signing
@@ -24,6 +24,7 @@ from app.services.participants import enrolment
 from app.services.runs import reports
 from app.services.studies import locking, preregistration, studies
 from app.web.experimenter import form_words
+from app.web.http import stored_file
 from app.web.http.deps import (
     ActingExperimenter,
     CurrentExperimenter,
@@ -197,8 +198,7 @@ def download_export(
     export = export_requests.find(session, studio.store, study, export_id)
     audit.record(session, experimenter.name, f"{export.kind} export downloaded", f"{slug}/{export_id}", study=study)
     filename = f"{slug}-{export.kind}-{export.requested_at:%Y%m%dT%H%M}.zip"
-    path = studio.store.path(export.artefact_sha256 or "")
-    return FileResponse(path, media_type="application/zip", filename=filename)
+    return stored_file.send(studio.store, export.artefact_sha256 or "", "application/zip", filename=filename)
 
 
 @router.get("/export/{table}.{kind}", name="download_table")

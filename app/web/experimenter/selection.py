@@ -4,7 +4,6 @@ import io
 import zipfile
 from collections.abc import Iterator, Sequence
 from http import HTTPStatus
-from pathlib import Path
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Form, Request
@@ -18,7 +17,9 @@ from app.services import audit
 from app.services.participants import enrolment
 from app.services.runs import publishing
 from app.services.studies import studies
+from app.storage import Artefact
 from app.web.experimenter.invitations import link_of
+from app.web.http import new_links
 from app.web.http.deps import ActingExperimenter, Slug, StudioDep, WritingSession
 from app.web.http.new_links import NewLink
 
@@ -56,7 +57,7 @@ def renew_links(
     for participant in _ticked(session, study, code):
         token = enrolment.renew_link(session, study, participant, experimenter.name)
         links.append(NewLink(participant.code, link_of(request, studio, token)))
-    key = studio.new_links.leave(experimenter.id, links)
+    key = new_links.leave(session, experimenter.id, links)
     address = request.app.url_path_for("show_links", slug=slug, key=key)
     return RedirectResponse(address, HTTPStatus.SEE_OTHER)
 
@@ -79,7 +80,7 @@ def download_bundles(
         subject = f"{slug}/{participant.code}/{bundle.version}"
         audit.record(session, experimenter.name, "bundle downloaded", subject, participant=participant)
         name = f"{slug}-{participant.code}-v{bundle.version}.zip"
-        files.append((name, studio.store.path(bundle.artefact_sha256)))
+        files.append((name, studio.store.verified(bundle.artefact_sha256)))
     headers = {"content-disposition": f'attachment; filename="{slug}-bundles.zip"'}
     return StreamingResponse(_zipped(files), media_type="application/zip", headers=headers)
 
@@ -104,13 +105,15 @@ class _Sink(io.RawIOBase):
         return b"".join(pieces)
 
 
-def _zipped(files: Sequence[tuple[str, Path]]) -> Iterator[bytes]:
+def _zipped(files: Sequence[tuple[str, Artefact]]) -> Iterator[bytes]:
     """The files as one zip file, written while it is sent: no transaction waits for it."""
     sink = _Sink()
     with zipfile.ZipFile(sink, "w", zipfile.ZIP_STORED) as together:  # a bundle is packed already
-        for name, path in files:
-            together.write(path, name)
-            yield sink.taken()
+        for name, artefact in files:
+            with together.open(zipfile.ZipInfo(name), "w") as entry:
+                for piece in artefact.pieces():
+                    entry.write(piece)
+                    yield sink.taken()
     yield sink.taken()
 
 

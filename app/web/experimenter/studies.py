@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Request
 from fastapi.concurrency import run_in_threadpool
-from fastapi.responses import FileResponse, RedirectResponse, Response
+from fastapi.responses import RedirectResponse, Response
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 from jinja2 import Environment
 from sqlalchemy.orm import Session
@@ -20,6 +20,7 @@ from app.services.runs import publishing
 from app.services.studies import studies
 from app.web.experimenter import charts, form_words, live
 from app.web.experimenter.participants_table import View, WantedView, people_table
+from app.web.http import stored_file
 from app.web.http.deps import (
     ActingExperimenter,
     Code,
@@ -178,7 +179,7 @@ def download_bundle(
     bundle = publishing.find_bundle(session, studio.store, participant, version)
     audit.record(session, experimenter.name, "bundle downloaded", f"{slug}/{code}/{version}", participant=participant)
     filename = f"{slug}-{code}-v{version}.zip"
-    return FileResponse(studio.store.path(bundle.artefact_sha256), media_type="application/zip", filename=filename)
+    return stored_file.send(studio.store, bundle.artefact_sha256, "application/zip", filename=filename)
 
 
 def _note_looking(studio: Studio, session: Session, experimenter: Experimenter, slug: str, code: str) -> None:
@@ -198,7 +199,7 @@ def _list_context(session: Session, studio: Studio, put_away: bool) -> dict[str,
     lines = dashboard.study_lines(session, put_away=put_away)
     names = Counter(line.study.name.casefold() for line in lines)
     return {
-        "machine": dashboard.machine(session, studio.settings.data_dir),
+        "machine": dashboard.machine(session, studio.settings.data_dir, studio.store),
         "lines": lines,
         "standings": study_state.standings(session, lines),
         "twice": {line.study.id for line in lines if names[line.study.name.casefold()] > 1},
@@ -215,7 +216,7 @@ def _study_context(session: Session, studio: Studio, slug: str, view: View) -> d
         "settings": study.settings,
         "overview": overview,
         "table": people_table(overview, view),
-        "machine": dashboard.machine(session, studio.settings.data_dir),
+        "machine": dashboard.machine(session, studio.settings.data_dir, studio.store),
         "sparkline": charts.sparkline,
         "scripted": enrolment.count_scripted(session, study),
     }
@@ -230,7 +231,7 @@ def _participant_context(session: Session, studio: Studio, slug: str, code: str)
         "settings": study.settings,
         "detail": detail,
         "films": debrief.before_and_after(session, participant),
-        "machine": dashboard.machine(session, studio.settings.data_dir),
+        "machine": dashboard.machine(session, studio.settings.data_dir, studio.store),
         "chart": charts.accuracy_chart(detail.row.curve, study.settings.labels_per_participant),
         "interval": charts.interval,
         "words": task_words.words_of(study.task),

@@ -22,7 +22,6 @@ from app.settings import Settings
 from app.storage import ArtefactStore
 from app.web.http.hashing import Hashing
 from app.web.http.import_limit import ImportLimit
-from app.web.http.new_links import NewLinks
 from app.web.http.rate_limit import LoginAttempts
 from app.web.http.readiness import Readiness
 from app.web.http.session_queue import SessionQueue
@@ -75,7 +74,6 @@ class Studio:
     hashing: Hashing = field(default_factory=Hashing)
     hashing_for_known: Hashing = field(default_factory=Hashing)
     """For people whose browser is known or who are logged in: they do not queue behind strangers who guess."""
-    new_links: NewLinks = field(default_factory=NewLinks)
     imports: ImportLimit = field(default_factory=ImportLimit)
     failed_logins: FailedLogins = field(default_factory=FailedLogins)
     tallies: Tallies = field(default_factory=Tallies)

@@ -1,12 +1,24 @@
-"""Hands new personal links to the experimenter who asked for them. In memory only: the database keeps hashes."""
+"""Hands new personal links to the experimenter who asked for them, whichever web server shows the page.
 
+The database keeps them sealed for ten minutes; the key is part of the page's address, and never stored.
+"""
+
+import base64
+import hashlib
+import json
 import secrets
-import time
 from collections.abc import Sequence
-from dataclasses import dataclass
-from threading import Lock
+from dataclasses import asdict, dataclass
+from datetime import timedelta
 
-KEPT_S = 600.0
+from cryptography.fernet import Fernet
+from sqlalchemy import delete, select
+from sqlalchemy.orm import Session
+
+from app.db import now
+from app.domain import people
+
+KEPT_FOR = timedelta(minutes=10)
 
 
 @dataclass(frozen=True)
@@ -17,23 +29,28 @@ class NewLink:
     url: str
 
 
-class NewLinks:
-    """Links wait here between the form that made them and the page that shows them, and are forgotten soon after."""
+def leave(session: Session, experimenter_id: int, links: Sequence[NewLink]) -> str:
+    """Keep the links for their experimenter; returns the key that picks them up."""
+    session.execute(delete(people.NewLinks).where(people.NewLinks.expires_at < now()))
+    key = secrets.token_urlsafe(24)
+    sealed = _seal(key).encrypt(json.dumps([asdict(link) for link in links]).encode()).decode()
+    row = people.NewLinks(
+        key_sha256=_hash(key), experimenter_id=experimenter_id, sealed=sealed, expires_at=now() + KEPT_FOR
+    )
+    session.add(row)
+    return key
 
-    def __init__(self) -> None:
-        self._lock = Lock()
-        self._waiting: dict[str, tuple[int, float, Sequence[NewLink]]] = {}
 
-    def leave(self, experimenter_id: int, links: Sequence[NewLink]) -> str:
-        """Keep the links for their experimenter; returns the key that picks them up."""
-        key, moment = secrets.token_urlsafe(16), time.monotonic()
-        with self._lock:
-            self._waiting = {each: entry for each, entry in self._waiting.items() if entry[1] > moment}
-            self._waiting[key] = (experimenter_id, moment + KEPT_S, links)
-        return key
+def pick_up(session: Session, experimenter_id: int, key: str) -> Sequence[NewLink]:
+    """The links left under this key; nothing for others, and nothing after ten minutes."""
+    left = select(people.NewLinks).where(people.NewLinks.key_sha256 == _hash(key), people.NewLinks.expires_at > now())
+    row = session.scalar(left.where(people.NewLinks.experimenter_id == experimenter_id))
+    return [NewLink(**link) for link in json.loads(_seal(key).decrypt(row.sealed))] if row else ()
 
-    def pick_up(self, experimenter_id: int, key: str) -> Sequence[NewLink]:
-        """The links left under this key; nothing for others, and nothing after ten minutes."""
-        with self._lock:
-            owner, expires, links = self._waiting.get(key, (0, 0.0, ()))
-        return links if owner == experimenter_id and expires > time.monotonic() else ()
+
+def _hash(key: str) -> str:
+    return hashlib.sha256(f"place of {key}".encode()).hexdigest()
+
+
+def _seal(key: str) -> Fernet:
+    return Fernet(base64.urlsafe_b64encode(hashlib.sha256(f"seal of {key}".encode()).digest()))

@@ -21,12 +21,13 @@ from sqlalchemy import text
 from app.__main__ import main
 from app.db import Database, now
 from app.domain.studies import Participant
+from app.files import lost as lost_files
 from app.services.backups import layout, making, restoring
 from app.services.backups.making import BackupFailed, BackupUnderWay, OfPostgresql
 from app.services.participants import withdrawal
 from app.settings import Settings
 from app.storage import ArtefactStore
-from tests import backed_up
+from tests import backed_up, stored_files
 from tests.waiting import PATIENCE_S
 
 
@@ -133,8 +134,8 @@ def test_a_file_that_the_studio_has_lost_is_taken_from_an_earlier_backup_or_said
 ) -> None:
     making.make(settings, directory)
     lost, damaged = sorted(backed_up.artefacts(settings.data_dir))[:2]
-    store.path(lost).unlink()
-    store.path(damaged).write_bytes(b"something else")
+    stored_files.lose(store, lost)
+    stored_files.overwrite(store, damaged, b"something else")
     assert making.make(settings, directory).manifest.missing == []
     without = making.make(settings, directory.with_name("elsewhere"))
     assert without.manifest.missing == [lost, damaged]
@@ -210,7 +211,7 @@ def test_a_file_that_goes_and_is_made_again_in_the_meantime_is_not_said_to_be_lo
     content, copy = b"trajectory 1", making._copied
 
     def remaking(source: Path, target: Path, sha256: str) -> bool:
-        if source != store.path(sha256_of_content):
+        if source != store.files.local(lost_files.place(sha256_of_content)):
             return copy(source, target, sha256)
         found, _ = copy(source, target, sha256), store.put(content)
         return found
@@ -315,6 +316,7 @@ def test_a_database_on_a_server_is_explained_with_the_commands_and_without_the_p
     assert "secret" not in said
 
 
+@pytest.mark.sqlite("PostgreSQL is backed up with its own tools")
 def test_the_commands_say_what_was_done(
     settings: Settings,
     database: Database,

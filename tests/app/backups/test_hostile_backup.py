@@ -32,7 +32,7 @@ def pristine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     migrate(settings)
     database = Database(settings.sqlalchemy_url)
     with database.writing() as session:
-        backed_up.fill(session, ArtefactStore(settings.data_dir / "artefacts"))
+        backed_up.fill(session, ArtefactStore.of(settings))
     (settings.data_dir / "some.key").write_bytes(b"key")
     yield making.make(settings, tmp_path_factory.mktemp("backups")).folder
     database.dispose()

@@ -109,7 +109,7 @@ def test_after_the_last_label_every_method_is_trained_evaluated_and_filmed(
         model = session.scalars(select(Model).where(Model.kind == ModelKind.METHOD)).one()
     assert (model.run_id, model.metrics["method"]) == (run_id, "prefft")
     assert model.metrics["evaluation"]["scenarios"] == 10
-    assert not any(context.store.unfinished(participant.id).iterdir())
+    assert not any(context.store.unfinished.folder(participant.id).iterdir())
 
     for filming in due(database, RunKind.FILMS):
         done(context, filming, make_films)
@@ -228,4 +228,4 @@ def test_a_controller_is_not_exchanged_once_the_robot_has_moved(
     done(context, job, make_films)
     with database.reading() as session:
         assert {each.method: each.artefact_sha256 for each in session.scalars(select(Controller))} == kept
-    shutil.rmtree(context.store.unfinished(participant.id), ignore_errors=True)
+    shutil.rmtree(context.store.unfinished.folder(participant.id), ignore_errors=True)

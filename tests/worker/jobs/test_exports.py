@@ -27,6 +27,7 @@ from app.domain.studies import Participant, Study
 from app.services.exports import export_requests, export_tables
 from app.services.exports.export_requests import ExportKind
 from app.storage import ArtefactStore
+from tests import stored_files
 from worker.compute.pools import Compute
 from worker.jobs import reconcile
 from worker.jobs.learning import dataset
@@ -122,10 +123,10 @@ def test_an_export_that_somebody_withdraws_from_while_it_is_made_is_made_again_w
     assert ["P01," in each for each in held] == [True, False], "made twice"
     assert "withdrawn" in made.read("csv/participants.csv").decode()
     assert "P01" not in made.read("csv/labels.csv").decode()
-    assert list(context.store.unfinished(0).parent.iterdir()) == []
+    assert list(context.store.unfinished.root.iterdir()) == []
     with context.database.reading() as session:
         kept = {each.artefact_sha256 for each in session.scalars(select(Export))}
-    assert {path.name for path in context.store.root.glob("??/*")} - withdrawal_keeps(context) == kept
+    assert stored_files.names(context.store) - withdrawal_keeps(context) == kept
 
 
 def withdrawal_keeps(context: WorkerContext) -> set[str]:
@@ -140,21 +141,21 @@ def withdrawal_keeps(context: WorkerContext) -> set[str]:
     }
 
 
-@pytest.mark.parametrize("damage", [lambda path: path.unlink(), lambda path: path.write_bytes(b"something else")])
+@pytest.mark.parametrize("damage", [stored_files.lose, stored_files.damage])
 @pytest.mark.parametrize("kind", ExportKind)
 def test_a_lost_or_damaged_recording_is_left_out_and_said_to_be(
     context: WorkerContext,
     study: Study,
     pairs: list[tuple[Clip, Clip]],
     kind: ExportKind,
-    damage: Callable[[Path], None],
+    damage: Callable[[ArtefactStore, str], None],
     experimenter: TestClient,
 ) -> None:
     with context.database.writing() as session:
         session.get_one(Study, study.id).unblinded_at = study.created_at
         lost = session.get_one(Rollout, pairs[0][0].rollout_id).trajectory_sha256
         others = len(session.scalars(select(Rollout.trajectory_sha256).distinct()).all()) - 1
-    damage(context.store.path(lost))
+    damage(context.store, lost)
     made = make_export(context, study, kind)
     if kind is ExportKind.DATA:
         arrays = np.load(io.BytesIO(made.read("pairs/P01.npz")), allow_pickle=False)

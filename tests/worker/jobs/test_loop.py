@@ -60,7 +60,7 @@ def outcome(studio: OwnStudio, database: Database) -> RehearsedPerson:
     killers = [_Killer(studio, database, RunKind.CLIPS), _Killer(studio, database, RunKind.FILTER)]
     for killer in killers:
         killer.start()
-    store = ArtefactStore(studio.settings.data_dir / "artefacts")
+    store = ArtefactStore.of(studio.settings)
     rehearsal = Rehearsal(database, store, studio.settings.base_url)
     manner = Manner(mistakes=0.1, equal_share=0.1, skip_share=0.1)
     (outcome,) = rehearsal.run("feeding", [TASTES["cautious"]], settings, manner, seed=1).outcomes
@@ -126,7 +126,7 @@ def test_every_run_succeeded_at_its_first_attempt_although_the_worker_was_killed
 
 
 def test_the_last_model_has_seen_every_label(outcome: RehearsedPerson, database: Database, studio: OwnStudio) -> None:
-    store = ArtefactStore(studio.settings.data_dir / "artefacts")
+    store = ArtefactStore.of(studio.settings)
     with database.reading() as session:
         said = dataset.load_preferences(session, store, outcome.participant_id)
         newest = session.scalars(select(Model).where(Model.kind == ModelKind.FILTER).order_by(Model.id.desc())).first()

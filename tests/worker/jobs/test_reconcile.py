@@ -108,7 +108,7 @@ def test_a_last_answer_that_is_changed_makes_the_last_models_stale(
     assert third != first
 
 
-def test_a_running_run_is_left_alone_until_nobody_has_heard_of_it_for_a_minute(
+def test_a_running_run_is_left_alone_until_nobody_has_heard_of_it_for_a_while(
     database: Database, labels: Callable[[int], list[Query]], found: Callable[[], dict[str, int]]
 ) -> None:
     labels(10)
@@ -119,7 +119,7 @@ def test_a_running_run_is_left_alone_until_nobody_has_heard_of_it_for_a_minute(
     with database.reading() as session:
         assert reconcile.abandoned(session, ()) == []
     with database.writing() as session:
-        session.get_one(Run, run_id).heartbeat_at = now() - timedelta(seconds=61)
+        session.get_one(Run, run_id).heartbeat_at = now() - 1.01 * records.LEASE
     with database.reading() as session:
         assert reconcile.abandoned(session, ()) == [(job, 1)]
         assert reconcile.abandoned(session, {"reward/participant-1/labels-10"}) == []

@@ -2,7 +2,6 @@
 
 import io
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import av
@@ -15,7 +14,7 @@ from app.domain.models import RunKind
 from app.domain.preferences import Query, Response
 from app.domain.studies import Participant, Study
 from app.storage import ArtefactStore
-from tests import factories
+from tests import factories, stored_files
 from tests.worker.at_hand import AtHand, at_once
 from worker.compute import simulation
 from worker.jobs import reconcile
@@ -69,17 +68,10 @@ def work(context: WorkerContext, job: Job) -> None:
         records.finish_run(session, run_id)
 
 
-def damage(path: Path) -> None:
-    """One bit is wrong, as on a decaying disk."""
-    content = bytearray(path.read_bytes())
-    content[len(content) // 2] ^= 1
-    path.write_bytes(content)
-
-
 def test_a_damaged_clip_is_rendered_again(context: WorkerContext, clips: list[Clip]) -> None:
     clip = clips[1]
     for _ in range(2):  # what is lost again is made again
-        damage(context.store.path(clip.video_sha256))
+        stored_files.damage(context.store, clip.video_sha256)
         assert not context.store.has(clip.video_sha256)
         (job,) = to_mend(context)
         work(context, job)
@@ -95,8 +87,8 @@ def test_a_damaged_clip_is_rendered_again(context: WorkerContext, clips: list[Cl
 
 
 def test_what_was_never_looked_at_is_found_by_a_scrub_and_made_again(context: WorkerContext, clips: list[Clip]) -> None:
-    damage(context.store.path(clips[0].video_sha256))
-    context.store.path(clips[1].poster_sha256).unlink()
+    stored_files.damage(context.store, clips[0].video_sha256)
+    stored_files.lose(context.store, clips[1].poster_sha256)
     assert to_mend(context) == []
     assert not any(context.store.scrub(sha256) for sha256 in (clips[0].video_sha256, clips[1].poster_sha256))
     for job in to_mend(context):
@@ -108,7 +100,7 @@ def test_what_was_never_looked_at_is_found_by_a_scrub_and_made_again(context: Wo
 
 def test_a_lost_recording_is_simulated_again(context: WorkerContext, clips: list[Clip]) -> None:
     sha256 = trajectory_of(context, clips[0])
-    context.store.path(sha256).unlink()
+    stored_files.lose(context.store, sha256)
     assert not context.store.has(sha256)
     (job,) = to_mend(context)
     work(context, job)
@@ -128,7 +120,7 @@ def test_another_recording_takes_its_place_only_where_nobody_has_answered(
     if answered:
         answer(clips[0], clips[1], Response.LEFT)
     before = trajectory_of(context, clips[0])
-    damage(context.store.path(before))
+    stored_files.damage(context.store, before)
     assert not context.store.has(before)
     simulate = simulation.record_clip
 
@@ -154,7 +146,7 @@ def test_a_film_is_rendered_again_from_its_recording(
     with context.database.writing() as session:
         film = factories.make_film(session, context.store, session.get_one(Participant, participant.id), "reference")
         film.trajectory_sha256 = trajectory_of(context, clips[0])
-    damage(context.store.path(film.video_sha256))
+    stored_files.damage(context.store, film.video_sha256)
     assert not context.store.has(film.video_sha256)
     (job,) = to_mend(context)
     assert job.participant_id == participant.id
@@ -162,8 +154,8 @@ def test_a_film_is_rendered_again_from_its_recording(
     with context.database.reading() as session:
         again = session.get_one(type(film), film.id)
     assert context.store.has(again.video_sha256)
-    damage(context.store.path(film.trajectory_sha256))
-    context.store.path(again.video_sha256).unlink()
+    stored_files.damage(context.store, film.trajectory_sha256)
+    stored_files.lose(context.store, again.video_sha256)
     assert not context.store.has(again.video_sha256)
     assert not context.store.has(film.trajectory_sha256)
     with pytest.raises(FilmLost, match="backup"):

@@ -4,7 +4,6 @@ Trained with what other people's reward models leave of the machine. A training 
 participant's, so a killed worker goes on where it was; the folder is removed at the end.
 """
 
-import shutil
 import time
 from collections.abc import Callable, Collection
 from dataclasses import replace
@@ -75,11 +74,13 @@ def _train(context: WorkerContext, run_id: int, job: Job, method: str, reward: s
     """
     folder = _folder(context, job, run_id)
     folder.mkdir(parents=True, exist_ok=True)
+    context.store.unfinished.bring(folder)
     baseline = _baseline(context, run_id, job, method, reward, folder)
 
     def beat() -> None:
         share = share_done(folder)
         context.report(run_id, f"training a method to be evaluated, {share:.0%} done", TRAINING_SHARE * share)
+        context.keep_unfinished(folder)
         if context.compute.is_needed_elsewhere(Lane.PATIENT) or _is_outdated(context, job):
             ask_to_pause(folder)
 
@@ -89,7 +90,7 @@ def _train(context: WorkerContext, run_id: int, job: Job, method: str, reward: s
         seconds += fitted.seconds
         if fitted.controller is not None:
             return {"artefact": context.store.put(fitted.controller), "notes": list(fitted.notes), "seconds": seconds}
-    shutil.rmtree(folder, ignore_errors=True)
+    context.store.unfinished.forget(folder)
     return {}
 
 
@@ -168,7 +169,7 @@ def _save(context: WorkerContext, run_id: int, job: Job, method: str, reward: st
     }
     with context.database.writing() as session:
         records.save_model(session, run_id, ModelKind.METHOD, str(trained["artefact"]), metrics)
-    shutil.rmtree(_folder(context, job, run_id), ignore_errors=True)
+    context.store.unfinished.forget(_folder(context, job, run_id))
 
 
 def _driven(
@@ -201,4 +202,4 @@ def newest(session: Session, participant_id: int, method: str) -> tuple[int, str
 
 
 def _folder(context: WorkerContext, job: Job, run_id: int) -> Path:
-    return context.store.unfinished(job.participant) / f"run-{run_id}"
+    return context.store.unfinished.folder(job.participant) / f"run-{run_id}"

@@ -15,6 +15,7 @@ from app.domain.clips import Clip, Rollout
 from app.domain.preferences import Label, Query, count_labels, current_labels
 from app.domain.studies import Participant, Study
 from app.errors import AppError
+from app.files.interface import Files
 from app.storage import ArtefactStore
 from worker.ml import acquisition
 from worker.ml.rewards.reward_training import SignalScale
@@ -125,7 +126,7 @@ def signal_scale(session: Session, store: ArtefactStore, study_id: int) -> Signa
 
 def shown(store: ArtefactStore, clip: Clip) -> Trajectory:
     """The whole simulated trajectory that a clip shows a stretch of."""
-    return _trajectory(store.root, clip.rollout.trajectory_sha256)
+    return _trajectory(store.root, store.files, clip.rollout.trajectory_sha256)
 
 
 def signal_names(study: Study) -> Sequence[str]:
@@ -135,21 +136,21 @@ def signal_names(study: Study) -> Sequence[str]:
 
 def stored_trajectory(store: ArtefactStore, sha256: str) -> Trajectory:
     """A trajectory by the hash of its file."""
-    return _trajectory(store.root, sha256)
+    return _trajectory(store.root, store.files, sha256)
 
 
 def _recorded(store: ArtefactStore, sha256: str, imported: bool) -> Recorded:
-    return (_recording if imported else _trajectory)(store.root, sha256)
+    return (_recording if imported else _trajectory)(store.root, store.files, sha256)
 
 
 @lru_cache(maxsize=1024)
-def _recording(root: Path, sha256: str) -> Recording:
-    return Recording.load(io.BytesIO(ArtefactStore(root).read(sha256)))
+def _recording(root: Path, files: Files, sha256: str) -> Recording:
+    return Recording.load(io.BytesIO(ArtefactStore(root, files).read(sha256)))
 
 
 @lru_cache(maxsize=1024)
-def _trajectory(root: Path, sha256: str) -> Trajectory:
+def _trajectory(root: Path, files: Files, sha256: str) -> Trajectory:
     try:
-        return Trajectory.load(io.BytesIO(ArtefactStore(root).read(sha256)))
+        return Trajectory.load(io.BytesIO(ArtefactStore(root, files).read(sha256)))
     except OutdatedTrajectory as error:
         raise RecordedByAnOlderVersion from error

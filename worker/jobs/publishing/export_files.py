@@ -95,7 +95,7 @@ def _write_archive(session: Session, context: WorkerContext, study: Study, path:
 @contextmanager
 def _workspace(context: WorkerContext) -> Iterator[Path]:
     """A folder on the disk of the store, gone afterwards whatever happens."""
-    base = context.store.unfinished(0).parent
+    base = context.store.unfinished.root
     base.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=base, prefix="export-") as folder:
         yield Path(folder)

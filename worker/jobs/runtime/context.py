@@ -10,6 +10,7 @@ from typing import Any, Protocol
 from sqlalchemy.exc import OperationalError
 
 from app.db import Database
+from app.files.interface import StorageUnavailable
 from app.signing import SigningKey
 from app.storage import ArtefactStore, hash_of_file
 from worker.compute.pools import Computing
@@ -32,7 +33,7 @@ class NotingStore(ArtefactStore):
     """Remembers what is put away, so that it can be erased although nothing refers to it (yet)."""
 
     def __init__(self, store: ArtefactStore, noted: set[str]) -> None:
-        super().__init__(store.root)
+        super().__init__(store.root, store.files)
         self._noted = noted
 
     def put(self, content: bytes) -> str:
@@ -70,6 +71,11 @@ class WorkerContext:
         """Say in a few words, and as a share between 0 and 1, where a run is."""
         with self.database.writing() as session:
             records.report(session, run_id, stage, progress)
+
+    def keep_unfinished(self, folder: Path) -> None:
+        """Let other machines go on with a training from here. Its own machine does so whether they can or not."""
+        with suppress(StorageUnavailable, FileNotFoundError):
+            self.store.unfinished.keep(folder)
 
     def beat(self, run_id: int) -> Callable[[], None]:
         """A function that says that the run is still being worked on."""

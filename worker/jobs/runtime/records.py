@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta
 from typing import Any
 
-from sqlalchemy import func, select
+from sqlalchemy import func, select, update
 from sqlalchemy.orm import Session, joinedload
 from sqlalchemy.sql.base import ExecutableOption
 
@@ -30,8 +30,8 @@ QUERIES_AHEAD = 12
 LIES_OPEN = timedelta(minutes=10)
 """So long a pair that was shown may still be in front of somebody."""
 
-LEASE = timedelta(seconds=60)
-"""A running run that has not been heard of for this long belongs to nobody."""
+LEASE = timedelta(seconds=45)
+"""A running run that has not been heard of for this long belongs to nobody: within a minute somebody takes it over."""
 
 
 @dataclass(frozen=True)
@@ -113,6 +113,12 @@ def report(session: Session, run_id: int, stage: str, progress: float) -> None:
 def beat(session: Session, run_id: int) -> None:
     """Say that somebody is still working on the run."""
     session.get_one(Run, run_id).heartbeat_at = now()
+
+
+def beat_all(session: Session, keys: Collection[str]) -> None:
+    """Say so of everything that one worker is at, whether it computes, writes a file, or waits for a process."""
+    at_work = update(Run).where(Run.workflow_id.in_(keys), Run.status == RunStatus.RUNNING)
+    session.execute(at_work.values(heartbeat_at=now()))
 
 
 def finish_run(session: Session, run_id: int) -> None:

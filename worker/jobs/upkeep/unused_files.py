@@ -2,11 +2,12 @@
 
 import logging
 import shutil
-import time
 from collections.abc import Collection
 from datetime import timedelta
-from pathlib import Path
 
+from sqlalchemy import select
+
+from app.domain.studies import Participant
 from app.services.participants import withdrawal
 from worker.jobs.runtime.context import WorkerContext
 
@@ -24,16 +25,20 @@ def clear_away(context: WorkerContext, promised: Collection[str]) -> int:
     old = context.store.older_than(OLD_ENOUGH.total_seconds()) - set(promised)
     with context.database.writing() as session:
         orphans = old - withdrawal.in_use(session, old)
+        if orphans:  # somebody may have put one of them here again while they were looked for
+            orphans &= context.store.older_than(OLD_ENOUGH.total_seconds())
         for sha256 in orphans:
             context.store.delete(sha256)
-    for folder in (*_workspaces(context, "export-*"), *_workspaces(context, "import-*")):
-        shutil.rmtree(folder, ignore_errors=True)
+    context.store.unfinished.clear_workspaces(OLD_ENOUGH.total_seconds())
+    _clear_unfinished(context)
     if orphans:
         log.info("%d stored files that nobody refers to any more are cleared away", len(orphans))
     return len(orphans)
 
 
-def _workspaces(context: WorkerContext, names: str) -> list[Path]:
-    """Folders in which a killed program was writing or reading an archive: they hold what everybody has said."""
-    oldest_s = time.time() - OLD_ENOUGH.total_seconds()
-    return [each for each in context.store.unfinished(0).parent.glob(names) if each.stat().st_mtime < oldest_s]
+def _clear_unfinished(context: WorkerContext) -> None:
+    """Of people whom another machine may have erased while this one was off."""
+    with context.database.reading() as session:
+        gone = session.scalars(select(Participant.id).where(Participant.withdrawn_at.is_not(None))).all()
+    for participant_id in gone:
+        shutil.rmtree(context.store.unfinished.folder(participant_id), ignore_errors=True)
