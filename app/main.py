@@ -34,6 +34,7 @@ from app.web.experimenter import (
     studies,
     translations,
 )
+from app.web.http.addresses import QuickAddresses
 from app.web.http.deps import Studio, StudioDep
 from app.web.http.rate_limit import LoginAttempts
 from app.web.http.readiness import Readiness
@@ -121,7 +122,7 @@ def create_routes(https: bool) -> FastAPI:
         studio.hashing_for_known.close()
         studio.database.dispose()
 
-    app = FastAPI(
+    app = QuickAddresses(
         title="PbARL Studio", openapi_url=None, lifespan=lifespan, max_body_size=MAX_BODY_BYTES, redirect_slashes=False
     )
     app.state.templates = make_environment(app.url_path_for)
