@@ -49,6 +49,22 @@ from app.web.texts.templating import make_environment
 MAX_BODY_BYTES = 256 * 1024
 WRONG_TOKENS = 600
 """A minute, from everywhere together; right ones always pass."""
+PARTICIPANT_PARTS = (
+    pairs,
+    media,
+    joining,
+    languages,
+    consent,
+    forms,
+    evaluation,
+    finish,
+    withdrawal,
+    entry,
+)
+"""What is asked for most comes first: routes are tried one by one.
+
+The last one comes last: it takes whatever address below /p/ is left for a personal link.
+"""
 EXPERIMENTER_PARTS = (
     login,
     accounts,
@@ -65,21 +81,8 @@ EXPERIMENTER_PARTS = (
     results,
     imports,
     pages,
-    media,
     metrics,
 )
-PARTICIPANT_PARTS = (
-    joining,
-    languages,
-    consent,
-    forms,
-    pairs,
-    evaluation,
-    finish,
-    withdrawal,
-    entry,
-)
-"""The last one comes last: it takes whatever address below /p/ is left for a personal link."""
 
 
 def create_app(settings: Settings | None = None) -> FastAPI:
@@ -130,7 +133,7 @@ def create_routes(https: bool) -> FastAPI:
     app.add_middleware(Guard, https=https, refuse=error_page)
     app.add_middleware(RequestLog, registry=app.state.metrics)
     add_error_pages(app)
-    for part in (*EXPERIMENTER_PARTS, *PARTICIPANT_PARTS):
+    for part in (*PARTICIPANT_PARTS, *EXPERIMENTER_PARTS):
         app.include_router(part.router)
     app.state.api = routes.create_api(app.url_path_for, MAX_BODY_BYTES)
     app.mount(routes.PREFIX, app.state.api)

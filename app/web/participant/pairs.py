@@ -11,7 +11,6 @@ from pydantic import BaseModel, BeforeValidator, Field
 from sqlalchemy.orm import Session
 
 from app.domain import preferences
-from app.domain.clips import Clip
 from app.domain.preferences import Purpose, SkipReason
 from app.domain.studies import Awaited, Participant
 from app.services import participant_events
@@ -21,7 +20,7 @@ from app.services.participants import time_left
 from app.services.participants.time_left import TimeLeft
 from app.services.runs import estimates
 from app.web.error_pages import wants_json
-from app.web.http.deps import AnsweringParticipant, OwnRowsSession, RowId, Studio, StudioDep
+from app.web.http.deps import AnsweringParticipant, RowId, Studio
 from app.web.participant.pages import go, participant_page
 from app.web.texts.languages import wording_of
 from app.web.texts.wording import Wording
@@ -98,51 +97,55 @@ def show_turn(request: Request, session: Session, studio: Studio, participant: P
 
 
 @router.post("/queries/{query_id}/label", name="label_query")
-def label_query(
-    request: Request,
-    query_id: RowId,
-    form: Annotated[LabelForm, Form()],
-    participant: AnsweringParticipant,
-    session: OwnRowsSession,
-    studio: StudioDep,
+async def label_query(
+    request: Request, query_id: RowId, form: Annotated[LabelForm, Form()], answering: AnsweringParticipant
 ) -> Response:
     """Record the answer; the transaction is committed before this response leaves."""
     measured = form.model_dump(exclude={"response", "client_uuid", "reason"})
     watching = labelling.Watching(**measured, by_script=wants_json(request))
-    labelling.record_label(session, participant, query_id, form.response, form.client_uuid, watching, form.reason)
-    return _go_on(request, session, studio, participant)
+
+    def label(session: Session, participant: Participant) -> Response:
+        labelling.record_label(session, participant, query_id, form.response, form.client_uuid, watching, form.reason)
+        return _go_on(request, session, answering.studio, participant)
+
+    return await answering.act(label)
 
 
 @router.post("/queries/{query_id}/undo", name="undo_label")
-def undo_label(
-    request: Request,
-    query_id: RowId,
-    client_uuid: Annotated[UUID, Form()],
-    participant: AnsweringParticipant,
-    session: OwnRowsSession,
-    studio: StudioDep,
+async def undo_label(
+    request: Request, query_id: RowId, client_uuid: Annotated[UUID, Form()], answering: AnsweringParticipant
 ) -> Response:
     """Take the newest answer back; its pair is the next to be shown."""
-    labelling.undo_label(session, participant, query_id, client_uuid)
-    return _go_on(request, session, studio, participant)
+
+    def undo(session: Session, participant: Participant) -> Response:
+        labelling.undo_label(session, participant, query_id, client_uuid)
+        return _go_on(request, session, answering.studio, participant)
+
+    return await answering.act(undo)
 
 
 @router.post("/break", name="end_break")
-def end_break(request: Request, participant: AnsweringParticipant, session: OwnRowsSession) -> Response:
+async def end_break(request: Request, answering: AnsweringParticipant) -> Response:
     """Go on after a break."""
-    next_query.seen(participant)
-    next_query.end_break(session, participant)
-    return go(request, "show_next")
+
+    def go_on(session: Session, participant: Participant) -> Response:
+        next_query.seen(participant)
+        next_query.end_break(session, participant)
+        return go(request, "show_next")
+
+    return await answering.act(go_on)
 
 
 @router.post("/events", name="note_event", status_code=HTTPStatus.NO_CONTENT)
-def note_event(
-    form: Annotated[EventForm, Form()], participant: AnsweringParticipant, session: OwnRowsSession
-) -> Response:
+async def note_event(form: Annotated[EventForm, Form()], answering: AnsweringParticipant) -> Response:
     """Keep what the script noticed; sent as a beacon, so nobody waits for an answer."""
-    if form.kind not in (EventKind.BREAK_BEGUN, EventKind.BREAK_OVER):
-        detail = {name: value for name, value in form.model_dump(exclude={"kind"}).items() if value is not None}
-        participant_events.note(session, participant, form.kind, detail)
+
+    def note(session: Session, participant: Participant) -> None:
+        if form.kind not in (EventKind.BREAK_BEGUN, EventKind.BREAK_OVER):
+            detail = {name: value for name, value in form.model_dump(exclude={"kind"}).items() if value is not None}
+            participant_events.note(session, participant, form.kind, detail)
+
+    await answering.act(note)
     return Response(status_code=HTTPStatus.NO_CONTENT)
 
 
@@ -202,8 +205,8 @@ def _state(turn: next_query.NextPair) -> str:
     return "waiting" if turn.query is None else "pair"
 
 
-def _pair(request: Request, query: preferences.Query) -> Pair:
-    def paths(clip: Clip) -> dict[str, str]:
+def _pair(request: Request, query: next_query.ReadyQuery) -> Pair:
+    def paths(clip: next_query.ClipFiles) -> dict[str, str]:
         return {
             "video": request.app.url_path_for("show_video", sha256=clip.video_sha256),
             "poster": request.app.url_path_for("show_poster", sha256=clip.poster_sha256),
@@ -212,9 +215,9 @@ def _pair(request: Request, query: preferences.Query) -> Pair:
     return Pair(
         query_id=query.id,
         label_path=request.app.url_path_for("label_query", query_id=query.id),
-        left=paths(query.left_clip),
-        right=paths(query.right_clip),
-        width=query.left_clip.width,
-        height=query.left_clip.height,
-        fps=query.left_clip.fps,
+        left=paths(query.left),
+        right=paths(query.right),
+        width=query.left.width,
+        height=query.left.height,
+        fps=query.left.fps,
     )
