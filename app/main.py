@@ -1,5 +1,6 @@
 """Puts the web server together: settings, database, guard, routes, error pages."""
 
+import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from http import HTTPStatus
@@ -35,6 +36,7 @@ from app.web.experimenter import (
     translations,
 )
 from app.web.http.addresses import QuickAddresses
+from app.web.http.counting_ahead import count_ahead
 from app.web.http.deps import Studio, StudioDep
 from app.web.http.rate_limit import LoginAttempts
 from app.web.http.readiness import Readiness
@@ -120,7 +122,9 @@ def create_routes(https: bool) -> FastAPI:
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         studio: Studio = app.state.studio
         with data_directory.shared(studio.settings.data_dir), live.closing_on_signals(studio.closing):
+            counting = asyncio.create_task(count_ahead(studio))
             yield
+        await counting
         studio.hashing.close()
         studio.hashing_for_known.close()
         studio.database.dispose()

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from datetime import timedelta
 from random import Random
+from typing import Any
 from uuid import UUID
 
 from sqlalchemy import insert
@@ -27,29 +28,32 @@ EVENTS_PER_LABEL = 0.2
 RETRAIN_EVERY_LABELS = 10
 
 
-def make_study(session: Session, labels: int) -> Study:
-    """A study with the usual breaks, practice, repeats and catch pairs, a video evaluation, and forms."""
+def make_study(session: Session, labels: int, **settings: Any) -> Study:
+    """A study with breaks, catch pairs, a video evaluation, and a questionnaire."""
     questions = tuple(
         FormItem(
             name=f"q{number}", kind="likert", question=f"Question {number}", low_label="not at all", high_label="very"
         )
         for number in range(8)
     )
-    return factories.make_study(
-        session,
-        labels_per_participant=max(10, labels),
-        pool_scenarios=500,
-        retrain_every_labels=RETRAIN_EVERY_LABELS,
-        break_every=50,
-        questionnaire=questions,
-        evaluation=EvaluationSettings(),
-    )
+    usual = {
+        "labels_per_participant": max(10, labels),
+        "pool_scenarios": 500,
+        "retrain_every_labels": RETRAIN_EVERY_LABELS,
+        "break_every": 50,
+        "questionnaire": questions,
+        "evaluation": EvaluationSettings(),
+    }
+    return factories.make_study(session, **{**usual, **settings})
 
 
-def fill(session: Session, store: ArtefactStore, people: int, labels: int) -> Study:
-    """The study and everything about so many people, who are all through with it."""
-    study = make_study(session, labels)
-    clips = [factories.make_clip(session, store, study) for _ in range(CLIPS)]
+def make_clips(session: Session, store: ArtefactStore, study: Study) -> Sequence[Clip]:
+    """The clips of every pair."""
+    return [factories.make_clip(session, store, study) for _ in range(CLIPS)]
+
+
+def fill(session: Session, store: ArtefactStore, study: Study, clips: Sequence[Clip], people: int, labels: int) -> None:
+    """Everything about so many people, who are all through with the study."""
     for _ in range(people):
         person, _ = factories.make_participant(session, study)
         random = Random(person.number)  # noqa: S311
@@ -64,12 +68,15 @@ def fill(session: Session, store: ArtefactStore, people: int, labels: int) -> St
         for number in range(5)
     )
     session.flush()
-    return study
 
 
-def wait_for_answers(session: Session, person: Participant, clips: Sequence[Clip], labels: int) -> None:
-    """Pairs that nobody has answered yet."""
-    session.execute(insert(Query), [_query(person, clips, place, Random(place)) for place in range(labels)])  # noqa: S311
+def begin(session: Session, study: Study, clips: Sequence[Clip], given: int, labels: int) -> str:
+    """Somebody who has given so many answers of all; the token of their link."""
+    person, token = factories.make_participant(session, study)
+    random = Random(person.number)  # noqa: S311
+    _answer(session, person, clips, given, random)
+    session.execute(insert(Query), [_query(person, clips, place, random) for place in range(given, labels)])
+    return token
 
 
 def _query(person: Participant, clips: Sequence[Clip], place: int, random: Random) -> dict[str, object]:
@@ -91,6 +98,8 @@ def _query(person: Participant, clips: Sequence[Clip], place: int, random: Rando
 def _answer(session: Session, person: Participant, clips: Sequence[Clip], labels: int, random: Random) -> None:
     begun = now() - timedelta(hours=3)
     queries = [_query(person, clips, place, random) for place in range(labels)]
+    if not queries:
+        return
     for place, query in enumerate(queries):
         query["served_at"] = begun + timedelta(seconds=8 * place)
     ids = session.scalars(insert(Query).returning(Query.id, sort_by_parameter_order=True), queries).all()

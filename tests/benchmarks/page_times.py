@@ -40,7 +40,9 @@ from tests.waiting import free_port
 
 API = "/api/v1"
 PROMISED_MS = 300
-NOT_ASKED = re.compile(r"^/(p|join|media|static|language)/|/links/|/live$|/controllers/|/figures/|/metrics|receipts")
+NOT_ASKED = re.compile(
+    r"^/(p|join|media|static|language)/|/links/|/live$|/controllers/|/figures/|/metrics|receipts|/operate|/report$"
+)
 """Of participants; of one's own files; streams; and what such a study has none of."""
 
 
@@ -96,7 +98,8 @@ def _studio(settings: Settings, people: int, labels: int) -> tuple[str, str, int
     database, store = Database(settings.sqlalchemy_url), ArtefactStore(settings.data_dir / "artefacts")
     with database.writing() as session:
         if session.scalar(select(Query.id).limit(1)) is None:
-            study = large_study.fill(session, store, people, labels)
+            study = large_study.make_study(session, labels)
+            large_study.fill(session, store, study, large_study.make_clips(session, store, study), people, labels)
             session.add(Export(study_id=study.id, kind="data", requested_by="ada"))
             session.add(Experimenter(name="ada", password_hash="-", must_change_password=False))
             session.flush()
@@ -110,11 +113,11 @@ def _studio(settings: Settings, people: int, labels: int) -> tuple[str, str, int
 
 def _pages(query_id: int) -> Iterator[str]:
     """Every page of experimenters, and every table as a file."""
-    values = {"slug": "feeding-at-home", "code": "P50", "query_id": str(query_id), "kind": "csv", "version": "1"}
+    values = {"slug": "feeding-at-home", "code": "P50", "query_id": str(query_id), "kind": "jsonl", "version": "1"}
     yield from _filled(_addresses(""), values)
     study = f"/studies/{values['slug']}"
-    yield from (f"{study}/export/{table.name}.{kind}" for table in export_tables.TABLES for kind in ("csv", "json"))
-    yield from (f"{study}?view={view}" for view in ("all", "attention"))
+    yield from (f"{study}/export/{table.name}.{kind}" for table in export_tables.TABLES for kind in ("csv", "jsonl"))
+    yield from (f"{study}?{view}" for view in ("page=0", "sort=seen"))
     yield from (f"{study}/answers?page={page}" for page in (100, 400, 800))
     yield from (
         f"{study}/answers?{narrowed}" for narrowed in ("mark=mispredicted", "mark=contradicts", "participant=P50")

@@ -7,7 +7,7 @@ has new ones 15 ms; so what was read is kept, and only what is new is read.
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from threading import Lock
 from typing import NamedTuple
 
@@ -23,6 +23,8 @@ from app.services.monitoring import participant_status
 from app.services.monitoring.participant_status import GivenAnswer
 from app.services.runs import model_metrics
 
+MOST_REMEMBERED = 300
+"""People whose answers are kept in memory, about 100 kB each."""
 MOST_NEWS = 10
 """Answers of one person that are read one by one; of more, all of theirs are read."""
 
@@ -53,8 +55,8 @@ class _Known:
     """What was counted for one participant, and what from."""
 
     mark: Watermark
-    given: Mapping[int, GivenAnswer]
-    """By the query's id, in the order of the queries"""
+    given: Mapping[int, GivenAnswer] | None
+    """By the query's id, in the order of the queries; None: forgotten"""
     advice: Advice | None
     tally: Tally
 
@@ -76,8 +78,17 @@ class Tallies:
             fresh = _count(session, {each: marks[each] for each in stale}, known)
             known |= fresh
             with self._lock:
-                self._known |= fresh
+                self._keep(fresh)
         return {each: known[each].tally for each in participant_ids}
+
+    def _keep(self, fresh: Mapping[int, _Known]) -> None:
+        """The answers themselves of those only who went on last: of everybody in every study they would be too many."""
+        for each, known in fresh.items():
+            self._known.pop(each, None)
+            self._known[each] = known  # at the end
+        remembered = [each for each, known in self._known.items() if known.given is not None]
+        for each in remembered[:-MOST_REMEMBERED]:
+            self._known[each] = replace(self._known[each], given=None)
 
 
 def _marks(session: Session, participant_ids: Sequence[int]) -> dict[int, Watermark]:
@@ -125,21 +136,20 @@ def _given(
 
     All of somebody's are read where an answer was left out or taken in again, rows have gone, or most is news.
     """
-    followed = {
-        each: known[each] for each in marks if each in known and known[each].mark.exclusions == marks[each].exclusions
-    }
-    told = _told_since(session, {each: before.mark.answers[1] for each, before in followed.items()})
+    unchanged = (each for each in marks if each in known and known[each].mark.exclusions == marks[each].exclusions)
+    remembered = {each: given for each in unchanged if (given := known[each].given) is not None}
+    told = _told_since(session, {each: known[each].mark.answers[1] for each in remembered})
     changed = {
         each: set(told[each])
-        for each, before in followed.items()
-        if marks[each].answers[0] == before.mark.answers[0] + len(told[each]) and len(told[each]) <= MOST_NEWS
+        for each in remembered
+        if marks[each].answers[0] == known[each].mark.answers[0] + len(told[each]) and len(told[each]) <= MOST_NEWS
     }
     answers = participant_status.answers_given(session, [each for each in marks if each not in changed])
     news = participant_status.answers_given(
         session, list(changed), [query for each in changed.values() for query in each]
     )
     for each, queries in changed.items():
-        kept = [answer for query_id, answer in followed[each].given.items() if query_id not in queries]
+        kept = [answer for query_id, answer in remembered[each].items() if query_id not in queries]
         answers[each] = sorted((*kept, *news[each]), key=_ordinal)
     return {each: {answer.answer.query_id: answer for answer in answers[each]} for each in marks}
 
