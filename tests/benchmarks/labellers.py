@@ -132,7 +132,9 @@ async def _race(
                 before.add_to(phase, _Clocks(pids, worker))
     for task in (*answering, *looking):
         task.cancel()
-    await asyncio.gather(*answering, *looking, return_exceptions=True)
+    ended = await asyncio.gather(*answering, *looking, return_exceptions=True)
+    fallen = [each for each in ended if isinstance(each, Exception)]
+    _say(f"labellers and dashboards that fell: {len(fallen)} {fallen[:2]}")
     for phase in phases.values():
         _print(phase, options)
 
@@ -169,7 +171,7 @@ class Labeller:
         """Compare pairs until cancelled. ``phase``: gives the phase that an answer belongs to."""
         await asyncio.sleep(self._random.uniform(0, self._thought_s))
         _, headers, _ = await self._ask("GET", f"/p/{self._token}")
-        self._cookie = headers["set-cookie"].partition(";")[0]
+        self._cookie = headers["set-cookie"]
         pair = await self._next()
         while pair:
             if self._clips:
@@ -213,7 +215,12 @@ class Labeller:
             lines += ["content-type: application/x-www-form-urlencoded", f"content-length: {len(form)}"]
         writer.write("\r\n".join([*lines, "", form]).encode())
         head = (await reader.readuntil(b"\r\n\r\n")).decode().split("\r\n")
-        headers = {name.lower(): value for name, _, value in (line.partition(": ") for line in head[1:])}
+        headers = dict[str, str]()
+        for line in head[1:]:
+            name, _, value = line.partition(": ")
+            if name.lower() == "set-cookie":  # there are several
+                value = f"{headers.get('set-cookie', '')}{value.partition(';')[0]}; "
+            headers[name.lower()] = value
         body = await reader.readexactly(int(headers.get("content-length", "0")))
         if headers.get("connection") == "close":
             writer.close()

@@ -5,9 +5,10 @@ from http import HTTPStatus
 from typing import Annotated, Any
 from uuid import UUID, uuid4
 
-from fastapi import APIRouter, Form, Request
+from fastapi import APIRouter, Depends, Form, Request
+from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, Response
-from pydantic import BaseModel, BeforeValidator, Field
+from pydantic import BaseModel, BeforeValidator, Field, ValidationError
 from sqlalchemy.orm import Session
 
 from app.domain import preferences
@@ -96,10 +97,19 @@ def show_turn(request: Request, session: Session, studio: Studio, participant: P
     return participant_page(request, f"participant/{_template(turn)}.html", participant, context)
 
 
+async def _label_form(request: Request) -> LabelForm:
+    """The answer as it was sent. FastAPI would find out anew with every request what its fields are."""
+    try:
+        return LabelForm.model_validate(dict(await request.form()))
+    except ValidationError as error:
+        raise RequestValidationError([{**each, "loc": ("body", *each["loc"])} for each in error.errors()]) from None
+
+
+SentLabel = Annotated[LabelForm, Depends(_label_form)]
+
+
 @router.post("/queries/{query_id}/label", name="label_query")
-async def label_query(
-    request: Request, query_id: RowId, form: Annotated[LabelForm, Form()], answering: AnsweringParticipant
-) -> Response:
+async def label_query(request: Request, query_id: RowId, answering: AnsweringParticipant, form: SentLabel) -> Response:
     """Record the answer; the transaction is committed before this response leaves."""
     measured = form.model_dump(exclude={"response", "client_uuid", "reason"})
     watching = labelling.Watching(**measured, by_script=wants_json(request))
