@@ -42,8 +42,6 @@ from tests.waiting import free_port
 STUDY = "/studies/feeding-at-home"
 GIVEN = 3
 """Answers of each labeller before it begins."""
-SETTLING_S = 8.0
-"""After the worker has begun or the dashboards were opened, before anything is counted."""
 _TICK_S = 1 / os.sysconf("SC_CLK_TCK")
 
 
@@ -125,7 +123,7 @@ async def _race(
                 worker = None
                 if name == "worker busy":
                     worker = stack.enter_context(_program(settings, "worker", "run"))
-                await asyncio.sleep(SETTLING_S)
+                await asyncio.sleep(options.settling)
                 current, before = phase, _Clocks(pids, worker)
                 await asyncio.sleep(options.seconds / options.rounds)
                 current = Phase("between phases")
@@ -294,6 +292,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--labels", type=int, default=200, help="asked of each")
     parser.add_argument("--clips", action="store_true", help="load every clip once, as browsers do")
     parser.add_argument("--seconds", type=float, default=60.0, help="of each phase")
+    parser.add_argument("--settling", type=float, default=8.0, help="seconds before each phase that are not counted")
     parser.add_argument("--rounds", type=int, default=2, help="turns that the phases take")
     parser.add_argument("--servers", type=int, default=1, help="web servers on one database")
     parser.add_argument("--postgresql", action="store_true", help="on a PostgreSQL server that syncs every commit")

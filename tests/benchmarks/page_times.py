@@ -113,20 +113,20 @@ def _studio(settings: Settings, people: int, labels: int) -> tuple[str, str, int
 
 def _pages(query_id: int) -> Iterator[str]:
     """Every page of experimenters, and every table as a file."""
-    values = {"slug": "feeding-at-home", "code": "P50", "query_id": str(query_id), "kind": "jsonl", "version": "1"}
+    values = {"slug": "feeding-at-home", "code": "P01", "query_id": str(query_id), "kind": "jsonl", "version": "1"}
     yield from _filled(_addresses(""), values)
     study = f"/studies/{values['slug']}"
     yield from (f"{study}/export/{table.name}.{kind}" for table in export_tables.TABLES for kind in ("csv", "jsonl"))
     yield from (f"{study}?{view}" for view in ("page=0", "sort=seen"))
     yield from (f"{study}/answers?page={page}" for page in (100, 400, 800))
     yield from (
-        f"{study}/answers?{narrowed}" for narrowed in ("mark=mispredicted", "mark=contradicts", "participant=P50")
+        f"{study}/answers?{narrowed}" for narrowed in ("mark=mispredicted", "mark=contradicts", "participant=P01")
     )
 
 
 def _api(browser: httpx2.Client) -> Iterator[str]:
     """Every address of the API, and of each table the first, middle and last page."""
-    values = {"slug": "feeding-at-home", "code": "P50", "version": "1"}
+    values = {"slug": "feeding-at-home", "code": "P01", "version": "1"}
     yield from (f"{API}{path}" for path in _filled(_addresses("api"), values))
     for table in export_tables.TABLES:
         pages, page = [], f"{API}/studies/{values['slug']}/tables/{table.name}"
