@@ -98,9 +98,10 @@ def show_turn(request: Request, session: Session, studio: Studio, participant: P
 
 
 async def _label_form(request: Request) -> LabelForm:
-    """The answer as it was sent. FastAPI would find out anew with every request what its fields are."""
+    """The answer as it was sent, where empty means left out. FastAPI would ask anew each time what the fields are."""
+    sent = await request.form()
     try:
-        return LabelForm.model_validate(dict(await request.form()))
+        return LabelForm.model_validate({name: value for name, value in sent.items() if value != ""})
     except ValidationError as error:
         raise RequestValidationError([{**each, "loc": ("body", *each["loc"])} for each in error.errors()]) from None
 
