@@ -18,6 +18,7 @@ from app.errors import AppError
 from app.services.accounts import browser_sessions, roles
 from app.services.accounts.failed_logins import FailedLogins
 from app.services.monitoring.tallies import Tallies
+from app.services.participants.time_left import UsualTimes
 from app.settings import Settings
 from app.storage import ArtefactStore
 from app.web.http.hashing import Hashing
@@ -80,6 +81,7 @@ class Studio:
     imports: ImportLimit = field(default_factory=ImportLimit)
     failed_logins: FailedLogins = field(default_factory=FailedLogins)
     tallies: Tallies = field(default_factory=Tallies)
+    usual_times: UsualTimes = field(default_factory=UsualTimes)
     closing: Event = field(default_factory=Event)
     """Set when the server is asked to stop, so that open event streams end by themselves."""
 

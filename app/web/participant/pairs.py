@@ -84,7 +84,7 @@ def show_turn(request: Request, session: Session, studio: Studio, participant: P
     next_query.seen(participant)
     turn = next_query.next_turn(session, studio.store, participant)
     next_query.waits(participant, Awaited.PAIR if _state(turn) == "waiting" else None)
-    state = _turn_for_script(request, session, participant, turn)
+    state = _turn_for_script(request, session, studio, participant, turn)
     if wants_json(request):
         return JSONResponse(state)
     if turn.break_due:
@@ -186,13 +186,14 @@ def _go_on(request: Request, session: Session, studio: Studio, participant: Part
         return go(request, "show_next")
     turn = next_query.next_turn(session, studio.store, participant)
     next_query.waits(participant, Awaited.PAIR if _state(turn) == "waiting" else None)
-    return JSONResponse(_turn_for_script(request, session, participant, turn))
+    return JSONResponse(_turn_for_script(request, session, studio, participant, turn))
 
 
 def _turn_for_script(
-    request: Request, session: Session, participant: Participant, turn: next_query.NextPair
+    request: Request, session: Session, studio: Studio, participant: Participant, turn: next_query.NextPair
 ) -> dict[str, Any]:
-    progress, left = turn.progress, time_left.time_left(session, participant, turn.progress)
+    progress = turn.progress
+    left = time_left.time_left(session, participant, turn.progress, studio.usual_times)
     practising = progress.practising
     return {
         "state": _state(turn),
