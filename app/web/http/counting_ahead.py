@@ -17,6 +17,8 @@ AT_ONCE = 10
 """People; somebody who saves an answer waits for a tenth of a second of counting at most."""
 REST = 4.0
 """Times as long as the last few took, before the next."""
+LONGEST_REST_S = 1.0
+"""The server stops no sooner than this."""
 
 
 async def count_ahead(studio: Studio) -> None:
@@ -28,7 +30,7 @@ async def count_ahead(studio: Studio) -> None:
                 return
             few, started_s = people[first : first + AT_ONCE], time.perf_counter()
             await studio.session_queue.look(partial(_count, studio, few))
-            await asyncio.sleep(REST * (time.perf_counter() - started_s))
+            await asyncio.sleep(min(LONGEST_REST_S, REST * (time.perf_counter() - started_s)))
     except SQLAlchemyError as error:  # whoever looks at a study will count, and be told what is wrong
         complaints.error("counting ahead: %s", error)
 
