@@ -167,6 +167,12 @@ class Labeller:
 
     async def answer(self, phase: Any) -> None:
         """Compare pairs until cancelled. ``phase``: gives the phase that an answer belongs to."""
+        try:
+            await self._compare(phase)
+        finally:
+            self._hang_up()
+
+    async def _compare(self, phase: Any) -> None:
         await asyncio.sleep(self._random.uniform(0, self._thought_s))
         _, headers, _ = await self._ask("GET", f"/p/{self._token}")
         self._cookie = headers["set-cookie"]
@@ -181,7 +187,7 @@ class Labeller:
                 status, _, body = await self._ask("POST", pair["label_path"], urlencode(form))
             except (OSError, asyncio.IncompleteReadError) as error:
                 during.errors.append(repr(error))
-                self._streams = None
+                self._hang_up()
                 continue
             if status == 200:
                 during.times_ms.append(1000 * (time.perf_counter() - started))
@@ -221,9 +227,13 @@ class Labeller:
             headers[name.lower()] = value
         body = await reader.readexactly(int(headers.get("content-length", "0")))
         if headers.get("connection") == "close":
-            writer.close()
-            self._streams = None
+            self._hang_up()
         return int(head[0].split()[1]), headers, body
+
+    def _hang_up(self) -> None:
+        if self._streams is not None:
+            self._streams[1].close()
+            self._streams = None
 
 
 async def _look(address: str, cookie: str) -> None:
@@ -233,9 +243,11 @@ async def _look(address: str, cookie: str) -> None:
         reader, writer = await asyncio.open_connection(place.hostname, place.port)
         lines = [f"GET {path} HTTP/1.1", f"host: {place.netloc}", f"cookie: studio_experimenter={cookie}"]
         writer.write("\r\n".join([*lines, "connection: close", "", ""]).encode())
-        while await reader.read(2**16):
-            pass
-        writer.close()
+        try:
+            while await reader.read(2**16):
+                pass
+        finally:
+            writer.close()
 
 
 @contextmanager
