@@ -1,5 +1,6 @@
 """Puts the web server together: settings, database, guard, routes, error pages."""
 
+import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from http import HTTPStatus
@@ -35,6 +36,8 @@ from app.web.experimenter import (
     studies,
     translations,
 )
+from app.web.http.addresses import QuickAddresses
+from app.web.http.counting_ahead import count_ahead
 from app.web.http.deps import Studio, StudioDep
 from app.web.http.rate_limit import SharedAttempts
 from app.web.http.readiness import Readiness
@@ -49,6 +52,22 @@ from app.web.texts.templating import make_environment
 MAX_BODY_BYTES = 256 * 1024
 WRONG_TOKENS = 600
 """A minute, from everywhere together; right ones always pass."""
+PARTICIPANT_PARTS = (
+    pairs,
+    media,
+    joining,
+    languages,
+    consent,
+    forms,
+    evaluation,
+    finish,
+    withdrawal,
+    entry,
+)
+"""What is asked for most comes first: routes are tried one by one.
+
+The last one comes last: it takes whatever address below /p/ is left for a personal link.
+"""
 EXPERIMENTER_PARTS = (
     login,
     accounts,
@@ -65,21 +84,8 @@ EXPERIMENTER_PARTS = (
     results,
     imports,
     pages,
-    media,
     metrics,
 )
-PARTICIPANT_PARTS = (
-    joining,
-    languages,
-    consent,
-    forms,
-    pairs,
-    evaluation,
-    finish,
-    withdrawal,
-    entry,
-)
-"""The last one comes last: it takes whatever address below /p/ is left for a personal link."""
 
 
 def create_app(settings: Settings | None = None) -> FastAPI:
@@ -123,12 +129,14 @@ def create_routes(https: bool) -> FastAPI:
             live.closing_on_signals(studio.closing),
             alerts.watching(studio.settings, studio.database, studio.store),
         ):
+            counting = asyncio.create_task(count_ahead(studio))
             yield
+        await counting
         studio.hashing.close()
         studio.hashing_for_known.close()
         studio.database.dispose()
 
-    app = FastAPI(
+    app = QuickAddresses(
         title="PbARL Studio", openapi_url=None, lifespan=lifespan, max_body_size=MAX_BODY_BYTES, redirect_slashes=False
     )
     app.state.templates = make_environment(app.url_path_for)
@@ -136,7 +144,7 @@ def create_routes(https: bool) -> FastAPI:
     app.add_middleware(Guard, https=https, refuse=error_page)
     app.add_middleware(RequestLog, registry=app.state.metrics)
     add_error_pages(app)
-    for part in (*EXPERIMENTER_PARTS, *PARTICIPANT_PARTS):
+    for part in (*PARTICIPANT_PARTS, *EXPERIMENTER_PARTS):
         app.include_router(part.router)
     app.state.api = routes.create_api(app.url_path_for, MAX_BODY_BYTES)
     app.mount(routes.PREFIX, app.state.api)

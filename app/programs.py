@@ -21,6 +21,8 @@ GRACE_S = 9.0
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 1.0, 60.0
 STEADY_S = 600.0
 """Whoever has run for so long has recovered, and falls before that are forgotten. A start alone may take a minute."""
+NICENESS = {"worker": 5}
+"""Whoever waits for a page goes before whoever plans and computes; compute processes are nicer than this by as much."""
 _LOOK_S = 0.2
 _LONGEST_WORDS = 300
 _PR_SET_PDEATHSIG = 1
@@ -103,8 +105,13 @@ class _Program:
             bufsize=1,
             env={**os.environ, "PYTHONUNBUFFERED": "1"},
             start_new_session=True,
-            preexec_fn=end_with_parent,
+            preexec_fn=self._begin,
         )
+
+    def _begin(self) -> None:
+        """Run in the new child."""
+        end_with_parent()
+        os.nice(NICENESS.get(self.name, 0))
 
     def look(self) -> bool:
         """Start it again if that is due; whether there is something new to tell about its falls."""

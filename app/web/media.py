@@ -1,12 +1,12 @@
 """Clips and posters, under the hash of their content: once loaded, a browser never has to ask again."""
 
 from email.utils import formatdate
+from functools import partial
 from http import HTTPStatus
-from typing import Annotated
 
-from fastapi import APIRouter, Depends, Request
+from fastapi import APIRouter, Request
 from fastapi.responses import Response
-from sqlalchemy import or_, select
+from sqlalchemy import String, bindparam, or_, select
 from sqlalchemy.orm import Session
 
 from app.domain.clips import Clip, Rollout
@@ -15,7 +15,7 @@ from app.errors import AppError
 from app.services.accounts import browser_sessions
 from app.storage import ArtefactStore
 from app.web.http import stored_file
-from app.web.http.deps import EXPERIMENTER_COOKIE, PARTICIPANT_COOKIE, ReadingSession, Sha256, StudioDep
+from app.web.http.deps import EXPERIMENTER_COOKIE, PARTICIPANT_COOKIE, Sha256, StudioDep
 
 router = APIRouter()
 
@@ -30,37 +30,41 @@ class ClipNotFound(AppError):
     status = HTTPStatus.NOT_FOUND
 
 
-def _may_watch(request: Request, session: ReadingSession, sha256: Sha256) -> None:
+# Made once: a browser asks for four files with every pair that is new to it.
+_SHA256 = bindparam("sha256", type_=String)
+_CLIP = select(Clip.id).join(Rollout).where(or_(Clip.video_sha256 == _SHA256, Clip.poster_sha256 == _SHA256)).limit(1)
+_FILM = select(Film.id).where(or_(Film.video_sha256 == _SHA256, Film.poster_sha256 == _SHA256)).limit(1)
+_CLIP_OF_STUDY = _CLIP.where(Rollout.study_id == bindparam("study_id"))
+_FILM_OF_PARTICIPANT = _FILM.where(Film.participant_id == bindparam("participant_id"))
+
+
+@router.api_route("/media/{sha256}.mp4", methods=["GET", "HEAD"], name="show_video")
+async def show_video(request: Request, sha256: Sha256, studio: StudioDep) -> Response:
+    """The video of a clip; answers ranges."""
+    return await studio.session_queue.look(partial(_artefact, request, studio.store, sha256, "video/mp4"))
+
+
+@router.api_route("/media/{sha256}.jpg", methods=["GET", "HEAD"], name="show_poster")
+async def show_poster(request: Request, sha256: Sha256, studio: StudioDep) -> Response:
+    """The first picture of a clip."""
+    return await studio.session_queue.look(partial(_artefact, request, studio.store, sha256, "image/jpeg"))
+
+
+def _require_may_watch(request: Request, session: Session, sha256: str) -> None:
     """A participant may watch the clips of their own study and their own films, an experimenter all.
 
     Raises ClipNotFound.
     """
-    clips = select(Clip.id).join(Rollout).where(or_(Clip.video_sha256 == sha256, Clip.poster_sha256 == sha256))
-    films = select(Film.id).where(or_(Film.video_sha256 == sha256, Film.poster_sha256 == sha256))
+    clip, film, whose = _CLIP, _FILM, dict[str, int]()
     if not _experimenter_asks(request, session):
         cookie = request.cookies.get(PARTICIPANT_COOKIE)
         participant = browser_sessions.participant_of(session, cookie) if cookie else None
         if participant is None:
             raise ClipNotFound
-        clips = clips.where(Rollout.study_id == participant.study_id)
-        films = films.where(Film.participant_id == participant.id)
-    if session.scalar(clips.limit(1)) is None and session.scalar(films.limit(1)) is None:
+        clip, film = _CLIP_OF_STUDY, _FILM_OF_PARTICIPANT
+        whose = {"study_id": participant.study_id, "participant_id": participant.id}
+    if all(session.scalar(each, {"sha256": sha256, **whose}) is None for each in (clip, film)):
         raise ClipNotFound
-
-
-MayWatch = Annotated[None, Depends(_may_watch, scope="function")]
-
-
-@router.api_route("/media/{sha256}.mp4", methods=["GET", "HEAD"], name="show_video")
-def show_video(request: Request, sha256: Sha256, studio: StudioDep, _allowed: MayWatch) -> Response:
-    """The video of a clip; answers ranges."""
-    return _artefact(request, studio.store, sha256, "video/mp4")
-
-
-@router.api_route("/media/{sha256}.jpg", methods=["GET", "HEAD"], name="show_poster")
-def show_poster(request: Request, sha256: Sha256, studio: StudioDep, _allowed: MayWatch) -> Response:
-    """The first picture of a clip."""
-    return _artefact(request, studio.store, sha256, "image/jpeg")
 
 
 def _experimenter_asks(request: Request, session: Session) -> bool:
@@ -69,7 +73,8 @@ def _experimenter_asks(request: Request, session: Session) -> bool:
     return experimenter is not None and not experimenter.must_change_password
 
 
-def _artefact(request: Request, store: ArtefactStore, sha256: str, media_type: str) -> Response:
+def _artefact(request: Request, store: ArtefactStore, sha256: str, media_type: str, session: Session) -> Response:
+    _require_may_watch(request, session, sha256)
     headers = {"etag": f'"{sha256}"', "cache-control": _FOREVER, "last-modified": AT_NO_TIME}
     known = request.headers.get("if-none-match", "")
     if known == "*" or sha256 in known:

@@ -104,6 +104,11 @@ def test_the_first_start_prints_all_that_is_needed(running: Studio) -> None:
     assert f"{running.address}/studies" in running.said
 
 
+def test_whoever_waits_for_a_page_goes_before_the_worker(running: Studio) -> None:
+    web, worker = (os.getpriority(os.PRIO_PROCESS, running.child(name)) for name in ("app\0web", "worker\0run"))
+    assert web < worker
+
+
 def test_ctrl_c_stops_both_programs(start: Start) -> None:
     studio = start()
     assert until(lambda: "worker-1 is ready" in studio.said and answers(studio.address))

@@ -11,6 +11,7 @@ from app.domain.preferences import LabelEvent, Query
 from app.domain.protocol import Stage
 from app.domain.studies import Study
 from app.services.participant_events import EventKind
+from app.services.participants import time_left
 from tests import factories
 from tests.app.conftest import TakingPart
 
@@ -35,6 +36,12 @@ def went_before(database: Database, at: TakingPart, stage: Stage, *seconds: floa
             record = StageRecord(participant_id=other.id, stage=stage, entered_at=now())
             record.finished_at = record.entered_at + timedelta(seconds=each)
             session.add(record)
+
+
+@pytest.fixture(autouse=True)
+def asked_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What others took is looked up for every answer here, and not twice a minute."""
+    monkeypatch.setattr(time_left, "KNOWN_FOR_S", -1.0)
 
 
 @pytest.fixture

@@ -76,7 +76,7 @@ def test_the_pace_leaves_breaks_out(participant: Participant, database: Database
             factories.make_label(session, query, ago=timedelta(seconds=ago_s))
     with database.reading() as session:
         pace_s = participant_status.judged(
-            participant_status.answers_given(session, [participant.id])[participant.id], []
+            participant_status.answers_given(session, [participant.id])[participant.id], None
         ).pace_s
     assert pace_s == pytest.approx(10.0, abs=0.5)
 

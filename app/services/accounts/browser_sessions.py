@@ -4,12 +4,21 @@ import hashlib
 import secrets
 from datetime import timedelta
 
-from sqlalchemy import delete, select
+from sqlalchemy import bindparam, delete, select
 from sqlalchemy.orm import Session, joinedload
 
 from app.db import now
 from app.domain.people import BrowserSession, Experimenter
 from app.domain.studies import Participant
+
+# Made once, because every request of a participant needs one of them.
+_PARTICIPANT = (
+    select(Participant)
+    .join(BrowserSession, BrowserSession.participant_id == Participant.id)
+    .where(BrowserSession.cookie_sha256 == bindparam("cookie"), BrowserSession.expires_at > bindparam("moment"))
+    .options(joinedload(Participant.study))
+)
+_PARTICIPANT_LOCKED = _PARTICIPANT.with_for_update(of=Participant)
 
 
 def open_for_participant(session: Session, participant: Participant, lifetime: timedelta) -> str:
@@ -35,13 +44,7 @@ def participant_of(session: Session, cookie: str, *, lock: bool = False) -> Part
 
     ``lock``: until the transaction ends, nobody else changes the participant's row or locks it.
     """
-    theirs = (
-        select(Participant)
-        .join(BrowserSession, BrowserSession.participant_id == Participant.id)
-        .where(BrowserSession.cookie_sha256 == _hash(cookie), BrowserSession.expires_at > now())
-        .options(joinedload(Participant.study))
-    )
-    return session.scalar(theirs.with_for_update(of=Participant) if lock else theirs)
+    return session.scalar(_PARTICIPANT_LOCKED if lock else _PARTICIPANT, {"cookie": _hash(cookie), "moment": now()})
 
 
 def experimenter_of(session: Session, cookie: str) -> Experimenter | None:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from http import HTTPStatus
 
-from sqlalchemy import ColumnElement, Row, ScalarSelect, Select, and_, case, func, or_, select
+from sqlalchemy import ColumnElement, Row, ScalarSelect, Select, and_, bindparam, case, func, or_, select, true
 from sqlalchemy.orm import InstrumentedAttribute, Session, aliased, joinedload
 
 from app.domain.clips import Clip
@@ -129,22 +129,14 @@ def counting_ids(study: Study) -> Select[int]:
 
 def _matching(study: Study, wanted: Wanted) -> Select[int, int, int, int]:
     """(event_id, query_id, number, ordinal) of the answers that count and are wanted."""
-    newer = aliased(LabelEvent)
-    superseded = select(newer.id).where(newer.query_id == LabelEvent.query_id, newer.revision > LabelEvent.revision)
-    matching = (
-        select(LabelEvent.id.label("event_id"), Query.id.label("query_id"), Participant.number, Query.ordinal)
-        .join(Query, Query.id == LabelEvent.query_id)
-        .join(Participant, Participant.id == Query.participant_id)
-        .where(Participant.study_id == study.id, Participant.is_preview.is_(False))
-        .where(LabelEvent.response.is_not(None), ~superseded.exists())
-    )
+    matching = _COUNTING.where(Participant.study_id == study.id)
     if wanted.code is not None:
         matching = matching.where(Participant.number == int(wanted.code[1:]))
     if wanted.purpose is not None:
         matching = matching.where(Query.purpose == wanted.purpose)
     if wanted.response is not None:
         matching = matching.where(LabelEvent.response == wanted.response)
-    return matching if wanted.mark is None else matching.where(_marked(wanted.mark))
+    return matching if wanted.mark is None else matching.where(_ONLY.get(wanted.mark, true()), _MARKED[wanted.mark])
 
 
 def _in_order(matching: Select[int, int, int, int]) -> Select[int, int, int, int]:
@@ -163,20 +155,6 @@ def _neighbour(session: Session, study: Study, wanted: Wanted, place: tuple[int,
         backwards = matching.where(there).order_by(Participant.number.desc(), Query.ordinal.desc())
         found = session.execute(backwards.limit(1)).first()
     return None if found is None else found.query_id
-
-
-def _marked(mark: Mark) -> ColumnElement[bool]:
-    """Whether an answer, LabelEvent with its Query, bears the mark; decided by the database, for pages to be quick."""
-    conditions: Mapping[Mark, ColumnElement[bool]] = {
-        Mark.MISPREDICTED: _mispredicted(),
-        Mark.CONTRADICTS: _contradicts(),
-        Mark.MISSED_CATCH: and_(Query.expected.is_not(None), LabelEvent.response.in_(_SIDES))
-        & (LabelEvent.response != Query.expected),
-        Mark.QUICK: _quick(),
-        Mark.WITHOUT_SCRIPT: LabelEvent.by_script.is_(False) & _is_by_a_person(),
-        Mark.EXCLUDED: is_excluded(),
-    }
-    return func.coalesce(conditions[mark], False)  # what is not known is not marked
 
 
 def _is_by_a_person() -> ColumnElement[bool]:
@@ -229,17 +207,52 @@ def _contradicts() -> ColumnElement[bool]:
     return and_(Query.repeats_query_id.is_not(None), told, LabelEvent.response != same)
 
 
+# Made once: making statements with so many aliases takes longer than running them.
+_newer = aliased(LabelEvent)
+_COUNTING = (
+    select(LabelEvent.id.label("event_id"), Query.id.label("query_id"), Participant.number, Query.ordinal)
+    .join(Query, Query.id == LabelEvent.query_id)
+    .join(Participant, Participant.id == Query.participant_id)
+    .where(
+        Participant.is_preview.is_(False),
+        LabelEvent.response.is_not(None),
+        ~select(_newer.id)
+        .where(_newer.query_id == LabelEvent.query_id, _newer.revision > LabelEvent.revision)
+        .exists(),
+    )
+)
+_CONDITIONS: Mapping[Mark, ColumnElement[bool]] = {
+    Mark.MISPREDICTED: _mispredicted(),
+    Mark.CONTRADICTS: _contradicts(),
+    Mark.MISSED_CATCH: and_(Query.expected.is_not(None), LabelEvent.response.in_(_SIDES))
+    & (LabelEvent.response != Query.expected),
+    Mark.QUICK: _quick(),
+    Mark.WITHOUT_SCRIPT: LabelEvent.by_script.is_(False) & _is_by_a_person(),
+    Mark.EXCLUDED: is_excluded(),
+}
+_MARKED: Mapping[Mark, ColumnElement[bool]] = {
+    mark: func.coalesce(condition, False)  # what is not known is not marked
+    for mark, condition in _CONDITIONS.items()
+}
+"""Whether an answer, LabelEvent with its Query, bears a mark; decided by the database, for pages to be quick."""
+_ONLY: Mapping[Mark, ColumnElement[bool]] = {
+    Mark.CONTRADICTS: Query.repeats_query_id.is_not(None),
+    Mark.MISSED_CATCH: Query.expected.is_not(None),
+    Mark.EXCLUDED: LabelEvent.id.in_(select(Exclusion.label_event_id)),
+}
+"""What few answers are, and all that can bear the mark: told apart, so that the others are not looked at closely."""
+_LOADING = (
+    select(LabelEvent, Query, Participant, *(condition.label(mark.value) for mark, condition in _MARKED.items()))
+    .join(Query, Query.id == LabelEvent.query_id)
+    .join(Participant, Participant.id == Query.participant_id)
+    .where(LabelEvent.id.in_(bindparam("event_ids", expanding=True)))
+    .options(joinedload(Query.left_clip), joinedload(Query.right_clip))
+)
+
+
 def _loaded(session: Session, event_ids: Sequence[int]) -> Sequence[ListedAnswer]:
     """These answers in this order."""
-    clips = (joinedload(Query.left_clip), joinedload(Query.right_clip))
-    marks = [_marked(mark).label(mark.value) for mark in Mark]
-    rows = session.execute(
-        select(LabelEvent, Query, Participant, *marks)
-        .join(Query, Query.id == LabelEvent.query_id)
-        .join(Participant, Participant.id == Query.participant_id)
-        .where(LabelEvent.id.in_(event_ids))
-        .options(*clips)
-    )
+    rows = session.execute(_LOADING, {"event_ids": event_ids})
     words = session.scalars(select(Exclusion).where(Exclusion.label_event_id.in_(event_ids)).order_by(Exclusion.id))
     newest = {word.label_event_id: word for word in words}
     given = {row.LabelEvent.id: _given(row, newest.get(row.LabelEvent.id)) for row in rows}

@@ -40,7 +40,7 @@ _SIDES = (Response.LEFT, Response.RIGHT)
 _OTHER_SIDE = {Response.LEFT: Response.RIGHT, Response.RIGHT: Response.LEFT}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class JudgedAnswer:
     """One answer that counts, with what judging it needs."""
 

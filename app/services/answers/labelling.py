@@ -1,12 +1,14 @@
 """Recording answers: each exactly once, whatever the network, the browser or an impatient finger does."""
 
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime
 from http import HTTPStatus
+from typing import Any, NamedTuple, cast
 from uuid import UUID
 
-from sqlalchemy import select
-from sqlalchemy.exc import IntegrityError
+from sqlalchemy import Table, bindparam, func, select
+from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.orm import Session
 
 from app.domain.preferences import LabelEvent, Query, Response, SkipReason
@@ -66,31 +68,21 @@ def record_label(
     client_uuid: UUID,
     watching: Watching,
     reason: SkipReason | None = None,
-) -> LabelEvent:
-    """Store one answer and return the one that counts: this, or an earlier one that this repeats or contradicts.
+) -> None:
+    """Store one answer, unless this repeats or contradicts an earlier one, which then goes on counting.
 
     ``reason``: why somebody could not tell; kept with that answer only.
 
     Raises QueryNotFound (missing, or put to someone else), QueryNotShown and AnswerMisdirected.
     """
-    query = _own_query(session, participant, query_id)
-    events = _events(session, query)
-    known = _earlier(session, events, client_uuid)
-    if known is not None:
-        return known
-    if query.served_at is None:
+    asked = _asked(session, participant, query_id, client_uuid)
+    if asked.sent_to is not None:
+        return
+    if asked.served_at is None:
         raise QueryNotShown
-    if events and events[-1].response is not None:
-        return events[-1]
-    event = LabelEvent(
-        query_id=query.id,
-        revision=len(events) + 1,
-        response=response,
-        client_uuid=str(client_uuid),
-        reason=reason if response is Response.SKIP else None,
-        **asdict(watching),
-    )
-    return _append(session, query, event)
+    if asked.response is None:
+        reason = reason if response is Response.SKIP else None
+        _append(session, asked, client_uuid, {"response": response, "reason": reason, **vars(watching)})
 
 
 def undo_label(session: Session, participant: Participant, query_id: int, client_uuid: UUID) -> None:
@@ -98,47 +90,67 @@ def undo_label(session: Session, participant: Participant, query_id: int, client
 
     Raises QueryNotFound, AnswerMisdirected and UndoTooLate.
     """
-    query = _own_query(session, participant, query_id)
-    events = _events(session, query)
-    if _earlier(session, events, client_uuid) is not None or not events or events[-1].response is None:
+    asked = _asked(session, participant, query_id, client_uuid)
+    if asked.sent_to is not None or asked.response is None:
         return
-    if next_query.answers_given(session, participant).newest_query_id != query.id:
+    if next_query.answers_given(session, participant).newest_query_id != query_id:
         raise UndoTooLate
-    _append(session, query, LabelEvent(query_id=query.id, revision=len(events) + 1, client_uuid=str(client_uuid)))
+    _append(session, asked, client_uuid, {})
 
 
-def _own_query(session: Session, participant: Participant, query_id: int) -> Query:
-    mine = select(Query).where(Query.id == query_id, Query.participant_id == participant.id)
-    query = session.scalar(mine.with_for_update())  # SQLite: the whole database is already ours
-    if query is None:
+class _Asked(NamedTuple):
+    """A pair that the participant was asked about, and what is known of the answer to it."""
+
+    query_id: int
+    served_at: datetime | None
+    revision: int
+    """the newest; 0: none"""
+    response: str | None
+    """None: not answered, or taken back"""
+    sent_to: int | None
+    """the pair that this client's message was stored for already"""
+
+
+_OF_THIS = LabelEvent.query_id == Query.id
+_ASKED = (
+    select(
+        Query.id,
+        Query.served_at,
+        select(func.coalesce(func.max(LabelEvent.revision), 0)).where(_OF_THIS).scalar_subquery(),
+        select(LabelEvent.response)
+        .where(_OF_THIS)
+        .order_by(LabelEvent.revision.desc())
+        .limit(1)
+        .correlate(Query)
+        .scalar_subquery(),
+        select(LabelEvent.query_id).where(LabelEvent.client_uuid == bindparam("client_uuid")).scalar_subquery(),
+    )
+    .where(Query.id == bindparam("query_id"), Query.participant_id == bindparam("participant_id"))
+    .with_for_update()  # SQLite: the whole database is already ours
+)
+_EVENTS = cast(Table, LabelEvent.__table__)
+_INSERT = {
+    dialect.name: insert(_EVENTS).on_conflict_do_nothing().returning(_EVENTS.c.id)
+    for dialect, insert in ((sqlite.dialect, sqlite.insert), (postgresql.dialect, postgresql.insert))
+}
+
+
+def _asked(session: Session, participant: Participant, query_id: int, client_uuid: UUID) -> _Asked:
+    """Raises QueryNotFound, and AnswerMisdirected for a message that was stored for another pair."""
+    sought = {"query_id": query_id, "participant_id": participant.id, "client_uuid": str(client_uuid)}
+    row = session.execute(_ASKED, sought).one_or_none()
+    if row is None:
         raise QueryNotFound
-    return query
-
-
-def _events(session: Session, query: Query) -> Sequence[LabelEvent]:
-    return session.scalars(
-        select(LabelEvent).where(LabelEvent.query_id == query.id).order_by(LabelEvent.revision)
-    ).all()
-
-
-def _earlier(session: Session, events: Sequence[LabelEvent], client_uuid: UUID) -> LabelEvent | None:
-    """The event this client already sent. Raises AnswerMisdirected when it was sent to another pair."""
-    mine = next((event for event in events if event.client_uuid == str(client_uuid)), None)
-    elsewhere = select(LabelEvent.id).where(LabelEvent.client_uuid == str(client_uuid))
-    if mine is None and session.scalar(elsewhere) is not None:
+    asked = _Asked(*row)
+    if asked.sent_to not in (None, query_id):
         raise AnswerMisdirected
-    return mine
+    return asked
 
 
-def _append(session: Session, query: Query, event: LabelEvent) -> LabelEvent:
+def _append(session: Session, asked: _Asked, client_uuid: UUID, said: Mapping[str, Any]) -> None:
     """Add the event; if another request was first, theirs counts. The unique constraints are the last judge."""
-    try:
-        with session.begin_nested():
-            session.add(event)
-            session.flush()
-    except IntegrityError as error:
-        events = _events(session, query)
-        if not events:
-            raise AnswerMisdirected from error
-        return events[-1]
-    return event
+    event = {"query_id": asked.query_id, "revision": asked.revision + 1, "client_uuid": str(client_uuid), **said}
+    if session.scalar(_INSERT[session.get_bind().dialect.name], event) is None:
+        elsewhere = select(LabelEvent.query_id).where(LabelEvent.client_uuid == str(client_uuid))
+        if session.scalar(elsewhere) not in (None, asked.query_id):
+            raise AnswerMisdirected

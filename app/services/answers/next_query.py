@@ -6,11 +6,13 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta
 from itertools import islice, pairwise
 from statistics import median
+from typing import NamedTuple
 
-from sqlalchemy import func, select
-from sqlalchemy.orm import Session, aliased, joinedload
+from sqlalchemy import bindparam, func, select, update
+from sqlalchemy.orm import Session, aliased
 
 from app.db import now
+from app.domain.clips import Clip
 from app.domain.preferences import LabelEvent, Purpose, Query
 from app.domain.studies import Awaited, Participant
 from app.services import participant_events
@@ -65,14 +67,34 @@ class PairProgress:
         return not self.practising and self.answered >= self.wanted
 
 
+class ClipFiles(NamedTuple):
+    """A clip as a page needs it."""
+
+    video_sha256: str
+    poster_sha256: str
+    width: int
+    height: int
+    fps: int
+
+
+class ReadyQuery(NamedTuple):
+    """A query that can be shown."""
+
+    id: int
+    purpose: str
+    served_at: datetime | None
+    left: ClipFiles
+    right: ClipFiles
+
+
 @dataclass(frozen=True)
 class NextPair:
     """What a participant is to be shown now."""
 
     progress: PairProgress
-    query: Query | None
+    query: ReadyQuery | None
     """None while no pair is ready, during a break, and when all are answered."""
-    following: Sequence[Query]
+    following: Sequence[ReadyQuery]
     """The next few pairs after it, so that the page can load them ahead."""
     undoable_id: int | None
     """The id of the query answered last, whose answer can be taken back."""
@@ -80,8 +102,57 @@ class NextPair:
     """Whether a break is to be offered before the next pair."""
 
 
+# Statements that every answer needs are made once: making them took as long as running them.
+_newer, _left, _right = aliased(LabelEvent), aliased(Clip), aliased(Clip)
+_GIVEN = (
+    select(
+        LabelEvent.query_id,
+        LabelEvent.created_at,
+        Query.purpose,
+        func.count().over().label("total"),
+        func.count().filter(Query.purpose == Purpose.PRACTICE).over().label("practised"),
+    )
+    .join(Query, Query.id == LabelEvent.query_id)
+    .where(
+        Query.participant_id == bindparam("participant_id"),
+        LabelEvent.response.is_not(None),
+        ~select(_newer.id)
+        .where(_newer.query_id == LabelEvent.query_id, _newer.revision > LabelEvent.revision)
+        .exists(),
+    )
+    .order_by(LabelEvent.id.desc())
+    .limit(RECENT_ANSWERS + 1)
+)
+_newest_response = (
+    select(LabelEvent.response)
+    .where(LabelEvent.query_id == Query.id)
+    .order_by(LabelEvent.revision.desc())
+    .limit(1)
+    .scalar_subquery()
+)  # NULL when there is no event, and when the newest takes an answer back
+_WAITING = (
+    select(
+        Query.id,
+        Query.purpose,
+        Query.served_at,
+        *(getattr(clip, name) for clip in (_left, _right) for name in ClipFiles._fields),
+    )
+    .join(_left, _left.id == Query.left_clip_id)
+    .join(_right, _right.id == Query.right_clip_id)
+    .where(Query.participant_id == bindparam("participant_id"), _newest_response.is_(None))
+    .order_by(Query.ordinal)
+    .execution_options(yield_per=1 + PAIRS_AHEAD)  # the rest of the list is of no interest
+)
+_SERVE = (
+    update(Query)
+    .where(Query.id == bindparam("query_id"))
+    .values(served_at=bindparam("moment"))
+    .execution_options(synchronize_session=False)
+)
+
+
 def next_turn(session: Session, store: ArtefactStore, participant: Participant) -> NextPair:
-    """The oldest ready pair of this participant, clips loaded, and what belongs on the page with it.
+    """The oldest ready pair of this participant, and what belongs on the page with it.
 
     Marks the pair as served. A pair whose files are not all stored is passed over.
     """
@@ -93,25 +164,15 @@ def next_turn(session: Session, store: ArtefactStore, participant: Participant) 
     ready = [] if progress.finished else list(islice(_ready(session, store, participant), 1 + PAIRS_AHEAD))
     query = ready[0] if ready else None
     if query is not None and query.served_at is None:
-        query.served_at = now()
+        session.execute(_SERVE, {"query_id": query.id, "moment": now()})
     left = progress.practice_wanted - progress.practised + progress.wanted - progress.answered
     return NextPair(progress, query, ready[1:left], undoable_id)
 
 
 def answers_given(session: Session, participant: Participant) -> AnswerCounts:
     """How many answers count, and the newest of them. Counted by the database: this is asked for with every answer."""
-    newer = aliased(LabelEvent)
-    superseded = select(newer.id).where(newer.query_id == LabelEvent.query_id, newer.revision > LabelEvent.revision)
-    counting = (
-        select(LabelEvent.query_id, LabelEvent.created_at, Query.purpose)
-        .join(Query, Query.id == LabelEvent.query_id)
-        .where(Query.participant_id == participant.id, LabelEvent.response.is_not(None), ~superseded.exists())
-    )
-    newest = session.execute(counting.order_by(LabelEvent.id.desc()).limit(RECENT_ANSWERS + 1)).all()
-    answers = counting.subquery()
-    total, practised = session.execute(
-        select(func.count(), func.count().filter(answers.c.purpose == Purpose.PRACTICE)).select_from(answers)
-    ).one()
+    newest = session.execute(_GIVEN, {"participant_id": participant.id}).all()
+    total, practised = (newest[0].total, newest[0].practised) if newest else (0, 0)
     return AnswerCounts(
         count=total - practised,
         practised=practised,
@@ -165,25 +226,13 @@ def waits(participant: Participant, awaited: Awaited | None) -> None:
         participant.waiting_since = None if awaited is None else now()
 
 
-def _ready(session: Session, store: ArtefactStore, participant: Participant) -> Iterator[Query]:
-    newest_response = (
-        select(LabelEvent.response)
-        .where(LabelEvent.query_id == Query.id)
-        .order_by(LabelEvent.revision.desc())
-        .limit(1)
-        .scalar_subquery()
-    )  # NULL when there is no event, and when the newest takes an answer back
-    waiting = (
-        select(Query)
-        .where(Query.participant_id == participant.id, newest_response.is_(None))
-        .options(joinedload(Query.left_clip), joinedload(Query.right_clip))
-        .order_by(Query.ordinal)
-        .execution_options(yield_per=2)  # the rest of the list is of no interest
-    )
-    with session.scalars(waiting) as queries:
-        for query in queries:
-            clips = (query.left_clip, query.right_clip)
-            if all(store.seems_whole(sha256) for clip in clips for sha256 in (clip.video_sha256, clip.poster_sha256)):
+def _ready(session: Session, store: ArtefactStore, participant: Participant) -> Iterator[ReadyQuery]:
+    with session.execute(_WAITING, {"participant_id": participant.id}) as rows:
+        for query_id, purpose, served_at, *clips in rows:
+            half = len(clips) // 2
+            query = ReadyQuery(query_id, purpose, served_at, ClipFiles(*clips[:half]), ClipFiles(*clips[half:]))
+            files = (sha256 for clip in (query.left, query.right) for sha256 in (clip.video_sha256, clip.poster_sha256))
+            if all(map(store.seems_whole, files)):
                 yield query
             else:
                 log.warning("query %d of participant %d has lost its files: passed over", query.id, participant.id)

@@ -23,7 +23,6 @@ from app.domain.preferences import LabelEvent, Purpose, Query, Response, is_excl
 from app.domain.protocol import Stage
 from app.domain.studies import Participant, Study
 from app.domain.study_settings import StudySettings
-from app.services.answers import stopping_advice
 from app.services.answers.consistency import Consistency, JudgedAnswer, consistency, seen
 from app.services.answers.stopping_advice import Advice
 from app.services.participants import stages
@@ -57,7 +56,7 @@ class Watched:
     advice: Advice | None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class GivenAnswer:
     """One answer that counts, when it was given, and what had been foreseen."""
 
@@ -93,11 +92,13 @@ class StageTime:
     record: StageRecord
 
 
-def answers_given(session: Session, participant_ids: Sequence[int]) -> dict[int, list[GivenAnswer]]:
-    """Everything that each of them has answered and not undone, in the order of the queries."""
+def answers_given(
+    session: Session, participant_ids: Sequence[int], query_ids: Sequence[int] | None = None
+) -> dict[int, list[GivenAnswer]]:
+    """Everything that each of them has answered and not undone, in the order of the queries; to these queries only."""
     left, right, newer = aliased(Clip), aliased(Clip), aliased(LabelEvent)
     superseded = select(newer.id).where(newer.query_id == LabelEvent.query_id, newer.revision > LabelEvent.revision)
-    rows = session.execute(
+    wanted = (
         select(
             Query.participant_id,
             *(Query.ordinal, Query.id, Query.purpose, Query.left_clip_id, Query.right_clip_id, Query.repeats_query_id),
@@ -113,6 +114,7 @@ def answers_given(session: Session, participant_ids: Sequence[int]) -> dict[int,
         .where(Query.participant_id.in_(participant_ids), LabelEvent.response.is_not(None), ~superseded.exists())
         .order_by(Query.participant_id, Query.ordinal)
     )  # columns, not objects: of 20 000 answers objects take two seconds
+    rows = session.execute(wanted if query_ids is None else wanted.where(Query.id.in_(query_ids)))
     given: dict[int, list[GivenAnswer]] = {each: [] for each in participant_ids}
     for row in rows:
         answer = JudgedAnswer(
@@ -145,7 +147,7 @@ def reward_models(session: Session, participant_ids: Sequence[int]) -> dict[int,
     return models
 
 
-def judged(given: Sequence[GivenAnswer], models: Sequence[Model]) -> Watched:
+def judged(given: Sequence[GivenAnswer], advice: Advice | None) -> Watched:
     """Everything that is said about the answers of one participant."""
     moments = sorted(each.moment for each in given if each.answer.purpose is not Purpose.PRACTICE)
     gaps = [(later - earlier).total_seconds() for earlier, later in pairwise(moments)]
@@ -153,7 +155,7 @@ def judged(given: Sequence[GivenAnswer], models: Sequence[Model]) -> Watched:
     return Watched(
         consistency=consistency([each.answer for each in given if not each.excluded]),
         pace_s=median(working) if len(working) >= 3 else None,
-        advice=stopping_advice.advice_of(models),
+        advice=advice,
     )
 
 

@@ -1,26 +1,41 @@
 """What is counted from each participant's answers and models, remembered until there are more of them.
 
 Answers, words about them, and models are only ever added, or erased with the person: how many there are, and the
-newest of them, tell whether what was counted still holds. Judging 20 000 answers takes half a second, finding out who
-has new ones 15 ms.
+newest of them, tell whether what was counted still holds. Reading 20 000 answers takes half a second, finding out who
+has new ones 15 ms; so what was read is kept, and only what is new is read.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from threading import Lock
+from typing import NamedTuple
 
-from sqlalchemy import Select, func, select
+from sqlalchemy import case, func, select
 from sqlalchemy.orm import Session
 
 from app.domain.models import Bundle, Model, ModelKind
 from app.domain.preferences import LEARNED_FROM, Exclusion, LabelEvent, Query, Response
-from app.services.answers import accuracy
+from app.services.answers import accuracy, stopping_advice
 from app.services.answers.accuracy import Predicted
+from app.services.answers.stopping_advice import Advice
 from app.services.monitoring import participant_status
 from app.services.monitoring.participant_status import GivenAnswer
 from app.services.runs import model_metrics
 
-Watermark = tuple[int | None, ...]
+MOST_REMEMBERED = 300
+"""People whose answers are kept in memory, about 100 kB each."""
+MOST_NEWS = 10
+"""Answers of one person that are read one by one; of more, all of theirs are read."""
+
+
+class Watermark(NamedTuple):
+    """How many rows of each kind somebody has, and the newest of them."""
+
+    answers: tuple[int, int] = (0, 0)
+    exclusions: tuple[int, int] = (0, 0)
+    models: tuple[int, int] = (0, 0)
+    bundles: tuple[int, int] = (0, 0)
 
 
 @dataclass(frozen=True)
@@ -35,54 +50,127 @@ class Tally:
     watched: participant_status.Watched
 
 
+@dataclass(frozen=True)
+class _Known:
+    """What was counted for one participant, and what from."""
+
+    mark: Watermark
+    given: Mapping[int, GivenAnswer] | None
+    """By the query's id, in the order of the queries; None: forgotten"""
+    advice: Advice | None
+    tally: Tally
+
+
 class Tallies:
     """Counts for whoever asks, and again only for those who have gone on since. One per database; any thread."""
 
     def __init__(self) -> None:
         self._lock = Lock()
-        self._known: dict[int, tuple[Watermark, Tally]] = {}
+        self._known: dict[int, _Known] = {}
 
     def of(self, session: Session, participant_ids: Sequence[int]) -> dict[int, Tally]:
         """The tally of each of these participants."""
         marks = _marks(session, participant_ids)
         with self._lock:
             known = {each: self._known[each] for each in participant_ids if each in self._known}
-        stale = [each for each in participant_ids if each not in known or known[each][0] != marks[each]]
-        fresh = _count(session, stale) if stale else {}
-        with self._lock:
-            self._known |= {each: (marks[each], tally) for each, tally in fresh.items()}
-        return {each: fresh[each] if each in fresh else known[each][1] for each in participant_ids}
+        stale = [each for each in participant_ids if each not in known or known[each].mark != marks[each]]
+        if stale:
+            fresh = _count(session, {each: marks[each] for each in stale}, known)
+            known |= fresh
+            with self._lock:
+                self._keep(fresh)
+        return {each: known[each].tally for each in participant_ids}
+
+    def _keep(self, fresh: Mapping[int, _Known]) -> None:
+        """The answers themselves of those only who went on last: of everybody in every study they would be too many."""
+        for each, known in fresh.items():
+            self._known.pop(each, None)
+            self._known[each] = known  # at the end
+        remembered = [each for each, known in self._known.items() if known.given is not None]
+        for each in remembered[:-MOST_REMEMBERED]:
+            self._known[each] = replace(self._known[each], given=None)
 
 
 def _marks(session: Session, participant_ids: Sequence[int]) -> dict[int, Watermark]:
-    marks: dict[int, Watermark] = dict.fromkeys(participant_ids, ())
-    for whose, counted in (
-        (Query.participant_id, select(Query.participant_id, func.count(), func.max(LabelEvent.id)).join(LabelEvent)),
-        (Query.participant_id, _exclusions()),
-        (Model.participant_id, select(Model.participant_id, func.count(), func.max(Model.id))),
-        (Bundle.participant_id, select(Bundle.participant_id, func.count(), func.max(Bundle.id))),
-    ):
-        found = session.execute(counted.where(whose.in_(participant_ids)).group_by(whose))
-        rows = {each: (count, newest) for each, count, newest in found}
-        for each in participant_ids:
-            marks[each] += rows.get(each, (0, None))
-    return marks
-
-
-def _exclusions() -> Select[int, int, int | None]:
     words = select(Query.participant_id, func.count(), func.max(Exclusion.id))
-    return words.join(LabelEvent, LabelEvent.query_id == Query.id).join(Exclusion)
+    counted = {
+        "answers": select(Query.participant_id, func.count(), func.max(LabelEvent.id)).join(LabelEvent),
+        "exclusions": words.join(LabelEvent, LabelEvent.query_id == Query.id).join(Exclusion),
+        "models": select(Model.participant_id, func.count(), func.max(Model.id)),
+        "bundles": select(Bundle.participant_id, func.count(), func.max(Bundle.id)),
+    }
+    marks: dict[int, dict[str, tuple[int, int]]] = {each: {} for each in participant_ids}
+    for name, statement in counted.items():
+        whose = statement.selected_columns[0]
+        for each, count, newest in session.execute(statement.where(whose.in_(participant_ids)).group_by(whose)):
+            marks[each][name] = count, newest
+    return {each: Watermark(**mark) for each, mark in marks.items()}
 
 
-def _count(session: Session, participant_ids: Sequence[int]) -> dict[int, Tally]:
-    given = participant_status.answers_given(session, participant_ids)
-    models = participant_status.reward_models(session, participant_ids)
-    filters = _newest_filters(session, participant_ids)
-    return {each: _tally(given[each], models[each], filters.get(each)) for each in participant_ids}
+def _count(session: Session, marks: Mapping[int, Watermark], known: Mapping[int, _Known]) -> Mapping[int, _Known]:
+    given = _given(session, marks, known)
+    trained = [each for each in marks if each not in known or known[each].mark.models != marks[each].models]
+    models = participant_status.reward_models(session, trained)
+    advice = {each: stopping_advice.advice_of(models[each]) if each in models else known[each].advice for each in marks}
+    published = {each for each in marks if each in models or known[each].mark.bundles != marks[each].bundles}
+    filters = _newest_filters(session, list(published))
+    return {
+        each: _Known(
+            mark,
+            given[each],
+            advice[each],
+            _tally(
+                list(given[each].values()),
+                advice[each],
+                filters.get(each) if each in published else known[each].tally.newest_filter,
+            ),
+        )
+        for each, mark in marks.items()
+    }
+
+
+def _given(
+    session: Session, marks: Mapping[int, Watermark], known: Mapping[int, _Known]
+) -> Mapping[int, Mapping[int, GivenAnswer]]:
+    """Everybody's answers, of which only those are read that are about queries with news.
+
+    All of somebody's are read where an answer was left out or taken in again, rows have gone, or most is news.
+    """
+    unchanged = (each for each in marks if each in known and known[each].mark.exclusions == marks[each].exclusions)
+    remembered = {each: given for each in unchanged if (given := known[each].given) is not None}
+    told = _told_since(session, {each: known[each].mark.answers[1] for each in remembered})
+    changed = {
+        each: set(told[each])
+        for each in remembered
+        if marks[each].answers[0] == known[each].mark.answers[0] + len(told[each]) and len(told[each]) <= MOST_NEWS
+    }
+    answers = participant_status.answers_given(session, [each for each in marks if each not in changed])
+    news = participant_status.answers_given(
+        session, list(changed), [query for each in changed.values() for query in each]
+    )
+    for each, queries in changed.items():
+        kept = [answer for query_id, answer in remembered[each].items() if query_id not in queries]
+        answers[each] = sorted((*kept, *news[each]), key=_ordinal)
+    return {each: {answer.answer.query_id: answer for answer in answers[each]} for each in marks}
+
+
+def _told_since(session: Session, newest: Mapping[int, int]) -> Mapping[int, Sequence[int]]:
+    """The queries about which somebody said something after their newest event known, once for each event."""
+    told = defaultdict[int, list[int]](list)
+    if newest:
+        since = case(dict(newest), value=Query.participant_id)
+        events = select(Query.participant_id, LabelEvent.query_id).join(LabelEvent, LabelEvent.query_id == Query.id)
+        for each, query_id in session.execute(events.where(Query.participant_id.in_(newest), LabelEvent.id > since)):
+            told[each].append(query_id)
+    return told
+
+
+def _ordinal(given: GivenAnswer) -> int:
+    return given.answer.ordinal
 
 
 def _tally(
-    given: Sequence[GivenAnswer], models: Sequence[Model], newest_filter: model_metrics.FilterVersion | None
+    given: Sequence[GivenAnswer], advice: Advice | None, newest_filter: model_metrics.FilterVersion | None
 ) -> Tally:
     labels = [each for each in given if each.answer.purpose in LEARNED_FROM]
     counting = [each for each in labels if not each.excluded]
@@ -98,7 +186,7 @@ def _tally(
             )
         ),
         newest_filter=newest_filter,
-        watched=participant_status.judged(given, models),
+        watched=participant_status.judged(given, advice),
     )
 
 

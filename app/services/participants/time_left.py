@@ -3,11 +3,13 @@
 Pairs at the person's own pace; what comes after by the median of those who went before in the same study.
 """
 
+import time
 from collections import defaultdict
+from collections.abc import Mapping
 from dataclasses import dataclass
 from statistics import median
 
-from sqlalchemy import select
+from sqlalchemy import bindparam, select
 from sqlalchemy.orm import Session
 
 from app.domain.participation import ParticipantEvent, StageRecord
@@ -22,8 +24,33 @@ LEAST_PEOPLE = 3
 """Who must have gone before so that a stage's time is known."""
 RECENT = 90
 """Rows looked at, the newest."""
+KNOWN_FOR_S = 30.0
 _AFTER_PAIRS = (Stage.EVALUATION, Stage.QUESTIONNAIRE, Stage.DEBRIEF)
 CONTROL_RATE_HZ = 10
+
+
+_BREAKS = (
+    select(ParticipantEvent.participant_id, ParticipantEvent.kind, ParticipantEvent.at, ParticipantEvent.detail)
+    .join(Participant)
+    .where(
+        Participant.study_id == bindparam("study_id"),
+        ParticipantEvent.kind.in_((EventKind.BREAK_BEGUN, EventKind.BREAK_OVER)),
+    )
+    .order_by(ParticipantEvent.id.desc())
+    .limit(RECENT)
+)
+_THROUGH = (
+    select(StageRecord.stage, StageRecord.entered_at, StageRecord.finished_at)
+    .join(Participant)
+    .where(
+        Participant.study_id == bindparam("study_id"),
+        Participant.is_preview.is_(False),
+        StageRecord.stage.in_(_AFTER_PAIRS),
+        StageRecord.finished_at.is_not(None),
+    )
+    .order_by(StageRecord.id.desc())
+    .limit(RECENT)
+)
 
 
 @dataclass(frozen=True)
@@ -35,16 +62,46 @@ class TimeLeft:
     """False: only of the comparing; nobody knows yet how long what comes afterwards takes."""
 
 
-def time_left(session: Session, participant: Participant, progress: PairProgress) -> TimeLeft | None:
+@dataclass(frozen=True)
+class Usual:
+    """What went before in a study usually took."""
+
+    break_s: float | None
+    """None while nobody has taken one"""
+    stages_s: Mapping[Stage, float]
+    """Of the stages after the pairs that enough people are through with."""
+
+
+class UsualTimes:
+    """What stages and breaks usually take, by study: every answer needs it, and it changes with people. Any thread."""
+
+    def __init__(self) -> None:
+        self._known: dict[int, tuple[float, Usual]] = {}
+
+    def of(self, session: Session, study_id: int) -> Usual:
+        """Asked of the database when it was not known of late."""
+        known = self._known.get(study_id)
+        if known is None or time.monotonic() - known[0] > KNOWN_FOR_S:
+            known = self._known[study_id] = (
+                time.monotonic(),
+                Usual(_usual_break_s(session, study_id), _usual_stages_s(session, study_id)),
+            )
+        return known[1]
+
+
+def time_left(
+    session: Session, participant: Participant, progress: PairProgress, usual_times: UsualTimes
+) -> TimeLeft | None:
     """None while the person's pace is not known. The study is loaded."""
     if progress.pace_s is None:
         return None
-    study = participant.study
-    pairs_s = _pairs_s(progress, study.settings, study.whole_clip_steps) + _breaks_s(session, participant, progress)
-    later = [stage for stage in stages.stages_of(study.settings) if stage in _AFTER_PAIRS]
-    usual = _usual_s(session, participant) if later else {}
-    known = all(stage in usual for stage in later)
-    return TimeLeft(round(pairs_s + (sum(usual[stage] for stage in later) if known else 0.0)), known)
+    study, usual = participant.study, usual_times.of(session, participant.study_id)
+    settings = study.settings
+    seconds = _pairs_s(progress, settings, study.whole_clip_steps)
+    seconds += _breaks_coming(progress, settings) * (usual.break_s or 0.0)
+    later = [stage for stage in stages.stages_of(settings) if stage in _AFTER_PAIRS]
+    known = all(stage in usual.stages_s for stage in later)
+    return TimeLeft(round(seconds + (sum(usual.stages_s[stage] for stage in later) if known else 0.0)), known)
 
 
 def _pairs_s(progress: PairProgress, settings: StudySettings, whole_clip_steps: int | None) -> float:
@@ -56,22 +113,14 @@ def _pairs_s(progress: PairProgress, settings: StudySettings, whole_clip_steps: 
     return whole * pace_s + (left - whole) * after_s
 
 
-def _breaks_s(session: Session, participant: Participant, progress: PairProgress) -> float:
-    """Breaks still to come, at the median of those that this study's participants took; nothing while none is known."""
-    every = participant.study.settings.break_every
-    coming = (progress.wanted - 1) // every - progress.answered // every if every else 0
-    if coming < 1:
-        return 0.0
-    events = session.execute(
-        select(ParticipantEvent.participant_id, ParticipantEvent.kind, ParticipantEvent.at, ParticipantEvent.detail)
-        .join(Participant)
-        .where(
-            Participant.study_id == participant.study_id,
-            ParticipantEvent.kind.in_((EventKind.BREAK_BEGUN, EventKind.BREAK_OVER)),
-        )
-        .order_by(ParticipantEvent.id.desc())
-        .limit(RECENT)
-    ).all()
+def _breaks_coming(progress: PairProgress, settings: StudySettings) -> int:
+    every = settings.break_every
+    return max(0, (progress.wanted - 1) // every - progress.answered // every) if every else 0
+
+
+def _usual_break_s(session: Session, study_id: int) -> float | None:
+    """The median of the breaks that this study's participants took, the longest cut off."""
+    events = session.execute(_BREAKS, {"study_id": study_id}).all()
     begun = {
         (row.participant_id, row.detail.get("answered")): row.at for row in events if row.kind == EventKind.BREAK_BEGUN
     }
@@ -80,23 +129,12 @@ def _breaks_s(session: Session, participant: Participant, progress: PairProgress
         for row in events
         if row.kind == EventKind.BREAK_OVER and (row.participant_id, row.detail.get("answered")) in begun
     ]
-    return coming * min(median(taken), LONGEST_PAUSE.total_seconds()) if taken else 0.0
+    return min(median(taken), LONGEST_PAUSE.total_seconds()) if taken else None
 
 
-def _usual_s(session: Session, participant: Participant) -> dict[Stage, float]:
-    """Median seconds of each stage after the pairs, of those stages that enough others are through with."""
-    through = (
-        select(StageRecord.stage, StageRecord.entered_at, StageRecord.finished_at)
-        .join(Participant)
-        .where(
-            Participant.study_id == participant.study_id,
-            Participant.id != participant.id,
-            Participant.is_preview.is_(False),
-            StageRecord.stage.in_(_AFTER_PAIRS),
-            StageRecord.finished_at.is_not(None),
-        )
-    )
+def _usual_stages_s(session: Session, study_id: int) -> Mapping[Stage, float]:
+    """Median seconds of each stage after the pairs, of those stages that enough people are through with."""
     seconds: dict[Stage, list[float]] = defaultdict(list)
-    for row in session.execute(through.order_by(StageRecord.id.desc()).limit(RECENT)):
+    for row in session.execute(_THROUGH, {"study_id": study_id}):
         seconds[Stage(row.stage)].append((row.finished_at - row.entered_at).total_seconds())
     return {stage: median(each) for stage, each in seconds.items() if len(each) >= LEAST_PEOPLE}

@@ -15,6 +15,8 @@ from app.services.monitoring.participant_status import INVITED, WITHDRAWN
 ATTENTION = "attention"
 """Shown: those with flags or failed work."""
 EVERYBODY = ""
+PAGE_SIZE = 50
+ON_ONE_PAGE = 0
 
 
 class Order(StrEnum):
@@ -39,6 +41,8 @@ class View:
     find: str = ""
     """Part of a code"""
     all_ticked: bool = False
+    page: int = 1
+    """ON_ONE_PAGE: all rows, however many there are"""
 
     def address(self, **changes: Any) -> str:
         """The part of an address that asks for this view with changes; nothing for the usual one."""
@@ -48,8 +52,9 @@ class View:
             "show": self.show,
             "find": self.find,
             "tick": "all" if self.all_ticked else "",
+            "page": str(self.page),
         } | changes
-        usual = {"sort": Order.ATTENTION.value}
+        usual = {"sort": Order.ATTENTION.value, "page": "1"}
         written = urlencode({name: value for name, value in asked.items() if value and usual.get(name) != value})
         return f"?{written}" if written else ""
 
@@ -65,9 +70,13 @@ class Choice:
 
 @dataclass(frozen=True)
 class PeopleTable:
-    """The rows in their order; who was invited and never came is apart."""
+    """The rows of one page in their order; who was invited and never came is apart."""
 
     rows: Sequence[ParticipantRow]
+    count: int
+    """on all pages"""
+    page: int
+    pages: int
     never_came: Sequence[ParticipantRow]
     choices: Sequence[Choice]
     view: View
@@ -79,8 +88,9 @@ def _view(
     show: Annotated[str, Query(max_length=40)] = EVERYBODY,
     find: Annotated[str, Query(max_length=20)] = "",
     tick: Annotated[str, Query(max_length=3)] = "",
+    page: Annotated[int, Query(ge=ON_ONE_PAGE, le=100_000)] = 1,
 ) -> View:
-    return View(sort, backwards == "yes", show, find.strip(), tick == "all")
+    return View(sort, backwards == "yes", show, find.strip(), tick == "all", page)
 
 
 WantedView = Annotated[View, Depends(_view)]
@@ -98,7 +108,10 @@ def people_table(overview: StudyOverview, view: View) -> PeopleTable:
         Choice(ATTENTION, "needing attention", alarming),
         *(Choice(stage, stage, count) for stage, count in overview.stage_counts),
     ]
-    return PeopleTable(rows, apart, choices, view)
+    size = PAGE_SIZE if view.page != ON_ONE_PAGE else max(1, len(rows))
+    pages = max(1, -(-len(rows) // size))
+    page = min(max(1, view.page), pages)
+    return PeopleTable(rows[(page - 1) * size : page * size], len(rows), page, pages, apart, choices, view)
 
 
 def needs_a_look(row: ParticipantRow) -> bool:

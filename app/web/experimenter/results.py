@@ -231,6 +231,8 @@ def download_table(
 
 
 def _handfuls(lines: Iterator[str]) -> Iterator[str]:
+    """The first line at once, so that whoever asked sees that it comes; then many together, which is cheaper."""
+    yield next(lines, "")
     waiting: list[str] = []
     for line in lines:
         waiting.append(line)

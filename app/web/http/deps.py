@@ -1,11 +1,11 @@
 """What a route may ask for: settings, sessions on the database, and the person who is asking."""
 
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping
 from dataclasses import dataclass, field
 from datetime import timedelta
 from http import HTTPStatus
 from threading import Event
-from typing import Annotated
+from typing import Annotated, TypeVar
 
 from fastapi import Depends, Path, Request, Response
 from fastapi.concurrency import run_in_threadpool
@@ -18,6 +18,7 @@ from app.errors import AppError
 from app.services.accounts import browser_sessions, roles
 from app.services.accounts.failed_logins import FailedLogins
 from app.services.monitoring.tallies import Tallies
+from app.services.participants.time_left import UsualTimes
 from app.settings import Settings
 from app.storage import ArtefactStore
 from app.web.http.hashing import Hashing
@@ -27,6 +28,7 @@ from app.web.http.readiness import Readiness
 from app.web.http.session_queue import SessionQueue
 from app.web.http.shared_pages import SharedPages
 
+T = TypeVar("T")
 PARTICIPANT_COOKIE = "studio_participant"
 EXPERIMENTER_COOKIE = "studio_experimenter"
 KNOWN_BROWSER_COOKIE = "studio_known_browser"
@@ -77,6 +79,7 @@ class Studio:
     imports: ImportLimit = field(default_factory=ImportLimit)
     failed_logins: FailedLogins = field(default_factory=FailedLogins)
     tallies: Tallies = field(default_factory=Tallies)
+    usual_times: UsualTimes = field(default_factory=UsualTimes)
     closing: Event = field(default_factory=Event)
     """Set when the server is asked to stop, so that open event streams end by themselves."""
 
@@ -100,17 +103,10 @@ async def _writing_session(studio: StudioDep) -> AsyncIterator[Session]:
         yield session
 
 
-async def _own_rows_session(studio: StudioDep) -> AsyncIterator[Session]:
-    async with studio.session_queue.writing(own_rows=True) as session:
-        yield session
-
-
 # scope="function": the transaction ends before the response leaves. With the default scope a commit that fails
 # would come after a response that says "saved".
 ReadingSession = Annotated[Session, Depends(_reading_session, scope="function")]
 WritingSession = Annotated[Session, Depends(_writing_session, scope="function")]
-OwnRowsSession = Annotated[Session, Depends(_own_rows_session, scope="function")]
-"""To write nothing with but rows of an AnsweringParticipant; on PostgreSQL, others do so at the same time."""
 
 
 def participant_or_nobody(request: Request, session: Session, *, lock: bool = False) -> Participant | None:
@@ -126,6 +122,23 @@ def participant_asking(request: Request, session: Session, *, lock: bool = False
     if participant is None:
         raise LinkNeeded
     return participant
+
+
+@dataclass(frozen=True)
+class Answering:
+    """The way into the database for what participants do most: the whole request is one step of one thread."""
+
+    request: Request
+    studio: Studio
+
+    async def act(self, step: Callable[[Session, Participant], T]) -> T:
+        """What the step returns, committed. Requests of one person wait for each other.
+
+        It may write nothing but rows of this participant: on PostgreSQL, others do so meanwhile. Raises LinkNeeded.
+        """
+        return await self.studio.session_queue.write_own_rows(
+            lambda session: step(session, participant_asking(self.request, session, lock=True))
+        )
 
 
 def experimenter_asking(request: Request, session: Session) -> Experimenter:
@@ -149,8 +162,10 @@ def _participant(request: Request, session: WritingSession) -> Participant:
     return participant_asking(request, session)
 
 
-def _answering_participant(request: Request, session: OwnRowsSession) -> Participant:
-    return participant_asking(request, session, lock=True)
+async def _answering(request: Request, studio: StudioDep) -> "Answering":
+    if PARTICIPANT_COOKIE not in request.cookies:
+        raise LinkNeeded
+    return Answering(request, studio)
 
 
 def _experimenter(request: Request, session: ReadingSession) -> Experimenter:
@@ -185,8 +200,8 @@ def _own_account(request: Request, session: WritingSession) -> Experimenter:
 
 CurrentParticipant = Annotated[Participant, Depends(_participant, scope="function")]
 """In the request's writing session: whatever a participant does leaves a trace, if only that they were here."""
-AnsweringParticipant = Annotated[Participant, Depends(_answering_participant, scope="function")]
-"""The same in the request's OwnRowsSession: requests of one person wait for each other, those of others do not."""
+AnsweringParticipant = Annotated[Answering, Depends(_answering)]
+"""For what participants do with every pair. Raises LinkNeeded for a browser without a cookie."""
 CurrentExperimenter = Annotated[Experimenter, Depends(_experimenter, scope="function")]
 """Whoever is logged in, readers included: for looking."""
 ActingExperimenter = Annotated[Experimenter, Depends(_acting_experimenter, scope="function")]

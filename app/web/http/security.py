@@ -1,10 +1,10 @@
 """Stands before every route: refuses forms sent by other sites, and tells browsers what our pages may do."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable
 from http import HTTPStatus
 from urllib.parse import urlsplit
 
-from starlette.datastructures import Headers, MutableHeaders
+from starlette.datastructures import MutableHeaders
 from starlette.requests import Request
 from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -76,17 +76,18 @@ class Guard:
             await send(message)
 
         app = self._app
-        if scope["method"] not in SAFE_METHODS and _is_foreign(Headers(scope=scope)):
+        if scope["method"] not in SAFE_METHODS and _is_foreign(scope["headers"]):
             app = self._refuse(Request(scope), ForeignForm())
         await app(scope, receive, send_guarded)
 
 
-def _is_foreign(headers: Mapping[str, str]) -> bool:
-    site = headers.get("sec-fetch-site")
+def _is_foreign(headers: Iterable[tuple[bytes, bytes]]) -> bool:
+    said = {name: value for name, value in headers if name in (b"sec-fetch-site", b"origin", b"host")}
+    site = said.get(b"sec-fetch-site")
     if site is not None:
-        return site not in ("same-origin", "none")
-    origin = headers.get("origin")
-    return origin is not None and _netloc(origin) != headers.get("host", "").lower()
+        return site not in (b"same-origin", b"none")
+    origin = said.get(b"origin")
+    return origin is not None and _netloc(origin.decode("latin-1")) != said.get(b"host", b"").decode("latin-1").lower()
 
 
 def _netloc(origin: str) -> str | None:

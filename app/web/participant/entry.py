@@ -1,11 +1,13 @@
 """The participant's way: the personal link, the page one should be on, instructions."""
 
 from datetime import timedelta
+from functools import partial
 from http import HTTPStatus
 from typing import Annotated
 
 from fastapi import APIRouter, Request
 from fastapi.responses import Response
+from sqlalchemy.orm import Session
 
 from app.domain.protocol import Stage
 from app.domain.studies import Participant
@@ -17,7 +19,7 @@ from app.web.error_pages import wants_json
 from app.web.http.deps import (
     PARTICIPANT_COOKIE,
     AnsweringParticipant,
-    OwnRowsSession,
+    Studio,
     StudioDep,
     Token,
     WritingSession,
@@ -33,10 +35,12 @@ AtInstructions = Annotated[Participant, has_reached(Stage.INSTRUCTIONS)]
 
 
 @router.get("/next", name="show_next")
-def show_next(
-    request: Request, participant: AnsweringParticipant, session: OwnRowsSession, studio: StudioDep
-) -> Response:
+async def show_next(request: Request, answering: AnsweringParticipant) -> Response:
     """Where this person should be: the pair to compare now, or on to the page of their stage."""
+    return await answering.act(partial(_next, request, answering.studio))
+
+
+def _next(request: Request, studio: Studio, session: Session, participant: Participant) -> Response:
     next_query.seen(participant)
     if participant.study.put_away_at is not None:
         return _closed(request, participant)

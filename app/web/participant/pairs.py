@@ -5,13 +5,13 @@ from http import HTTPStatus
 from typing import Annotated, Any
 from uuid import UUID, uuid4
 
-from fastapi import APIRouter, Form, Request
+from fastapi import APIRouter, Depends, Form, Request
+from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, Response
-from pydantic import BaseModel, BeforeValidator, Field
+from pydantic import BaseModel, BeforeValidator, Field, ValidationError
 from sqlalchemy.orm import Session
 
 from app.domain import preferences
-from app.domain.clips import Clip
 from app.domain.preferences import Purpose, SkipReason
 from app.domain.studies import Awaited, Participant
 from app.services import participant_events
@@ -21,7 +21,7 @@ from app.services.participants import time_left
 from app.services.participants.time_left import TimeLeft
 from app.services.runs import estimates
 from app.web.error_pages import wants_json
-from app.web.http.deps import AnsweringParticipant, OwnRowsSession, RowId, Studio, StudioDep
+from app.web.http.deps import AnsweringParticipant, RowId, Studio
 from app.web.participant.pages import go, participant_page
 from app.web.texts.languages import wording_of
 from app.web.texts.wording import Wording
@@ -84,7 +84,7 @@ def show_turn(request: Request, session: Session, studio: Studio, participant: P
     next_query.seen(participant)
     turn = next_query.next_turn(session, studio.store, participant)
     next_query.waits(participant, Awaited.PAIR if _state(turn) == "waiting" else None)
-    state = _turn_for_script(request, session, participant, turn)
+    state = _turn_for_script(request, session, studio, participant, turn)
     if wants_json(request):
         return JSONResponse(state)
     if turn.break_due:
@@ -97,52 +97,66 @@ def show_turn(request: Request, session: Session, studio: Studio, participant: P
     return participant_page(request, f"participant/{_template(turn)}.html", participant, context)
 
 
+async def _label_form(request: Request) -> LabelForm:
+    """The answer as it was sent, where empty means left out. FastAPI would ask anew each time what the fields are."""
+    sent = await request.form()
+    try:
+        return LabelForm.model_validate({name: value for name, value in sent.items() if value != ""})
+    except ValidationError as error:
+        raise RequestValidationError([{**each, "loc": ("body", *each["loc"])} for each in error.errors()]) from None
+
+
+SentLabel = Annotated[LabelForm, Depends(_label_form)]
+
+
 @router.post("/queries/{query_id}/label", name="label_query")
-def label_query(
-    request: Request,
-    query_id: RowId,
-    form: Annotated[LabelForm, Form()],
-    participant: AnsweringParticipant,
-    session: OwnRowsSession,
-    studio: StudioDep,
-) -> Response:
+async def label_query(request: Request, query_id: RowId, answering: AnsweringParticipant, form: SentLabel) -> Response:
     """Record the answer; the transaction is committed before this response leaves."""
     measured = form.model_dump(exclude={"response", "client_uuid", "reason"})
     watching = labelling.Watching(**measured, by_script=wants_json(request))
-    labelling.record_label(session, participant, query_id, form.response, form.client_uuid, watching, form.reason)
-    return _go_on(request, session, studio, participant)
+
+    def label(session: Session, participant: Participant) -> Response:
+        labelling.record_label(session, participant, query_id, form.response, form.client_uuid, watching, form.reason)
+        return _go_on(request, session, answering.studio, participant)
+
+    return await answering.act(label)
 
 
 @router.post("/queries/{query_id}/undo", name="undo_label")
-def undo_label(
-    request: Request,
-    query_id: RowId,
-    client_uuid: Annotated[UUID, Form()],
-    participant: AnsweringParticipant,
-    session: OwnRowsSession,
-    studio: StudioDep,
+async def undo_label(
+    request: Request, query_id: RowId, client_uuid: Annotated[UUID, Form()], answering: AnsweringParticipant
 ) -> Response:
     """Take the newest answer back; its pair is the next to be shown."""
-    labelling.undo_label(session, participant, query_id, client_uuid)
-    return _go_on(request, session, studio, participant)
+
+    def undo(session: Session, participant: Participant) -> Response:
+        labelling.undo_label(session, participant, query_id, client_uuid)
+        return _go_on(request, session, answering.studio, participant)
+
+    return await answering.act(undo)
 
 
 @router.post("/break", name="end_break")
-def end_break(request: Request, participant: AnsweringParticipant, session: OwnRowsSession) -> Response:
+async def end_break(request: Request, answering: AnsweringParticipant) -> Response:
     """Go on after a break."""
-    next_query.seen(participant)
-    next_query.end_break(session, participant)
-    return go(request, "show_next")
+
+    def go_on(session: Session, participant: Participant) -> Response:
+        next_query.seen(participant)
+        next_query.end_break(session, participant)
+        return go(request, "show_next")
+
+    return await answering.act(go_on)
 
 
 @router.post("/events", name="note_event", status_code=HTTPStatus.NO_CONTENT)
-def note_event(
-    form: Annotated[EventForm, Form()], participant: AnsweringParticipant, session: OwnRowsSession
-) -> Response:
+async def note_event(form: Annotated[EventForm, Form()], answering: AnsweringParticipant) -> Response:
     """Keep what the script noticed; sent as a beacon, so nobody waits for an answer."""
-    if form.kind not in (EventKind.BREAK_BEGUN, EventKind.BREAK_OVER):
-        detail = {name: value for name, value in form.model_dump(exclude={"kind"}).items() if value is not None}
-        participant_events.note(session, participant, form.kind, detail)
+
+    def note(session: Session, participant: Participant) -> None:
+        if form.kind not in (EventKind.BREAK_BEGUN, EventKind.BREAK_OVER):
+            detail = {name: value for name, value in form.model_dump(exclude={"kind"}).items() if value is not None}
+            participant_events.note(session, participant, form.kind, detail)
+
+    await answering.act(note)
     return Response(status_code=HTTPStatus.NO_CONTENT)
 
 
@@ -172,13 +186,14 @@ def _go_on(request: Request, session: Session, studio: Studio, participant: Part
         return go(request, "show_next")
     turn = next_query.next_turn(session, studio.store, participant)
     next_query.waits(participant, Awaited.PAIR if _state(turn) == "waiting" else None)
-    return JSONResponse(_turn_for_script(request, session, participant, turn))
+    return JSONResponse(_turn_for_script(request, session, studio, participant, turn))
 
 
 def _turn_for_script(
-    request: Request, session: Session, participant: Participant, turn: next_query.NextPair
+    request: Request, session: Session, studio: Studio, participant: Participant, turn: next_query.NextPair
 ) -> dict[str, Any]:
-    progress, left = turn.progress, time_left.time_left(session, participant, turn.progress)
+    progress = turn.progress
+    left = time_left.time_left(session, participant, turn.progress, studio.usual_times)
     practising = progress.practising
     return {
         "state": _state(turn),
@@ -202,8 +217,8 @@ def _state(turn: next_query.NextPair) -> str:
     return "waiting" if turn.query is None else "pair"
 
 
-def _pair(request: Request, query: preferences.Query) -> Pair:
-    def paths(clip: Clip) -> dict[str, str]:
+def _pair(request: Request, query: next_query.ReadyQuery) -> Pair:
+    def paths(clip: next_query.ClipFiles) -> dict[str, str]:
         return {
             "video": request.app.url_path_for("show_video", sha256=clip.video_sha256),
             "poster": request.app.url_path_for("show_poster", sha256=clip.poster_sha256),
@@ -212,9 +227,9 @@ def _pair(request: Request, query: preferences.Query) -> Pair:
     return Pair(
         query_id=query.id,
         label_path=request.app.url_path_for("label_query", query_id=query.id),
-        left=paths(query.left_clip),
-        right=paths(query.right_clip),
-        width=query.left_clip.width,
-        height=query.left_clip.height,
-        fps=query.left_clip.fps,
+        left=paths(query.left),
+        right=paths(query.right),
+        width=query.left.width,
+        height=query.left.height,
+        fps=query.left.fps,
     )
