@@ -1,10 +1,10 @@
-"""Experimenters, browser sessions of everybody, the record of who did what, and receipts of what was erased."""
+"""Experimenters, members of studies, browser sessions of everybody, the audit log, and receipts of what was erased."""
 
 from datetime import datetime
 from enum import StrEnum
 from typing import Any
 
-from sqlalchemy import CheckConstraint, ForeignKey, Index, String
+from sqlalchemy import CheckConstraint, ForeignKey, Index, String, UniqueConstraint
 from sqlalchemy.orm import Mapped, mapped_column
 
 from app.db import Base, now
@@ -13,11 +13,22 @@ from app.db import Base, now
 class Role(StrEnum):
     """What an experimenter may do; each may do what the next one may."""
 
-    OWNER = "owner"
-    """Accounts, deleting whole studies, and everything below."""
+    ADMINISTRATOR = "administrator"
+    """Accounts, and everything in every study."""
     EXPERIMENTER = "experimenter"
-    """Studies: make, lock, invite, unblind, export."""
+    """Make studies; in those of others, what their role as a member is."""
     READER = "reader"
+    """Look at the studies they are a member of, and nothing else."""
+
+
+class StudyRole(StrEnum):
+    """What a member of a study may do in it; each may do what the next one may."""
+
+    OWNER = "owner"
+    """Members, deleting the study, and everything below."""
+    EDITOR = "editor"
+    """Settings, participants, locking, unblinding, exports."""
+    VIEWER = "viewer"
     """Look, and nothing else."""
 
 
@@ -30,10 +41,23 @@ class Experimenter(Base):
     name: Mapped[str] = mapped_column(String(80), unique=True)
     password_hash: Mapped[str] = mapped_column(String(200))
     must_change_password: Mapped[bool] = mapped_column(default=True)
-    role: Mapped[str] = mapped_column(String(20), default=Role.OWNER, server_default=Role.OWNER)
+    role: Mapped[str] = mapped_column(String(20), default=Role.ADMINISTRATOR, server_default=Role.ADMINISTRATOR)
     created_at: Mapped[datetime] = mapped_column(default=now)
     disabled_at: Mapped[datetime | None]
     """No login and no token of this account is good any more."""
+
+
+class StudyMember(Base):
+    """An experimenter who may work in a study, or look at it. Administrators may without being one."""
+
+    __tablename__ = "study_member"
+    __table_args__ = (UniqueConstraint("study_id", "experimenter_id"),)
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    study_id: Mapped[int] = mapped_column(ForeignKey("study.id"))
+    experimenter_id: Mapped[int] = mapped_column(ForeignKey("experimenter.id"), index=True)
+    role: Mapped[str] = mapped_column(String(20))
+    added_at: Mapped[datetime] = mapped_column(default=now)
 
 
 class ApiToken(Base):

@@ -11,10 +11,13 @@ from sqlalchemy.orm import Session
 
 from app.domain.clips import Clip, Rollout
 from app.domain.evaluation import Film
+from app.domain.people import Experimenter
+from app.domain.studies import Participant, Study
 from app.errors import AppError
 from app.services.accounts import browser_sessions
+from app.services.studies import membership
 from app.storage import ArtefactStore
-from app.web.http.deps import EXPERIMENTER_COOKIE, PARTICIPANT_COOKIE, ReadingSession, Sha256, StudioDep
+from app.web.http.deps import PARTICIPANT_COOKIE, ReadingSession, Sha256, StudioDep, experimenter_asking
 
 router = APIRouter()
 
@@ -30,20 +33,24 @@ class ClipNotFound(AppError):
 
 
 def _may_watch(request: Request, session: ReadingSession, sha256: Sha256) -> None:
-    """A participant may watch the clips of their own study and their own films, an experimenter all.
+    """A participant may watch the clips of their own study and their own films, an experimenter those of their studies.
 
     Raises ClipNotFound.
     """
     clips = select(Clip.id).join(Rollout).where(or_(Clip.video_sha256 == sha256, Clip.poster_sha256 == sha256))
     films = select(Film.id).where(or_(Film.video_sha256 == sha256, Film.poster_sha256 == sha256))
-    if not _experimenter_asks(request, session):
-        cookie = request.cookies.get(PARTICIPANT_COOKIE)
-        participant = browser_sessions.participant_of(session, cookie) if cookie else None
-        if participant is None:
-            raise ClipNotFound
-        clips = clips.where(Rollout.study_id == participant.study_id)
-        films = films.where(Film.participant_id == participant.id)
-    if session.scalar(clips.limit(1)) is None and session.scalar(films.limit(1)) is None:
+    experimenter, participant = _experimenter(request, session), _participant(request, session)
+    found = []
+    if experimenter is not None:
+        theirs = select(Study.id).where(membership.visible_to(experimenter))
+        people = select(Participant.id).where(Participant.study_id.in_(theirs))
+        found += [clips.where(Rollout.study_id.in_(theirs)), films.where(Film.participant_id.in_(people))]
+    if participant is not None:
+        found += [
+            clips.where(Rollout.study_id == participant.study_id),
+            films.where(Film.participant_id == participant.id),
+        ]
+    if all(session.scalar(each.limit(1)) is None for each in found):
         raise ClipNotFound
 
 
@@ -62,10 +69,16 @@ def show_poster(request: Request, sha256: Sha256, studio: StudioDep, _allowed: M
     return _artefact(request, studio.store, sha256, "image/jpeg")
 
 
-def _experimenter_asks(request: Request, session: Session) -> bool:
-    cookie = request.cookies.get(EXPERIMENTER_COOKIE)
-    experimenter = browser_sessions.experimenter_of(session, cookie) if cookie else None
-    return experimenter is not None and not experimenter.must_change_password
+def _experimenter(request: Request, session: Session) -> Experimenter | None:
+    try:
+        return experimenter_asking(request, session)
+    except AppError:
+        return None
+
+
+def _participant(request: Request, session: Session) -> Participant | None:
+    cookie = request.cookies.get(PARTICIPANT_COOKIE)
+    return browser_sessions.participant_of(session, cookie) if cookie else None
 
 
 def _artefact(request: Request, store: ArtefactStore, sha256: str, media_type: str) -> Response:

@@ -54,6 +54,8 @@ NOT_PERSONAL = {
     "show_lock": "the study's settings",
     "download_lock": "the study's settings",
     "show_translations": "the study's own texts",
+    "show_members": "who has an account; every change of it is recorded",
+    "api list_members": "who has an account; every change of it is recorded",
     "show_joining": "an address without anybody's name",
     "show_erasing": "a form",
     "show_put_away": "a form",
@@ -119,6 +121,8 @@ class Place:
         headers = self.headers if act.address.startswith(API) else {}
         if act.form is None:
             return self.browser.get(act.address, headers=headers).status_code
+        if act.name == "api remove_member":
+            return self.browser.delete(act.address, headers=headers).status_code
         if act.address.startswith(API):
             return self.browser.post(act.address, json=act.form, headers=headers).status_code
         if act.name == "import_study":
@@ -165,6 +169,8 @@ def place(database: Database, store: ArtefactStore, experimenter: TestClient, tm
         Act("change_account_role", "role changed", f"/accounts/{other_id}/role", {"role": "reader"}),
         Act("disable_account", "account disabled", f"/accounts/{other_id}/disable", {}),
         Act("enable_account", "account enabled", f"/accounts/{other_id}/enable", {}),
+        Act("admit_member", "member added", f"{S}/members", {"name": "kim", "role": "viewer"}),
+        Act("remove_member", "member removed", f"{S}/members/{other_id}/remove", {}),
         Act("show_answers", "answers viewed", f"{S}/answers"),
         Act("show_answer", "answers viewed", f"{S}/answers/{query}"),
         Act("exclude_answer", "answer excluded", f"{S}/answers/{query}/exclude", {"reason": "the phone rang"}),
@@ -204,6 +210,8 @@ def place(database: Database, store: ArtefactStore, experimenter: TestClient, tm
         Act("download_table", "table exported", f"{S}/export/labels.csv"),
         Act("import_study", "study imported", "/import", {}),
         Act("create_token", "API token made", "/tokens", {"name": "another"}),
+        Act("api admit_member", "member added", f"{API}{S}/members", {"name": "kim", "role": "viewer"}),
+        Act("api remove_member", "member removed", f"{API}{S}/members/{other_id}", {}),
         Act("api list_participants", "participants read by the API", f"{API}{S}/participants"),
         Act("api add_participants", "participant added", f"{API}{S}/participants", {"count": 1}),
         Act("api list_bundles", "bundles read by the API", f"{API}{P}/bundles"),

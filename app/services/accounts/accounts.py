@@ -41,8 +41,8 @@ class NameUnacceptable(AppError):
     """The name cannot be used for an account."""
 
 
-class OwnerNeeded(AppError):
-    """Nobody would be left to manage accounts. Make somebody else an owner first."""
+class AdministratorNeeded(AppError):
+    """Nobody would be left to manage accounts. Make somebody else an administrator first."""
 
     status = HTTPStatus.CONFLICT
 
@@ -122,17 +122,17 @@ def use_one_time_password(session: Session, experimenter: Experimenter, password
 
 
 def change_role(session: Session, experimenter: Experimenter, role: Role, actor: str) -> None:
-    """Give the account another role. Raises OwnerNeeded when nobody would be left to manage accounts."""
-    if role is not Role.OWNER:
-        _leave_an_owner(session, experimenter)
+    """Give the account another role. Raises AdministratorNeeded when nobody would be left to manage accounts."""
+    if role is not Role.ADMINISTRATOR:
+        _leave_an_administrator(session, experimenter)
     if experimenter.role != role:
         experimenter.role = role
         audit.record(session, actor, "role changed", f"{experimenter.name} ({role})")
 
 
 def disable(session: Session, experimenter: Experimenter, actor: str) -> None:
-    """Shut the account out at once: logins and tokens. Raises OwnerNeeded when nobody could undo it."""
-    _leave_an_owner(session, experimenter)
+    """Shut the account out at once: logins and tokens. Raises AdministratorNeeded when nobody could undo it."""
+    _leave_an_administrator(session, experimenter)
     if experimenter.disabled_at is None:
         experimenter.disabled_at = now()
         _end_logins(session, experimenter)
@@ -187,12 +187,12 @@ def set_password(session: Session, experimenter: Experimenter, password_hash: st
     return account
 
 
-def _leave_an_owner(session: Session, experimenter: Experimenter) -> None:
+def _leave_an_administrator(session: Session, experimenter: Experimenter) -> None:
     others = select(func.count(Experimenter.id)).where(
-        Experimenter.role == Role.OWNER, Experimenter.disabled_at.is_(None), Experimenter.id != experimenter.id
+        Experimenter.role == Role.ADMINISTRATOR, Experimenter.disabled_at.is_(None), Experimenter.id != experimenter.id
     )
-    if experimenter.role == Role.OWNER and not session.scalar(others):
-        raise OwnerNeeded
+    if experimenter.role == Role.ADMINISTRATOR and not session.scalar(others):
+        raise AdministratorNeeded
 
 
 def _end_logins(session: Session, experimenter: Experimenter) -> None:

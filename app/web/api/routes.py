@@ -14,18 +14,18 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from app.domain.models import Bundle, Export, Model
-from app.domain.people import Experimenter, Role
+from app.domain.people import Experimenter, Role, StudyMember, StudyRole
 from app.domain.studies import Participant, Study
 from app.errors import AppError
 from app.services import audit
-from app.services.accounts import api_tokens, failed_logins, roles
+from app.services.accounts import api_tokens, failed_logins
 from app.services.accounts.api_tokens import TokenInvalid
 from app.services.evaluation import unblinding
 from app.services.exports import export_formats, export_requests, export_tables, paging
 from app.services.exports.export_requests import ExportKind
 from app.services.participants import enrolment
 from app.services.runs import publishing, reports
-from app.services.studies import studies
+from app.services.studies import membership, studies
 from app.web.api import schemas as answers
 from app.web.api.problems import add_problems, only_known_parameters
 from app.web.http.deps import Code, ReadingSession, RowId, Slug, Studio, StudioDep, WritingSession
@@ -36,8 +36,9 @@ DESCRIPTION = """\
 Everything that the pages show and the exports hold, for programs.
 
 Make a token on the page of API tokens and send it with every request: `Authorization: Bearer pbarl_...`. A token has
-the rights of the account that made it: a *reader* may look at studies, participants and reports; an *experimenter* may
-also read tables, download bundles, add participants and ask for files. Times are UTC (ISO 8601), unknown is null.
+the rights of the account that made it in the studies this is a member of: a *viewer* may look at participants and
+reports; an *editor* may also read tables, download bundles, add participants and ask for files; an *owner* also decides
+who is a member. Other studies are not there at all. Times are UTC (ISO 8601), unknown is null.
 Errors are problem details (RFC 9457) whose `detail` says in words what happened and what to do. Too many wrong tokens
 from one address are answered with 429 for a minute. Until a study is unblinded, methods of the evaluation are letters
 here as everywhere.
@@ -74,7 +75,7 @@ class TableUnknown(AppError):
     status = HTTPStatus.NOT_FOUND
 
 
-def _caller(
+def _whoever(
     request: Request,
     studio: StudioDep,
     session: ReadingSession,
@@ -101,16 +102,34 @@ def _caller(
     return experimenter
 
 
+_Whoever = Annotated[Experimenter, Depends(_whoever, scope="function")]
+
+
+def _caller(request: Request, session: ReadingSession, experimenter: _Whoever) -> Experimenter:
+    return _entering(request, session, experimenter, StudyRole.VIEWER)
+
+
+def _acting_caller(request: Request, session: ReadingSession, experimenter: _Whoever) -> Experimenter:
+    return _entering(request, session, experimenter, StudyRole.EDITOR)
+
+
+def _owning_caller(request: Request, session: ReadingSession, experimenter: _Whoever) -> Experimenter:
+    return _entering(request, session, experimenter, StudyRole.OWNER)
+
+
+def _entering(request: Request, session: Session, experimenter: Experimenter, needed: StudyRole) -> Experimenter:
+    """Whose the study of this address is, if it has one. Raises StudyNotFound, RoleTooLow and StudyRoleTooLow."""
+    slug = request.path_params.get("slug")
+    if slug is not None:
+        membership.enter(session, experimenter, slug, needed)
+    return experimenter
+
+
 Caller = Annotated[Experimenter, Depends(_caller, scope="function")]
-
-
-def _experimenter(caller: Caller) -> Experimenter:
-    roles.require(caller, Role.EXPERIMENTER)
-    return caller
-
-
-ActingCaller = Annotated[Experimenter, Depends(_experimenter, scope="function")]
-"""May do more than look."""
+"""A member of the study that the address names: for looking."""
+ActingCaller = Annotated[Experimenter, Depends(_acting_caller, scope="function")]
+"""An editor of it: for whatever changes something or leaves the studio."""
+OwningCaller = Annotated[Experimenter, Depends(_owning_caller, scope="function")]
 
 _PROBLEMS: dict[int | str, dict[str, Any]] = {
     code: {"model": answers.Problem, "description": words}
@@ -129,9 +148,10 @@ def show_account(caller: Caller) -> answers.Account:
 
 
 @router.get("/studies", tags=["studies"])
-def list_studies(_caller: Caller, session: ReadingSession) -> list[answers.StudyLine]:
-    """Every study, the newest first."""
-    found = session.scalars(select(Study).where(Study.deleted_at.is_(None)).order_by(Study.id.desc()))
+def list_studies(caller: Caller, session: ReadingSession) -> list[answers.StudyLine]:
+    """Every study that is yours, the newest first."""
+    theirs = membership.visible_to(caller)
+    found = session.scalars(select(Study).where(Study.deleted_at.is_(None), theirs).order_by(Study.id.desc()))
     return [answers.StudyLine(**_study_line(study)) for study in found]
 
 
@@ -170,6 +190,34 @@ def list_participants(
     provenance = export_formats.provenance_of(session, study)
     rows = export_formats.records(export_tables.BY_NAME["participants"], session, study, provenance)
     return [answers.ParticipantAnswer.model_validate(row) for row in rows]
+
+
+@router.get("/studies/{slug}/members", tags=["members"])
+def list_members(slug: Slug, _caller: Caller, session: ReadingSession) -> list[answers.MemberAnswer]:
+    """Whose study this is."""
+    found = membership.members(session, studies.find_study(session, slug))
+    return [_member(member, account) for member, account in found]
+
+
+@router.post("/studies/{slug}/members", tags=["members"])
+def admit_member(
+    slug: Slug, wanted: answers.NewMember, caller: OwningCaller, session: WritingSession
+) -> list[answers.MemberAnswer]:
+    """Make an account a member, or give a member another role. Answers with all members."""
+    study = studies.find_study(session, slug)
+    membership.admit(session, study, wanted.name, StudyRole(wanted.role), caller.name)
+    return [_member(member, account) for member, account in membership.members(session, study)]
+
+
+@router.delete("/studies/{slug}/members/{account_id}", tags=["members"], status_code=HTTPStatus.NO_CONTENT)
+def remove_member(slug: Slug, account_id: RowId, caller: OwningCaller, session: WritingSession) -> None:
+    """Shut a member out of the study at once."""
+    membership.remove(session, studies.find_study(session, slug), account_id, caller.name)
+
+
+def _member(member: StudyMember, account: Experimenter) -> answers.MemberAnswer:
+    role = StudyRole(member.role).value
+    return answers.MemberAnswer(account_id=account.id, name=account.name, role=role, added_at=member.added_at)
 
 
 @router.post("/studies/{slug}/participants", tags=["participants"], status_code=HTTPStatus.CREATED)

@@ -12,12 +12,13 @@ from fastapi.concurrency import run_in_threadpool
 from sqlalchemy.orm import Session
 
 from app.db import Database
-from app.domain.people import Experimenter, Role
+from app.domain.people import Experimenter, Role, StudyRole
 from app.domain.studies import Participant
 from app.errors import AppError
 from app.services.accounts import browser_sessions, roles
 from app.services.accounts.failed_logins import FailedLogins
 from app.services.monitoring.tallies import Tallies
+from app.services.studies import membership
 from app.settings import Settings
 from app.storage import ArtefactStore
 from app.web.http.hashing import Hashing
@@ -130,11 +131,25 @@ def participant_asking(request: Request, session: Session, *, lock: bool = False
     return participant
 
 
-def experimenter_asking(request: Request, session: Session) -> Experimenter:
-    """The experimenter who is logged in, password changed. Raises LoginNeeded and PasswordChangeDue."""
+def experimenter_asking(
+    request: Request, session: Session, needed: StudyRole = StudyRole.VIEWER, account_needed: Role = Role.READER
+) -> Experimenter:
+    """The experimenter who is logged in, password changed, and whose the study of this address is, if it has one.
+
+    There is no other way to an experimenter, so no page can forget to ask. Raises LoginNeeded, PasswordChangeDue,
+    StudyNotFound, RoleTooLow and StudyRoleTooLow.
+    """
     experimenter = experimenter_logged_in(request, session)
     if experimenter.must_change_password:
         raise PasswordChangeDue
+    slug = request.path_params.get("slug")
+    if slug is None:
+        roles.require(experimenter, account_needed)
+        request.state.may_change = roles.may(experimenter, Role.EXPERIMENTER)
+    else:
+        role = membership.enter(session, experimenter, slug, needed)
+        request.state.may_change = membership.is_at_least(role, StudyRole.EDITOR)
+        request.state.may_manage = membership.is_at_least(role, StudyRole.OWNER)
     return experimenter
 
 
@@ -159,15 +174,13 @@ def _experimenter(request: Request, session: ReadingSession) -> Experimenter:
     return experimenter_asking(request, session)
 
 
-def _owner(request: Request, session: ReadingSession) -> Experimenter:
-    experimenter = experimenter_asking(request, session)
-    roles.require(experimenter, Role.OWNER)
-    return experimenter
+def _administrator(request: Request, session: ReadingSession) -> Experimenter:
+    return experimenter_asking(request, session, account_needed=Role.ADMINISTRATOR)
 
 
-async def _owner_briefly(request: Request, studio: StudioDep) -> Experimenter:
+async def _administrator_briefly(request: Request, studio: StudioDep) -> Experimenter:
     async with studio.session_queue.reading() as session:
-        return await run_in_threadpool(_owner, request, session)
+        return await run_in_threadpool(_administrator, request, session)
 
 
 async def _logged_in_briefly(request: Request, studio: StudioDep) -> Experimenter:
@@ -176,9 +189,11 @@ async def _logged_in_briefly(request: Request, studio: StudioDep) -> Experimente
 
 
 def _acting_experimenter(request: Request, session: WritingSession) -> Experimenter:
-    experimenter = experimenter_asking(request, session)
-    roles.require(experimenter, Role.EXPERIMENTER)
-    return experimenter
+    return experimenter_asking(request, session, StudyRole.EDITOR, Role.EXPERIMENTER)
+
+
+def _study_owner(request: Request, session: WritingSession) -> Experimenter:
+    return experimenter_asking(request, session, StudyRole.OWNER, Role.ADMINISTRATOR)
 
 
 def _own_account(request: Request, session: WritingSession) -> Experimenter:
@@ -190,12 +205,16 @@ CurrentParticipant = Annotated[Participant, Depends(_participant, scope="functio
 AnsweringParticipant = Annotated[Participant, Depends(_answering_participant, scope="function")]
 """The same in the request's OwnRowsSession: requests of one person wait for each other, those of others do not."""
 CurrentExperimenter = Annotated[Experimenter, Depends(_experimenter, scope="function")]
-"""Whoever is logged in, readers included: for looking."""
+"""Whoever is logged in, readers included; a member of the study that the address names: for looking."""
 ActingExperimenter = Annotated[Experimenter, Depends(_acting_experimenter, scope="function")]
-"""In the request's writing session; at least an experimenter: for whatever changes something or leaves the studio."""
-CurrentOwner = Annotated[Experimenter, Depends(_owner, scope="function")]
-OwnerBriefly = Annotated[Experimenter, Depends(_owner_briefly)]
-"""Like CurrentOwner, and no turn is held when the route begins: for what hashes a password."""
+"""In the request's writing session; an editor of the study, or where there is none an experimenter.
+
+For whatever changes something or leaves the studio."""
+StudyOwner = Annotated[Experimenter, Depends(_study_owner, scope="function")]
+"""In the request's writing session; an owner of the study that the address names."""
+CurrentAdministrator = Annotated[Experimenter, Depends(_administrator, scope="function")]
+AdministratorBriefly = Annotated[Experimenter, Depends(_administrator_briefly)]
+"""Like CurrentAdministrator, and no turn is held when the route begins: for what hashes a password."""
 LoggedInBriefly = Annotated[Experimenter, Depends(_logged_in_briefly)]
 """Whoever is logged in, a one-time password is enough; no turn is held either."""
 OwnAccount = Annotated[Experimenter, Depends(_own_account, scope="function")]
