@@ -18,6 +18,7 @@ from app.web import media, metrics
 from app.web.api import pages, routes
 from app.web.error_pages import add_error_pages, error_page
 from app.web.experimenter import (
+    account,
     accounts,
     answers,
     audit,
@@ -31,6 +32,7 @@ from app.web.experimenter import (
     planning,
     results,
     retirement,
+    second_factor,
     selection,
     studies,
     translations,
@@ -51,6 +53,8 @@ WRONG_TOKENS = 600
 """A minute, from everywhere together; right ones always pass."""
 EXPERIMENTER_PARTS = (
     login,
+    second_factor,
+    account,
     accounts,
     answers,
     audit,

@@ -23,6 +23,7 @@ class Settings(BaseSettings):
     secure_cookies: bool = Field(default=False, description="Set when the server is reached by HTTPS only.")
     session_days: int = Field(default=30, ge=1, description="How long a participant's browser is remembered.")
     login_hours: int = Field(default=12, ge=1, description="How long an experimenter stays logged in.")
+    require_second_factor: bool = Field(default=False, description="Experimenters must set up a second factor.")
     login_attempts_per_minute: int = Field(default=10, ge=1, description="Password attempts per address.")
     trusted_proxies: str = Field(default="", description="Addresses or networks whose X-Forwarded-For is believed.")
     signing_key_file: Path | None = Field(default=None, description="Private key; default: signing.key in DATA_DIR.")

@@ -4,7 +4,7 @@ from datetime import datetime
 from enum import StrEnum
 from typing import Any
 
-from sqlalchemy import CheckConstraint, ForeignKey, Index, String, UniqueConstraint
+from sqlalchemy import CheckConstraint, ForeignKey, Index, String, UniqueConstraint, false
 from sqlalchemy.orm import Mapped, mapped_column
 
 from app.db import Base, now
@@ -45,6 +45,15 @@ class Experimenter(Base):
     created_at: Mapped[datetime] = mapped_column(default=now)
     disabled_at: Mapped[datetime | None]
     """No login and no token of this account is good any more."""
+    totp_secret: Mapped[str | None] = mapped_column(String(64))
+    """Shared with an authenticator app, base32. It cannot be a hash: the code is computed from it."""
+    second_factor_since: Mapped[datetime | None]
+    """When the first code was right: since then a login needs one. None with a secret: it is still being set up."""
+    totp_used_step: Mapped[int | None]
+    """The 30 s of the newest code that was used: neither it nor an older one is good again."""
+    wrong_codes: Mapped[int] = mapped_column(default=0, server_default="0")
+    """Since the last right one."""
+    code_wrong_at: Mapped[datetime | None]
 
 
 class StudyMember(Base):
@@ -60,8 +69,27 @@ class StudyMember(Base):
     added_at: Mapped[datetime] = mapped_column(default=now)
 
 
+class RecoveryCode(Base):
+    """Instead of a code of the authenticator app, once. Shown once; only the hash is stored."""
+
+    __tablename__ = "recovery_code"
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    experimenter_id: Mapped[int] = mapped_column(ForeignKey("experimenter.id"), index=True)
+    code_sha256: Mapped[str] = mapped_column(String(64))
+    used_at: Mapped[datetime | None]
+
+
+class TokenScope(StrEnum):
+    """What a token may at most do."""
+
+    READ = "read"
+    WRITE = "write"
+    """Everything that its account may."""
+
+
 class ApiToken(Base):
-    """A key to the API with the rights of its experimenter. Shown once; only the hash is stored."""
+    """A key to the API, with the rights of its experimenter or fewer. Shown once; only the hash is stored."""
 
     __tablename__ = "api_token"
 
@@ -69,6 +97,11 @@ class ApiToken(Base):
     experimenter_id: Mapped[int] = mapped_column(ForeignKey("experimenter.id"), index=True)
     name: Mapped[str] = mapped_column(String(80))
     token_sha256: Mapped[str] = mapped_column(String(64), unique=True)
+    scope: Mapped[str] = mapped_column(String(10), default=TokenScope.WRITE, server_default=TokenScope.WRITE)
+    study_id: Mapped[int | None] = mapped_column(ForeignKey("study.id"), index=True)
+    """The only study it opens; None: all of the account's."""
+    expires_at: Mapped[datetime | None]
+    """None: of before tokens expired."""
     created_at: Mapped[datetime] = mapped_column(default=now)
     last_used_at: Mapped[datetime | None]
     revoked_at: Mapped[datetime | None]
@@ -86,6 +119,10 @@ class BrowserSession(Base):
     experimenter_id: Mapped[int | None] = mapped_column(ForeignKey("experimenter.id"), index=True)
     created_at: Mapped[datetime] = mapped_column(default=now)
     expires_at: Mapped[datetime]
+    browser: Mapped[str | None] = mapped_column(String(80))
+    """Of an experimenter, in words such as "Firefox on Linux", so that they recognise where they are logged in."""
+    second_factor_due: Mapped[bool] = mapped_column(default=False, server_default=false())
+    """The password was right, and that is all so far: such a session opens the form for the code and nothing else."""
 
 
 class AuditEvent(Base):

@@ -1,4 +1,6 @@
-"""Studies have members, and whoever could see and do what before still can.
+"""Members of studies, second factors, scopes of tokens, links that are revoked.
+
+Whoever could see and do what before still can: accounts become members, tokens keep all rights and do not expire.
 
 The role that was called "owner" is "administrator" now: an owner is a member of a study.
 """
@@ -41,9 +43,55 @@ def upgrade() -> None:
         "WHEN 'experimenter' THEN 'editor' ELSE 'viewer' END, CURRENT_TIMESTAMP "
         "FROM study CROSS JOIN experimenter WHERE study.deleted_at IS NULL"
     )
+    op.create_table(
+        "recovery_code",
+        sa.Column("id", sa.Integer(), nullable=False),
+        sa.Column("experimenter_id", sa.Integer(), nullable=False),
+        sa.Column("code_sha256", sa.String(64), nullable=False),
+        sa.Column("used_at", sa.DateTime(timezone=True), nullable=True),
+        sa.ForeignKeyConstraint(
+            ["experimenter_id"], ["experimenter.id"], name=op.f("fk_recovery_code_experimenter_id_experimenter")
+        ),
+        sa.PrimaryKeyConstraint("id", name=op.f("pk_recovery_code")),
+    )
+    op.create_index(op.f("ix_recovery_code_experimenter_id"), "recovery_code", ["experimenter_id"])
+    with op.batch_alter_table("experimenter") as batch_op:
+        batch_op.add_column(sa.Column("totp_secret", sa.String(64), nullable=True))
+        batch_op.add_column(sa.Column("second_factor_since", sa.DateTime(timezone=True), nullable=True))
+        batch_op.add_column(sa.Column("totp_used_step", sa.Integer(), nullable=True))
+        batch_op.add_column(sa.Column("wrong_codes", sa.Integer(), nullable=False, server_default="0"))
+        batch_op.add_column(sa.Column("code_wrong_at", sa.DateTime(timezone=True), nullable=True))
+    with op.batch_alter_table("browser_session") as batch_op:
+        batch_op.add_column(sa.Column("browser", sa.String(80), nullable=True))
+        batch_op.add_column(sa.Column("second_factor_due", sa.Boolean(), nullable=False, server_default=sa.false()))
+    with op.batch_alter_table("api_token") as batch_op:
+        batch_op.add_column(sa.Column("scope", sa.String(10), nullable=False, server_default="write"))
+        batch_op.add_column(sa.Column("study_id", sa.Integer(), nullable=True))
+        batch_op.add_column(sa.Column("expires_at", sa.DateTime(timezone=True), nullable=True))
+        batch_op.create_foreign_key(op.f("fk_api_token_study_id_study"), "study", ["study_id"], ["id"])
+        batch_op.create_index(op.f("ix_api_token_study_id"), ["study_id"])
+    with op.batch_alter_table("participant") as batch_op:
+        batch_op.add_column(sa.Column("link_revoked_at", sa.DateTime(timezone=True), nullable=True))
 
 
 def downgrade() -> None:
+    with op.batch_alter_table("participant") as batch_op:
+        batch_op.drop_column("link_revoked_at")
+    with op.batch_alter_table("api_token") as batch_op:
+        batch_op.drop_index(op.f("ix_api_token_study_id"))
+        batch_op.drop_constraint(op.f("fk_api_token_study_id_study"), type_="foreignkey")
+        for name in ("expires_at", "study_id", "scope"):
+            batch_op.drop_column(name)
+    # Before this version such a session would be a whole one.
+    op.execute("DELETE FROM browser_session WHERE second_factor_due")
+    with op.batch_alter_table("browser_session") as batch_op:
+        for name in ("second_factor_due", "browser"):
+            batch_op.drop_column(name)
+    with op.batch_alter_table("experimenter") as batch_op:
+        for name in ("code_wrong_at", "wrong_codes", "totp_used_step", "second_factor_since", "totp_secret"):
+            batch_op.drop_column(name)
+    op.drop_index(op.f("ix_recovery_code_experimenter_id"), "recovery_code")
+    op.drop_table("recovery_code")
     op.execute("UPDATE experimenter SET role = 'owner' WHERE role = 'administrator'")
     with op.batch_alter_table("experimenter") as batch_op:
         batch_op.alter_column("role", existing_type=sa.String(20), existing_nullable=False, server_default="owner")

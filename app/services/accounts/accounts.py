@@ -14,6 +14,7 @@ from app.db import now
 from app.domain.people import BrowserSession, Experimenter, Role
 from app.errors import AppError
 from app.services import audit
+from app.services.accounts import second_factor
 
 FIRST_EXPERIMENTER = "experimenter"
 """The name of the account made at the first start."""
@@ -72,6 +73,7 @@ def reset_password(session: Session, name: str) -> str:
         raise ExperimenterNotFound
     one_time = new_one_time_password()
     use_one_time_password(session, experimenter, one_time, audit.SYSTEM)
+    second_factor.turn_off(session, experimenter, audit.SYSTEM)  # the phone may be what is lost
     return one_time.text
 
 

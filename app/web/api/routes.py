@@ -10,16 +10,16 @@ from typing import Annotated, Any, Literal
 from fastapi import APIRouter, Depends, FastAPI, Path, Query, Request
 from fastapi.responses import FileResponse, Response
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
-from sqlalchemy import select
+from sqlalchemy import ColumnElement, and_, select, true
 from sqlalchemy.orm import Session
 
 from app.domain.models import Bundle, Export, Model
-from app.domain.people import Experimenter, Role, StudyMember, StudyRole
+from app.domain.people import ApiToken, Experimenter, Role, StudyMember, StudyRole, TokenScope
 from app.domain.studies import Participant, Study
 from app.errors import AppError
 from app.services import audit
 from app.services.accounts import api_tokens, failed_logins
-from app.services.accounts.api_tokens import TokenInvalid
+from app.services.accounts.api_tokens import ScopeTooNarrow, TokenInvalid
 from app.services.evaluation import unblinding
 from app.services.exports import export_formats, export_requests, export_tables, paging
 from app.services.exports.export_requests import ExportKind
@@ -28,7 +28,18 @@ from app.services.runs import publishing, reports
 from app.services.studies import membership, studies
 from app.web.api import schemas as answers
 from app.web.api.problems import add_problems, only_known_parameters
-from app.web.http.deps import Code, ReadingSession, RowId, Slug, Studio, StudioDep, WritingSession
+from app.web.http.deps import (
+    Code,
+    ReadingSession,
+    RowId,
+    SecondFactorNeeded,
+    Slug,
+    Studio,
+    StudioDep,
+    WritingSession,
+    lacks_second_factor,
+)
+from app.web.http.security import SAFE_METHODS
 
 PREFIX = "/api/v1"
 LARGEST_PAGE = 1000
@@ -38,10 +49,11 @@ Everything that the pages show and the exports hold, for programs.
 Make a token on the page of API tokens and send it with every request: `Authorization: Bearer pbarl_...`. A token has
 the rights of the account that made it in the studies this is a member of: a *viewer* may look at participants and
 reports; an *editor* may also read tables, download bundles, add participants and ask for files; an *owner* also decides
-who is a member. Other studies are not there at all. Times are UTC (ISO 8601), unknown is null.
-Errors are problem details (RFC 9457) whose `detail` says in words what happened and what to do. Too many wrong tokens
-from one address are answered with 429 for a minute. Until a study is unblinded, methods of the evaluation are letters
-here as everywhere.
+who is a member. Other studies are not there at all. A token can be for reading or for one study only, and expires.
+
+Times are UTC (ISO 8601), unknown is null. Errors are problem details (RFC 9457) whose `detail` says in words what
+happened and what to do. Too many wrong tokens from one address are answered with 429 for a minute. Until a study is
+unblinded, methods of the evaluation are letters here as everywhere.
 
 Tables come in pages: follow `next`, whose `cursor` says where to go on. Together the pages are the table as it was when
 the first one was asked for. There is no `offset` any more (what people answer between two pages would shift it), and a
@@ -81,7 +93,10 @@ def _whoever(
     session: ReadingSession,
     credentials: Annotated[HTTPAuthorizationCredentials | None, Depends(bearer)],
 ) -> Experimenter:
-    """Whose token was sent. Raises TokenMissing, TokenInvalid and TooManyWrongTokens."""
+    """Whose token was sent, and it may be used so.
+
+    Raises TokenMissing, TokenInvalid, TooManyWrongTokens, ScopeTooNarrow and SecondFactorNeeded.
+    """
     if credentials is None:
         raise TokenMissing
     try:
@@ -96,6 +111,11 @@ def _whoever(
         if not studio.token_attempts.allow(address):
             raise TooManyWrongTokens from None
         raise
+    if lacks_second_factor(studio.settings, experimenter):
+        raise SecondFactorNeeded
+    if token.scope == TokenScope.READ and request.method not in SAFE_METHODS:
+        raise ScopeTooNarrow
+    request.state.token = token
     if api_tokens.use_is_worth_noting(token):
         with studio.database.writing() as writing:
             api_tokens.note_use(writing, token.id)
@@ -122,7 +142,14 @@ def _entering(request: Request, session: Session, experimenter: Experimenter, ne
     slug = request.path_params.get("slug")
     if slug is not None:
         membership.enter(session, experimenter, slug, needed)
+        if request.state.token.study_id not in (None, studies.find_study(session, slug).id):
+            raise studies.StudyNotFound
     return experimenter
+
+
+def _theirs(request: Request, caller: Experimenter) -> ColumnElement[bool]:
+    only = request.state.token.study_id
+    return and_(membership.visible_to(caller), true() if only is None else Study.id == only)
 
 
 Caller = Annotated[Experimenter, Depends(_caller, scope="function")]
@@ -140,18 +167,24 @@ router = APIRouter(responses=_PROBLEMS, dependencies=[Depends(only_known_paramet
 
 
 @router.get("/me", tags=["account"])
-def show_account(caller: Caller) -> answers.Account:
+def show_account(request: Request, caller: Caller, session: ReadingSession) -> answers.Account:
     """Whose token this is, and what it may do."""
+    token: ApiToken = request.state.token
     return answers.Account(
-        name=caller.name, role=Role(caller.role).value, software_version=export_formats.software_version()
+        name=caller.name,
+        role=Role(caller.role).value,
+        scope=TokenScope(token.scope).value,
+        study=None if token.study_id is None else session.get_one(Study, token.study_id).slug,
+        expires_at=token.expires_at,
+        software_version=export_formats.software_version(),
     )
 
 
 @router.get("/studies", tags=["studies"])
-def list_studies(caller: Caller, session: ReadingSession) -> list[answers.StudyLine]:
-    """Every study that is yours, the newest first."""
-    theirs = membership.visible_to(caller)
-    found = session.scalars(select(Study).where(Study.deleted_at.is_(None), theirs).order_by(Study.id.desc()))
+def list_studies(request: Request, caller: Caller, session: ReadingSession) -> list[answers.StudyLine]:
+    """Every study that the token opens, the newest first."""
+    theirs = select(Study).where(Study.deleted_at.is_(None), _theirs(request, caller))
+    found = session.scalars(theirs.order_by(Study.id.desc()))
     return [answers.StudyLine(**_study_line(study)) for study in found]
 
 
@@ -234,6 +267,13 @@ def _personal_link(request: Request, token: str) -> str:
     studio: Studio = request.app.state.studio
     base = studio.settings.public_url or str(request.base_url).removesuffix("/").removesuffix(PREFIX)
     return f"{base.rstrip('/')}{request.app.state.path_for('open_link', token=token)}"
+
+
+@router.delete("/studies/{slug}/participants/{code}/link", tags=["participants"], status_code=HTTPStatus.NO_CONTENT)
+def revoke_link(slug: Slug, code: Code, caller: ActingCaller, session: WritingSession) -> None:
+    """Switch a personal link off at once, with every browser that used it; a new link brings the participant back."""
+    study = studies.find_study(session, slug)
+    enrolment.revoke_link(session, study, enrolment.find_by_code(session, study, code), caller.name)
 
 
 @router.get("/studies/{slug}/participants/{code}/bundles", tags=["bundles"])

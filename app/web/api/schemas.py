@@ -16,6 +16,9 @@ class Account(BaseModel):
 
     name: str = Field(examples=["experimenter"])
     role: Literal["administrator", "experimenter", "reader"]
+    scope: Literal["read", "write"]
+    study: str | None = Field(description="The only study that the token opens; null: all that are yours.")
+    expires_at: datetime | None
     software_version: str = Field(examples=["0.1.0"])
 
 

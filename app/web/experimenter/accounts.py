@@ -10,7 +10,7 @@ from sqlalchemy.orm import Session
 
 from app.domain.people import Experimenter, Role
 from app.errors import AppError
-from app.services.accounts import accounts
+from app.services.accounts import accounts, second_factor
 from app.web.http.deps import AdministratorBriefly, CurrentAdministrator, ReadingSession, RowId, StudioDep
 from app.web.texts.templating import page
 
@@ -68,6 +68,16 @@ def _reset(
     account = accounts.find(session, account_id)
     accounts.use_one_time_password(session, account, password, admin.name)
     return _page(request, admin, session, shown=(account.name, password.text))
+
+
+@router.post("/{account_id}/second-factor/off", name="remove_second_factor")
+def remove_second_factor(
+    request: Request, account_id: RowId, admin: CurrentAdministrator, studio: StudioDep
+) -> Response:
+    """For somebody who has lost phone and recovery codes: the password alone is enough again."""
+    with studio.database.writing() as session:
+        second_factor.turn_off(session, accounts.find(session, account_id), admin.name)
+    return _back(request)
 
 
 @router.post("/{account_id}/role", name="change_account_role")

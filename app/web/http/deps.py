@@ -15,7 +15,7 @@ from app.db import Database
 from app.domain.people import Experimenter, Role, StudyRole
 from app.domain.studies import Participant
 from app.errors import AppError
-from app.services.accounts import browser_sessions, roles
+from app.services.accounts import browser_sessions, roles, second_factor
 from app.services.accounts.failed_logins import FailedLogins
 from app.services.monitoring.tallies import Tallies
 from app.services.studies import membership
@@ -56,6 +56,12 @@ class LoginNeeded(AppError):
 
 class PasswordChangeDue(AppError):
     """Please choose a password of your own first."""
+
+    status = HTTPStatus.FORBIDDEN
+
+
+class SecondFactorNeeded(AppError):
+    """This studio asks for a second factor. Please set it up first."""
 
     status = HTTPStatus.FORBIDDEN
 
@@ -137,11 +143,11 @@ def experimenter_asking(
     """The experimenter who is logged in, password changed, and whose the study of this address is, if it has one.
 
     There is no other way to an experimenter, so no page can forget to ask. Raises LoginNeeded, PasswordChangeDue,
-    StudyNotFound, RoleTooLow and StudyRoleTooLow.
+    SecondFactorNeeded, StudyNotFound, RoleTooLow and StudyRoleTooLow.
     """
-    experimenter = experimenter_logged_in(request, session)
-    if experimenter.must_change_password:
-        raise PasswordChangeDue
+    experimenter = experimenter_with_own_password(request, session)
+    if lacks_second_factor(request.app.state.studio.settings, experimenter):
+        raise SecondFactorNeeded
     slug = request.path_params.get("slug")
     if slug is None:
         roles.require(experimenter, account_needed)
@@ -150,6 +156,19 @@ def experimenter_asking(
         role = membership.enter(session, experimenter, slug, needed)
         request.state.may_change = membership.is_at_least(role, StudyRole.EDITOR)
         request.state.may_manage = membership.is_at_least(role, StudyRole.OWNER)
+    return experimenter
+
+
+def lacks_second_factor(settings: Settings, experimenter: Experimenter) -> bool:
+    """Whether this installation asks for a second factor that the account does not have."""
+    return settings.require_second_factor and not second_factor.is_on(experimenter)
+
+
+def experimenter_with_own_password(request: Request, session: Session) -> Experimenter:
+    """The experimenter who is logged in, perhaps without a second factor. Raises LoginNeeded and PasswordChangeDue."""
+    experimenter = experimenter_logged_in(request, session)
+    if experimenter.must_change_password:
+        raise PasswordChangeDue
     return experimenter
 
 
@@ -181,6 +200,11 @@ def _administrator(request: Request, session: ReadingSession) -> Experimenter:
 async def _administrator_briefly(request: Request, studio: StudioDep) -> Experimenter:
     async with studio.session_queue.reading() as session:
         return await run_in_threadpool(_administrator, request, session)
+
+
+async def _account_briefly(request: Request, studio: StudioDep) -> Experimenter:
+    async with studio.session_queue.reading() as session:
+        return await run_in_threadpool(experimenter_with_own_password, request, session)
 
 
 async def _logged_in_briefly(request: Request, studio: StudioDep) -> Experimenter:
@@ -215,6 +239,8 @@ StudyOwner = Annotated[Experimenter, Depends(_study_owner, scope="function")]
 CurrentAdministrator = Annotated[Experimenter, Depends(_administrator, scope="function")]
 AdministratorBriefly = Annotated[Experimenter, Depends(_administrator_briefly)]
 """Like CurrentAdministrator, and no turn is held when the route begins: for what hashes a password."""
+AccountBriefly = Annotated[Experimenter, Depends(_account_briefly)]
+"""Whoever is logged in with a password of their own, a second factor may be missing; no turn is held either."""
 LoggedInBriefly = Annotated[Experimenter, Depends(_logged_in_briefly)]
 """Whoever is logged in, a one-time password is enough; no turn is held either."""
 OwnAccount = Annotated[Experimenter, Depends(_own_account, scope="function")]
