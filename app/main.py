@@ -12,6 +12,7 @@ from prometheus_client import CollectorRegistry
 from app import data_directory
 from app.db import Database
 from app.paths import STATIC
+from app.services.accounts.openid import Provider
 from app.settings import Settings
 from app.storage import ArtefactStore
 from app.web import media, metrics
@@ -30,6 +31,7 @@ from app.web.experimenter import (
     members,
     operator,
     planning,
+    provider_login,
     results,
     retirement,
     second_factor,
@@ -53,6 +55,7 @@ WRONG_TOKENS = 600
 """A minute, from everywhere together; right ones always pass."""
 EXPERIMENTER_PARTS = (
     login,
+    provider_login,
     second_factor,
     account,
     accounts,
@@ -105,6 +108,7 @@ def make_studio(settings: Settings) -> Studio:
         readiness=Readiness(database, settings.data_dir),
         session_queue=SessionQueue(database),
         login_attempts=LoginAttempts(settings.login_attempts_per_minute),
+        provider=Provider(settings) if settings.oidc_issuer else None,
         token_attempts=LoginAttempts(settings.login_attempts_per_minute, WRONG_TOKENS, WRONG_TOKENS),
         shared_pages=SharedPages(database),
     )

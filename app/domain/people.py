@@ -45,6 +45,8 @@ class Experimenter(Base):
     created_at: Mapped[datetime] = mapped_column(default=now)
     disabled_at: Mapped[datetime | None]
     """No login and no token of this account is good any more."""
+    oidc_subject: Mapped[str | None] = mapped_column(String(500), unique=True)
+    """Issuer and subject of the identity that logs in to this account; None: its password does."""
     totp_secret: Mapped[str | None] = mapped_column(String(64))
     """Shared with an authenticator app, base32. It cannot be a hash: the code is computed from it."""
     second_factor_since: Mapped[datetime | None]

@@ -56,6 +56,8 @@ def upgrade() -> None:
     )
     op.create_index(op.f("ix_recovery_code_experimenter_id"), "recovery_code", ["experimenter_id"])
     with op.batch_alter_table("experimenter") as batch_op:
+        batch_op.add_column(sa.Column("oidc_subject", sa.String(500), nullable=True))
+        batch_op.create_unique_constraint(op.f("uq_experimenter_oidc_subject"), ["oidc_subject"])
         batch_op.add_column(sa.Column("totp_secret", sa.String(64), nullable=True))
         batch_op.add_column(sa.Column("second_factor_since", sa.DateTime(timezone=True), nullable=True))
         batch_op.add_column(sa.Column("totp_used_step", sa.Integer(), nullable=True))
@@ -88,7 +90,15 @@ def downgrade() -> None:
         for name in ("second_factor_due", "browser"):
             batch_op.drop_column(name)
     with op.batch_alter_table("experimenter") as batch_op:
-        for name in ("code_wrong_at", "wrong_codes", "totp_used_step", "second_factor_since", "totp_secret"):
+        batch_op.drop_constraint(op.f("uq_experimenter_oidc_subject"), type_="unique")
+        for name in (
+            "oidc_subject",
+            "code_wrong_at",
+            "wrong_codes",
+            "totp_used_step",
+            "second_factor_since",
+            "totp_secret",
+        ):
             batch_op.drop_column(name)
     op.drop_index(op.f("ix_recovery_code_experimenter_id"), "recovery_code")
     op.drop_table("recovery_code")

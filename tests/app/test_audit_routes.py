@@ -72,6 +72,7 @@ NOT_PERSONAL = {
     "show_own_account": "one's own logins",
     "show_second_factor": "a form",
     "show_code": "a form",
+    "begin_provider_login": "nobody yet",
     "begin_second_factor": "nothing is in force yet; turning it on is recorded",
     "show_tokens": "names of one's own tokens",
     "show_video": "a robot",
@@ -93,6 +94,7 @@ RECORDED_AS_ANOTHER = {
     "save_translations": "change_settings",
     "join_study_now": "add_participants",
     "enter_code": "log_in",
+    "end_provider_login": "log_in",
 }
 """They call the same function, which records it."""
 OF_PARTICIPANTS = ("/p/", "/join/")

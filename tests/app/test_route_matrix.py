@@ -77,9 +77,8 @@ TOKEN_READS_DATA = Rule({READS, WRITES, ADMINS}, forbidden={VIEWERS}, hidden={EL
 TOKEN_WRITES = Rule({WRITES, ADMINS}, forbidden={READS, VIEWERS}, hidden={ELSEWHERE, OTHERS})
 
 MATRIX: dict[str, Rule] = {
-    **dict.fromkeys(
-        ("show_login", "log_in", "log_out", "show_start", "show_health", "show_life", "static", "show_api"), ANYBODY
-    ),
+    **dict.fromkeys(("show_login", "log_in", "begin_provider_login", "end_provider_login", "log_out"), ANYBODY),
+    **dict.fromkeys(("show_start", "show_health", "show_life", "static", "show_api"), ANYBODY),
     **dict.fromkeys(("show_code", "enter_code"), NOBODY),
     **dict.fromkeys(
         ("show_password", "change_password", "show_own_account", "end_login", "end_other_logins", "show_help"), ACCOUNT

@@ -116,10 +116,14 @@ def add(session: Session, name: str, role: Role, password: OneTimePassword, acto
 
 
 def use_one_time_password(session: Session, experimenter: Experimenter, password: OneTimePassword, actor: str) -> None:
-    """Replace the password by one that must be changed at the next login, and end all logins."""
+    """Replace the password by one that must be changed at the next login, and end all logins.
+
+    An account that was connected to the identity provider is so no more.
+    """
     experimenter.password_hash = password.hash
     experimenter.must_change_password = True
-    _end_logins(session, experimenter)
+    experimenter.oidc_subject = None
+    end_logins(session, experimenter)
     audit.record(session, actor, "password reset", experimenter.name)
 
 
@@ -137,7 +141,7 @@ def disable(session: Session, experimenter: Experimenter, actor: str) -> None:
     _leave_an_administrator(session, experimenter)
     if experimenter.disabled_at is None:
         experimenter.disabled_at = now()
-        _end_logins(session, experimenter)
+        end_logins(session, experimenter)
         audit.record(session, actor, "account disabled", experimenter.name)
 
 
@@ -184,7 +188,7 @@ def set_password(session: Session, experimenter: Experimenter, password_hash: st
     account = session.get_one(Experimenter, experimenter.id)
     account.password_hash = password_hash
     account.must_change_password = False
-    _end_logins(session, account)
+    end_logins(session, account)
     audit.record(session, account.name, "password changed", account.name)
     return account
 
@@ -197,7 +201,8 @@ def _leave_an_administrator(session: Session, experimenter: Experimenter) -> Non
         raise AdministratorNeeded
 
 
-def _end_logins(session: Session, experimenter: Experimenter) -> None:
+def end_logins(session: Session, experimenter: Experimenter) -> None:
+    """In every browser."""
     for login in session.scalars(select(BrowserSession).where(BrowserSession.experimenter_id == experimenter.id)):
         session.delete(login)
 

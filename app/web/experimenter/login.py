@@ -39,9 +39,11 @@ class TooManyAttempts(AppError):
 
 
 @router.get("/login", name="show_login")
-def show_login(request: Request, next: str = "") -> Response:
-    """The form."""
-    return page(request, "experimenter/login.html", {"next": inside(next), "name": "", "error": None})
+def show_login(request: Request, studio: StudioDep, next: str = "") -> Response:
+    """The form, and the way to the identity provider if there is one."""
+    provider = studio.provider is not None
+    context = {"next": inside(next), "name": "", "error": None, "provider": provider}
+    return page(request, "experimenter/login.html", context)
 
 
 @router.post("/login", name="log_in")
@@ -59,10 +61,11 @@ async def log_in(
     try:
         experimenter = await _verified(request, studio, name, password)
         if second_factor.is_on(experimenter):
-            return await _ask_for_code(request, studio, experimenter, inside(next))
+            return await ask_for_code(request, studio, experimenter, inside(next))
         return await enter(request, studio, experimenter, inside(next), "logged in")
     except (accounts.WrongNameOrPassword, TooManyAttempts) as error:
-        context = {"next": inside(next), "name": name, "error": error.message}
+        provider = studio.provider is not None
+        context = {"next": inside(next), "name": name, "error": error.message, "provider": provider}
         status = error.status if isinstance(error, TooManyAttempts) else HTTPStatus.UNAUTHORIZED
         response = page(request, "experimenter/login.html", context, status)
         # After the response, so that the time taken does not tell which names exist.
@@ -145,8 +148,10 @@ def count_attempt(request: Request, studio: Studio, account: str, browser: str |
         raise TooManyAttempts
 
 
-async def _ask_for_code(request: Request, studio: Studio, experimenter: Experimenter, target: str) -> Response:
-    """Raises WrongNameOrPassword when the password was replaced while it was being checked."""
+async def ask_for_code(request: Request, studio: Studio, experimenter: Experimenter, target: str) -> Response:
+    """Open a session that waits for the code.
+
+    Raises WrongNameOrPassword when the password was replaced while it was being checked."""
     async with studio.session_queue.writing() as session:
         stored = await run_in_threadpool(_stored, session, experimenter)
         cookie = browser_sessions.open_for_experimenter(session, stored, TIME_FOR_CODE, second_factor_due=True)

@@ -17,6 +17,7 @@ from app.domain.studies import Participant
 from app.errors import AppError
 from app.services.accounts import browser_sessions, roles, second_factor
 from app.services.accounts.failed_logins import FailedLogins
+from app.services.accounts.openid import Provider
 from app.services.monitoring.tallies import Tallies
 from app.services.studies import membership
 from app.settings import Settings
@@ -77,6 +78,8 @@ class Studio:
     session_queue: SessionQueue
     login_attempts: LoginAttempts
     shared_pages: SharedPages
+    provider: Provider | None
+    """Where experimenters can log in instead of here."""
     token_attempts: LoginAttempts
     """Of their own: a program with an old token must not lock out the people who log in from the same address."""
     hashing: Hashing = field(default_factory=Hashing)
@@ -161,7 +164,8 @@ def experimenter_asking(
 
 def lacks_second_factor(settings: Settings, experimenter: Experimenter) -> bool:
     """Whether this installation asks for a second factor that the account does not have."""
-    return settings.require_second_factor and not second_factor.is_on(experimenter)
+    theirs = second_factor.is_on(experimenter) or experimenter.oidc_subject is not None  # the provider asks for it
+    return settings.require_second_factor and not theirs
 
 
 def experimenter_with_own_password(request: Request, session: Session) -> Experimenter:
