@@ -22,6 +22,11 @@ FIRST_EXPERIMENTER = "experimenter"
 LONGEST_NAME = 80
 MIN_PASSWORD_LENGTH = 10
 MAX_PASSWORD_LENGTH = 200
+_OUR_WORDS = ("pbarl", "studio", "experimenter", "robot", "preference", "study")
+_LEAST_SCORE = 3
+"""zxcvbn's: more than a hundred million guesses."""
+_LONGEST_JUDGED = 72
+"""What is longer is long enough, and takes zxcvbn long."""
 
 
 class WrongNameOrPassword(AppError):
@@ -180,6 +185,8 @@ def hash_of_new(experimenter: Experimenter, *, current: str, new: str) -> str:
         raise PasswordUnacceptable(f"A password has {MIN_PASSWORD_LENGTH} to {MAX_PASSWORD_LENGTH} characters.")
     if new == current:
         raise PasswordUnacceptable("The new password is the same as the present one. Choose another.")
+    if _is_easily_guessed(new, experimenter.name):
+        raise PasswordUnacceptable("This password is among the first that are guessed. A few unrelated words are good.")
     return _hasher().hash(new)
 
 
@@ -199,6 +206,14 @@ def _leave_an_administrator(session: Session, experimenter: Experimenter) -> Non
     )
     if experimenter.role == Role.ADMINISTRATOR and not session.scalar(others):
         raise AdministratorNeeded
+
+
+def _is_easily_guessed(password: str, name: str) -> bool:
+    """Whether it is one of the common passwords, or little more than one, or than the name of account or studio."""
+    from zxcvbn import zxcvbn  # its lists take a tenth of a second to load
+
+    guessed: int = zxcvbn(password[:_LONGEST_JUDGED], [name, *name.split(), *_OUR_WORDS])["score"]
+    return guessed < _LEAST_SCORE
 
 
 def end_logins(session: Session, experimenter: Experimenter) -> None:

@@ -165,8 +165,8 @@ def _new_recovery_codes(session: Session, account: Experimenter) -> Sequence[str
 
 
 def _recovery_text() -> str:
-    """80 bits in four groups."""
-    text = secrets.token_hex(10)
+    """120 bits in six groups: too many to be guessed, so a plain hash of it may be kept."""
+    text = secrets.token_hex(15)
     return "-".join(text[at : at + 5] for at in range(0, len(text), 5))
 
 
