@@ -120,7 +120,8 @@ class Provider:
         try:
             claims = self._claims(token, keys, attempt.nonce)
         except (JoseError, ValueError):  # perhaps it has a new key
-            self._kept = None
+            with self._lock:
+                self._kept = None
             _, keys = self._known()
             try:
                 claims = self._claims(token, keys, attempt.nonce)

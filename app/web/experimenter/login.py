@@ -151,10 +151,10 @@ def count_attempt(request: Request, studio: Studio, account: str, browser: str |
 async def ask_for_code(request: Request, studio: Studio, experimenter: Experimenter, target: str) -> Response:
     """Open a session that waits for the code.
 
-    Raises WrongNameOrPassword when the password was replaced while it was being checked."""
+    Raises WrongNameOrPassword when the password was replaced while it was being checked.
+    """
     async with studio.session_queue.writing() as session:
-        stored = await run_in_threadpool(_stored, session, experimenter)
-        cookie = browser_sessions.open_for_experimenter(session, stored, TIME_FOR_CODE, second_factor_due=True)
+        cookie = await run_in_threadpool(_open_session_for_code, session, experimenter)
     address = request.app.url_path_for("show_code")
     response = RedirectResponse(f"{address}?{urlencode({'next': target})}" if target else address, HTTPStatus.SEE_OTHER)
     set_cookie(response, studio.settings, EXPERIMENTER_COOKIE, cookie, TIME_FOR_CODE)
@@ -182,6 +182,11 @@ def _stored(session: Session, experimenter: Experimenter) -> Experimenter:
     if stored is None or stored.password_hash != experimenter.password_hash:
         raise accounts.WrongNameOrPassword
     return stored
+
+
+def _open_session_for_code(session: Session, experimenter: Experimenter) -> str:
+    stored = _stored(session, experimenter)
+    return browser_sessions.open_for_experimenter(session, stored, TIME_FOR_CODE, second_factor_due=True)
 
 
 def _open_session(session: Session, experimenter: Experimenter, lifetime: timedelta, act: str, user_agent: str) -> str:
