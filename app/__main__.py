@@ -12,7 +12,7 @@ from pathlib import Path
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
-from app import audit_commands, data_directory, logs, signing, upgrading
+from app import audit_commands, data_directory, deploy_check, logs, signing, upgrading
 from app.db import Database, now
 from app.domain.studies import Study
 from app.errors import EXPLAINED, AppError, in_words
@@ -40,6 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for name, act in _COMMANDS.items():
         commands.add_parser(name, help=act.__doc__).set_defaults(act=act)
     audit_commands.add_to(commands)
+    deploy_check.add_to(commands)
     demo = commands.add_parser("demo", help=demo_study.__doc__)
     demo.add_argument("--task", choices=catalogue.names(), default=catalogue.usual())
     demo.set_defaults(act=demo_study)
@@ -54,7 +55,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         logging.basicConfig(level=logging.WARNING, format="%(message)s")
     try:
         settings = Settings()
-        keep_private(settings)
+        if act is not deploy_check.check:  # which says what is open, and closes nothing
+            keep_private(settings)
         result: int = act(settings, **chosen)
         return result
     except EXPLAINED as error:

@@ -13,6 +13,7 @@ from prometheus_client import CollectorRegistry
 from app import data_directory
 from app.db import Database
 from app.paths import STATIC
+from app.services.accounts.openid import Provider
 from app.services.alerting import alerts
 from app.settings import Settings
 from app.storage import ArtefactStore
@@ -20,6 +21,7 @@ from app.web import media, metrics
 from app.web.api import pages, routes
 from app.web.error_pages import add_error_pages, error_page
 from app.web.experimenter import (
+    account,
     accounts,
     answers,
     audit,
@@ -28,10 +30,13 @@ from app.web.experimenter import (
     invitations,
     live,
     login,
+    members,
     operator,
     planning,
+    provider_login,
     results,
     retirement,
+    second_factor,
     selection,
     studies,
     translations,
@@ -70,9 +75,13 @@ The last one comes last: it takes whatever address below /p/ is left for a perso
 """
 EXPERIMENTER_PARTS = (
     login,
+    provider_login,
+    second_factor,
+    account,
     accounts,
     answers,
     audit,
+    members,
     planning,
     translations,
     invitations,
@@ -109,6 +118,7 @@ def make_studio(settings: Settings) -> Studio:
         token_attempts=SharedAttempts(
             database, "token", settings.login_attempts_per_minute, WRONG_TOKENS, WRONG_TOKENS
         ),
+        provider=Provider(settings) if settings.oidc_issuer else None,
         shared_pages=SharedPages(database),
     )
 

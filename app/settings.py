@@ -3,9 +3,10 @@
 import re
 from ipaddress import ip_network
 from pathlib import Path
+from typing import Literal, Self
 from urllib.parse import urlsplit
 
-from pydantic import Field, field_validator
+from pydantic import Field, SecretStr, field_validator, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from app.logs import LogFormat
@@ -25,8 +26,16 @@ class Settings(BaseSettings):
     secure_cookies: bool = Field(default=False, description="Set when the server is reached by HTTPS only.")
     session_days: int = Field(default=30, ge=1, description="How long a participant's browser is remembered.")
     login_hours: int = Field(default=12, ge=1, description="How long an experimenter stays logged in.")
+    require_second_factor: bool = Field(default=False, description="Experimenters must set up a second factor.")
     login_attempts_per_minute: int = Field(default=10, ge=1, description="Password attempts per address.")
     trusted_proxies: str = Field(default="", description="Addresses or networks whose X-Forwarded-For is believed.")
+    oidc_issuer: str | None = Field(default=None, description="Address of the identity provider (OpenID Connect).")
+    oidc_client_id: str | None = Field(default=None, description="What the provider calls this studio.")
+    oidc_client_secret: SecretStr | None = Field(default=None, description="Given by the provider, if it gives one.")
+    oidc_account_claim: str = Field(default="email", description="Claim that is the name of an account here.")
+    oidc_new_accounts: Literal["", "reader", "experimenter"] = Field(
+        default="", description="Role of somebody the provider knows and this studio does not; none: refused."
+    )
     signing_key_file: Path | None = Field(default=None, description="Private key; default: signing.key in DATA_DIR.")
     trusted_keys: str = Field(default="", description="Fingerprints of other studios' keys, separated by commas.")
     worker_name: str = Field(
@@ -95,6 +104,18 @@ class Settings(BaseSettings):
             if network.prefixlen == 0:
                 raise ValueError(f"{each} is everybody. Name the proxy's own address.")
         return ",".join(named)
+
+    @model_validator(mode="after")
+    def _whole_provider(self) -> Self:
+        """Over plain HTTP anybody in between could say who somebody is; on this machine nobody is in between."""
+        if self.oidc_issuer is None:
+            return self
+        parts = urlsplit(self.oidc_issuer)
+        if parts.scheme != "https" and parts.hostname not in {"127.0.0.1", "::1", "localhost"}:
+            raise ValueError("OIDC_ISSUER begins with https://.")
+        if not self.oidc_client_id:
+            raise ValueError("OIDC_ISSUER needs OIDC_CLIENT_ID.")
+        return self
 
     @field_validator("trusted_keys")
     @classmethod

@@ -73,6 +73,15 @@ def upgrade(settings: Settings) -> None:
             raise UpgradeFailed(f"{_words(UpgradeFailed)} The database says: {error.orig}.") from error
 
 
+def revisions(settings: Settings) -> tuple[str | None, str | None]:
+    """What the schema's revision is, None while there is none, and what this version needs. Changes nothing.
+
+    Raises NewerDatabase, DamagedDatabase and UnfinishedDatabase.
+    """
+    config = _config(settings)
+    return _revision(settings, config), ScriptDirectory.from_config(config).get_current_head()
+
+
 def require_known(settings: Settings, revision: str) -> None:
     """Raises NewerDatabase for a schema that this version cannot bring to its own."""
     if revision not in _known(_config(settings)):

@@ -18,13 +18,14 @@ from app.db import now
 from app.domain.clips import Clip, Rollout
 from app.domain.evaluation import Controller, Film, Rating, Trial
 from app.domain.models import Bundle, Model, ModelKind, Run, RunKind, RunStatus
+from app.domain.people import Experimenter, Role, StudyRole
 from app.domain.preferences import LabelEvent, Query, Response
 from app.domain.protocol import EvaluationMode, Stage
 from app.domain.studies import Participant, Study
 from app.domain.study_settings import StudySettings
 from app.services.evaluation import evaluation_plan
 from app.services.participants import enrolment, stages
-from app.services.studies import studies
+from app.services.studies import membership, studies
 from app.storage import ArtefactStore
 
 FPS = 10
@@ -332,3 +333,11 @@ def _frame(number: int, step: int) -> "np.typing.NDArray[np.uint8]":
     up = 60 + (number * 17) % 100
     frame[up : up + 40, at : at + 40] = ((number * 67) % 200, (number * 31) % 160, 90)
     return frame
+
+
+def give_role(session: Session, role: Role, study_role: StudyRole = StudyRole.VIEWER) -> None:
+    """Another role for every account, and in every study that there is."""
+    for account in session.scalars(select(Experimenter)):
+        account.role = role
+        for study in session.scalars(select(Study)):
+            membership.admit(session, study, account.name, study_role, "the test")

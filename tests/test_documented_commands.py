@@ -61,6 +61,7 @@ SHIPPED = "would overwrite what ships with the studio; the same function runs sm
 
 RUN: dict[str, str | Elsewhere | OnlyParsed] = {
     "app audit-head": "",
+    "app check": Elsewhere("tests/app/test_deploy_check.py::test_the_command_says_what_is_unsafe_and_exits_with_1"),
     "app check-signature": Elsewhere("tests/app/test_signing.py::test_commands_show_the_key_and_check_files"),
     "app backup": "../backups",
     "app demo": "--task drinking",

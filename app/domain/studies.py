@@ -113,6 +113,8 @@ class Participant(Base):
     study_id: Mapped[int] = mapped_column(ForeignKey("study.id"), index=True)
     number: Mapped[int]
     token_sha256: Mapped[str] = mapped_column(String(64), unique=True)
+    link_revoked_at: Mapped[datetime | None]
+    """Since then the link leads to a page that says so, until a new one is made."""
     seed: Mapped[int]
     created_at: Mapped[datetime] = mapped_column(default=now)
     last_seen_at: Mapped[datetime | None]

@@ -13,7 +13,14 @@ from starlette.exceptions import HTTPException
 from app.db import complaints
 from app.errors import AppError
 from app.web.http import request_log
-from app.web.http.deps import EXPERIMENTER_COOKIE, PARTICIPANT_COOKIE, LoginNeeded, NotYet, PasswordChangeDue
+from app.web.http.deps import (
+    EXPERIMENTER_COOKIE,
+    PARTICIPANT_COOKIE,
+    LoginNeeded,
+    NotYet,
+    PasswordChangeDue,
+    SecondFactorNeeded,
+)
 from app.web.http.security import HEADERS
 from app.web.texts import languages
 from app.web.texts.templating import page
@@ -72,6 +79,12 @@ def add_error_pages(app: FastAPI) -> None:
         if wants_json(request):
             return error_page(request, error)
         return RedirectResponse(request.app.url_path_for("show_password"), HTTPStatus.SEE_OTHER)
+
+    @app.exception_handler(SecondFactorNeeded)
+    def second_factor_needed(request: Request, error: SecondFactorNeeded) -> Response:
+        if wants_json(request):
+            return error_page(request, error)
+        return RedirectResponse(request.app.url_path_for("show_second_factor"), HTTPStatus.SEE_OTHER)
 
     @app.exception_handler(HTTPException)
     def of_the_framework(request: Request, error: HTTPException) -> Response:
@@ -140,8 +153,8 @@ def _wording(request: Request) -> Wording | None:
 
 def _for_participants(wording: Wording, status: HTTPStatus, message: str, key: str) -> tuple[str, str]:
     name = "error-" + "-".join(word.lower() for word in re.findall("[A-Z][a-z]*", key))
-    title = f"error-title-{status.value}"
+    titles = (name.replace("error-", "error-title-", 1), f"error-title-{status.value}", "error-title-other")
     return (
-        wording(title if title in wording else "error-title-other"),
+        wording(next(each for each in titles if each in wording)),
         wording(name) if name in wording else message,
     )

@@ -1,21 +1,25 @@
 """Clips and posters, under the hash of their content: once loaded, a browser never has to ask again."""
 
+from collections.abc import Iterator
 from email.utils import formatdate
 from functools import partial
 from http import HTTPStatus
 
 from fastapi import APIRouter, Request
 from fastapi.responses import Response
-from sqlalchemy import String, bindparam, or_, select
+from sqlalchemy import Select, String, bindparam, or_, select
 from sqlalchemy.orm import Session
 
 from app.domain.clips import Clip, Rollout
 from app.domain.evaluation import Film
+from app.domain.people import Experimenter
+from app.domain.studies import Participant, Study
 from app.errors import AppError
 from app.services.accounts import browser_sessions
+from app.services.studies import membership
 from app.storage import ArtefactStore
 from app.web.http import stored_file
-from app.web.http.deps import EXPERIMENTER_COOKIE, PARTICIPANT_COOKIE, Sha256, StudioDep
+from app.web.http.deps import PARTICIPANT_COOKIE, Sha256, StudioDep, experimenter_asking
 
 router = APIRouter()
 
@@ -51,26 +55,38 @@ async def show_poster(request: Request, sha256: Sha256, studio: StudioDep) -> Re
 
 
 def _require_may_watch(request: Request, session: Session, sha256: str) -> None:
-    """A participant may watch the clips of their own study and their own films, an experimenter all.
+    """A participant may watch clips of their own study and their own films, an experimenter those of their studies.
 
     Raises ClipNotFound.
     """
-    clip, film, whose = _CLIP, _FILM, dict[str, int]()
-    if not _experimenter_asks(request, session):
-        cookie = request.cookies.get(PARTICIPANT_COOKIE)
-        participant = browser_sessions.participant_of(session, cookie) if cookie else None
-        if participant is None:
-            raise ClipNotFound
-        clip, film = _CLIP_OF_STUDY, _FILM_OF_PARTICIPANT
-        whose = {"study_id": participant.study_id, "participant_id": participant.id}
-    if all(session.scalar(each, {"sha256": sha256, **whose}) is None for each in (clip, film)):
+    if not any(session.scalar(each, {"sha256": sha256, **whose}) for each, whose in _looked_for(request, session)):
         raise ClipNotFound
 
 
-def _experimenter_asks(request: Request, session: Session) -> bool:
-    cookie = request.cookies.get(EXPERIMENTER_COOKIE)
-    experimenter = browser_sessions.experimenter_of(session, cookie) if cookie else None
-    return experimenter is not None and not experimenter.must_change_password
+def _looked_for(request: Request, session: Session) -> Iterator[tuple[Select[int], dict[str, int]]]:
+    participant = _participant(request, session)
+    if participant is not None:
+        whose = {"study_id": participant.study_id, "participant_id": participant.id}
+        yield _CLIP_OF_STUDY, whose
+        yield _FILM_OF_PARTICIPANT, whose
+    experimenter = _experimenter(request, session)
+    if experimenter is not None:
+        theirs = select(Study.id).where(membership.visible_to(experimenter))
+        people = select(Participant.id).where(Participant.study_id.in_(theirs))
+        yield _CLIP.where(Rollout.study_id.in_(theirs)), {}
+        yield _FILM.where(Film.participant_id.in_(people)), {}
+
+
+def _experimenter(request: Request, session: Session) -> Experimenter | None:
+    try:
+        return experimenter_asking(request, session)
+    except AppError:
+        return None
+
+
+def _participant(request: Request, session: Session) -> Participant | None:
+    cookie = request.cookies.get(PARTICIPANT_COOKIE)
+    return browser_sessions.participant_of(session, cookie) if cookie else None
 
 
 def _artefact(request: Request, store: ArtefactStore, sha256: str, media_type: str, session: Session) -> Response:

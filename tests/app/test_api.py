@@ -32,7 +32,7 @@ def study(database: Database, store: ArtefactStore) -> Study:
 
 @pytest.fixture
 def token(database: Database, password: str) -> str:
-    """A token of the only account, which is an owner."""
+    """A token of the only account, which is an administrator."""
     with database.writing() as session:
         return api_tokens.create(session, session.scalars(select(Experimenter)).one(), "a notebook")[1]
 
@@ -49,9 +49,9 @@ def call(client: TestClient, token: str) -> Call:
 
 
 @pytest.fixture
-def as_reader(database: Database, token: str) -> None:
+def as_reader(database: Database, token: str, study: Study) -> None:
     with database.writing() as session:
-        session.scalars(select(Experimenter)).one().role = Role.READER
+        factories.give_role(session, Role.READER)
 
 
 def test_without_a_token_nothing_is_told_and_the_answer_says_what_is_missing(client: TestClient, study: Study) -> None:
@@ -172,7 +172,7 @@ def test_whatever_tells_something_of_people_is_kept_with_who_read_it(
         run = factories.make_run(session, study, kind="report")
         contents = {"version": reports.VERSION}
         session.add(Report(study_id=study.id, run_id=run.id, basis="", contents=contents, figures={}))
-    impersonal = {"/studies/{slug}", "/studies/{slug}/tables", "/studies/{slug}/exports"}
+    impersonal = {"/studies/{slug}", "/studies/{slug}/members", "/studies/{slug}/tables", "/studies/{slug}/exports"}
     files = ("/studies/{slug}/exports/{export_id}.zip", "/studies/{slug}/report/figures/{name}.{kind}")
     asked = []
     for route in iter_route_contexts(studio_app.state.api.routes):
@@ -205,7 +205,7 @@ def test_a_reader_looks_and_does_nothing_else(call: Call, study: Study) -> None:
     for path, method in (("participants", "POST"), ("tables/ratings", "GET"), ("exports", "POST")):
         answer = call(f"/studies/{study.slug}/{path}", method, json={} if method == "POST" else None)
         assert answer.status_code == 403
-        assert "role of experimenter" in answer.json()["detail"]
+        assert "another role" in answer.json()["detail"]
 
 
 @pytest.mark.parametrize(

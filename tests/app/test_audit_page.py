@@ -1,4 +1,4 @@
-"""The page of the audit log: for owners, by person, act, study and day, page by page; and its files."""
+"""The page of the audit log: for administrators, by person, act, study and day, page by page; and its files."""
 
 import csv
 import io
@@ -43,7 +43,7 @@ def long_log(database: Database, experimenter: TestClient) -> TestClient:
 
 
 @pytest.mark.parametrize("address", ADDRESSES)
-def test_only_owners_see_it(experimenter: TestClient, database: Database, address: str) -> None:
+def test_only_administrators_see_it(experimenter: TestClient, database: Database, address: str) -> None:
     assert experimenter.get(address).status_code == 200
     with database.writing() as session:
         session.scalars(select(Experimenter)).one().role = Role.EXPERIMENTER

@@ -6,6 +6,7 @@ from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
+import pyotp
 import pytest
 from fastapi import FastAPI
 from fastapi.routing import iter_route_contexts
@@ -18,7 +19,7 @@ from app.domain.people import AuditEvent, Experimenter
 from app.domain.preferences import Query
 from app.domain.protocol import EvaluationMode, EvaluationSettings
 from app.domain.studies import Participant, Study
-from app.services.accounts import api_tokens
+from app.services.accounts import api_tokens, browser_sessions, second_factor
 from app.services.archives import archive
 from app.services.participants import withdrawal
 from app.services.runs import reports
@@ -54,6 +55,8 @@ NOT_PERSONAL = {
     "show_lock": "the study's settings",
     "download_lock": "the study's settings",
     "show_translations": "the study's own texts",
+    "show_members": "who has an account; every change of it is recorded",
+    "api list_members": "who has an account; every change of it is recorded",
     "show_joining": "an address without anybody's name",
     "show_erasing": "a form",
     "show_put_away": "a form",
@@ -66,6 +69,11 @@ NOT_PERSONAL = {
     "forget_seal_key": "leads to show_exports",
     "show_import": "a form",
     "show_api": "the documentation",
+    "show_own_account": "one's own logins",
+    "show_second_factor": "a form",
+    "show_code": "a form",
+    "begin_provider_login": "nobody yet",
+    "begin_second_factor": "nothing is in force yet; turning it on is recorded",
     "show_tokens": "names of one's own tokens",
     "show_video": "a robot",
     "show_poster": "a robot",
@@ -85,6 +93,8 @@ RECORDED_AS_ANOTHER = {
     "stream_participant": "show_participant",
     "save_translations": "change_settings",
     "join_study_now": "add_participants",
+    "enter_code": "log_in",
+    "end_provider_login": "log_in",
 }
 """They call the same function, which records it."""
 OF_PARTICIPANTS = ("/p/", "/join/")
@@ -119,6 +129,8 @@ class Place:
         headers = self.headers if act.address.startswith(API) else {}
         if act.form is None:
             return self.browser.get(act.address, headers=headers).status_code
+        if act.name in ("api remove_member", "api revoke_link"):
+            return self.browser.delete(act.address, headers=headers).status_code
         if act.address.startswith(API):
             return self.browser.post(act.address, json=act.form, headers=headers).status_code
         if act.name == "import_study":
@@ -149,6 +161,9 @@ def place(database: Database, store: ArtefactStore, experimenter: TestClient, tm
         session.flush()
         query = session.scalars(select(Query.id).where(Query.participant_id == rater.id)).first()
         withdrawal.withdraw(session, store, people[2], "pat")
+        elsewhere = browser_sessions.open_for_experimenter(session, account, timedelta(hours=1))
+        session.flush()
+        login_id = browser_sessions.of_experimenter(session, account, elsewhere)[0][0].id
         export_id, run_id, token_id, other_id = export.id, failed.id, token.id, other.id
         # The withdrawal took them back.
         export.artefact_sha256, export.byte_count = store.put(b"PK an export"), 12
@@ -163,8 +178,11 @@ def place(database: Database, store: ArtefactStore, experimenter: TestClient, tm
         Act("add_account", "account created", "/accounts", {"name": "ada", "role": "reader"}),
         Act("reset_account", "password reset", f"/accounts/{other_id}/password", {}),
         Act("change_account_role", "role changed", f"/accounts/{other_id}/role", {"role": "reader"}),
+        Act("remove_second_factor", "second factor turned off", f"/accounts/{other_id}/second-factor/off", {}),
         Act("disable_account", "account disabled", f"/accounts/{other_id}/disable", {}),
         Act("enable_account", "account enabled", f"/accounts/{other_id}/enable", {}),
+        Act("admit_member", "member added", f"{S}/members", {"name": "kim", "role": "viewer"}),
+        Act("remove_member", "member removed", f"{S}/members/{other_id}/remove", {}),
         Act("show_answers", "answers viewed", f"{S}/answers"),
         Act("show_answer", "answers viewed", f"{S}/answers/{query}"),
         Act("exclude_answer", "answer excluded", f"{S}/answers/{query}/exclude", {"reason": "the phone rang"}),
@@ -182,6 +200,8 @@ def place(database: Database, store: ArtefactStore, experimenter: TestClient, tm
         Act("show_sheet", "personal links viewed", f"{S}/links/KEY/sheet"),
         Act("download_links", "personal links viewed", f"{S}/links/KEY/links.csv"),
         Act("renew_link", "link renewed", f"{P}/link", {}),
+        Act("revoke_link", "link revoked", f"{P}/link/revoke", {}),
+        Act("api revoke_link", "link revoked", f"{API}{P}/link", {}),
         Act("renew_links", "link renewed", f"{S}/selection/links", {"code": ["P01"]}),
         Act("open_joining", "joining opened", f"{S}/joining/open", {}),
         Act("close_joining", "joining closed", f"{S}/joining/close", {}),
@@ -204,6 +224,8 @@ def place(database: Database, store: ArtefactStore, experimenter: TestClient, tm
         Act("download_table", "table exported", f"{S}/export/labels.csv"),
         Act("import_study", "study imported", "/import", {}),
         Act("create_token", "API token made", "/tokens", {"name": "another"}),
+        Act("api admit_member", "member added", f"{API}{S}/members", {"name": "kim", "role": "viewer"}),
+        Act("api remove_member", "member removed", f"{API}{S}/members/{other_id}", {}),
         Act("api list_participants", "participants read by the API", f"{API}{S}/participants"),
         Act("api add_participants", "participant added", f"{API}{S}/participants", {"count": 1}),
         Act("api list_bundles", "bundles read by the API", f"{API}{P}/bundles"),
@@ -218,6 +240,11 @@ def place(database: Database, store: ArtefactStore, experimenter: TestClient, tm
         Act("put_study_away", "study put away", f"{S}/away", {}),
         Act("take_study_out", "study taken out again", f"{S}/back", {}),
         Act("delete_study", "study deleted", f"{S}/delete", {"typed": SLUG}),
+        Act("end_login", "logged out elsewhere", f"/account/logins/{login_id}/end", {}),
+        Act("end_other_logins", "logged out everywhere else", "/account/logins/end-others", {}),
+        Act("confirm_second_factor", "second factor turned on", "/second-factor/confirm", {"code": "CODE"}),
+        Act("renew_recovery_codes", "recovery codes renewed", "/second-factor/codes", {"code": "CODE"}),
+        Act("turn_off_second_factor", "second factor turned off", "/second-factor/off", {"code": "CODE"}),
         Act(
             "change_password",
             "password changed",
@@ -245,12 +272,23 @@ def test_whatever_is_done_or_looked_at_is_in_the_log(place: Place) -> None:
         if act.name == "api show_report":
             with place.database.writing() as session:
                 session.scalars(select(Report)).one().contents = {"version": reports.VERSION}
+        if "second factor" in act.action or "recovery" in act.action:
+            act.form = _with_code(place.database, on=act.name != "confirm_second_factor")
         before = place.newest(act.action)
         status = place.do(act)
         assert place.newest(act.action) > before, (act.name, status)
         assert status < 400 or "figure" in act.name, act.name  # no figure was drawn; who asked is known all the same
         if act.name == "add_participants":
             key = place.browser.post(act.address, data=act.form).headers["location"].rpartition("/")[2]
+
+
+def _with_code(database: Database, *, on: bool) -> Mapping[str, str]:
+    """Give every account a second factor whose next code is known."""
+    with database.writing() as session:
+        for account in session.scalars(select(Experimenter)):
+            account.totp_secret, account.totp_used_step = "A" * 32, None
+            account.second_factor_since = now() if on else None
+    return {"code": pyotp.TOTP("A" * 32).at(second_factor.present_step() * second_factor.STEP_S)}
 
 
 def _pass_an_hour(database: Database) -> None:

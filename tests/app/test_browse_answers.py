@@ -11,7 +11,7 @@ from fastapi.testclient import TestClient
 from sqlalchemy import event, insert, select
 
 from app.db import Database, now
-from app.domain.people import AuditEvent, Experimenter, Role
+from app.domain.people import AuditEvent, Role
 from app.domain.preferences import Exclusion, LabelEvent, Purpose, Query, Response, current_answers, current_labels
 from app.domain.studies import Participant, Study
 from app.services.answers import answers
@@ -234,7 +234,7 @@ class TestExcluding:
 
     def test_readers_cannot_exclude(self, experimenter: TestClient, database: Database, queries: list[Query]) -> None:
         with database.writing() as session:
-            session.scalars(select(Experimenter)).one().role = Role.READER
+            factories.give_role(session, Role.READER)
         assert exclude(experimenter, queries[0]) == 403
 
     def test_a_new_answer_to_the_same_pair_counts(

@@ -14,11 +14,12 @@ from sqlalchemy import delete, select
 from sqlalchemy.orm import Session
 
 from app.db import Database
-from app.domain.people import BrowserSession, Experimenter, Role
+from app.domain.people import BrowserSession, Experimenter, Role, StudyRole
 from app.domain.studies import Participant, Study
 from app.services.accounts import browser_sessions
 from app.services.monitoring import dashboard
 from app.services.monitoring.tallies import Tallies
+from app.services.studies import membership
 from app.storage import ArtefactStore
 from tests import factories
 from tests.conftest import serving
@@ -122,6 +123,8 @@ def test_all_who_look_are_sent_the_same_whatever_their_role(
         reader = Experimenter(name="reader", password_hash="-", must_change_password=False, role=Role.READER)
         session.add(reader)
         session.flush()
+        for study in session.scalars(select(Study)):
+            membership.admit(session, study, "reader", StudyRole.VIEWER, "the test")
         cookie = browser_sessions.open_for_experimenter(session, reader, timedelta(hours=1))
     with httpx2.Client(base_url=address, cookies={"studio_experimenter": cookie}, timeout=PATIENCE_S) as other:
         for page in ("/studies", "/studies/pilot", "/studies/pilot/participants/P01"):

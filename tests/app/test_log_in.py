@@ -138,6 +138,9 @@ class TestFirstLogin:
         [
             ("short", "short", "10 to 200"),
             (PASSWORD, "another password", "differ"),
+            ("qwertyuiop", None, "first that are guessed"),
+            ("Password123!", None, "first that are guessed"),
+            ("experimenter2026", None, "first that are guessed"),
             ("y" * 200 + "z", None, "not valid"),
         ],
     )

@@ -64,3 +64,24 @@ def test_every_study_of_the_second_version_gets_a_secret_of_its_own(config: Conf
         secrets = connection.execute(text("SELECT key_secret FROM study")).scalars().all()
     assert len(set(secrets)) == 2
     assert all(len(secret) == 64 for secret in secrets)
+
+
+def test_whoever_could_see_and_do_what_before_studies_had_members_still_can(config: Config, engine: Engine) -> None:
+    command.upgrade(config, "0009")
+    account = "INSERT INTO experimenter (name, password_hash, must_change_password, role, created_at)"
+    study = "INSERT INTO study (slug, name, task, stored_settings, seed, created_at, key_secret)"
+    with engine.begin() as connection:
+        for role in ("owner", "experimenter", "reader"):
+            connection.execute(text(f"{account} VALUES (:role, '-', false, :role, '2026-01-01')"), {"role": role})
+        connection.execute(text(f"{study} VALUES ('pilot', 'x', 'feeding', '{{}}', 7, '2026-01-01', 's')"))
+    command.upgrade(config, "head")
+    joined = (
+        "FROM experimenter JOIN study_member ON experimenter_id = experimenter.id JOIN study ON study_id = study.id"
+    )
+    with engine.connect() as connection:
+        found = connection.execute(text(f"SELECT experimenter.name, experimenter.role, study_member.role {joined}"))
+        assert {tuple(row) for row in found} == {
+            ("owner", "administrator", "owner"),
+            ("experimenter", "experimenter", "editor"),
+            ("reader", "reader", "viewer"),
+        }

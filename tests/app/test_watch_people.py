@@ -4,6 +4,7 @@ from datetime import timedelta
 
 import pytest
 from fastapi.testclient import TestClient
+from sqlalchemy import true
 
 from app.db import Database, now
 from app.domain.clips import Clip, Rollout
@@ -241,7 +242,7 @@ def test_finished_on_the_list_of_studies_are_those_who_are_through_with_everythi
 ) -> None:
     def finished() -> int:
         with database.reading() as session:
-            return dashboard.study_lines(session)[0].finished
+            return dashboard.study_lines(session, true())[0].finished
 
     with database.writing() as session:
         for query in factories.make_queries(session, store, participant, 20):

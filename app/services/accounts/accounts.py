@@ -14,6 +14,7 @@ from app.db import now
 from app.domain.people import BrowserSession, Experimenter, Role
 from app.errors import AppError
 from app.services import audit
+from app.services.accounts import second_factor
 
 FIRST_EXPERIMENTER = "experimenter"
 """The name of the account made at the first start."""
@@ -21,6 +22,11 @@ FIRST_EXPERIMENTER = "experimenter"
 LONGEST_NAME = 80
 MIN_PASSWORD_LENGTH = 10
 MAX_PASSWORD_LENGTH = 200
+_OUR_WORDS = ("pbarl", "studio", "experimenter", "robot", "preference", "study")
+_LEAST_SCORE = 3
+"""zxcvbn's: more than a hundred million guesses."""
+_LONGEST_JUDGED = 72
+"""What is longer is long enough, and takes zxcvbn long."""
 
 
 class WrongNameOrPassword(AppError):
@@ -41,8 +47,8 @@ class NameUnacceptable(AppError):
     """The name cannot be used for an account."""
 
 
-class OwnerNeeded(AppError):
-    """Nobody would be left to manage accounts. Make somebody else an owner first."""
+class AdministratorNeeded(AppError):
+    """Nobody would be left to manage accounts. Make somebody else an administrator first."""
 
     status = HTTPStatus.CONFLICT
 
@@ -72,6 +78,7 @@ def reset_password(session: Session, name: str) -> str:
         raise ExperimenterNotFound
     one_time = new_one_time_password()
     use_one_time_password(session, experimenter, one_time, audit.SYSTEM)
+    second_factor.turn_off(session, experimenter, audit.SYSTEM)  # the phone may be what is lost
     return one_time.text
 
 
@@ -114,28 +121,32 @@ def add(session: Session, name: str, role: Role, password: OneTimePassword, acto
 
 
 def use_one_time_password(session: Session, experimenter: Experimenter, password: OneTimePassword, actor: str) -> None:
-    """Replace the password by one that must be changed at the next login, and end all logins."""
+    """Replace the password by one that must be changed at the next login, and end all logins.
+
+    An account that was connected to the identity provider is so no more.
+    """
     experimenter.password_hash = password.hash
     experimenter.must_change_password = True
-    _end_logins(session, experimenter)
+    experimenter.oidc_subject = None
+    end_logins(session, experimenter)
     audit.record(session, actor, "password reset", experimenter.name)
 
 
 def change_role(session: Session, experimenter: Experimenter, role: Role, actor: str) -> None:
-    """Give the account another role. Raises OwnerNeeded when nobody would be left to manage accounts."""
-    if role is not Role.OWNER:
-        _leave_an_owner(session, experimenter)
+    """Give the account another role. Raises AdministratorNeeded when nobody would be left to manage accounts."""
+    if role is not Role.ADMINISTRATOR:
+        _leave_an_administrator(session, experimenter)
     if experimenter.role != role:
         experimenter.role = role
         audit.record(session, actor, "role changed", f"{experimenter.name} ({role})")
 
 
 def disable(session: Session, experimenter: Experimenter, actor: str) -> None:
-    """Shut the account out at once: logins and tokens. Raises OwnerNeeded when nobody could undo it."""
-    _leave_an_owner(session, experimenter)
+    """Shut the account out at once: logins and tokens. Raises AdministratorNeeded when nobody could undo it."""
+    _leave_an_administrator(session, experimenter)
     if experimenter.disabled_at is None:
         experimenter.disabled_at = now()
-        _end_logins(session, experimenter)
+        end_logins(session, experimenter)
         audit.record(session, actor, "account disabled", experimenter.name)
 
 
@@ -174,6 +185,8 @@ def hash_of_new(experimenter: Experimenter, *, current: str, new: str) -> str:
         raise PasswordUnacceptable(f"A password has {MIN_PASSWORD_LENGTH} to {MAX_PASSWORD_LENGTH} characters.")
     if new == current:
         raise PasswordUnacceptable("The new password is the same as the present one. Choose another.")
+    if _is_easily_guessed(new, experimenter.name):
+        raise PasswordUnacceptable("This password is among the first that are guessed. A few unrelated words are good.")
     return _hasher().hash(new)
 
 
@@ -182,20 +195,29 @@ def set_password(session: Session, experimenter: Experimenter, password_hash: st
     account = session.get_one(Experimenter, experimenter.id)
     account.password_hash = password_hash
     account.must_change_password = False
-    _end_logins(session, account)
+    end_logins(session, account)
     audit.record(session, account.name, "password changed", account.name)
     return account
 
 
-def _leave_an_owner(session: Session, experimenter: Experimenter) -> None:
+def _leave_an_administrator(session: Session, experimenter: Experimenter) -> None:
     others = select(func.count(Experimenter.id)).where(
-        Experimenter.role == Role.OWNER, Experimenter.disabled_at.is_(None), Experimenter.id != experimenter.id
+        Experimenter.role == Role.ADMINISTRATOR, Experimenter.disabled_at.is_(None), Experimenter.id != experimenter.id
     )
-    if experimenter.role == Role.OWNER and not session.scalar(others):
-        raise OwnerNeeded
+    if experimenter.role == Role.ADMINISTRATOR and not session.scalar(others):
+        raise AdministratorNeeded
 
 
-def _end_logins(session: Session, experimenter: Experimenter) -> None:
+def _is_easily_guessed(password: str, name: str) -> bool:
+    """Whether it is one of the common passwords, or little more than one, or than the name of account or studio."""
+    from zxcvbn import zxcvbn  # its lists take a tenth of a second to load
+
+    guessed: int = zxcvbn(password[:_LONGEST_JUDGED], [name, *name.split(), *_OUR_WORDS])["score"]
+    return guessed < _LEAST_SCORE
+
+
+def end_logins(session: Session, experimenter: Experimenter) -> None:
+    """In every browser."""
     for login in session.scalars(select(BrowserSession).where(BrowserSession.experimenter_id == experimenter.id)):
         session.delete(login)
 

@@ -1,4 +1,4 @@
-"""Keys to the API: each has the rights of the account that made it, is shown once, and can be revoked."""
+"""Keys to the API, with the rights of the account that made them or fewer: shown once, and good for a time."""
 
 import hashlib
 import secrets
@@ -10,7 +10,8 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from app.db import now
-from app.domain.people import ApiToken, Experimenter
+from app.domain.people import ApiToken, Experimenter, TokenScope
+from app.domain.studies import Study
 from app.errors import AppError
 from app.services import audit
 
@@ -18,11 +19,13 @@ PREFIX = "pbarl_"
 """So that people, and programs that search code for secrets, recognise one."""
 LONGEST_NAME = 80
 MOST_TOKENS = 50
+LIFETIMES_DAYS = (7, 30, 90, 365)
+USUAL_LIFETIME_DAYS = 90
 USE_NOTED_EVERY = timedelta(minutes=1)
 
 
 class TokenInvalid(AppError):
-    """This token is not valid. It may have been revoked; make a new one on the page of API tokens."""
+    """This token is not valid. It may have expired or been revoked; make a new one on the page of API tokens."""
 
     status = HTTPStatus.UNAUTHORIZED
 
@@ -39,13 +42,35 @@ class TooManyTokens(AppError):
     status = HTTPStatus.CONFLICT
 
 
-def create(session: Session, experimenter: Experimenter, name: str) -> tuple[ApiToken, str]:
-    """A new token and its text, which is returned here and nowhere else: its hash is kept. Raises TooManyTokens."""
+class ScopeTooNarrow(AppError):
+    """This token may only read. Make one that may also write."""
+
+    status = HTTPStatus.FORBIDDEN
+
+
+def create(
+    session: Session,
+    experimenter: Experimenter,
+    name: str,
+    *,
+    scope: TokenScope = TokenScope.WRITE,
+    study: Study | None = None,
+    days: int = USUAL_LIFETIME_DAYS,
+) -> tuple[ApiToken, str]:
+    """A new token and its text, which is returned here and nowhere else: its hash is kept. Raises TooManyTokens.
+
+    ``study``: the only one it opens.
+    """
     if len(of_experimenter(session, experimenter)) >= MOST_TOKENS:
         raise TooManyTokens
     text = PREFIX + secrets.token_urlsafe(32)
     token = ApiToken(
-        experimenter_id=experimenter.id, name=name.strip()[:LONGEST_NAME] or "token", token_sha256=_hash(text)
+        experimenter_id=experimenter.id,
+        name=name.strip()[:LONGEST_NAME] or "token",
+        token_sha256=_hash(text),
+        scope=scope,
+        study_id=None if study is None else study.id,
+        expires_at=now() + timedelta(days=days),
     )
     session.add(token)
     session.flush()
@@ -64,7 +89,7 @@ def revoke(session: Session, experimenter: Experimenter, token_id: int) -> None:
 
 
 def of_experimenter(session: Session, experimenter: Experimenter) -> Sequence[ApiToken]:
-    """The tokens that are good, the newest first."""
+    """The tokens that are not revoked, those that have expired included, the newest first."""
     theirs = select(ApiToken).where(ApiToken.experimenter_id == experimenter.id, ApiToken.revoked_at.is_(None))
     return session.scalars(theirs.order_by(ApiToken.id.desc())).all()
 
@@ -79,6 +104,8 @@ def find(session: Session, text: str) -> tuple[ApiToken, Experimenter]:
     if row is None:
         raise TokenInvalid
     token, experimenter = row
+    if token.expires_at is not None and token.expires_at <= now():
+        raise TokenInvalid
     if experimenter.must_change_password or experimenter.disabled_at is not None:
         raise TokenInvalid
     return token, experimenter

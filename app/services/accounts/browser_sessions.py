@@ -2,7 +2,9 @@
 
 import hashlib
 import secrets
+from collections.abc import Sequence
 from datetime import timedelta
+from http import HTTPStatus
 
 from sqlalchemy import bindparam, delete, select
 from sqlalchemy.orm import Session, joinedload
@@ -10,6 +12,16 @@ from sqlalchemy.orm import Session, joinedload
 from app.db import now
 from app.domain.people import BrowserSession, Experimenter
 from app.domain.studies import Participant
+from app.errors import AppError
+from app.services import audit
+from app.services.accounts import browser_names
+
+
+class SessionNotFound(AppError):
+    """You are not logged in there any more."""
+
+    status = HTTPStatus.NOT_FOUND
+
 
 # Made once, because every request of a participant needs one of them.
 _PARTICIPANT = (
@@ -29,12 +41,25 @@ def open_for_participant(session: Session, participant: Participant, lifetime: t
     return cookie
 
 
-def open_for_experimenter(session: Session, experimenter: Experimenter, lifetime: timedelta) -> str:
-    """A new cookie for this experimenter's browser."""
+def open_for_experimenter(
+    session: Session,
+    experimenter: Experimenter,
+    lifetime: timedelta,
+    *,
+    user_agent: str = "",
+    second_factor_due: bool = False,
+) -> str:
+    """A new cookie for this experimenter's browser; ``second_factor_due``: it opens the form for the code only."""
     cookie = secrets.token_urlsafe(32)
     _forget_expired(session)
     session.add(
-        BrowserSession(cookie_sha256=_hash(cookie), experimenter_id=experimenter.id, expires_at=now() + lifetime)
+        BrowserSession(
+            cookie_sha256=_hash(cookie),
+            experimenter_id=experimenter.id,
+            expires_at=now() + lifetime,
+            browser=browser_names.in_words(user_agent),
+            second_factor_due=second_factor_due,
+        )
     )
     return cookie
 
@@ -47,14 +72,46 @@ def participant_of(session: Session, cookie: str, *, lock: bool = False) -> Part
     return session.scalar(_PARTICIPANT_LOCKED if lock else _PARTICIPANT, {"cookie": _hash(cookie), "moment": now()})
 
 
-def experimenter_of(session: Session, cookie: str) -> Experimenter | None:
-    """The experimenter the cookie stands for; None when it stands for nobody (any more)."""
+def experimenter_of(session: Session, cookie: str, *, second_factor_due: bool = False) -> Experimenter | None:
+    """The experimenter the cookie stands for; None when it stands for nobody (any more).
+
+    ``second_factor_due``: the one whose password was right and whose code is still to come; otherwise nobody is.
+    """
     return session.scalar(
         select(Experimenter)
         .join(BrowserSession, BrowserSession.experimenter_id == Experimenter.id)
         .where(BrowserSession.cookie_sha256 == _hash(cookie), BrowserSession.expires_at > now())
-        .where(Experimenter.disabled_at.is_(None))
+        .where(Experimenter.disabled_at.is_(None), BrowserSession.second_factor_due.is_(second_factor_due))
     )
+
+
+def of_experimenter(session: Session, experimenter: Experimenter, cookie: str) -> Sequence[tuple[BrowserSession, bool]]:
+    """Where they are logged in, the newest first, and which of these is the browser with this cookie."""
+    theirs = select(BrowserSession).where(
+        BrowserSession.experimenter_id == experimenter.id,
+        BrowserSession.expires_at > now(),
+        BrowserSession.second_factor_due.is_(False),
+    )
+    found = session.scalars(theirs.order_by(BrowserSession.id.desc()))
+    return [(each, each.cookie_sha256 == _hash(cookie)) for each in found]
+
+
+def end(session: Session, experimenter: Experimenter, session_id: int) -> None:
+    """Log one's own account out in another browser. Raises SessionNotFound."""
+    login = session.get(BrowserSession, session_id)
+    if login is None or login.experimenter_id != experimenter.id:
+        raise SessionNotFound
+    session.delete(login)
+    audit.record(session, experimenter.name, "logged out elsewhere", experimenter.name)
+
+
+def end_others(session: Session, experimenter: Experimenter, cookie: str) -> None:
+    """Log one's own account out everywhere but in the browser with this cookie."""
+    others = delete(BrowserSession).where(
+        BrowserSession.experimenter_id == experimenter.id, BrowserSession.cookie_sha256 != _hash(cookie)
+    )
+    session.execute(others)
+    audit.record(session, experimenter.name, "logged out everywhere else", experimenter.name)
 
 
 def close(session: Session, cookie: str) -> None:

@@ -1,15 +1,15 @@
-"""Who may do what: owner over experimenter over reader."""
+"""Who may do what: administrator over experimenter over reader."""
 
 from http import HTTPStatus
 
 from app.domain.people import Experimenter, Role
 from app.errors import AppError
 
-_RANKS = {Role.READER: 0, Role.EXPERIMENTER: 1, Role.OWNER: 2}
+_RANKS = {Role.READER: 0, Role.EXPERIMENTER: 1, Role.ADMINISTRATOR: 2}
 
 
 class RoleTooLow(AppError):
-    """Your account may look at this, but not do it. Ask an owner of this studio for the role of experimenter."""
+    """Your account may look at this, but not do it. Ask an administrator of this studio for another role."""
 
     status = HTTPStatus.FORBIDDEN
 

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import timedelta
 
-from sqlalchemy import func, select
+from sqlalchemy import func, select, true
 from sqlalchemy.orm import Session
 
 from app.db import now
@@ -66,5 +66,5 @@ def of_studies(session: Session, settings: Settings, store: ArtefactStore) -> It
             f"failed work of study {study_id}",
             f"Work has failed and waits for somebody. Its study says which: {settings.base_url}/studies",
         )
-    if lost := len(damage.standing(session, store).others):
+    if lost := len(damage.standing(session, store, true()).others):
         yield Trouble("damage", f"Stored files are damaged: {lost}. To see which: python -m app scrub")

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
-from sqlalchemy import Select, select
+from sqlalchemy import ColumnElement, Select, select
 from sqlalchemy.orm import InstrumentedAttribute, Session
 
 from app.domain.clips import Clip, Rollout
@@ -38,7 +38,7 @@ class Use:
 
 @dataclass(frozen=True)
 class Damage:
-    """All that is wrong with stored files at this moment, as far as anybody has noticed."""
+    """All that is wrong with stored files of some studies at this moment, as far as anybody has noticed."""
 
     mending: int
     """so many are made again without anybody's doing"""
@@ -50,10 +50,11 @@ class Damage:
         return self.mending + len(self.others)
 
 
-def standing(session: Session, store: ArtefactStore) -> Damage:
+def standing(session: Session, store: ArtefactStore, theirs: ColumnElement[bool]) -> Damage:
     """What was found and is not back yet; costs a look into a folder that is usually empty."""
     lost = store.lost()
-    found = list(uses(session, lost)) if lost else []
+    named = set(session.scalars(select(Study.slug).where(theirs))) if lost else set()
+    found = [use for use in uses(session, lost) if use.study in named] if lost else []
     return Damage(
         mending=sum(use.remedy is Remedy.WORKER for use in found),
         others=[use for use in found if use.remedy is not Remedy.WORKER],

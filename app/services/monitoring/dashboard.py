@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
 
-from sqlalchemy import func, select
+from sqlalchemy import ColumnElement, func, select
 from sqlalchemy.orm import Session, joinedload
 
 from app.db import now
@@ -15,6 +15,7 @@ from app.domain.clips import Clip, Rollout
 from app.domain.evaluation import Film, Rating, Trial
 from app.domain.models import Bundle, Model, ModelKind, Run, RunKind, RunStatus, WorkerPresence
 from app.domain.participation import StageRecord
+from app.domain.people import StudyMember
 from app.domain.preferences import Exclusion, LabelEvent, Response, count_labels
 from app.domain.protocol import Stage
 from app.domain.studies import Awaited, Participant, Study
@@ -136,12 +137,12 @@ class ParticipantDetail:
     stage_times: Sequence[participant_status.StageTime]
 
 
-def machine(session: Session, data_dir: Path, store: ArtefactStore) -> Machine:
-    """The state of the worker and of the disk."""
+def machine(session: Session, data_dir: Path, store: ArtefactStore, theirs: ColumnElement[bool]) -> Machine:
+    """The state of the worker and of the disk, and of the files of these studies."""
     seen_at = session.scalar(select(WorkerPresence.last_seen_at).order_by(WorkerPresence.last_seen_at.desc()).limit(1))
     free = shutil.disk_usage(data_dir).free
     alive = seen_at is not None and now() - seen_at <= WORKER_SILENCE
-    broken = damage.standing(session, store)
+    broken = damage.standing(session, store, theirs)
     falls, backups = noted(data_dir), schedule.standing(data_dir)
     return Machine(seen_at, alive, free, free < DISK_LOW_BYTES, broken, falls, backups)
 
@@ -161,6 +162,8 @@ def fingerprint(session: Session) -> str:
         select(func.max(Run.finished_at)).scalar_subquery(),
         select(func.count(Run.id)).where(Run.status == RunStatus.RETRY).scalar_subquery(),
         select(func.max(Study.id)).scalar_subquery(),
+        select(func.max(StudyMember.id)).scalar_subquery(),
+        select(func.count(StudyMember.id)).scalar_subquery(),
         select(func.max(Study.deleted_at)).scalar_subquery(),
         select(func.count(Study.put_away_at)).scalar_subquery(),
         select(func.max(StageRecord.id)).scalar_subquery(),
@@ -176,8 +179,8 @@ def fingerprint(session: Session) -> str:
     return repr(tuple(session.execute(select(*newest)).one()))
 
 
-def study_lines(session: Session, *, put_away: bool = False) -> Sequence[StudySummary]:
-    """Every study that is at work, or every one that is put away; the newest first."""
+def study_lines(session: Session, theirs: ColumnElement[bool], *, put_away: bool = False) -> Sequence[StudySummary]:
+    """Of these studies those that are at work, or those that are put away; the newest first."""
     counted = session.execute(select(Rollout.study_id, func.count(Clip.id)).join(Clip).group_by(Rollout.study_id))
     clips = dict(counted.all())
     everybody = select(Participant).where(Participant.is_preview.is_(False))
@@ -188,7 +191,8 @@ def study_lines(session: Session, *, put_away: bool = False) -> Sequence[StudySu
     failed = Counter(run.study_id for run in jobs.failures(session))
     lines = []
     kept = Study.put_away_at.is_not(None) if put_away else Study.put_away_at.is_(None)
-    for study in session.scalars(select(Study).where(Study.deleted_at.is_(None), kept).order_by(Study.id.desc())):
+    shown = select(Study).where(Study.deleted_at.is_(None), kept, theirs)
+    for study in session.scalars(shown.order_by(Study.id.desc())):
         given = [labels.get(person.id, 0) for person in people[study.id]]
         wanted = study.settings.labels_per_participant
         lines.append(

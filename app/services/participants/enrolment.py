@@ -7,6 +7,7 @@ from http import HTTPStatus
 from sqlalchemy import delete, func, select
 from sqlalchemy.orm import Session, joinedload
 
+from app.db import now
 from app.domain.people import BrowserSession
 from app.domain.studies import PREVIEW_NUMBERS, Participant, Study
 from app.errors import AppError
@@ -17,6 +18,12 @@ class LinkNotValid(AppError):
     """This link is not valid. It may have been replaced by a newer one; please ask the person who sent it to you."""
 
     status = HTTPStatus.NOT_FOUND
+
+
+class LinkRevoked(AppError):
+    """This link has been switched off. Your answers so far are kept; to go on, please ask for a new link."""
+
+    status = HTTPStatus.GONE
 
 
 class ParticipantNotFound(AppError):
@@ -72,19 +79,28 @@ def _add(session: Session, study: Study, actor: str, *, preview: bool) -> tuple[
 def renew_link(session: Session, study: Study, participant: Participant, actor: str) -> str:
     """Give the participant a new link; the old one, and every browser that used it, is shut out."""
     token = _new_token()
-    participant.token_sha256 = _hash(token)
+    participant.token_sha256, participant.link_revoked_at = _hash(token), None
     session.execute(delete(BrowserSession).where(BrowserSession.participant_id == participant.id))
     audit.record(session, actor, "link renewed", f"{study.slug}/{participant.code}", participant=participant)
     return token
 
 
+def revoke_link(session: Session, study: Study, participant: Participant, actor: str) -> None:
+    """Shut out the participant's link, and every browser that used it, until there is a new link."""
+    participant.link_revoked_at = participant.link_revoked_at or now()
+    session.execute(delete(BrowserSession).where(BrowserSession.participant_id == participant.id))
+    audit.record(session, actor, "link revoked", f"{study.slug}/{participant.code}", participant=participant)
+
+
 def find_by_token(session: Session, token: str) -> Participant:
-    """The participant whose personal link this is, study loaded. Raises LinkNotValid."""
+    """The participant whose personal link this is, study loaded. Raises LinkNotValid and LinkRevoked."""
     participant = session.scalar(
         select(Participant).where(Participant.token_sha256 == _hash(token)).options(joinedload(Participant.study))
     )
     if participant is None:
         raise LinkNotValid
+    if participant.link_revoked_at is not None:
+        raise LinkRevoked
     return participant
 
 

@@ -13,6 +13,7 @@ from app.domain.studies import Participant, Study
 from app.errors import AppError
 from app.services import audit
 from app.services.participants import enrolment
+from app.services.participants.enrolment import LinkRevoked
 
 LONGEST_PANEL_ID = 120
 MOST_PARAMETERS = 20
@@ -74,12 +75,14 @@ def panel_id_in(study: Study, parameters: Mapping[str, str]) -> str | None:
 def join(session: Session, study: Study, parameters: Mapping[str, str]) -> Joined:
     """The participant for these parameters of the panel: whoever has this id already, else somebody new.
 
-    Without a panel parameter in the settings everybody is new. Raises PanelIdMissing.
+    Without a panel parameter in the settings everybody is new. Raises PanelIdMissing and LinkRevoked.
     """
     panel_id = panel_id_in(study, parameters)
     if panel_id is None:
         return _add(session, study, None, parameters)
     known = _known(session, study, panel_id)
+    if known is not None and known.link_revoked_at is not None:
+        raise LinkRevoked
     if known is not None:
         return Joined(known, None)
     try:

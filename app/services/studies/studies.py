@@ -6,7 +6,7 @@ import unicodedata
 from http import HTTPStatus
 from typing import TypeVar
 
-from sqlalchemy import func, select
+from sqlalchemy import ColumnElement, func, select
 from sqlalchemy.orm import Session
 
 from app.db import Base
@@ -68,15 +68,15 @@ def find_study(session: Session, slug: str) -> Study:
     return study
 
 
-def others_named(session: Session, name: str, study: Study | None = None) -> bool:
-    """Whether another study has this name, however it is capitalised."""
-    known = session.execute(select(Study.id, Study.name).where(Study.deleted_at.is_(None)))
+def others_named(session: Session, name: str, theirs: ColumnElement[bool], study: Study | None = None) -> bool:
+    """Whether another one of ``theirs``, studies somebody may see, has this name, however it is capitalised."""
+    known = session.execute(select(Study.id, Study.name).where(Study.deleted_at.is_(None), theirs))
     return any(other != (study.id if study else None) and each.casefold() == name.casefold() for other, each in known)
 
 
-def count_put_away(session: Session) -> int:
-    """How many studies are put away."""
-    away = select(func.count(Study.id)).where(Study.put_away_at.is_not(None), Study.deleted_at.is_(None))
+def count_put_away(session: Session, theirs: ColumnElement[bool]) -> int:
+    """How many of these studies are put away."""
+    away = select(func.count(Study.id)).where(Study.put_away_at.is_not(None), Study.deleted_at.is_(None), theirs)
     return session.scalar(away) or 0
 
 

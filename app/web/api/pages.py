@@ -6,8 +6,14 @@ from typing import Annotated
 
 from fastapi import APIRouter, Form, Request
 from fastapi.responses import RedirectResponse, Response
+from sqlalchemy import select
+from sqlalchemy.orm import Session
 
+from app.db import now
+from app.domain.people import ApiToken, Experimenter, StudyRole, TokenScope
+from app.domain.studies import Study
 from app.services.accounts import api_tokens
+from app.services.studies import membership, studies
 from app.web.api import openapi, routes
 from app.web.http.deps import CurrentExperimenter, OwnAccount, ReadingSession, RowId, WritingSession
 from app.web.texts.templating import page
@@ -38,8 +44,7 @@ def show_api(request: Request) -> Response:
 @router.get("/tokens", name="show_tokens")
 def show_tokens(request: Request, experimenter: CurrentExperimenter, session: ReadingSession) -> Response:
     """The tokens of this account."""
-    tokens = api_tokens.of_experimenter(session, experimenter)
-    return page(request, "experimenter/tokens.html", {"experimenter": experimenter, "tokens": tokens, "made": None})
+    return _tokens_page(request, session, experimenter)
 
 
 @router.post("/tokens", name="create_token")
@@ -48,12 +53,16 @@ def create_token(
     name: Annotated[str, Form(min_length=1, max_length=api_tokens.LONGEST_NAME)],
     experimenter: OwnAccount,
     session: WritingSession,
+    scope: Annotated[TokenScope, Form()] = TokenScope.READ,
+    study: Annotated[str, Form(pattern=r"^[a-z0-9-]{0,80}$")] = "",
+    days: Annotated[int, Form(ge=1, le=max(api_tokens.LIFETIMES_DAYS))] = api_tokens.USUAL_LIFETIME_DAYS,
 ) -> Response:
     """Make a token and show it, this one time; there is nothing to come back to, so this is the page itself."""
-    token, text = api_tokens.create(session, experimenter, name)
-    tokens = api_tokens.of_experimenter(session, experimenter)
-    context = {"experimenter": experimenter, "tokens": tokens, "made": (token, text)}
-    return page(request, "experimenter/tokens.html", context)
+    if study:
+        membership.enter(session, experimenter, study, StudyRole.VIEWER)
+    only = studies.find_study(session, study) if study else None
+    made = api_tokens.create(session, experimenter, name, scope=scope, study=only, days=days)
+    return _tokens_page(request, session, experimenter, made)
 
 
 @router.post("/tokens/{token_id}/revoke", name="revoke_token")
@@ -61,3 +70,22 @@ def revoke_token(request: Request, token_id: RowId, experimenter: OwnAccount, se
     """Make a token worthless."""
     api_tokens.revoke(session, experimenter, token_id)
     return RedirectResponse(request.app.url_path_for("show_tokens"), HTTPStatus.SEE_OTHER)
+
+
+def _tokens_page(
+    request: Request, session: Session, experimenter: Experimenter, made: tuple[ApiToken, str] | None = None
+) -> Response:
+    theirs = select(Study).where(Study.deleted_at.is_(None), membership.visible_to(experimenter))
+    tokens = api_tokens.of_experimenter(session, experimenter)
+    only = select(Study.id, Study.name).where(Study.id.in_({token.study_id for token in tokens} - {None}))
+    context = {
+        "experimenter": experimenter,
+        "tokens": tokens,
+        "made": made,
+        "studies": session.scalars(theirs.order_by(Study.name)).all(),
+        "study_names": dict(session.execute(only).all()),
+        "lifetimes": api_tokens.LIFETIMES_DAYS,
+        "usual_lifetime": api_tokens.USUAL_LIFETIME_DAYS,
+        "now": now(),
+    }
+    return page(request, "experimenter/tokens.html", context)

@@ -10,26 +10,37 @@ from typing import Annotated, Any, Literal
 from fastapi import APIRouter, Depends, FastAPI, Path, Query, Request
 from fastapi.responses import FileResponse, Response
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
-from sqlalchemy import select
+from sqlalchemy import ColumnElement, and_, select, true
 from sqlalchemy.orm import Session
 
 from app.domain.models import Bundle, Export, Model
-from app.domain.people import Experimenter, Role
+from app.domain.people import ApiToken, Experimenter, Role, StudyMember, StudyRole, TokenScope
 from app.domain.studies import Participant, Study
 from app.errors import AppError
 from app.services import audit
-from app.services.accounts import api_tokens, failed_logins, roles
-from app.services.accounts.api_tokens import TokenInvalid
+from app.services.accounts import api_tokens, failed_logins
+from app.services.accounts.api_tokens import ScopeTooNarrow, TokenInvalid
 from app.services.evaluation import unblinding
 from app.services.exports import export_formats, export_requests, export_tables, paging
 from app.services.exports.export_requests import ExportKind
 from app.services.participants import enrolment
 from app.services.runs import publishing, reports
-from app.services.studies import studies
+from app.services.studies import membership, studies
 from app.web.api import schemas as answers
 from app.web.api.problems import add_problems, only_known_parameters
 from app.web.http import stored_file
-from app.web.http.deps import Code, ReadingSession, RowId, Slug, Studio, StudioDep, WritingSession
+from app.web.http.deps import (
+    Code,
+    ReadingSession,
+    RowId,
+    SecondFactorNeeded,
+    Slug,
+    Studio,
+    StudioDep,
+    WritingSession,
+    lacks_second_factor,
+)
+from app.web.http.security import SAFE_METHODS
 
 PREFIX = "/api/v1"
 LARGEST_PAGE = 1000
@@ -37,11 +48,13 @@ DESCRIPTION = """\
 Everything that the pages show and the exports hold, for programs.
 
 Make a token on the page of API tokens and send it with every request: `Authorization: Bearer pbarl_...`. A token has
-the rights of the account that made it: a *reader* may look at studies, participants and reports; an *experimenter* may
-also read tables, download bundles, add participants and ask for files. Times are UTC (ISO 8601), unknown is null.
-Errors are problem details (RFC 9457) whose `detail` says in words what happened and what to do. Too many wrong tokens
-from one address are answered with 429 for a minute. Until a study is unblinded, methods of the evaluation are letters
-here as everywhere.
+the rights of the account that made it in the studies this is a member of: a *viewer* may look at participants and
+reports; an *editor* may also read tables, download bundles, add participants and ask for files; an *owner* also decides
+who is a member. Other studies are not there at all. A token can be for reading or for one study only, and expires.
+
+Times are UTC (ISO 8601), unknown is null. Errors are problem details (RFC 9457) whose `detail` says in words what
+happened and what to do. Too many wrong tokens from one address are answered with 429 for a minute. Until a study is
+unblinded, methods of the evaluation are letters here as everywhere.
 
 Tables come in pages: follow `next`, whose `cursor` says where to go on. Together the pages are the table as it was when
 the first one was asked for. There is no `offset` any more (what people answer between two pages would shift it), and a
@@ -75,13 +88,16 @@ class TableUnknown(AppError):
     status = HTTPStatus.NOT_FOUND
 
 
-def _caller(
+def _whoever(
     request: Request,
     studio: StudioDep,
     session: ReadingSession,
     credentials: Annotated[HTTPAuthorizationCredentials | None, Depends(bearer)],
 ) -> Experimenter:
-    """Whose token was sent. Raises TokenMissing, TokenInvalid and TooManyWrongTokens."""
+    """Whose token was sent, and it may be used so.
+
+    Raises TokenMissing, TokenInvalid, TooManyWrongTokens, ScopeTooNarrow and SecondFactorNeeded.
+    """
     if credentials is None:
         raise TokenMissing
     try:
@@ -96,22 +112,52 @@ def _caller(
         if not studio.token_attempts.allow(address):
             raise TooManyWrongTokens from None
         raise
+    if lacks_second_factor(studio.settings, experimenter):
+        raise SecondFactorNeeded
+    if token.scope == TokenScope.READ and request.method not in SAFE_METHODS:
+        raise ScopeTooNarrow
+    request.state.token = token
     if api_tokens.use_is_worth_noting(token):
         with studio.database.writing() as writing:
             api_tokens.note_use(writing, token.id)
     return experimenter
 
 
+_Whoever = Annotated[Experimenter, Depends(_whoever, scope="function")]
+
+
+def _caller(request: Request, session: ReadingSession, experimenter: _Whoever) -> Experimenter:
+    return _entering(request, session, experimenter, StudyRole.VIEWER)
+
+
+def _acting_caller(request: Request, session: ReadingSession, experimenter: _Whoever) -> Experimenter:
+    return _entering(request, session, experimenter, StudyRole.EDITOR)
+
+
+def _owning_caller(request: Request, session: ReadingSession, experimenter: _Whoever) -> Experimenter:
+    return _entering(request, session, experimenter, StudyRole.OWNER)
+
+
+def _entering(request: Request, session: Session, experimenter: Experimenter, needed: StudyRole) -> Experimenter:
+    """Whose the study of this address is, if it has one. Raises StudyNotFound, RoleTooLow and StudyRoleTooLow."""
+    slug = request.path_params.get("slug")
+    if slug is not None:
+        membership.enter(session, experimenter, slug, needed)
+        if request.state.token.study_id not in (None, studies.find_study(session, slug).id):
+            raise studies.StudyNotFound
+    return experimenter
+
+
+def _theirs(request: Request, caller: Experimenter) -> ColumnElement[bool]:
+    only = request.state.token.study_id
+    return and_(membership.visible_to(caller), true() if only is None else Study.id == only)
+
+
 Caller = Annotated[Experimenter, Depends(_caller, scope="function")]
-
-
-def _experimenter(caller: Caller) -> Experimenter:
-    roles.require(caller, Role.EXPERIMENTER)
-    return caller
-
-
-ActingCaller = Annotated[Experimenter, Depends(_experimenter, scope="function")]
-"""May do more than look."""
+"""A member of the study that the address names: for looking."""
+ActingCaller = Annotated[Experimenter, Depends(_acting_caller, scope="function")]
+"""An editor of it: for whatever changes something or leaves the studio."""
+OwningCaller = Annotated[Experimenter, Depends(_owning_caller, scope="function")]
 
 _PROBLEMS: dict[int | str, dict[str, Any]] = {
     code: {"model": answers.Problem, "description": words}
@@ -122,17 +168,24 @@ router = APIRouter(responses=_PROBLEMS, dependencies=[Depends(only_known_paramet
 
 
 @router.get("/me", tags=["account"])
-def show_account(caller: Caller) -> answers.Account:
+def show_account(request: Request, caller: Caller, session: ReadingSession) -> answers.Account:
     """Whose token this is, and what it may do."""
+    token: ApiToken = request.state.token
     return answers.Account(
-        name=caller.name, role=Role(caller.role).value, software_version=export_formats.software_version()
+        name=caller.name,
+        role=Role(caller.role).value,
+        scope=TokenScope(token.scope).value,
+        study=None if token.study_id is None else session.get_one(Study, token.study_id).slug,
+        expires_at=token.expires_at,
+        software_version=export_formats.software_version(),
     )
 
 
 @router.get("/studies", tags=["studies"])
-def list_studies(_caller: Caller, session: ReadingSession) -> list[answers.StudyLine]:
-    """Every study, the newest first."""
-    found = session.scalars(select(Study).where(Study.deleted_at.is_(None)).order_by(Study.id.desc()))
+def list_studies(request: Request, caller: Caller, session: ReadingSession) -> list[answers.StudyLine]:
+    """Every study that the token opens, the newest first."""
+    theirs = select(Study).where(Study.deleted_at.is_(None), _theirs(request, caller))
+    found = session.scalars(theirs.order_by(Study.id.desc()))
     return [answers.StudyLine(**_study_line(study)) for study in found]
 
 
@@ -173,6 +226,34 @@ def list_participants(
     return [answers.ParticipantAnswer.model_validate(row) for row in rows]
 
 
+@router.get("/studies/{slug}/members", tags=["members"])
+def list_members(slug: Slug, _caller: Caller, session: ReadingSession) -> list[answers.MemberAnswer]:
+    """Whose study this is."""
+    found = membership.members(session, studies.find_study(session, slug))
+    return [_member(member, account) for member, account in found]
+
+
+@router.post("/studies/{slug}/members", tags=["members"])
+def admit_member(
+    slug: Slug, wanted: answers.NewMember, caller: OwningCaller, session: WritingSession
+) -> list[answers.MemberAnswer]:
+    """Make an account a member, or give a member another role. Answers with all members."""
+    study = studies.find_study(session, slug)
+    membership.admit(session, study, wanted.name, StudyRole(wanted.role), caller.name)
+    return [_member(member, account) for member, account in membership.members(session, study)]
+
+
+@router.delete("/studies/{slug}/members/{account_id}", tags=["members"], status_code=HTTPStatus.NO_CONTENT)
+def remove_member(slug: Slug, account_id: RowId, caller: OwningCaller, session: WritingSession) -> None:
+    """Shut a member out of the study at once."""
+    membership.remove(session, studies.find_study(session, slug), account_id, caller.name)
+
+
+def _member(member: StudyMember, account: Experimenter) -> answers.MemberAnswer:
+    role = StudyRole(member.role).value
+    return answers.MemberAnswer(account_id=account.id, name=account.name, role=role, added_at=member.added_at)
+
+
 @router.post("/studies/{slug}/participants", tags=["participants"], status_code=HTTPStatus.CREATED)
 def add_participants(
     request: Request, slug: Slug, wanted: answers.NewParticipants, caller: ActingCaller, session: WritingSession
@@ -187,6 +268,13 @@ def _personal_link(request: Request, token: str) -> str:
     studio: Studio = request.app.state.studio
     base = studio.settings.public_url or str(request.base_url).removesuffix("/").removesuffix(PREFIX)
     return f"{base.rstrip('/')}{request.app.state.path_for('open_link', token=token)}"
+
+
+@router.delete("/studies/{slug}/participants/{code}/link", tags=["participants"], status_code=HTTPStatus.NO_CONTENT)
+def revoke_link(slug: Slug, code: Code, caller: ActingCaller, session: WritingSession) -> None:
+    """Switch a personal link off at once, with every browser that used it; a new link brings the participant back."""
+    study = studies.find_study(session, slug)
+    enrolment.revoke_link(session, study, enrolment.find_by_code(session, study, code), caller.name)
 
 
 @router.get("/studies/{slug}/participants/{code}/bundles", tags=["bundles"])

@@ -15,7 +15,10 @@ class Account(BaseModel):
     """Whose token this is."""
 
     name: str = Field(examples=["experimenter"])
-    role: Literal["owner", "experimenter", "reader"]
+    role: Literal["administrator", "experimenter", "reader"]
+    scope: Literal["read", "write"]
+    study: str | None = Field(description="The only study that the token opens; null: all that are yours.")
+    expires_at: datetime | None
     software_version: str = Field(examples=["0.1.0"])
 
 
@@ -38,6 +41,24 @@ class StudyAnswer(StudyLine):
     deviations: str = Field(examples=["none"])
     unblinded_at: datetime | None
     settings: StudySettings
+
+
+class MemberAnswer(BaseModel):
+    """One member of a study."""
+
+    account_id: int
+    name: str = Field(examples=["A colleague"])
+    role: Literal["owner", "editor", "viewer"]
+    added_at: datetime
+
+
+class NewMember(BaseModel):
+    """Whom to make a member, by the name of the account, and what they may do."""
+
+    model_config = ConfigDict(extra="forbid", json_schema_extra={"example": {"name": "A colleague", "role": "viewer"}})
+
+    name: str = Field(min_length=1, max_length=80)
+    role: Literal["owner", "editor", "viewer"]
 
 
 class ParticipantAnswer(BaseModel):

@@ -1,4 +1,4 @@
-"""The audit log, for owners: who did what when, its head, receipts of what was erased, the key that signs."""
+"""The audit log, for administrators: who did what when, its head, receipts of what was erased, the key that signs."""
 
 from collections.abc import Iterator
 from dataclasses import asdict
@@ -17,7 +17,7 @@ from app.services import audit
 from app.services.auditing import lookup, receipts
 from app.services.auditing.lookup import Wanted
 from app.services.exports.csv_cells import csv_line
-from app.web.http.deps import CurrentOwner, ReadingSession, RowId, Studio, StudioDep
+from app.web.http.deps import CurrentAdministrator, ReadingSession, RowId, Studio, StudioDep
 from app.web.http.spooling import spooled
 from app.web.texts.templating import page
 
@@ -47,14 +47,14 @@ def _wanted(
 def show_audit(
     request: Request,
     wanted: Annotated[Wanted, Depends(_wanted)],
-    owner: CurrentOwner,
+    admin: CurrentAdministrator,
     session: ReadingSession,
     studio: StudioDep,
 ) -> Response:
     """The newest rows, or those that are looked for."""
-    _note(studio, session, owner, "audit log viewed")
+    _note(studio, session, admin, "audit log viewed")
     context = {
-        "experimenter": owner,
+        "experimenter": admin,
         "wanted": wanted,
         "found": lookup.find(session, wanted),
         "actors": lookup.actors(session),
@@ -68,10 +68,10 @@ def show_audit(
 
 @router.get("/log.{kind}", name="download_audit")
 def download_audit(
-    kind: Literal["csv", "jsonl"], owner: CurrentOwner, session: ReadingSession, studio: StudioDep
+    kind: Literal["csv", "jsonl"], admin: CurrentAdministrator, session: ReadingSession, studio: StudioDep
 ) -> Response:
     """The whole log; as JSONL with what checks it elsewhere."""
-    _note(studio, session, owner, "audit log exported")
+    _note(studio, session, admin, "audit log exported")
 
     def lines(later: Session) -> Iterator[str]:
         """The request's own session is over by the time anything is sent."""
@@ -82,19 +82,19 @@ def download_audit(
 
 
 @router.get("/head.json", name="download_head")
-def download_head(owner: CurrentOwner, session: ReadingSession, studio: StudioDep) -> Response:
+def download_head(admin: CurrentAdministrator, session: ReadingSession, studio: StudioDep) -> Response:
     """The newest row's hash, signed: to be kept where nobody of this studio can change it."""
-    _note(studio, session, owner, "head of the audit log downloaded")
+    _note(studio, session, admin, "head of the audit log downloaded")
     head = audit.head(session)
     document = {"format": HEAD_FORMAT, "written_at": now().isoformat(), "row": head.row, "hash": head.hash}
     return _file(signing.load(studio.settings).signed(document), f"audit-head-{head.row}.json")
 
 
 @router.get("/proof", name="show_proof")
-def show_proof(request: Request, owner: CurrentOwner, session: ReadingSession, studio: StudioDep) -> Response:
+def show_proof(request: Request, admin: CurrentAdministrator, session: ReadingSession, studio: StudioDep) -> Response:
     """The head of the log, the key that signs, and what was erased, the newest first."""
     context = {
-        "experimenter": owner,
+        "experimenter": admin,
         "head": audit.head(session),
         "key": signing.load(studio.settings),
         "erasures": receipts.erasures(session, MOST_RECEIPTS),
@@ -105,15 +105,17 @@ def show_proof(request: Request, owner: CurrentOwner, session: ReadingSession, s
 
 
 @router.get("/receipts/{number}.json", name="download_receipt")
-def download_receipt(number: RowId, owner: CurrentOwner, session: ReadingSession, studio: StudioDep) -> Response:
+def download_receipt(
+    number: RowId, admin: CurrentAdministrator, session: ReadingSession, studio: StudioDep
+) -> Response:
     """One erasure with all its steps, signed; it says nothing of whom."""
     document = receipts.document(session, receipts.find(session, number))
-    _note(studio, session, owner, "receipt downloaded", f"receipt {number}")
+    _note(studio, session, admin, "receipt downloaded", f"receipt {number}")
     return _file(signing.load(studio.settings).signed(document), f"erasure-receipt-{number}.json")
 
 
-def _note(studio: Studio, session: Session, owner: Experimenter, action: str, subject: str = "all of it") -> None:
-    audit.note_reading(studio.database, session, owner.name, action, subject)
+def _note(studio: Studio, session: Session, admin: Experimenter, action: str, subject: str = "all of it") -> None:
+    audit.note_reading(studio.database, session, admin.name, action, subject)
 
 
 def _file(document: dict[str, Any], name: str) -> Response:

@@ -19,6 +19,7 @@ from app.services.accounts import roles
 from app.services.archives import study_import
 from app.services.archives.archive import ArchiveInvalid
 from app.services.archives.study_import import Imported
+from app.services.studies import membership
 from app.web.http import new_links
 from app.web.http.deps import CurrentExperimenter, Studio, StudioDep, experimenter_asking
 from app.web.http.new_links import NewLink
@@ -62,9 +63,7 @@ def show_import(request: Request, experimenter: CurrentExperimenter) -> Response
 async def _may_import(request: Request, studio: StudioDep) -> Experimenter:
     """Checked before a byte of the upload is read, and without a session that lasts as long as the upload."""
     async with studio.session_queue.reading() as session:
-        experimenter = await run_in_threadpool(experimenter_asking, request, session)
-    roles.require(experimenter, Role.EXPERIMENTER)
-    return experimenter
+        return await run_in_threadpool(experimenter_asking, request, session, account_needed=Role.EXPERIMENTER)
 
 
 @router.post("/import", name="import_study", max_body_size=LARGEST_ARCHIVE_BYTES)
@@ -82,7 +81,7 @@ async def import_study(
                 file, seal_key = form.get("file"), form.get("seal_key", "")
                 if not isinstance(file, UploadFile) or not isinstance(seal_key, str):
                     raise ArchiveInvalid
-                imported = await _bring_in(studio, file.file, seal_key[:LONGEST_SEAL_KEY], experimenter.name)
+                imported = await _bring_in(studio, file.file, seal_key[:LONGEST_SEAL_KEY], experimenter)
     except ClientDisconnect as error:
         raise UploadStalled from error
     except ArchiveInvalid as invalid:
@@ -100,10 +99,12 @@ async def import_study(
     return RedirectResponse(request.app.url_path_for("show_links", slug=slug, key=key), HTTPStatus.SEE_OTHER)
 
 
-async def _bring_in(studio: Studio, file: IO[bytes], seal_key: str, actor: str) -> Imported:
+async def _bring_in(studio: Studio, file: IO[bytes], seal_key: str, experimenter: Experimenter) -> Imported:
     unpacking = study_import.unpack(studio.store, file, seal_key)
     async with contextmanager_in_threadpool(unpacking) as unpacked, studio.session_queue.writing() as session:
-        return await run_in_threadpool(study_import.bring_in, session, studio.store, unpacked, actor)
+        imported = await run_in_threadpool(study_import.bring_in, session, studio.store, unpacked, experimenter.name)
+        membership.begin(session, imported.study, experimenter)
+    return imported
 
 
 def _require_room(request: Request) -> None:

@@ -72,6 +72,16 @@ def renew_link(
     return _see(request, "show_links", slug=slug, key=new_links.leave(session, experimenter.id, links))
 
 
+@router.post("/{slug}/participants/{code}/link/revoke", name="revoke_link")
+def revoke_link(
+    request: Request, slug: Slug, code: Code, experimenter: ActingExperimenter, session: WritingSession
+) -> Response:
+    """Switch a participant's link off, until there is a new one."""
+    study = studies.find_study(session, slug)
+    enrolment.revoke_link(session, study, enrolment.find_by_code(session, study, code), experimenter.name)
+    return _see(request, "show_participant", slug=slug, code=code)
+
+
 @router.get("/{slug}/links/{key}", name="show_links")
 def show_links(
     request: Request,

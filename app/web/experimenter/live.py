@@ -25,11 +25,16 @@ ASK_AGAIN_S = 5.0
 """How often a login is looked at while nothing is sent; before anything is sent it always is."""
 
 
-async def redrawn_parts(request: Request, studio: Studio, draw: Draw) -> AsyncIterator[ServerSentEvent]:
-    """An endless stream of what changed. Ends when the login or the page does, or the server stops."""
+async def redrawn_parts(
+    request: Request, studio: Studio, draw: Draw, whose: str = ""
+) -> AsyncIterator[ServerSentEvent]:
+    """An endless stream of what changed. Ends when the login, the right to look or the page does, or the server stops.
+
+    ``whose``: among whom the page is shared, where people see different things at one address.
+    """
     sent: Mapping[str, Pieces] = {}
     loop, asked_at_s = asyncio.get_running_loop(), 0.0
-    with studio.shared_pages.watching(f"{request.url.path}?{request.url.query}", draw) as screen:
+    with studio.shared_pages.watching(f"{whose}{request.url.path}?{request.url.query}", draw) as screen:
         while not studio.closing.is_set() and not screen.ended:
             drawn, parts = screen.drawn, screen.parts
             changes = list(_changes(sent, parts))

@@ -9,13 +9,13 @@ from fastapi import APIRouter, Form, Query, Request
 from fastapi.responses import RedirectResponse, Response
 from sqlalchemy.orm import Session
 
-from app.domain.people import Experimenter
+from app.domain.people import Experimenter, StudyRole
 from app.domain.protocol import Language
 from app.domain.studies import NAME_LENGTH, Study
 from app.installed_tasks import catalogue
 from app.services.accounts import browser_sessions
 from app.services.participants import enrolment
-from app.services.studies import locking, preregistration, studies
+from app.services.studies import locking, membership, preregistration, studies
 from app.services.studies.studies import ClipsTooLong
 from app.web.experimenter.study_form import study_form
 from app.web.experimenter.study_form.form_fields import FIELDS, SECTIONS
@@ -50,7 +50,7 @@ def show_new_study(
 ) -> Response:
     """The form, filled in with what usually works, with the paper's protocol, or with another study's settings."""
     if like:
-        source = studies.find_study(session, like)
+        source = _source(session, experimenter, like)
         return _form_page(request, experimenter, _form_like(source), own_task=_own_task(source))
     form = study_form.form_with_defaults(preset).model_copy(update={"preset": preset.value})
     return _form_page(request, experimenter, form)
@@ -61,19 +61,20 @@ def create_study(
     request: Request, form: TypedStudy, experimenter: ActingExperimenter, session: WritingSession
 ) -> Response:
     """Open the study, or show the form again: with what is wrong with it, or started from another preset."""
-    source = studies.find_study(session, form.like) if form.like else None
+    source = _source(session, experimenter, form.like) if form.like else None
     own_task = _own_task(source) if source else None
     if form.switch_to in set(Preset):
         started = study_form.with_preset(form, Preset(form.switch_to))
         return _form_page(request, experimenter, started, own_task=own_task)
     try:
         typed = study_form.typed_study(form, own_task)
-        _check_name(session, form, typed.name)
+        _check_name(session, experimenter, form, typed.name)
     except FormInvalid as invalid:
         return _form_page(request, experimenter, form, errors=invalid.errors, own_task=own_task)
     study = studies.create_study(
         session, typed.name, typed.settings, seed=typed.seed, actor=experimenter.name, task=typed.task
     )
+    membership.begin(session, study, experimenter)
     if source is not None:
         studies.copy_material(session, source, study)
     return _see(request, "show_study", slug=study.slug)
@@ -108,7 +109,7 @@ def change_settings(
     form = _with_fixed(session, study, form)
     try:
         typed = study_form.typed_study(form, study.task)
-        _check_name(session, form, typed.name, study)
+        _check_name(session, experimenter, form, typed.name, study)
         locking.change(
             session,
             studio.store,
@@ -211,10 +212,19 @@ def _own_task(source: Study) -> str | None:
     return None if source.material is None else source.task
 
 
-def _check_name(session: Session, form: StudyForm, name: str, study: Study | None = None) -> None:
+def _source(session: Session, experimenter: Experimenter, slug: str) -> Study:
+    """The study that is copied with its clips: by those who edit it. Raises StudyNotFound and StudyRoleTooLow."""
+    membership.enter(session, experimenter, slug, StudyRole.EDITOR)
+    return studies.find_study(session, slug)
+
+
+def _check_name(
+    session: Session, experimenter: Experimenter, form: StudyForm, name: str, study: Study | None = None
+) -> None:
     """Two studies of one name are told apart by their addresses only. Raises FormInvalid until that is meant."""
     unchanged = study is not None and study.name == name
-    if not unchanged and form.same_name != "yes" and studies.others_named(session, name, study):
+    theirs = membership.visible_to(experimenter)
+    if not unchanged and form.same_name != "yes" and studies.others_named(session, name, theirs, study):
         raise FormInvalid({"name": "Another study has this name. Change it, or say below that it is meant."})
 
 

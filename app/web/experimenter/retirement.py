@@ -8,12 +8,19 @@ from fastapi.responses import RedirectResponse, Response
 from sqlalchemy.orm import Session
 from starlette.background import BackgroundTask
 
-from app.domain.people import Experimenter, Role
+from app.domain.people import Experimenter
 from app.domain.studies import Study
-from app.services.accounts import roles
 from app.services.exports import export_rows
 from app.services.studies import retirement, studies
-from app.web.http.deps import ActingExperimenter, CurrentExperimenter, ReadingSession, Slug, StudioDep, WritingSession
+from app.web.http.deps import (
+    ActingExperimenter,
+    CurrentExperimenter,
+    ReadingSession,
+    Slug,
+    StudioDep,
+    StudyOwner,
+    WritingSession,
+)
 from app.web.texts.templating import page
 
 router = APIRouter(prefix="/studies/{slug}")
@@ -44,12 +51,11 @@ def delete_study(
     request: Request,
     slug: Slug,
     typed: Annotated[str, Form(max_length=200)],
-    experimenter: ActingExperimenter,
+    experimenter: StudyOwner,
     session: WritingSession,
     studio: StudioDep,
 ) -> Response:
     """Erase the study and everybody in it, when an owner has typed its short name."""
-    roles.require(experimenter, Role.OWNER)
     study = studies.find_study(session, slug)
     try:
         retirement.delete(session, studio.store, study, typed, experimenter.name)
@@ -72,7 +78,7 @@ def _page(
         "study": study,
         "experimenter": experimenter,
         "people": len(export_rows.everybody(session, study)),
-        "may_delete": roles.may(experimenter, Role.OWNER),
+        "may_delete": request.state.may_manage,
         "error": error,
     }
     return page(request, "experimenter/put_away.html", context, status)

@@ -12,12 +12,13 @@ from fastapi.sse import EventSourceResponse, ServerSentEvent
 from jinja2 import Environment
 from sqlalchemy.orm import Session
 
-from app.domain.people import Experimenter
+from app.domain.people import Experimenter, Role
+from app.domain.studies import Study
 from app.services import audit
 from app.services.monitoring import dashboard, form_summaries, study_state
 from app.services.participants import debrief, enrolment
 from app.services.runs import publishing
-from app.services.studies import studies
+from app.services.studies import membership, studies
 from app.web.experimenter import charts, form_words, live
 from app.web.experimenter.participants_table import View, WantedView, people_table
 from app.web.http import stored_file
@@ -59,13 +60,13 @@ PARTICIPANT_PARTS = {
 """What is drawn anew while a page is open: by its name in data-fragment, the template of the experimenter's side."""
 
 
-def _may_stream(request: Request, studio: StudioDep) -> None:
-    """Checks the login before a stream begins, and holds no session while it lasts."""
+def _may_stream(request: Request, studio: StudioDep) -> Experimenter:
+    """Checks login and membership before a stream begins, and holds no session while it lasts."""
     with studio.database.reading() as session:
-        experimenter_asking(request, session)
+        return experimenter_asking(request, session)
 
 
-MayStream = Annotated[None, Depends(_may_stream)]
+MayStream = Annotated[Experimenter, Depends(_may_stream)]
 
 
 @router.get("", name="show_studies")
@@ -77,21 +78,25 @@ def show_studies(
     put_away: bool = False,
 ) -> Response:
     """Every study that is at work, or those that are put away."""
-    context = _list_context(session, studio, put_away) | {"experimenter": experimenter, "parts": LIST_PARTS}
+    context = _list_context(session, studio, experimenter, put_away) | {
+        "experimenter": experimenter,
+        "parts": LIST_PARTS,
+    }
     return page(request, "experimenter/studies.html", context)
 
 
 @router.get("/live", name="stream_studies", response_class=EventSourceResponse)
 async def stream_studies(
-    request: Request, studio: StudioDep, _allowed: MayStream, put_away: bool = False
+    request: Request, studio: StudioDep, experimenter: MayStream, put_away: bool = False
 ) -> AsyncIterator[ServerSentEvent]:
-    """The list of studies as it changes."""
-    templates = request.app.state.templates  # and nothing else of the request: what is drawn is for all who look
+    """The list of studies as it changes: one for all administrators, one for each of the others."""
+    templates = request.app.state.templates
+    whose = "" if experimenter.role == Role.ADMINISTRATOR else f"{experimenter.id} "
 
     def draw(session: Session) -> Mapping[str, str]:
-        return _draw(templates, LIST_PARTS, _list_context(session, studio, put_away))
+        return _draw(templates, LIST_PARTS, _list_context(session, studio, experimenter, put_away))
 
-    async for event in live.redrawn_parts(request, studio, draw):
+    async for event in live.redrawn_parts(request, studio, draw, whose):
         yield event
 
 
@@ -195,16 +200,18 @@ def _note_streaming(request: Request, studio: Studio, slug: str, code: str) -> N
         _note_looking(studio, session, experimenter_asking(request, session), slug, code)
 
 
-def _list_context(session: Session, studio: Studio, put_away: bool) -> dict[str, Any]:
-    lines = dashboard.study_lines(session, put_away=put_away)
+def _list_context(session: Session, studio: Studio, experimenter: Experimenter, put_away: bool) -> dict[str, Any]:
+    """What the list shows to whoever may see the same studies."""
+    theirs = membership.visible_to(experimenter)
+    lines = dashboard.study_lines(session, theirs, put_away=put_away)
     names = Counter(line.study.name.casefold() for line in lines)
     return {
-        "machine": dashboard.machine(session, studio.settings.data_dir, studio.store),
+        "machine": dashboard.machine(session, studio.settings.data_dir, studio.store, theirs),
         "lines": lines,
         "standings": study_state.standings(session, lines),
         "twice": {line.study.id for line in lines if names[line.study.name.casefold()] > 1},
         "put_away": put_away,
-        "put_away_count": studies.count_put_away(session),
+        "put_away_count": studies.count_put_away(session, theirs),
     }
 
 
@@ -216,7 +223,7 @@ def _study_context(session: Session, studio: Studio, slug: str, view: View) -> d
         "settings": study.settings,
         "overview": overview,
         "table": people_table(overview, view),
-        "machine": dashboard.machine(session, studio.settings.data_dir, studio.store),
+        "machine": dashboard.machine(session, studio.settings.data_dir, studio.store, Study.id == study.id),
         "sparkline": charts.sparkline,
         "scripted": enrolment.count_scripted(session, study),
     }
@@ -231,7 +238,7 @@ def _participant_context(session: Session, studio: Studio, slug: str, code: str)
         "settings": study.settings,
         "detail": detail,
         "films": debrief.before_and_after(session, participant),
-        "machine": dashboard.machine(session, studio.settings.data_dir, studio.store),
+        "machine": dashboard.machine(session, studio.settings.data_dir, studio.store, Study.id == study.id),
         "chart": charts.accuracy_chart(detail.row.curve, study.settings.labels_per_participant),
         "interval": charts.interval,
         "words": task_words.words_of(study.task),

@@ -12,13 +12,15 @@ from fastapi.concurrency import run_in_threadpool
 from sqlalchemy.orm import Session
 
 from app.db import Database
-from app.domain.people import Experimenter, Role
+from app.domain.people import Experimenter, Role, StudyRole
 from app.domain.studies import Participant
 from app.errors import AppError
-from app.services.accounts import browser_sessions, roles
+from app.services.accounts import browser_sessions, roles, second_factor
 from app.services.accounts.failed_logins import FailedLogins
+from app.services.accounts.openid import Provider
 from app.services.monitoring.tallies import Tallies
 from app.services.participants.time_left import UsualTimes
+from app.services.studies import membership
 from app.settings import Settings
 from app.storage import ArtefactStore
 from app.web.http.hashing import Hashing
@@ -60,6 +62,12 @@ class PasswordChangeDue(AppError):
     status = HTTPStatus.FORBIDDEN
 
 
+class SecondFactorNeeded(AppError):
+    """This studio asks for a second factor. Please set it up first."""
+
+    status = HTTPStatus.FORBIDDEN
+
+
 @dataclass(frozen=True)
 class Studio:
     """The parts that every request shares."""
@@ -71,6 +79,8 @@ class Studio:
     session_queue: SessionQueue
     login_attempts: LoginAttempts
     shared_pages: SharedPages
+    provider: Provider | None
+    """Where experimenters can log in instead of here."""
     token_attempts: LoginAttempts
     """Of their own: a program with an old token must not lock out the people who log in from the same address."""
     hashing: Hashing = field(default_factory=Hashing)
@@ -141,8 +151,36 @@ class Answering:
         )
 
 
-def experimenter_asking(request: Request, session: Session) -> Experimenter:
-    """The experimenter who is logged in, password changed. Raises LoginNeeded and PasswordChangeDue."""
+def experimenter_asking(
+    request: Request, session: Session, needed: StudyRole = StudyRole.VIEWER, account_needed: Role = Role.READER
+) -> Experimenter:
+    """The experimenter who is logged in, password changed, and whose the study of this address is, if it has one.
+
+    There is no other way to an experimenter, so no page can forget to ask. Raises LoginNeeded, PasswordChangeDue,
+    SecondFactorNeeded, StudyNotFound, RoleTooLow and StudyRoleTooLow.
+    """
+    experimenter = experimenter_with_own_password(request, session)
+    if lacks_second_factor(request.app.state.studio.settings, experimenter):
+        raise SecondFactorNeeded
+    slug = request.path_params.get("slug")
+    if slug is None:
+        roles.require(experimenter, account_needed)
+        request.state.may_change = roles.may(experimenter, Role.EXPERIMENTER)
+    else:
+        role = membership.enter(session, experimenter, slug, needed)
+        request.state.may_change = membership.is_at_least(role, StudyRole.EDITOR)
+        request.state.may_manage = membership.is_at_least(role, StudyRole.OWNER)
+    return experimenter
+
+
+def lacks_second_factor(settings: Settings, experimenter: Experimenter) -> bool:
+    """Whether this installation asks for a second factor that the account does not have."""
+    theirs = second_factor.is_on(experimenter) or experimenter.oidc_subject is not None  # the provider asks for it
+    return settings.require_second_factor and not theirs
+
+
+def experimenter_with_own_password(request: Request, session: Session) -> Experimenter:
+    """The experimenter who is logged in, perhaps without a second factor. Raises LoginNeeded and PasswordChangeDue."""
     experimenter = experimenter_logged_in(request, session)
     if experimenter.must_change_password:
         raise PasswordChangeDue
@@ -172,15 +210,18 @@ def _experimenter(request: Request, session: ReadingSession) -> Experimenter:
     return experimenter_asking(request, session)
 
 
-def _owner(request: Request, session: ReadingSession) -> Experimenter:
-    experimenter = experimenter_asking(request, session)
-    roles.require(experimenter, Role.OWNER)
-    return experimenter
+def _administrator(request: Request, session: ReadingSession) -> Experimenter:
+    return experimenter_asking(request, session, account_needed=Role.ADMINISTRATOR)
 
 
-async def _owner_briefly(request: Request, studio: StudioDep) -> Experimenter:
+async def _administrator_briefly(request: Request, studio: StudioDep) -> Experimenter:
     async with studio.session_queue.reading() as session:
-        return await run_in_threadpool(_owner, request, session)
+        return await run_in_threadpool(_administrator, request, session)
+
+
+async def _account_briefly(request: Request, studio: StudioDep) -> Experimenter:
+    async with studio.session_queue.reading() as session:
+        return await run_in_threadpool(experimenter_with_own_password, request, session)
 
 
 async def _logged_in_briefly(request: Request, studio: StudioDep) -> Experimenter:
@@ -189,9 +230,11 @@ async def _logged_in_briefly(request: Request, studio: StudioDep) -> Experimente
 
 
 def _acting_experimenter(request: Request, session: WritingSession) -> Experimenter:
-    experimenter = experimenter_asking(request, session)
-    roles.require(experimenter, Role.EXPERIMENTER)
-    return experimenter
+    return experimenter_asking(request, session, StudyRole.EDITOR, Role.EXPERIMENTER)
+
+
+def _study_owner(request: Request, session: WritingSession) -> Experimenter:
+    return experimenter_asking(request, session, StudyRole.OWNER, Role.ADMINISTRATOR)
 
 
 def _own_account(request: Request, session: WritingSession) -> Experimenter:
@@ -203,12 +246,18 @@ CurrentParticipant = Annotated[Participant, Depends(_participant, scope="functio
 AnsweringParticipant = Annotated[Answering, Depends(_answering)]
 """For what participants do with every pair. Raises LinkNeeded for a browser without a cookie."""
 CurrentExperimenter = Annotated[Experimenter, Depends(_experimenter, scope="function")]
-"""Whoever is logged in, readers included: for looking."""
+"""Whoever is logged in, readers included; a member of the study that the address names: for looking."""
 ActingExperimenter = Annotated[Experimenter, Depends(_acting_experimenter, scope="function")]
-"""In the request's writing session; at least an experimenter: for whatever changes something or leaves the studio."""
-CurrentOwner = Annotated[Experimenter, Depends(_owner, scope="function")]
-OwnerBriefly = Annotated[Experimenter, Depends(_owner_briefly)]
-"""Like CurrentOwner, and no turn is held when the route begins: for what hashes a password."""
+"""In the request's writing session; an editor of the study, or where there is none an experimenter.
+
+For whatever changes something or leaves the studio."""
+StudyOwner = Annotated[Experimenter, Depends(_study_owner, scope="function")]
+"""In the request's writing session; an owner of the study that the address names."""
+CurrentAdministrator = Annotated[Experimenter, Depends(_administrator, scope="function")]
+AdministratorBriefly = Annotated[Experimenter, Depends(_administrator_briefly)]
+"""Like CurrentAdministrator, and no turn is held when the route begins: for what hashes a password."""
+AccountBriefly = Annotated[Experimenter, Depends(_account_briefly)]
+"""Whoever is logged in with a password of their own, a second factor may be missing; no turn is held either."""
 LoggedInBriefly = Annotated[Experimenter, Depends(_logged_in_briefly)]
 """Whoever is logged in, a one-time password is enough; no turn is held either."""
 OwnAccount = Annotated[Experimenter, Depends(_own_account, scope="function")]

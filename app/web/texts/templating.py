@@ -115,8 +115,9 @@ def task_title(task: str) -> str:
 
 
 def page(request: Request, template: str, context: Mapping[str, Any], status: int = 200) -> HTMLResponse:
-    """A whole page."""
-    return HTMLResponse(fragment(request, template, context), status)
+    """A whole page; ``may_change``: what changes something is offered to whoever asks for it."""
+    may_change = getattr(request.state, "may_change", True)
+    return HTMLResponse(fragment(request, template, {"may_change": may_change, **context}), status)
 
 
 def fragment(request: Request, template: str, context: Mapping[str, Any]) -> str:
