@@ -30,7 +30,7 @@ from uuid import uuid4
 from app.__main__ import migrate
 from app.db import Database
 from app.domain.people import Experimenter
-from app.programs import end_with_parent
+from app.programs import NICENESS, end_with_parent
 from app.services.accounts import browser_sessions
 from app.settings import Settings
 from app.storage import ArtefactStore
@@ -252,14 +252,19 @@ async def _look(address: str, cookie: str) -> None:
 
 @contextmanager
 def _program(settings: Settings, *command: str, **environment: str) -> Iterator["subprocess.Popen[bytes]"]:
-    """One of the studio's programs, as they are started side by side; its log goes nowhere."""
+    """One of the studio's programs, at the priority that it has beside the others; its log goes nowhere."""
+
+    def begin() -> None:
+        end_with_parent()
+        os.nice(NICENESS.get(command[0], 0))
+
     program = subprocess.Popen(
         [sys.executable, "-m", *command],
         env={**os.environ, "DATA_DIR": str(settings.data_dir), "DATABASE_URL": settings.sqlalchemy_url, **environment},
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         start_new_session=True,
-        preexec_fn=end_with_parent,
+        preexec_fn=begin,
     )
     try:
         yield program
