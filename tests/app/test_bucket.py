@@ -180,6 +180,7 @@ class TestOnline:
         video = taking_part.browser.get(f"/media/{clip.video_sha256}.mp4")
         assert video.status_code == 503
         assert "Nothing that was answered is lost" in video.text
+        assert taking_part.turn().json()["pair"]["query_id"] == query.id
         said = taking_part.answer(query)
         assert said.json()["pair"]["query_id"] != query.id, "and the next pair is there as well"
         with database.reading() as session:
