@@ -9,7 +9,7 @@ VENV := .venv
 PY := $(VENV)/bin/python
 PIP := $(PY) -m pip --disable-pip-version-check --quiet
 
-.PHONY: help run link demo rehearse test lint types contracts pytest pytest-postgresql pytest-s3 validate browser postgresql migrate reset-password benchmark clean
+.PHONY: help run link demo rehearse test lint types contracts pytest pytest-postgresql pytest-s3 test-long validate browser postgresql migrate reset-password benchmark clean
 
 help: ## List the commands
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-16s %s\n", $$1, $$2}'
@@ -56,9 +56,12 @@ pytest-postgresql: $(VENV)/dev.stamp postgresql ## Tests that use a database, on
 pytest-s3: $(VENV)/dev.stamp ## Tests of stored files, on an S3-compatible server (ARGS="tests/app -n 2": others)
 	OMP_NUM_THREADS=1 $(PY) -m tests.on_s3 $(ARGS)
 
+test-long: $(VENV)/dev.stamp ## Tests that are too long for continuous integration
+	OMP_NUM_THREADS=1 $(PY) -m pytest -n 2 --dist loadfile -m long
+
 validate: $(VENV)/dev.stamp browser ## Run the suite and write build/validation.html: what is promised, and what was shown
 	@mkdir -p build
-	-OMP_NUM_THREADS=1 $(PY) -m pytest -n 3 --dist loadfile --no-loadscope-reorder --junitxml=build/validation.xml
+	-OMP_NUM_THREADS=1 $(PY) -m pytest -n 3 --dist loadfile --no-loadscope-reorder -m "" --junitxml=build/validation.xml
 	$(PY) -m tests.validation build/validation.xml build/validation.html
 
 postgresql: ## PostgreSQL for the tests (Debian package)

@@ -119,7 +119,7 @@ def test_new_links_and_their_sheet_shut_nobody_out(page: Page) -> None:
         page.wait_for_load_state()
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("scheme", [pytest.param("light", marks=pytest.mark.long), "dark"])
 def test_no_page_shuts_anybody_out(page: Page, scheme: str) -> None:
     page.emulate_media(color_scheme="dark" if scheme == "dark" else "light")
     for path in (

@@ -89,6 +89,7 @@ def test_a_cell_run_again_gives_the_same_numbers(work: Path, tmp_path: Path) -> 
     assert (tmp_path / "before" / "table1.csv").read_text() == (tmp_path / "after" / "table1.csv").read_text()
 
 
+@pytest.mark.long
 def test_an_interrupted_benchmark_runs_what_is_missing_and_nothing_else(work: Path, tmp_path: Path) -> None:
     cells = Selection(["pbarl_n1"], ["feeding"], [SHY]).cells()
     assert [cell.method for cell in cells] == ["reference", "pbarl_n1"]

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from worker.compute import simulation
 from worker.experiments import fit_response_surface
@@ -32,6 +33,7 @@ def test_modes_that_people_want_lie_at_the_edges_where_random_modes_are_rare(tmp
     assert near_an_edge(wanted) > 3 * near_an_edge(random)
 
 
+@pytest.mark.long
 def test_every_round_seeks_anew_and_the_same_again_when_repeated(tmp_path: Path) -> None:
     first, again, second = sought(0, tmp_path), sought(0, tmp_path), sought(1, tmp_path)
     assert all(np.array_equal(one.modes, other.modes) for one, other in zip(first, again, strict=True))

@@ -39,6 +39,7 @@ def fitting(context: WorkerContext) -> FilterFit:
     )
 
 
+@pytest.mark.long
 def test_they_are_those_a_filter_would_make_for_itself(context: WorkerContext) -> None:
     evaluation = reference_blocks("feeding", SETTINGS)[-1]
     own = fitting(context).reference(evaluation)

@@ -84,12 +84,16 @@ def stops(process: Worker, number: int = signal.SIGTERM) -> bool:
     return until(lambda: all(gone(pid) for pid in computing))
 
 
+@pytest.mark.long
 def test_while_it_starts(worker: Worker, settings: Settings) -> None:
     assert until((settings.data_dir / "worker-1.lock").exists)  # and now it loads what it needs
     assert stops(worker)
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
+OTHER_SIGNALS = [pytest.param(number, marks=pytest.mark.long) for number in (signal.SIGINT, signal.SIGHUP)]
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, *OTHER_SIGNALS])
 def test_while_it_films(worker: Worker, database: Database, number: int) -> None:
     assert until(lambda: is_filming(database))
     assert stops(worker, number)
@@ -120,7 +124,7 @@ def test_while_what_forks_its_compute_processes_is_killed(worker: Worker, databa
     assert stops(worker)
 
 
-@pytest.mark.parametrize("file", ["studio.sqlite3", "engine.sqlite3"])
+@pytest.mark.parametrize("file", ["studio.sqlite3", pytest.param("engine.sqlite3", marks=pytest.mark.long)])
 def test_while_somebody_else_has_locked_its_files(
     worker: Worker, database: Database, settings: Settings, file: str
 ) -> None:

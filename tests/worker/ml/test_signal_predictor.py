@@ -161,6 +161,7 @@ def test_a_study_s_reward_model_is_fitted_without_sensors() -> None:
     assert set(metrics["weights"]) == set(SIGNALS)
 
 
+@pytest.mark.long
 def test_the_command_keeps_its_rollouts_and_says_how_well_signals_are_foreseen(tmp_path: Path) -> None:
     target = tmp_path / "predictor.safetensors"
     record = train_signal_predictor.foresee(

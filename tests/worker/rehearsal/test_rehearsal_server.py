@@ -72,6 +72,7 @@ def test_a_signal_that_ends_the_command_ends_its_web_server_and_its_worker(
     assert until(lambda: programs_in(tmp_path) == {})
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("command", [rehearsal], indirect=True)
 def test_a_rehearsal_that_is_told_to_stop_takes_its_studio_along(
