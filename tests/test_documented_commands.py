@@ -280,7 +280,13 @@ def test_a_program_takes_what_it_is_told(command: str, monkeypatch: pytest.Monke
             assert run(program, arguments, monkeypatch) == 0, "no more than --help"
 
 
-@pytest.mark.parametrize("program", [name for name, small in RUN.items() if isinstance(small, str)])
+SMALL = [name for name, small in RUN.items() if isinstance(small, str)]
+BENCHMARKS = {name for name in SMALL if not name.startswith(("app ", "worker "))}
+
+
+@pytest.mark.parametrize(
+    "program", [pytest.param(name, marks=[pytest.mark.long] if name in BENCHMARKS else []) for name in SMALL]
+)
 def test_a_program_runs(program: str, directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     small = RUN[program]
     assert isinstance(small, str)
