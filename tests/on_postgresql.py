@@ -19,7 +19,7 @@ import psycopg
 from tests.waiting import until
 
 WRITING = ("answer_pair", "archive", "draw_evaluation", "many_servers", "rate_robots", "undo_answer", "withdraw")
-READING = ("api_pages", "audit_chain", "export_data", "private_and_plain", "upgrading", "watch_database")
+READING = ("api_pages", "audit_chain", "watch_database")
 USUAL = (
     *(f"tests/app/test_{name}.py" for name in (*WRITING, *READING, "writing_sessions")),
     "tests/worker/jobs/test_erasure.py",

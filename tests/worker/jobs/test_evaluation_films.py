@@ -93,6 +93,7 @@ def names(jobs: list[Job]) -> list[str]:
     return ["/".join(job.key.split("/")[:3]) for job in jobs]
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.usefixtures("all_said")
 def test_after_the_last_label_every_method_is_trained_evaluated_and_filmed(

@@ -114,6 +114,7 @@ def test_while_its_compute_processes_are_killed(worker: Worker, database: Databa
     assert stops(worker)
 
 
+@pytest.mark.long
 def test_while_what_forks_its_compute_processes_is_killed(worker: Worker, database: Database) -> None:
     assert until(lambda: is_filming(database) and len(compute_processes(worker.pid)) > 0)
     (server,) = fork_servers(worker.pid)

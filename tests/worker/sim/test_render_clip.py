@@ -115,6 +115,7 @@ def test_rendering_twice_gives_identical_bytes(renderer: ClipRenderer) -> None:
     assert renderer.render_clip(trajectory, 0, 5) == first
 
 
+@pytest.mark.long
 def test_nothing_of_other_clips_remains(renderer: ClipRenderer) -> None:
     trajectories = [
         waving_trajectory(2, body="slim", skin_tone=4),
