@@ -36,6 +36,8 @@ from app.errors import OncePerMinute
 
 BUSY_TIMEOUT_S = 15
 SAME_TIME = timedelta(seconds=1)
+USUAL_LOG_PAGES, LONGEST_LOG_PAGES = 1000, 20_000
+"""Of SQLite's write-ahead log, before a commit copies them into the database: as usual, and where others do it first."""
 WRITING, NAMES, AUDITING = 1_347_310_157, 1_347_310_158, 1_347_310_159
 """Advisory locks of PostgreSQL: of whoever writes, of names, of the audit log. Numbers that no other program uses."""
 
@@ -114,11 +116,13 @@ def now() -> datetime:
 class Database:
     """Sessions on one database. Use as ``with database.writing() as session`` or ``reading()``."""
 
-    def __init__(self, url: str) -> None:
+    def __init__(self, url: str, *, keeps_log_short: bool = False) -> None:
+        """``keeps_log_short``: whoever opens it calls keep_log_short() now and then, so no commit needs to."""
         self.url = url
         self.is_sqlite = url.startswith("sqlite")
         if self.is_sqlite:
-            self.writer, self.reader = _sqlite(url, "BEGIN IMMEDIATE"), _sqlite(url, "BEGIN")
+            pages = LONGEST_LOG_PAGES if keeps_log_short else USUAL_LOG_PAGES
+            self.writer, self.reader = _sqlite(url, "BEGIN IMMEDIATE", pages), _sqlite(url, "BEGIN", pages)
         else:
             from app import postgresql  # its driver takes a tenth of a second to load
 
@@ -152,6 +156,15 @@ class Database:
         """One consistent snapshot; what is changed in it is not kept."""
         with self._read() as session:
             yield session
+
+    def keep_log_short(self) -> None:
+        """Copy SQLite's write-ahead log into the database as far as nobody reads it, in nobody's way.
+
+        A commit that has to do so takes a quarter of a second on a slow disk.
+        """
+        if (path := file_of(self.url)) is not None:
+            with closing(sqlite3.connect(path, isolation_level=None)) as connection, suppress(sqlite3.OperationalError):
+                connection.execute("PRAGMA wal_checkpoint(PASSIVE)")
 
     def forget_erased(self) -> bool:
         """Let no byte of erased rows stay in the database's files; False when it was too busy and must be asked again.
@@ -275,7 +288,7 @@ def copy(path: Path, target: Path) -> None:
         os.fsync(stream.fileno())
 
 
-def _sqlite(url: str, begin: str) -> Engine:
+def _sqlite(url: str, begin: str, log_pages: int) -> Engine:
     engine = create_engine(url, connect_args={"timeout": BUSY_TIMEOUT_S, "check_same_thread": False})
 
     @event.listens_for(engine, "connect")
@@ -283,6 +296,7 @@ def _sqlite(url: str, begin: str) -> Engine:
         connection.isolation_level = None  # the driver must not begin transactions of its own
         for pragma in ("journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON", "mmap_size=0"):
             connection.execute(f"PRAGMA {pragma}")
+        connection.execute(f"PRAGMA wal_autocheckpoint={log_pages}")
 
     @event.listens_for(engine, "begin")
     def start(connection: Any) -> None:

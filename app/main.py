@@ -42,7 +42,7 @@ from app.web.experimenter import (
     translations,
 )
 from app.web.http.addresses import QuickAddresses
-from app.web.http.counting_ahead import count_ahead
+from app.web.http.asides import count_ahead, keep_log_short
 from app.web.http.deps import Studio, StudioDep
 from app.web.http.rate_limit import SharedAttempts
 from app.web.http.readiness import Readiness
@@ -107,7 +107,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
 
 def make_studio(settings: Settings) -> Studio:
     """What every request shares."""
-    database = Database(settings.sqlalchemy_url)
+    database = Database(settings.sqlalchemy_url, keeps_log_short=True)
     return Studio(
         settings=settings,
         database=database,
@@ -139,9 +139,9 @@ def create_routes(https: bool) -> FastAPI:
             live.closing_on_signals(studio.closing),
             alerts.watching(studio.settings, studio.database, studio.store),
         ):
-            counting = asyncio.create_task(count_ahead(studio))
+            aside = asyncio.gather(count_ahead(studio), keep_log_short(studio))
             yield
-        await counting
+        await aside
         studio.hashing.close()
         studio.hashing_for_known.close()
         studio.database.dispose()

@@ -104,7 +104,7 @@ class _Program:
             errors="replace",
             bufsize=1,
             env={**os.environ, "PYTHONUNBUFFERED": "1"},
-            start_new_session=True,
+            process_group=0,
             preexec_fn=self._begin,
         )
 

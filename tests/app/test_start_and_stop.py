@@ -105,8 +105,10 @@ def test_the_first_start_prints_all_that_is_needed(running: Studio) -> None:
 
 
 def test_whoever_waits_for_a_page_goes_before_the_worker(running: Studio) -> None:
-    web, worker = (os.getpriority(os.PRIO_PROCESS, running.child(name)) for name in ("app\0web", "worker\0run"))
-    assert web < worker
+    web, worker = (running.child(name) for name in ("app\0web", "worker\0run"))
+    assert os.getpriority(os.PRIO_PROCESS, web) < os.getpriority(os.PRIO_PROCESS, worker)
+    assert os.getsid(web) == os.getsid(worker), "Linux compares priorities within a session only (autogroups)"
+    assert len({os.getpgid(each) for each in (web, worker, running.process.pid)}) == 3, "Ctrl-C reaches one of them"
 
 
 def test_ctrl_c_stops_both_programs(start: Start) -> None:

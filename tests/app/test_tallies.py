@@ -11,7 +11,7 @@ from app.domain.models import ModelKind
 from app.domain.preferences import Query, Response
 from app.domain.studies import Participant, Study
 from app.services.monitoring import dashboard
-from app.services.monitoring.tallies import Tallies
+from app.services.monitoring.tallies import AT_ONCE, Tallies
 from app.services.participants import withdrawal
 from app.storage import ArtefactStore
 from tests import factories
@@ -93,3 +93,17 @@ def test_who_has_not_gone_on_costs_no_reading_of_answers(
     with database.reading() as session:
         rows(session, session.get_one(Study, study.id), tallies)
     assert not [each for each in statements if "response_time_ms" in each]
+
+
+def test_counting_without_hurry_counts_the_same(database: Database, store: ArtefactStore, study: Study) -> None:
+    tallies = Tallies()
+    with database.writing() as session:
+        for _ in range(AT_ONCE + 3):
+            person, _ = factories.make_participant(session, study)
+            factories.make_label(session, factories.make_queries(session, store, person, 1)[0])
+        assert rows(session, study, tallies.unhurried()) == rows(session, study, Tallies())
+    statements = list[str]()
+    event.listen(database.reader, "before_cursor_execute", lambda *given: statements.append(given[2]))
+    with database.reading() as session:
+        rows(session, session.get_one(Study, study.id), tallies)
+    assert not [each for each in statements if "response_time_ms" in each], "both know what either has counted"

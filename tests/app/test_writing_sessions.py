@@ -3,10 +3,10 @@
 from collections.abc import Iterator
 
 import pytest
-from sqlalchemy import select
+from sqlalchemy import select, text
 from sqlalchemy.exc import OperationalError
 
-from app.db import Database
+from app.db import Database, file_of
 from app.settings import Settings
 from tests import databases
 
@@ -58,3 +58,20 @@ def test_a_name_is_claimed_by_one_at_a_time(database: Database, settings: Settin
     with other.claiming("worker-1") as again:
         assert again
     other.dispose()
+
+
+@pytest.mark.sqlite("about its write-ahead log")
+def test_no_commit_copies_the_log_while_somebody_else_keeps_it_short(database: Database) -> None:
+    path = file_of(database.url)
+    assert path is not None
+    served = Database(database.url, keeps_log_short=True)
+    before = path.stat().st_size
+    with served.writing() as session:
+        session.execute(text("CREATE TABLE filler (content BLOB)"))
+    for _ in range(3):
+        with served.writing() as session:
+            session.execute(text("INSERT INTO filler VALUES (zeroblob(4000000))"))
+    assert path.stat().st_size == before
+    served.keep_log_short()
+    assert path.stat().st_size > before + 12_000_000
+    served.dispose()

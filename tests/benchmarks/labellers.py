@@ -263,7 +263,7 @@ def _program(settings: Settings, *command: str, **environment: str) -> Iterator[
         env={**os.environ, "DATA_DIR": str(settings.data_dir), "DATABASE_URL": settings.sqlalchemy_url, **environment},
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
-        start_new_session=True,
+        process_group=0,
         preexec_fn=begin,
     )
     try:

@@ -5,8 +5,10 @@ newest of them, tell whether what was counted still holds. Reading 20 000 answer
 has new ones 15 ms; so what was read is kept, and only what is new is read.
 """
 
+import time
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from threading import Lock
 from typing import NamedTuple
@@ -27,6 +29,10 @@ MOST_REMEMBERED = 300
 """People whose answers are kept in memory, about 100 kB each."""
 MOST_NEWS = 10
 """Answers of one person that are read one by one; of more, all of theirs are read."""
+AT_ONCE = 10
+"""People that are counted between two rests."""
+REST = 4.0
+"""Times as long as that took of a processor."""
 
 
 class Watermark(NamedTuple):
@@ -67,6 +73,13 @@ class Tallies:
     def __init__(self) -> None:
         self._lock = Lock()
         self._known: dict[int, _Known] = {}
+        self._rest = 0.0
+
+    def unhurried(self) -> "Tallies":
+        """The same counts, for whoever can wait: made in small portions, so that others get on meanwhile."""
+        unhurried = copy(self)
+        unhurried._rest = REST
+        return unhurried
 
     def of(self, session: Session, participant_ids: Sequence[int]) -> dict[int, Tally]:
         """The tally of each of these participants."""
@@ -74,11 +87,14 @@ class Tallies:
         with self._lock:
             known = {each: self._known[each] for each in participant_ids if each in self._known}
         stale = [each for each in participant_ids if each not in known or known[each].mark != marks[each]]
-        if stale:
-            fresh = _count(session, {each: marks[each] for each in stale}, known)
+        portion = AT_ONCE if self._rest else max(1, len(stale))
+        for first in range(0, len(stale), portion):
+            started_s = time.thread_time()
+            fresh = _count(session, {each: marks[each] for each in stale[first : first + portion]}, known)
             known |= fresh
             with self._lock:
                 self._keep(fresh)
+            time.sleep(self._rest * (time.thread_time() - started_s))
         return {each: known[each].tally for each in participant_ids}
 
     def _keep(self, fresh: Mapping[int, _Known]) -> None:

@@ -16,6 +16,7 @@ from app.domain.people import Experimenter, Role
 from app.domain.studies import Study
 from app.services import audit
 from app.services.monitoring import dashboard, form_summaries, study_state
+from app.services.monitoring.tallies import Tallies
 from app.services.participants import debrief, enrolment
 from app.services.runs import publishing
 from app.services.studies import membership, studies
@@ -122,7 +123,7 @@ async def stream_study(
     templates = request.app.state.templates  # and nothing else of the request: what is drawn is for all who look
 
     def draw(session: Session) -> Mapping[str, str]:
-        return _draw(templates, STUDY_PARTS, _study_context(session, studio, slug, view))
+        return _draw(templates, STUDY_PARTS, _study_context(session, studio, slug, view, studio.tallies.unhurried()))
 
     async for event in live.redrawn_parts(request, studio, draw):
         yield event
@@ -215,9 +216,11 @@ def _list_context(session: Session, studio: Studio, experimenter: Experimenter, 
     }
 
 
-def _study_context(session: Session, studio: Studio, slug: str, view: View) -> dict[str, Any]:
+def _study_context(
+    session: Session, studio: Studio, slug: str, view: View, tallies: Tallies | None = None
+) -> dict[str, Any]:
     study = studies.find_study(session, slug)
-    overview = dashboard.study_overview(session, study, studio.tallies)
+    overview = dashboard.study_overview(session, study, tallies or studio.tallies)
     return {
         "study": study,
         "settings": study.settings,

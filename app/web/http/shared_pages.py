@@ -1,7 +1,7 @@
 """The pages that somebody looks at: however many look at one, it is drawn once for all of them.
 
 So a drawing must not depend on who looks, and cannot: it is made from a session and nothing else. Pages are drawn when
-something has changed, one drawing of a page at a time, and a tenth of a core at most goes into each.
+something has changed, one drawing of a page at a time, and a thirtieth of a core at most goes into each.
 """
 
 import asyncio
@@ -19,7 +19,7 @@ from app.errors import AppError
 from app.services.monitoring import dashboard
 
 LOOK_EVERY_S = 1.0
-REST = 9.0
+REST = 29.0
 """Times as long as the last drawing took of a processor, before the next one."""
 REDRAW_AFTER = timedelta(seconds=20)
 """Even when no row changed, "3 min ago" and a silent worker do."""
