@@ -37,7 +37,7 @@ from app.errors import OncePerMinute
 BUSY_TIMEOUT_S = 15
 SAME_TIME = timedelta(seconds=1)
 USUAL_LOG_PAGES, LONGEST_LOG_PAGES = 1000, 20_000
-"""Of SQLite's write-ahead log, before a commit copies them into the database: as usual, and where others do it first."""
+"""Of SQLite's log, before a commit copies them into the database: as usual, and where others do it first."""
 WRITING, NAMES, AUDITING = 1_347_310_157, 1_347_310_158, 1_347_310_159
 """Advisory locks of PostgreSQL: of whoever writes, of names, of the audit log. Numbers that no other program uses."""
 

@@ -18,27 +18,21 @@ from app.services.alerting import alerts
 from app.settings import Settings
 from app.storage import ArtefactStore
 from app.web import media, metrics
-from app.web.api import pages, routes
+from app.web.api import pages
+from app.web.api.application import create_api
+from app.web.api.callers import PREFIX
 from app.web.error_pages import add_error_pages, error_page
-from app.web.experimenter import (
-    account,
-    accounts,
-    answers,
-    audit,
-    help_page,
+from app.web.experimenter import audit, help_page, results
+from app.web.experimenter.accounts import account, accounts, login, provider_login, second_factor
+from app.web.experimenter.dashboard import answers, live, studies
+from app.web.experimenter.study import (
     imports,
     invitations,
-    live,
-    login,
     members,
     operator,
     planning,
-    provider_login,
-    results,
     retirement,
-    second_factor,
     selection,
-    studies,
     translations,
 )
 from app.web.http.addresses import QuickAddresses
@@ -156,8 +150,8 @@ def create_routes(https: bool) -> FastAPI:
     add_error_pages(app)
     for part in (*PARTICIPANT_PARTS, *EXPERIMENTER_PARTS):
         app.include_router(part.router)
-    app.state.api = routes.create_api(app.url_path_for, MAX_BODY_BYTES)
-    app.mount(routes.PREFIX, app.state.api)
+    app.state.api = create_api(app.url_path_for, MAX_BODY_BYTES)
+    app.mount(PREFIX, app.state.api)
     app.mount("/static", StaticFiles(directory=STATIC), name="static")
 
     @app.get("/", name="show_start")

@@ -7,7 +7,7 @@ from sqlalchemy import select
 from app.db import Database
 from app.domain.choices import RewardKind, Strategy
 from app.domain.studies import Study
-from app.web.experimenter.study_form.study_form import form_with_defaults
+from app.web.experimenter.study.study_form.study_form import form_with_defaults
 
 CHOICES = [
     *(("strategy", each.value) for each in Strategy),

@@ -22,7 +22,7 @@ from app.services.monitoring import participant_status
 from app.services.monitoring.participant_status import GivenAnswer
 from app.services.monitoring.tallies import Tallies
 from app.storage import ArtefactStore
-from app.web.experimenter.participants_table import PAGE_SIZE
+from app.web.experimenter.dashboard.participants_table import PAGE_SIZE
 from app.web.http.asides import count_ahead
 from app.web.http.session_queue import SessionQueue
 from tests import factories

@@ -15,8 +15,14 @@ from app.domain.study_settings import PAPER_PROTOCOL, StudySettings
 from app.installed_tasks import catalogue
 from app.services.studies import locking
 from app.web.api.openapi import described
-from app.web.experimenter.study_form.form_fields import BY_NAME, FIELDS, Kind
-from app.web.experimenter.study_form.study_form import FormInvalid, StudyForm, form_of, form_with_defaults, typed_study
+from app.web.experimenter.study.study_form.form_fields import BY_NAME, FIELDS, Kind
+from app.web.experimenter.study.study_form.study_form import (
+    FormInvalid,
+    StudyForm,
+    form_of,
+    form_with_defaults,
+    typed_study,
+)
 
 NOT_ON_THE_FORM: dict[str, str] = {}
 """Settings that the form leaves out, each with the reason; all are on it so far."""

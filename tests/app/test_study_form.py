@@ -14,8 +14,8 @@ from app.domain.studies import PREVIEW_NUMBERS, Deviation, Participant, Study
 from app.domain.study_settings import PAPER_PROTOCOL, StudySettings
 from app.services.studies import locking
 from app.storage import ArtefactStore
-from app.web.experimenter.study_form.form_lines import items_of, lines_of, lines_of_texts, texts_of
-from app.web.experimenter.study_form.study_form import StudyForm
+from app.web.experimenter.study.study_form.form_lines import items_of, lines_of, lines_of_texts, texts_of
+from app.web.experimenter.study.study_form.study_form import StudyForm
 from tests import factories
 from tests.app.study_pages import typed
 

@@ -15,7 +15,7 @@ from app.domain.people import Experimenter, Role
 from app.domain.studies import Study
 from app.services.archives import archive
 from app.storage import ArtefactStore
-from app.web.experimenter import imports
+from app.web.experimenter.study import imports
 from tests import factories
 from tests.waiting import PATIENCE_S
 

@@ -14,7 +14,8 @@ from app.domain.people import ApiToken, Experimenter, StudyRole, TokenScope
 from app.domain.studies import Study
 from app.services.accounts import api_tokens
 from app.services.studies import membership, studies
-from app.web.api import openapi, routes
+from app.web.api import openapi
+from app.web.api.callers import PREFIX
 from app.web.http.deps import CurrentExperimenter, OwnAccount, ReadingSession, RowId, WritingSession
 from app.web.texts.templating import page
 
@@ -25,7 +26,7 @@ router = APIRouter()
 def show_api(request: Request) -> Response:
     """Everything that the API offers, on one page that loads nothing from anywhere else."""
     document = request.app.state.api.openapi()
-    operations = openapi.described(document, routes.PREFIX)
+    operations = openapi.described(document, PREFIX)
     for operation in operations:
         for side in ("takes", "gives"):
             example = operation[side]
@@ -36,7 +37,7 @@ def show_api(request: Request) -> Response:
         "tags": list(dict.fromkeys(operation["tag"] for operation in operations)),
         "operations": operations,
         "base": str(request.base_url).rstrip("/"),
-        "prefix": routes.PREFIX,
+        "prefix": PREFIX,
     }
     return page(request, "experimenter/api_docs.html", context)
 

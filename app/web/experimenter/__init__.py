@@ -1,1 +1,1 @@
-"""The experimenter's pages: studies and results."""
+"""The experimenter's pages."""

@@ -22,7 +22,7 @@ from app.services.monitoring import form_summaries
 from app.services.participants import enrolment
 from app.services.runs import reports
 from app.services.studies import locking, preregistration, studies
-from app.web.experimenter import form_words
+from app.web.experimenter.dashboard import form_words
 from app.web.http import stored_file
 from app.web.http.deps import (
     ActingExperimenter,

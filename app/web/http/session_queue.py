@@ -102,7 +102,7 @@ class SessionQueue:
                 return step(session)
         except OperationalError:
             raise
-        except Exception as error:
+        except Exception as error:  # whatever a request raises is told to that request alone
             return _Raised(error)
 
     def _write(self, step: Step[T]) -> T:

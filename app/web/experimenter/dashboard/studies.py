@@ -20,8 +20,8 @@ from app.services.monitoring.tallies import Tallies
 from app.services.participants import debrief, enrolment
 from app.services.runs import publishing
 from app.services.studies import membership, studies
-from app.web.experimenter import charts, form_words, live
-from app.web.experimenter.participants_table import View, WantedView, people_table
+from app.web.experimenter.dashboard import charts, form_words, live
+from app.web.experimenter.dashboard.participants_table import View, WantedView, people_table
 from app.web.http import stored_file
 from app.web.http.deps import (
     ActingExperimenter,

@@ -17,9 +17,9 @@ from app.services.accounts import browser_sessions
 from app.services.participants import enrolment
 from app.services.studies import locking, membership, preregistration, studies
 from app.services.studies.studies import ClipsTooLong
-from app.web.experimenter.study_form import study_form
-from app.web.experimenter.study_form.form_fields import FIELDS, SECTIONS
-from app.web.experimenter.study_form.study_form import FormInvalid, Preset, StudyForm, TypedStudy
+from app.web.experimenter.study.study_form import study_form
+from app.web.experimenter.study.study_form.form_fields import FIELDS, SECTIONS
+from app.web.experimenter.study.study_form.study_form import FormInvalid, Preset, StudyForm, TypedStudy
 from app.web.http.deps import (
     PARTICIPANT_COOKIE,
     ActingExperimenter,

@@ -18,7 +18,7 @@ from app.services.participants import enrolment
 from app.services.runs import publishing
 from app.services.studies import studies
 from app.storage import Artefact
-from app.web.experimenter.invitations import link_of
+from app.web.experimenter.study.invitations import link_of
 from app.web.http import new_links
 from app.web.http.deps import ActingExperimenter, Slug, StudioDep, WritingSession
 from app.web.http.new_links import NewLink

@@ -15,7 +15,7 @@ from starlette.background import BackgroundTask
 from app.domain.people import Experimenter
 from app.errors import AppError
 from app.services.accounts import accounts, browser_sessions, second_factor
-from app.web.experimenter.login import Password, TooManyAttempts, count_attempt, enter, inside, note_failure
+from app.web.experimenter.accounts.login import Password, TooManyAttempts, count_attempt, enter, inside, note_failure
 from app.web.http.deps import (
     EXPERIMENTER_COOKIE,
     AccountBriefly,

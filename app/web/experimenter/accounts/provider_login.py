@@ -12,7 +12,7 @@ from app.domain.people import Role
 from app.errors import AppError
 from app.services.accounts import accounts, openid, provider_accounts, second_factor
 from app.services.accounts.openid import Attempt, Provider
-from app.web.experimenter.login import TooManyAttempts, ask_for_code, count_attempt, enter, inside
+from app.web.experimenter.accounts.login import TooManyAttempts, ask_for_code, count_attempt, enter, inside
 from app.web.http.deps import Studio, StudioDep, set_cookie
 from app.web.texts.templating import page
 

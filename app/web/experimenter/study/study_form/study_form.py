@@ -12,8 +12,8 @@ from app.domain.protocol import FormItem
 from app.domain.studies import NAME_LENGTH, SEED_LIMIT, longest_clip_steps, usual_clip_steps
 from app.domain.study_settings import PAPER_PROTOCOL, StudySettings
 from app.installed_tasks import catalogue
-from app.web.experimenter.study_form import form_lines
-from app.web.experimenter.study_form.form_fields import BY_NAME, FIELDS, FormField, Kind
+from app.web.experimenter.study.study_form import form_lines
+from app.web.experimenter.study.study_form.form_fields import BY_NAME, FIELDS, FormField, Kind
 from app.web.texts.own_texts import CONSENT
 from app.web.texts.wording import broken_texts
 

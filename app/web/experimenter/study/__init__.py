@@ -1,0 +1,1 @@
+"""Making, running and ending a study."""
