@@ -16,6 +16,7 @@ import time
 from collections import Counter
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
+from datetime import datetime
 from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from itertools import cycle
@@ -134,13 +135,13 @@ class Cluster:
         """Wait until one of the workers is in the middle of such work, kill it, and see when another one goes on."""
         key, name = wait_until(PATIENCE_S, f"no {kind.value} at work", lambda: _at_work(database, kind))
         folder = next(each for each in self.workers if self._name_of(each) == name)
-        time.sleep(7)  # so that it has given a sign of life of its own
+        first = _sign_of_life(database, key)
+        wait_until(PATIENCE_S, f"{name} shows no life", lambda: _sign_of_life(database, key) != first or None)
         worker = self.workers.pop(folder)
         worker.kill()
         worker.wait()
         killed_at = time.monotonic()
-        with database.reading() as session:
-            last = session.scalars(select(Run.heartbeat_at).where(Run.workflow_id == key)).one()
+        last = _sign_of_life(database, key)
         self.told.append(f"killed for good         {name}, in the middle of {key}")
         wait_until(PATIENCE_S, "nobody takes it over", lambda: _goes_on(database, key, last))
         self.told.append(f"taken over after        {time.monotonic() - killed_at:.0f} s")
@@ -189,6 +190,11 @@ def _at_work(database: Database, kind: RunKind) -> tuple[str, str] | None:
             if name is not None:
                 return key, name
     return None
+
+
+def _sign_of_life(database: Database, key: str) -> datetime | None:
+    with database.reading() as session:
+        return session.scalars(select(Run.heartbeat_at).where(Run.workflow_id == key)).one()
 
 
 def _is_idle(database: Database) -> bool | None:
