@@ -54,6 +54,8 @@ class Table:
     keyed_rows: Callable[[Session, Study, Window], KeyedRows]
     made_of: Sequence[type[Base]]
     """The database's tables whose rows, old or new, decide which rows there are and which of them count."""
+    grows_by: type[Base] | None = None
+    """The database's table of which each row here is one, taken away only with the person; its id ends the key."""
 
     def rows(self, session: Session, study: Study) -> Iterator[Sequence[Any]]:
         """Everything, in the order of the columns."""
@@ -144,6 +146,8 @@ def keyed_records(
     """The rows that are wanted as plain values by column, each with its key."""
     names = [column.name for column in table.all_columns]
     for key, values in table.keyed_rows(session, study, window):
+        if window.since and key[-1] <= window.since:
+            continue
         whole = (*values, *provenance.values)
         yield key, {name: _plain(value) for name, value in zip(names, whole, strict=True)}
 

@@ -223,7 +223,7 @@ def ratings(session: Session, study: Study, window: Window = EVERYTHING) -> Keye
         ).all()
         newest = {trial.id: rating.revision for trial, rating in rows if rating is not None}
         for trial, rating in rows:
-            key = trial.ordinal, rating.revision if rating else 0
+            key = trial.ordinal, *((rating.revision, rating.id) if rating else (0, 0))
             if key <= wanted.after:
                 continue
             yield (

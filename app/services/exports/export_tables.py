@@ -150,6 +150,7 @@ TABLES: Sequence[Table] = (
         ),
         export_rows.labels,
         (LabelEvent,),
+        grows_by=LabelEvent,
     ),
     Table(
         "forms",
@@ -164,6 +165,7 @@ TABLES: Sequence[Table] = (
         ),
         export_rows.forms,
         (FormAnswer,),
+        grows_by=FormAnswer,
     ),
     Table(
         "consent",
@@ -177,6 +179,7 @@ TABLES: Sequence[Table] = (
         ),
         export_rows.consent,
         (ConsentRecord,),
+        grows_by=ConsentRecord,
     ),
     Table(
         "events",
@@ -189,6 +192,7 @@ TABLES: Sequence[Table] = (
         ),
         export_rows.events,
         (ParticipantEvent,),
+        grows_by=ParticipantEvent,
     ),
     Table(
         "ratings",
@@ -224,6 +228,7 @@ TABLES: Sequence[Table] = (
         ),
         export_rows.ratings,
         (Trial, Rating),
+        grows_by=Rating,
     ),
     Table(
         "models",
@@ -246,6 +251,7 @@ TABLES: Sequence[Table] = (
         ),
         export_rows.models,
         (Model,),
+        grows_by=Model,
     ),
     Table(
         "evaluations",
@@ -302,6 +308,7 @@ TABLES: Sequence[Table] = (
         ),
         export_rows.deviations,
         (Deviation,),
+        grows_by=Deviation,
     ),
 )
 BY_NAME = {table.name: table for table in TABLES}

@@ -39,6 +39,8 @@ class Window:
     after: Key = ()
     newest: Mapping[str, int] = field(default_factory=dict)
     """Largest id by name of database table; a table that is not named has no bound."""
+    since: int = 0
+    """Of a table that grows: the largest id that an earlier reading has seen."""
 
     def known(self, *entities: type[Base]) -> ColumnElement[bool]:
         """That rows of these were there when the first page was read."""
@@ -55,7 +57,7 @@ class Window:
 
     def within(self, first: int) -> "Window":
         """The part that is wanted of the rows whose keys begin with this number, by the rest of their keys."""
-        return Window(self.after[1:] if self.after[:1] == (first,) else (), self.newest)
+        return Window(self.after[1:] if self.after[:1] == (first,) else (), self.newest, self.since)
 
 
 EVERYTHING = Window()
@@ -75,28 +77,40 @@ class _Cursor(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
     of: Annotated[str, Field(max_length=200)]
-    after: Annotated[list[_Number], Field(min_length=1, max_length=6)]
+    after: Annotated[list[_Number], Field(max_length=6)]
+    """Empty: the reading has not begun."""
     newest: Annotated[dict[str, _Number], Field(max_length=6)]
+    since: _Number = 0
 
 
-def first_window(session: Session, entities: Sequence[type[Base]]) -> Window:
-    """Everything there is now of a table that is made of these."""
+def first_window(session: Session, entities: Sequence[type[Base]], since: int = 0) -> Window:
+    """Everything there is now of a table that is made of these, or of what came since."""
     newest = {each.__tablename__: session.scalar(select(func.max(each.__table__.c.id))) or 0 for each in entities}
-    return Window(newest=newest)
+    return Window(newest=newest, since=since)
 
 
 def cursor_of(of: str, window: Window, last: Key) -> str:
     """What leads to the rows after the last one. ``of``: whose rows these are."""
-    cursor = _Cursor(of=of, after=list(last), newest=dict(window.newest))
-    return base64.urlsafe_b64encode(cursor.model_dump_json().encode()).decode().rstrip("=")
+    return _written(_Cursor(of=of, after=list(last), newest=dict(window.newest), since=window.since))
 
 
-def window_of(cursor: str, of: str, entities: Sequence[type[Base]]) -> Window:
-    """Where to go on. Raises CursorInvalid for everything that cursor_of would not have made."""
+def later_cursor(of: str, window: Window, grows_by: type[Base]) -> str:
+    """What leads, at another time, to the rows that were added after this reading began."""
+    return _written(_Cursor(of=of, after=[], newest={}, since=window.newest[grows_by.__tablename__]))
+
+
+def window_of(session: Session, cursor: str, of: str, entities: Sequence[type[Base]]) -> Window:
+    """Where to go on. Raises CursorInvalid for everything that cursor_of and later_cursor would not have made."""
     try:
         read = _Cursor.model_validate_json(base64.b64decode(cursor + "=" * (-len(cursor) % 4), b"-_", validate=True))
     except (binascii.Error, ValueError, ValidationError) as error:
         raise CursorInvalid from error
-    if read.of != of or set(read.newest) != {each.__tablename__ for each in entities}:
+    if read.of == of and not read.after and not read.newest:
+        return first_window(session, entities, read.since)
+    if read.of != of or not read.after or set(read.newest) != {each.__tablename__ for each in entities}:
         raise CursorInvalid
-    return Window(tuple(read.after), read.newest)
+    return Window(tuple(read.after), read.newest, read.since)
+
+
+def _written(cursor: _Cursor) -> str:
+    return base64.urlsafe_b64encode(cursor.model_dump_json().encode()).decode().rstrip("=")

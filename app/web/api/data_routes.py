@@ -167,22 +167,28 @@ def read_table(
     limit: Annotated[int, Query(ge=1, le=LARGEST_PAGE)] = 100,
 ) -> answers.Page:
     """Rows of a table, as in the exported files. Follow `next` until it is null: no row comes twice and none is lost,
-    however much is answered meanwhile. A page takes as long at the end of a table as at its beginning."""
+    however much is answered meanwhile. A page takes as long at the end of a table as at its beginning.
+
+    Of labels, forms, consent, events, ratings, models and deviations, rows are only ever added: the last page's `later`
+    leads to those that come after this reading. (What `superseded`, `counts` and `excluded` say of earlier rows may
+    have changed meanwhile.)"""
     study = studies.find_study(session, slug)
     if table not in export_tables.BY_NAME:
         raise TableUnknown
     wanted, whose = export_tables.BY_NAME[table], f"{study.id}/{table}"
     made_of = wanted.made_of
-    window = paging.window_of(cursor, whose, made_of) if cursor else paging.first_window(session, made_of)
+    window = paging.window_of(session, cursor, whose, made_of) if cursor else paging.first_window(session, made_of)
     provenance = export_formats.provenance_of(session, study)
     rows = export_formats.keyed_records(wanted, session, study, provenance, window)
     found = list(islice(rows, limit + 1))
     note_reading(studio, session, caller, "table", study, f"{slug}/{table}")
-    following = None
+    address = f"{PREFIX}/studies/{slug}/tables/{table}?limit={limit}&cursor="
+    following = later = None
     if len(found) > limit:
-        place = paging.cursor_of(whose, window, found[limit - 1][0])
-        following = f"{PREFIX}/studies/{slug}/tables/{table}?limit={limit}&cursor={place}"
-    return answers.Page(table=table, rows=[row for _, row in found[:limit]], next=following)
+        following = address + paging.cursor_of(whose, window, found[limit - 1][0])
+    elif wanted.grows_by is not None:
+        later = address + paging.later_cursor(whose, window, wanted.grows_by)
+    return answers.Page(table=table, rows=[row for _, row in found[:limit]], next=following, later=later)
 
 
 @router.get("/studies/{slug}/exports", tags=["exports"])

@@ -99,6 +99,10 @@ class Page(BaseModel):
         description="Address of the rows that follow; null at the end.",
         examples=["/api/v1/studies/pilot-at-home/tables/ratings?limit=100&cursor=eyJvZiI6InBpbG90LWF0LWhv..."],
     )
+    later: str | None = Field(
+        description="At the end of a table that grows: address of the rows that will have been added; keep it.",
+        examples=["/api/v1/studies/pilot-at-home/tables/ratings?limit=100&cursor=eyJvZiI6InBpbG90LWF0LWhv..."],
+    )
 
 
 class ColumnAnswer(BaseModel):
