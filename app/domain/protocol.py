@@ -56,6 +56,16 @@ class EvaluatedMethod(Choice):
     PREFFT_ANCHORED = "prefft_anchored", "PrefFT, anchored", "Fine-tuned, but kept near the reference."
     PBARL = "pbarl", "PbARL", "The personal filter, as set below."
     PBARL_PRINTED = "pbarl_printed", "PbARL as printed", "Exactly as in the paper."
+    SOMEBODY_ELSE = (
+        "somebody_else",
+        "Somebody else\N{RIGHT SINGLE QUOTATION MARK}s",
+        "The personal filter of another participant, drawn by lot; of a usual type of user while there is none.",
+    )
+    AVERAGE = "average", "Average", "One filter for everybody, of what earlier participants want on average."
+
+
+FROM_OTHERS = (EvaluatedMethod.SOMEBODY_ELSE, EvaluatedMethod.AVERAGE)
+"""Methods that show somebody what others have taught; who takes part must be told that."""
 
 
 class EvaluationMode(Choice):
@@ -74,7 +84,7 @@ class EvaluationSettings(BaseModel):
         (EvaluatedMethod.REFERENCE, EvaluatedMethod.PREFFT, EvaluatedMethod.PBARL),
         Section.EVALUATION,
         "Methods",
-        complaint="Choose two methods at least.",
+        complaint="Choose two methods at least, and five at most.",
         min_length=2,
         max_length=5,
     )
@@ -97,6 +107,11 @@ class EvaluationSettings(BaseModel):
         if len(set(self.methods)) != len(self.methods):
             raise ValueError("Each method can be evaluated once only.")
         return self
+
+    @property
+    def shows_others(self) -> bool:
+        """Whether people are shown what others have taught."""
+        return any(method in FROM_OTHERS for method in self.methods)
 
     @property
     def trial_count(self) -> int:
