@@ -70,12 +70,12 @@ class Assignment(Base):
 class DonorRule(StrEnum):
     """By which rule it was drawn whose filter somebody is shown as a method that is not theirs."""
 
-    LEAST_LENT = "least_lent"
-    """The candidate whose filter was lent least often; ties by lot."""
+    BY_LOT = "by_lot"
+    """One of the candidates, none of whom is lent much more often than another."""
     MEAN_OF_PEOPLE = "mean_of_people"
     """All candidates together."""
     TYPE_OF_USER = "type_of_user"
-    """Nobody was there yet: the type of user that was lent least often; ties by lot."""
+    """Nobody was there yet: one of the types of users, by lot in the same way."""
     MEAN_OF_TYPES = "mean_of_types"
     """Too few people were there yet: all types of users together."""
     WITHDREW = "withdrew"

@@ -6,6 +6,7 @@ what another participant has taught. The rules, and why they are these: docs/dec
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from typing import TypeVar
 
 from sqlalchemy import delete, select
 from sqlalchemy.orm import Session
@@ -19,6 +20,9 @@ from app.services.evaluation import evaluation_plan
 
 FEWEST_PEOPLE = 3
 """An average of fewer would tell too much about each of them."""
+SLACK = 1
+"""Loans by which one donor may be ahead of another and still be drawn."""
+Name = TypeVar("Name", int, str)
 
 
 def draw(
@@ -82,18 +86,23 @@ def candidates(session: Session, study: Study, participant: Participant) -> Sequ
 def _one(
     session: Session, study: Study, participant: Participant, people: Sequence[int], types: Sequence[str]
 ) -> tuple[DonorRule, Donors]:
-    """One donor, of those lent least often; by lot among equals."""
+    """One donor, by lot among those lent at most SLACK times more than whoever was lent least.
+
+    With no slack, people who finish one after the other would each get the filter of the one before.
+    """
     mine = select(DonorDraw).join(Participant, Participant.id == DonorDraw.participant_id)
     mine = mine.where(Participant.study_id == study.id, Participant.is_preview.is_(False))
     earlier = session.scalars(mine.where(DonorDraw.method == EvaluatedMethod.SOMEBODY_ELSE)).all()
     lent = Counter[int | str](name for each in earlier for name in (*each.donors.people, *each.donors.types))
 
-    def turn(name: int | str) -> tuple[int, str]:
-        return lent[name], evaluation_plan.mark(study.key_secret, "donor", participant.number, name)
+    def drawn(names: Sequence[Name]) -> Name:
+        least = min(lent[name] for name in names)
+        eligible = [name for name in names if lent[name] <= least + SLACK]
+        return min(eligible, key=lambda name: evaluation_plan.mark(study.key_secret, "donor", participant.number, name))
 
     if people:
-        return DonorRule.LEAST_LENT, Donors(people=(min(people, key=turn),), candidates=tuple(people))
-    return DonorRule.TYPE_OF_USER, Donors(types=(min(types, key=turn),))
+        return DonorRule.BY_LOT, Donors(people=(drawn(people),), candidates=tuple(people))
+    return DonorRule.TYPE_OF_USER, Donors(types=(drawn(types),))
 
 
 def numbers_in(draws: Iterable[DonorDraw]) -> set[int]:
