@@ -234,8 +234,8 @@ TABLES: Sequence[Table] = (
             Column(
                 "rule",
                 T,
-                "How it was drawn. by_lot: one of the candidates, nobody much more often than others. mean_of_people: all "
-                "candidates. type_of_user, mean_of_types: there were too few candidates. withdrew: whose it was has "
+                "How it was drawn. by_lot: one of the candidates, nobody much more often than others. mean_of_people: "
+                "all candidates. type_of_user, mean_of_types: there were too few candidates. withdrew: whose it was has "
                 "withdrawn since.",
                 allowed=_words(DonorRule),
             ),
