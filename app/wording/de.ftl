@@ -72,6 +72,7 @@ form-felt_safe-high = vollkommen
 form-would_use = Ich würde einen solchen Roboter benutzen.
 form-would_use-low = auf keinen Fall
 form-would_use-high = auf jeden Fall
+form-made_for_you = Einer der Roboter, die Sie gerade bewertet haben, wurde für Sie gemacht: Er hat aus Ihren Antworten gelernt. Welcher war es? Wenn Sie es nicht wissen, wählen Sie den, der es Ihrer Meinung nach war.
 form-comments = Möchten Sie uns sonst noch etwas mitteilen?
 
 ## Anleitung

@@ -74,6 +74,7 @@ form-felt_safe-high = completely
 form-would_use = I would use a robot like this.
 form-would_use-low = definitely not
 form-would_use-high = definitely
+form-made_for_you = One of the robots that you have just rated was made for you: it has learned from your answers. Which one was it? If you do not know, choose the one that you think it was.
 form-comments = Is there anything else you would like to tell us?
 
 ## Instructions

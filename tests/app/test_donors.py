@@ -145,7 +145,11 @@ class TestADonorWithdraws:
             films = session.scalars(select(Film).where(Film.method == SOMEBODY_ELSE)).all()
             controllers = session.scalars(select(Controller).where(Controller.method == SOMEBODY_ELSE)).all()
             models = session.scalars(select(Model).where(Model.kind == ModelKind.METHOD)).all()
-        return {film.video_sha256 for film in films} | {each.artefact_sha256 for each in (*controllers, *models)}
+        return (
+            {film.video_sha256 for film in films}
+            | {each.artefact_sha256 for each in controllers}
+            | {each.artefact_sha256 for each in models}
+        )
 
     def test_what_nobody_has_begun_to_look_at_is_erased_and_due_again(
         self, database: Database, store: ArtefactStore, lent: tuple[Participant, Participant]

@@ -93,7 +93,10 @@ def _one(
     mine = select(DonorDraw).join(Participant, Participant.id == DonorDraw.participant_id)
     mine = mine.where(Participant.study_id == study.id, Participant.is_preview.is_(False))
     earlier = session.scalars(mine.where(DonorDraw.method == EvaluatedMethod.SOMEBODY_ELSE)).all()
-    lent = Counter[int | str](name for each in earlier for name in (*each.donors.people, *each.donors.types))
+    lent = Counter[int | str]()
+    for each in earlier:
+        lent.update(each.donors.people)
+        lent.update(each.donors.types)
 
     def drawn(names: Sequence[Name]) -> Name:
         least = min(lent[name] for name in names)
@@ -148,14 +151,15 @@ def _take_back(session: Session, borrower_id: int, method: str, rows: Counter[st
     models = [model for model in session.scalars(made) if model.metrics.get("method") == method]
     files = {film.trajectory_sha256 for film in films} | {film.video_sha256 for film in films}
     files |= {film.poster_sha256 for film in films}
-    files |= {each.artefact_sha256 for each in (*controllers, *models)}
+    files |= {each.artefact_sha256 for each in controllers} | {each.artefact_sha256 for each in models}
     gone = {film.id for film in films}
     for trial in session.scalars(select(Trial).where(Trial.film_id.in_(gone))):
         trial.film_id = None
     session.flush()
-    for table, erased in ((Film, films), (Controller, controllers), (Model, models)):
-        session.execute(delete(table).where(table.id.in_([row.id for row in erased])))
-        rows[table.__tablename__] += len(erased)
+    session.execute(delete(Film).where(Film.id.in_(gone)))
+    session.execute(delete(Controller).where(Controller.id.in_([each.id for each in controllers])))
+    session.execute(delete(Model).where(Model.id.in_([each.id for each in models])))
+    rows.update({"film": len(films), "controller": len(controllers), "model": len(models)})
     _make_again(session, borrower_id, method)
     return files
 

@@ -23,11 +23,10 @@ from sqlalchemy.orm import Session, joinedload
 
 from app.db import now
 from app.domain.evaluation import Assignment, Controller, Film, Rating, Trial
-from app.domain.protocol import EvaluatedMethod, EvaluationMode, EvaluationSettings
+from app.domain.protocol import LETTERS, EvaluatedMethod, EvaluationMode, EvaluationSettings
 from app.domain.studies import Participant, Study
 from app.storage import ArtefactStore
 
-LETTERS = "ABCDE"
 TRAINED = tuple(each for each in EvaluatedMethod if each not in (EvaluatedMethod.REFERENCE, EvaluatedMethod.PBARL))
 """Methods that are made for the evaluation alone; the reference is there, and pbarl is the participant's filter."""
 

@@ -1,6 +1,6 @@
 """The tables of an export and what every column means; export_rows reads what stands in them."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from app.domain.clips import Clip
@@ -22,7 +22,7 @@ WITHOUT_SCRIPT = (
 )
 
 
-def _words(values: type[Any]) -> str:
+def _words(values: Iterable[Any]) -> str:
     return ", ".join(value.value for value in values)
 
 
@@ -235,8 +235,8 @@ TABLES: Sequence[Table] = (
                 "rule",
                 T,
                 "How it was drawn. by_lot: one of the candidates, nobody much more often than others. mean_of_people: "
-                "all candidates. type_of_user, mean_of_types: there were too few candidates. withdrew: whose it was has "
-                "withdrawn since.",
+                "all candidates. type_of_user, mean_of_types: there were too few candidates. withdrew: whose it was "
+                "has withdrawn since.",
                 allowed=_words(DonorRule),
             ),
             Column("people", T, "Codes of those whose filter, or whose wishes, these are; separated by spaces."),

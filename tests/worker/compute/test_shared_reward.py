@@ -39,8 +39,6 @@ def test_whoever_is_more_decided_does_not_count_for_more() -> None:
 def test_a_type_of_user_values_episodes_as_its_omega_does(user: User) -> None:
     model = load_reward_model(shared_reward.of_types(TASK, [user.value], SCALE))
     episodes = [each for each in reference_rollouts(TASK) if each.success]
-    wanted = [
-        preference_rewards(registry.task(TASK), each.costs, each.signals, OMEGA[user]).sum() for each in episodes
-    ]
+    wanted = [preference_rewards(registry.task(TASK), each.costs, each.signals, OMEGA[user]).sum() for each in episodes]
     # Steps are cut at eight standard deviations, which the true reward is not.
     assert np.corrcoef(model.returns(episodes), wanted)[0, 1] > 0.9
