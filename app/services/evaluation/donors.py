@@ -16,7 +16,7 @@ from app.domain.models import Model, ModelKind, Run, RunKind, RunStatus
 from app.domain.protocol import EvaluatedMethod
 from app.domain.run_keys import CONTROLLERS, TRIALS, read
 from app.domain.studies import Participant, Study
-from app.services.evaluation import evaluation_plan
+from app.services.evaluation import evaluation_plan, unblinding
 
 FEWEST_PEOPLE = 3
 """An average of fewer would tell too much about each of them."""
@@ -106,6 +106,18 @@ def _one(
     if people:
         return DonorRule.BY_LOT, Donors(people=(drawn(people),), candidates=tuple(people))
     return DonorRule.TYPE_OF_USER, Donors(types=(drawn(types),))
+
+
+def counts(session: Session, study: Study) -> dict[str, Counter[str]]:
+    """How many participants were lent a filter by which rule, by method; nothing while the study is blinded."""
+    if unblinding.is_blinded(study):
+        return {}
+    drawn = select(DonorDraw.method, DonorDraw.rule).join(Participant, Participant.id == DonorDraw.participant_id)
+    drawn = drawn.where(Participant.study_id == study.id, Participant.is_preview.is_(False))
+    found: dict[str, Counter[str]] = {}
+    for method, rule in session.execute(drawn.order_by(DonorDraw.id)):
+        found.setdefault(method, Counter())[rule] += 1
+    return found
 
 
 def numbers_in(draws: Iterable[DonorDraw]) -> set[int]:
