@@ -91,6 +91,26 @@ def test_somebody_else_s_filter_is_taken_as_it_is_and_the_model_does_not_say_who
 
 
 @pytest.mark.usefixtures("all_said")
+def test_what_was_fitted_to_types_of_users_is_fitted_once_for_a_study(
+    context: WorkerContext, study: Study, donor: Participant
+) -> None:
+    job = method_job(context, study, "average")
+    types = ["neutral", "cautious", "impatient"]
+    fitted = context.store.put(b"fitted for the first")
+    with context.database.writing() as session:
+        first = session.get_one(Participant, donor.id)
+        donors.draw(session, session.get_one(Study, study.id), first, EvaluatedMethod.AVERAGE, types)
+        earlier = Job(RunKey(RunKind.METHOD, participant_id=first.id, subject="average", labels=LABELS), study.id)
+        run_id = records.begin_run(session, earlier, seed=1)
+        records.set_labels(session, run_id, LABELS, "hash of the first")
+        metrics = {"method": "average", "notes": ["As it was fitted."]}
+        records.save_model(session, run_id, ModelKind.METHOD, fitted, metrics)
+        run_id = records.begin_run(session, job, seed=1)
+    made = lent_filters.make(context, job, run_id, at_once, EvaluatedMethod.AVERAGE)
+    assert (made["artefact"], made["notes"]) == (fitted, ["As it was fitted."])
+
+
+@pytest.mark.usefixtures("all_said")
 def test_a_donor_who_withdraws_while_it_is_made_is_not_shown(
     context: WorkerContext, study: Study, donor: Participant, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -37,7 +37,7 @@ def make(context: WorkerContext, job: Job, run_id: int, step: Step, method: Eval
     """
     started = time.time()
     mark = step("draw", _draw, context, job, method)
-    artefact, notes = step("lent", _lent, context, job, run_id, method, mark), list[str]()
+    artefact, notes = step("lent", _lent, context, job, run_id, method, mark)
     if not artefact:
         reward, draft = step("wishes", _wishes, context, job, run_id, method, mark), ""
         for stage in STAGES:
@@ -66,21 +66,39 @@ def _draw(context: WorkerContext, job: Job, method: EvaluatedMethod) -> str:
         return _mark(donors.draw(session, study, participant, method, [user.value for user in OMEGA]))
 
 
-def _lent(context: WorkerContext, job: Job, run_id: int, method: EvaluatedMethod, mark: str) -> str:
-    """The controller of the one person whose filter it is; empty when it has to be fitted."""
+def _lent(context: WorkerContext, job: Job, run_id: int, method: EvaluatedMethod, mark: str) -> tuple[str, list[str]]:
+    """The controller of the one person or type whose filter it is, with its notes; empty when it has to be fitted."""
     with context.database.reading() as session:
         check(session, job, method, mark)
+        known = _made_before(session, job, method)
+        if known is not None:
+            return known.artefact_sha256, list(known.metrics["notes"])
         if method is EvaluatedMethod.AVERAGE:
-            return ""
+            return "", []
         models = _models_of_donors(session, job, method, ModelKind.FILTER)
         task = session.get_one(Study, job.study_id).task
     if not models:
-        return ""
+        return "", []
     weights = context.store.read(models[0])
     beat = context.beat(run_id)
-    return context.store.put(
-        context.compute.run(Lane.LEARNING, beat, baseline_fitting.controller_of_filter, task, weights)
-    )
+    controller = context.compute.run(Lane.LEARNING, beat, baseline_fitting.controller_of_filter, task, weights)
+    return context.store.put(controller), []
+
+
+def _made_before(session: Session, job: Job, method: str) -> Model | None:
+    """What was fitted in this study to the same types of users: they want the same of everybody."""
+    drawn = donors.find(session, job.participant, method)
+    if drawn is None or not drawn.donors.types:
+        return None
+    earlier = select(DonorDraw).join(Participant, Participant.id == DonorDraw.participant_id)
+    earlier = earlier.where(Participant.study_id == job.study_id, DonorDraw.id != drawn.id)
+    for each in session.scalars(earlier.where(DonorDraw.method == method).order_by(DonorDraw.id)):
+        if each.donors.types == drawn.donors.types:
+            models = records.models_of(session, each.participant_id, ModelKind.METHOD)
+            known = next((model for model in models if model.metrics.get("method") == method), None)
+            if known is not None:
+                return known
+    return None
 
 
 def _wishes(context: WorkerContext, job: Job, run_id: int, method: EvaluatedMethod, mark: str) -> str:
