@@ -13,9 +13,9 @@ from app.domain.evaluation import Rating, Trial
 from app.domain.models import ModelKind
 from app.domain.participation import ConsentRecord, FormAnswer, ParticipantEvent, StageRecord
 from app.domain.preferences import Purpose, Query, Response
-from app.domain.protocol import EvaluationSettings
+from app.domain.protocol import EvaluatedMethod, EvaluationSettings
 from app.domain.studies import Participant, Study
-from app.services.evaluation import evaluation_plan
+from app.services.evaluation import donors, evaluation_plan
 from app.storage import ArtefactStore
 from tests import factories
 
@@ -39,6 +39,7 @@ def make_finished_study(
         _forms(session, person)
         _evaluate(session, study, person, random)
         _rate(session, study, person, random)
+        donors.draw(session, study, person, EvaluatedMethod.SOMEBODY_ELSE, ("cautious",))
     return study
 
 

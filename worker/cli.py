@@ -210,7 +210,11 @@ OF_SETTINGS: options.Table = {
     "strategy": ("--strategy", "which pairs are asked"),
     "pooled_prior": ("--pooled-prior", "start from those who finished before"),
 }
-OF_EVALUATION: options.Table = {"fine_tuning_steps": ("--fine-tuning-steps", "of PrefFT, with --paper")}
+OF_EVALUATION: options.Table = {
+    "methods": ("--methods", "to be rated, with --paper"),
+    "trials": ("--trials", "of each method, with --paper"),
+    "fine_tuning_steps": ("--fine-tuning-steps", "of PrefFT, with --paper"),
+}
 OF_MANNER: options.Table = {
     "rationality": ("--rationality", "log odds per typical difference; without it no doubt at all"),
     "myopia": ("--myopia", "below 1 the end of a clip weighs more"),

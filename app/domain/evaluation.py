@@ -1,7 +1,10 @@
 """The blinded evaluation: which letter hides which method, what was shown or run, and how it was rated."""
 
 from datetime import datetime
+from enum import StrEnum
+from typing import Any
 
+from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy import CheckConstraint, ForeignKey, String, UniqueConstraint
 from sqlalchemy.orm import Mapped, mapped_column, relationship
 
@@ -62,6 +65,62 @@ class Assignment(Base):
     letter: Mapped[str] = mapped_column(String(1))
     method: Mapped[str] = mapped_column(String(40))
     created_at: Mapped[datetime] = mapped_column(default=now)
+
+
+class DonorRule(StrEnum):
+    """By which rule it was drawn whose filter somebody is shown as a method that is not theirs."""
+
+    BY_LOT = "by_lot"
+    """One of the candidates, none of whom is lent much more often than another."""
+    MEAN_OF_PEOPLE = "mean_of_people"
+    """All candidates together."""
+    TYPE_OF_USER = "type_of_user"
+    """Nobody was there yet: one of the types of users, by lot in the same way."""
+    MEAN_OF_TYPES = "mean_of_types"
+    """Too few people were there yet: all types of users together."""
+    WITHDREW = "withdrew"
+    """Drawn once, but the donor has withdrawn since, and nothing says any more who it was."""
+
+
+class Donors(BaseModel):
+    """Whose filter it is, and whose it could have been: people by their number in the study, types by their name."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    people: tuple[int, ...] = Field(default=(), max_length=100_000)
+    types: tuple[str, ...] = Field(default=(), max_length=100)
+    candidates: tuple[int, ...] = Field(default=(), max_length=100_000)
+
+    def without(self, number: int) -> "Donors":
+        """The same after somebody has withdrawn."""
+        people, candidates = (
+            tuple(each for each in group if each != number) for group in (self.people, self.candidates)
+        )
+        return Donors(people=people, types=self.types, candidates=candidates)
+
+
+class DonorDraw(Base):
+    """What one participant is shown of others: drawn once per method, and kept.
+
+    Numbers instead of foreign keys: the row is about whoever is shown the robot.
+    """
+
+    __tablename__ = "donor_draw"
+    __table_args__ = (UniqueConstraint("participant_id", "method"),)
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    participant_id: Mapped[int] = mapped_column(ForeignKey("participant.id"), index=True)
+    method: Mapped[str] = mapped_column(String(40))
+    """One of protocol.FROM_OTHERS."""
+    rule: Mapped[str] = mapped_column(String(20))
+    """One of DonorRule."""
+    stored_donors: Mapped[dict[str, Any]]
+    created_at: Mapped[datetime] = mapped_column(default=now)
+
+    @property
+    def donors(self) -> Donors:
+        """Who, validated."""
+        return Donors.model_validate(self.stored_donors)
 
 
 class Trial(Base):

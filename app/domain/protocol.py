@@ -56,6 +56,20 @@ class EvaluatedMethod(Choice):
     PREFFT_ANCHORED = "prefft_anchored", "PrefFT, anchored", "Fine-tuned, but kept near the reference."
     PBARL = "pbarl", "PbARL", "The personal filter, as set below."
     PBARL_PRINTED = "pbarl_printed", "PbARL as printed", "Exactly as in the paper."
+    SOMEBODY_ELSE = (
+        "somebody_else",
+        "Somebody else\N{RIGHT SINGLE QUOTATION MARK}s",
+        "The personal filter of another participant, drawn by lot; of a usual type of user while there is none.",
+    )
+    AVERAGE = "average", "Average", "One filter for everybody, of what earlier participants want on average."
+
+
+LETTERS = "ABCDE"
+"""Of robots in a blinded evaluation, in the order in which somebody meets them."""
+MADE_FOR_YOU = "made_for_you"
+"""The question which robot was made for somebody."""
+FROM_OTHERS = (EvaluatedMethod.SOMEBODY_ELSE, EvaluatedMethod.AVERAGE)
+"""Methods that show somebody what others have taught; who takes part must be told that."""
 
 
 class EvaluationMode(Choice):
@@ -74,7 +88,7 @@ class EvaluationSettings(BaseModel):
         (EvaluatedMethod.REFERENCE, EvaluatedMethod.PREFFT, EvaluatedMethod.PBARL),
         Section.EVALUATION,
         "Methods",
-        complaint="Choose two methods at least.",
+        complaint="Choose two methods at least, and five at most.",
         min_length=2,
         max_length=5,
     )
@@ -91,12 +105,48 @@ class EvaluationSettings(BaseModel):
         ge=1_000,
         le=2_000_000,
     )
+    ask_which_is_theirs: bool = setting(
+        False,
+        Section.EVALUATION,
+        "Ask which robot was made for them",
+        options=(
+            ("no", "Do not ask", "Ratings say how personal each robot seemed."),
+            (
+                "yes",
+                "Ask at the end",
+                "A letter is named with the questions at the end; tested against chance. Only where no robot but "
+                "PbARL\N{RIGHT SINGLE QUOTATION MARK}s has learned from the person.",
+            ),
+        ),
+    )
 
     @model_validator(mode="after")
     def _each_once(self) -> "EvaluationSettings":
         if len(set(self.methods)) != len(self.methods):
             raise ValueError("Each method can be evaluated once only.")
         return self
+
+    @model_validator(mode="after")
+    def _one_is_theirs(self) -> "EvaluationSettings":
+        of_others = {EvaluatedMethod.REFERENCE, *FROM_OTHERS}
+        if self.ask_which_is_theirs and set(self.methods) - of_others != {EvaluatedMethod.PBARL}:
+            raise ValueError(
+                "Which robot was made for somebody can be asked only where one was: choose PbARL, and beside it only "
+                "the reference, somebody else's filter or the average."
+            )
+        return self
+
+    @property
+    def closing_questions(self) -> tuple[FormItem, ...]:
+        """What is asked of the robots once all are rated, with the questions at the end."""
+        if not self.ask_which_is_theirs:
+            return ()
+        return (FormItem(name=MADE_FOR_YOU, kind="choice", choices=tuple(LETTERS[: len(self.methods)])),)
+
+    @property
+    def shows_others(self) -> bool:
+        """Whether people are shown what others have taught."""
+        return any(method in FROM_OTHERS for method in self.methods)
 
     @property
     def trial_count(self) -> int:

@@ -92,6 +92,11 @@ PREVIEW_NUMBERS = 900_000
 """Previews are counted from here, so that they take no participant's number: the numbers balance the evaluation."""
 
 
+def code_of(number: int) -> str:
+    """What the participant of this number is called on pages and in files, such as P07."""
+    return f"P{number:02d}"
+
+
 class Awaited(StrEnum):
     """What a waiting page waits for."""
 
@@ -144,4 +149,4 @@ class Participant(Base):
     @property
     def code(self) -> str:
         """The name used on pages and in files, such as P07; those of previews begin at PREVIEW_NUMBERS."""
-        return f"P{self.number:02d}"
+        return code_of(self.number)

@@ -262,6 +262,19 @@ class StudySettings(BaseModel):
             )
         return self
 
+    @model_validator(mode="after")
+    def _asked_once(self) -> "StudySettings":
+        names = [each.name for each in self.closing_form]
+        twice = next((name for name in names if names.count(name) > 1), None)
+        if self.evaluation and twice in [each.name for each in self.evaluation.closing_questions]:
+            raise ValueError(f"{twice} is asked by the evaluation already. Leave it out of the questions at the end.")
+        return self
+
+    @property
+    def closing_form(self) -> tuple[FormItem, ...]:
+        """All questions at the end: those about the robots come first."""
+        return (*(self.evaluation.closing_questions if self.evaluation else ()), *self.questionnaire)
+
     @property
     def offered_languages(self) -> tuple[Language, ...]:
         """Languages people may choose from: the study's own first, which is always one of them."""

@@ -22,6 +22,7 @@ consent-body =
     - Sie vergleichen { $count } Paare. Machen Sie so viele Pausen, wie Sie möchten, auch tagelange: Ihr Link bringt Sie dorthin zurück, wo Sie waren.
     - Gespeichert werden Ihre Antworten, wann Sie sie gegeben haben und wie lange Sie dafür gebraucht haben, unter dem Kürzel { $code }. Wir fragen nicht nach Ihrem Namen und benutzen weder Kamera noch Mikrofon. Wenn Sie über ein Teilnahmeportal kommen, speichern wir auch die Kennung, unter der Sie dort geführt werden.
     - Die Teilnahme ist freiwillig. Sie können jederzeit ohne Angabe von Gründen aufhören: Schließen Sie einfach die Seite. Wenn Sie unten auf einer Seite „Teilnahme widerrufen“ wählen, wird alles über Sie gelöscht.
+consent-others = Zum Schluss bewerten Sie mehrere Roboter. Darunter können Roboter sein, die von anderen Menschen gelernt haben, und der Roboter, der von Ihnen gelernt hat, kann anderen gezeigt werden. Von wem ein Roboter gelernt hat, erfährt niemand, der ihn bewertet. Wenn Sie Ihre Teilnahme widerrufen, bekommt niemand Ihren Roboter neu zu sehen; wer schon angefangen hat, ihn zu bewerten, sieht ihn weiterhin. Auf Sie zurückführen lässt er sich dann nicht mehr.
 consent-duration = Dauer: { $duration }
 consent-payment = Vergütung: { $payment }
 consent-ethics = Ethikvotum: { $ethics }
@@ -71,6 +72,7 @@ form-felt_safe-high = vollkommen
 form-would_use = Ich würde einen solchen Roboter benutzen.
 form-would_use-low = auf keinen Fall
 form-would_use-high = auf jeden Fall
+form-made_for_you = Einer der Roboter, die Sie gerade bewertet haben, wurde für Sie gemacht: Er hat aus Ihren Antworten gelernt. Welcher war es? Wenn Sie es nicht wissen, wählen Sie den, der es Ihrer Meinung nach war.
 form-comments = Möchten Sie uns sonst noch etwas mitteilen?
 
 ## Anleitung
@@ -167,6 +169,7 @@ withdraw-body =
     - Es bleibt nur der Vermerk, dass { $code } teilgenommen und widerrufen hat und wann das war. Daraus geht weder hervor, wer Sie sind, noch, was Sie uns mitgeteilt haben.
     - Ergebnisse, die schon veröffentlicht sind, lassen sich nicht zurückholen.
 withdraw-average = Die Roboter von Menschen, die nach Ihnen kamen, sind möglicherweise von einem Durchschnitt ausgegangen, zu dem Ihrer beigetragen hat. Auf Sie zurückführen lässt er sich nicht.
+withdraw-others = Vielleicht haben andere schon angefangen, den Roboter zu bewerten, der von Ihnen gelernt hat. Sie sehen ihn weiterhin, aber nichts weist mehr darauf hin, dass es Ihrer war. Wer noch nicht angefangen hat, bekommt ihn nicht mehr zu sehen.
 withdraw-final = Das lässt sich nicht rückgängig machen, auch nicht von uns.
 withdraw-confirm = Alles über mich löschen
 withdraw-keep = Nein, alles behalten

@@ -24,6 +24,7 @@ consent-body =
     - You compare { $count } pairs. Take as many breaks as you like, even for days: your link brings you back to where you were.
     - We store your answers, when you gave them and how long you took, under the code { $code }. We do not ask for your name, and we use neither camera nor microphone. If a recruitment panel sent you here, we also keep the ID it uses for you.
     - Taking part is voluntary. You may stop at any time without giving a reason: just close the page. If you choose “Withdraw from the study” at the foot of a page, everything about you is erased.
+consent-others = At the end you rate several robots. Some of them may have learned from other people, and other people may be shown the robot that learned from you. Nobody who rates a robot is told whom it learned from. If you withdraw, nobody new is shown yours; whoever has begun to rate it goes on seeing it, and it can no longer be traced back to you.
 consent-duration = Duration: { $duration }
 consent-payment = Payment: { $payment }
 consent-ethics = Ethics approval: { $ethics }
@@ -73,6 +74,7 @@ form-felt_safe-high = completely
 form-would_use = I would use a robot like this.
 form-would_use-low = definitely not
 form-would_use-high = definitely
+form-made_for_you = One of the robots that you have just rated was made for you: it has learned from your answers. Which one was it? If you do not know, choose the one that you think it was.
 form-comments = Is there anything else you would like to tell us?
 
 ## Instructions
@@ -169,6 +171,7 @@ withdraw-body =
     - All that remains is a note that { $code } took part and withdrew, and when. It says neither who you are nor what you told us.
     - Results that have already been published cannot be taken back.
 withdraw-average = The robots of people who came after you may have started from an average to which yours contributed. It cannot be traced back to you.
+withdraw-others = Other people may have begun to rate the robot that learned from you. They go on seeing it, but nothing says any more that it was yours. Nobody new is shown it.
 withdraw-final = It cannot be undone, not even by us.
 withdraw-confirm = Erase everything about me
 withdraw-keep = No, keep it and go back

@@ -1,6 +1,7 @@
 """The page of results: honest while there is nothing, by letters while blinded, planned tests marked."""
 
 import re
+from collections import Counter
 from collections.abc import Callable
 from datetime import timedelta
 from typing import Any
@@ -10,11 +11,13 @@ from fastapi.testclient import TestClient
 from sqlalchemy import select
 
 from app.db import Database, now
+from app.domain.evaluation import DonorDraw
 from app.domain.models import Report, RunStatus
 from app.domain.preferences import Query, Response
-from app.domain.protocol import PlannedTest
-from app.domain.studies import Study
+from app.domain.protocol import EvaluatedMethod, PlannedTest
+from app.domain.studies import Participant, Study
 from app.services.answers import exclusions
+from app.services.evaluation import donors
 from app.services.monitoring import dashboard
 from app.services.studies import locking
 from app.storage import ArtefactStore
@@ -51,6 +54,21 @@ def results(browser: TestClient, study: Study) -> str:
     answer = browser.get(f"/studies/{study.slug}/results")
     assert answer.status_code == 200
     return answer.text
+
+
+def test_whose_filters_were_shown_is_counted_once_the_study_is_unblinded(
+    experimenter: TestClient, finished: Finished, database: Database
+) -> None:
+    study = finished(unblinded=False)
+    with database.writing() as session:
+        for person in session.scalars(select(Participant)):
+            donors.draw(session, study, person, EvaluatedMethod.SOMEBODY_ELSE, ("neutral",))
+    assert "by whose it was" not in results(experimenter, study)
+    with database.writing() as session:
+        session.get_one(Study, study.id).unblinded_at = now()
+    with database.reading() as session:
+        rules = Counter(session.scalars(select(DonorDraw.rule)))
+    assert f"another participant\N{RIGHT SINGLE QUOTATION MARK}s: {rules['by_lot']}" in results(experimenter, study)
 
 
 def test_without_answers_the_page_says_what_it_waits_for(database: Database, experimenter: TestClient) -> None:

@@ -10,7 +10,7 @@ from sqlalchemy import func, select
 
 from app.db import Base, Database, now
 from app.domain.clips import Clip
-from app.domain.evaluation import Assignment, Controller, Film, Rating, Trial
+from app.domain.evaluation import Assignment, Controller, DonorDraw, Film, Rating, Trial
 from app.domain.models import Export, Model, ModelKind, Report, RunKind
 from app.domain.participation import ConsentRecord, FormAnswer, ParticipantEvent, StageRecord
 from app.domain.people import AuditEvent
@@ -45,6 +45,8 @@ def leave_traces(database: Database, store: ArtefactStore, participant_id: int) 
         model.artefact_sha256 = store.put(marked("model").encode())
         query.predicted_by_model_id = model.id
         factories.make_bundle(session, store, model, marked("bundle").encode())
+        stored_donors = {"types": [marked("type")]}
+        session.add(DonorDraw(participant_id=person.id, method="average", rule="by_lot", stored_donors=stored_donors))
         film = Film(
             participant_id=person.id,
             method="pbarl",

@@ -29,6 +29,8 @@ NAMES = {
     "prefft_anchored": "PrefFT, anchored",
     "pbarl": "PbARL",
     "pbarl_printed": "PbARL as printed",
+    "somebody_else": "Somebody else's filter",
+    "average": "Average filter",
 }
 COST_NAMES = {
     "C_d": "Distance (C_d)",

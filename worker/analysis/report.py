@@ -1,7 +1,8 @@
 """One report: tables in, contents and figures out. The one function that the worker's processes run.
 
 Contents (stored as Report.contents): ``version``, ``blinded``, ``plan`` (standing, planned tests, in_words: see
-app.services.studies.preregistration), ``ratings`` (see statistics), ``answers`` and ``change`` (see answers).
+app.services.studies.preregistration), ``ratings`` (see statistics), ``guesses`` (see guesses; None where it is not
+asked), ``answers`` and ``change`` (see answers).
 Figures by name, each as SVG and PNG (see figures).
 """
 
@@ -12,6 +13,7 @@ from typing import Any
 import pandas as pd
 
 from worker.analysis import answers, figures, statistics
+from worker.analysis.guesses import guess_report
 
 Row = dict[str, Any]
 
@@ -32,6 +34,8 @@ class Tables:
     plan: Mapping[str, Any] = field(default_factory=dict)
     window: int = 30
     """answers in the running accuracy"""
+    guesses: Sequence[Row] | None = None
+    """who named which robot as made for them; None: that is not asked"""
     version: int = 0
     """of the contents, see app.services.runs.reports"""
     columns: dict[str, Sequence[str]] = field(default_factory=dict)
@@ -50,6 +54,7 @@ def make_report(tables: Tables) -> tuple[dict[str, Any], dict[str, dict[str, byt
             by="letter" if tables.blinded else "method",
             compare=not tables.blinded,
         ),
+        "guesses": None if tables.guesses is None else guess_report(tables.guesses, len(tables.groups)),
         "answers": answers.answer_report(tables.answers, tables.window),
         "change": answers.change_report(_frame(tables, "evaluations"), tables.participants),
     }

@@ -48,6 +48,18 @@ RECORDED_EPISODES = 2
 
 
 @dataclass(frozen=True)
+class Proven:
+    """A filter, or the reference in its place, with what was measured of it on unseen scenarios."""
+
+    draft: FilterDraft
+    act: FilterAct
+    evaluation: dict[str, Any]
+    driven: list[Trajectory]
+    rejected: dict[str, Any]
+    """what was measured of the filter that the reference has replaced; empty: it was not"""
+
+
+@dataclass(frozen=True)
 class Finished:
     """A filter ready to be published."""
 
@@ -98,26 +110,17 @@ class FilterFit:
         return self.compute.run(Lane.LEARNING, self.beat, printed_filter.fit_printed, self.problem, transitions)
 
     def finish(self, draft: FilterDraft, provenance: Provenance, learned: Mapping[str, Any]) -> Finished:
-        """Export, drive through unseen scenarios, pack. A studio's filter that does not meet the burden of proof
-        (worker.analysis.proof) is replaced by the reference.
+        """Prove and pack.
 
         ``learned``: the reward model's metrics and what to say of its foresight (``foresight_notes``), for the card.
         """
         started = time.perf_counter()
-        self.progress("driving the filter through unseen scenarios", 0.88)
-        act = filter_problem.act_of(self.problem.task.modes, self.problem.policy, draft.weights)
-        evaluation, filtered = self._evaluate(act)
-        against = case_against(evaluation) if draft.weights.method == "studio" else ()
-        rejected: dict[str, Any] = {}
-        if against:
-            rejected = {"evaluation": evaluation, "mode": dict(draft.weights.mode), **_strengths(draft.weights)}
-            draft = as_reference(draft, evaluation["preference"], against)
-            act = filter_problem.act_of(self.problem.task.modes, self.problem.policy, draft.weights)
-            evaluation, filtered = self._evaluate_reference()
+        proven = self.prove(draft)
+        draft, evaluation = proven.draft, proven.evaluation
         metrics: dict[str, Any] = {
             "evaluation": evaluation,
             "uses_reference": moves_nothing(draft.weights),
-            "rejected": rejected,
+            "rejected": proven.rejected,
             **_strengths(draft.weights),
             "mode": dict(draft.weights.mode),
             "method": draft.weights.method,
@@ -133,15 +136,30 @@ class FilterFit:
         }
         contents = BundleContents(
             task=self.problem.task,
-            filter_onnx=act.exported.stored,
+            filter_onnx=proven.act.exported.stored,
             weights=draft.weights,
             reward=self.problem.reward,
             policy=self.problem.policy,
-            recording=RecordedSteps.of(filtered[:RECORDED_EPISODES]),
+            recording=RecordedSteps.of(proven.driven[:RECORDED_EPISODES]),
             metrics=metrics,
             provenance=provenance,
         )
         return Finished(draft.weights.to_bytes(), bundle.write(contents), metrics)
+
+    def prove(self, draft: FilterDraft) -> Proven:
+        """Drive through unseen scenarios; a studio's filter that does not meet the burden of proof
+        (worker.analysis.proof) is replaced by the reference.
+        """
+        self.progress("driving the filter through unseen scenarios", 0.88)
+        act = filter_problem.act_of(self.problem.task.modes, self.problem.policy, draft.weights)
+        evaluation, driven = self._evaluate(act)
+        against = case_against(evaluation) if draft.weights.method == "studio" else ()
+        if not against:
+            return Proven(draft, act, evaluation, driven, {})
+        rejected = {"evaluation": evaluation, "mode": dict(draft.weights.mode), **_strengths(draft.weights)}
+        draft = as_reference(draft, evaluation["preference"], against)
+        act = filter_problem.act_of(self.problem.task.modes, self.problem.policy, draft.weights)
+        return Proven(draft, act, *self._evaluate_reference(), rejected)
 
     def _evaluate(self, act: FilterAct) -> tuple[dict[str, Any], list[Trajectory]]:
         scenarios = first_of(EVALUATION, self.config.evaluation_scenarios)

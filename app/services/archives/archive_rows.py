@@ -17,6 +17,7 @@ from sqlalchemy import JSON, Boolean, Column, Float, Integer, String, Table
 
 from app.db import Base, UtcDateTime
 from app.domain import run_keys
+from app.domain.evaluation import DonorDraw, DonorRule, Donors
 from app.domain.models import ModelKind, RunKind, RunStatus
 from app.domain.preferences import Purpose, Response, SkipReason
 from app.domain.protocol import EvaluatedMethod, Stage
@@ -39,6 +40,8 @@ _WORDS: Mapping[tuple[str, str], type[StrEnum]] = {
     ("assignment", "method"): EvaluatedMethod,
     ("film", "method"): EvaluatedMethod,
     ("controller", "method"): EvaluatedMethod,
+    ("donor_draw", "method"): EvaluatedMethod,
+    ("donor_draw", "rule"): DonorRule,
 }
 _PATTERNS: Mapping[tuple[str, str], str] = {
     ("study", "task"): r"[a-z][a-z0-9_]{0,39}",  # names a folder of the worker
@@ -102,6 +105,8 @@ class RowCheck:
                 _check_value(table.name, column, row[column.name])
         if table.name == Study.__tablename__:
             self._check_study(row)
+        if table.name == DonorDraw.__tablename__:
+            _check_donors(row)
         _check_left_out(table.name, row)
         for _, sha256 in artefacts(table.name, row):
             if not SHA256.fullmatch(sha256) or (sha256 not in self._manifest.files and self._is_here(sha256)):
@@ -215,6 +220,14 @@ def _check_left_out(table_name: str, row: Mapping[str, Any]) -> None:
             raise _Wrong("previews are not imported")
         if not 0 < (row.get("number") or 0) < PREVIEW_NUMBERS:
             raise _Wrong("number has a value that it cannot have")
+
+
+def _check_donors(row: Mapping[str, Any]) -> None:
+    """Raises _Wrong."""
+    try:
+        Donors.model_validate(row.get("stored_donors"))
+    except ValidationError as error:
+        raise _Wrong("stored_donors has a value that it cannot have") from error
 
 
 def _describes_recordings(material: Mapping[str, Any]) -> bool:

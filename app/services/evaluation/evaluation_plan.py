@@ -23,13 +23,12 @@ from sqlalchemy.orm import Session, joinedload
 
 from app.db import now
 from app.domain.evaluation import Assignment, Controller, Film, Rating, Trial
-from app.domain.protocol import EvaluatedMethod, EvaluationMode, EvaluationSettings
+from app.domain.protocol import LETTERS, EvaluatedMethod, EvaluationMode, EvaluationSettings
 from app.domain.studies import Participant, Study
 from app.storage import ArtefactStore
 
-LETTERS = "ABCDE"
-TRAINED = (EvaluatedMethod.PREFFT, EvaluatedMethod.PREFFT_ANCHORED, EvaluatedMethod.PBARL_PRINTED)
-"""Methods that are trained for the evaluation alone; the reference is there, and pbarl is the participant's filter."""
+TRAINED = tuple(each for each in EvaluatedMethod if each not in (EvaluatedMethod.REFERENCE, EvaluatedMethod.PBARL))
+"""Methods that are made for the evaluation alone; the reference is there, and pbarl is the participant's filter."""
 
 TRIAL_SCENARIOS = range(6_000_000, 6_800_000)
 """Scenarios of trials; nothing else uses them (worker.scenarios has the others)."""

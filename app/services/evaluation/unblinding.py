@@ -19,6 +19,8 @@ NAMES = {
     EvaluatedMethod.PREFFT_ANCHORED: "PrefFT, anchored",
     EvaluatedMethod.PBARL: "PbARL",
     EvaluatedMethod.PBARL_PRINTED: "PbARL as printed",
+    EvaluatedMethod.SOMEBODY_ELSE: "somebody else's filter",
+    EvaluatedMethod.AVERAGE: "average filter",
 }
 """What people call the methods, once they may know."""
 

@@ -10,11 +10,11 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session, aliased, joinedload
 
 from app.domain.clips import Clip, Rollout
-from app.domain.evaluation import Rating, Trial
+from app.domain.evaluation import DonorDraw, Rating, Trial
 from app.domain.models import Bundle, Model, ModelKind
 from app.domain.participation import ConsentRecord, FormAnswer, ParticipantEvent, StageRecord
 from app.domain.preferences import LEARNED_FROM, Exclusion, LabelEvent, Query
-from app.domain.studies import Deviation, Participant, Study
+from app.domain.studies import Deviation, Participant, Study, code_of
 from app.services.evaluation import unblinding
 from app.services.exports.paging import EVERYTHING, KeyedRows, Window
 from app.services.runs import model_metrics
@@ -246,6 +246,28 @@ def ratings(session: Session, study: Study, window: Window = EVERYTHING) -> Keye
                     trial.started_at,
                     trial.finished_at,
                     trial.film.success if trial.film is not None and not blinded else None,
+                ),
+            )
+
+
+def donors(session: Session, study: Study, window: Window = EVERYTHING) -> KeyedRows:
+    """Nothing while the study is blinded."""
+    if unblinding.is_blinded(study):
+        return
+    for person, wanted in _present(session, study, window):
+        theirs = select(DonorDraw).where(DonorDraw.participant_id == person.id)
+        theirs = theirs.where(wanted.beyond(DonorDraw.id), wanted.known(DonorDraw)).order_by(DonorDraw.id)
+        for each in session.scalars(theirs):
+            yield (
+                (person.number, each.id),
+                (
+                    person.code,
+                    each.method,
+                    each.rule,
+                    " ".join(code_of(number) for number in each.donors.people),
+                    " ".join(each.donors.types),
+                    " ".join(code_of(number) for number in each.donors.candidates),
+                    each.created_at,
                 ),
             )
 

@@ -1,14 +1,14 @@
 """The tables of an export and what every column means; export_rows reads what stands in them."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from app.domain.clips import Clip
-from app.domain.evaluation import Rating, Trial
+from app.domain.evaluation import DonorDraw, DonorRule, Rating, Trial
 from app.domain.models import Model, ModelKind
 from app.domain.participation import ConsentRecord, FormAnswer, ParticipantEvent, StageRecord
 from app.domain.preferences import LabelEvent, Purpose, Query, Response, SkipReason
-from app.domain.protocol import EvaluatedMethod, Stage
+from app.domain.protocol import FROM_OTHERS, EvaluatedMethod, Stage
 from app.domain.studies import Deviation, Participant
 from app.services.exports import export_rows
 from app.services.exports.export_formats import Column, ColumnKind, Table
@@ -22,7 +22,7 @@ WITHOUT_SCRIPT = (
 )
 
 
-def _words(values: type[Any]) -> str:
+def _words(values: Iterable[Any]) -> str:
     return ", ".join(value.value for value in values)
 
 
@@ -229,6 +229,28 @@ TABLES: Sequence[Table] = (
         export_rows.ratings,
         (Trial, Rating),
         grows_by=Rating,
+    ),
+    Table(
+        "donors",
+        "Whose filter a participant was shown as somebody_else and average; no rows until the study is unblinded.",
+        (
+            PARTICIPANT,
+            Column("method", T, "As what it was shown.", allowed=_words(FROM_OTHERS)),
+            Column(
+                "rule",
+                T,
+                "How it was drawn. by_lot: one of the candidates, nobody much more often than others. mean_of_people: "
+                "all candidates. type_of_user, mean_of_types: there were too few candidates. withdrew: whose it was "
+                "has withdrawn since.",
+                allowed=_words(DonorRule),
+            ),
+            Column("people", T, "Codes of those whose filter, or whose wishes, these are; separated by spaces."),
+            Column("types", T, "The paper's types of users whose wishes these are; separated by spaces."),
+            Column("candidates", T, "Codes of those who could have been drawn, without who has withdrawn since."),
+            Column("drawn_at", W, "When it was drawn: after the participant's last answer."),
+        ),
+        export_rows.donors,
+        (DonorDraw,),
     ),
     Table(
         "models",

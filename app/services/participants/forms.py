@@ -27,7 +27,7 @@ class AnswerProblem(StrEnum):
 
 def items_of(settings: StudySettings, form: Stage) -> Sequence[FormItem]:
     """The questions of a form."""
-    return settings.demographics if form is Stage.DEMOGRAPHICS else settings.questionnaire
+    return settings.demographics if form is Stage.DEMOGRAPHICS else settings.closing_form
 
 
 def answers_of(session: Session, participant: Participant, form: Stage) -> dict[str, str | None]:

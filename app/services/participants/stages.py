@@ -24,7 +24,7 @@ def stages_of(settings: StudySettings) -> Sequence[Stage]:
         Stage.DEMOGRAPHICS: bool(settings.demographics),
         Stage.PRACTICE: settings.practice_pairs > 0,
         Stage.EVALUATION: settings.evaluation is not None,
-        Stage.QUESTIONNAIRE: bool(settings.questionnaire),
+        Stage.QUESTIONNAIRE: bool(settings.closing_form),
         Stage.DEBRIEF: settings.debrief,
     }
     return [stage for stage in Stage if asked_for.get(stage, True)]

@@ -20,6 +20,7 @@ from app.domain.study_settings import StudySettings
 from app.services import audit
 from app.services.auditing import receipts
 from app.services.auditing.receipts import ROWS_AND_FILES, Erased
+from app.services.evaluation import donors
 from app.storage import ArtefactStore
 
 ARTEFACT_COLUMNS: tuple[InstrumentedAttribute[Any], ...] = (
@@ -65,7 +66,11 @@ def erase(session: Session, store: ArtefactStore, participant: Participant) -> N
     artefacts = set(_artefacts(session, participant))
     erased = Erased(audit_rows=audit.forget(session, participant_id=participant.id))
     _erase_made_of_everybody(session, participant.study_id)
+    lent, files = donors.release(session, participant)
+    artefacts |= files
     _erase_rows(session, personal_rows(participant.id), erased)
+    for table, count in lent.items():
+        erased.rows[table] += count
     session.expire_all()  # what the session remembers of those rows is gone as well
     _erase_files(session, store, artefacts, erased)
     store.unfinished.forget(store.unfinished.folder(participant.id))

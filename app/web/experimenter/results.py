@@ -9,13 +9,14 @@ from fastapi.responses import RedirectResponse, Response, StreamingResponse
 from sqlalchemy.orm import Session
 
 from app import signing
+from app.domain.evaluation import DonorRule
 from app.domain.people import Experimenter
 from app.domain.studies import Study
 from app.errors import AppError
 from app.services import audit
 from app.services.answers import exclusions
 from app.services.archives import sealing, study_import
-from app.services.evaluation import evaluation_plan, unblinding
+from app.services.evaluation import donors, evaluation_plan, unblinding
 from app.services.exports import export_formats, export_requests, export_tables
 from app.services.exports.export_requests import ExportKind
 from app.services.monitoring import form_summaries
@@ -45,6 +46,13 @@ FileKind = Literal["csv", "jsonl"]
 MEDIA_TYPES = {"csv": "text/csv; charset=utf-8", "jsonl": "application/x-ndjson"}
 LINES_AT_ONCE = 200
 METHOD_NAMES = {method.value: name[:1].upper() + name[1:] for method, name in unblinding.NAMES.items()}
+DONOR_WORDS = {
+    DonorRule.BY_LOT: "another participant\N{RIGHT SINGLE QUOTATION MARK}s",
+    DonorRule.MEAN_OF_PEOPLE: "the mean of other participants",
+    DonorRule.TYPE_OF_USER: "of a type of user",
+    DonorRule.MEAN_OF_TYPES: "the mean of the types of users",
+    DonorRule.WITHDREW: "of somebody who has withdrawn since",
+}
 FIGURES = {
     "ratings": ("Mean ratings, as in the paper", ""),
     "ratings_of_each_person": (
@@ -98,6 +106,7 @@ def results_context(session: Session, study: Study) -> dict[str, Any]:
         "blinded": unblinding.is_blinded(study),
         "evaluated": evaluation_plan.settings_of(study) is not None,
         "words": task_words.words_of(study.task),
+        "lent": _lent(session, study),
         "name_of": _name_of,
         "p_value": _p_value,
         "two_decimals": _two_decimals,
@@ -234,6 +243,14 @@ def _handfuls(lines: Iterator[str]) -> Iterator[str]:
             yield "".join(waiting)
             waiting = []
     yield "".join(waiting)
+
+
+def _lent(session: Session, study: Study) -> dict[str, str]:
+    """Whose filters were shown as methods that are not the person's own, in words, by what the method is called."""
+    return {
+        _name_of(method): ", ".join(f"{DONOR_WORDS[DonorRule(rule)]}: {count}" for rule, count in found.items())
+        for method, found in sorted(donors.counts(session, study).items())
+    }
 
 
 def _name_of(group: str) -> str:

@@ -31,9 +31,14 @@ def consent_text(wording: Wording, participant: Participant) -> ConsentText:
     return ConsentText(
         title=wording("consent-title"),
         welcome=wording("consent-welcome"),
-        body=_with_list(body, _facts_in_words(wording, facts)),
+        body=_with_list(body, [*_shown_to_others(wording, settings), *_facts_in_words(wording, facts)]),
         version=wording("consent-version", version=settings.consent_version),
     )
+
+
+def _shown_to_others(wording: Wording, settings: StudySettings) -> list[str]:
+    """In every study where it happens, whatever its own text says."""
+    return [wording("consent-others")] if settings.evaluation and settings.evaluation.shows_others else []
 
 
 def fact_of(wording: Wording, settings: StudySettings, name: str) -> str:

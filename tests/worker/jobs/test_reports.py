@@ -11,11 +11,13 @@ from scipy import stats
 from sqlalchemy import select
 
 from app.db import Database, now
+from app.domain.evaluation import Assignment
 from app.domain.models import Report, Run, RunKind, RunStatus
 from app.domain.preferences import Exclusion, LabelEvent, Query
+from app.domain.protocol import MADE_FOR_YOU, Stage
 from app.domain.studies import Participant, Study
 from app.services.exports import export_formats, export_tables
-from app.services.participants import withdrawal
+from app.services.participants import forms, withdrawal
 from app.storage import ArtefactStore
 from tests import factories
 from tests.finished_study import make_finished_study
@@ -66,6 +68,28 @@ def age(context: WorkerContext, by: timedelta, took: timedelta = timedelta(0)) -
             report.created_at = now() - by
             run = session.get_one(Run, report.run_id)
             run.started_at, run.finished_at = now() - took, now()
+
+
+def test_who_named_their_own_robot_is_counted_after_unblinding(context: WorkerContext, finished: Study) -> None:
+    with context.database.writing() as session:
+        study = session.get_one(Study, finished.id)
+        study.unblinded_at = None
+        methods = ("reference", "pbarl", "somebody_else")
+        evaluation = {"methods": methods, "ask_which_is_theirs": True}
+        study.stored_settings = {**study.stored_settings, "evaluation": evaluation}
+        people = session.scalars(select(Participant).where(Participant.study_id == study.id)).all()
+        own = select(Assignment).where(Assignment.method == "pbarl")
+        letters = {each.participant_id: each.letter for each in session.scalars(own)}
+        for person, is_right in zip(people, (True, True, True, False), strict=False):  # the fifth leaves it out
+            letter = next(each for each in "ABC" if (each == letters[person.id]) == is_right)
+            forms.record(session, person, Stage.QUESTIONNAIRE, study.settings.closing_form, {MADE_FOR_YOU: letter})
+    blinded = make_report(context, finished).contents["guesses"]
+    assert (blinded["people"], blinded["right"], blinded["p"]) == (4, None, None)
+    with context.database.writing() as session:
+        session.get_one(Study, finished.id).unblinded_at = now()
+    found = make_report(context, finished).contents["guesses"]
+    assert (found["people"], found["right"], found["robots"]) == (4, 3, 3)
+    assert found["p"] == pytest.approx(stats.binomtest(3, 4, 1 / 3).pvalue)
 
 
 def test_an_empty_study_has_no_report(context: WorkerContext) -> None:

@@ -24,6 +24,7 @@ from worker.jobs.clips import repairs
 from worker.jobs.clips.stored_video import video_columns
 from worker.jobs.learning import baselines
 from worker.jobs.learning.filters import NothingToLearnFrom
+from worker.jobs.learning.lent_filters import LoanEnded
 from worker.jobs.runtime import due_work, records
 from worker.jobs.runtime.context import Step, WorkerContext
 from worker.jobs.runtime.records import Job
@@ -69,6 +70,20 @@ def make_films(context: WorkerContext, job: Job, run_id: int, step: Step) -> Non
         context.report(run_id, f"{_DOING[what]} {first + 1} of {len(shots)}", first / len(shots))
         some = shots[first : first + AT_A_TIME]
         step(f"shots-{first}", _pack if what == CONTROLLERS else _film, context, run_id, job, some)
+    step("check", _check, context, job, what)
+
+
+def _check(context: WorkerContext, job: Job, what: str) -> None:
+    """Somebody may have withdrawn meanwhile whose filter was shown. Raises LoanEnded, so that all is done again."""
+    with context.database.reading() as session:
+        if what == CONTROLLERS:
+            made = len(evaluation_plan.controllers_of(session, job.participant))
+            whole = made >= len(evaluation_plan.assignments_of(session, job.participant))
+        else:
+            trials = evaluation_plan.trials_of(session, job.participant) if what == TRIALS else ()
+            whole = all(trial.film is not None for trial in trials)
+    if not whole:
+        raise LoanEnded
 
 
 _DOING = {BEFORE_AFTER: "filming before and after,", TRIALS: "filming robot", CONTROLLERS: "packing robot"}

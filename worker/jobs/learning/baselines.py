@@ -1,5 +1,7 @@
 """Methods that are only evaluated, such as PrefFT: trained once somebody has given all labels, on what they said.
 
+Those that others have taught are made by lent_filters, and measured and kept here like the rest.
+
 Trained with what other people's reward models leave of the machine. A training keeps checkpoints in a folder of the
 participant's, so a killed worker goes on where it was; the folder is removed at the end.
 """
@@ -8,21 +10,24 @@ import time
 from collections.abc import Callable, Collection
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from sqlalchemy.orm import Session
 
 from app.domain.choices import RewardKind
 from app.domain.models import ModelKind, RunKind
-from app.domain.protocol import EvaluatedMethod
+from app.domain.protocol import FROM_OTHERS, EvaluatedMethod
 from app.domain.run_keys import RunKey
 from app.domain.studies import Participant, Study
 from app.services.evaluation import evaluation_plan
+from app.services.participants import withdrawal
 from worker.analysis.evaluation import evaluate
 from worker.compute import baseline_fitting, learning
 from worker.compute.baseline_fitting import Baseline
 from worker.compute.pools import Lane
-from worker.jobs.learning import dataset
+from worker.jobs.learning import dataset, lent_filters
 from worker.jobs.learning.filters import NothingToLearnFrom, reward_to_follow
+from worker.jobs.learning.lent_filters import LoanEnded
 from worker.jobs.runtime import due_work, records
 from worker.jobs.runtime.context import Step, WorkerContext
 from worker.jobs.runtime.records import Job
@@ -56,7 +61,10 @@ def train_method(context: WorkerContext, job: Job, run_id: int, step: Step) -> N
     """Train the method that the job names, drive it through unseen scenarios, and keep it."""
     method = EvaluatedMethod(job.about.subject)
     reward = step("reward", _choose_reward, context, run_id, job)
-    trained = step("train", _train, context, run_id, job, method.value, reward)
+    if method in FROM_OTHERS:
+        trained = lent_filters.make(context, job, run_id, step, method)
+    else:
+        trained = step("train", _train, context, run_id, job, method.value, reward)
     if not trained:
         return  # the last answer was given again, and the same method is due anew
     step("save", _save, context, run_id, job, method.value, reward, trained)
@@ -167,9 +175,24 @@ def _save(context: WorkerContext, run_id: int, job: Job, method: str, reward: st
         "notes": trained["notes"],
         "seconds": {"fit": trained["seconds"], "evaluation": round(time.perf_counter() - started, 1)},
     }
-    with context.database.writing() as session:
-        records.save_model(session, run_id, ModelKind.METHOD, str(trained["artefact"]), metrics)
+    _keep(context, run_id, job, method, trained, metrics)
     context.store.unfinished.forget(_folder(context, job, run_id))
+
+
+def _keep(
+    context: WorkerContext, run_id: int, job: Job, method: str, trained: dict[str, object], metrics: dict[str, Any]
+) -> None:
+    """Record the model; nothing is left of somebody else's filter if they have withdrawn. Raises LoanEnded then."""
+    artefact = str(trained["artefact"])
+    with context.database.writing() as session:
+        try:
+            if method in FROM_OTHERS:
+                lent_filters.check(session, job, method, trained["draw"])
+        except LoanEnded:
+            for sha256 in {artefact} - withdrawal.in_use(session, [artefact]):
+                context.store.delete(sha256)
+            raise
+        records.save_model(session, run_id, ModelKind.METHOD, artefact, metrics)
 
 
 def _driven(

@@ -36,7 +36,7 @@ def train_filter(context: WorkerContext, job: Job, run_id: int, step: Step) -> N
     Nothing is made of a filter that is outdated before it is begun, and none is gone on with once its person has given
     the last answer, for then they wait for the last one.
     """
-    if step("is-outdated", _is_outdated, context, job, False):
+    if step("is-outdated", is_outdated, context, job, False):
         return
     reward = step("reward", _choose_reward, context, run_id, job)
     if not reward:
@@ -45,13 +45,14 @@ def train_filter(context: WorkerContext, job: Job, run_id: int, step: Step) -> N
         settings = session.get_one(Study, job.study_id).settings
     draft = ""
     for stage in STAGES[settings.method]:
-        if step(f"is-outdated-before-{stage}", _is_outdated, context, job, True):
+        if step(f"is-outdated-before-{stage}", is_outdated, context, job, True):
             return
-        draft = step(stage, _stage, context, run_id, job, reward, draft, stage)
+        draft = step(stage, fit_stage, context, run_id, job, reward, draft, stage)
     step("publish", _publish, context, run_id, job, reward, draft)
 
 
-def _is_outdated(context: WorkerContext, job: Job, begun: bool) -> bool:
+def is_outdated(context: WorkerContext, job: Job, begun: bool) -> bool:
+    """See due_work.is_outdated."""
     with context.database.reading() as session:
         return due_work.is_outdated(session, job, begun=begun)
 
@@ -100,23 +101,25 @@ def _choose_reward(context: WorkerContext, run_id: int, job: Job) -> str:
     return context.store.put(stored)
 
 
-def _stage(context: WorkerContext, run_id: int, job: Job, reward: str, draft: str, stage: str) -> str:
-    """One stage of the fit: the artefact of a draft in, the artefact of a better one out."""
-    fitting = _fitting(context, run_id, job, reward)
+def fit_stage(
+    context: WorkerContext, run_id: int, job: Job, reward: str, draft: str, stage: str, shared: bool = False
+) -> str:
+    """One stage of the fit: the artefact of a draft in, the artefact of a better one out. ``shared``: see fitting()."""
+    fit = fitting(context, run_id, job, reward, shared=shared)
     if stage in {"mode", "printed"}:
         with context.database.reading() as session:
             clips = dataset.pool_clips(session, job.study_id)
         pool = [dataset.shown(context.store, clip) for clip in clips]
-        result = fitting.find_mode(pool) if stage == "mode" else fitting.fit_printed()
+        result = fit.find_mode(pool) if stage == "mode" else fit.fit_printed()
     else:
-        before = _draft(context, draft)
-        result = fitting.train_residual(before) if stage == "residual" else fitting.gate_residual(before)
+        before = load_draft(context, draft)
+        result = fit.train_residual(before) if stage == "residual" else fit.gate_residual(before)
     return context.store.put(filter_fitting.draft_to_bytes(result))
 
 
 def _publish(context: WorkerContext, run_id: int, job: Job, reward: str, draft: str) -> None:
     """Evaluate on unseen scenarios, write the bundle, and only then let anybody see it."""
-    fitting = _fitting(context, run_id, job, reward)
+    fit = fitting(context, run_id, job, reward)
     with context.database.reading() as session:
         participant = session.get_one(Participant, job.participant)
         study = session.get_one(Study, job.study_id)
@@ -137,7 +140,7 @@ def _publish(context: WorkerContext, run_id: int, job: Job, reward: str, draft: 
         deviations=export.deviations,
     )
     learned = {**(model.metrics if model else {}), "foresight_notes": notes}
-    finished = fitting.finish(_draft(context, draft), provenance, learned)
+    finished = fit.finish(load_draft(context, draft), provenance, learned)
     packed = finished.bundle if context.key is None else bundle.signed(finished.bundle, context.key.signed)
     model_artefact, bundle_artefact = context.store.put(finished.filter_weights), context.store.put(packed)
     with context.database.writing() as session:
@@ -166,7 +169,8 @@ def notes_on_foresight(curve: accuracy.Curve) -> Sequence[str]:
     ]
 
 
-def _draft(context: WorkerContext, artefact: str) -> FilterDraft:
+def load_draft(context: WorkerContext, artefact: str) -> FilterDraft:
+    """A stored draft of a filter."""
     return filter_fitting.draft_from_bytes(context.store.read(artefact))
 
 
@@ -177,11 +181,12 @@ def filter_config(settings: StudySettings) -> FilterConfig:
     )
 
 
-def _fitting(context: WorkerContext, run_id: int, job: Job, reward: str) -> FilterFit:
+def fitting(context: WorkerContext, run_id: int, job: Job, reward: str, *, shared: bool = False) -> FilterFit:
+    """What fits a filter to a stored reward model. ``shared``: not the person's own, so the study's seed is used."""
     with context.database.reading() as session:
         study = session.get_one(Study, job.study_id)
         task, settings = study.task, study.settings
-        seed = session.get_one(Participant, job.participant).seed
+        seed = study.seed if shared else session.get_one(Participant, job.participant).seed
     return FilterFit(
         task=task,
         compute=context.compute,

@@ -15,13 +15,15 @@ from sqlalchemy.orm import Session
 from app.db import now
 from app.domain.evaluation import Rating, Trial
 from app.domain.models import Model, Report, Run, RunKind, RunStatus
+from app.domain.participation import FormAnswer
 from app.domain.preferences import Exclusion, LabelEvent, Query
+from app.domain.protocol import LETTERS, MADE_FOR_YOU, EvaluatedMethod, Stage
 from app.domain.run_keys import BASIS, RunKey
 from app.domain.studies import Participant, Study
 from app.services.answers import accuracy, answer_figures
 from app.services.evaluation import evaluation_plan, unblinding
 from app.services.exports import export_formats, export_rows, export_tables
-from app.services.participants import withdrawal
+from app.services.participants import forms, withdrawal
 from app.services.runs.reports import VERSION
 from app.services.studies import preregistration
 from worker.analysis.report import Tables, make_report
@@ -74,6 +76,9 @@ def basis_of(session: Session, study: Study) -> str | None:
         return None
     words = select(func.max(Exclusion.id)).join(LabelEvent).join(Query).where(Query.participant_id.in_(people))
     newest.append(session.scalar(words))
+    if _asks_whose(study):
+        said = select(func.max(FormAnswer.id)).where(FormAnswer.participant_id.in_(people))
+        newest.append(session.scalar(said.where(FormAnswer.item == MADE_FOR_YOU)))
     gone = session.scalars(people.where(Participant.withdrawn_at.is_not(None)).order_by(Participant.id)).all()
     blinded, plan = unblinding.is_blinded(study), _plan(session, study)
     basis = (VERSION, newest, list(gone), blinded, study.lock_hash, study.stored_settings, plan)
@@ -119,13 +124,32 @@ def tables_of(session: Session, study: Study) -> Tables:
         answers=[answer_figures.figures_of(session, each) for each in people],
         window=accuracy.WINDOW,
         version=VERSION,
-        groups=list(evaluation_plan.LETTERS[: len(groups)]) if blinded else groups,
+        groups=list(LETTERS[: len(groups)]) if blinded else groups,
         blinded=blinded,
         plan=_plan(session, study),
         columns={name: [column.name for column in table.all_columns] for name, table in wanted.items()},
         ratings=rows["ratings"],
         evaluations=rows["evaluations"],
+        guesses=_guesses(session, study) if _asks_whose(study) else None,
     )
+
+
+def _asks_whose(study: Study) -> bool:
+    settings = evaluation_plan.settings_of(study)
+    return settings is not None and settings.ask_which_is_theirs
+
+
+def _guesses(session: Session, study: Study) -> list[dict[str, Any]]:
+    """Who named which robot as theirs, and whether it is; that is None while the study is blinded."""
+    methods = {} if unblinding.is_blinded(study) else unblinding.methods_by_letter(session, study)
+    found = []
+    for person in export_rows.everybody(session, study):
+        letter = forms.answers_of(session, person, Stage.QUESTIONNAIRE).get(MADE_FOR_YOU)
+        if person.withdrawn_at is None and letter is not None:
+            method = methods.get((person.id, letter))
+            right = None if method is None else method == EvaluatedMethod.PBARL
+            found.append({"participant": person.code, "letter": letter, "right": right})
+    return found
 
 
 def _plan(session: Session, study: Study) -> dict[str, Any]:

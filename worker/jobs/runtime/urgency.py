@@ -54,8 +54,8 @@ class Urgency(NamedTuple):
     step: int
 
 
-_STEPS = {RunKind.REWARD: 0, RunKind.FILTER: 1, RunKind.METHOD: 1, RunKind.FILMS: 2}
-_LAST_STEP = 3
+_STEPS = {RunKind.REWARD: 0, RunKind.FILTER: 1, RunKind.METHOD: 2, RunKind.FILMS: 3}
+_LAST_STEP = 4
 
 
 @dataclass(frozen=True)

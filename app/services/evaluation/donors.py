@@ -1,0 +1,189 @@
+"""Whose filter somebody is shown as ``somebody_else`` and ``average``: drawn once, logged, given back on withdrawal.
+
+A donor is a participant of the same study with a filter of all their answers. ``somebody_else`` is a yoked control:
+what another participant has taught. The rules, and why they are these: docs/decisions.md, 103.
+"""
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from typing import TypeVar
+
+from sqlalchemy import delete, select
+from sqlalchemy.orm import Session
+
+from app.domain.evaluation import Controller, DonorDraw, DonorRule, Donors, Film, Trial
+from app.domain.models import Model, ModelKind, Run, RunKind, RunStatus
+from app.domain.protocol import EvaluatedMethod
+from app.domain.run_keys import CONTROLLERS, TRIALS, read
+from app.domain.studies import Participant, Study
+from app.services.evaluation import evaluation_plan, unblinding
+
+FEWEST_PEOPLE = 3
+"""An average of fewer would tell too much about each of them."""
+SLACK = 1
+"""Loans by which one donor may be ahead of another and still be drawn."""
+Name = TypeVar("Name", int, str)
+
+
+def draw(
+    session: Session, study: Study, participant: Participant, method: EvaluatedMethod, types: Sequence[str]
+) -> DonorDraw:
+    """Draw whose filter the participant is shown, or give what was drawn before. ``types``: of users, by name."""
+    session.scalar(select(Study.id).where(Study.id == study.id).with_for_update())  # one at a time: loans are counted
+    known = find(session, participant.id, method)
+    if known is not None:
+        return known
+    people = candidates(session, study, participant)
+    if method is EvaluatedMethod.SOMEBODY_ELSE:
+        rule, donors = _one(session, study, participant, people, types)
+    elif len(people) >= FEWEST_PEOPLE:
+        rule, donors = DonorRule.MEAN_OF_PEOPLE, Donors(people=tuple(people), candidates=tuple(people))
+    else:
+        rule, donors = DonorRule.MEAN_OF_TYPES, Donors(types=tuple(types), candidates=tuple(people))
+    drawn = DonorDraw(
+        participant_id=participant.id, method=method, rule=rule, stored_donors=donors.model_dump(mode="json")
+    )
+    session.add(drawn)
+    session.flush()
+    return drawn
+
+
+def find(session: Session, participant_id: int, method: str) -> DonorDraw | None:
+    """What was drawn for somebody; None while nothing was."""
+    theirs = select(DonorDraw).where(DonorDraw.participant_id == participant_id, DonorDraw.method == method)
+    return session.scalar(theirs)
+
+
+def candidates(session: Session, study: Study, participant: Participant) -> Sequence[int]:
+    """Numbers of those whose filter may be lent to the participant, ascending.
+
+    People and scripted participants are never mixed: what a program has taught is no control for a person. A preview
+    borrows from nobody, for the experimenter who tries the study out knows who has finished.
+    """
+    if participant.is_preview:
+        return []
+    has_filter = (
+        select(Model.id)
+        .where(
+            Model.participant_id == Participant.id,
+            Model.kind == ModelKind.FILTER,
+            Model.label_count >= study.settings.labels_per_participant,
+        )
+        .exists()
+    )
+    scripted = Participant.scripted_as.is_not(None)
+    others = select(Participant.number).where(
+        Participant.study_id == study.id,
+        Participant.id != participant.id,
+        Participant.withdrawn_at.is_(None),
+        Participant.is_preview.is_(False),
+        scripted if participant.scripted_as is not None else ~scripted,
+        has_filter,
+    )
+    return session.scalars(others.order_by(Participant.number)).all()
+
+
+def _one(
+    session: Session, study: Study, participant: Participant, people: Sequence[int], types: Sequence[str]
+) -> tuple[DonorRule, Donors]:
+    """One donor, by lot among those lent at most SLACK times more than whoever was lent least.
+
+    With no slack, people who finish one after the other would each get the filter of the one before.
+    """
+    mine = select(DonorDraw).join(Participant, Participant.id == DonorDraw.participant_id)
+    mine = mine.where(Participant.study_id == study.id, Participant.is_preview.is_(False))
+    earlier = session.scalars(mine.where(DonorDraw.method == EvaluatedMethod.SOMEBODY_ELSE)).all()
+    lent = Counter[int | str]()
+    for each in earlier:
+        lent.update(each.donors.people)
+        lent.update(each.donors.types)
+
+    def drawn(names: Sequence[Name]) -> Name:
+        least = min(lent[name] for name in names)
+        eligible = [name for name in names if lent[name] <= least + SLACK]
+        return min(eligible, key=lambda name: evaluation_plan.mark(study.key_secret, "donor", participant.number, name))
+
+    if people:
+        return DonorRule.BY_LOT, Donors(people=(drawn(people),), candidates=tuple(people))
+    return DonorRule.TYPE_OF_USER, Donors(types=(drawn(types),))
+
+
+def counts(session: Session, study: Study) -> dict[str, Counter[str]]:
+    """How many participants were lent a filter by which rule, by method; nothing while the study is blinded."""
+    if unblinding.is_blinded(study):
+        return {}
+    drawn = select(DonorDraw.method, DonorDraw.rule).join(Participant, Participant.id == DonorDraw.participant_id)
+    drawn = drawn.where(Participant.study_id == study.id, Participant.is_preview.is_(False))
+    found: dict[str, Counter[str]] = {}
+    for method, rule in session.execute(drawn.order_by(DonorDraw.id)):
+        found.setdefault(method, Counter())[rule] += 1
+    return found
+
+
+def numbers_in(draws: Iterable[DonorDraw]) -> set[int]:
+    """Everybody who is named in these draws."""
+    return {number for each in draws for number in (*each.donors.people, *each.donors.candidates)}
+
+
+def release(session: Session, participant: Participant) -> tuple[dict[str, int], set[str]]:
+    """Take the participant, who has withdrawn, out of what was drawn for others; doing it again changes nothing.
+
+    What was made of their filter for somebody who has not begun to look is erased, to be drawn and made anew. Returns
+    the erased rows by table, and the files that they named.
+    """
+    study = session.get_one(Study, participant.study_id)
+    begun = evaluation_plan.begun(session, study)
+    theirs = select(DonorDraw).join(Participant, Participant.id == DonorDraw.participant_id)
+    theirs = theirs.where(Participant.study_id == study.id, DonorDraw.participant_id != participant.id)
+    rows, files = Counter[str](), set[str]()
+    for each in session.scalars(theirs).all():
+        if participant.number not in numbers_in([each]):
+            continue
+        was = each.donors
+        each.stored_donors = was.without(participant.number).model_dump(mode="json")
+        if participant.number not in was.people or each.method != EvaluatedMethod.SOMEBODY_ELSE:
+            continue
+        if each.participant_id in begun:
+            each.rule = DonorRule.WITHDREW
+            continue
+        files |= _take_back(session, each.participant_id, each.method, rows)
+        session.delete(each)
+        rows[DonorDraw.__tablename__] += 1
+    session.flush()
+    return dict(rows), files
+
+
+def _take_back(session: Session, borrower_id: int, method: str, rows: Counter[str]) -> set[str]:
+    """Erase what was made of a loan, and have it made again. Returns the files."""
+    films = session.scalars(select(Film).where(Film.participant_id == borrower_id, Film.method == method)).all()
+    controllers = session.scalars(
+        select(Controller).where(Controller.participant_id == borrower_id, Controller.method == method)
+    ).all()
+    made = select(Model).where(Model.participant_id == borrower_id, Model.kind == ModelKind.METHOD)
+    models = [model for model in session.scalars(made) if model.metrics.get("method") == method]
+    files = {film.trajectory_sha256 for film in films} | {film.video_sha256 for film in films}
+    files |= {film.poster_sha256 for film in films}
+    files |= {each.artefact_sha256 for each in controllers} | {each.artefact_sha256 for each in models}
+    gone = {film.id for film in films}
+    for trial in session.scalars(select(Trial).where(Trial.film_id.in_(gone))):
+        trial.film_id = None
+    session.flush()
+    session.execute(delete(Film).where(Film.id.in_(gone)))
+    session.execute(delete(Controller).where(Controller.id.in_([each.id for each in controllers])))
+    session.execute(delete(Model).where(Model.id.in_([each.id for each in models])))
+    rows.update({"film": len(films), "controller": len(controllers), "model": len(models)})
+    _make_again(session, borrower_id, method)
+    return files
+
+
+def _make_again(session: Session, borrower_id: int, method: str) -> None:
+    """Their runs are due once more: the method, and what shows it."""
+    for run in session.scalars(select(Run).where(Run.participant_id == borrower_id)):
+        about = read(run.workflow_id)
+        of_loan = about is not None and (
+            (about.kind is RunKind.METHOD and about.subject == method)
+            or (about.kind is RunKind.FILMS and about.subject in (TRIALS, CONTROLLERS))
+        )
+        if of_loan and run.status == RunStatus.SUCCEEDED:
+            run.status = RunStatus.RETRY
+            run.attempt += 1  # the engine does nothing twice under one name

@@ -1,0 +1,45 @@
+"""Reward models of nobody in particular: the mean of several people's, and those of the paper's types of users."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from worker.compute.simulation import reference_rollouts
+from worker.ml.rewards.loading import load_reward_model
+from worker.ml.rewards.reward_models import StructuredReward
+from worker.ml.rewards.reward_training import UNDONE, SignalScale
+from worker.ml.teachers import OMEGA, User
+from worker.sim.costs import signal_weights
+from worker.tasks import registry
+from worker.trajectory import SIGNALS
+from worker.type_aliases import FloatArray
+
+
+def of_people(task: str, rewards: Sequence[bytes], scale: SignalScale) -> bytes:
+    """The mean of stored reward models, each with standard deviation 1 per step of the reference policy.
+
+    So nobody counts more for being more decided. A model that is not linear in the signals counts as the linear one
+    nearest to it (RewardModel.signal_weights).
+    """
+    reference = reference_rollouts(task)
+    models = [load_reward_model(each) for each in rewards]
+    return _stored(task, np.array([each.signal_weights(reference).mean(axis=0) for each in models]), scale)
+
+
+def of_types(task: str, users: Sequence[str], scale: SignalScale) -> bytes:
+    """The mean of what the paper's types of users want, by their names. Raises ValueError for a type there is not."""
+    known = registry.task(task)
+    return _stored(task, np.array([signal_weights(known, OMEGA[User(user)]) for user in users]), scale)
+
+
+def _stored(task: str, weights: FloatArray, scale: SignalScale) -> bytes:
+    """(P, S), reward per unit of each signal -> a model whose one member is the mean of P, each scaled alike."""
+    reference = reference_rollouts(task)
+    alike = [StructuredReward(each[None]).normalised_over(reference).signal_weights()[0] for each in weights]
+    mean = StructuredReward(
+        np.mean(alike, axis=0)[None],
+        least_per_step=scale.least_per_step,
+        most_per_step=scale.most_per_step,
+    )
+    return replace(mean.normalised_over(reference), undone_column=SIGNALS.index(UNDONE)).to_bytes()
