@@ -7,11 +7,11 @@ from http import HTTPStatus
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, RedirectResponse, Response
-from sqlalchemy.exc import OperationalError
+from sqlalchemy.exc import DatabaseError, OperationalError
 from starlette.exceptions import HTTPException
 
 from app.db import complaints
-from app.errors import AppError
+from app.errors import AppError, in_words
 from app.web.http import request_log
 from app.web.http.deps import (
     EXPERIMENTER_COOKIE,
@@ -107,6 +107,14 @@ def add_error_pages(app: FastAPI) -> None:
         complaints.error("the database did not answer: %s", error.orig)
         message = "The database is busy or not ready. Nothing was saved; please try again in a moment."
         return _answer(request, HTTPStatus.SERVICE_UNAVAILABLE, message, {"retry-after": "2"}, "DatabaseBusy")
+
+    @app.exception_handler(DatabaseError)
+    def database_damaged(request: Request, error: DatabaseError) -> Response:
+        if in_words(error) is None:
+            raise error
+        complaints.error("the database cannot be used: %s", error.orig)
+        message = "The database cannot be used at the moment. Nothing was saved; please tell the experimenter."
+        return _answer(request, HTTPStatus.SERVICE_UNAVAILABLE, message, {"retry-after": "60"}, "DatabaseBusy")
 
     @app.exception_handler(Exception)
     def unforeseen(request: Request, _error: Exception) -> Response:

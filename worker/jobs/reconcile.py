@@ -9,7 +9,7 @@ from dataclasses import replace
 from datetime import datetime, timedelta
 from typing import NamedTuple
 
-from sqlalchemy import func, or_, select
+from sqlalchemy import ColumnElement, func, or_, select
 from sqlalchemy.orm import Session
 
 from app.db import now
@@ -57,7 +57,7 @@ def due(session: Session, lost: Mapping[str, int] | None = None) -> Iterator[tup
     known = session.execute(select(Run.workflow_id, Run.status, Run.attempt, Run.finished_at))
     runs = {name: _Attempted(status, attempt, finished) for name, status, attempt, finished in known}
     filters = select(Run.participant_id).where(Run.kind == RunKind.FILTER, Run.status == RunStatus.RUNNING)
-    being_filtered = set(session.scalars(filters.where(Run.heartbeat_at >= now() - LEASE)))
+    being_filtered = set(session.scalars(filters.where(~_is_silent())))
     succeeded = {name for name, run in runs.items() if run.status == RunStatus.SUCCEEDED}
     for study in session.scalars(select(Study).where(Study.deleted_at.is_(None)).order_by(Study.id)).all():
         if study.put_away_at is not None:
@@ -83,9 +83,15 @@ def abandoned(session: Session, in_hand: Collection[str]) -> list[tuple[Job, int
 
     ``in_hand``: keys of runs that this worker is busy with; a machine under load may be late with a sign of life.
     """
-    lost = select(Run).where(Run.status == RunStatus.RUNNING, Run.heartbeat_at < now() - LEASE)
+    lost = select(Run).where(Run.status == RunStatus.RUNNING, _is_silent())
     left = [(job_of(run), run.attempt) for run in session.scalars(lost) if run.workflow_id not in in_hand]
     return [(job, attempt) for job, attempt in left if job is not None]
+
+
+def _is_silent() -> ColumnElement[bool]:
+    """Nobody has been at a run for a while. A sign from the future is none: the clock has been set back since."""
+    moment = now()
+    return or_(Run.heartbeat_at < moment - LEASE, Run.heartbeat_at > moment + LEASE)
 
 
 def job_of(run: Run) -> Job | None:
