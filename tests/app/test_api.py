@@ -232,6 +232,8 @@ def test_the_openapi_document_has_a_security_scheme_and_an_example_for_everythin
     assert all(operation["security"] == [{"HTTPBearer": []}] for operation in operations)
     assert all(operation["description"] for operation in operations)
     assert all("404" in operation["responses"] for operation in operations)
+    refusals = [answer for each in operations for code, answer in each["responses"].items() if code >= "400"]
+    assert {kind for answer in refusals for kind in answer["content"]} == {"application/problem+json"}
 
 
 def test_the_documentation_needs_nothing_from_anywhere_else(client: TestClient, studio_app: FastAPI) -> None:

@@ -27,7 +27,7 @@ from app.services.participants import enrolment
 from app.services.runs import publishing, reports
 from app.services.studies import membership, studies
 from app.web.api import schemas as answers
-from app.web.api.problems import add_problems, only_known_parameters
+from app.web.api.problems import add_problems, document_problems, only_known_parameters
 from app.web.http import stored_file
 from app.web.http.deps import (
     Code,
@@ -161,7 +161,17 @@ OwningCaller = Annotated[Experimenter, Depends(_owning_caller, scope="function")
 
 _PROBLEMS: dict[int | str, dict[str, Any]] = {
     code: {"model": answers.Problem, "description": words}
-    for code, words in ((401, "No valid token"), (403, "Not with this role"), (404, "Nothing here"), (422, "Not valid"))
+    for code, words in (
+        (400, "Not understood, or not possible"),
+        (401, "No valid token"),
+        (403, "Not with this role"),
+        (404, "Nothing here"),
+        (409, "Not any longer, or not as things are"),
+        (413, "Too much at once"),
+        (422, "Not valid"),
+        (429, "Too many wrong tokens"),
+        (503, "The database or a stored file cannot be reached"),
+    )
 }
 _ZIP: dict[int | str, dict[str, Any]] = {200: {"content": {"application/zip": {}}, "description": "The file"}}
 router = APIRouter(responses=_PROBLEMS, dependencies=[Depends(only_known_parameters)])
@@ -487,4 +497,5 @@ def create_api(path_for: Any, max_body_bytes: int) -> FastAPI:
     api.state.path_for = path_for
     add_problems(api)
     api.include_router(router)
+    document_problems(api)
     return api
