@@ -11,7 +11,16 @@ ROWS = [
     for line in (ROOT / "docs/faults.md").read_text().splitlines()
     if line.startswith("|") and not line.startswith(("|---", "| Fault "))
 ]
-KINDS = ("Database", "Log of the database", "Engine's file", "Clip", "Trajectory", "Reward model", "Bundle", "Disk full")
+KINDS = (
+    "Database",
+    "Log of the database",
+    "Engine's file",
+    "Clip",
+    "Trajectory",
+    "Reward model",
+    "Bundle",
+    "Disk full",
+)
 
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: row[0].strip())
