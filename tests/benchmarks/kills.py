@@ -2,8 +2,8 @@
 
     python -m tests.benchmarks.kills --servers 100 --workers 200 --directory build/kills
 
-A real studio on SQLite with two workers. Most participants answer as long as kills go on; two have given all their
-labels, so that filters and bundles are made meanwhile. Afterwards everything is left alone until nothing is due, and
+A real studio on SQLite with two workers. Most participants answer as long as kills go on; some give all their labels at
+once, so that filters and bundles are made meanwhile. Afterwards everything is left alone until nothing is due, and
 looked at. Then a worker is killed that never comes back, and one person's work kills its process again and again.
 Ctrl-C ends the killing early and goes on with looking; the same command on the same directory goes on killing.
 """
@@ -22,6 +22,7 @@ from collections import Counter
 from collections.abc import Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import asdict, dataclass, field
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,7 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 from tqdm import tqdm
 
-from app.db import Database
+from app.db import Database, now
 from app.domain.clips import Rollout
 from app.domain.models import Run, RunKind, RunStatus, WorkerPresence
 from app.domain.studies import Study
@@ -196,11 +197,11 @@ class Campaign:
             self.progress.tokens = [factories.make_participant(session, study)[1] for _ in range(self.options.people)]
             brief = factories.make_study(session, "Brief", **SETTINGS)
             _make_clips(session, self.store, brief, brief.settings.pool_scenarios - TO_FILM)
-            count = 2 + self.options.takeovers + self.options.poison
+            count = self.options.finishing + self.options.takeovers + self.options.poison
             people = [factories.make_participant(session, brief)[1] for _ in range(count)]
-        self.progress.brief = people[2:]
+        self.progress.brief = people[self.options.finishing :]
         self._keep()
-        return people[:2]
+        return people[: self.options.finishing]
 
     def _labeller(self, token: str, pause_s: float) -> Labeller:
         labeller = Labeller(self.studio.settings.base_url, token, self.acknowledged, self._answers, pause_s)
@@ -223,17 +224,19 @@ class Campaign:
 
     def _kill_workers(self) -> None:
         rng = random.Random(self.options.seed + 2)  # noqa: S311
-        total = self.progress.workers + self.progress.compute
+        total, since = self.progress.workers + self.progress.compute, dict[str, datetime]()
         with tqdm(total=self.options.workers, initial=total, desc="workers", mininterval=10) as bar:
             while total < self.options.workers and not self._over.wait(rng.uniform(0.2, self.options.gap)):
                 if rng.random() < COMPUTE_SHARE:
                     killed = self._kill_compute(rng)
                     self.progress.compute += killed
                 else:
-                    name, killed = rng.choice(WORKERS), 1
-                    self.studio.kill(name)
-                    self.studio.start_worker(name)
-                    self.progress.workers += 1
+                    name, killed = rng.choice(WORKERS), 0
+                    if self._is_present(name, since.get(name)):  # whoever is killed while starting does nothing
+                        self.studio.kill(name)
+                        since[name], killed = now(), 1
+                        self.studio.start_worker(name)
+                        self.progress.workers += 1
                 total += killed
                 bar.update(killed)
 
@@ -262,9 +265,11 @@ class Campaign:
         with self.database.reading() as session:
             return session.scalar(select(Run.id).where(Run.kind == kind, Run.status == RunStatus.RUNNING))
 
-    def _is_present(self, worker: str) -> bool | None:
+    def _is_present(self, worker: str, since: datetime | None = None) -> bool | None:
+        """Whether the worker has given a sign of life since it was started."""
         with self.database.reading() as session:
-            return session.get(WorkerPresence, worker) is not None or None
+            known = session.get(WorkerPresence, worker)
+        return (known is not None and (since is None or known.last_seen_at > since)) or None
 
     def _newest_of(self, kind: RunKind) -> Run:
         with self.database.reading() as session:
@@ -329,6 +334,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--workers", type=int, default=200, help="kills of workers and compute processes")
     parser.add_argument("--gap", type=float, default=4.0, help="longest time between two of the latter, in seconds")
     parser.add_argument("--people", type=int, default=6, help="who answer all the time")
+    parser.add_argument("--finishing", type=int, default=2, help="who give few labels, so that filters are made")
     parser.add_argument("--takeovers", type=int, default=2, help="workers that never come back")
     parser.add_argument("--poison", type=int, default=1, choices=(0, 1), help="whether work kills its process")
     parser.add_argument("--seed", type=int, default=0, help="of the moments and of what is hit")
