@@ -26,6 +26,8 @@ from app.web.texts import languages
 from app.web.texts.templating import page
 from app.web.texts.wording import Wording
 
+_FOR_PROGRAMS = "/api/v1/"
+"""Addresses with a line break do not reach the application that is mounted there."""
 _TITLES = {
     HTTPStatus.UNAUTHORIZED: "Please log in",
     HTTPStatus.FORBIDDEN: "That is not allowed",
@@ -134,7 +136,7 @@ def _answer(
     if wording is not None:
         title, message = _for_participants(wording, status, message, key)
     answer: Response
-    if wants_json(request):
+    if wants_json(request) or request.url.path.startswith(_FOR_PROGRAMS):
         problem = {"title": title, "status": status, "detail": message}
         answer = JSONResponse(problem, status, media_type="application/problem+json")
     else:
