@@ -301,11 +301,13 @@ _FILE = "file"
 
 def _identity(path: Path | None) -> tuple[int, int] | None:
     """Device and number of the file; None when there is none."""
+    if path is None:
+        return None
     try:
-        known = path and path.stat()
+        known = path.stat()
     except OSError:
         return None
-    return known and (known.st_dev, known.st_ino)
+    return known.st_dev, known.st_ino
 
 
 def _require_same(connection: Any, present: tuple[int, int] | None) -> None:

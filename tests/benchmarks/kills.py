@@ -259,7 +259,8 @@ class Campaign:
                 self.parked.append(f"{run.workflow_id}: {run.error}")
                 publishing.retry_run(session, session.get_one(Study, run.study_id), run.id, "the benchmark")
             busy = session.scalar(select(Run.id).where(Run.status.in_((RunStatus.RUNNING, RunStatus.RETRY))).limit(1))
-            return None if busy or parked or list(reconcile.due(session)) else True
+            is_due = any(True for _ in reconcile.due(session))
+            return None if busy or parked or is_due else True
 
     def _at_work(self, kind: RunKind) -> int | None:
         with self.database.reading() as session:

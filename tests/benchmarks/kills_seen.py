@@ -80,7 +80,7 @@ class Onlooker(threading.Thread):
             with suppress(OperationalError), self._database.reading() as session:
                 running = select(Run.participant_id, Run.kind, Run.workflow_id, Run.heartbeat_at)
                 rows = session.execute(running.where(Run.status == RunStatus.RUNNING, Run.participant_id.is_not(None)))
-                self._signs |= {_Sign(*row) for row in rows}
+                self._signs |= {_Sign(person, kind, key, at) for person, kind, key, at in rows if person is not None}
                 named = [use for use in damage.uses(session) if use.sha256 not in self._read]
             for use in named:
                 self._read.add(use.sha256)
