@@ -242,17 +242,18 @@ def web(settings: Settings) -> int:
     store.unfinished.clear_workspaces(_DAY_S)
     in_json = settings.log_format is LogFormat.JSON
     logs.write_to_stderr(settings.log_format, logging.INFO if in_json else logging.WARNING)
-    uvicorn.run(
-        partial(_prompt_app, settings),
-        factory=True,
-        host=settings.host,
-        port=settings.port,
-        log_config=None,
-        access_log=False,  # it would tell personal links; ours tells routes
-        proxy_headers=bool(settings.trusted_proxies),  # left alone, uvicorn believes whoever asks from this machine
-        forwarded_allow_ips=settings.trusted_proxies or None,
-        timeout_graceful_shutdown=5,
-    )
+    with data_directory.shared(settings.data_dir):  # the server does so, too, but cannot say in words why not
+        uvicorn.run(
+            partial(_prompt_app, settings),
+            factory=True,
+            host=settings.host,
+            port=settings.port,
+            log_config=None,
+            access_log=False,  # it would tell personal links; ours tells routes
+            proxy_headers=bool(settings.trusted_proxies),  # left alone, uvicorn believes whoever asks from this machine
+            forwarded_allow_ips=settings.trusted_proxies or None,
+            timeout_graceful_shutdown=5,
+        )
     return 0
 
 

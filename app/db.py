@@ -318,18 +318,50 @@ def _take_the_lock(connection: Connection) -> None:
 def _sqlite(url: str, begin: str, log_pages: int) -> Engine:
     engine = create_engine(url, connect_args={"timeout": BUSY_TIMEOUT_S, "check_same_thread": False})
 
+    path = file_of(url)
+
     @event.listens_for(engine, "connect")
-    def prepare(connection: Any, _record: Any) -> None:
+    def prepare(connection: Any, record: Any) -> None:
         connection.isolation_level = None  # the driver must not begin transactions of its own
         for pragma in ("journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON", "mmap_size=0"):
             connection.execute(f"PRAGMA {pragma}")
         connection.execute(f"PRAGMA wal_autocheckpoint={log_pages}")
+        record.info[_FILE] = _identity(path)
 
     @event.listens_for(engine, "begin")
     def start(connection: Connection) -> None:
+        _require_same(connection, _identity(path))
         if begin == TAKE_THE_LOCK:
             _take_the_lock(connection)
         else:
             connection.exec_driver_sql(begin)
 
     return engine
+
+
+_FILE = "file"
+"""What a connection remembers: which file it has opened."""
+
+
+def _identity(path: Path | None) -> tuple[int, int] | None:
+    """Device and number of the file; None when there is none."""
+    if path is None:
+        return None
+    try:
+        known = path.stat()
+    except OSError:
+        return None
+    return known.st_dev, known.st_ino
+
+
+def _require_same(connection: Any, present: tuple[int, int] | None) -> None:
+    """Raises OperationalError when the file was deleted or replaced: what is written to it now would be lost.
+
+    SQLite goes on with the file it has opened, which nobody else will ever see.
+    """
+    opened = connection.info[_FILE]
+    if opened in (None, present):
+        return
+    if present is not None:
+        connection.invalidate()  # the next connection opens what is there now
+    raise OperationalError("BEGIN", None, sqlite3.OperationalError("unable to open: the file was deleted or replaced"))

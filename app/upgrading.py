@@ -17,8 +17,10 @@ from sqlalchemy.exc import DatabaseError, OperationalError
 from app.data_directory import require_whole
 from app.db import copy, file_of, now
 from app.errors import AppError, in_words
+from app.files.lost import ARTEFACTS
 from app.paths import MIGRATIONS
 from app.settings import Settings
+from app.storage import ArtefactStore
 
 log = logging.getLogger(__name__)
 
@@ -50,6 +52,11 @@ class DamagedDatabase(AppError):
     """The database is damaged and was left as it is. Restore it from a backup."""
 
 
+class DatabaseLost(AppError):
+    """The database is gone, and stored files of it are there. Restore it from a backup. To begin anew, choose another
+    DATA_DIR, or move this one away."""
+
+
 def upgrade(settings: Settings) -> None:
     """Bring the database to the newest schema; whoever comes second finds it done."""
     settings.data_dir.mkdir(parents=True, exist_ok=True)
@@ -61,6 +68,8 @@ def upgrade(settings: Settings) -> None:
         path = file_of(settings.sqlalchemy_url)
         if present == newest:
             return
+        if present is None:
+            _require_new(settings)
         if present is not None and path is not None:
             _copy(path, newest)
         elif present is not None:
@@ -111,6 +120,16 @@ def _config(settings: Settings) -> Config:
     config.set_main_option("script_location", str(MIGRATIONS))
     config.set_main_option("sqlalchemy.url", settings.sqlalchemy_url.replace("%", "%%"))
     return config
+
+
+def _require_new(settings: Settings) -> None:
+    """Raises DatabaseLost where an empty database would take the place of one: the worker clears away what no row of
+    it refers to."""
+    path = file_of(settings.sqlalchemy_url)
+    log_of_it = path and path.with_name(f"{path.name}-wal")
+    has_log = log_of_it is not None and log_of_it.exists() and log_of_it.stat().st_size > 0
+    if has_log or next(iter(ArtefactStore.of(settings).files.found(ARTEFACTS)), None) is not None:
+        raise DatabaseLost
 
 
 @contextmanager

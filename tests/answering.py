@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import threading
+import time
 from collections import Counter
 from uuid import uuid4
 
@@ -11,6 +12,8 @@ import httpx2
 from app.settings import Settings
 from tests import databases
 from tests.waiting import PATIENCE_S
+
+_LOOK_AGAIN_S = 0.3
 
 
 class Server:
@@ -49,16 +52,20 @@ class Labeller(threading.Thread):
     def run(self) -> None:
         with httpx2.Client(base_url=self.address, headers={"Accept": "application/json"}, timeout=PATIENCE_S) as client:
             self._persist(client, "GET", f"/p/{self.token}", {})
-            path = self._persist(client, "GET", "/p/next", {}).json()["pair"]["label_path"]
-            while path and not self.enough.wait(self.pause_s):
-                uuid = str(uuid4())
-                reply = self._persist(client, "POST", path, {"response": "left", "client_uuid": uuid}).json()
+            turn = self._persist(client, "GET", "/p/next", {}).json()
+            while turn["state"] != "finished" and not self.enough.wait(self.pause_s):
+                if turn["state"] == "waiting":
+                    self.enough.wait(_LOOK_AGAIN_S)
+                    turn = self._persist(client, "GET", "/p/next", {}).json()
+                    continue
+                uuid, path = str(uuid4()), turn["pair"]["label_path"]
+                turn = self._persist(client, "POST", path, {"response": "left", "client_uuid": uuid}).json()
                 self.acknowledged[uuid] += 1
                 self.everybody.release()
-                path = reply["pair"]["label_path"] if reply["state"] == "pair" else None
 
     def _persist(self, client: httpx2.Client, method: str, path: str, fields: dict[str, str]) -> httpx2.Response:
-        for _ in range(600):
+        deadline = time.monotonic() + PATIENCE_S
+        while time.monotonic() < deadline:
             try:
                 response = client.request(method, path, data=fields or None)
             except httpx2.TransportError:

@@ -7,11 +7,11 @@ from http import HTTPStatus
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, RedirectResponse, Response
-from sqlalchemy.exc import OperationalError
+from sqlalchemy.exc import DatabaseError, OperationalError
 from starlette.exceptions import HTTPException
 
 from app.db import complaints
-from app.errors import AppError
+from app.errors import AppError, in_words
 from app.web.http import request_log
 from app.web.http.deps import (
     EXPERIMENTER_COOKIE,
@@ -26,6 +26,8 @@ from app.web.texts import languages
 from app.web.texts.templating import page
 from app.web.texts.wording import Wording
 
+_FOR_PROGRAMS = "/api/v1/"
+"""Addresses with a line break do not reach the application that is mounted there."""
 _TITLES = {
     HTTPStatus.UNAUTHORIZED: "Please log in",
     HTTPStatus.FORBIDDEN: "That is not allowed",
@@ -108,6 +110,14 @@ def add_error_pages(app: FastAPI) -> None:
         message = "The database is busy or not ready. Nothing was saved; please try again in a moment."
         return _answer(request, HTTPStatus.SERVICE_UNAVAILABLE, message, {"retry-after": "2"}, "DatabaseBusy")
 
+    @app.exception_handler(DatabaseError)
+    def database_damaged(request: Request, error: DatabaseError) -> Response:
+        if in_words(error) is None:
+            raise error
+        complaints.error("the database cannot be used: %s", error.orig)
+        message = "The database cannot be used at the moment. Nothing was saved; please tell the experimenter."
+        return _answer(request, HTTPStatus.SERVICE_UNAVAILABLE, message, {"retry-after": "60"}, "DatabaseBusy")
+
     @app.exception_handler(Exception)
     def unforeseen(request: Request, _error: Exception) -> Response:
         # The server logs the traceback; this tells the person that nothing they did was lost silently.
@@ -126,7 +136,7 @@ def _answer(
     if wording is not None:
         title, message = _for_participants(wording, status, message, key)
     answer: Response
-    if wants_json(request):
+    if wants_json(request) or request.url.path.startswith(_FOR_PROGRAMS):
         problem = {"title": title, "status": status, "detail": message}
         answer = JSONResponse(problem, status, media_type="application/problem+json")
     else:

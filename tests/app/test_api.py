@@ -225,6 +225,12 @@ def test_what_goes_wrong_is_said_in_words(call: Call, study: Study, path: str, s
     assert words in answer.json()["detail"]
 
 
+def test_an_address_with_a_line_break_is_answered_as_all_others_are(client: TestClient) -> None:
+    """It does not reach the API: patterns of mounted applications end at line breaks."""
+    answer = client.get("/api/v1/studies/a%0Ab")
+    assert (answer.status_code, answer.headers["content-type"]) == (404, "application/problem+json")
+
+
 def test_the_openapi_document_has_a_security_scheme_and_an_example_for_everything(client: TestClient) -> None:
     document = client.get("/api/v1/openapi.json").json()
     assert document["components"]["securitySchemes"]["HTTPBearer"]["scheme"] == "bearer"
@@ -232,6 +238,8 @@ def test_the_openapi_document_has_a_security_scheme_and_an_example_for_everythin
     assert all(operation["security"] == [{"HTTPBearer": []}] for operation in operations)
     assert all(operation["description"] for operation in operations)
     assert all("404" in operation["responses"] for operation in operations)
+    refusals = [answer for each in operations for code, answer in each["responses"].items() if code >= "400"]
+    assert {kind for answer in refusals for kind in answer["content"]} == {"application/problem+json"}
 
 
 def test_the_documentation_needs_nothing_from_anywhere_else(client: TestClient, studio_app: FastAPI) -> None:

@@ -9,7 +9,7 @@ from dataclasses import replace
 from datetime import datetime, timedelta
 from typing import NamedTuple
 
-from sqlalchemy import func, or_, select
+from sqlalchemy import ColumnElement, func, or_, select
 from sqlalchemy.orm import Session
 
 from app.db import now
@@ -38,6 +38,8 @@ CLIPS_AHEAD = 2
 """Scenarios per study in the making at a time: enough to keep busy, few enough that studies share fairly."""
 
 RETRY_AFTER = timedelta(seconds=10)
+_ONE_AT_A_TIME = (RunKind.REWARD, RunKind.FILTER)
+"""Of one participant: the next one waits, and has then seen more."""
 _AT_WORK = (Study.deleted_at.is_(None), Study.put_away_at.is_(None))
 
 
@@ -56,8 +58,8 @@ def due(session: Session, lost: Mapping[str, int] | None = None) -> Iterator[tup
     """
     known = session.execute(select(Run.workflow_id, Run.status, Run.attempt, Run.finished_at))
     runs = {name: _Attempted(status, attempt, finished) for name, status, attempt, finished in known}
-    filters = select(Run.participant_id).where(Run.kind == RunKind.FILTER, Run.status == RunStatus.RUNNING)
-    being_filtered = set(session.scalars(filters.where(Run.heartbeat_at >= now() - LEASE)))
+    learning = select(Run.participant_id, Run.kind).where(Run.kind.in_(_ONE_AT_A_TIME), Run.status == RunStatus.RUNNING)
+    at_work = {(person, kind) for person, kind in session.execute(learning.where(~_is_silent()))}
     succeeded = {name for name, run in runs.items() if run.status == RunStatus.SUCCEEDED}
     for study in session.scalars(select(Study).where(Study.deleted_at.is_(None)).order_by(Study.id)).all():
         if study.put_away_at is not None:
@@ -66,8 +68,7 @@ def due(session: Session, lost: Mapping[str, int] | None = None) -> Iterator[tup
             jobs = (*repairs.due(session, study, lost or {}), *_all_due(session, study, succeeded))
         for job in jobs:
             attempt = _attempt_due(runs.get(job.key), now())
-            one_at_a_time = job.kind == RunKind.FILTER and job.participant_id in being_filtered
-            if attempt is not None and not one_at_a_time:
+            if attempt is not None and (job.participant_id, job.kind) not in at_work:
                 yield job, attempt
 
 
@@ -83,9 +84,15 @@ def abandoned(session: Session, in_hand: Collection[str]) -> list[tuple[Job, int
 
     ``in_hand``: keys of runs that this worker is busy with; a machine under load may be late with a sign of life.
     """
-    lost = select(Run).where(Run.status == RunStatus.RUNNING, Run.heartbeat_at < now() - LEASE)
+    lost = select(Run).where(Run.status == RunStatus.RUNNING, _is_silent())
     left = [(job_of(run), run.attempt) for run in session.scalars(lost) if run.workflow_id not in in_hand]
     return [(job, attempt) for job, attempt in left if job is not None]
+
+
+def _is_silent() -> ColumnElement[bool]:
+    """Nobody has been at a run for a while. A sign from the future is none: the clock has been set back since."""
+    moment = now()
+    return or_(Run.heartbeat_at < moment - LEASE, Run.heartbeat_at > moment + LEASE)
 
 
 def job_of(run: Run) -> Job | None:

@@ -21,7 +21,7 @@ from app.domain.study_settings import StudySettings
 from app.errors import AppError, OncePerMinute
 from app.files.interface import StorageUnavailable
 from app.settings import Settings
-from app.storage import ArtefactStore, keep_private
+from app.storage import ArtefactMissing, ArtefactStore, keep_private
 from worker.compute import learning, simulation
 from worker.compute.pools import Compute, ComputeLost, Interrupted, Lane
 from worker.jobs import reconcile
@@ -222,6 +222,8 @@ class _Rounds:
             query_selection.refill_queries(self._context, participant_id)
         except StorageUnavailable:
             raise
+        except ArtefactMissing:  # which is known now, and done without or made again by the next round
+            complaints.warning("pairs of participant %d could not be chosen: a stored file is lost", participant_id)
         except AppError as refusal:  # one study that cannot go on must not stop the others
             log.warning("participant %d gets no further pairs: %s", participant_id, refusal.message)
             self._refused.add(participant_id)

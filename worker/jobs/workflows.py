@@ -53,6 +53,11 @@ class ParticipantWithdrew(AppError):
     """The participant has withdrawn, or the study was deleted, so there is nothing to be done."""
 
 
+class OutOfMemory(AppError):
+    """This work needs more memory than it could have. Give the machine more, or set COMPUTE_PROCESSES lower, and try
+    again."""
+
+
 @DBOS.dbos_class()
 class JobRunner(DBOSConfiguredInstance):
     """Does jobs at one workplace."""
@@ -92,7 +97,7 @@ class JobRunner(DBOSConfiguredInstance):
                 log.info("%s is abandoned: the participant has withdrawn, or the study was deleted", job.key)
                 return
             log.exception("%s failed", job.key)
-            _step("fail", self._fail, job.key, f"{type(error).__name__}: {error}", not _is_the_machine_s(error))
+            _step("fail", self._fail, job.key, _in_words(error), not _is_the_machine_s(error))
         finally:
             self.in_hand.discard(job.key)
 
@@ -134,6 +139,13 @@ class JobRunner(DBOSConfiguredInstance):
 
 def _step(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
     return DBOS.run_step({"name": name}, function, *arguments)
+
+
+def _in_words(error: Exception) -> str:
+    """What the experimenter reads on the study's page."""
+    if isinstance(error, MemoryError) or "can't allocate memory" in str(error):
+        return f"{OutOfMemory().message} ({type(error).__name__}: {error})"
+    return f"{type(error).__name__}: {error}"
 
 
 def _is_the_machine_s(error: Exception) -> bool:

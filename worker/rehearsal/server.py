@@ -29,9 +29,9 @@ class StandsStill(AppError):
 class OwnStudio:
     """Web server and worker of a studio of our own in a directory; a context that stops both at its end."""
 
-    def __init__(self, directory: Path) -> None:
+    def __init__(self, directory: Path, port: int | None = None) -> None:
         directory.mkdir(parents=True, exist_ok=True)
-        self.settings = Settings(data_dir=directory, port=_free_port(), database_url=None, storage_url=None)
+        self.settings = Settings(data_dir=directory, port=port or _free_port(), database_url=None, storage_url=None)
         self.log = directory / "rehearsal.log"
         self._environment = {
             **{name: value for name, value in os.environ.items() if name not in ("DATABASE_URL", "STORAGE_URL")},
@@ -70,14 +70,22 @@ class OwnStudio:
         self._start("web", "app", "web")
         wait_until(PATIENCE_S, "no web server", self._answers)
 
-    def start_worker(self) -> None:
-        """Start the worker; whatever an earlier one has left undone is its to finish."""
-        self._start("worker", "worker", "run")
+    def start_worker(self, name: str = "worker") -> None:
+        """Start a worker; whatever an earlier one of this name has left undone is its to finish."""
+        self._start(name, "worker", "run", WORKER_NAME=name)
 
     def kill(self, name: str) -> None:
-        """SIGKILL to "web" or "worker": no chance to clean up."""
+        """SIGKILL to "web" or a worker: no chance to clean up."""
         self._programs[name].kill()
         self._programs[name].wait()
+
+    def running(self) -> list[str]:
+        """Names of the programs that have not ended."""
+        return [name for name, program in self._programs.items() if program.poll() is None]
+
+    def process_id(self, name: str) -> int:
+        """Of "web" or a worker."""
+        return self._programs[name].pid
 
     def _answers(self) -> bool | None:
         if self._programs["web"].poll() is not None:
@@ -87,12 +95,12 @@ class OwnStudio:
         except httpx2.TransportError:
             return None
 
-    def _start(self, name: str, module: str, *arguments: str) -> None:
+    def _start(self, name: str, module: str, *arguments: str, **settings: str) -> None:
         with self.log.open("ab") as stream:
             self._programs[name] = self._starter.submit(
                 subprocess.Popen[bytes],
                 [sys.executable, "-m", module, *arguments],
-                env=self._environment,
+                env={**self._environment, **settings},
                 stdout=stream,
                 stderr=subprocess.STDOUT,
                 preexec_fn=end_with_parent,

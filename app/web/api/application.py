@@ -8,7 +8,7 @@ from app.services.exports import export_formats
 from app.web.api import data_routes, study_routes
 from app.web.api import schemas as answers
 from app.web.api.callers import PREFIX
-from app.web.api.problems import add_problems, only_known_parameters
+from app.web.api.problems import add_problems, document_problems, only_known_parameters
 
 DESCRIPTION = """\
 Everything that the pages show and the exports hold, for programs.
@@ -29,7 +29,17 @@ parameter that an address does not know is refused with 422 instead of being ign
 
 _PROBLEMS: dict[int | str, dict[str, Any]] = {
     code: {"model": answers.Problem, "description": words}
-    for code, words in ((401, "No valid token"), (403, "Not with this role"), (404, "Nothing here"), (422, "Not valid"))
+    for code, words in (
+        (400, "Not understood, or not possible"),
+        (401, "No valid token"),
+        (403, "Not with this role"),
+        (404, "Nothing here"),
+        (409, "Not any longer, or not as things are"),
+        (413, "Too much at once"),
+        (422, "Not valid"),
+        (429, "Too many wrong tokens"),
+        (503, "The database or a stored file cannot be reached"),
+    )
 }
 
 
@@ -51,4 +61,5 @@ def create_api(path_for: Any, max_body_bytes: int) -> FastAPI:
     add_problems(api)
     for part in (study_routes, data_routes):
         api.include_router(part.router, responses=_PROBLEMS, dependencies=[Depends(only_known_parameters)])
+    document_problems(api)
     return api

@@ -2,17 +2,19 @@
 
 from collections.abc import Mapping
 from http import HTTPStatus
+from typing import Any
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, Response
-from sqlalchemy.exc import OperationalError
+from sqlalchemy.exc import DatabaseError, OperationalError
 from starlette.exceptions import HTTPException
 
 from app.db import complaints
-from app.errors import AppError
+from app.errors import AppError, in_words
 from app.web.http.security import HEADERS
 
+MEDIA_TYPE = "application/problem+json"
 _REPLACED = {"offset": "offset is gone, because answers between two pages would shift it: follow next instead."}
 
 
@@ -70,16 +72,39 @@ def add_problems(api: FastAPI) -> None:
         message = "The database is busy or not ready. Nothing was saved; please try again in a moment."
         return problem(HTTPStatus.SERVICE_UNAVAILABLE, message, {"retry-after": "2"})
 
+    @api.exception_handler(DatabaseError)
+    def database_damaged(_request: Request, error: DatabaseError) -> Response:
+        if in_words(error) is None:
+            raise error
+        complaints.error("the database cannot be used: %s", error.orig)
+        message = "The database cannot be used at the moment. Nothing was saved; please tell who runs the studio."
+        return problem(HTTPStatus.SERVICE_UNAVAILABLE, message, {"retry-after": "60"})
+
     @api.exception_handler(Exception)
     def unforeseen(_request: Request, _error: Exception) -> Response:
         message = "This is our fault, and it is in the log. Nothing was saved by this step; please try again."
         return problem(HTTPStatus.INTERNAL_SERVER_ERROR, message, HEADERS)
 
 
+def document_problems(api: FastAPI) -> None:
+    """Have the OpenAPI document name the content type that problems are sent with, and not that of other answers."""
+    made = api.openapi
+
+    def openapi() -> dict[str, Any]:
+        document = made()
+        for operation in (each for methods in document["paths"].values() for each in methods.values()):
+            for code, answer in operation["responses"].items():
+                if int(code) >= HTTPStatus.BAD_REQUEST and MEDIA_TYPE not in answer["content"]:
+                    answer["content"] = {MEDIA_TYPE: answer["content"]["application/json"]}
+        return document
+
+    api.openapi = openapi  # type: ignore[method-assign]
+
+
 def problem(status: HTTPStatus, detail: str, headers: Mapping[str, str] | None = None) -> Response:
     """Problem details, RFC 9457."""
     content = {"title": status.phrase, "status": int(status), "detail": detail}
-    answer = JSONResponse(content, status, media_type="application/problem+json")
+    answer = JSONResponse(content, status, media_type=MEDIA_TYPE)
     answer.headers.update(headers or {})
     if status is HTTPStatus.UNAUTHORIZED:
         answer.headers["www-authenticate"] = "Bearer"

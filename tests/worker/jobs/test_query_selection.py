@@ -15,7 +15,9 @@ from app.domain.clips import Clip
 from app.domain.models import ModelKind, Run
 from app.domain.preferences import Query, Response
 from app.domain.studies import Participant, Study
-from app.storage import ArtefactStore
+from app.storage import ArtefactDamaged, ArtefactStore
+from tests import stored_files
+from tests.waiting import until
 from worker.compute.pools import Compute
 from worker.jobs.learning import dataset, query_selection, reward_models
 from worker.jobs.runtime import records
@@ -238,13 +240,32 @@ def somebody_else(
     return other_id
 
 
+def test_without_its_newest_model_s_file_the_pairs_are_chosen_and_foreseen_by_the_one_before(
+    context: WorkerContext, participant: Participant, add_clips: AddClips
+) -> None:
+    add_clips(1)
+    settle_on(context, Strategy.ENTROPY)
+    save_model_of(context, participant.study_id, participant.id, FIRST_SIGNAL, labels=5)
+    save_model_of(context, participant.study_id, participant.id, 2 * FIRST_SIGNAL, labels=10)
+    with context.database.reading() as session:
+        newest, older = records.models_of(session, participant.id, ModelKind.REWARD)
+    stored_files.damage(context.store, newest.artefact_sha256)
+    with pytest.raises(ArtefactDamaged):  # nobody knew
+        query_selection.refill_queries(context, participant.id)
+    assert until(lambda: newest.artefact_sha256 in context.store.lost())
+    query_selection.refill_queries(context, participant.id)
+    queries = queries_of(context.database, participant)
+    assert queries
+    assert {query.predicted_by_model_id for query in queries} == {older.id}
+
+
 def save_model_of(
     context: WorkerContext, study_id: int, participant_id: int, weights: npt.NDArray[np.float64], labels: int
 ) -> None:
     """Give a participant a reward model of these weights."""
     stored = StructuredReward(np.tile(weights, (8, 1))).to_bytes()
     with context.database.writing() as session:
-        name = f"reward-{participant_id}"
+        name = f"reward-{participant_id}-{labels}"
         run = Run(workflow_id=name, kind="reward", study_id=study_id, participant_id=participant_id, seed=0)
         session.add(run)
         session.flush()

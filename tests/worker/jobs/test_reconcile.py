@@ -125,6 +125,19 @@ def test_a_running_run_is_left_alone_until_nobody_has_heard_of_it_for_a_while(
         assert reconcile.abandoned(session, {"reward/participant-1/labels-10"}) == []
 
 
+def test_a_sign_of_life_from_before_the_clock_was_set_back_keeps_nobody_from_taking_over(
+    database: Database, labels: Callable[[int], list[Query]]
+) -> None:
+    """It would for as many minutes as the clock was wrong. Who is alive gives another one within seconds."""
+    labels(10)
+    job = job_of("filter/participant-1/labels-10", 1)
+    with database.writing() as session:
+        run_id = records.begin_run(session, job, seed=5)
+        session.get_one(Run, run_id).heartbeat_at = now() + timedelta(minutes=7)
+    with database.reading() as session:
+        assert reconcile.abandoned(session, ()) == [(job, 1)]
+
+
 def test_a_failed_run_is_tried_again_a_few_times_and_then_only_when_somebody_asks(
     database: Database, labels: Callable[[int], list[Query]], found: Callable[[], dict[str, int]]
 ) -> None:

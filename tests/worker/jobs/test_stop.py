@@ -7,8 +7,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import closing, suppress
-from pathlib import Path
+from contextlib import closing
 
 import pytest
 from sqlalchemy import select
@@ -19,6 +18,7 @@ from app.domain.study_settings import StudySettings
 from app.services.studies import studies
 from app.settings import Settings
 from tests import databases
+from tests.processes import compute_processes, fork_servers
 from tests.waiting import PATIENCE_S, gone, hear_hangups, until
 
 pytestmark = pytest.mark.slow
@@ -41,26 +41,6 @@ def worker(settings: Settings, database: Database) -> Iterator[Worker]:
         if not gone(pid):
             os.kill(pid, signal.SIGKILL)
     process.wait()
-
-
-def fork_servers(pid: int) -> list[int]:
-    """The process that forks its compute processes, if it has begun."""
-    return [child for child in children(pid) if "forkserver" in Path(f"/proc/{child}/cmdline").read_text()]
-
-
-def compute_processes(pid: int) -> list[int]:
-    """Those it has had forked."""
-    return [child for server in fork_servers(pid) for child in children(server)]
-
-
-def children(pid: int) -> list[int]:
-    """Whichever of its threads has started them."""
-    found = []
-    for stat in Path("/proc").glob("[0-9]*/stat"):
-        with suppress(OSError):
-            if int(stat.read_text().rsplit(")", 1)[1].split()[1]) == pid:
-                found.append(int(stat.parent.name))
-    return found
 
 
 def is_filming(database: Database) -> bool:

@@ -66,8 +66,9 @@ def predict_waiting(context: WorkerContext, participant_id: int) -> None:
 
     Only to labels: a repeat was answered before, a catch pair is no question of taste, practice is none at all.
     """
+    lost = context.store.lost()
     with context.database.reading() as session:
-        model = records.newest_model(session, participant_id, ModelKind.REWARD)
+        model = _newest_whole(session, participant_id, lost)
         waiting = records.unanswered(session, participant_id, *dataset.CLIPS_AND_ROLLOUTS)
     queries = [query for query in waiting if query.purpose in LEARNED_FROM]
     if model is None or all(query.predicted_by_model_id == model.id for query in queries):
@@ -94,7 +95,7 @@ class _Known:
     whole_clips: Sequence[Clip]
     """Of whole trajectories."""
     model: Model | None
-    """The participant's newest reward model."""
+    """The participant's newest reward model whose file is whole."""
     others: Sequence[Model]
     """Newest reward models of other participants who have said enough."""
     has_unanswered: bool
@@ -123,13 +124,23 @@ def _load(session: Session, participant_id: int, lost: Collection[str]) -> _Know
         {query.ordinal: (query.left_clip_id, query.right_clip_id) for query in session.scalars(asked)},
         shown(dataset.pool_clips(session, study.id)) if free else [],
         shown(dataset.whole_clips(session, study.id)) if Purpose.INTRODUCTION in wanted else [],
-        records.newest_model(session, participant_id, ModelKind.REWARD) if scored else None,
-        records.models_of_others(session, participant_id, ModelKind.REWARD, OTHERS_LABELS, MOST_OTHERS)
+        _newest_whole(session, participant_id, lost) if scored else None,
+        [
+            model
+            for model in records.models_of_others(session, participant_id, ModelKind.REWARD, OTHERS_LABELS, MOST_OTHERS)
+            if model.artefact_sha256 not in lost
+        ]
         if contested
         else [],
         bool(records.unanswered(session, participant_id)),
         bool(lost),
     )
+
+
+def _newest_whole(session: Session, participant_id: int, lost: Collection[str]) -> Model | None:
+    """An older reward model chooses and foresees until there is a newer one: worse, but nobody waits for a backup."""
+    mine = records.models_of(session, participant_id, ModelKind.REWARD)
+    return next((model for model in mine if model.artefact_sha256 not in lost), None)
 
 
 def _scores(
