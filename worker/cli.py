@@ -19,6 +19,7 @@ from app.storage import ArtefactStore, keep_private
 from worker import options
 from worker.experiments import (
     behaviour_differences,
+    check_lab,
     benchmark,
     fit_response_surface,
     pretrain_policy,
@@ -117,6 +118,11 @@ def _add_new_task(commands: _Commands) -> None:
     _add_task(speed)
     speed.add_argument("--scenarios", type=int, default=speed_cost_weight.SCENARIOS)
     speed.set_defaults(act=lambda said: speed_cost_weight.weigh_speed(said.task, said.scenarios))
+
+    checking = commands.add_parser("check", help=check_lab.check.__doc__)
+    checking.add_argument("file", type=Path, help="lab.toml, or the folder it lies in")
+    checking.add_argument("--sheet", type=Path, help="the contact sheet; default: contact_sheet.png beside lab.toml")
+    checking.set_defaults(act=lambda said: check_lab.check(said.file, said.sheet))
 
     differences = commands.add_parser("behaviours", help=behaviour_differences.tell_behaviours_apart.__doc__)
     differences.add_argument("--tasks", nargs="+", choices=catalogue.names(), default=list(catalogue.names()))

@@ -83,8 +83,8 @@ class ModeFamily(ABC):
         """The observation (..., D) as the policy should see it in this mode."""
 
     @abstractmethod
-    def speed_factor(self, observation: Any, mode: Any, xp: Any = np) -> Any:
-        """The factor on the policy's mean action, (..., 1) or (..., 7)."""
+    def executed(self, observation: Any, mode: Any, action: Any, xp: Any = np) -> Any:
+        """The action (..., A) that becomes of the policy's in this mode."""
 
     # For subclasses
 
@@ -142,6 +142,10 @@ class ApproachModes(ModeFamily):
             tool_to_target_m=self._field(observation, "tool_to_target_m") + shift,
             body_to_target_m=self._field(observation, "body_to_target_m") + shift,
         )
+
+    def executed(self, observation: Any, mode: Any, action: Any, xp: Any = np) -> Any:
+        """The policy's action times the speed factor."""
+        return self.speed_factor(observation, mode, xp) * action
 
     def shift(self, observation: Any, mode: Any, xp: Any = np) -> Any:
         """How far the perceived target lies from the true one, (..., 3), in the base frame."""

@@ -159,9 +159,12 @@ def _answers_of_others(context: WorkerContext, known: _Known, pairs: Sequence[tu
 
 
 def _stand_ins(context: WorkerContext, task: Task, clip: Clip) -> FloatArray:
-    """(3,) what the paper's users would feel about what a clip shows, by their own costs."""
+    """(U,) what others would feel about what a clip shows: the paper's users by their own costs, or, in a laboratory's
+    task, people who each mind one of its signals."""
     shown, steps = dataset.shown(context.store, clip), slice(clip.first_step, clip.first_step + clip.step_count)
     costs, signals = shown.costs[steps], shown.signals[steps]
+    if task.is_a_labs:
+        return -signals.sum(axis=0, dtype=np.float64)
     return np.array([preference_rewards(task, costs, signals, OMEGA[user]).sum() for user in User])
 
 
@@ -247,10 +250,11 @@ class _Choosing:
         While the pool is growing the place stays free, unless there is nothing else to go on with.
         """
         store = self._context.store
+        names = dataset.signal_names(self._known.study)
         candidates = [
             (pair, answer)
             for pair in self._unused(self._clips)
-            if (answer := query_plan.obvious_answer(*(dataset.stretch(store, clip) for clip in pair))) is not None
+            if (answer := query_plan.obvious_answer(*(dataset.stretch(store, clip) for clip in pair), names)) is not None
         ]
         if not candidates and self._may_yet_come():
             return None
