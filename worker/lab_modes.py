@@ -21,6 +21,8 @@ HESITATES_AT, HESITATES_WITHIN = 0.35, 0.15
 SPEED, SMOOTH, HESITATE, PUSH = (-1.4, 0.9), (0.0, 0.9), (0.0, 2.0), (-0.6, 0.6)
 """Widest ranges; the program narrows them (worker.experiments.lab_ranges)."""
 MOST_PUSHES = 6
+PUSHES_UNTIL = 0.5
+"""Share of the episode after which nothing is pushed, so that every way arrives."""
 
 
 def widest_axes(by_distance: bool, moving: tuple[str, ...]) -> tuple[Axis, ...]:
@@ -66,8 +68,9 @@ class LabModes(ModeFamily):
             - self._of(mode, "hesitate") * band
         )
         scaled = action * factor
+        pushed = early * xp.clip(1.0 - self._field(observation, EPISODE_SHARE) / PUSHES_UNTIL, 0.0, 1.0)
         for index in self.moving:
-            scaled = scaled + early * self._of(mode, f"push_{self.actions[index]}") * self._unit(index, action, xp)
+            scaled = scaled + pushed * self._of(mode, f"push_{self.actions[index]}") * self._unit(index, action, xp)
         kept = self._of(mode, "smooth")
         smoothed = (1.0 - kept) * scaled + kept * self._field(observation, PREVIOUS_ACTION)
         if len(self.moving) == len(self.actions):
