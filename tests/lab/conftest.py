@@ -112,7 +112,11 @@ def forget() -> None:
 @pytest.fixture
 def plane(tmp_path: Path) -> Path:
     """The laboratory's folder, as its lab.toml wants it."""
-    folder = tmp_path / "plane_lab"
+    return write_plane(tmp_path / "plane_lab")
+
+
+def write_plane(folder: Path) -> Path:
+    """All of its files."""
     folder.mkdir()
     (folder / "plane.py").write_text(ENVIRONMENT)
     (folder / "lab.toml").write_text(DESCRIPTION)

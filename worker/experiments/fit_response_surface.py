@@ -98,9 +98,10 @@ def explore(task: str, work_directory: Path, processes: int, scenarios: int = SC
     compute = Compute(processes)
     try:
         _run(compute, processes, blocks, "random modes")
+        per_round = sought_scenarios(scenarios)
         for number in range(ROUNDS):
             surface = _joined(blocks).fit(described)
-            sought = sought_blocks(described, surface, number, work_directory)
+            sought = sought_blocks(described, surface, number, work_directory, per_round)
             _run(compute, processes, sought, f"modes that people want, round {number + 1}")
             blocks += sought
     finally:
@@ -155,9 +156,16 @@ def _random_modes(task: Task, first: int) -> FloatArray:
     )
 
 
-def sought_blocks(task: Task, surface: ResponseSurface, number: int, work_directory: Path) -> list[Block]:
+def sought_scenarios(scenarios: int) -> int:
+    """In every later round, where the first has so many: in the same proportion as usual, a block at least."""
+    return max(BLOCK, SOUGHT_SCENARIOS * scenarios // SCENARIOS // BLOCK * BLOCK)
+
+
+def sought_blocks(
+    task: Task, surface: ResponseSurface, number: int, work_directory: Path, scenarios: int = SOUGHT_SCENARIOS
+) -> list[Block]:
     """Every scenario is executed in the modes of as many people, and near them."""
-    count = SOUGHT_SCENARIOS // BLOCK
+    count = scenarios // BLOCK
     per_block = BLOCK * MODES_PER_SCENARIO
     rng = np.random.default_rng([number, 3])
     wanted = np.array([best_mode(surface, _somebody(task, surface, rng), number) for _ in range(per_block)])
@@ -208,7 +216,7 @@ def _publish(task: Task, scenarios: int, found: Differences) -> dict[str, Any]:
     record = {
         "command": f"python -m worker explore --task {task.name} --scenarios {scenarios}",
         "scenarios": [RESPONSE_SURFACE.start, RESPONSE_SURFACE[scenarios - 1]],
-        "sought": {"rounds": ROUNDS, "scenarios_per_round": SOUGHT_SCENARIOS, "jitter": JITTER},
+        "sought": {"rounds": ROUNDS, "scenarios_per_round": sought_scenarios(scenarios), "jitter": JITTER},
         "modes_per_scenario": MODES_PER_SCENARIO,
         "axes": {axis.name: [axis.low, axis.high] for axis in task.modes.axes},
         "reference_success": float(found.reference_success.mean()),
