@@ -19,8 +19,8 @@ from app.storage import ArtefactStore, keep_private
 from worker import options
 from worker.experiments import (
     behaviour_differences,
-    check_lab,
     benchmark,
+    check_lab,
     fit_response_surface,
     pretrain_policy,
     speed_cost_weight,

@@ -1,8 +1,8 @@
 """Execution modes of a policy nobody can look into: they act on the actions it says, for any continuous actions.
 
-Speed is time-scaling: of velocities or changes of position a part is the same way, more slowly. What a mode needs beside
-the policy's action stands at the end of the observation: the action before, and how much of the episode is over. So a
-filter stays a function of one observation and one action, and what is trained is what is shipped.
+Speed is time-scaling: of velocities or changes of position a part is the same way, more slowly. What a mode needs
+beside the policy's action stands at the end of the observation: the action before, and how much of the episode is over.
+So a filter stays a function of one observation and one action, and what is trained is what is shipped.
 """
 
 from dataclasses import dataclass

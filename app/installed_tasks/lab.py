@@ -131,7 +131,7 @@ class LabDescription(DescribedTask):
     policy: LabPolicy
     success: Measured
     """Whether the task has succeeded so far; what it says at the last step counts."""
-    signals: dict[Annotated[str, AfterValidator(_name)], LabSignal] = {}
+    signals: dict[Annotated[str, AfterValidator(_name)], LabSignal] = Field(default_factory=dict)
     fields: LabFields = LabFields()
     modes: LabModes = LabModes()
 

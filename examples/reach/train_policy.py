@@ -50,7 +50,9 @@ def write(layers: list[torch.nn.Linear], file: Path) -> None:
     nodes, constants, name = [], [], "observation"
     for index, layer in enumerate(layers):
         arrays = {f"weight_{index}": layer.weight, f"bias_{index}": layer.bias}
-        constants += [numpy_helper.from_array(each.detach().numpy().astype(np.float32), key) for key, each in arrays.items()]
+        constants += [
+            numpy_helper.from_array(each.detach().numpy().astype(np.float32), key) for key, each in arrays.items()
+        ]
         nodes.append(helper.make_node("Gemm", [name, *arrays], [f"raw_{index}"], transB=1))
         name = "action" if index + 1 == len(layers) else f"hidden_{index}"
         nodes.append(helper.make_node("Tanh", [f"raw_{index}"], [name]))

@@ -53,7 +53,7 @@ def effort(step):
     return float(np.abs(step.action).sum())
 '''
 
-DESCRIPTION = '''
+DESCRIPTION = """
 name = "plane"
 title = "Plane"
 summary = "A point moves to a place."
@@ -91,7 +91,7 @@ words = { en = "effort (m)", de = "Aufwand (m)" }
 [instructions]
 en = "A point moves to a place."
 de = "Ein Punkt bewegt sich an eine Stelle."
-'''
+"""
 
 
 def way_to_goal(gain: float = 0.4) -> bytes:
@@ -104,7 +104,12 @@ def way_to_goal(gain: float = 0.4) -> bytes:
 def forget() -> None:
     """What was read or made before, as a new process would."""
     of_texts = (wording._resource, wording._built_in, wording._known_variables, wording._remembered)
-    of_labs = (registry.found_out, simulation.lab_environment, simulation.reference_policy, simulation.reference_rollouts)
+    of_labs = (
+        registry.found_out,
+        simulation.lab_environment,
+        simulation.reference_policy,
+        simulation.reference_rollouts,
+    )
     for remembered in (catalogue.installed, *of_labs, *of_texts):
         remembered.cache_clear()
 

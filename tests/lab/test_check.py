@@ -62,7 +62,7 @@ def test_what_is_wrong_is_an_exit_code_too(plane: Path, capsys: pytest.CaptureFi
         ('factory = "plane:Plane"', "", "environment needs either id (a Gymnasium id) or factory"),
         ('info = "height"', "", "signals.height needs either info"),
         ("[signals.height]", "[signals.undelivered]", "signals.undelivered is measured by the studio already"),
-        ("en = \"height of the point (m)\", ", "", "needs words.en"),
+        ('en = "height of the point (m)", ', "", "needs words.en"),
         ("plane:Plane", "plain:Plane", "'plain:Plane' cannot be imported (ModuleNotFoundError"),
         ("plane:Plane", "plane:Plain", "'plane:Plain' cannot be imported (AttributeError"),
         ('factory = "plane:Plane"', 'id = "PandaReech-v9"', "Name the module that registers it before a colon"),
@@ -77,7 +77,11 @@ def test_what_is_wrong_is_an_exit_code_too(plane: Path, capsys: pytest.CaptureFi
         ('info = "is_success"', 'info = "success"', "no 'success'; it has height, is_success"),
         ("gain = 0.5", "gain = 0.001", "none of 3 episodes succeeded. Check what success says"),
         ('file = "policy.onnx"', 'file = "policy.pt"', "policy.pt, which does not exist"),
-        ("[instructions]", '[modes]\nleave_out = ["wave"]\n[instructions]', "there is no way 'wave'; this task has speed_far"),
+        (
+            "[instructions]",
+            '[modes]\nleave_out = ["wave"]\n[instructions]',
+            "there is no way 'wave'; this task has speed_far",
+        ),
     ],
 )
 def test_a_mistake_in_the_file_is_said_with_its_key_and_what_to_do(
@@ -99,7 +103,11 @@ def test_a_mistake_in_the_file_is_said_with_its_key_and_what_to_do(
         ("near = bool", "self.place[0] = np.nan\n        near = bool", "not finite (NaN)"),
         ("float(self.place[1])", "float('inf')", "signals.height: was inf"),
         ("float(self.place[1])", "[1.0, 2.0]", "signals.height: is of length 2; it must be one number"),
-        ("float(np.abs(step.action).sum())", "step.no_such_thing", "signals.effort.function: failed with AttributeError"),
+        (
+            "float(np.abs(step.action).sum())",
+            "step.no_such_thing",
+            "signals.effort.function: failed with AttributeError",
+        ),
         ("False, False, {", "near, False, {", "environment.ignore_terminated"),
         ("False, False, {", "False, near, {", "Lower episode_steps"),
         ("self.np_random.uniform", "np.random.uniform", 'Set environment.reset = "rebuild"'),
@@ -132,7 +140,10 @@ def test_a_slow_environment_is_a_remark_with_what_it_will_cost(plane: Path, monk
         (b"not a graph", "cannot be read as ONNX"),
         (mlp_to_onnx([(np.zeros((2, 5), np.float32), np.zeros(2, np.float32))], "Relu", ""), "has 5 numbers, but"),
         (mlp_to_onnx([(np.zeros((3, 4), np.float32), np.zeros(3, np.float32))], "Relu", ""), "has 3 numbers, but its"),
-        (mlp_to_onnx([(np.full((2, 4), np.nan, np.float32), np.zeros(2, np.float32))], "Relu", ""), "not two rows of 2"),
+        (
+            mlp_to_onnx([(np.full((2, 4), np.nan, np.float32), np.zeros(2, np.float32))], "Relu", ""),
+            "not two rows of 2",
+        ),
     ],
 )
 def test_a_policy_that_is_none_for_this_environment_is_refused(plane: Path, stored: bytes, complaint: str) -> None:

@@ -25,14 +25,20 @@ ROOT = Path(__file__).parents[2]
 
 
 def test_it_stands_on_the_form_and_its_study_is_in_its_words(
-    plane: Path, use: Callable[[Path], None], database: Database, new_browser: Callable[[], TestClient], experimenter: TestClient
+    plane: Path,
+    use: Callable[[Path], None],
+    database: Database,
+    new_browser: Callable[[], TestClient],
+    experimenter: TestClient,
 ) -> None:
     use(plane)
     page = experimenter.get("/studies/new").text
     assert re.findall(r'name="task" value="(\w+)"', page)[-1] == "plane"
     assert "A point moves to a place." in page
     with database.writing() as session:
-        study = studies.create_study(session, "Points", StudySettings(language=Language.GERMAN, clip_steps=40), task="plane")
+        study = studies.create_study(
+            session, "Points", StudySettings(language=Language.GERMAN, clip_steps=40), task="plane"
+        )
         _, token = factories.make_participant(session, study, ready=False)
     browser = new_browser()
     browser.get(f"/p/{token}")

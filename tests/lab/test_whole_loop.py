@@ -98,14 +98,22 @@ def do(context: WorkerContext, act: Act, key: RunKey, study_id: int) -> None:
 
 def film(context: WorkerContext, study_id: int) -> None:
     for scenario in range(SCENARIOS):
-        do(context, build_clips, RunKey(RunKind.CLIPS, study_id=study_id, subject="scenario", number=scenario), study_id)
+        do(
+            context,
+            build_clips,
+            RunKey(RunKind.CLIPS, study_id=study_id, subject="scenario", number=scenario),
+            study_id,
+        )
 
 
 def answer(context: WorkerContext, study_id: int, person_id: int, minds: dict[str, float]) -> None:
     """Every pair of the pool, by somebody who minds these signals, without mistakes."""
     names = registry.task("plane").signals
     with context.database.writing() as session:
-        person, pairs = session.get_one(Participant, person_id), dataset.matched_pairs(dataset.pool_clips(session, study_id))
+        person, pairs = (
+            session.get_one(Participant, person_id),
+            dataset.matched_pairs(dataset.pool_clips(session, study_id)),
+        )
         for left, right in pairs:
             cost = [weighed(dataset.shown(context.store, clip), names, minds) for clip in (left, right)]
             says = Response.LEFT if cost[0] < cost[1] else Response.RIGHT
@@ -137,7 +145,9 @@ def test_from_a_lab_toml_to_bundles_that_serve_two_opposed_people(
             model = session.scalars(
                 select(Model).where(Model.participant_id == person_id, Model.kind == ModelKind.FILTER)
             ).one()
-            stored = context.store.read(session.scalars(select(Bundle).where(Bundle.model_id == model.id)).one().artefact_sha256)
+            stored = context.store.read(
+                session.scalars(select(Bundle).where(Bundle.model_id == model.id)).one().artefact_sha256
+            )
         manifest = bundle.verify(stored)
         assert manifest["signals"] == list(registry.task("plane").signals)
         assert manifest["control_rate_hz"] == 10.0
@@ -146,7 +156,9 @@ def test_from_a_lab_toml_to_bundles_that_serve_two_opposed_people(
         assert "max_force_n" not in manifest["evaluation"]["safety"], "nothing measures a force here"
         assert manifest["evaluation"]["success"]["delta"] >= -0.035
         bundles[name] = stored
-    driven = {name: [run(stored, tmp_path / name, scenario) for scenario in range(20)] for name, stored in bundles.items()}
+    driven = {
+        name: [run(stored, tmp_path / name, scenario) for scenario in range(20)] for name, stored in bundles.items()
+    }
     names = registry.task("plane").signals
     for own, other, minds in (("quick", "slow", QUICK), ("slow", "quick", SLOW)):
         mine, theirs = (np.mean([weighed(each, names, minds) for each in driven[whose]]) for whose in (own, other))
@@ -157,7 +169,9 @@ def run(stored: bytes, folder: Path, scenario: int) -> Trajectory:
     """An episode of the plane with the files of a bundle alone."""
     if not folder.exists():
         zipfile.ZipFile(io.BytesIO(stored)).extractall(folder)
-        checked = subprocess.run([sys.executable, "run_filter.py"], cwd=folder, capture_output=True, text=True, check=False)
+        checked = subprocess.run(
+            [sys.executable, "run_filter.py"], cwd=folder, capture_output=True, text=True, check=False
+        )
         assert checked.returncode == 0, checked.stderr
     import onnxruntime
 
@@ -206,7 +220,9 @@ def test_what_was_found_for_another_lab_toml_is_not_used(explored: Path, use: Ca
     assert registry.task("plane").title == "The plane", "words change nothing that was found"
     (explored / "lab.toml").write_text(text.replace("gain = 0.5", "gain = 0.4"))
     use(explored)
-    with pytest.raises(registry.NotExplored, match="has changed since its ways were found: run python -m worker explore"):
+    with pytest.raises(
+        registry.NotExplored, match="has changed since its ways were found: run python -m worker explore"
+    ):
         registry.task("plane")
 
 

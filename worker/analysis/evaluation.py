@@ -27,7 +27,8 @@ def evaluate(
     """Everything the dashboard and the model card show, as plain values.
 
     ``*_returns`` (N,): learned returns of the same trajectories; their change is given in standard deviations of the
-    reference's returns. ``task``: whose signals and costs the columns are; None: those that all of ours share. Costs are means over episodes of the summed unweighted costs.
+    reference's returns. ``task``: whose signals and costs the columns are; None: those that all of ours share.
+    Costs are means over episodes of the summed unweighted costs.
     Raises ValueError when the two lists are not the same scenarios in the same order.
     """
     if [each.scenario for each in reference] != [each.scenario for each in filtered] or not reference:

@@ -148,7 +148,9 @@ class FilterFit:
         scenarios = first_of(EVALUATION, self.config.evaluation_scenarios)
         filtered = self.collect(act, scenarios, 0.0, self.seed)
         reference, reward = self.reference(scenarios), self.problem.reward
-        return evaluate(reference, filtered, reward.returns(reference), reward.returns(filtered), self.problem.task), filtered
+        return evaluate(
+            reference, filtered, reward.returns(reference), reward.returns(filtered), self.problem.task
+        ), filtered
 
     def _evaluate_reference(self) -> tuple[dict[str, Any], list[Trajectory]]:
         """What would be measured of a filter that changes nothing: simulations repeat themselves exactly."""

@@ -27,18 +27,16 @@ def film(
     return trajectory, rendered(pictures, environment.description.environment.rate_hz)
 
 
-def film_again(
-    environment: LabEnvironment, recorded: Trajectory, first_step: int, step_count: int
-) -> RenderedClip:
-    """Another stretch of an episode that was recorded before, from its actions. Raises LabTaskBroken when it differs."""
+def film_again(environment: LabEnvironment, recorded: Trajectory, first_step: int, step_count: int) -> RenderedClip:
+    """Another stretch of an episode that was recorded before, from its actions. Raises LabTaskBroken if it differs."""
     actions = iter(recorded.actions)
     repeated, clip = film(environment, lambda _: next(actions), recorded.scenario, _nothing, first_step, step_count)
     difference = float(np.abs(repeated.observations - recorded.observations).max())
     if difference > SAME_WITHIN:
         raise LabTaskBroken(
             "environment.reset",
-            f"scenario {recorded.scenario} with the same actions went otherwise (by up to {difference:.3g}), so it cannot "
-            'be filmed again. Set reset = "rebuild" for a study of its own.',
+            f"scenario {recorded.scenario} with the same actions went otherwise (by up to {difference:.3g}), so it "
+            'cannot be filmed again. Set reset = "rebuild" for a study of its own.',
         )
     return clip
 

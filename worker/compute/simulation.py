@@ -14,18 +14,18 @@ import numpy as np
 import numpy.typing as npt
 
 from app.installed_tasks import catalogue
-from worker.compute.behaviours import Behaviour, SlowWaves, draw_behaviours
 from worker.compute import lab_clips
+from worker.compute.behaviours import Behaviour, SlowWaves, draw_behaviours
 from worker.ml.policies.gaussian import GaussianPolicy
 from worker.ml.policies.reference import ReferencePolicy
 from worker.ml.rewards.signal_predictor import SignalPredictor
 from worker.scenarios import NORMALISATION
 from worker.sim.assistive import AssistiveEnv
+from worker.sim.lab.environment import LabEnvironment
 from worker.sim.render.clip import STYLES, ClipRenderer, RenderedClip
 from worker.sim.render.scene import Scene
 from worker.sim.rollout import rollout
 from worker.task import Task
-from worker.sim.lab.environment import LabEnvironment
 from worker.tasks import registry
 from worker.tasks.registry import checkpoint, environment_class, filmed_task, task
 from worker.trajectory import Trajectory
@@ -189,9 +189,7 @@ def film(name: str, quality: str, controller: bytes, scenario: int) -> RecordedC
     return _recorded(name, quality, Controller(controller), scenario, 0, task(name).episode_steps)
 
 
-def _recorded(
-    name: str, quality: str, act: Act, scenario: int, first_step: int, step_count: int
-) -> RecordedClip:
+def _recorded(name: str, quality: str, act: Act, scenario: int, first_step: int, step_count: int) -> RecordedClip:
     if registry.lab(name) is not None:
         reference = reference_policy(name).mean
         trajectory, clip = lab_clips.film(lab_environment(name), act, scenario, reference, first_step, step_count)

@@ -82,7 +82,9 @@ def _run(described: LabDescription, environment: LabEnvironment, policy: OnnxPol
         trajectories.append(environment.episode(policy.mean, scenario))
         seconds.append(time.perf_counter() - started)
         again = environment.episode(
-            policy.mean, scenario, take=lambda step, row=row: row.append if step in shown else None  # type: ignore[misc]
+            policy.mean,
+            scenario,
+            take=lambda step, row=row: row.append if step in shown else None,  # type: ignore[misc]
         )
         rows.append(row)
         if not np.array_equal(again.observations, trajectories[-1].observations):
@@ -104,7 +106,8 @@ def _not_repeated(again: Trajectory, before: Trajectory, described: LabDescripti
         if described.environment.reset == "seed"
         else "It must draw everything random from reset(seed=...), or the same scenario cannot be compared with itself."
     )
-    return f"environment: the same seed and policy gave another episode (observations differ by {difference:.2g}). {advice}"
+    differ = f"observations differ by {difference:.2g}"
+    return f"environment: the same seed and policy gave another episode ({differ}). {advice}"
 
 
 def _remarks(

@@ -121,7 +121,9 @@ def find_ranges(task: str, scenarios: int = lab_ranges.SCENARIOS) -> None:
     with tqdm(total=1.0, desc="ranges of the ways to do it") as bar:
         environment = registry.lab_environment(task)
         try:
-            found = lab_ranges.find(described, installed.folder, environment, lambda _, share: bar.update(share - bar.n), scenarios)
+            found = lab_ranges.find(
+                described, installed.folder, environment, lambda _, share: bar.update(share - bar.n), scenarios
+            )
         finally:
             environment.close()
     found.save(installed.checkpoint / FOUND_FILE)

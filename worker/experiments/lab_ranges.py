@@ -89,7 +89,7 @@ def find(
     if success == 0.0:
         raise LabTaskBroken(
             "success",
-            f"the policy succeeded in none of {scenarios} episodes, so nothing can be learned about doing it otherwise. "
+            f"the policy succeeded in none of {scenarios} episodes, so there is nothing to do otherwise. "
             "Check what success says at the last step, episode_steps, policy.gain and the policy itself.",
         )
     found = replace(found, start_distance_m=_start_distance_m(found, reference))
@@ -105,7 +105,9 @@ def find(
         if any(ends):
             kept.append(replace(axis, low=ends[0], high=ends[1]))
     if not kept:
-        raise LabTaskBroken("modes", f"no way to do it otherwise is left: {dropped}. There is nothing people could choose.")
+        raise LabTaskBroken(
+            "modes", f"no way to do it otherwise is left: {dropped}. There is nothing people could choose."
+        )
     at_limit = _share_at_limit(found, policy, reference)
     return replace(
         found,
@@ -139,9 +141,13 @@ def _usable_end(
         changed = [environment.episode(act, each.scenario) for each in reference]
         wrong = _disaster(described, reference, changed)
         if not wrong:
-            return (value, f"narrowed to {value:g}: {why}" if why else "") if _seen(reference, changed) else (
-                0.0,
-                "changes nothing that is measured",
+            return (
+                (value, f"narrowed to {value:g}: {why}" if why else "")
+                if _seen(reference, changed)
+                else (
+                    0.0,
+                    "changes nothing that is measured",
+                )
             )
         why, value = wrong, value / 2.0
     return 0.0, why
@@ -188,7 +194,7 @@ def _notes(success: float, at_limit: float, described: LabDescription) -> tuple[
         notes.append(f"The policy succeeds in {success:.0%} of its episodes; differences in success will hide others.")
     if at_limit > USUALLY_AT_LIMIT:
         notes.append(
-            f"{at_limit:.0%} of the policy's actions are at their limit, so nobody can have it quicker. Set policy.gain "
-            f"below {described.policy.gain:g}, such as {0.5 * described.policy.gain:g}."
+            f"{at_limit:.0%} of the policy's actions are at their limit, so nobody can have it quicker. Set "
+            f"policy.gain below {described.policy.gain:g}, such as {0.5 * described.policy.gain:g}."
         )
     return tuple(notes)

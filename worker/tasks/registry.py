@@ -101,8 +101,8 @@ def coded(name: str) -> TaskDescription:
     installed = installed_task(name)
     if not isinstance(installed.description, TaskDescription):
         raise TaskBroken(
-            f"{name} is a laboratory's own environment: it has no robot, person and training of the studio's. Leave out "
-            "what needs them: the printed method, fine-tuning, and the tools for new tasks of ours."
+            f"{name} is a laboratory's own environment: it has no robot, person and training of the studio's. Leave "
+            "out what needs them: the printed method, fine-tuning, and the tools for new tasks of ours."
         )
     return installed.description
 

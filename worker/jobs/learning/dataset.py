@@ -132,7 +132,11 @@ def shown(store: ArtefactStore, clip: Clip) -> Trajectory:
 
 def signal_names(study: Study) -> Sequence[str]:
     """Names, with units, of the columns of signals in the study's trajectories."""
-    return registry.task(study.task).signals if study.material is None else [each["name"] for each in study.material["signals"]]
+    return (
+        registry.task(study.task).signals
+        if study.material is None
+        else [each["name"] for each in study.material["signals"]]
+    )
 
 
 def stored_trajectory(store: ArtefactStore, sha256: str) -> Trajectory:

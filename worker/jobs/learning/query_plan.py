@@ -112,9 +112,7 @@ def very_different(pairs: SegmentPairs) -> npt.NDArray[np.int64]:
     return np.argsort(-distance, kind="stable")[:count]
 
 
-def obvious_answer(
-    left: Stretch, right: Stretch, signals: Sequence[str] = SIGNALS
-) -> Literal["left", "right"] | None:
+def obvious_answer(left: Stretch, right: Stretch, signals: Sequence[str] = SIGNALS) -> Literal["left", "right"] | None:
     """Which side nobody would refuse: a clean success beside a run that fails and is seen to; None where that is open.
 
     Only what is shown counts: somebody who likes it slow may prefer a run that has not arrived at the end of the clip,

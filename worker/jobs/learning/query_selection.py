@@ -254,7 +254,8 @@ class _Choosing:
         candidates = [
             (pair, answer)
             for pair in self._unused(self._clips)
-            if (answer := query_plan.obvious_answer(*(dataset.stretch(store, clip) for clip in pair), names)) is not None
+            if (answer := query_plan.obvious_answer(*(dataset.stretch(store, clip) for clip in pair), names))
+            is not None
         ]
         if not candidates and self._may_yet_come():
             return None

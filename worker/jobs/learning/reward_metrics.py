@@ -50,11 +50,11 @@ def insight(context: WorkerContext, participant_id: int, stored_model: bytes) ->
 def weights_of_costs(sums: FloatArray, returns: FloatArray, costs_named: Sequence[str] = COSTS) -> dict[str, Any]:
     """What the model's returns say about the paper's six costs, whatever it was learned from.
 
-    ``sums`` (N, C): summed costs of every clip, ``costs_named`` in that order; ``returns`` (E, N): every member's return of it. Least squares of
-    each member's standardised returns on the standardised costs. Weights are standard deviations of the learned return
-    per standard deviation of a cost, the other costs being equal; positive: liked. Intervals (95 %) hold how members
-    differ and what the costs leave unexplained. Costs that are the same in all clips are left out. ``explained``: the
-    share of the mean return's variance.
+    ``sums`` (N, C): summed costs of every clip, ``costs_named`` in that order; ``returns`` (E, N): every member's
+    return of it. Least squares of each member's standardised returns on the standardised costs. Weights are
+    standard deviations of the learned return per standard deviation of a cost, the other costs being equal;
+    positive: liked. Intervals (95 %) hold how members differ and what the costs leave unexplained. Costs that are
+    the same in all clips are left out. ``explained``: the share of the mean return's variance.
     """
     varied = sums.std(axis=0) > 1e-9
     costs, mean_return = _standardised(sums[:, varied]), _standardised(returns.mean(axis=0))

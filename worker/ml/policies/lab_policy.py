@@ -29,7 +29,7 @@ def load(
     gain: float = 1.0,
     activation: str | None = None,
 ) -> OnnxPolicy:
-    """The policy in a file; see onnx_policy.adapted() for the sizes and bounds. Nothing is unpickled. Raises NotAPolicy."""
+    """The policy in a file; for sizes and bounds see onnx_policy.adapted(). Nothing is unpickled. Raises NotAPolicy."""
     if file.stat().st_size > LARGEST_BYTES:
         raise NotAPolicy(f"{file.name} is larger than {LARGEST_BYTES >> 20} MB.")
     try:
@@ -49,11 +49,13 @@ def _of_ours(file: Path, bounds: tuple[FloatArray, FloatArray]) -> bytes:
         policy = GaussianPolicy.load(file)
     except (SafetensorError, KeyError) as error:
         raise NotAPolicy(
-            f"it is not a policy.safetensors of the studio ({error}). It needs offset, scale, and weight_i and bias_i of "
-            "three layers; export any other network as ONNX."
+            f"it is not a policy.safetensors of the studio ({error}). It needs offset, scale, and weight_i and bias_i "
+            "of three layers; export any other network as ONNX."
         ) from error
     if not (np.allclose(bounds[0], -1.0) and np.allclose(bounds[1], 1.0)):
-        raise NotAPolicy("it says actions in [-1, 1], and the environment has other bounds; wrap it with RescaleAction.")
+        raise NotAPolicy(
+            "it says actions in [-1, 1], and the environment has other bounds; wrap it with RescaleAction."
+        )
     return policy_to_onnx(policy)
 
 
@@ -76,7 +78,7 @@ def _of_stable_baselines(file: Path, activation: str | None, bounds: tuple[Float
 
 
 def _stretched(stored: bytes, bounds: tuple[FloatArray, FloatArray]) -> bytes:
-    """A network that says actions in [-1, 1] as one that says them in the environment's unit, which is what is expected."""
+    """A network that says actions in [-1, 1] as one that says them in the environment's unit."""
     low, high = bounds
     if np.allclose(low, -1.0) and np.allclose(high, 1.0):
         return stored
@@ -92,7 +94,10 @@ def _stretched(stored: bytes, bounds: tuple[FloatArray, FloatArray]) -> bytes:
     )
     model.graph.node[-1].output[0] = "squashed"
     model.graph.node.extend(
-        [helper.make_node("Mul", ["squashed", "half"], ["scaled"]), helper.make_node("Add", ["scaled", "middle"], ["action"])]
+        [
+            helper.make_node("Mul", ["squashed", "half"], ["scaled"]),
+            helper.make_node("Add", ["scaled", "middle"], ["action"]),
+        ]
     )
     written: bytes = model.SerializeToString(deterministic=True)
     return written
@@ -120,7 +125,9 @@ def _state(file: Path) -> Mapping[str, Any]:
 
 
 def _layers(state: Mapping[str, Any], prefix: str) -> list[tuple[Float32Array, Float32Array]]:
-    numbers = sorted(int(found[1]) for name in state if (found := re.fullmatch(rf"{re.escape(prefix)}\.(\d+)\.weight", name)))
+    numbers = sorted(
+        int(found[1]) for name in state if (found := re.fullmatch(rf"{re.escape(prefix)}\.(\d+)\.weight", name))
+    )
     return [_layer(state, f"{prefix}.{number}") for number in numbers]
 
 

@@ -82,7 +82,9 @@ def adapted(
         onnx.checker.check_model(model)
         session(stored)
     except Exception as error:  # the libraries raise many kinds
-        raise NotAPolicy(f"it cannot be read as ONNX ({_short(error)}). Export it again, weights inside the file.") from error
+        raise NotAPolicy(
+            f"it cannot be read as ONNX ({_short(error)}). Export it again, weights inside the file."
+        ) from error
     constants = {each.name for each in model.graph.initializer}
     inputs = [each for each in model.graph.input if each.name not in constants]
     if len(inputs) != 1:
@@ -131,7 +133,9 @@ def adapted(
     try:
         said = policy.mean(np.zeros((2, observation_size), np.float32))
     except Exception as error:
-        raise NotAPolicy(f"it does not run on two observations at once ({_short(error)}). Export it with a free batch size.") from error
+        raise NotAPolicy(
+            f"it does not run on two observations at once ({_short(error)}). Export it with a free batch size."
+        ) from error
     if said.shape != (2, len(low)) or not np.isfinite(said).all():
         raise NotAPolicy(f"for two observations of zeros it says {said.tolist()}, not two rows of {len(low)} numbers.")
     return policy
@@ -140,12 +144,15 @@ def adapted(
 def mlp_to_onnx(layers: Sequence[tuple[Float32Array, Float32Array]], activation: str, squash: str) -> bytes:
     """A plain network, observation (batch, D) -> action (batch, A), written node by node.
 
-    ``layers``: weights (out, in) and biases (out,) as torch has them; ``activation``: an operation of ONNX between them;
-    ``squash``: one after the last, or empty.
+    ``layers``: weights (out, in) and biases (out,) as torch has them; ``activation``: an operation of ONNX between
+    them; ``squash``: one after the last, or empty.
     """
     nodes, constants, name = [], [], INPUT
     for index, (weight, bias) in enumerate(layers):
-        constants += [numpy_helper.from_array(weight, f"weight_{index}"), numpy_helper.from_array(bias, f"bias_{index}")]
+        constants += [
+            numpy_helper.from_array(weight, f"weight_{index}"),
+            numpy_helper.from_array(bias, f"bias_{index}"),
+        ]
         nodes.append(helper.make_node("Gemm", [name, f"weight_{index}", f"bias_{index}"], [f"raw_{index}"], transB=1))
         name = f"raw_{index}"
         operation = activation if index + 1 < len(layers) else squash

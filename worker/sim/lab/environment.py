@@ -1,7 +1,7 @@
 """A laboratory's environment behind one interface: vectors in, vectors out, signals measured, pictures taken.
 
-Observations are the environment's own, flattened, and behind them the action before and the share of the episode that is
-over, which modes need (worker.lab_modes). Actions are in [-1, 1] and stretched to the environment's own range.
+Observations are the environment's own, flattened, and behind them the action before and the share of the episode that
+is over, which modes need (worker.lab_modes). Actions are in [-1, 1] and stretched to the environment's own range.
 """
 
 import math
@@ -100,7 +100,11 @@ class LabEnvironment:
         return self._low, self._high
 
     def episode(
-        self, act: Act, scenario: int, reference: Act | None = None, take: Callable[[int], Callable[[Picture], None] | None] | None = None
+        self,
+        act: Act,
+        scenario: int,
+        reference: Act | None = None,
+        take: Callable[[int], Callable[[Picture], None] | None] | None = None,
     ) -> Trajectory:
         """One whole episode, from reset(seed=scenario). ``take`` says of every step, from 0 on, who
         is given its picture; None: nobody."""
@@ -129,7 +133,10 @@ class LabEnvironment:
             measured = {name: self._number(f"signals.{name}", read(happened)) for name, read in self._signals.items()}
             velocity, moved = self._motion(seen[-2], seen[-1], velocity)
             change = (action - previous).astype(np.float64)
-            builtin = {"undelivered": float(not succeeded), "action_change_squared": float(change @ change) / len(change)}
+            builtin = {
+                "undelivered": float(not succeeded),
+                "action_change_squared": float(change @ change) / len(change),
+            }
             everything = {**builtin, **moved, **measured}
             rows.append([everything[name] for name in described.signal_names])
             costs.append([measured[name] for name in described.cost_names])
@@ -174,7 +181,8 @@ class LabEnvironment:
         if drawn.ndim != 3 or drawn.shape[2] != 3 or drawn.dtype != np.uint8:
             raise LabTaskBroken(
                 "environment",
-                f"render() gave {drawn.dtype} of shape {drawn.shape}; rgb_array must give uint8 of shape (height, width, 3).",
+                f"render() gave {drawn.dtype} of shape {drawn.shape}; rgb_array must give uint8 of "
+                "shape (height, width, 3).",
             )
         height, width = drawn.shape[0] // 2 * 2, drawn.shape[1] // 2 * 2
         if min(height, width) < SMALLEST_PICTURE_PX:
@@ -201,7 +209,7 @@ class LabEnvironment:
         key = "environment.id" if said.id else "environment.factory"
         arguments = {"render_mode": "rgb_array", **said.kwargs}
         make = gymnasium.make if said.id else named_object(self.folder, key, str(said.factory))
-        first = (said.id, ) if said.id else ()
+        first = (said.id,) if said.id else ()
         try:
             self._made = make(*first, **arguments)
         except LabTaskBroken:
@@ -212,7 +220,8 @@ class LabEnvironment:
             raise LabTaskBroken(key, f"gave a {type(self._made).__name__}, which is no gymnasium.Env.")
         if self._made.render_mode != "rgb_array":
             raise LabTaskBroken(
-                key, "has no render_mode 'rgb_array', so nobody can be shown what it does. Give it one (see Env.render)."
+                key,
+                "has no render_mode 'rgb_array', so nobody can be shown what it does. Give it one (see Env.render).",
             )
 
     def _described_observation(self) -> Space:
@@ -228,7 +237,8 @@ class LabEnvironment:
                 )
             if len(part.shape) > 1:
                 raise LabTaskBroken(
-                    "environment", f"its observation {name!r} is a picture or table {part.shape}; only vectors are known."
+                    "environment",
+                    f"its observation {name!r} is a picture or table {part.shape}; only vectors are known.",
                 )
             low, high = float(np.min(part.low)), float(np.max(part.high))
             size = gymnasium.spaces.flatdim(part)
@@ -295,7 +305,9 @@ class LabEnvironment:
         share = np.float32(step / self.description.episode_steps)
         return np.concatenate([own, previous, [share]]).astype(np.float32)
 
-    def _motion(self, before: Float32Array, after: Float32Array, earlier: FloatArray) -> tuple[FloatArray, dict[str, float]]:
+    def _motion(
+        self, before: Float32Array, after: Float32Array, earlier: FloatArray
+    ) -> tuple[FloatArray, dict[str, float]]:
         if not self.tip:
             return earlier, {}
         tip = after[list(self.tip)].astype(np.float64)

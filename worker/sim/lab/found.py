@@ -19,7 +19,6 @@ from worker.whole_files import written_whole
 FOUND_FILE = "found.json"
 
 
-
 def mark_of(described: LabDescription, folder: Path) -> str:
     """A fingerprint of what was found depends on: everything but names and words, and the policy itself."""
     kept = described.model_dump(mode="json", exclude={"title", "summary", "words", "instructions", "usual_clip_steps"})
