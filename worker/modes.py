@@ -82,9 +82,13 @@ class ModeFamily(ABC):
     def perceived(self, observation: Any, mode: Any, xp: Any = np) -> Any:
         """The observation (..., D) as the policy should see it in this mode."""
 
-    @abstractmethod
+    def speed_factor(self, observation: Any, mode: Any, xp: Any = np) -> Any:
+        """The factor on the policy's mean action, (..., 1) or (..., 7)."""
+        return 1.0
+
     def executed(self, observation: Any, mode: Any, action: Any, xp: Any = np) -> Any:
-        """The action (..., A) that becomes of the policy's in this mode."""
+        """The action (..., A) that becomes of the policy's in this mode; not clipped."""
+        return self.speed_factor(observation, mode, xp) * action
 
     # For subclasses
 
@@ -142,10 +146,6 @@ class ApproachModes(ModeFamily):
             tool_to_target_m=self._field(observation, "tool_to_target_m") + shift,
             body_to_target_m=self._field(observation, "body_to_target_m") + shift,
         )
-
-    def executed(self, observation: Any, mode: Any, action: Any, xp: Any = np) -> Any:
-        """The policy's action times the speed factor."""
-        return self.speed_factor(observation, mode, xp) * action
 
     def shift(self, observation: Any, mode: Any, xp: Any = np) -> Any:
         """How far the perceived target lies from the true one, (..., 3), in the base frame."""

@@ -40,6 +40,7 @@ from worker.ml.export import bundle
 from worker.sim.lab.errors import LabTaskBroken
 from worker.tasks import registry
 from worker.trajectory import Trajectory
+from worker.type_aliases import Float32Array
 
 SCENARIOS, BEHAVIOURS = 5, 4
 LABELS = SCENARIOS * BEHAVIOURS * (BEHAVIOURS - 1) // 2
@@ -177,9 +178,10 @@ def run(stored: bytes, folder: Path, scenario: int) -> Trajectory:
 
     policy, session = (onnxruntime.InferenceSession(folder / name) for name in ("policy.onnx", "filter.onnx"))
 
-    def act(observation: np.ndarray) -> np.ndarray:
+    def act(observation: Float32Array) -> Float32Array:
         (mean,) = policy.run(["policy_mean"], {"observation": observation[None]})
-        return session.run(["action"], {"observation": observation[None], "policy_mean": mean})[0][0]
+        filtered: Float32Array = session.run(["action"], {"observation": observation[None], "policy_mean": mean})[0][0]
+        return filtered
 
     return simulation.lab_environment("plane").episode(act, scenario)
 

@@ -24,7 +24,7 @@ from worker.ml.export.run_controller import INPUT, OUTPUT, Controller
 from worker.ml.filters.filter_onnx import LARGEST_DIFFERENCE, ExportDiffers
 from worker.ml.filters.filter_problem import FilterAct
 from worker.ml.methods.preference_rl import PolicyAct
-from worker.ml.policies.gaussian import GaussianPolicy
+from worker.ml.policies.reference import ReferencePolicy
 from worker.ml.policies.stored_policy import stored_policy
 from worker.task import Task
 from worker.type_aliases import Act, Float32Array
@@ -142,7 +142,7 @@ def _blinded(
     constants: Iterable[TensorProto],
     named: dict[str, str],
     like: ModelProto,
-    policy: GaussianPolicy,
+    policy: ReferencePolicy,
 ) -> bytes:
     """A model of these nodes in which every name is a number. ``named``: values that become input or output."""
     numbers: dict[str, str] = {**_ENDS, **named}

@@ -2,8 +2,20 @@
 
 from typing import TYPE_CHECKING, TypeAlias
 
-if TYPE_CHECKING:  # each is loaded by whoever needs it
-    from worker.ml.policies.gaussian import GaussianPolicy
+from worker.ml.policies.gaussian import GaussianPolicy
+
+if TYPE_CHECKING:  # its runtime is loaded by whoever needs it
     from worker.ml.policies.onnx_policy import OnnxPolicy
 
 ReferencePolicy: TypeAlias = "GaussianPolicy | OnnxPolicy"
+
+
+class NotLookedInto(ValueError):
+    """This method needs the policy's own weights; a laboratory's policy is only asked what it does. Take another."""
+
+
+def looked_into(policy: ReferencePolicy) -> GaussianPolicy:
+    """The policy as a network that is known. Raises NotLookedInto."""
+    if not isinstance(policy, GaussianPolicy):
+        raise NotLookedInto(NotLookedInto.__doc__)
+    return policy

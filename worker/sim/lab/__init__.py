@@ -1,1 +1,1 @@
-"""A laboratory's own Gymnasium environment: its episodes, its signals, its pictures."""
+"""A laboratory's own Gymnasium environment."""

@@ -272,10 +272,11 @@ class LabEnvironment:
             return self._guarded(key, named_object(self.folder, f"{key}.function", said.function))
 
         def read(step: LabStep) -> Any:
-            if said.info not in step.info:
+            key_of_info = str(said.info)
+            if key_of_info not in step.info:
                 known = ", ".join(sorted(map(str, step.info))) or "nothing"
                 raise LabTaskBroken(f"{key}.info", f"the environment's info has no {said.info!r}; it has {known}.")
-            return step.info[said.info]
+            return step.info[key_of_info]
 
         return read
 
