@@ -88,7 +88,7 @@ def envelope(trajectories: Sequence[Trajectory], signals: Sequence[str] = SIGNAL
 
     Only what is measured: laboratories' environments have no person of ours, and a speed if they say what moves.
     """
-    found = {}
+    found: dict[str, float] = {}
     if "speed_m_s" in signals:
         column = signals.index("speed_m_s")
         speeds = np.array([each.signals[:, column].max() for each in trajectories])

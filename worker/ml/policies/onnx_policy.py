@@ -5,6 +5,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import onnx
 import onnxruntime
 from onnx import TensorProto, helper, numpy_helper
@@ -96,7 +97,7 @@ def adapted(
     _require_shape("output", model.graph.output[0], len(bounds[0]), "its actions")
     low, high = bounds
     half = (high - low) / 2.0
-    ends = {
+    ends: dict[str, npt.NDArray[Any]] = {
         "first": np.array([0], np.int64),
         "last": np.array([own_size], np.int64),
         "axis": np.array([1], np.int64),
