@@ -31,9 +31,11 @@ from worker.experiments.benchmark_cell import INDIRECT_USERS, OPPOSED_USERS, PAP
 from worker.jobs import service
 from worker.jobs.clips import import_clips
 from worker.ml.methods.registry import METHODS
+from worker.ml.policies.onnx_policy import NotAPolicy
 from worker.ml.teachers import Manner, Taste
 from worker.rehearsal import demo_study, rehearsal
 from worker.rehearsal.server import OwnStudio
+from worker.sim.lab.errors import LabTaskBroken
 from worker.tasks.registry import checkpoint
 
 
@@ -272,12 +274,12 @@ def _pretrain(said: argparse.Namespace) -> int:
 
 
 def _explore(said: argparse.Namespace) -> int:
-    record = fit_response_surface.explore(
-        said.task,
-        said.work_directory or Settings().data_dir / "explore" / said.task,
-        said.processes,
-        said.scenarios,
-    )
+    work = said.work_directory or Settings().data_dir / "explore" / said.task
+    try:
+        record = fit_response_surface.explore(said.task, work, said.processes, said.scenarios)
+    except (LabTaskBroken, NotAPolicy) as error:
+        sys.stderr.write(f"Error: {error}\n")
+        return 1
     sys.stdout.write(json.dumps(record, indent=2) + "\n")
     return 0
 

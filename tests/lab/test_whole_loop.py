@@ -27,6 +27,7 @@ from app.web.texts.task_words import words_of
 from tests import factories
 from tests.lab.conftest import forget, way_to_goal, write_plane
 from tests.worker.at_hand import AtHand, at_once
+from worker.__main__ import main
 from worker.compute import simulation
 from worker.experiments import fit_response_surface
 from worker.jobs.clips.pool_clips import build_clips
@@ -207,12 +208,16 @@ def test_a_policy_that_goes_at_its_limit_is_told_of_for_nobody_could_have_it_qui
     assert "of the policy's actions are at their limit, so nobody can have it quicker. Set policy.gain below 1" in note
 
 
-def test_a_policy_that_never_succeeds_has_no_ranges(plane: Path, use: Callable[[Path], None]) -> None:
+def test_a_policy_that_never_succeeds_has_no_ranges(
+    plane: Path, use: Callable[[Path], None], capsys: pytest.CaptureFixture[str]
+) -> None:
     text = (plane / "lab.toml").read_text()
     (plane / "lab.toml").write_text(text.replace("gain = 0.5", "gain = 0.001"))
     use(plane)
     with pytest.raises(LabTaskBroken, match="succeeded in none of 4 episodes"):
         fit_response_surface.find_ranges("plane", scenarios=4)
+    assert main(["explore", "--task", "plane", "--work-directory", str(plane / "blocks")]) == 1
+    assert "Error: success: the policy succeeded in none of 15 episodes" in capsys.readouterr().err
 
 
 def test_what_was_found_for_another_lab_toml_is_not_used(explored: Path, use: Callable[[Path], None]) -> None:
