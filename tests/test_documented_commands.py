@@ -37,8 +37,8 @@ COMMAND = re.compile(
     rf"((?:{MAKE}|{VARIABLES}*(?:[\w.]+/)*python {OURS}|\.venv/bin/[\w-]+)(?:(?! {{2}}| #| \.\.\.)[^`<\n])*)",
     re.MULTILINE,
 )
-EXAMPLE = {"dabbing": "feeding", "NAME": "feeding"}
-"""The task that docs/new_task.md makes up, and any task."""
+EXAMPLE = {"dabbing": "feeding", "reach": "feeding", "NAME": "feeding"}
+"""The tasks that docs/new_task.md makes up and docs/your_robot.md brings, and any task."""
 
 
 @dataclass(frozen=True)
@@ -84,6 +84,7 @@ RUN: dict[str, str | Elsewhere | OnlyParsed] = {
     "worker --help": "",
     "worker behaviours": "--tasks feeding --scenarios 1 --axis-scenarios 1",
     "worker benchmark": Elsewhere("tests/worker/experiments/test_benchmark.py::test_the_command_can_only_report"),
+    "worker check": Elsewhere("tests/lab/test_your_robot.py::test_the_example_can_be_used"),
     "worker demo-study": OnlyParsed(
         "takes minutes; what it made is looked at by tests/worker/rehearsal/test_demo_study.py"
     ),

@@ -20,6 +20,7 @@ from worker import options
 from worker.experiments import (
     behaviour_differences,
     benchmark,
+    check_lab,
     fit_response_surface,
     pretrain_policy,
     speed_cost_weight,
@@ -30,9 +31,11 @@ from worker.experiments.benchmark_cell import INDIRECT_USERS, OPPOSED_USERS, PAP
 from worker.jobs import service
 from worker.jobs.clips import import_clips
 from worker.ml.methods.registry import METHODS
+from worker.ml.policies.onnx_policy import NotAPolicy
 from worker.ml.teachers import Manner, Taste
 from worker.rehearsal import demo_study, rehearsal
 from worker.rehearsal.server import OwnStudio
+from worker.sim.lab.errors import LabTaskBroken
 from worker.tasks.registry import checkpoint
 
 
@@ -117,6 +120,11 @@ def _add_new_task(commands: _Commands) -> None:
     _add_task(speed)
     speed.add_argument("--scenarios", type=int, default=speed_cost_weight.SCENARIOS)
     speed.set_defaults(act=lambda said: speed_cost_weight.weigh_speed(said.task, said.scenarios))
+
+    checking = commands.add_parser("check", help=check_lab.check.__doc__)
+    checking.add_argument("file", type=Path, help="lab.toml, or the folder it lies in")
+    checking.add_argument("--sheet", type=Path, help="the contact sheet; default: contact_sheet.png beside lab.toml")
+    checking.set_defaults(act=lambda said: check_lab.check(said.file, said.sheet))
 
     differences = commands.add_parser("behaviours", help=behaviour_differences.tell_behaviours_apart.__doc__)
     differences.add_argument("--tasks", nargs="+", choices=catalogue.names(), default=list(catalogue.names()))
@@ -270,12 +278,12 @@ def _pretrain(said: argparse.Namespace) -> int:
 
 
 def _explore(said: argparse.Namespace) -> int:
-    record = fit_response_surface.explore(
-        said.task,
-        said.work_directory or Settings().data_dir / "explore" / said.task,
-        said.processes,
-        said.scenarios,
-    )
+    work = said.work_directory or Settings().data_dir / "explore" / said.task
+    try:
+        record = fit_response_surface.explore(said.task, work, said.processes, said.scenarios)
+    except (LabTaskBroken, NotAPolicy) as error:
+        sys.stderr.write(f"Error: {error}\n")
+        return 1
     sys.stdout.write(json.dumps(record, indent=2) + "\n")
     return 0
 

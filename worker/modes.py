@@ -82,9 +82,13 @@ class ModeFamily(ABC):
     def perceived(self, observation: Any, mode: Any, xp: Any = np) -> Any:
         """The observation (..., D) as the policy should see it in this mode."""
 
-    @abstractmethod
     def speed_factor(self, observation: Any, mode: Any, xp: Any = np) -> Any:
         """The factor on the policy's mean action, (..., 1) or (..., 7)."""
+        return 1.0
+
+    def executed(self, observation: Any, mode: Any, action: Any, xp: Any = np) -> Any:
+        """The action (..., A) that becomes of the policy's in this mode; not clipped."""
+        return self.speed_factor(observation, mode, xp) * action
 
     # For subclasses
 

@@ -6,7 +6,8 @@ Each task's own stands beside its environment in the task's folder and travels f
 from dataclasses import dataclass, field
 
 from worker.modes import ModeFamily
-from worker.spaces import Space
+from worker.spaces import CONTROL_STEP_S, JOINT_ACTION, Space
+from worker.trajectory import COSTS, SIGNALS
 
 
 @dataclass(frozen=True)
@@ -32,3 +33,11 @@ class Task:
     """as in the folder's task.toml"""
     pieces: int = 8
     """of food or water in the usual portion"""
+    action: Space = field(default=JOINT_ACTION, repr=False)
+    control_step_s: float = field(default=CONTROL_STEP_S, repr=False)
+    signals: tuple[str, ...] = field(default=SIGNALS, repr=False)
+    """columns of the signals of its trajectories"""
+    costs: tuple[str, ...] = field(default=COSTS, repr=False)
+    """columns of the costs of its trajectories"""
+    is_a_labs: bool = field(default=False, repr=False)
+    """A laboratory's own environment and policy: filters act on what the policy says, which is not looked into."""

@@ -143,11 +143,14 @@ class Trajectory:
     scenario: int
     task: str
     body: str
-    """one of BODIES"""
+    """one of BODIES; empty in a laboratory's own environment, in which there is no person of ours"""
     skin_tone: int
 
     def __post_init__(self) -> None:
         steps = len(self.actions)
+        if not self.body:
+            self._require_lab_shapes(steps)
+            return
         expected = {
             "observations": (steps + 1, None),
             "actions": (steps, 7),
@@ -163,6 +166,20 @@ class Trajectory:
             "contact_force_n": (steps,),
         }
         for name, shape in expected.items():
+            _require_shape(name, getattr(self, name), shape)
+
+    def _require_lab_shapes(self, steps: int) -> None:
+        """A laboratory's own actions, signals and costs; nothing of our robot and person."""
+        lab = {
+            "observations": (steps + 1, None),
+            "actions": (steps, None),
+            "reference_actions": (steps, None),
+            "signals": (steps, None),
+            "costs": (steps, None),
+            "task_rewards": (steps,),
+            "contact_force_n": (steps,),
+        }
+        for name, shape in lab.items():
             _require_shape(name, getattr(self, name), shape)
 
     def __len__(self) -> int:

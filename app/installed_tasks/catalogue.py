@@ -2,9 +2,10 @@
 
 The studio runs from its checkout, so its own are read from the file beside this one that declares them: an
 installation that is older than the checkout, or was never made, changes nothing. Those of other packages come from
-what is installed.
+what is installed. Those of laboratories come from the files that ``LAB_TASKS`` names.
 """
 
+import os
 import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -16,13 +17,22 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import NamedTuple
 
+from pydantic_settings import BaseSettings, SettingsConfigDict
+
+from app.installed_tasks import lab
 from app.installed_tasks.description import InstalledTask, TaskRefused, read
 
 GROUP = "pbarl_studio.tasks"
 OURS, OUR_ENTRY_POINTS = "pbarl-studio", Path(__file__).with_name("entry_points.txt")
-_NAME, _PACKAGE = r"[a-z][a-z0-9_]{0,39}", r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*"
+_PACKAGE = r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*"
 _RESERVED = {"other", "own_clips"}
 """What is said of tasks that are not installed goes by one of these, studies of imported clips by the other."""
+
+
+class _LabSettings(BaseSettings):
+    model_config = SettingsConfigDict(env_file=".env", extra="ignore")
+
+    lab_tasks: str = ""
 
 
 class Declared(NamedTuple):
@@ -62,7 +72,22 @@ def installed() -> Catalogue:
         except TaskRefused as error:
             advice = f"Correct it or uninstall {declared.distribution}, and start the studio again."
             broken.append(BrokenTask(declared.name, f"The task {declared.name} cannot be used. {error} {advice}"))
+    for file in lab_files():
+        try:
+            found = lab.read(file)
+            if found.name in tasks or found.name in _RESERVED:
+                raise TaskRefused(f"{file}: the name {found.name} is not free.")
+            tasks[found.name] = found
+        except TaskRefused as error:
+            advice = "Correct it or take it out of LAB_TASKS, and start the studio again."
+            broken.append(BrokenTask(file.parent.name, f"The task of {file} cannot be used. {error} {advice}"))
     return Catalogue(tasks, broken)
+
+
+def lab_files() -> list[Path]:
+    """The files that LAB_TASKS names, separated as in PATH; a folder stands for the lab.toml in it."""
+    named = [Path(each) for each in _LabSettings().lab_tasks.split(os.pathsep) if each.strip()]
+    return [each / "lab.toml" if each.is_dir() else each for each in named]
 
 
 def names() -> tuple[str, ...]:
@@ -91,7 +116,7 @@ def _declared() -> Iterator[Declared]:
 
 
 def _read(declared: Declared) -> InstalledTask:
-    if not re.fullmatch(_NAME, declared.name):
+    if not re.fullmatch(lab.NAME, declared.name):
         raise TaskRefused("Its name must be at most 40 small letters, digits and underscores, and begin with a letter.")
     if declared.name in _RESERVED:
         raise TaskRefused("This name is not free.")

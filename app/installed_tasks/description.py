@@ -4,7 +4,7 @@ import re
 import tomllib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Self, TypeVar
 from xml.etree import ElementTree
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -38,11 +38,14 @@ _EXPLAINED = {
     "string_pattern_mismatch": "must be like module:name, a name in a module of the package",
 }
 
-_Word = Annotated[str, Field(min_length=1, max_length=200)]
-_Text = Annotated[str, Field(min_length=1, max_length=4000), AfterValidator(_flowing)]
-_Language = Annotated[str, AfterValidator(_code)]
-_Reference = Annotated[str, Field(pattern=r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*$")]
+Word = Annotated[str, Field(min_length=1, max_length=200)]
+Text = Annotated[str, Field(min_length=1, max_length=4000), AfterValidator(_flowing)]
+LanguageCode = Annotated[str, AfterValidator(_code)]
+Reference = Annotated[str, Field(pattern=r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*$")]
 """An object of the task's package: ``module:name``."""
+
+
+_Described = TypeVar("_Described", bound="DescribedTask")
 
 
 class TaskRefused(ValueError):
@@ -54,20 +57,20 @@ class Words(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    tool: _Word
+    tool: Word
     """what the robot holds"""
-    target: _Word
+    target: Word
     """where it goes"""
-    carried: _Word | None = None
+    carried: Word | None = None
     """what can be spilled; None: nothing"""
-    axes: dict[str, _Word] = {}
+    axes: dict[str, Word] = {}
     """The ways in which executions differ, beyond those of every approach; the sign says which end."""
     silent_signals: frozenset[str] = frozenset()
     """Always 0 in this task; a weight of them says nothing."""
 
 
-class TaskDescription(BaseModel):
-    """What ``task.toml`` says."""
+class DescribedTask(BaseModel):
+    """What both ways to describe a task say: a folder of code with ``task.toml``, and a ``lab.toml``."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -77,16 +80,8 @@ class TaskDescription(BaseModel):
     episode_steps: int = Field(ge=SHORTEST_CLIP_STEPS, le=LONGEST_CLIP_STEPS)
     usual_clip_steps: int = Field(ge=SHORTEST_CLIP_STEPS)
     """from the start, in which what matters has happened"""
-    environment: _Reference
-    """a subclass of worker.sim.assistive.AssistiveEnv"""
-    look: _Reference | None = None
-    """a worker.sim.render.task_look.TaskLook; None: the usual one"""
-    demonstrator: _Reference | None = None
-    """returns a scripted controller that the reference policy imitates first; None: trial and error alone"""
-    training: dict[str, Any] = {}
-    """What the reference policy's training does otherwise than worker.ml.policies.sac.SacConfig."""
     words: Words
-    instructions: dict[_Language, _Text]
+    instructions: dict[LanguageCode, Text]
     """What participants read of the task, by language; an empty line makes a paragraph."""
 
     @model_validator(mode="after")
@@ -94,6 +89,19 @@ class TaskDescription(BaseModel):
         if self.usual_clip_steps > self.episode_steps:
             raise ValueError(f"usual_clip_steps must not be more than the {self.episode_steps} steps of an episode")
         return self
+
+
+class TaskDescription(DescribedTask):
+    """What ``task.toml`` says."""
+
+    environment: Reference
+    """a subclass of worker.sim.assistive.AssistiveEnv"""
+    look: Reference | None = None
+    """a worker.sim.render.task_look.TaskLook; None: the usual one"""
+    demonstrator: Reference | None = None
+    """returns a scripted controller that the reference policy imitates first; None: trial and error alone"""
+    training: dict[str, Any] = {}
+    """What the reference policy's training does otherwise than worker.ml.policies.sac.SacConfig."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +112,7 @@ class InstalledTask:
     """as stored in studies, trajectories and bundles"""
     package: str
     folder: Path
-    description: TaskDescription
+    description: DescribedTask
     picture: str
     """shapes beside a seated person, as SVG; empty: none"""
 
@@ -120,8 +128,13 @@ def read(name: str, package: str, folder: Path) -> InstalledTask:
 
 
 def _description(file: Path) -> TaskDescription:
+    return parsed(TaskDescription, file)
+
+
+def parsed(kind: type[_Described], file: Path) -> _Described:
+    """What a TOML file says. Raises TaskRefused, which names the file and every key that is wrong."""
     try:
-        return TaskDescription.model_validate(tomllib.loads(_text(file)))
+        return kind.model_validate(tomllib.loads(_text(file)))
     except tomllib.TOMLDecodeError as error:
         raise TaskRefused(f"{file} is not valid TOML: {error}.") from error
     except ValidationError as error:

@@ -47,7 +47,7 @@ def test_environment_and_look_of_a_task_are_as_its_description_says(task: str) -
     assert registry.look(task).tool is not None
     assert installed.picture
     assert set(installed.description.instructions) == set(Language)
-    assert (registry.demonstrator(task) is None) == (installed.description.demonstrator is None)
+    assert (registry.demonstrator(task) is None) == (registry.coded(task).demonstrator is None)
 
 
 @pytest.mark.parametrize("task", NAMES)

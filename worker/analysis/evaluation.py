@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from worker.analysis.agreement import Z_95, wilson_interval
+from worker.task import Task
 from worker.trajectory import COSTS, SIGNALS, Trajectory
 from worker.type_aliases import FloatArray
 
@@ -21,26 +22,29 @@ def evaluate(
     filtered: Sequence[Trajectory],
     reference_returns: npt.ArrayLike,
     filtered_returns: npt.ArrayLike,
+    task: Task | None = None,
 ) -> dict[str, Any]:
     """Everything the dashboard and the model card show, as plain values.
 
     ``*_returns`` (N,): learned returns of the same trajectories; their change is given in standard deviations of the
-    reference's returns. Costs are means over episodes of the summed unweighted costs.
+    reference's returns. ``task``: whose signals and costs the columns are; None: those that all of ours share.
+    Costs are means over episodes of the summed unweighted costs.
     Raises ValueError when the two lists are not the same scenarios in the same order.
     """
     if [each.scenario for each in reference] != [each.scenario for each in filtered] or not reference:
         raise ValueError("Both must have been run on the same scenarios, in the same order.")
     before, after = np.asarray(reference_returns, np.float64), np.asarray(filtered_returns, np.float64)
     unit = max(float(before.std()), 1e-9)
+    costs, signals = (COSTS, SIGNALS) if task is None else (task.costs, task.signals)
     return {
         "scenarios": len(reference),
         "success": success_change(_successes(reference), _successes(filtered)),
         "preference": _with_interval((after - before) / unit),
         "costs": {
             name: mean_change(_summed(reference, column), _summed(filtered, column))
-            for column, name in enumerate(COSTS)
+            for column, name in enumerate(costs)
         },
-        "safety": {"reference": envelope(reference), "filter": envelope(filtered)},
+        "safety": {"reference": envelope(reference, signals), "filter": envelope(filtered, signals)},
     }
 
 
@@ -79,16 +83,20 @@ def _correlation(before: FloatArray, after: FloatArray) -> float:
     return float(corrected / np.sqrt(margins))
 
 
-def envelope(trajectories: Sequence[Trajectory]) -> dict[str, float]:
-    """The largest speed and force seen in these rollouts, and the 95th percentile of each episode's largest."""
-    speeds = np.array([_column(each, "speed_m_s").max() for each in trajectories])
-    forces = np.array([each.contact_force_n.max() for each in trajectories])
-    return {
-        "max_speed_m_s": float(speeds.max()),
-        "p95_max_speed_m_s": float(np.quantile(speeds, 0.95)),
-        "max_force_n": float(forces.max()),
-        "p95_max_force_n": float(np.quantile(forces, 0.95)),
-    }
+def envelope(trajectories: Sequence[Trajectory], signals: Sequence[str] = SIGNALS) -> dict[str, float]:
+    """The largest speed and force seen in these rollouts, and the 95th percentile of each episode's largest.
+
+    Only what is measured: laboratories' environments have no person of ours, and a speed if they say what moves.
+    """
+    found: dict[str, float] = {}
+    if "speed_m_s" in signals:
+        column = signals.index("speed_m_s")
+        speeds = np.array([each.signals[:, column].max() for each in trajectories])
+        found |= {"max_speed_m_s": float(speeds.max()), "p95_max_speed_m_s": float(np.quantile(speeds, 0.95))}
+    if all(each.body for each in trajectories):
+        forces = np.array([each.contact_force_n.max() for each in trajectories])
+        found |= {"max_force_n": float(forces.max()), "p95_max_force_n": float(np.quantile(forces, 0.95))}
+    return found
 
 
 def _with_interval(differences: FloatArray) -> dict[str, float]:
@@ -103,8 +111,3 @@ def _successes(trajectories: Sequence[Trajectory]) -> FloatArray:
 
 def _summed(trajectories: Sequence[Trajectory], column: int) -> FloatArray:
     return np.array([each.costs[:, column].sum(dtype=np.float64) for each in trajectories])
-
-
-def _column(trajectory: Trajectory, name: str) -> npt.NDArray[np.float32]:
-    signal: npt.NDArray[np.float32] = trajectory.signals[:, SIGNALS.index(name)]
-    return signal

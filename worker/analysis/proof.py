@@ -19,6 +19,8 @@ _HARMS = {
     "C_fd": "spills on the person",
     "C_fdv": "speed of what enters the mouth",
 }
+_HARMLESS = {"C_d", "C_v"}
+"""Distance and speed by themselves; of a laboratory's costs each may harm."""
 _LARGEST = {
     "max_force_n": ("the largest force", FORCE_MARGIN_N, "N"),
     "p95_max_force_n": ("the force that 95 % of the episodes stay below", FORCE_MARGIN_N, "N"),
@@ -45,13 +47,13 @@ def _larger(safety: Mapping[str, Mapping[str, float]]) -> list[str]:
     return [
         f"{words} {before[name]:.2f} -> {after[name]:.2f} {unit}"
         for name, (words, margin, unit) in _LARGEST.items()
-        if after[name] > before[name] + margin
+        if name in before and after[name] > before[name] + margin
     ]
 
 
 def _more_harm(costs: Mapping[str, Mapping[str, float]]) -> list[str]:
     return [
-        f"{words} {costs[name]['reference']:.3g} -> {costs[name]['filter']:.3g} per episode"
-        for name, words in _HARMS.items()
-        if costs[name]["low"] > 0.0
+        f"{_HARMS.get(name, name)} {cost['reference']:.3g} -> {cost['filter']:.3g} per episode"
+        for name, cost in costs.items()
+        if name not in _HARMLESS and cost["low"] > 0.0
     ]

@@ -45,11 +45,14 @@ class Behaviour:
         return {name: value for name, value in asdict(self).items() if value}
 
 
-def draw_behaviours(task: Task, scenario: int, count: int, checkpoints: Sequence[str] = ()) -> list[Behaviour]:
-    """Random behaviours of one scenario, no two of them alike. ``checkpoints``: the early policies there are."""
+def draw_behaviours(
+    task: Task, scenario: int, count: int, checkpoints: Sequence[str] = (), sampled: bool = True
+) -> list[Behaviour]:
+    """Random behaviours of one scenario, no two of them alike. ``checkpoints``: the early policies there are;
+    ``sampled``: whether the policy can draw actions at random."""
     rng = np.random.default_rng([scenario, 1])
     modes = _different_modes(task, count, rng)
-    return [_dressed(task, mode, (scenario, index), checkpoints, rng) for index, mode in enumerate(modes)]
+    return [_dressed(task, mode, (scenario, index), checkpoints, rng, sampled) for index, mode in enumerate(modes)]
 
 
 def _different_modes(task: Task, count: int, rng: np.random.Generator) -> list[npt.NDArray[np.float64]]:
@@ -70,13 +73,14 @@ def _dressed(
     seed: tuple[int, ...],
     checkpoints: Sequence[str],
     rng: np.random.Generator,
+    sampled: bool,
 ) -> Behaviour:
     """The mode itself, or with something else on top: modes keep the behaviours of a scenario apart."""
     plain, kind, which = rng.random(3)
     named = task.modes.named(mode)
     if plain < PLAIN_SHARE:
         return Behaviour(named)
-    if kind < 1 / 3:
+    if kind < 1 / 3 and sampled:
         return Behaviour(named, temperature=TEMPERATURES[int(which * len(TEMPERATURES))], seed=seed)
     if kind < 2 / 3 or not checkpoints:
         return Behaviour(named, disturbance=DISTURBANCES[int(which * len(DISTURBANCES))], seed=seed)
@@ -86,10 +90,10 @@ def _dressed(
 class SlowWaves:
     """Two slow sine waves per joint with random phases: a calm but visible deviation of at most the amplitude."""
 
-    def __init__(self, amplitude: float, rng: np.random.Generator) -> None:
+    def __init__(self, amplitude: float, rng: np.random.Generator, actions: int = 7) -> None:
         self._amplitude = amplitude
-        self._hertz = rng.uniform(0.2, 0.6, (2, 7))
-        self._phase = rng.uniform(0.0, 2 * np.pi, (2, 7))
+        self._hertz = rng.uniform(0.2, 0.6, (2, actions))
+        self._phase = rng.uniform(0.0, 2 * np.pi, (2, actions))
         self._step = 0
 
     def __call__(self) -> npt.NDArray[np.float32]:

@@ -86,11 +86,12 @@ class FilterFit:
     def problem(self) -> FilterProblem:
         """What is to be fitted, in the words of the learning code."""
         task, policy = registry.task(self.task), simulation.reference_policy(self.task)
-        return FilterProblem(task, policy, load_reward_model(self.reward), self.seed, self.config)
+        config = replace(self.config, residual_rounds=0) if task.is_a_labs else self.config
+        return FilterProblem(task, policy, load_reward_model(self.reward), self.seed, config)
 
     def find_mode(self, pool: Sequence[Trajectory]) -> FilterDraft:
         """The person's execution mode, as far as held-out scenarios allow it."""
-        surface = ResponseSurface.load(surface_file(self.task), self.problem.task.modes)
+        surface = ResponseSurface.load(surface_file(self.task), self.problem.task.modes, self.problem.task.signals)
         reference = self._gate_reference()
         return mode_search.find_mode(self.problem, surface, pool, reference, self.collect, self.progress)
 
@@ -165,13 +166,15 @@ class FilterFit:
         scenarios = first_of(EVALUATION, self.config.evaluation_scenarios)
         filtered = self.collect(act, scenarios, 0.0, self.seed)
         reference, reward = self.reference(scenarios), self.problem.reward
-        return evaluate(reference, filtered, reward.returns(reference), reward.returns(filtered)), filtered
+        return evaluate(
+            reference, filtered, reward.returns(reference), reward.returns(filtered), self.problem.task
+        ), filtered
 
     def _evaluate_reference(self) -> tuple[dict[str, Any], list[Trajectory]]:
         """What would be measured of a filter that changes nothing: simulations repeat themselves exactly."""
         reference = self.reference(first_of(EVALUATION, self.config.evaluation_scenarios))
         returns = self.problem.reward.returns(reference)
-        return evaluate(reference, reference, returns, returns), list(reference)
+        return evaluate(reference, reference, returns, returns, self.problem.task), list(reference)
 
     def collect(self, act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
         """One rollout per scenario, in order; the same whatever the number of processes."""

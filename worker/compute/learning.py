@@ -7,7 +7,7 @@ from typing import Any, cast, get_args
 import numpy as np
 import numpy.typing as npt
 
-from worker.compute.simulation import environment, reference_policy, reference_rollouts, signal_predictor
+from worker.compute.simulation import reference_rollouts, run_episode, signal_predictor
 from worker.ml.filters.filter_problem import noisy
 from worker.ml.rewards import reward_training
 from worker.ml.rewards.loading import load_reward_model
@@ -15,8 +15,8 @@ from worker.ml.rewards.pooled_prior import prior_of
 from worker.ml.rewards.reward_models import RewardModel
 from worker.ml.rewards.reward_training import SignalScale
 from worker.ml.rewards.segments import SegmentPairs
-from worker.sim.rollout import rollout
-from worker.trajectory import SIGNALS, Trajectory
+from worker.tasks import registry
+from worker.trajectory import Trajectory
 from worker.type_aliases import Act, Float32Array
 
 
@@ -27,10 +27,7 @@ def warm_up(task: str) -> None:
 
 def run_scenarios(task: str, act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
     """One rollout per scenario, with Gaussian noise of this deviation on every action."""
-    return [
-        rollout(environment(task), noisy(act, noise, seed, scenario), scenario, reference_policy(task).mean)
-        for scenario in scenarios
-    ]
+    return [run_episode(task, noisy(act, noise, seed, scenario), scenario) for scenario in scenarios]
 
 
 def fit_reward(
@@ -52,6 +49,7 @@ def fit_reward(
     """
     if kind not in get_args(reward_training.RewardKind):
         raise ValueError(f"There is no reward model of the kind {kind!r}.")
+    simulated = None if recorded_signals is not None else registry.task(task)
     prior = prior_of([_model(each) for each in earlier], scale.spread)
     fitted = reward_training.fit(
         pairs,
@@ -61,7 +59,8 @@ def fit_reward(
         scale=scale,
         reference=reference_rollouts(task) if recorded_signals is None else (),
         prior=prior,
-        signal_names=SIGNALS if recorded_signals is None else recorded_signals,
+        signal_names=recorded_signals or () if simulated is None else simulated.signals,
+        costs=reward_training.NEVER_WANTED if simulated is None else (*reward_training.NEVER_WANTED, *simulated.costs),
         predictor=signal_predictor(task) if kind == "predicted" else None,
     )
     return fitted.model.to_bytes(), {**fitted.metrics, "pooled_from": len(earlier)}

@@ -14,15 +14,19 @@ import numpy as np
 import numpy.typing as npt
 
 from app.installed_tasks import catalogue
+from worker.compute import lab_clips
 from worker.compute.behaviours import Behaviour, SlowWaves, draw_behaviours
 from worker.ml.policies.gaussian import GaussianPolicy
+from worker.ml.policies.reference import ReferencePolicy
 from worker.ml.rewards.signal_predictor import SignalPredictor
 from worker.scenarios import NORMALISATION
 from worker.sim.assistive import AssistiveEnv
+from worker.sim.lab.environment import LabEnvironment
 from worker.sim.render.clip import STYLES, ClipRenderer, RenderedClip
 from worker.sim.render.scene import Scene
 from worker.sim.rollout import rollout
 from worker.task import Task
+from worker.tasks import registry
 from worker.tasks.registry import checkpoint, environment_class, filmed_task, task
 from worker.trajectory import Trajectory
 from worker.type_aliases import Act, Float32Array
@@ -60,6 +64,20 @@ def environment(name: str) -> AssistiveEnv:
 
 
 @cache
+def lab_environment(name: str) -> LabEnvironment:
+    """This process' environment of a laboratory's task. Raises UnknownTask and LabTaskBroken."""
+    return registry.lab_environment(name)
+
+
+def run_episode(name: str, act: Act, scenario: int) -> Trajectory:
+    """One whole episode of any task, with what the frozen policy would have done in every state."""
+    reference = reference_policy(name).mean
+    if registry.lab(name) is not None:
+        return lab_environment(name).episode(act, scenario, reference)
+    return rollout(environment(name), act, scenario, reference)
+
+
+@cache
 def renderer(quality: str) -> ClipRenderer:
     """This process' renderer of clips in a quality."""
     return ClipRenderer(filmed_task, STYLES[quality], _scene())
@@ -90,12 +108,27 @@ def signal_predictor(name: str) -> SignalPredictor:
 
 
 @cache
-def reference_policy(name: str, early: str = "") -> GaussianPolicy:
-    """The frozen policy that lies in a task's folder, or one from an early stage of its training. Raises NoPolicy."""
+def reference_policy(name: str, early: str = "") -> ReferencePolicy:
+    """The frozen policy that lies in a task's folder, or one from an early stage of its training. Raises NoPolicy, and
+    NotAPolicy for a laboratory's."""
+    if registry.lab(name) is not None:
+        return _lab_policy(name)
     file = checkpoint(name) / (f"early/{early}.safetensors" if early else "policy.safetensors")
     if not file.exists():
         raise NoPolicy(f"The task {name} has no policy {file}: run python -m worker pretrain --task {name}.")
     return GaussianPolicy.load(file)
+
+
+def _lab_policy(name: str) -> ReferencePolicy:
+    from worker.ml.policies import lab_policy  # torch, which processes that film our tasks do without
+
+    found, described = registry.found_out(name), registry.lab(name)
+    assert described is not None  # noqa: S101 -- whoever asks has asked
+    low, high = (np.array(each) for each in found.bounds)
+    said = described.policy
+    size = sum(each.size for each in found.observation)
+    file = registry.installed_task(name).folder / said.file
+    return lab_policy.load(file, found.own_size, size, (low, high), said.gain, said.activation)
 
 
 def early_policies(name: str) -> list[str]:
@@ -105,7 +138,8 @@ def early_policies(name: str) -> list[str]:
 
 def behaviours(name: str, scenario: int, count: int) -> list[Behaviour]:
     """The ways in which a pool executes a scenario of a task."""
-    return draw_behaviours(task(name), scenario, count, early_policies(name))
+    sampled = isinstance(reference_policy(name), GaussianPolicy)
+    return draw_behaviours(task(name), scenario, count, early_policies(name), sampled)
 
 
 def act_in_mode(name: str, mode: npt.ArrayLike) -> Act:
@@ -118,7 +152,7 @@ def act_as(name: str, behaviour: Behaviour) -> Act:
     policy = reference_policy(name, behaviour.checkpoint)
     rng = np.random.default_rng(behaviour.seed)
     base: Act = policy.mean
-    if behaviour.temperature:
+    if behaviour.temperature and isinstance(policy, GaussianPolicy):
 
         def base(observation: Float32Array) -> Float32Array:
             return policy.sample(observation, rng, behaviour.temperature)
@@ -127,13 +161,13 @@ def act_as(name: str, behaviour: Behaviour) -> Act:
     moved = _in_mode(task(name), base, np.array(family.vector(behaviour.mode), np.float32))
     if not behaviour.disturbance:
         return moved
-    waves = SlowWaves(behaviour.disturbance, rng)
+    waves = SlowWaves(behaviour.disturbance, rng, policy.action_size)
     return lambda observation: moved(observation) + waves()
 
 
 def _in_mode(of: Task, base: Act, mode: Float32Array) -> Act:
     def act(observation: Float32Array) -> Float32Array:
-        action: Float32Array = of.modes.speed_factor(observation, mode) * base(of.modes.perceived(observation, mode))
+        action: Float32Array = of.modes.executed(observation, mode, base(of.modes.perceived(observation, mode)))
         return action
 
     return act
@@ -143,12 +177,7 @@ def record_clip(
     name: str, quality: str, scenario: int, behaviour: Behaviour, first_step: int, step_count: int
 ) -> RecordedClip:
     """Run the scenario in some behaviour and render the stretch of it that participants will see."""
-    trajectory = rollout(environment(name), act_as(name, behaviour), scenario, reference_policy(name).mean)
-    target = io.BytesIO()
-    trajectory.save(target)
-    return RecordedClip(
-        target.getvalue(), trajectory.success, renderer(quality).render_clip(trajectory, first_step, step_count)
-    )
+    return _recorded(name, quality, act_as(name, behaviour), scenario, first_step, step_count)
 
 
 def film(name: str, quality: str, controller: bytes, scenario: int) -> RecordedClip:
@@ -157,16 +186,27 @@ def film(name: str, quality: str, controller: bytes, scenario: int) -> RecordedC
         Controller,  # processes that never film controllers do without its runtime
     )
 
-    trajectory = rollout(environment(name), Controller(controller), scenario, reference_policy(name).mean)
+    return _recorded(name, quality, Controller(controller), scenario, 0, task(name).episode_steps)
+
+
+def _recorded(name: str, quality: str, act: Act, scenario: int, first_step: int, step_count: int) -> RecordedClip:
+    if registry.lab(name) is not None:
+        reference = reference_policy(name).mean
+        trajectory, clip = lab_clips.film(lab_environment(name), act, scenario, reference, first_step, step_count)
+    else:
+        trajectory = run_episode(name, act, scenario)
+        clip = renderer(quality).render_clip(trajectory, first_step, step_count)
     target = io.BytesIO()
     trajectory.save(target)
-    clip = renderer(quality).render_clip(trajectory, 0, len(trajectory))
     return RecordedClip(target.getvalue(), trajectory.success, clip)
 
 
 def film_again(quality: str, trajectory: bytes, first_step: int, step_count: int) -> RenderedClip:
     """Another stretch of a rollout that was recorded before."""
-    return renderer(quality).render_clip(Trajectory.load(io.BytesIO(trajectory)), first_step, step_count)
+    recorded = Trajectory.load(io.BytesIO(trajectory))
+    if registry.lab(recorded.task) is not None:
+        return lab_clips.film_again(lab_environment(recorded.task), recorded, first_step, step_count)
+    return renderer(quality).render_clip(recorded, first_step, step_count)
 
 
 @lru_cache(maxsize=4)
@@ -175,4 +215,4 @@ def reference_rollouts(
 ) -> tuple[Trajectory, ...]:
     """Rollouts of the frozen policy's mean action in consecutive scenarios."""
     policy = reference_policy(name)
-    return tuple(rollout(environment(name), policy.mean, scenario) for scenario in range(first, first + count))
+    return tuple(run_episode(name, policy.mean, scenario) for scenario in range(first, first + count))

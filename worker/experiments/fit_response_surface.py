@@ -20,15 +20,16 @@ from tqdm import tqdm
 
 from worker.compute import simulation
 from worker.compute.pools import Compute, Lane
+from worker.experiments import lab_ranges
 from worker.ml.filters import response_surface
 from worker.ml.filters.response_surface import ResponseSurface, best_mode
+from worker.ml.rewards.reward_training import NEVER_WANTED
 from worker.ml.teachers import random_taste
 from worker.scenarios import RESPONSE_SURFACE, RESPONSE_SURFACE_SOUGHT, first_of
 from worker.sim.costs import signal_weights
-from worker.sim.rollout import rollout
+from worker.sim.lab.found import FOUND_FILE
 from worker.task import Task
 from worker.tasks import registry
-from worker.trajectory import SIGNALS
 from worker.type_aliases import FloatArray
 from worker.whole_files import written_whole
 
@@ -58,7 +59,7 @@ class Differences:
 
     def fit(self, task: Task) -> ResponseSurface:
         """A surface of all of them."""
-        return response_surface.fit(task.modes, self.modes, self.signals, self.successes)
+        return response_surface.fit(task.modes, self.modes, self.signals, self.successes, task.signals)
 
     @property
     def successes(self) -> FloatArray:
@@ -87,6 +88,8 @@ class Block:
 def explore(task: str, work_directory: Path, processes: int, scenarios: int = SCENARIOS) -> dict[str, Any]:
     """Run what is missing, fit the response surface, write it and its record; returns the record."""
     work_directory.mkdir(parents=True, exist_ok=True)
+    if registry.lab(task) is not None:
+        find_ranges(task)
     described = registry.task(task)
     blocks = [
         Block(task, first, _random_modes(described, first), work_directory / f"differences-{first}.npz")
@@ -95,9 +98,10 @@ def explore(task: str, work_directory: Path, processes: int, scenarios: int = SC
     compute = Compute(processes)
     try:
         _run(compute, processes, blocks, "random modes")
+        per_round = sought_scenarios(scenarios)
         for number in range(ROUNDS):
             surface = _joined(blocks).fit(described)
-            sought = sought_blocks(described, surface, number, work_directory)
+            sought = sought_blocks(described, surface, number, work_directory, per_round)
             _run(compute, processes, sought, f"modes that people want, round {number + 1}")
             blocks += sought
     finally:
@@ -105,15 +109,37 @@ def explore(task: str, work_directory: Path, processes: int, scenarios: int = SC
     return _publish(described, scenarios, _joined(blocks))
 
 
+def find_ranges(task: str, scenarios: int = lab_ranges.SCENARIOS) -> None:
+    """The ways to do a laboratory's task, unless they are known already."""
+    installed, described = registry.installed_task(task), registry.lab(task)
+    assert described is not None  # noqa: S101 -- whoever asks has asked
+    try:
+        registry.found_out(task)
+        return
+    except registry.NotExplored:
+        pass
+    with tqdm(total=1.0, desc="ranges of the ways to do it") as bar:
+        environment = registry.lab_environment(task)
+        try:
+            found = lab_ranges.find(
+                described, installed.folder, environment, lambda _, share: bar.update(share - bar.n), scenarios
+            )
+        finally:
+            environment.close()
+    found.save(installed.checkpoint / FOUND_FILE)
+    for each in (*found.notes, *(f"{way}: {why}" for way, why in found.dropped.items())):
+        tqdm.write(each)
+
+
 def compare_block(block: Block) -> None:
     """Differences of one block of scenarios, written to a file that is either complete or absent."""
-    policy, environment = simulation.reference_policy(block.task), simulation.environment(block.task)
+    policy = simulation.reference_policy(block.task)
     signals, success, reference_success = [], [], []
     for scenario, modes in zip(range(block.first, block.first + BLOCK), block.modes, strict=True):
-        reference = rollout(environment, policy.mean, scenario)
+        reference = simulation.run_episode(block.task, policy.mean, scenario)
         reference_success.append(reference.success)
         for mode in modes:
-            changed = rollout(environment, simulation.act_in_mode(block.task, mode), scenario)
+            changed = simulation.run_episode(block.task, simulation.act_in_mode(block.task, mode), scenario)
             signals.append(
                 changed.signals.sum(axis=0, dtype=np.float64) - reference.signals.sum(axis=0, dtype=np.float64)
             )
@@ -132,15 +158,19 @@ def _random_modes(task: Task, first: int) -> FloatArray:
     )
 
 
-def sought_blocks(task: Task, surface: ResponseSurface, number: int, work_directory: Path) -> list[Block]:
+def sought_scenarios(scenarios: int) -> int:
+    """In every later round, where the first has so many: in the same proportion as usual, a block at least."""
+    return max(BLOCK, SOUGHT_SCENARIOS * scenarios // SCENARIOS // BLOCK * BLOCK)
+
+
+def sought_blocks(
+    task: Task, surface: ResponseSurface, number: int, work_directory: Path, scenarios: int = SOUGHT_SCENARIOS
+) -> list[Block]:
     """Every scenario is executed in the modes of as many people, and near them."""
-    count = SOUGHT_SCENARIOS // BLOCK
+    count = scenarios // BLOCK
     per_block = BLOCK * MODES_PER_SCENARIO
     rng = np.random.default_rng([number, 3])
-    people = [random_taste("somebody", rng) for _ in range(per_block)]
-    wanted = np.array(
-        [best_mode(surface, signal_weights(task, each.omega, per_signal=each.per_signal), number) for each in people]
-    )
+    wanted = np.array([best_mode(surface, _somebody(task, surface, rng), number) for _ in range(per_block)])
     width = surface.high - surface.low
     blocks = []
     for index in range(count):
@@ -149,6 +179,19 @@ def sought_blocks(task: Task, surface: ResponseSurface, number: int, work_direct
         modes = np.clip(around, surface.low, surface.high).reshape(BLOCK, MODES_PER_SCENARIO, -1)
         blocks.append(Block(task.name, first, modes, work_directory / f"sought-{first}.npz"))
     return blocks
+
+
+def _somebody(task: Task, surface: ResponseSurface, rng: np.random.Generator) -> FloatArray:
+    """(S,) how much somebody drawn at random wants of each signal; of a laboratory's, each about equally much."""
+    if not task.is_a_labs:
+        taste = random_taste("somebody", rng)
+        return signal_weights(task, taste.omega, per_signal=taste.per_signal)
+    modes = rng.uniform(surface.low, surface.high, (200, len(surface.low)))
+    spread = np.maximum(surface.predict(modes)[0].std(axis=0), 1e-9)
+    weights = rng.standard_normal(len(spread))
+    minded = [name in (*NEVER_WANTED, *task.costs) for name in task.signals]
+    wants: FloatArray = np.where(minded, -np.abs(weights), weights) / spread
+    return wants
 
 
 def _run(compute: Compute, processes: int, blocks: Sequence[Block], what: str) -> None:
@@ -175,14 +218,14 @@ def _publish(task: Task, scenarios: int, found: Differences) -> dict[str, Any]:
     record = {
         "command": f"python -m worker explore --task {task.name} --scenarios {scenarios}",
         "scenarios": [RESPONSE_SURFACE.start, RESPONSE_SURFACE[scenarios - 1]],
-        "sought": {"rounds": ROUNDS, "scenarios_per_round": SOUGHT_SCENARIOS, "jitter": JITTER},
+        "sought": {"rounds": ROUNDS, "scenarios_per_round": sought_scenarios(scenarios), "jitter": JITTER},
         "modes_per_scenario": MODES_PER_SCENARIO,
         "axes": {axis.name: [axis.low, axis.high] for axis in task.modes.axes},
         "reference_success": float(found.reference_success.mean()),
         "mode_success": float(successes.mean()),
         "explained_share": {
             name: round(float(1 - residual[column] / spread[column]), 3)
-            for column, name in enumerate(SIGNALS)
+            for column, name in enumerate(task.signals)
             if spread[column] > 1e-9
         },
         "versions": {"python": platform.python_version(), "numpy": np.__version__},

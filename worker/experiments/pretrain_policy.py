@@ -28,6 +28,6 @@ def pretrain(task: str, seed: int, directory: Path) -> int:
 def _config(task: str, seed: int) -> SacConfig:
     installed = registry.installed_task(task)
     try:
-        return SacConfig(registry.task(task).observation, seed=seed, **installed.description.training)
+        return SacConfig(registry.task(task).observation, seed=seed, **registry.coded(task).training)
     except TypeError as error:
         raise registry.broken(installed, "training", f"is not understood: {error}") from error

@@ -6,8 +6,11 @@ from pathlib import Path
 from typing import Any
 
 from app.installed_tasks import catalogue
-from app.installed_tasks.description import InstalledTask
+from app.installed_tasks.description import InstalledTask, TaskDescription
+from app.installed_tasks.lab import LabDescription
 from worker.sim.assistive import AssistiveEnv
+from worker.sim.lab.environment import LabEnvironment
+from worker.sim.lab.found import FOUND_FILE, Found, mark_of
 from worker.sim.render.clip import FilmedTask
 from worker.sim.render.task_look import TaskLook
 from worker.task import Task
@@ -15,6 +18,10 @@ from worker.task import Task
 
 class UnknownTask(ValueError):
     """This installation cannot simulate the task."""
+
+
+class NotExplored(ValueError):
+    """The ways to do a laboratory's task have not been found yet."""
 
 
 class TaskBroken(ValueError):
@@ -39,33 +46,74 @@ def checkpoint(name: str) -> Path:
 @cache
 def environment_class(name: str) -> type[AssistiveEnv]:
     """The environment of a task. Raises UnknownTask and TaskBroken."""
-    installed = installed_task(name)
-    kind = _object(installed, "environment", installed.description.environment)
+    installed, description = installed_task(name), coded(name)
+    kind = _object(installed, "environment", description.environment)
     if not (isinstance(kind, type) and issubclass(kind, AssistiveEnv)):
         raise broken(installed, "environment", "is no subclass of worker.sim.assistive.AssistiveEnv")
-    described = (name, installed.description.episode_steps)
+    described = (name, description.episode_steps)
     if (kind.task.name, kind.task.episode_steps) != described:
         raise broken(
             installed,
             "environment",
             f"is of the task {kind.task.name!r} with {kind.task.episode_steps} steps an episode, not of {name!r} with "
-            f"{installed.description.episode_steps}",
+            f"{description.episode_steps}",
         )
     return kind
 
 
 def task(name: str) -> Task:
-    """What learning knows of a task. Raises UnknownTask and TaskBroken."""
-    return environment_class(name).task
+    """What learning knows of a task. Raises UnknownTask, TaskBroken, and NotExplored for a laboratory's."""
+    described = lab(name)
+    return environment_class(name).task if described is None else found_out(name).task(described)
+
+
+def lab(name: str) -> LabDescription | None:
+    """What a laboratory's lab.toml says; None for a task that is a folder of code. Raises UnknownTask."""
+    description = installed_task(name).description
+    return description if isinstance(description, LabDescription) else None
+
+
+@cache
+def found_out(name: str) -> Found:
+    """What the program has found out about a laboratory's task, without any code of it. Raises NotExplored."""
+    file = checkpoint(name) / FOUND_FILE
+    if not file.exists():
+        raise NotExplored(f"Nothing is known yet of the ways to do {name}: run python -m worker explore --task {name}.")
+    found, described = Found.load(file), lab(name)
+    if described is None or found.mark != mark_of(described, installed_task(name).folder):
+        raise NotExplored(
+            f"The lab.toml or the policy of {name} has changed since its ways were found: run python -m worker explore "
+            f"--task {name} again."
+        )
+    return found
+
+
+def lab_environment(name: str) -> LabEnvironment:
+    """A laboratory's environment, made anew. Raises UnknownTask, and LabTaskBroken when it is not as it must be."""
+    installed, described = installed_task(name), lab(name)
+    if described is None:
+        raise UnknownTask(f"{name} is not described by a lab.toml.")
+    return LabEnvironment(described, installed.folder)
+
+
+def coded(name: str) -> TaskDescription:
+    """Of a task that is a folder of code."""
+    installed = installed_task(name)
+    if not isinstance(installed.description, TaskDescription):
+        raise TaskBroken(
+            f"{name} is a laboratory's own environment: it has no robot, person and training of the studio's. Leave "
+            "out what needs them: the printed method, fine-tuning, and the tools for new tasks of ours."
+        )
+    return installed.description
 
 
 @cache
 def look(name: str) -> TaskLook:
     """How a task is filmed. Raises UnknownTask and TaskBroken."""
-    installed = installed_task(name)
-    if installed.description.look is None:
+    installed, description = installed_task(name), coded(name)
+    if description.look is None:
         return TaskLook()
-    found = _object(installed, "look", installed.description.look)
+    found = _object(installed, "look", description.look)
     if not isinstance(found, TaskLook):
         raise broken(installed, "look", "is no worker.sim.render.task_look.TaskLook")
     return found
@@ -79,10 +127,8 @@ def filmed_task(name: str) -> FilmedTask:
 
 def demonstrator(name: str) -> Any:
     """A scripted controller for a task that is not found by trial and error, or None. Raises as above."""
-    installed = installed_task(name)
-    if installed.description.demonstrator is None:
-        return None
-    return _object(installed, "demonstrator", installed.description.demonstrator)()
+    installed, description = installed_task(name), coded(name)
+    return None if description.demonstrator is None else _object(installed, "demonstrator", description.demonstrator)()
 
 
 def _object(installed: InstalledTask, key: str, reference: str) -> Any:

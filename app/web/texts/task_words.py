@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from app.installed_tasks import catalogue
 from app.installed_tasks.description import Words
+from app.installed_tasks.lab import LabDescription
 
 _NEUTRAL = Words(tool="tool", target="target", carried="food or water")
 
@@ -38,6 +39,8 @@ def words_of(task: str) -> TaskWords:
         title = task.replace("_", " ").capitalize()
         return TaskWords(title, "", "", _costs(_NEUTRAL), axes={}, signals={})
     words = installed.description.words
+    if isinstance(installed.description, LabDescription):
+        return _of_lab(installed.description)
     return TaskWords(
         installed.description.title,
         installed.description.summary,
@@ -45,6 +48,32 @@ def words_of(task: str) -> TaskWords:
         _costs(words),
         {**_approach(words.target), **words.axes},
         _signals(words),
+        words.silent_signals,
+    )
+
+
+def _of_lab(described: LabDescription) -> TaskWords:
+    """Of a laboratory's own environment: what all labs share in its nouns, and its own signals in its words."""
+    words = described.words
+    own = {name: signal.words["en"] for name, signal in described.signals.items()}
+    shared = _signals(words)
+    minus, target = "\N{MINUS SIGN}", words.target
+    axes = {
+        "speed_far": f"far from the {target}: slower ({minus}), quicker (+)",
+        "speed_near": f"near the {target}: slower ({minus}), quicker (+)",
+        "speed_early": f"at first: slower ({minus}), quicker (+)",
+        "speed_late": f"later: slower ({minus}), quicker (+)",
+        "smooth": "smoother (+)",
+        "hesitate": f"slows down before the {target} (+)",
+        **{f"push_{name}": f"on the way pushed along {name}" for name in described.environment.action_names},
+    }
+    return TaskWords(
+        described.title,
+        described.summary,
+        "",
+        {name: own[name] for name in described.cost_names},
+        {**axes, **words.axes},
+        {name: own.get(name) or shared[name] for name in described.signal_names},
         words.silent_signals,
     )
 

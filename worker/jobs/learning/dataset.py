@@ -21,7 +21,8 @@ from worker.ml import acquisition
 from worker.ml.rewards.reward_training import SignalScale
 from worker.ml.rewards.segments import SegmentPairs, Stretch
 from worker.responses import TARGETS
-from worker.trajectory import SIGNALS, OutdatedTrajectory, Recorded, Recording, Trajectory
+from worker.tasks import registry
+from worker.trajectory import OutdatedTrajectory, Recorded, Recording, Trajectory
 from worker.type_aliases import Float32Array
 
 
@@ -131,7 +132,11 @@ def shown(store: ArtefactStore, clip: Clip) -> Trajectory:
 
 def signal_names(study: Study) -> Sequence[str]:
     """Names, with units, of the columns of signals in the study's trajectories."""
-    return SIGNALS if study.material is None else [each["name"] for each in study.material["signals"]]
+    return (
+        registry.task(study.task).signals
+        if study.material is None
+        else [each["name"] for each in study.material["signals"]]
+    )
 
 
 def stored_trajectory(store: ArtefactStore, sha256: str) -> Trajectory:

@@ -4,6 +4,7 @@ Practice comes first, then labels on whole trajectories, then the other labels w
 Which clips a place gets is decided later, when the newest model can have a say; see query_selection.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Literal
@@ -24,9 +25,8 @@ CATCH_FROM = 12
 """Place among clips from which on catch pairs come: by then the pool is likely to have an obvious pair."""
 _MOST_DIFFERENT = 0.1
 """Share of the pairs that are different enough for practice."""
-_UNDELIVERED, _ON_PERSON, _HIGH_FORCE = (
-    SIGNALS.index(name) for name in ("undelivered", "spilled_on_person", "high_force_n")
-)
+_UNDELIVERED = "undelivered"
+_UNCLEAN = ("spilled_on_person", "high_force_n")
 
 
 @dataclass(frozen=True)
@@ -112,22 +112,22 @@ def very_different(pairs: SegmentPairs) -> npt.NDArray[np.int64]:
     return np.argsort(-distance, kind="stable")[:count]
 
 
-def obvious_answer(left: Stretch, right: Stretch) -> Literal["left", "right"] | None:
+def obvious_answer(left: Stretch, right: Stretch, signals: Sequence[str] = SIGNALS) -> Literal["left", "right"] | None:
     """Which side nobody would refuse: a clean success beside a run that fails and is seen to; None where that is open.
 
     Only what is shown counts: somebody who likes it slow may prefer a run that has not arrived at the end of the clip,
     so that one must have failed altogether.
     """
-    if _clean(left) and _failed(right):
+    if _clean(left, signals) and _failed(right, signals):
         return "left"
-    return "right" if _clean(right) and _failed(left) else None
+    return "right" if _clean(right, signals) and _failed(left, signals) else None
 
 
-def _clean(side: Stretch) -> bool:
+def _clean(side: Stretch, names: Sequence[str]) -> bool:
     signals = side.cut("signals")
-    delivered = side.trajectory.success and not signals[-1, _UNDELIVERED]
-    return bool(delivered and not signals[:, [_ON_PERSON, _HIGH_FORCE]].any())
+    delivered = side.trajectory.success and not signals[-1, names.index(_UNDELIVERED)]
+    return bool(delivered and not signals[:, [names.index(name) for name in _UNCLEAN if name in names]].any())
 
 
-def _failed(side: Stretch) -> bool:
-    return not side.trajectory.success and bool(side.cut("signals")[-1, _UNDELIVERED])
+def _failed(side: Stretch, names: Sequence[str]) -> bool:
+    return not side.trajectory.success and bool(side.cut("signals")[-1, names.index(_UNDELIVERED)])

@@ -14,12 +14,14 @@ from app.domain.clips import Clip
 from app.domain.models import Model, ModelKind
 from app.domain.preferences import LEARNED_FROM, Purpose, Query
 from app.domain.studies import Participant, Study
+from app.storage import ArtefactStore
 from worker.compute import learning
 from worker.jobs.learning import dataset, query_plan
 from worker.jobs.learning.query_plan import Slot
 from worker.jobs.runtime import records
 from worker.jobs.runtime.context import WorkerContext
 from worker.ml import acquisition
+from worker.ml.rewards.segments import Stretch
 from worker.ml.teachers import OMEGA, User
 from worker.sim.costs import preference_rewards
 from worker.task import Task
@@ -169,10 +171,19 @@ def _answers_of_others(context: WorkerContext, known: _Known, pairs: Sequence[tu
     return acquisition.expected_answers(np.array([returns[right.id] - returns[left.id] for left, right in pairs]).T)
 
 
+def _stretches(store: ArtefactStore, pair: tuple[Clip, Clip]) -> tuple[Stretch, Stretch]:
+    left, right = pair
+    return dataset.stretch(store, left), dataset.stretch(store, right)
+
+
 def _stand_ins(context: WorkerContext, task: Task, clip: Clip) -> FloatArray:
-    """(3,) what the paper's users would feel about what a clip shows, by their own costs."""
+    """(U,) what others would feel about what a clip shows: the paper's users by their own costs, or, in a laboratory's
+    task, people who each mind one of its signals."""
     shown, steps = dataset.shown(context.store, clip), slice(clip.first_step, clip.first_step + clip.step_count)
     costs, signals = shown.costs[steps], shown.signals[steps]
+    if task.is_a_labs:
+        minded: FloatArray = -signals.sum(axis=0, dtype=np.float64)
+        return minded
     return np.array([preference_rewards(task, costs, signals, OMEGA[user]).sum() for user in User])
 
 
@@ -258,10 +269,11 @@ class _Choosing:
         While the pool is growing the place stays free, unless there is nothing else to go on with.
         """
         store = self._context.store
+        names = dataset.signal_names(self._known.study)
         candidates = [
             (pair, answer)
             for pair in self._unused(self._clips)
-            if (answer := query_plan.obvious_answer(*(dataset.stretch(store, clip) for clip in pair))) is not None
+            if (answer := query_plan.obvious_answer(*_stretches(store, pair), names)) is not None
         ]
         if not candidates and self._may_yet_come():
             return None

@@ -40,21 +40,21 @@ def insight(context: WorkerContext, participant_id: int, stored_model: bytes) ->
         return found
     if len(stretches) >= FEWEST_CLIPS:
         sums = np.array([each.cut("costs").sum(axis=0, dtype=np.float64) for each in stretches])
-        found["costs"] = weights_of_costs(sums, returns)
+        found["costs"] = weights_of_costs(sums, returns, registry.task(task).costs)
     regret = _regret(task, model)
     if regret is not None:
         found["advice"] = {"expected_regret": round(regret, 4)}
     return found
 
 
-def weights_of_costs(sums: FloatArray, returns: FloatArray) -> dict[str, Any]:
+def weights_of_costs(sums: FloatArray, returns: FloatArray, costs_named: Sequence[str] = COSTS) -> dict[str, Any]:
     """What the model's returns say about the paper's six costs, whatever it was learned from.
 
-    ``sums`` (N, 6): summed costs of every clip, ``returns`` (E, N): every member's return of it. Least squares of
-    each member's standardised returns on the standardised costs. Weights are standard deviations of the learned return
-    per standard deviation of a cost, the other costs being equal; positive: liked. Intervals (95 %) hold how members
-    differ and what the costs leave unexplained. Costs that are the same in all clips are left out. ``explained``: the
-    share of the mean return's variance.
+    ``sums`` (N, C): summed costs of every clip, ``costs_named`` in that order; ``returns`` (E, N): every member's
+    return of it. Least squares of each member's standardised returns on the standardised costs. Weights are
+    standard deviations of the learned return per standard deviation of a cost, the other costs being equal;
+    positive: liked. Intervals (95 %) hold how members differ and what the costs leave unexplained. Costs that are
+    the same in all clips are left out. ``explained``: the share of the mean return's variance.
     """
     varied = sums.std(axis=0) > 1e-9
     costs, mean_return = _standardised(sums[:, varied]), _standardised(returns.mean(axis=0))
@@ -63,7 +63,7 @@ def weights_of_costs(sums: FloatArray, returns: FloatArray) -> dict[str, Any]:
     left_over = (mean_return - costs @ (inverse @ costs.T @ mean_return)).var()
     variance = members.var(axis=0) + left_over * np.diag(inverse)
     mean, spread = members.mean(axis=0), WITHIN_95 * np.sqrt(variance)
-    names = [name for name, there in zip(COSTS, varied, strict=True) if there]
+    names = [name for name, there in zip(costs_named, varied, strict=True) if there]
     return {
         "weights": {
             name: {"mean": round(float(at), 4), "low": round(float(at - by), 4), "high": round(float(at + by), 4)}
@@ -103,5 +103,6 @@ def _regret(task: str, model: RewardModel) -> float | None:
     """None for reward models that are not linear: their members' wishes are not known."""
     if not isinstance(model, StructuredReward) or not surface_file(task).exists():
         return None
-    surface = ResponseSurface.load(surface_file(task), registry.task(task).modes)
+    described = registry.task(task)
+    surface = ResponseSurface.load(surface_file(task), described.modes, described.signals)
     return expected_regret(surface, model.signal_weights(()))

@@ -24,9 +24,8 @@ from worker.ml.export.run_controller import INPUT, OUTPUT, Controller
 from worker.ml.filters.filter_onnx import LARGEST_DIFFERENCE, ExportDiffers
 from worker.ml.filters.filter_problem import FilterAct
 from worker.ml.methods.preference_rl import PolicyAct
-from worker.ml.policies.gaussian import GaussianPolicy
-from worker.ml.policies.policy_onnx import policy_to_onnx
-from worker.spaces import CONTROL_STEP_S, JOINT_ACTION
+from worker.ml.policies.reference import ReferencePolicy
+from worker.ml.policies.stored_policy import stored_policy
 from worker.task import Task
 from worker.type_aliases import Act, Float32Array
 
@@ -60,7 +59,7 @@ def of_act(act: Act, observations: Float32Array) -> bytes:
     Raises NotExportable for a method that is neither a policy nor a filter around one, and ExportDiffers.
     """
     if isinstance(act, PolicyAct):
-        joined = onnx.load_from_string(policy_to_onnx(act.policy))
+        joined = onnx.load_from_string(stored_policy(act.policy))
         named = {_POLICY_MEAN: OUTPUT}
         stored = _blinded([*joined.graph.node], joined.graph.initializer, named, joined, act.policy)
     elif isinstance(act, FilterAct) and act.gate == 1.0:
@@ -100,20 +99,20 @@ def _manifest(blinded: Blinded) -> dict[str, Any]:
         "participant": blinded.participant,
         "letter": blinded.letter,
         "task": blinded.task.name,
-        "control_rate_hz": round(1.0 / CONTROL_STEP_S, 6),
+        "control_rate_hz": round(1.0 / blinded.task.control_step_s, 6),
         "observation": described_space(blinded.task.observation),
-        "action": described_space(JOINT_ACTION),
+        "action": described_space(blinded.task.action),
         "onnx": {
             "file": "controller.onnx",
             "input": {"name": INPUT, "type": "float32", "shape": ["batch", blinded.task.observation.size]},
-            "output": {"name": OUTPUT, "type": "float32", "shape": ["batch", JOINT_ACTION.size]},
+            "output": {"name": OUTPUT, "type": "float32", "shape": ["batch", blinded.task.action.size]},
         },
     }
 
 
 def _of_filter(act: FilterAct) -> bytes:
     """The policy's graph, and the filter's behind it."""
-    policy = onnx.load_from_string(policy_to_onnx(act.policy))
+    policy = onnx.load_from_string(stored_policy(act.policy))
     filtering = onnx.load_from_string(act.exported.stored)
     mean = {_POLICY_MEAN: f"policy/{_POLICY_MEAN}"}
     nodes = [*_renamed(policy, "policy", {INPUT: INPUT}), *_renamed(filtering, "filter", {**_ENDS, **mean})]
@@ -143,7 +142,7 @@ def _blinded(
     constants: Iterable[TensorProto],
     named: dict[str, str],
     like: ModelProto,
-    policy: GaussianPolicy,
+    policy: ReferencePolicy,
 ) -> bytes:
     """A model of these nodes in which every name is a number. ``named``: values that become input or output."""
     numbers: dict[str, str] = {**_ENDS, **named}

@@ -21,12 +21,12 @@ from worker.ml.export import run_filter
 from worker.ml.export.model_card import model_card
 from worker.ml.filters.filter_module import FilterWeights
 from worker.ml.filters.filter_onnx import INPUTS, OUTPUT, OnnxFilter
-from worker.ml.policies.gaussian import GaussianPolicy
-from worker.ml.policies.policy_onnx import policy_to_onnx
+from worker.ml.policies.reference import ReferencePolicy
+from worker.ml.policies.stored_policy import stored_policy
 from worker.ml.rewards.reward_models import CLIP, RewardModel
-from worker.spaces import CONTROL_STEP_S, JOINT_ACTION, Space
+from worker.spaces import Space
 from worker.task import Task
-from worker.trajectory import SIGNALS, Trajectory
+from worker.trajectory import Trajectory
 from worker.type_aliases import Float32Array
 
 SCHEMA_VERSION = 1
@@ -84,7 +84,7 @@ class BundleContents:
     filter_onnx: bytes
     weights: FilterWeights
     reward: RewardModel
-    policy: GaussianPolicy
+    policy: ReferencePolicy
     recording: RecordedSteps
     metrics: Mapping[str, Any]
     """Model.metrics of the filter; evaluation, notes and the reward model's weights are published"""
@@ -97,7 +97,7 @@ def write(contents: BundleContents) -> bytes:
     recording = contents.recording
     files = {
         "filter.onnx": contents.filter_onnx,
-        "policy.onnx": policy_to_onnx(contents.policy),
+        "policy.onnx": stored_policy(contents.policy),
         "reward_model.safetensors": contents.reward.to_bytes(),
         "action_encoder.safetensors": contents.weights.to_bytes(),
         "run_filter.py": Path(run_filter.__file__).read_bytes(),
@@ -160,10 +160,10 @@ def _manifest(contents: BundleContents) -> dict[str, Any]:
         "created_at": provenance.created_at,
         "labels": {"count": provenance.label_count, "sha256": provenance.label_hash},
         "seed": provenance.seed,
-        "control_rate_hz": round(1.0 / CONTROL_STEP_S, 6),
+        "control_rate_hz": round(1.0 / contents.task.control_step_s, 6),
         "observation": described_space(contents.task.observation),
-        "action": described_space(JOINT_ACTION),
-        "onnx": _onnx_interface(contents.filter_onnx, contents.task.observation.size),
+        "action": described_space(contents.task.action),
+        "onnx": _onnx_interface(contents.filter_onnx, contents.task),
         "normalisation": {
             "inside_filter": True,
             "observation_offset": contents.policy.offset.tolist(),
@@ -183,7 +183,7 @@ def _manifest(contents: BundleContents) -> dict[str, Any]:
         "gate": weights.gate,
         "residual_share": weights.residual_share if weights.encoder else 0.0,
         "reward_kind": contents.reward.kind,
-        "signals": list(SIGNALS),
+        "signals": list(contents.task.signals),
         "uses_reference_policy": bool(contents.metrics.get("uses_reference")),
         "learned_weights": contents.metrics.get("weights"),
         "learned_costs": contents.metrics.get("costs"),
@@ -214,8 +214,8 @@ def described_space(space: Space) -> dict[str, Any]:
     return {"size": space.size, "fields": fields}
 
 
-def _onnx_interface(stored: bytes, observation_size: int) -> dict[str, Any]:
-    sizes = {INPUTS[0]: observation_size, INPUTS[1]: JOINT_ACTION.size, OUTPUT: JOINT_ACTION.size}
+def _onnx_interface(stored: bytes, task: Task) -> dict[str, Any]:
+    sizes = {INPUTS[0]: task.observation.size, INPUTS[1]: task.action.size, OUTPUT: task.action.size}
 
     def described(name: str) -> dict[str, Any]:
         return {"name": name, "type": "float32", "shape": ["batch", sizes[name]]}

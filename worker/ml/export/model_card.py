@@ -109,7 +109,7 @@ def _costs(learned: Mapping[str, Any] | None) -> str:
         f" the others stay as they are; they account for {learned['explained']:.0%} of what was learned."
         " 95 % intervals; below 0: disliked."
     )
-    rows = [(f"{name}: {_COSTS.get(name, '')}", each) for name, each in learned["weights"].items()]
+    rows = [(_cost(name), each) for name, each in learned["weights"].items()]
     return f"{introduction}\n\n{_weights('cost', rows)}"
 
 
@@ -151,7 +151,7 @@ def _measured(evaluation: Mapping[str, Any] | None) -> str:
         "|---|---|---|---|",
     ]
     for name, cost in evaluation["costs"].items():
-        row = f"| {name}: {_COSTS.get(name, '')} | {cost['reference']:.3g} | {cost['filter']:.3g} | {_interval(cost)} |"
+        row = f"| {_cost(name)} | {cost['reference']:.3g} | {cost['filter']:.3g} | {_interval(cost)} |"
         lines.append(row)
     if safety:
         lines += ["", "### Largest speeds and forces seen", "", "| | reference | filter |", "|---|---|---|"]
@@ -162,8 +162,14 @@ def _measured(evaluation: Mapping[str, Any] | None) -> str:
             "p95_max_force_n": "95 % of episodes stay below, N",
         }
         for key, word in words.items():
-            lines.append(f"| {word} | {safety['reference'][key]:.3g} | {safety['filter'][key]:.3g} |")
+            if key in safety["reference"]:
+                lines.append(f"| {word} | {safety['reference'][key]:.3g} | {safety['filter'][key]:.3g} |")
     return "\n".join(lines)
+
+
+def _cost(name: str) -> str:
+    """One of the paper's with its meaning, or a laboratory's own by its name."""
+    return f"{name}: {_COSTS[name]}" if name in _COSTS else name
 
 
 def _notes(manifest: Mapping[str, Any]) -> str:

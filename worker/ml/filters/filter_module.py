@@ -15,7 +15,8 @@ from torch import Tensor, nn
 
 from worker.ml.filters.action_encoder import ResidualAdapter
 from worker.ml.filters.pbarl_printed import PrintedEncoder
-from worker.ml.policies.gaussian import GaussianPolicy
+from worker.ml.policies.onnx_policy import OnnxPolicy
+from worker.ml.policies.reference import ReferencePolicy
 from worker.ml.policies.torch_module import FrozenPolicy
 from worker.ml.rewards.reward_models import stored_config
 from worker.modes import ModeFamily
@@ -84,8 +85,8 @@ class ModeTransform(nn.Module):
     def base(self, observation: Tensor) -> tuple[Tensor, Tensor]:
         """The mode's action and the policy's deviation where the mode looks, (B, 7) each."""
         action, log_std = self.policy(self.family.perceived(observation, self.mode, torch))
-        quicker = self.family.speed_factor(observation, self.mode, torch) * action
-        return quicker.clamp(-1.0, 1.0), self.policy.action_std(action, log_std)
+        executed = self.family.executed(observation, self.mode, action, torch)
+        return executed.clamp(-1.0, 1.0), self.policy.action_std(action, log_std)
 
     def forward(self, observation: Tensor, policy_mean: Tensor) -> Tensor:
         """(B, D), (B, 7) -> (B, 7). The policy is asked where the mode looks; policy_mean is not needed."""
@@ -94,6 +95,22 @@ class ModeTransform(nn.Module):
             return action
         moved: Tensor = self.adapter(observation, action, deviation)
         return action + self.residual_share * (moved - action)
+
+
+class ActionModeTransform(nn.Module):
+    """The person's execution mode of a policy that is not looked into: it acts on what the policy said."""
+
+    mode: Tensor
+
+    def __init__(self, family: ModeFamily, mode: Mapping[str, float]) -> None:
+        super().__init__()
+        self.family = family
+        self.register_buffer("mode", torch.tensor(family.vector(mode), dtype=torch.float32))
+
+    def forward(self, observation: Tensor, policy_mean: Tensor) -> Tensor:
+        """(B, D), (B, A) -> (B, A)"""
+        action: Tensor = self.family.executed(observation, self.mode, policy_mean, torch).clamp(-1.0, 1.0)
+        return action
 
 
 class PrintedTransform(nn.Module):
@@ -131,13 +148,17 @@ class ActionFilter(nn.Module):
         return action
 
 
-def build(family: ModeFamily, policy: GaussianPolicy, weights: FilterWeights) -> ActionFilter:
+def build(family: ModeFamily, policy: ReferencePolicy, weights: FilterWeights) -> ActionFilter:
     """The module for these weights around this policy, in evaluation mode, on the CPU.
 
     Raises ValueError when the weights name an axis that the task's family of modes does not have.
     """
-    frozen = FrozenPolicy(policy.weights)
     transform: nn.Module
+    if isinstance(policy, OnnxPolicy):
+        if weights.method != "studio" or weights.encoder:
+            raise ValueError("A policy that cannot be looked into has filters of modes alone.")
+        return _frozen(ActionFilter(ActionModeTransform(family, weights.mode), weights.gate))
+    frozen = FrozenPolicy(policy.weights)
     if weights.method == "printed":
         encoder = PrintedEncoder(frozen.offset, frozen.scale)
         load_state(encoder, weights.encoder)
@@ -148,7 +169,11 @@ def build(family: ModeFamily, policy: GaussianPolicy, weights: FilterWeights) ->
             adapter = ResidualAdapter(frozen.offset, frozen.scale)
             load_state(adapter, weights.encoder)
         transform = ModeTransform(family, frozen, weights.mode, adapter, weights.residual_share)
-    return ActionFilter(transform, weights.gate).eval().requires_grad_(False)
+    return _frozen(ActionFilter(transform, weights.gate))
+
+
+def _frozen(module: ActionFilter) -> ActionFilter:
+    return module.eval().requires_grad_(False)
 
 
 def state_of(module: nn.Module) -> dict[str, Float32Array]:

@@ -20,7 +20,8 @@ import torch
 from worker.ml.filters.action_encoder import ResidualAdapter
 from worker.ml.filters.filter_module import FilterWeights, build, state_of
 from worker.ml.filters.filter_onnx import OnnxFilter, to_onnx
-from worker.ml.policies.gaussian import GaussianPolicy
+from worker.ml.policies.onnx_policy import OnnxPolicy
+from worker.ml.policies.reference import ReferencePolicy
 from worker.ml.rewards.reward_models import RewardModel
 from worker.modes import ModeFamily
 from worker.scenarios import GATE, RESIDUAL, first_of
@@ -103,7 +104,7 @@ class FilterProblem:
     """What a filter is fitted for."""
 
     task: Task
-    policy: GaussianPolicy
+    policy: ReferencePolicy
     reward: RewardModel
     seed: int
     config: FilterConfig = FilterConfig()
@@ -150,7 +151,7 @@ def _affordable(episodes: int, task: Task) -> int:
 class FilterAct:
     """The exported filter around the frozen policy, as a rollout's callable: what is evaluated is what is shipped."""
 
-    policy: GaussianPolicy
+    policy: ReferencePolicy
     exported: OnnxFilter
     gate: float = 1.0
     """an extra gate on top of the exported one, to try gates without exporting again"""
@@ -174,14 +175,17 @@ def noisy(act: Act, noise: float, seed: int, scenario: int) -> Act:
     return act_with_noise
 
 
-def trace(family: ModeFamily, policy: GaussianPolicy) -> None:
+def trace(family: ModeFamily, policy: ReferencePolicy) -> None:
     """Export a mode without and with a residual, so that act_of() takes a hundredth of a second in this process."""
+    if isinstance(policy, OnnxPolicy):
+        act_of(family, policy, FilterWeights())
+        return
     untrained = ResidualAdapter(torch.from_numpy(policy.offset), torch.from_numpy(policy.scale))
     for encoder in ({}, state_of(untrained)):
         act_of(family, policy, FilterWeights(encoder=encoder))
 
 
-def act_of(family: ModeFamily, policy: GaussianPolicy, weights: FilterWeights) -> FilterAct:
+def act_of(family: ModeFamily, policy: ReferencePolicy, weights: FilterWeights) -> FilterAct:
     """Export a filter for rollouts."""
     rng = np.random.default_rng(0)
     spread = 0.3 * rng.standard_normal((64, len(policy.offset)))

@@ -7,6 +7,7 @@ from worker.ml.filters.filter_module import FilterWeights, state_of
 from worker.ml.filters.filter_problem import FilterDraft, FilterProblem, ReportProgress
 from worker.ml.filters.fitted_q import Transitions
 from worker.ml.filters.pbarl_printed import PrintedConfig, train
+from worker.ml.policies.reference import looked_into
 from worker.ml.rewards.action_ranking import ranker_at
 from worker.trajectory import Trajectory
 
@@ -32,7 +33,7 @@ def fit_printed(
         progress("training the printed action encoder", share)
 
     settings = config or PrintedConfig(betas=problem.task.printed_betas)
-    encoder, losses = train(problem.policy, ranker, data, settings, problem.seed, report)
+    encoder, losses = train(looked_into(problem.policy), ranker, data, settings, problem.seed, report)
     notes = (
         f"Printed method: {settings.steps} steps (the paper: 1.5e7), n = {settings.list_length},"
         f" eps = {settings.epsilon:g}, tau = {settings.temperature:g}.",

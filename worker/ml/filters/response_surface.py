@@ -53,6 +53,8 @@ class ResponseSurface:
     """(A,) range of the modes it was fitted on"""
     high: FloatArray
     axes: tuple[str, ...]
+    signals: tuple[str, ...] = SIGNALS
+    """names of the columns of the coefficients"""
 
     def predict(self, modes: npt.ArrayLike, caution: float = 0.0) -> tuple[FloatArray, FloatArray]:
         """(..., A) -> changes of the summed signals (..., S) and of the chance of success (...).
@@ -80,7 +82,7 @@ class ResponseSurface:
 
     def to_bytes(self) -> bytes:
         """One safetensors file."""
-        config = {"axes": list(self.axes), "kind": "response surface", "signals": list(SIGNALS)}
+        config = {"axes": list(self.axes), "kind": "response surface", "signals": list(self.signals)}
         names = ("coefficients", "gram", "log_odds", "precision", "low", "high")
         return save(
             {name: np.ascontiguousarray(getattr(self, name), np.float32) for name in names},
@@ -88,24 +90,24 @@ class ResponseSurface:
         )
 
     @classmethod
-    def from_bytes(cls, stored: bytes, family: ModeFamily) -> Self:
+    def from_bytes(cls, stored: bytes, family: ModeFamily, signals: tuple[str, ...] = SIGNALS) -> Self:
         """Read what to_bytes() wrote. Raises ValueError when it was fitted for other signals or axes than today's."""
         config = stored_config(stored)
-        if config.get("signals") != list(SIGNALS) or config.get("axes") != list(family.names):
+        if config.get("signals") != list(signals) or config.get("axes") != list(family.names):
             raise ValueError(
                 "This response surface was fitted for other signals or axes; `python -m worker explore` fits another."
             )
         tensors = {name: array.astype(np.float64) for name, array in load(stored).items()}
-        return cls(**tensors, axes=family.names)
+        return cls(**tensors, axes=family.names, signals=signals)
 
     def save(self, path: Path) -> None:
         """Write to_bytes() to a file."""
         path.write_bytes(self.to_bytes())
 
     @classmethod
-    def load(cls, path: Path, family: ModeFamily) -> Self:
+    def load(cls, path: Path, family: ModeFamily, signals: tuple[str, ...] = SIGNALS) -> Self:
         """Read a file written by save()."""
-        return cls.from_bytes(path.read_bytes(), family)
+        return cls.from_bytes(path.read_bytes(), family, signals)
 
 
 def monomials(modes: FloatArray) -> FloatArray:
@@ -115,7 +117,13 @@ def monomials(modes: FloatArray) -> FloatArray:
     return np.stack([*columns, *products, *(column**3 for column in columns)], axis=-1)
 
 
-def fit(family: ModeFamily, modes: FloatArray, signal_deltas: FloatArray, successes: FloatArray) -> ResponseSurface:
+def fit(
+    family: ModeFamily,
+    modes: FloatArray,
+    signal_deltas: FloatArray,
+    successes: FloatArray,
+    signals: tuple[str, ...] = SIGNALS,
+) -> ResponseSurface:
     """Ridge regression of the signals and logistic regression of success, from N paired rollouts.
 
     modes (N, A); signal_deltas (N, S): summed signals of the rollout with this mode minus those of the reference
@@ -135,6 +143,7 @@ def fit(family: ModeFamily, modes: FloatArray, signal_deltas: FloatArray, succes
         np.array([axis.low for axis in family.axes]),
         np.array([axis.high for axis in family.axes]),
         family.names,
+        signals,
     )
 
 

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from worker.ml.policies.checkpoint import Checkpoint, Paused
-from worker.ml.policies.gaussian import GaussianPolicy
+from worker.ml.policies.reference import ReferencePolicy
 from worker.ml.policies.sac import Learner, Replay, SacConfig
 from worker.ml.rewards.reward_models import RewardModel
 from worker.trajectory import SIGNALS
@@ -37,7 +37,7 @@ _LONGEST_EPISODE = 1_000
 class PolicyAct:
     """A policy's deterministic action as a rollout's callable."""
 
-    policy: GaussianPolicy
+    policy: ReferencePolicy
 
     def __call__(self, observation: Float32Array) -> Float32Array:
         """(D,) -> (7,)"""

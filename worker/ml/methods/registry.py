@@ -24,6 +24,7 @@ from worker.ml.methods.pbrl_hri import FromScratch
 from worker.ml.methods.preference_rl import Env, MakeEnv, PolicyAct, learned
 from worker.ml.methods.prefft import TIED, FineTuning
 from worker.ml.policies.checkpoint import Checkpoint
+from worker.ml.policies.reference import looked_into
 from worker.ml.rewards.reward_models import RewardModel
 from worker.scenarios import RESIDUAL, first_of
 from worker.trajectory import Trajectory
@@ -128,7 +129,7 @@ def fit_prefft(setting: Setting, tie_weight: float) -> tuple[Act, tuple[str, ...
     problem, config = setting.problem, replace(setting.config.fine_tuning, tie_weight=tie_weight)
     policy = prefft.fine_tune(
         setting.make_env,
-        problem.policy,
+        looked_into(problem.policy),
         learned(problem.reward),
         problem.task.observation,
         config,
@@ -143,7 +144,9 @@ def fit_pbrl_hri(setting: Setting) -> tuple[Act, tuple[str, ...]]:
     problem, config = setting.problem, setting.config.from_scratch
     reference = setting.reference(problem.config.gate_block(problem.task))
     reward = pbrl_hri.sketchy(reference, learned(problem.reward))
-    policy = pbrl_hri.train(setting.make_env, problem.policy, reward, problem.task.observation, config, problem.seed)
+    policy = pbrl_hri.train(
+        setting.make_env, looked_into(problem.policy), reward, problem.task.observation, config, problem.seed
+    )
     return PolicyAct(policy), (f"SAC from scratch for {config.steps} steps.",)
 
 
@@ -151,8 +154,10 @@ def fit_best_of(setting: Setting) -> tuple[Act, tuple[str, ...]]:
     """The most valuable of n samples in every step."""
     problem, config = setting.problem, setting.config
     scenarios = first_of(RESIDUAL, config.value_rollouts)
-    rollouts = setting.collect(PolicyAct(problem.policy), scenarios, config.value_noise, problem.seed)
-    act = fit_best_of_n(problem.policy, problem.reward, rollouts, config.candidates, config.value_steps, problem.seed)
+    rollouts = setting.collect(PolicyAct(looked_into(problem.policy)), scenarios, config.value_noise, problem.seed)
+    act = fit_best_of_n(
+        looked_into(problem.policy), problem.reward, rollouts, config.candidates, config.value_steps, problem.seed
+    )
     return act, (f"n = {config.candidates} samples and the mean, ranked by value.",)
 
 

@@ -88,6 +88,7 @@ def fit(
     mlp: MlpTraining | None = None,
     transformer: TransformerTraining | None = None,
     signal_names: Sequence[str] = SIGNALS,
+    costs: Sequence[str] = NEVER_WANTED,
     predictor: SignalPredictor | None = None,
 ) -> FitResult:
     """Fit an ensemble to N pairs and their targets P(right preferred) in {0, 1/2, 1}.
@@ -97,6 +98,7 @@ def fit(
     ``reference``: rollouts of the reference policy to normalise over; the labelled segments when missing.
     ``prior``: of the structured kind's weights, Prior.standard() when missing.
     ``signal_names``: what the columns of the pairs' signals are called.
+    ``costs``: the signals of which nobody wants more.
     ``predictor``: of the signals, which the kind "predicted" needs.
     Raises ValueError for targets outside {0, 1/2, 1}, a count that differs from the pairs', or a missing predictor.
     """
@@ -106,14 +108,14 @@ def fit(
     known = prior or Prior.standard(len(signal_names))
     model: RewardModel
     if kind == "structured":
-        model, found = _fit_structured(pairs, answers, seed, scale or SignalScale.of(pairs), known, signal_names)
+        model, found = _fit_structured(pairs, answers, seed, scale or SignalScale.of(pairs), known, signal_names, costs)
     elif kind == "predicted":
         if predictor is None:
             raise ValueError("The kind 'predicted' needs a predictor of the signals.")
         foreseen = predictor.completed(pairs.signals, pairs.observations, pairs.actions).astype(np.float32)
         completed = replace(pairs, signals=foreseen)
         wider = _wider(scale or SignalScale.of(completed), completed)
-        linear, found = _fit_structured(completed, answers, seed, wider, known, signal_names)
+        linear, found = _fit_structured(completed, answers, seed, wider, known, signal_names, costs)
         model = PredictedReward.with_predictor(linear, predictor)
     elif kind == "mlp":
         model, found = fit_mlp(pairs, answers, seed, mlp or MlpTraining())
@@ -168,10 +170,16 @@ def _normalised_over_segments(model: RewardModel, pairs: SegmentPairs) -> Reward
 
 
 def _fit_structured(
-    pairs: SegmentPairs, answers: FloatArray, seed: int, scale: SignalScale, prior: Prior, signal_names: Sequence[str]
+    pairs: SegmentPairs,
+    answers: FloatArray,
+    seed: int,
+    scale: SignalScale,
+    prior: Prior,
+    signal_names: Sequence[str],
+    never_wanted: Sequence[str],
 ) -> tuple[StructuredReward, dict[str, Any]]:
     features = pairs.signal_differences() / scale.spread
-    costs = [column for column, name in enumerate(signal_names) if name in NEVER_WANTED]
+    costs = [column for column, name in enumerate(signal_names) if name in never_wanted]
     mean, covariance = posterior(features, answers, prior, costs)
     members = _antithetic(mean, covariance, np.random.default_rng(seed)) / scale.spread
     deviation = 1.96 * np.sqrt(np.diag(covariance))

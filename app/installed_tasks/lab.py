@@ -1,0 +1,180 @@
+"""A laboratory's own task, as one ``lab.toml`` describes it: a Gymnasium environment, a policy, and what is measured.
+
+Only the file is read here. What it names (modules, policies) is loaded in the worker's processes.
+"""
+
+import re
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+
+from app.installed_tasks.description import (
+    DescribedTask,
+    InstalledTask,
+    LanguageCode,
+    Reference,
+    TaskRefused,
+    Word,
+    Words,
+    parsed,
+)
+
+NO_PACKAGE = ""
+"""Of an installed task that a lab.toml describes."""
+NAME = r"[a-z][a-z0-9_]{0,39}"
+LARGEST_RATE_HZ = 100.0
+
+_Columns = Annotated[str, Field(pattern=r"^([A-Za-z_]\w*)?(\[\d+:\d+\])?$", min_length=1)]
+"""Columns of an observation: a key of a Dict, a range of columns as in [0:3], or both."""
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class LabEnvironment(_Table):
+    """Which environment it is and how it is used."""
+
+    id: str | None = None
+    """as gymnasium.make() takes it, with the module that registers it: module:Name-v0"""
+    factory: Reference | None = None
+    """module:function that returns the environment"""
+    kwargs: dict[str, Any] = {}
+    """given to either, sizes and cameras of pictures among them"""
+    rate_hz: float = Field(gt=0.0, le=LARGEST_RATE_HZ)
+    """control steps per second"""
+    actions: Literal["delta", "velocity"]
+    """what an action is: a change of position or a speed. Only of these is a part also a slower way."""
+    action_names: tuple[Annotated[str, Field(pattern="^[a-z][a-z0-9_]{0,19}$")], ...] = ()
+    """one for each action; empty: numbers"""
+    moving: tuple[int, ...] = ()
+    """the actions that move the robot, from 0; empty: all. The others, a gripper's, are left as they are."""
+    ignore_terminated: bool = False
+    """go on to the last step although the environment says that the episode is over"""
+    reset: Literal["seed", "rebuild"] = "seed"
+    """rebuild: a new environment for every episode, where reset(seed) alone does not repeat an episode exactly"""
+
+    @model_validator(mode="after")
+    def _one_of_both(self) -> Self:
+        if (self.id is None) == (self.factory is None):
+            raise ValueError("needs either id (a Gymnasium id) or factory (module:function)")
+        return self
+
+
+class LabPolicy(_Table):
+    """The frozen policy."""
+
+    file: str = Field(min_length=1)
+    """.onnx, .zip (Stable-Baselines3) or .safetensors (ours), beside the lab.toml"""
+    gain: float = Field(default=1.0, gt=0.0, le=1.0)
+    """its actions are multiplied by this, so that somebody may also want it quicker"""
+    activation: Literal["relu", "tanh", "elu"] | None = None
+    """of a Stable-Baselines3 network; None: what its algorithm uses unless told otherwise"""
+
+
+class Measured(_Table):
+    """Where a number comes from at every step: a key of info, or a function of the step."""
+
+    info: str | None = None
+    function: Reference | None = None
+
+    @model_validator(mode="after")
+    def _one_of_both(self) -> Self:
+        if (self.info is None) == (self.function is None):
+            raise ValueError("needs either info (a key of the environment's info) or function (module:function)")
+        return self
+
+
+class LabSignal(Measured):
+    """Something that is measured at every step and that people may judge by."""
+
+    unit: str = Field(max_length=20)
+    words: dict[LanguageCode, Word]
+    """what people call it; en is needed"""
+    cost: bool = False
+    """nobody wants more of it"""
+
+    @model_validator(mode="after")
+    def _in_english(self) -> Self:
+        if "en" not in self.words:
+            raise ValueError("needs words.en, for the experimenters' pages")
+        return self
+
+
+class LabFields(_Table):
+    """Where the observation says what moves and where to, in metres; without them ways differ by time alone."""
+
+    tip: _Columns | None = None
+    goal: _Columns | None = None
+
+
+class LabModes(_Table):
+    """Which ways to do it differently are tried."""
+
+    leave_out: tuple[str, ...] = ()
+
+
+def _name(name: str) -> str:
+    if not re.fullmatch(NAME, name):
+        raise ValueError("must be at most 40 small letters, digits and underscores, and begin with a letter")
+    return name
+
+
+class LabDescription(DescribedTask):
+    """What ``lab.toml`` says."""
+
+    name: Annotated[str, AfterValidator(_name)]
+    """as stored in studies, trajectories and bundles"""
+    words: Words = Words(tool="robot", target="goal")
+    environment: LabEnvironment
+    policy: LabPolicy
+    success: Measured
+    """Whether the task has succeeded so far; what it says at the last step counts."""
+    signals: dict[Annotated[str, AfterValidator(_name)], LabSignal] = Field(default_factory=dict)
+    fields: LabFields = LabFields()
+    modes: LabModes = LabModes()
+
+    @model_validator(mode="after")
+    def _not_measured_already(self) -> Self:
+        taken = sorted(set(self.signals) & set(BUILT_IN_SIGNALS))
+        if taken:
+            raise ValueError(f"signals.{taken[0]} is measured by the studio already; choose another name")
+        if not (self.signals or self.fields.tip):
+            raise ValueError("signals is empty and fields.tip is not given: there is nothing people could judge by")
+        return self
+
+    @property
+    def signal_names(self) -> tuple[str, ...]:
+        """Columns of the signals: what is measured in every lab, what fields allow for, what the lab declares."""
+        tip = ("speed_m_s", "speed_squared_m2_s2", "acceleration_squared_m2_s4") if self.fields.tip else ()
+        distance = ("distance_m",) if self.fields.tip and self.fields.goal else ()
+        return ("undelivered", "action_change_squared", *tip, *distance, *self.signals)
+
+    @property
+    def cost_names(self) -> tuple[str, ...]:
+        """The declared signals of which nobody wants more."""
+        return tuple(name for name, signal in self.signals.items() if signal.cost)
+
+
+BUILT_IN_SIGNALS = (
+    "undelivered",
+    "action_change_squared",
+    "speed_m_s",
+    "speed_squared_m2_s2",
+    "acceleration_squared_m2_s4",
+    "distance_m",
+)
+
+
+def read(file: Path) -> InstalledTask:
+    """A lab.toml as a task; what the studio finds out about it lies in checkpoint/ beside it. Raises TaskRefused."""
+    if not file.is_file():
+        raise TaskRefused(f"There is no file {file}.")
+    description = parsed(LabDescription, file)
+    policy = file.parent / description.policy.file
+    if not policy.is_file():
+        raise TaskRefused(f"{file}: policy.file names {policy}, which does not exist.")
+    if policy.suffix not in {".onnx", ".zip", ".safetensors"}:
+        raise TaskRefused(f"{file}: policy.file must end in .onnx, .zip (Stable-Baselines3) or .safetensors.")
+    return InstalledTask(description.name, NO_PACKAGE, file.parent.resolve(), description, picture="")

@@ -1,0 +1,192 @@
+"""``python -m worker check lab.toml`` says in words what is missing or wrong, and what to do."""
+
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from stable_baselines3 import PPO, SAC, TD3
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from tests.lab.conftest import way_to_goal
+from worker.__main__ import main
+from worker.experiments.check_lab import Checked, checked
+from worker.ml.policies import lab_policy
+from worker.ml.policies.onnx_policy import mlp_to_onnx
+from worker.sim.lab.references import named_object
+
+
+def said(folder: Path) -> str:
+    """All that is wrong."""
+    return " ".join(found(folder).wrong)
+
+
+def found(folder: Path) -> Checked:
+    return checked(folder / "lab.toml", folder / "sheet.png")
+
+
+def change(folder: Path, before: str, after: str, name: str = "lab.toml") -> None:
+    text = (folder / name).read_text()
+    assert before in text
+    (folder / name).write_text(text.replace(before, after))
+
+
+def test_a_whole_lab_can_be_used_and_three_episodes_are_shown(plane: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["check", str(plane)]) == 0
+    printed = capsys.readouterr().out
+    assert "3 of 3 episodes succeeded" in printed
+    assert "python -m worker explore --task plane" in printed
+    with Image.open(plane / "contact_sheet.png") as sheet:
+        assert sheet.size == (1440, 720), "six pictures of each of three episodes"
+        assert (np.asarray(sheet) != 255).any()
+
+
+def test_what_is_wrong_is_an_exit_code_too(plane: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (plane / "policy.onnx").unlink()
+    assert main(["check", str(plane)]) == 1
+    assert "policy.onnx, which does not exist" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "complaint"),
+    [
+        ("[policy]", "[polcy]", "policy is missing; polcy is not known here"),
+        ('name = "plane"', 'name = "My Plane"', "name must be at most 40 small letters"),
+        ("episode_steps = 40", "episode_steps = 5", "episode_steps: Input should be greater than or equal to 20"),
+        ('title = "Plane"', "title = Plane", "is not valid TOML"),
+        ("rate_hz = 10", "rate_hz = 10\nspeed = 3", "environment.speed is not known here"),
+        ('actions = "delta"', 'actions = "torque"', "environment.actions: Input should be 'delta' or 'velocity'"),
+        ('factory = "plane:Plane"', "", "environment needs either id (a Gymnasium id) or factory"),
+        ('info = "height"', "", "signals.height needs either info"),
+        ("[signals.height]", "[signals.undelivered]", "signals.undelivered is measured by the studio already"),
+        ('en = "height of the point (m)", ', "", "needs words.en"),
+        ("plane:Plane", "plain:Plane", "'plain:Plane' cannot be imported (ModuleNotFoundError"),
+        ("plane:Plane", "plane:Plain", "'plane:Plain' cannot be imported (AttributeError"),
+        ('factory = "plane:Plane"', 'id = "PandaReech-v9"', "Name the module that registers it before a colon"),
+        ('factory = "plane:Plane"', 'id = "no_such_package:Reach-v3"', "Install its package"),
+        ('factory = "plane:Plane"', 'factory = "plane:Plane"\nkwargs = { colour = 1 }', "Check environment.kwargs"),
+        ('factory = "plane:Plane"', 'factory = "plane:Plane"\nkwargs = { size = 16 }', "pixels are too small"),
+        ('action_names = ["x", "y"]', 'action_names = ["x"]', "1 names for 2 actions"),
+        ("rate_hz = 10", "rate_hz = 10\nmoving = [2]", "actions are numbered from 0 to 1"),
+        ('tip = "[0:2]"', 'tip = "tip[0:2]"', "No field 'tip'"),
+        ('tip = "[0:2]"', 'tip = "[0:1]"', "tip has 1 columns and goal 2"),
+        ('tip = "[0:2]"', 'tip = "[7:9]"', "[7:9] has no columns; the observation has 4"),
+        ('info = "is_success"', 'info = "success"', "no 'success'; it has height, is_success"),
+        ("gain = 0.5", "gain = 0.001", "none of 3 episodes succeeded. Check what success says"),
+        ('file = "policy.onnx"', 'file = "policy.pt"', "policy.pt, which does not exist"),
+        (
+            "[instructions]",
+            '[modes]\nleave_out = ["wave"]\n[instructions]',
+            "there is no way 'wave'; this task has speed_far",
+        ),
+    ],
+)
+def test_a_mistake_in_the_file_is_said_with_its_key_and_what_to_do(
+    plane: Path, before: str, after: str, complaint: str
+) -> None:
+    change(plane, before, after)
+    assert complaint in said(plane)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "complaint"),
+    [
+        ("self.render_mode, self.size = render_mode, size", "self.render_mode, self.size = None, size", "rgb_array"),
+        ("np.full((self.size, self.size, 3), 255, np.uint8)", "np.full((self.size, self.size, 3), 255.0)", "float64"),
+        ("spaces.Box(-0.1, 0.1, (2,))", "spaces.Discrete(4)", "one vector of continuous numbers"),
+        ("spaces.Box(-0.1, 0.1, (2,))", "spaces.Box(-np.inf, np.inf, (2,))", "its actions have no bounds"),
+        ("spaces.Box(-2.0, 2.0, (4,))", "spaces.Box(-2.0, 2.0, (2, 2))", "only vectors are known"),
+        ("spaces.Box(-2.0, 2.0, (4,))", "spaces.Discrete(3)", "must be a Box or a Dict"),
+        ("near = bool", "self.place[0] = np.nan\n        near = bool", "not finite (NaN)"),
+        ("float(self.place[1])", "float('inf')", "signals.height: was inf"),
+        ("float(self.place[1])", "[1.0, 2.0]", "signals.height: is of length 2; it must be one number"),
+        (
+            "float(np.abs(step.action).sum())",
+            "step.no_such_thing",
+            "signals.effort.function: failed with AttributeError",
+        ),
+        ("False, False, {", "near, False, {", "environment.ignore_terminated"),
+        ("False, False, {", "False, near, {", "Lower episode_steps"),
+        ("self.np_random.uniform", "np.random.uniform", 'Set environment.reset = "rebuild"'),
+        ("class Plane(gymnasium.Env)", "class Plane", "which is no gymnasium.Env"),
+    ],
+)
+def test_a_mistake_in_the_environment_is_said_with_what_to_do(
+    plane: Path, before: str, after: str, complaint: str
+) -> None:
+    change(plane, before, after, "plane.py")
+    assert complaint in said(plane)
+
+
+def test_what_the_environment_says_too_little_of_is_a_remark(plane: Path) -> None:
+    change(plane, "float(self.place[1])", "0.0", "plane.py")
+    change(plane, 'de = "Ein Punkt bewegt sich an eine Stelle."', "")
+    remarks = " ".join(found(plane).remarks)
+    assert "Always 0 in these episodes: height." in remarks
+    assert "instructions.de is missing" in remarks
+
+
+def test_a_slow_environment_is_a_remark_with_what_it_will_cost(plane: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("worker.experiments.check_lab.SLOW_EPISODE_S", 0.0)
+    assert "This is a slow environment" in " ".join(found(plane).remarks)
+
+
+@pytest.mark.parametrize(
+    ("stored", "complaint"),
+    [
+        (b"not a graph", "cannot be read as ONNX"),
+        (mlp_to_onnx([(np.zeros((2, 5), np.float32), np.zeros(2, np.float32))], "Relu", ""), "has 5 numbers, but"),
+        (mlp_to_onnx([(np.zeros((3, 4), np.float32), np.zeros(3, np.float32))], "Relu", ""), "has 3 numbers, but its"),
+        (
+            mlp_to_onnx([(np.full((2, 4), np.nan, np.float32), np.zeros(2, np.float32))], "Relu", ""),
+            "not two rows of 2",
+        ),
+    ],
+)
+def test_a_policy_that_is_none_for_this_environment_is_refused(plane: Path, stored: bytes, complaint: str) -> None:
+    (plane / "policy.onnx").write_bytes(stored)
+    assert complaint in said(plane)
+
+
+@pytest.mark.parametrize("algorithm", [SAC, TD3, PPO])
+def test_a_stable_baselines_zip_says_what_the_library_says(plane: Path, algorithm: type[BaseAlgorithm]) -> None:
+    env = named_object(plane, "environment.factory", "plane:Plane")()
+    model = algorithm("MlpPolicy", env, policy_kwargs={"net_arch": [16, 16]}, device="cpu", seed=1)  # type: ignore[call-arg]
+    model.save(plane / "policy.zip")
+    low, high = env.action_space.low.astype(float), env.action_space.high.astype(float)
+    policy = lab_policy.load(plane / "policy.zip", 4, 7, (low, high))
+    seen = np.random.default_rng(0).uniform(-1, 1, (20, 7)).astype(np.float32)
+    said_by_library, _ = model.predict(seen[:, :4], deterministic=True)
+    np.testing.assert_allclose(low + (policy.mean(seen) + 1) / 2 * (high - low), said_by_library, atol=1e-6)
+
+
+def test_a_zip_whose_weights_want_to_run_code_is_refused(plane: Path) -> None:
+    class Harm:
+        def __reduce__(self) -> tuple[Callable[[str], object], tuple[str]]:
+            return Path.touch, (plane / "harmed",)  # type: ignore[return-value]
+
+    torch.save({"actor.mu.weight": Harm()}, plane / "policy.pth")
+    with zipfile.ZipFile(plane / "policy.zip", "w") as archive:
+        archive.write(plane / "policy.pth", "policy.pth")
+    change(plane, "policy.onnx", "policy.zip")
+    assert "would have to be unpickled" in said(plane)
+    assert not (plane / "harmed").exists()
+
+
+def test_a_zip_of_something_else_is_refused(plane: Path) -> None:
+    with zipfile.ZipFile(plane / "policy.zip", "w") as archive:
+        archive.writestr("readme", "hello")
+    change(plane, "policy.onnx", "policy.zip")
+    assert "it has no policy.pth" in said(plane)
+
+
+def test_a_policys_actions_are_mapped_to_the_studios_range_and_multiplied(plane: Path) -> None:
+    (plane / "policy.onnx").write_bytes(way_to_goal())
+    bounds = (np.full(2, -0.1), np.full(2, 0.1))
+    far = np.array([0, 0, 1, -1, 0, 0, 0], np.float32)
+    whole, half = (lab_policy.load(plane / "policy.onnx", 4, 7, bounds, gain).mean(far) for gain in (1.0, 0.5))
+    np.testing.assert_allclose(whole, np.tanh(4.0) * np.array([1, -1]), rtol=1e-5)
+    np.testing.assert_allclose(half, whole / 2, rtol=1e-6)

@@ -1,0 +1,146 @@
+"""Check a lab.toml: what is missing or wrong, in words; three episodes, and a contact sheet of them."""
+
+import sys
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from PIL import Image
+
+from app.installed_tasks import lab
+from app.installed_tasks.description import TaskRefused
+from app.installed_tasks.lab import LabDescription
+from worker.experiments import lab_ranges
+from worker.ml.policies.onnx_policy import NotAPolicy, OnnxPolicy
+from worker.scenarios import POLICY_TEST
+from worker.sim.lab.environment import LabEnvironment, Picture
+from worker.sim.lab.errors import LabTaskBroken
+from worker.trajectory import Trajectory
+
+EPISODES, PICTURES = 3, 6
+SLOW_EPISODE_S = 5.0
+"""Above this the exploration's five thousand episodes take more than three hours on two processes."""
+EXPLORED_EPISODES = 6000
+SHEET_WIDTH_PX = 1440
+
+
+class Checked(NamedTuple):
+    """What a check found. Without ``wrong`` the task can be used."""
+
+    wrong: tuple[str, ...]
+    remarks: tuple[str, ...]
+    sheet: Path | None
+
+
+def check(file: Path, sheet: Path | None = None) -> int:
+    """Say what is missing or wrong in a lab.toml, run three episodes and write a contact sheet (docs/your_robot.md)."""
+    file = file / "lab.toml" if file.is_dir() else file
+    found = checked(file, sheet or file.with_name("contact_sheet.png"))
+    for each in found.remarks:
+        sys.stdout.write(f"{each}\n")
+    for each in found.wrong:
+        sys.stderr.write(f"Wrong: {each}\n")
+    if not found.wrong:
+        name = lab.read(file).name
+        sys.stdout.write(
+            f"{file} can be used. Next:\n  export LAB_TASKS={file}\n  python -m worker explore --task {name}\n"
+            f"  python -m app demo --task {name}\n"
+        )
+    return 1 if found.wrong else 0
+
+
+def checked(file: Path, sheet: Path) -> Checked:
+    """The same as values; the sheet is written when episodes ran."""
+    try:
+        installed = lab.read(file)
+    except TaskRefused as error:
+        return Checked((str(error),), (), None)
+    described = installed.description
+    assert isinstance(described, LabDescription)  # noqa: S101 -- which lab.read() reads
+    environment = None
+    try:
+        environment = LabEnvironment(described, installed.folder)
+        lab_ranges.first_found(described, environment, installed.folder)
+        policy = lab_ranges.policy_of(described, environment, installed.folder)
+        return _run(described, environment, policy, sheet)
+    except LabTaskBroken as error:
+        return Checked((f"{file}: {error}",), (), None)
+    except NotAPolicy as error:
+        return Checked((f"{file}: policy.file: {error}",), (), None)
+    finally:
+        if environment is not None:
+            environment.close()
+
+
+def _run(described: LabDescription, environment: LabEnvironment, policy: OnnxPolicy, sheet: Path) -> Checked:
+    shown = set(np.linspace(0, described.episode_steps - 1, PICTURES).round().astype(int).tolist())
+    rows: list[list[Picture]] = []
+    trajectories, seconds = [], []
+    for scenario in POLICY_TEST[:EPISODES]:
+        started, row = time.perf_counter(), list[Picture]()
+        trajectories.append(environment.episode(policy.mean, scenario))
+        seconds.append(time.perf_counter() - started)
+        again = environment.episode(
+            policy.mean,
+            scenario,
+            take=lambda step, row=row: row.append if step in shown else None,  # type: ignore[misc]
+        )
+        rows.append(row)
+        if not np.array_equal(again.observations, trajectories[-1].observations):
+            return Checked((_not_repeated(again, trajectories[-1], described),), (), None)
+    _write(sheet, rows)
+    wrong = []
+    if not any(each.success for each in trajectories):
+        wrong.append(
+            f"success: none of {EPISODES} episodes succeeded. Check what success says at the last step, episode_steps, "
+            "policy.gain and the policy itself."
+        )
+    return Checked(tuple(wrong), _remarks(described, trajectories, seconds, sheet), sheet)
+
+
+def _not_repeated(again: Trajectory, before: Trajectory, described: LabDescription) -> str:
+    difference = float(np.abs(again.observations - before.observations).max())
+    advice = (
+        'Set environment.reset = "rebuild".'
+        if described.environment.reset == "seed"
+        else "It must draw everything random from reset(seed=...), or the same scenario cannot be compared with itself."
+    )
+    differ = f"observations differ by {difference:.2g}"
+    return f"environment: the same seed and policy gave another episode ({differ}). {advice}"
+
+
+def _remarks(
+    described: LabDescription, trajectories: list[Trajectory], seconds: list[float], sheet: Path
+) -> tuple[str, ...]:
+    usual = float(np.median(seconds))
+    successes = sum(each.success for each in trajectories)
+    remarks = [
+        f"{successes} of {len(trajectories)} episodes succeeded; an episode takes {usual:.2f} s.",
+        f"Contact sheet: {sheet}",
+    ]
+    sums = np.array([each.signals.sum(axis=0) for each in trajectories])
+    silent = [name for name, column in zip(described.signal_names, sums.T, strict=True) if not column.any()]
+    if silent:
+        remarks.append(f"Always 0 in these episodes: {', '.join(silent)}. What never varies cannot be judged by.")
+    if usual > SLOW_EPISODE_S:
+        hours = EXPLORED_EPISODES * usual / 2 / 3600
+        remarks.append(
+            f"This is a slow environment: exploring it takes about {hours:.0f} hours on two processes. Lower "
+            "episode_steps, use a quicker simulation, or explore fewer scenarios (--scenarios)."
+        )
+    missing = [language for language in ("en", "de") if language not in described.instructions]
+    if missing:
+        remarks.append(f"instructions.{missing[0]} is missing: participants of that language read neutral words.")
+    return tuple(remarks)
+
+
+def _write(sheet: Path, rows: list[list[Picture]]) -> None:
+    """Episodes below each other, time to the right."""
+    width = SHEET_WIDTH_PX // PICTURES
+    height = round(width * rows[0][0].shape[0] / rows[0][0].shape[1])
+    whole = Image.new("RGB", (width * PICTURES, height * len(rows)))
+    for row, pictures in enumerate(rows):
+        for column, picture in enumerate(pictures):
+            whole.paste(Image.fromarray(picture).resize((width, height)), (column * width, row * height))
+    whole.save(sheet)

@@ -1,0 +1,89 @@
+"""Execution modes of a policy nobody can look into: they act on the actions it says, for any continuous actions.
+
+Speed is time-scaling: of velocities or changes of position a part is the same way, more slowly. What a mode needs
+beside the policy's action stands at the end of the observation: the action before, and how much of the episode is over.
+So a filter stays a function of one observation and one action, and what is trained is what is shipped.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from worker.modes import Axis, ModeFamily
+
+PREVIOUS_ACTION, EPISODE_SHARE = "previous_action", "episode_share"
+BY_DISTANCE, BY_TIME = ("far", "near"), ("early", "late")
+HALFWAY, WIDTH = 0.5, 0.5
+"""Share of the way (or of the episode) around which early becomes late, and over how much of it."""
+HESITATES_AT, HESITATES_WITHIN = 0.35, 0.15
+"""Share of the way that is left where hesitate slows the robot, and how far around it."""
+SPEED, SMOOTH, HESITATE, PUSH = (-1.4, 0.9), (0.0, 0.9), (0.0, 2.0), (-0.6, 0.6)
+"""Widest ranges; the program narrows them (worker.experiments.lab_ranges)."""
+MOST_PUSHES = 6
+PUSHES_UNTIL = 0.5
+"""Share of the episode after which nothing is pushed, so that every way arrives."""
+
+
+def widest_axes(by_distance: bool, moving: tuple[str, ...]) -> tuple[Axis, ...]:
+    """Every way there is, in its widest range. ``moving``: the names of the actions that move the robot."""
+    early, late = BY_DISTANCE if by_distance else BY_TIME
+    where = {"far": "far from the goal", "near": "near the goal", "early": "early", "late": "late in the episode"}
+    return (
+        Axis(f"speed_{early}", *SPEED, f"log of the speed factor {where[early]}"),
+        Axis(f"speed_{late}", *SPEED, f"log of the speed factor {where[late]}"),
+        Axis("smooth", *SMOOTH, "share of the action before that is kept: a low-pass filter"),
+        Axis("hesitate", *HESITATE, "slows down before the end of the way"),
+        *(Axis(f"push_{name}", *PUSH, f"added to the action {name} on the way") for name in moving[:MOST_PUSHES]),
+    )
+
+
+@dataclass(frozen=True)
+class LabModes(ModeFamily):
+    """Speed early and late, smoothing, hesitation and a constant push per action that fades on the way."""
+
+    actions: tuple[str, ...]
+    """their names"""
+    moving: tuple[int, ...]
+    """those that modes change, from 0"""
+    tip: tuple[int, ...] = ()
+    """columns of the observation; empty: ways differ by time"""
+    goal: tuple[int, ...] = ()
+    start_distance_m: float = 1.0
+    """how far the goal usually is at the start"""
+
+    def perceived(self, observation: Any, mode: Any, xp: Any = np) -> Any:
+        """The policy sees what is there."""
+        return observation
+
+    def executed(self, observation: Any, mode: Any, action: Any, xp: Any = np) -> Any:
+        """(..., D), (..., A) -> (..., A); not clipped."""
+        left = self._left(observation, xp)
+        early = xp.clip((left - HALFWAY + WIDTH / 2) / WIDTH, 0.0, 1.0)
+        names = BY_DISTANCE if self.tip and self.goal else BY_TIME
+        band = xp.clip(1.0 - ((left - HESITATES_AT) / HESITATES_WITHIN) ** 2, 0.0, 1.0)
+        factor = xp.exp(
+            self._of(mode, f"speed_{names[0]}") * early
+            + self._of(mode, f"speed_{names[1]}") * (1.0 - early)
+            - self._of(mode, "hesitate") * band
+        )
+        scaled = action * factor
+        pushed = early * xp.clip(1.0 - self._field(observation, EPISODE_SHARE) / PUSHES_UNTIL, 0.0, 1.0)
+        for index in self.moving:
+            scaled = scaled + pushed * self._of(mode, f"push_{self.actions[index]}") * self._unit(index, action, xp)
+        kept = self._of(mode, "smooth")
+        smoothed = (1.0 - kept) * scaled + kept * self._field(observation, PREVIOUS_ACTION)
+        if len(self.moving) == len(self.actions):
+            return smoothed
+        moved = sum(self._unit(index, action, xp) for index in self.moving)
+        return action + moved * (smoothed - action)
+
+    def _left(self, observation: Any, xp: Any) -> Any:
+        """Share of the way (or of the time) that is left, (..., 1)."""
+        if not (self.tip and self.goal):
+            return 1.0 - self._field(observation, EPISODE_SHARE)
+        way = observation[..., list(self.goal)] - observation[..., list(self.tip)]
+        return xp.sqrt((way * way).sum(-1) + 1e-12)[..., None] / self.start_distance_m
+
+    def _unit(self, index: int, action: Any, xp: Any) -> Any:
+        return xp.asarray([float(place == index) for place in range(len(self.actions))], dtype=action.dtype)

@@ -1,0 +1,96 @@
+"""What the program has found out about a laboratory's task: sizes, ranges of its modes, how long its way is.
+
+Kept in a file beside the lab.toml, so that whoever learns knows the task without running any code of the laboratory.
+"""
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Self
+
+from app.installed_tasks.lab import LabDescription
+from worker.lab_modes import LabModes
+from worker.modes import Axis
+from worker.spaces import Field, Space
+from worker.task import Task
+from worker.whole_files import written_whole
+
+FOUND_FILE = "found.json"
+
+
+def mark_of(described: LabDescription, folder: Path) -> str:
+    """A fingerprint of what was found depends on: everything but names and words, and the policy itself."""
+    kept = described.model_dump(mode="json", exclude={"title", "summary", "words", "instructions", "usual_clip_steps"})
+    policy = hashlib.sha256((folder / described.policy.file).read_bytes()).hexdigest()
+    return hashlib.sha256(f"{json.dumps(kept, sort_keys=True)} {policy}".encode()).hexdigest()
+
+
+@dataclass(frozen=True)
+class Found:
+    """Plain values."""
+
+    mark: str
+    """mark_of() the description it was found for"""
+    observation: tuple[Field, ...]
+    action: tuple[Field, ...]
+    own_size: int
+    """of the environment's own part of the observation"""
+    bounds: tuple[tuple[float, ...], tuple[float, ...]]
+    """of the actions in the environment's own unit"""
+    moving: tuple[int, ...]
+    tip: tuple[int, ...]
+    goal: tuple[int, ...]
+    start_distance_m: float
+    axes: tuple[Axis, ...]
+    dropped: dict[str, str]
+    """which axes, or ends of them, were left out, and why"""
+    notes: tuple[str, ...]
+    reference: dict[str, float]
+    """of the frozen policy's episodes: success, share of actions at their limit"""
+
+    def modes(self, axes: tuple[Axis, ...] | None = None) -> LabModes:
+        """The ways to do the task."""
+        return LabModes(
+            Space(self.observation),
+            self.axes if axes is None else axes,
+            tuple(each.name for each in self.action),
+            self.moving,
+            self.tip,
+            self.goal,
+            self.start_distance_m,
+        )
+
+    def task(self, described: LabDescription) -> Task:
+        """What learning knows of the task."""
+        return Task(
+            name=described.name,
+            title=described.title,
+            observation=Space(self.observation),
+            modes=self.modes(),
+            calibrated_speed_weight=0.0,
+            episode_steps=described.episode_steps,
+            action=Space(self.action),
+            control_step_s=1.0 / described.environment.rate_hz,
+            signals=described.signal_names,
+            costs=described.cost_names,
+            is_a_labs=True,
+        )
+
+    def save(self, file: Path) -> None:
+        """Write a JSON file that is either complete or absent."""
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with written_whole(file) as draft:
+            draft.write_text(json.dumps(asdict(self), indent=2) + "\n")
+
+    @classmethod
+    def load(cls, file: Path) -> Self:
+        """Read what save() wrote."""
+        stored: dict[str, Any] = json.loads(file.read_text())
+        kinds = {"observation": Field, "action": Field, "axes": Axis}
+        for name, kind in kinds.items():
+            stored[name] = tuple(kind(**each) for each in stored[name])
+        for name in ("moving", "tip", "goal", "notes"):
+            stored[name] = tuple(stored[name])
+        stored["bounds"] = tuple(map(tuple, stored["bounds"]))
+        return cls(**stored)
