@@ -6,42 +6,33 @@ On PostgreSQL an advisory lock does the same, and participants who write nothing
 """
 
 import logging
-import os
 import sqlite3
-import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from contextlib import closing, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, ClassVar
 
 from sqlalchemy import (
     JSON,
-    Connection,
     DateTime,
     Dialect,
     Engine,
     MetaData,
     TypeDecorator,
-    create_engine,
-    event,
     func,
-    make_url,
     select,
     text,
 )
 from sqlalchemy.exc import OperationalError
 from sqlalchemy.orm import DeclarativeBase, Session, sessionmaker
 
+from app import sqlite
 from app.errors import OncePerMinute
+from app.sqlite import BUSY_TIMEOUT_S
 
-BUSY_TIMEOUT_S = 15
-LOOK_AGAIN_S = 0.003
-TAKE_THE_LOCK = "BEGIN IMMEDIATE"
 SAME_TIME = timedelta(seconds=1)
-USUAL_LOG_PAGES, LONGEST_LOG_PAGES = 1000, 20_000
-"""Of SQLite's log, before a commit copies them into the database: as usual, and where others do it first."""
 WRITING, NAMES, AUDITING = 1_347_310_157, 1_347_310_158, 1_347_310_159
 """Advisory locks of PostgreSQL: of whoever writes, of names, of the audit log. Numbers that no other program uses."""
 
@@ -86,12 +77,6 @@ class Base(DeclarativeBase):
     type_annotation_map: ClassVar[dict[Any, Any]] = {datetime: UtcDateTime, dict[str, Any]: JSON}
 
 
-def file_of(url: str) -> Path | None:
-    """The file of an SQLite database; None for any other."""
-    parts = make_url(url)
-    return Path(parts.database) if parts.get_backend_name() == "sqlite" and parts.database else None
-
-
 class _Clock:
     """The database's clock on PostgreSQL, else this machine's: leases of different machines are compared.
 
@@ -125,8 +110,9 @@ class Database:
         self.url = url
         self.is_sqlite = url.startswith("sqlite")
         if self.is_sqlite:
-            pages = LONGEST_LOG_PAGES if keeps_log_short else USUAL_LOG_PAGES
-            self.writer, self.reader = _sqlite(url, TAKE_THE_LOCK, pages), _sqlite(url, "BEGIN", pages)
+            pages = sqlite.LONGEST_LOG_PAGES if keeps_log_short else sqlite.USUAL_LOG_PAGES
+            self.writer = sqlite.engine(url, BUSY_TIMEOUT_S, writes=True, log_pages=pages)
+            self.reader = sqlite.engine(url, BUSY_TIMEOUT_S, writes=False, log_pages=pages)
         else:
             from app import postgresql  # its driver takes a tenth of a second to load
 
@@ -166,21 +152,20 @@ class Database:
 
         A commit that has to do so takes a quarter of a second on a slow disk.
         """
-        if (path := file_of(self.url)) is not None:
-            with closing(sqlite3.connect(path, isolation_level=None)) as connection, suppress(sqlite3.OperationalError):
-                connection.execute("PRAGMA wal_checkpoint(PASSIVE)")
+        if (path := sqlite.file_of(self.url)) is not None:
+            sqlite.shorten_log(path)
 
     def forget_erased(self) -> bool:
         """Let no byte of erased rows stay in the database's files; False when it was too busy and must be asked again.
 
         PostgreSQL's own log forgets them later, when it is recycled; its archive and backups when they are deleted.
         """
-        path = file_of(self.url)
+        path = sqlite.file_of(self.url)
         if path is None:
             from app import postgresql
 
             return postgresql.rewrite_tables(self.writer, BUSY_TIMEOUT_S)
-        return rewrite(path)
+        return sqlite.rewrite(path)
 
     @contextmanager
     def claiming(self, name: str) -> Iterator[bool]:
@@ -201,7 +186,7 @@ class Database:
 
     def watch(self) -> "Watch":
         """Tells from now on whether anybody has written."""
-        path = file_of(self.url)
+        path = sqlite.file_of(self.url)
         return _SnapshotWatch(self.writer) if path is None else _FileWatch(path)
 
     def dispose(self) -> None:
@@ -262,106 +247,3 @@ class _SnapshotWatch(Watch):
 
     def close(self) -> None:
         """It has no connection of its own."""
-
-
-def rewrite(path: Path) -> bool:
-    """Write a SQLite database anew, without what freed pages and the write-ahead log remember. False while it is busy.
-
-    Deleting alone leaves the bytes where they were; VACUUM copies only what is alive, and the log is cut to nothing.
-    """
-    with closing(sqlite3.connect(path, timeout=BUSY_TIMEOUT_S, isolation_level=None)) as connection:
-        try:
-            connection.execute("PRAGMA secure_delete=ON")
-            connection.execute("VACUUM")
-            busy, *_ = connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchone()
-        except sqlite3.OperationalError:
-            return False
-    return not busy
-
-
-def copy(path: Path, target: Path) -> None:
-    """A consistent copy of a SQLite database, whoever writes to it meanwhile; for its owner only.
-
-    VACUUM INTO and not the backup API: the copy is one snapshot either way, but this leaves out freed pages, in which
-    erased rows may still stand. Raises sqlite3.DatabaseError.
-    """
-    os.close(os.open(target, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600))  # SQLite fills an empty file as it is
-    with closing(sqlite3.connect(path, timeout=BUSY_TIMEOUT_S, isolation_level=None)) as connection:
-        connection.execute("VACUUM INTO ?", (str(target),))
-    with target.open("rb") as stream:
-        os.fsync(stream.fileno())
-
-
-def _take_the_lock(connection: Connection) -> None:
-    """Begin to write, as soon as whoever writes has finished.
-
-    SQLite's own waiting looks again every 25 to 100 ms, which is many answers long.
-    """
-    ours: Any = connection.connection.dbapi_connection
-    give_up_at_s = time.monotonic() + BUSY_TIMEOUT_S
-    ours.execute("PRAGMA busy_timeout=0")
-    try:
-        while time.monotonic() < give_up_at_s:
-            try:
-                ours.execute(TAKE_THE_LOCK)
-            except sqlite3.OperationalError as error:
-                if error.sqlite_errorcode & 0xFF != sqlite3.SQLITE_BUSY:  # the rest says why it is
-                    break
-                time.sleep(LOOK_AGAIN_S)
-            else:
-                return
-        connection.exec_driver_sql(TAKE_THE_LOCK)  # so that what it raises is SQLAlchemy's
-    finally:
-        ours.execute(f"PRAGMA busy_timeout={round(1000 * BUSY_TIMEOUT_S)}")
-
-
-def _sqlite(url: str, begin: str, log_pages: int) -> Engine:
-    engine = create_engine(url, connect_args={"timeout": BUSY_TIMEOUT_S, "check_same_thread": False})
-
-    path = file_of(url)
-
-    @event.listens_for(engine, "connect")
-    def prepare(connection: Any, record: Any) -> None:
-        connection.isolation_level = None  # the driver must not begin transactions of its own
-        for pragma in ("journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON", "mmap_size=0"):
-            connection.execute(f"PRAGMA {pragma}")
-        connection.execute(f"PRAGMA wal_autocheckpoint={log_pages}")
-        record.info[_FILE] = _identity(path)
-
-    @event.listens_for(engine, "begin")
-    def start(connection: Connection) -> None:
-        _require_same(connection, _identity(path))
-        if begin == TAKE_THE_LOCK:
-            _take_the_lock(connection)
-        else:
-            connection.exec_driver_sql(begin)
-
-    return engine
-
-
-_FILE = "file"
-"""What a connection remembers: which file it has opened."""
-
-
-def _identity(path: Path | None) -> tuple[int, int] | None:
-    """Device and number of the file; None when there is none."""
-    if path is None:
-        return None
-    try:
-        known = path.stat()
-    except OSError:
-        return None
-    return known.st_dev, known.st_ino
-
-
-def _require_same(connection: Any, present: tuple[int, int] | None) -> None:
-    """Raises OperationalError when the file was deleted or replaced: what is written to it now would be lost.
-
-    SQLite goes on with the file it has opened, which nobody else will ever see.
-    """
-    opened = connection.info[_FILE]
-    if opened in (None, present):
-        return
-    if present is not None:
-        connection.invalidate()  # the next connection opens what is there now
-    raise OperationalError("BEGIN", None, sqlite3.OperationalError("unable to open: the file was deleted or replaced"))

@@ -16,8 +16,8 @@ from urllib.parse import urlsplit
 from sqlalchemy import func, make_url, select
 from sqlalchemy.orm import Session
 
-from app import upgrading
-from app.db import Database, file_of, now
+from app import sqlite, upgrading
+from app.db import Database, now
 from app.domain.people import ApiToken, Experimenter
 from app.programs import say
 from app.services.backups import schedule
@@ -105,7 +105,7 @@ def _of_proxies(settings: Settings) -> Iterator[Finding]:
 
 
 def _of_files(settings: Settings) -> Iterator[Finding]:
-    database = file_of(settings.sqlalchemy_url)
+    database = sqlite.file_of(settings.sqlalchemy_url)
     secret = [settings.signing_key_path, Path(".env"), *([database] if database else [])]
     if database is not None:
         secret += database.parent.glob(f"{database.name}[-.]*")

@@ -14,8 +14,9 @@ from alembic.script import ScriptDirectory
 from sqlalchemy import create_engine, inspect, text
 from sqlalchemy.exc import DatabaseError, OperationalError
 
+from app import sqlite
 from app.data_directory import require_whole
-from app.db import copy, file_of, now
+from app.db import now
 from app.errors import AppError, in_words
 from app.files.lost import ARTEFACTS
 from app.paths import MIGRATIONS
@@ -65,7 +66,7 @@ def upgrade(settings: Settings) -> None:
     newest = ScriptDirectory.from_config(config).get_current_head() or ""
     with _one_at_a_time(settings):
         present = _revision(settings, config)
-        path = file_of(settings.sqlalchemy_url)
+        path = sqlite.file_of(settings.sqlalchemy_url)
         if present == newest:
             return
         if present is None:
@@ -125,7 +126,7 @@ def _config(settings: Settings) -> Config:
 def _require_new(settings: Settings) -> None:
     """Raises DatabaseLost where an empty database would take the place of one: the worker clears away what no row of
     it refers to."""
-    path = file_of(settings.sqlalchemy_url)
+    path = sqlite.file_of(settings.sqlalchemy_url)
     log_of_it = path and path.with_name(f"{path.name}-wal")
     has_log = log_of_it is not None and log_of_it.exists() and log_of_it.stat().st_size > 0
     if has_log or next(iter(ArtefactStore.of(settings).files.found(ARTEFACTS)), None) is not None:
@@ -141,7 +142,7 @@ def _one_at_a_time(settings: Settings) -> Iterator[None]:
 
 def _revision(settings: Settings, config: Config) -> str | None:
     """The schema's revision, None while there is none. Raises what an upgrade could not mend."""
-    path = file_of(settings.sqlalchemy_url)
+    path = sqlite.file_of(settings.sqlalchemy_url)
     if path is not None and not path.exists():
         return None
     engine = create_engine(settings.sqlalchemy_url)
@@ -179,7 +180,7 @@ def _copy(path: Path, newest: str) -> None:
     draft = _draft(path)
     draft.unlink(missing_ok=True)
     try:
-        copy(path, draft)
+        sqlite.copy(path, draft)
         draft.replace(target)
     except sqlite3.DatabaseError as error:
         if error.sqlite_errorcode & 0xFF in {sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB}:

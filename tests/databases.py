@@ -15,8 +15,8 @@ from uuid import uuid4
 import psycopg
 from sqlalchemy import Connection, Pool, create_engine, event, make_url, text
 
-from app import upgrading
-from app.db import Base, Database, file_of
+from app import sqlite, upgrading
+from app.db import Base, Database
 from app.settings import Settings
 
 SERVER = os.environ.get("TEST_DATABASE_URL")
@@ -34,7 +34,7 @@ def _empty() -> bytes:
 
 def make_tables(database: Database) -> None:
     """Give a database its tables, unless it has them, as those on PostgreSQL do."""
-    path = file_of(database.url)
+    path = sqlite.file_of(database.url)
     if path is not None and not path.exists():
         path.write_bytes(_empty())
 
@@ -65,7 +65,7 @@ def lent(folder: Path, *, with_tables: bool = True) -> Iterator[str]:
 
 def tables_with(marks: Sequence[bytes], url: str) -> list[str]:
     """Tables and indices of a PostgreSQL database whose files hold one of these, as they lie on the server's disk."""
-    if file_of(url) is not None:
+    if sqlite.file_of(url) is not None:
         return []
     found = []
     engine = create_engine(url, isolation_level="AUTOCOMMIT")

@@ -6,7 +6,8 @@ import pytest
 from sqlalchemy import select, text
 from sqlalchemy.exc import OperationalError
 
-from app.db import Database, file_of
+from app import sqlite
+from app.db import Database
 from app.settings import Settings
 from tests import databases
 
@@ -62,7 +63,7 @@ def test_a_name_is_claimed_by_one_at_a_time(database: Database, settings: Settin
 
 @pytest.mark.sqlite("about its write-ahead log")
 def test_no_commit_copies_the_log_while_somebody_else_keeps_it_short(database: Database) -> None:
-    path = file_of(database.url)
+    path = sqlite.file_of(database.url)
     assert path is not None
     served = Database(database.url, keeps_log_short=True)
     before = path.stat().st_size
@@ -75,3 +76,6 @@ def test_no_commit_copies_the_log_while_somebody_else_keeps_it_short(database: D
     served.keep_log_short()
     assert path.stat().st_size > before + 12_000_000
     served.dispose()
+    path.unlink()
+    served.keep_log_short()
+    assert not path.exists(), "a lost database is to be noticed"

@@ -22,7 +22,8 @@ from typing import IO
 
 from sqlalchemy import URL, make_url
 
-from app.db import copy, file_of, now
+from app import sqlite
+from app.db import now
 from app.errors import AppError
 from app.services.backups import layout, snapshots, withdrawals
 from app.services.backups.layout import ARTEFACTS, BESIDE, DATABASE, DRAFT, MANIFEST, Backup, File, Manifest
@@ -77,7 +78,7 @@ def in_words(error: OSError | sqlite3.Error) -> str:
 
 def database_file(settings: Settings) -> Path:
     """The database to copy. Raises OfPostgresql, which says how to copy any other, and OfBucket."""
-    path = file_of(settings.sqlalchemy_url)
+    path = sqlite.file_of(settings.sqlalchemy_url)
     if path is None:
         raise OfPostgresql(_commands_for_postgresql(settings))
     if settings.storage_url is not None:
@@ -139,7 +140,7 @@ class _Draft:
         """Copy everything, and only then give it its name."""
         made_at = now()
         _require_space(self.folder, self.source.stat().st_size)
-        copy(self.source, self.folder / DATABASE)
+        sqlite.copy(self.source, self.folder / DATABASE)
         with snapshots.reading(self.folder / DATABASE, still=True) as connection:
             complaint = snapshots.complaint(connection)
             if complaint is not None:

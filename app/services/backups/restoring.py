@@ -12,8 +12,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from app import data_directory, upgrading
-from app.db import file_of, now
+from app import data_directory, sqlite, upgrading
+from app.db import now
 from app.errors import AppError
 from app.services.backups import layout, making, snapshots, withdrawals
 from app.services.backups.layout import BESIDE, DATABASE, Backup, BackupRefused
@@ -56,7 +56,7 @@ def verify(settings: Settings, folder: Path) -> Backup:
 
 def restore(settings: Settings, folder: Path, into: Path | None = None, *, replace: bool = False) -> Restored:
     """Put a backup in place. ``replace``: move aside what is there. Raises what verify() does, and in words."""
-    if into is None and file_of(settings.sqlalchemy_url) != settings.data_dir.resolve() / DATABASE:
+    if into is None and sqlite.file_of(settings.sqlalchemy_url) != settings.data_dir.resolve() / DATABASE:
         raise RestoreFailed(
             "DATABASE_URL says that the database is not in the data directory. Restore with --into a new directory and "
             "move the database from there to its place. For PostgreSQL, docs/backups.md has the commands."
@@ -154,7 +154,7 @@ def _known_withdrawals(settings: Settings, folder: Path, target: Path) -> set[st
             gone |= withdrawals.noted(directory)
         except ValueError as error:
             raise BackupRefused(f"{error} It says who has withdrawn since: put a sound one there, or none.") from error
-    for path in {target / DATABASE, file_of(settings.sqlalchemy_url)} - {None}:
+    for path in {target / DATABASE, sqlite.file_of(settings.sqlalchemy_url)} - {None}:
         if path is not None and path.exists():
             gone |= withdrawals.known_to(path)
     return gone

@@ -12,8 +12,8 @@ from pathlib import Path
 
 from sqlalchemy.orm import Session
 
-from app import upgrading
-from app.db import Database, file_of, now
+from app import sqlite, upgrading
+from app.db import Database, now
 from app.domain.studies import Participant, Study
 from app.services import audit
 from app.services.backups import snapshots
@@ -66,7 +66,7 @@ def replay(settings: Settings, gone: Collection[Identity]) -> int:
 
     The database is brought to the newest schema for it, since erasing knows no other.
     """
-    path = file_of(settings.sqlalchemy_url)
+    path = sqlite.file_of(settings.sqlalchemy_url)
     if path is None or not _rows(path, gone):
         return 0
     upgrading.upgrade(settings)

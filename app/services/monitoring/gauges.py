@@ -8,7 +8,8 @@ from pathlib import Path
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
-from app.db import file_of, now
+from app import sqlite
+from app.db import now
 from app.domain.models import Run, RunStatus, WorkerPresence
 from app.domain.preferences import LabelEvent
 from app.domain.studies import Participant, Study
@@ -29,7 +30,7 @@ class Gauge:
 def of_machine(data_dir: Path, database_url: str, store: ArtefactStore) -> Iterator[Gauge]:
     """Disk, files and programs: known even when the database is not."""
     yield Gauge("studio_disk_free_bytes", "Free space where the data are.", shutil.disk_usage(data_dir).free)
-    database = file_of(database_url)
+    database = sqlite.file_of(database_url)
     if database is not None and database.exists():
         yield Gauge("studio_database_bytes", "Size of the SQLite database.", database.stat().st_size)
     lost = len(store.lost())

@@ -14,8 +14,8 @@ from dbos import DBOS, WorkflowStatus
 from sqlalchemy import select, update
 from sqlalchemy.orm import Session
 
-from app import upgrading
-from app.db import file_of, now, rewrite
+from app import sqlite, upgrading
+from app.db import now
 from app.domain.models import RunKind
 from app.domain.studies import Participant, Study
 from app.services.auditing import receipts
@@ -146,13 +146,13 @@ def _erase(
         if late:
             receipts.add(session, whom(session), receipts.LATE_RESULTS, late)
     DBOS.delete_workflows(list(jobs))
-    if not context.database.forget_erased() or (engine_file is not None and not rewrite(engine_file)):
+    if not context.database.forget_erased() or (engine_file is not None and not sqlite.rewrite(engine_file)):
         return ErasureProgress(
             finished=False, forgotten=frozenset(jobs)
         )  # somebody is reading; the next round tries again
     if engine_file is not None:
         engine.forget_set_aside(engine_file)
-    database_file = file_of(context.database.url)
+    database_file = sqlite.file_of(context.database.url)
     if database_file is not None:
         upgrading.forget_copies(database_file)
     restoring.forget_replaced(context.store.root.parent)
