@@ -48,7 +48,7 @@ contracts: $(VENV)/dev.stamp ## Who may import whom
 
 # One thread each: processes whose libraries take every core spend their time waiting for each other.
 pytest: $(VENV)/dev.stamp browser ## The test suite
-	OMP_NUM_THREADS=1 $(PY) -m pytest -n 3 --dist loadfile --no-loadscope-reorder
+	OMP_NUM_THREADS=1 $(PY) -m pytest -n 4 --dist loadfile --no-loadscope-reorder
 
 pytest-postgresql: $(VENV)/dev.stamp postgresql ## Tests that use a database, on PostgreSQL (ARGS="tests/app -n 2": others)
 	OMP_NUM_THREADS=1 $(PY) -m tests.on_postgresql $(ARGS)

@@ -192,7 +192,7 @@ class ArtefactStore:
         return self.has(sha256)
 
     def lost(self) -> dict[str, int]:
-        """What was found to be damaged or missing and is not back yet, with when that was (seconds since 1970)."""
+        """What was found to be damaged or missing and is not back yet, with when that was (milliseconds since 1970)."""
         return self._lost.now()
 
     def older_than(self, seconds: float) -> set[str]:

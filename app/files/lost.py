@@ -34,7 +34,7 @@ class Lost:
         self._noted = 0
 
     def now(self) -> dict[str, int]:
-        """Hashes, and since when (seconds since 1970)."""
+        """Hashes, and since when (milliseconds since 1970): what is lost twice within a second is made again twice."""
         if not self._files.is_shared:
             return self._found()
         with self._lock:
@@ -49,7 +49,7 @@ class Lost:
         """This one, too, from now on."""
         with self._lock:
             self._noted += 1
-            self._known = self._known | {sha256: int(time.time())}
+            self._known = self._known | {sha256: round(1000 * time.time())}
 
     def forget(self, sha256: str) -> None:
         """It is there again, or nobody wants it."""
@@ -73,5 +73,5 @@ class Lost:
             if self._files.stat(place(sha256)) is not None:
                 self._files.delete(aside(sha256))
             else:
-                lost[sha256] = int(known.placed_at_s)
+                lost[sha256] = round(1000 * known.placed_at_s)
         return lost

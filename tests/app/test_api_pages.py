@@ -19,8 +19,10 @@ from app.domain.models import ModelKind
 from app.domain.participation import ConsentRecord, FormAnswer, ParticipantEvent, StageRecord
 from app.domain.people import AuditEvent, Experimenter
 from app.domain.preferences import LabelEvent, Query, Response
+from app.domain.protocol import EvaluatedMethod
 from app.domain.studies import Deviation, Participant, Study
 from app.services.accounts import api_tokens
+from app.services.evaluation import donors
 from app.services.exports import export_tables
 from app.services.participants import withdrawal
 from app.storage import ArtefactStore
@@ -95,6 +97,7 @@ def somebody_does_everything(session: Session, store: ArtefactStore, study: Stud
         uuid = f"{person.id}-{len(given)}"
         more = Rating(trial_id=trial.id, revision=len(given) + 1, satisfaction=1, personalisation=1, client_uuid=uuid)
         session.add(more)
+        donors.draw(session, study, person, EvaluatedMethod.AVERAGE, ("cautious",))
     factories.make_participant(session, study)
     session.add(Deviation(study_id=study.id, actor="pat", reason="later", before={}, after={}))
 

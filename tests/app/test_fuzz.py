@@ -22,6 +22,7 @@ UPLOADS = {"/import"}
 """tests/app/test_uploads.py is about these."""
 
 
+@pytest.mark.long
 @pytest.mark.sqlite("makes studios of its own")
 def test_nothing_generated_fails_or_is_answered_otherwise_than_documented() -> None:
     found = fuzz_api.fuzz(120, seed=1)

@@ -368,6 +368,7 @@ def test_two_members_of_one_name_are_refused(database: Database, store: Artefact
         bring(database, store, packed)
 
 
+@pytest.mark.long
 def test_a_large_study_takes_little_memory_both_ways(
     database: Database, store: ArtefactStore, packed: Path, tmp_path: Path
 ) -> None:

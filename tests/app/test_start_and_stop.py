@@ -121,6 +121,7 @@ def test_ctrl_c_stops_both_programs(start: Start) -> None:
     assert all(gone(pid) for pid in programs)
 
 
+@pytest.mark.long
 def test_a_second_start_makes_no_second_demo_study_and_no_new_password(start: Start) -> None:
     first = start()
     assert until(lambda: "Participant link" in first.said)
@@ -138,6 +139,7 @@ def test_a_worker_that_is_killed_is_started_again(running: Studio) -> None:
     assert "The worker stopped by itself (exit code -9); starting it again." in running.said
 
 
+@pytest.mark.long
 def test_a_worker_that_keeps_falling_leaves_the_web_server_alone_and_is_tried_until_it_can_run(
     start: Start, tmp_path: Path
 ) -> None:
@@ -162,6 +164,7 @@ def test_a_web_server_that_falls_is_started_again_and_the_worker_keeps_its_work(
     assert running.child("worker") == worker
 
 
+@pytest.mark.long
 @pytest.mark.sqlite("about the engine's own file")
 def test_a_damaged_file_of_the_engine_is_set_aside_and_the_studio_starts(start: Start, tmp_path: Path) -> None:
     (tmp_path / "engine.sqlite3").write_bytes(os.urandom(30_000))

@@ -149,6 +149,7 @@ def test_without_scripts_robots_are_rated_by_a_plain_form(
     assert (stored.satisfaction, stored.personalisation, stored.by_script) == (4, 4, False)
 
 
+@pytest.mark.long
 def test_the_closed_page_is_fit_for_assistive_technology(invited: Invited, new_page: NewPage) -> None:
     page = new_page()
     Held(page, "pair.js")

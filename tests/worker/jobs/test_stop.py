@@ -80,6 +80,7 @@ def test_while_it_films(worker: Worker, database: Database, number: int) -> None
     assert worker.returncode == 0, "in good order"
 
 
+@pytest.mark.long
 def test_while_its_compute_processes_are_stopped(worker: Worker, database: Database) -> None:
     assert until(lambda: is_filming(database) and len(compute_processes(worker.pid)) > 0)
     for pid in compute_processes(worker.pid):

@@ -268,6 +268,7 @@ def test_unknown_impairments_are_refused_by_name(kind: type[AssistiveEnv]) -> No
         kind(impairments=("cold",))  # type: ignore[arg-type]
 
 
+@pytest.mark.long
 def test_many_resets_do_not_grow_memory(kind: type[AssistiveEnv]) -> None:
     environment = kind()
 
