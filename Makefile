@@ -70,9 +70,10 @@ postgresql: ## PostgreSQL for the tests (Debian package)
 	  echo "The tests on PostgreSQL need its server: install your system's package 'postgresql'."; exit 1; }
 
 browser: ## Chromium for the browser tests (Debian package)
-	@command -v chromium >/dev/null || { \
-	  [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null && apt-get update -qq && apt-get install -y -qq chromium; } || { \
-	  echo "The browser tests need Chromium: install your system's package 'chromium'."; exit 1; }
+	@command -v chromium-headless-shell >/dev/null || { \
+	  [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null && apt-get update -qq && apt-get install -y -qq chromium-headless-shell; } || \
+	  command -v chromium >/dev/null || { \
+	  echo "The browser tests need Chromium: install your system's package 'chromium-headless-shell'."; exit 1; }
 
 benchmark: $(VENV)/dev.stamp ## Print speed and quality figures (minutes; see tests/benchmarks)
 	@OMP_NUM_THREADS=1 $(PY) -m tests.benchmarks.sim_speed

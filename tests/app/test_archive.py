@@ -239,7 +239,7 @@ def test_a_page_says_why_a_file_was_refused(experimenter: TestClient) -> None:
 
 
 def test_a_study_is_imported_by_a_command(packed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    settings = Settings(_env_file=None, data_dir=tmp_path / "by command")
+    settings = Settings(_env_file=None, data_dir=tmp_path / "by command", storage_url=None)  # files of its own, too
     assert import_study(settings, packed) == 0
     said = capsys.readouterr().out
     assert "/studies/feeding-finished" in said

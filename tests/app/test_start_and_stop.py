@@ -173,6 +173,7 @@ def test_a_damaged_file_of_the_engine_is_set_aside_and_the_studio_starts(start: 
     assert "the engine's file cannot be read (file is not a database); it is kept as" in studio.said
 
 
+@pytest.mark.long
 def test_killing_the_supervisor_leaves_nothing_running(start: Start) -> None:
     studio = start()
     assert until(lambda: "worker-1 is ready" in studio.said and answers(studio.address))

@@ -88,6 +88,7 @@ def test_while_its_compute_processes_are_stopped(worker: Worker, database: Datab
     assert stops(worker)
 
 
+@pytest.mark.long
 def test_while_its_compute_processes_are_killed(worker: Worker, database: Database) -> None:
     assert until(lambda: is_filming(database) and len(compute_processes(worker.pid)) > 0)
     for pid in compute_processes(worker.pid):
