@@ -64,6 +64,7 @@ def test_columns_have_the_types_of_the_dictionary(reader: Client) -> None:
     assert str(labels["created_at"].dtype).endswith("UTC]")
 
 
+@pytest.mark.sqlite("only there ids are in the order of commits")
 def test_what_was_added_since_is_read_alone(
     reader: Client, database: Database, study: Study, store: ArtefactStore
 ) -> None:
@@ -101,6 +102,7 @@ def test_bundles_come_by_participant(reader: Client, database: Database, study: 
         reader.bundle(code, version=7)
 
 
+@pytest.mark.sqlite("only there ids are in the order of commits")
 def test_the_example_of_the_manual_runs(
     address: str, token: str, study: Study, database: Database, store: ArtefactStore
 ) -> None:

@@ -62,7 +62,7 @@ class Client:
         if since is not None:
             address = since.attrs.get("later")
             if since.attrs.get("table") != name or address is None:
-                raise ValueError(f"This is no reading of {name!r} after which rows are only added; leave `since` out.")
+                raise ValueError(f"What came after this reading of {name!r} cannot be told; leave `since` out.")
         rows, page = list[dict[str, Any]](), dict[str, Any]()
         while address is not None:
             page = json.loads(self._get(urljoin(self._root, address)))

@@ -135,7 +135,7 @@ def fuzz(count: int, seed: int, *, quiet: bool = True) -> Found:
         addresses = list(_addresses(application))
         for number, (method, path, fields) in enumerate(addresses):
             share = _share(count - count // 2, number, len(addresses))
-            rng = random.Random(f"{seed} {method} {path}")  # noqa: S311
+            rng = random.Random(f"{seed} {method} {path}")  # noqa: S311  (no secret)
             if share:
                 with _studio(application) as studio:
                     for _ in range(share):
@@ -159,7 +159,7 @@ def _fuzz_operation(
 ) -> None:
     schema = schemathesis.openapi.from_dict(application.state.api.openapi())
     operation = schema[path][method]
-    rng = random.Random(f"{seed} {method} {path}")  # noqa: S311
+    rng = random.Random(f"{seed} {method} {path}")  # noqa: S311  (no secret)
     modes = [GenerationMode.POSITIVE, GenerationMode.NEGATIVE]
     strategy = hypothesis.strategies.one_of(*(operation.as_strategy(generation_mode=mode) for mode in modes))
 

@@ -111,7 +111,7 @@ class Campaign:
 
     def __init__(self, directory: Path, options: argparse.Namespace) -> None:
         self.options = options
-        self.random = random.Random(options.seed)  # noqa: S311
+        self.random = random.Random(options.seed)  # noqa: S311  (no secret)
         self.studio = OwnStudio(directory, free_port())
         self.database = Database(self.studio.settings.sqlalchemy_url)
         self.store = ArtefactStore.of(self.studio.settings)
@@ -165,7 +165,7 @@ class Campaign:
         run = wait_until(PATIENCE_S, "no filter at work", lambda: self._at_work(RunKind.FILTER))
         self.studio.start_worker(other)
         wait_until(PATIENCE_S, "no other worker", lambda: self._is_present(other))
-        time.sleep(self.random.uniform(0, 5))
+        time.sleep(self.random.uniform(0, 5))  # kills are to come at random moments
         self.studio.kill(self.worker)
         killed, last = time.monotonic(), self._row(run).heartbeat_at
         wait_until(PATIENCE_S, "nobody takes it over", lambda: self._row(run).heartbeat_at != last or None)
@@ -213,7 +213,7 @@ class Campaign:
         self._labeller(self.progress.brief.pop(0), 0.0).join()
 
     def _kill_servers(self) -> None:
-        rng = random.Random(self.options.seed + 1)  # noqa: S311
+        rng = random.Random(self.options.seed + 1)  # noqa: S311  (no secret)
         with tqdm(total=self.options.servers, initial=self.progress.servers, desc="servers", mininterval=10) as bar:
             while self.progress.servers < self.options.servers and not self._over.wait(rng.uniform(0.1, 2.5)):
                 self.studio.kill("web")
@@ -223,7 +223,7 @@ class Campaign:
                 self._keep()
 
     def _kill_workers(self) -> None:
-        rng = random.Random(self.options.seed + 2)  # noqa: S311
+        rng = random.Random(self.options.seed + 2)  # noqa: S311  (no secret)
         total, since = self.progress.workers + self.progress.compute, dict[str, datetime]()
         with tqdm(total=self.options.workers, initial=total, desc="workers", mininterval=10) as bar:
             while total < self.options.workers and not self._over.wait(rng.uniform(0.2, self.options.gap)):

@@ -159,7 +159,7 @@ class Labeller:
     """A browser with next to no processor time of its own, so that the server's share is what is measured."""
 
     def __init__(self, address: str, token: str, thought_s: float, clips: bool) -> None:
-        self._random = random.Random(token)  # noqa: S311
+        self._random = random.Random(token)  # noqa: S311  (no secret)
         self._address, self._token, self._thought_s, self._clips = address, token, thought_s, clips
         self._cookie = ""
         self._loaded: set[str] = set()

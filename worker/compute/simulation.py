@@ -123,7 +123,7 @@ def _lab_policy(name: str) -> ReferencePolicy:
     from worker.ml.policies import lab_policy  # torch, which processes that film our tasks do without
 
     found, described = registry.found_out(name), registry.lab(name)
-    assert described is not None  # noqa: S101 -- whoever asks has asked
+    assert described is not None  # noqa: S101 -- callers do this for laboratories' tasks only
     low, high = (np.array(each) for each in found.bounds)
     said = described.policy
     size = sum(each.size for each in found.observation)

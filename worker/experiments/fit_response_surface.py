@@ -112,7 +112,7 @@ def explore(task: str, work_directory: Path, processes: int, scenarios: int = SC
 def find_ranges(task: str, scenarios: int = lab_ranges.SCENARIOS) -> None:
     """The ways to do a laboratory's task, unless they are known already."""
     installed, described = registry.installed_task(task), registry.lab(task)
-    assert described is not None  # noqa: S101 -- whoever asks has asked
+    assert described is not None  # noqa: S101 -- callers do this for laboratories' tasks only
     try:
         registry.found_out(task)
         return

@@ -171,7 +171,7 @@ def read_table(
 
     Of labels, forms, consent, events, ratings, models and deviations, rows are only ever added: the last page's `later`
     leads to those that come after this reading. (What `superseded`, `counts` and `excluded` say of earlier rows may
-    have changed meanwhile.)"""
+    have changed meanwhile.) With PostgreSQL, where a row can appear before one with a lower id, `later` is null."""
     study = studies.find_study(session, slug)
     if table not in export_tables.BY_NAME:
         raise TableUnknown
@@ -186,7 +186,7 @@ def read_table(
     following = later = None
     if len(found) > limit:
         following = address + paging.cursor_of(whose, window, found[limit - 1][0])
-    elif wanted.grows_by is not None:
+    elif wanted.grows_by is not None and studio.database.is_sqlite:
         later = address + paging.later_cursor(whose, window, wanted.grows_by)
     return answers.Page(table=table, rows=[row for _, row in found[:limit]], next=following, later=later)
 
