@@ -98,7 +98,7 @@ def document_problems(api: FastAPI) -> None:
                     answer["content"] = {MEDIA_TYPE: answer["content"]["application/json"]}
         return document
 
-    api.openapi = openapi  # type: ignore[method-assign]  (FastAPI's documented way to change the document)
+    api.openapi = openapi  # type: ignore[method-assign]  # FastAPI's documented way
 
 
 def problem(status: HTTPStatus, detail: str, headers: Mapping[str, str] | None = None) -> Response:
