@@ -3,8 +3,13 @@
 import subprocess
 import sys
 from graphlib import TopologicalSorter
+from pkgutil import resolve_name
 
 import grimp
+import pytest
+
+from app.domain.models import RunKind
+from worker.jobs import workflows
 
 HEAVY = ("torch", "pybullet", "numpy", "imageio", "av", "dbos", "worker")
 
@@ -16,6 +21,20 @@ def python(code: str) -> str:
 def test_the_web_server_loads_nothing_of_the_learning_stack() -> None:
     loaded = python(f"import sys, app.main; print([name for name in {HEAVY!r} if name in sys.modules])")
     assert loaded == "[]"
+
+
+def test_the_worker_starts_without_the_learning_stack() -> None:
+    """Whoever starts it waits for less, and it stays small until somebody has answered; then it is loaded on the way."""
+    heavy = ("torch", "scipy", "matplotlib", "pandas", "onnxruntime")
+    code = f"import sys, worker.commands.service; print([name for name in {heavy!r} if name in sys.modules])"
+    assert python(code) == "[]"
+
+
+@pytest.mark.parametrize("kind", RunKind)
+def test_every_kind_of_work_has_somebody_who_does_it(kind: RunKind) -> None:
+    body = workflows.BODIES[kind]
+    assert isinstance(body, workflows.Imported)
+    assert callable(resolve_name(body.name))
 
 
 def test_the_domain_loads_nothing_of_the_web() -> None:

@@ -39,7 +39,7 @@ from worker.ml.filters.response_surface import ResponseSurface, best_mode
 from worker.ml.rewards import calibration, reward_training
 from worker.ml.rewards.pooled_prior import Prior
 from worker.ml.rewards.reward_models import RewardModel
-from worker.ml.rewards.reward_training import SignalScale
+from worker.ml.rewards.signal_scale import SignalScale
 from worker.ml.teachers import TASTES, Manner, ScriptedTeacher, Taste, User, random_taste
 from worker.responses import TARGETS
 from worker.scenarios import EVALUATION, first_of

@@ -116,7 +116,7 @@ def quick(context: WorkerContext, job: Job, run_id: int, step: Step) -> None:
 
 def serve() -> None:
     """The worker, with tasks that only take their time."""
-    workflows._BODIES.update(
+    workflows.BODIES.update(
         {
             RunKind.CLIPS: clips,
             RunKind.REWARD: learning(Lane.REWARDS, ((1, 1, 1.0),)),

@@ -9,8 +9,9 @@ import pytest
 
 from app.domain.protocol import EvaluationSettings
 from app.domain.study_settings import StudySettings
-from worker import cli, options, stop_signals
+from worker import cli, stop_signals
 from worker.__main__ import main
+from worker.commands import benchmarking, options, rehearsing
 from worker.experiments.benchmark import PROFILES
 from worker.ml.teachers import Manner
 
@@ -111,10 +112,10 @@ def test_the_help_names_the_default_that_holds(capsys: pytest.CaptureFixture[str
 @pytest.mark.parametrize(
     ("command", "table", "config"),
     [
-        ("rehearse", cli.OF_SETTINGS, StudySettings(strategy="uniform")),
-        ("rehearse", cli.OF_EVALUATION, EvaluationSettings()),
-        ("rehearse", cli.OF_MANNER, Manner(skip_share=0.02)),
-        ("benchmark", cli.OF_TERMS, None),
+        ("rehearse", rehearsing.OF_SETTINGS, StudySettings(strategy="uniform")),
+        ("rehearse", rehearsing.OF_EVALUATION, EvaluationSettings()),
+        ("rehearse", rehearsing.OF_MANNER, Manner(skip_share=0.02)),
+        ("benchmark", benchmarking.OF_TERMS, None),
     ],
 )
 def test_a_command_without_options_uses_the_usual_values(command: str, table: options.Table, config: Any) -> None:
@@ -126,7 +127,7 @@ def test_a_benchmark_fills_parts_of_its_configuration() -> None:
     said = cli.parser().parse_args(
         ["benchmark", "--prefft-steps", "5", "--pbrl-steps", "6", "--printed-steps", "7", "--mistakes", "0.5"]
     )
-    terms = options.filled(PROFILES["full"], cli.OF_TERMS, said)
+    terms = options.filled(PROFILES["full"], benchmarking.OF_TERMS, said)
     methods = terms.methods
     assert (methods.fine_tuning.steps, methods.from_scratch.steps, methods.printed_steps) == (5, 6, 7)
     assert (terms.manner.mistakes, terms.labels) == (0.5, PROFILES["full"].labels)
@@ -146,7 +147,7 @@ def test_no_share_is_more_than_everything(option: str, capsys: pytest.CaptureFix
 def test_settings_that_no_study_can_have_are_refused_in_words_before_anything_starts(
     said: list[str], name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(cli, "OwnStudio", None)  # a server that was started would fail otherwise
+    monkeypatch.setattr(rehearsing, "OwnStudio", None)  # a server that was started would fail otherwise
     monkeypatch.setattr(stop_signals, "any_signal_is_ctrl_c", lambda: None)  # the suite keeps its own
     assert main(["rehearse", *said]) == 1
     told = capsys.readouterr().err

@@ -8,12 +8,10 @@ Figures by name, each as SVG and PNG (see figures).
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import pandas as pd
-
-from worker.analysis import answers, figures, statistics
-from worker.analysis.guesses import guess_report
+if TYPE_CHECKING:
+    import pandas as pd
 
 Row = dict[str, Any]
 
@@ -44,6 +42,10 @@ class Tables:
 
 def make_report(tables: Tables) -> tuple[dict[str, Any], dict[str, dict[str, bytes]]]:
     """The contents, and the figures as {name: {format: file}}."""
+    # Takes seconds, and the worker, which only names this function, needs none of it.
+    from worker.analysis import answers, figures, statistics
+    from worker.analysis.guesses import guess_report
+
     contents = {
         "version": tables.version,
         "blinded": tables.blinded,
@@ -61,6 +63,8 @@ def make_report(tables: Tables) -> tuple[dict[str, Any], dict[str, dict[str, byt
     return contents, figures.all_figures(contents)
 
 
-def _frame(tables: Tables, name: str) -> pd.DataFrame:
+def _frame(tables: Tables, name: str) -> "pd.DataFrame":
+    import pandas as pd
+
     frame = pd.DataFrame(getattr(tables, name), columns=tables.columns.get(name))
     return frame[frame["counts"].astype(bool)] if name == "ratings" and not frame.empty else frame

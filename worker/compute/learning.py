@@ -1,4 +1,7 @@
-"""What the learning processes do: fit reward models, ask them, and drive filters through scenarios."""
+"""What the learning processes do: fit reward models, ask them, and drive filters through scenarios.
+
+What takes seconds to load is imported where it is used: the worker only names these functions, and needs none of it.
+"""
 
 from collections.abc import Sequence
 from functools import lru_cache
@@ -8,13 +11,11 @@ import numpy as np
 import numpy.typing as npt
 
 from worker.compute.simulation import reference_rollouts, run_episode, signal_predictor
-from worker.ml.filters.filter_problem import noisy
-from worker.ml.rewards import reward_training
 from worker.ml.rewards.loading import load_reward_model
 from worker.ml.rewards.pooled_prior import prior_of
-from worker.ml.rewards.reward_models import RewardModel
-from worker.ml.rewards.reward_training import SignalScale
+from worker.ml.rewards.reward_models import NEVER_WANTED, RewardModel
 from worker.ml.rewards.segments import SegmentPairs
+from worker.ml.rewards.signal_scale import SignalScale
 from worker.tasks import registry
 from worker.trajectory import Trajectory
 from worker.type_aliases import Act, Float32Array
@@ -28,6 +29,19 @@ def warm_up(task: str) -> None:
 def run_scenarios(task: str, act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
     """One rollout per scenario, with Gaussian noise of this deviation on every action."""
     return [run_episode(task, noisy(act, noise, seed, scenario), scenario) for scenario in scenarios]
+
+
+def noisy(act: Act, noise: float, seed: int, scenario: int) -> Act:
+    """The same with Gaussian noise, drawn independently for every scenario."""
+    if noise == 0.0:
+        return act
+    rng = np.random.default_rng([seed, scenario])
+
+    def act_with_noise(observation: Float32Array) -> Float32Array:
+        action = act(observation)
+        return action + noise * rng.standard_normal(action.shape, np.float32)
+
+    return act_with_noise
 
 
 def fit_reward(
@@ -47,6 +61,8 @@ def fit_reward(
     is no reference policy to normalise over, and what the person was shown takes its place.
     Raises ValueError for a kind there is not, and simulation.NoPredictor where the task's signals cannot be foreseen.
     """
+    from worker.ml.rewards import reward_training
+
     if kind not in get_args(reward_training.RewardKind):
         raise ValueError(f"There is no reward model of the kind {kind!r}.")
     simulated = None if recorded_signals is not None else registry.task(task)
@@ -60,7 +76,7 @@ def fit_reward(
         reference=reference_rollouts(task) if recorded_signals is None else (),
         prior=prior,
         signal_names=recorded_signals or () if simulated is None else simulated.signals,
-        costs=reward_training.NEVER_WANTED if simulated is None else (*reward_training.NEVER_WANTED, *simulated.costs),
+        costs=NEVER_WANTED if simulated is None else (*NEVER_WANTED, *simulated.costs),
         predictor=signal_predictor(task) if kind == "predicted" else None,
     )
     return fitted.model.to_bytes(), {**fitted.metrics, "pooled_from": len(earlier)}

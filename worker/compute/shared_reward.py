@@ -7,8 +7,8 @@ import numpy as np
 
 from worker.compute.simulation import reference_rollouts
 from worker.ml.rewards.loading import load_reward_model
-from worker.ml.rewards.reward_models import StructuredReward
-from worker.ml.rewards.reward_training import UNDONE, SignalScale
+from worker.ml.rewards.reward_models import UNDONE, StructuredReward
+from worker.ml.rewards.signal_scale import SignalScale
 from worker.ml.teachers import OMEGA, User
 from worker.sim.costs import signal_weights
 from worker.tasks import registry

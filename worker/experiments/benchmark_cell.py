@@ -30,8 +30,8 @@ from worker.ml.rewards import reward_training
 from worker.ml.rewards.action_ranking import can_rank
 from worker.ml.rewards.loading import load_reward_model
 from worker.ml.rewards.reward_models import RewardModel
-from worker.ml.rewards.reward_training import SignalScale
 from worker.ml.rewards.segments import SegmentPairs
+from worker.ml.rewards.signal_scale import SignalScale
 from worker.ml.teachers import INDIRECT, OPPOSED, TASTES, Manner, ScriptedTeacher, Taste, User
 from worker.responses import TARGETS
 from worker.scenarios import EVALUATION, POOL, first_of

@@ -23,7 +23,7 @@ from worker.compute.pools import Compute, Lane
 from worker.experiments import lab_ranges
 from worker.ml.filters import response_surface
 from worker.ml.filters.response_surface import ResponseSurface, best_mode
-from worker.ml.rewards.reward_training import NEVER_WANTED
+from worker.ml.rewards.reward_models import NEVER_WANTED
 from worker.ml.teachers import random_taste
 from worker.scenarios import RESPONSE_SURFACE, RESPONSE_SURFACE_SOUGHT, first_of
 from worker.sim.costs import signal_weights

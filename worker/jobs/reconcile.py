@@ -21,9 +21,9 @@ from app.domain.run_keys import SCENARIO, WHOLE, RunKey
 from app.domain.studies import Participant, Study
 from app.services.evaluation import evaluation_plan
 from worker import scenarios
-from worker.jobs.clips import evaluation_films, repairs
-from worker.jobs.learning import baselines
+from worker.jobs.clips import repairs
 from worker.jobs.publishing import export_files, report_files
+from worker.jobs.runtime import due_evaluation
 from worker.jobs.runtime.due_work import (
     answers_known,
     filter_due,
@@ -196,18 +196,5 @@ def _stale_models(session: Session, study: Study, succeeded: Collection[str]) ->
             if milestone and str(reward) in succeeded and study.material is None:  # no simulator, no filter
                 jobs.append(Job(replace(reward, kind=RunKind.FILTER, labels=milestone), study.id))
         if count >= settings.labels_per_participant and study.material is None:
-            jobs += _missing_from_evaluation(study, reward, succeeded, participant_id in begun)
-    return jobs
-
-
-def _missing_from_evaluation(study: Study, reward: RunKey, succeeded: Collection[str], robots_shown: bool) -> list[Job]:
-    """What is to be trained, filmed or packed for somebody who has given all labels. ``reward``: their last model's.
-
-    Whoever has been shown robots rates those: other ones, learned without an excluded answer, would be for nobody.
-    """
-    if str(reward) not in succeeded:
-        return []
-    jobs = [] if robots_shown else baselines.due(study, reward)
-    if str(replace(reward, kind=RunKind.FILTER)) in succeeded:
-        jobs += evaluation_films.due(study, reward, succeeded, robots_shown)
+            jobs += due_evaluation.due(study, reward, succeeded, participant_id in begun)
     return jobs

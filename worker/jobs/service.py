@@ -25,7 +25,7 @@ from app.storage import ArtefactMissing, ArtefactStore, keep_private
 from worker.compute import learning, simulation
 from worker.compute.pools import Compute, ComputeLost, Interrupted, Lane
 from worker.jobs import reconcile
-from worker.jobs.learning import query_selection, reference_rollouts
+from worker.jobs.learning import query_selection
 from worker.jobs.runtime import engine, records
 from worker.jobs.runtime.context import WorkerContext
 from worker.jobs.runtime.lanes import Lanes
@@ -205,6 +205,8 @@ class _Rounds:
 
     def _make_references(self, task: str, settings: StudySettings) -> None:
         """What the first filter would otherwise wait for."""
+        from worker.jobs.learning import reference_rollouts  # seconds, for which nothing else shall wait
+
         try:
             reference_rollouts.make_ready(self._context.compute, self._context.references, task, settings)
         except Interrupted:

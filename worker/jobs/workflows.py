@@ -8,6 +8,8 @@ import errno
 import logging
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
+from pkgutil import resolve_name
 from typing import Any
 
 from dbos import DBOS, DBOSConfiguredInstance
@@ -22,12 +24,6 @@ from app.domain.studies import Participant, Study
 from app.errors import AppError
 from app.files.interface import StorageUnavailable
 from app.services.participants import withdrawal
-from worker.jobs.clips.evaluation_films import make_films
-from worker.jobs.clips.pool_clips import build_clips
-from worker.jobs.learning.baselines import train_method
-from worker.jobs.learning.filters import train_filter
-from worker.jobs.learning.reward_models import train_reward
-from worker.jobs.publishing import export_files, report_files
 from worker.jobs.runtime import records
 from worker.jobs.runtime.context import Step, WorkerContext
 from worker.jobs.runtime.lanes import Lanes
@@ -38,14 +34,25 @@ log = logging.getLogger("worker")
 FALLS_ALLOWED = 5
 """How often a worker may fall in the middle of an attempt before that has failed."""
 
-_BODIES: dict[RunKind, Callable[[WorkerContext, Job, int, Step], None]] = {
-    RunKind.CLIPS: build_clips,
-    RunKind.REWARD: train_reward,
-    RunKind.FILTER: train_filter,
-    RunKind.METHOD: train_method,
-    RunKind.FILMS: make_films,
-    RunKind.REPORT: report_files.make,
-    RunKind.EXPORT: export_files.make,
+
+@dataclass(frozen=True)
+class Imported:
+    """A function that is imported when it is first called: together they take seconds to load."""
+
+    name: str
+
+    def __call__(self, context: WorkerContext, job: Job, run_id: int, step: Step) -> None:
+        resolve_name(self.name)(context, job, run_id, step)
+
+
+BODIES: dict[RunKind, Callable[[WorkerContext, Job, int, Step], None]] = {
+    RunKind.CLIPS: Imported("worker.jobs.clips.pool_clips:build_clips"),
+    RunKind.REWARD: Imported("worker.jobs.learning.reward_models:train_reward"),
+    RunKind.FILTER: Imported("worker.jobs.learning.filters:train_filter"),
+    RunKind.METHOD: Imported("worker.jobs.learning.baselines:train_method"),
+    RunKind.FILMS: Imported("worker.jobs.clips.evaluation_films:make_films"),
+    RunKind.REPORT: Imported("worker.jobs.publishing.report_files:make"),
+    RunKind.EXPORT: Imported("worker.jobs.publishing.export_files:make"),
 }
 
 
@@ -85,7 +92,7 @@ class JobRunner(DBOSConfiguredInstance):
             if run_id is None:
                 return
             context = self.context.noting(self.stored.setdefault(job.key, set())).computing(self.lanes.of(job))
-            _BODIES[RunKind(job.kind)](context, job, run_id, _step)
+            BODIES[RunKind(job.kind)](context, job, run_id, _step)
             _step("finish", self._finish, run_id)
             self.stored.pop(job.key, None)
             log.info("%s done in %.1f s", job.key, time.monotonic() - started)

@@ -7,7 +7,7 @@ from worker.compute import shared_reward
 from worker.compute.simulation import reference_rollouts
 from worker.ml.rewards.loading import load_reward_model
 from worker.ml.rewards.reward_models import StructuredReward
-from worker.ml.rewards.reward_training import SignalScale
+from worker.ml.rewards.signal_scale import SignalScale
 from worker.ml.teachers import OMEGA, User
 from worker.sim.costs import preference_rewards
 from worker.tasks import registry

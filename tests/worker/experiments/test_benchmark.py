@@ -6,8 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from worker import cli, options
+from worker import cli
 from worker.analysis.comparison import compared
+from worker.commands import options
 from worker.experiments import benchmark, benchmark_cell
 from worker.experiments.benchmark import PROFILES, Selection
 from worker.experiments.benchmark_cell import OPPOSED_USERS, PAPER_USERS, BenchmarkConfig, Cell

@@ -62,7 +62,7 @@ class Work:
 @pytest.fixture
 def work(monkeypatch: pytest.MonkeyPatch) -> Work:
     work = Work()
-    monkeypatch.setitem(workflows._BODIES, RunKind.FILTER, work)
+    monkeypatch.setitem(workflows.BODIES, RunKind.FILTER, work)
     return work
 
 

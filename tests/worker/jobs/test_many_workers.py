@@ -58,7 +58,7 @@ def test_a_job_whose_files_cannot_be_reached_is_tried_again_for_as_long_as_it_ta
         with database.reading() as session:
             return session.scalar(select(Run).where(Run.status == RunStatus.FAILED))
 
-    monkeypatch.setitem(workflows._BODIES, RunKind.FILTER, unreachable)
+    monkeypatch.setitem(workflows.BODIES, RunKind.FILTER, unreachable)
     start(runner, job)
     assert until(lambda: failed() is not None)
     run = failed()
@@ -81,7 +81,7 @@ def test_what_was_made_for_somebody_whom_another_worker_has_erased_is_removed(
         context.store.put(b"a result that comes late")
         context.report(run_id, "nearly done", 0.9)
 
-    monkeypatch.setitem(workflows._BODIES, RunKind.FILTER, late)
+    monkeypatch.setitem(workflows.BODIES, RunKind.FILTER, late)
     start(runner, job)
     assert at_work.wait(PATIENCE_S)
     with database.writing() as session:  # as the other worker does, which has nothing of this in hand

@@ -71,7 +71,7 @@ def test_a_training_without_enough_memory_fails_with_advice_and_its_neighbour_su
         with database.reading() as session:
             return dict(session.execute(select(Run.workflow_id, Run.status)).all())
 
-    monkeypatch.setitem(workflows._BODIES, RunKind.FILTER, work)
+    monkeypatch.setitem(workflows.BODIES, RunKind.FILTER, work)
     jobs = [job_of(f"filter/participant-{participant.id}/labels-{count}", participant.study_id) for count in (10, 20)]
     for job in jobs:
         with SetWorkflowID(f"{job.key}#1"):

@@ -11,9 +11,10 @@ import pytest
 import torch
 
 from tests.worker import invented
+from worker.compute import learning
 from worker.ml.filters import response_surface
 from worker.ml.filters.filter_module import load_state
-from worker.ml.filters.filter_problem import FilterConfig, FilterProblem, noisy
+from worker.ml.filters.filter_problem import FilterConfig, FilterProblem
 from worker.ml.filters.fitted_q import ActionValue
 from worker.ml.methods import pbrl_hri, preference_rl, prefft, registry
 from worker.ml.methods.best_of_n import BestOfN, fit_best_of_n
@@ -52,7 +53,7 @@ class World(gymnasium.Env[Any, Any]):
 
 def collect(act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
     """See filter_problem.Collect; the same world."""
-    return [_episode(noisy(act, noise, seed, scenario), scenario) for scenario in scenarios]
+    return [_episode(learning.noisy(act, noise, seed, scenario), scenario) for scenario in scenarios]
 
 
 def _episode(act: Act, scenario: int) -> Trajectory:

@@ -9,9 +9,10 @@ import pytest
 import torch
 
 from tests.worker import invented
+from worker.compute import learning
 from worker.ml.filters import mode_search, pbarl, residual, response_surface
 from worker.ml.filters.filter_module import FilterWeights
-from worker.ml.filters.filter_problem import FilterConfig, FilterDraft, FilterProblem, act_of, noisy
+from worker.ml.filters.filter_problem import FilterConfig, FilterDraft, FilterProblem, act_of
 from worker.ml.filters.residual import learn_round
 from worker.ml.filters.response_surface import ResponseSurface
 from worker.ml.rewards.reward_models import StructuredReward
@@ -44,7 +45,7 @@ class World:
     def collect(self, act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
         """See filter_problem.Collect."""
         self.asked.append(len(scenarios))
-        return [self._episode(noisy(act, noise, seed, scenario), scenario) for scenario in scenarios]
+        return [self._episode(learning.noisy(act, noise, seed, scenario), scenario) for scenario in scenarios]
 
     def _episode(self, act: Act, scenario: int) -> Trajectory:
         rng = np.random.default_rng(scenario)

@@ -7,13 +7,14 @@ import pytest
 import torch
 
 from tests.worker import invented
-from worker.ml.rewards import bradley_terry, reward_training
+from worker.ml.rewards import bradley_terry, preference_loss, reward_training
 from worker.ml.rewards.loading import load_reward_model
 from worker.ml.rewards.network_training import MlpTraining, TransformerTraining
 from worker.ml.rewards.pooled_prior import DEVIATION
 from worker.ml.rewards.reward_models import CLIP, RewardModel, StructuredReward, stored_config
-from worker.ml.rewards.reward_training import SignalScale, fit, posterior
+from worker.ml.rewards.reward_training import fit, posterior
 from worker.ml.rewards.segments import SegmentPairs
+from worker.ml.rewards.signal_scale import SignalScale
 from worker.trajectory import SIGNALS
 
 KINDS: tuple[reward_training.RewardKind, ...] = ("structured", "predicted", "mlp", "preference_transformer")
@@ -53,14 +54,14 @@ def test_the_probability_is_the_softmax_of_the_returns_as_in_equation_1() -> Non
 
 def test_an_equal_answer_is_served_best_by_equal_returns() -> None:
     target = torch.tensor([0.5])
-    losses = [float(bradley_terry.preference_loss(torch.tensor([logit]), target)) for logit in (-1.0, 0.0, 1.0)]
+    losses = [float(preference_loss.preference_loss(torch.tensor([logit]), target)) for logit in (-1.0, 0.0, 1.0)]
     assert losses[1] < losses[0] == pytest.approx(losses[2])
 
 
 def test_equation_2_as_printed_learns_the_reversed_preference() -> None:
     """y = 1 means right was preferred: the right form raises the return of right, the printed one that of left."""
     learned = []
-    for loss in (bradley_terry.preference_loss, bradley_terry.preference_loss_as_printed):
+    for loss in (preference_loss.preference_loss, preference_loss.preference_loss_as_printed):
         logit = torch.zeros(1, requires_grad=True)
         loss(logit, torch.ones(1)).backward()  # type: ignore[no-untyped-call]
         assert logit.grad is not None

@@ -18,9 +18,9 @@ from worker.ml.rewards.action_ranking import ranker_at
 from worker.ml.rewards.loading import load_reward_model
 from worker.ml.rewards.predicted_reward import PredictedReward
 from worker.ml.rewards.reward_models import StructuredReward
-from worker.ml.rewards.reward_training import SignalScale
 from worker.ml.rewards.segments import SegmentPairs
 from worker.ml.rewards.signal_predictor import UNSENSED, SignalPredictor
+from worker.ml.rewards.signal_scale import SignalScale
 from worker.ml.rewards.signal_training import PredictorTraining
 from worker.sim.rollout import rollout
 from worker.trajectory import SIGNALS, Trajectory

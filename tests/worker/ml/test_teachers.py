@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from worker import cli
+from worker.commands import rehearsing
 from worker.ml.teachers import OMEGA, TASTES, Manner, ScriptedTeacher, Taste, User, random_taste, segment_returns
 
 FAULTLESS = Manner(mistakes=0.0, equal_share=0.0)
@@ -126,7 +127,7 @@ def test_people_of_the_population_differ_and_come_back_with_their_seed() -> None
 
 def test_a_rehearsal_takes_names_and_weights_and_the_paper_s_three_when_nobody_is_named() -> None:
     def tastes(*words: str) -> list[str]:
-        return [taste.name for taste in cli._tastes(cli.parser().parse_args(["rehearse", *words]))]
+        return [taste.name for taste in rehearsing._tastes(cli.parser().parse_args(["rehearse", *words]))]
 
     assert tastes() == ["neutral", "cautious", "impatient"]
     assert tastes("--users", "wide", "shy=1,3,2,2,1,1") == ["wide", "shy"]
@@ -137,6 +138,6 @@ def test_a_rehearsal_takes_names_and_weights_and_the_paper_s_three_when_nobody_i
 def test_a_rehearsal_can_use_any_reward_model_and_manner() -> None:
     words = "rehearse --reward preference_transformer --rationality 2 --myopia 0.9 --mistakes 0.1 --pooled-prior"
     options = cli.parser().parse_args(words.split())
-    assert cli._manner(options) == Manner(2.0, 0.9, 0.1, 0.10, 0.02)
-    assert cli._settings(options).reward_kind == "preference_transformer"
-    assert cli._settings(options).pooled_prior
+    assert rehearsing._manner(options) == Manner(2.0, 0.9, 0.1, 0.10, 0.02)
+    assert rehearsing._settings(options).reward_kind == "preference_transformer"
+    assert rehearsing._settings(options).pooled_prior

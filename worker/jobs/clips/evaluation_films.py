@@ -4,17 +4,16 @@ Three kinds of runs: ``before-after`` (the participant's robot beside the refere
 ``trials`` (everything that is rated in video mode), ``controllers`` (one file per letter in physical mode).
 """
 
-from collections.abc import Collection
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from app.domain.evaluation import Controller, Film, Trial
-from app.domain.models import Model, ModelKind, RunKind
-from app.domain.protocol import EvaluatedMethod, EvaluationMode
-from app.domain.run_keys import BEFORE_AFTER, CONTROLLERS, TRIALS, RunKey
+from app.domain.models import Model, ModelKind
+from app.domain.protocol import EvaluatedMethod
+from app.domain.run_keys import BEFORE_AFTER, CONTROLLERS, TRIALS
 from app.domain.studies import Participant, Study
 from app.services.evaluation import evaluation_plan
 from worker.compute import baseline_fitting, simulation
@@ -22,7 +21,6 @@ from worker.compute.pools import Lane
 from worker.compute.simulation import RecordedClip
 from worker.jobs.clips import repairs
 from worker.jobs.clips.stored_video import video_columns
-from worker.jobs.learning import baselines
 from worker.jobs.learning.filters import NothingToLearnFrom
 from worker.jobs.learning.lent_filters import LoanEnded
 from worker.jobs.runtime import due_work, records
@@ -40,21 +38,6 @@ class ShownRobot:
     method: str
     model_id: int | None
     controller: bytes
-
-
-def due(study: Study, reward: RunKey, succeeded: Collection[str], robots_shown: bool = False) -> list[Job]:
-    """What is to be filmed or packed for somebody whose last filter is there. ``reward``: their last model's.
-
-    ``robots_shown``: they have begun to rate, so that what they rate stays.
-    """
-    wanted = [BEFORE_AFTER] if study.material is None else []
-    settings = None if robots_shown else evaluation_plan.settings_of(study)
-    if settings and baselines.all_trained(study, reward, succeeded):
-        wanted.append(TRIALS if settings.mode is EvaluationMode.VIDEO else CONTROLLERS)
-    return [
-        Job(replace(reward, kind=RunKind.FILMS, subject=what), study.id)
-        for what in reversed(wanted)  # the debrief comes last
-    ]
 
 
 def make_films(context: WorkerContext, job: Job, run_id: int, step: Step) -> None:
@@ -128,8 +111,8 @@ def _newest_model(session: Session, participant_id: int, method: str) -> int | N
         own = records.newest_model(session, participant_id, ModelKind.FILTER)
         found = None if own is None else own.id
     else:
-        baseline = baselines.newest(session, participant_id, method)
-        found = None if baseline is None else baseline[0]
+        trained = records.models_of(session, participant_id, ModelKind.METHOD)
+        found = next((model.id for model in trained if model.metrics.get("method") == method), None)
     if found is None:
         raise NothingToLearnFrom
     return found

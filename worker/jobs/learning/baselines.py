@@ -7,17 +7,13 @@ participant's, so a killed worker goes on where it was; the folder is removed at
 """
 
 import time
-from collections.abc import Callable, Collection
-from dataclasses import replace
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy.orm import Session
-
 from app.domain.choices import RewardKind
-from app.domain.models import ModelKind, RunKind
+from app.domain.models import ModelKind
 from app.domain.protocol import FROM_OTHERS, EvaluatedMethod
-from app.domain.run_keys import RunKey
 from app.domain.studies import Participant, Study
 from app.services.evaluation import evaluation_plan
 from app.services.participants import withdrawal
@@ -40,21 +36,6 @@ CHUNK = 10
 """Unseen scenarios between two signs of life."""
 TRAINING_SHARE = 0.9
 """Of the progress; the rest is the drive through unseen scenarios."""
-
-
-def due(study: Study, reward: RunKey) -> list[Job]:
-    """What is to be trained for somebody whose last reward model, that of ``reward``, is there."""
-    settings = evaluation_plan.settings_of(study)
-    return [
-        Job(replace(reward, kind=RunKind.METHOD, subject=method), study.id)
-        for method in (settings.methods if settings else ())
-        if method in evaluation_plan.TRAINED
-    ]
-
-
-def all_trained(study: Study, reward: RunKey, succeeded: Collection[str]) -> bool:
-    """Whether everything that is due has been done."""
-    return all(job.key in succeeded for job in due(study, reward))
 
 
 def train_method(context: WorkerContext, job: Job, run_id: int, step: Step) -> None:
@@ -214,14 +195,6 @@ def _reference(context: WorkerContext, task: str, scenarios: range, beat: Callab
         model = baseline_fitting.controller_of_reference(task)
         context.references[key] = _driven(context, task, model, scenarios, lambda share: beat)
     return context.references[key]
-
-
-def newest(session: Session, participant_id: int, method: str) -> tuple[int, str] | None:
-    """Id and artefact of the participant's newest model of this method; None while there is none."""
-    for model in records.models_of(session, participant_id, ModelKind.METHOD):
-        if model.metrics.get("method") == method:
-            return model.id, model.artefact_sha256
-    return None
 
 
 def _folder(context: WorkerContext, job: Job, run_id: int) -> Path:

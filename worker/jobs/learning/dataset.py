@@ -18,8 +18,8 @@ from app.errors import AppError
 from app.files.interface import Files
 from app.storage import ArtefactStore
 from worker.ml import acquisition
-from worker.ml.rewards.reward_training import SignalScale
 from worker.ml.rewards.segments import SegmentPairs, Stretch
+from worker.ml.rewards.signal_scale import SignalScale
 from worker.responses import TARGETS
 from worker.tasks import registry
 from worker.trajectory import OutdatedTrajectory, Recorded, Recording, Trajectory

@@ -6,7 +6,8 @@ the simulation:
     collect(act, scenarios, noise, seed) -> one Trajectory per scenario, in order
 
 with act(observation (D,)) -> action (7,), and ``noise`` the standard deviation of Gaussian noise added to every action
-(0 for evaluations; see noisy()). Acts can be pickled, so that collect may spread the scenarios over processes.
+(0 for evaluations; see worker.compute.learning.noisy()). Acts can be pickled, so that collect may spread the scenarios
+over processes.
 """
 
 import time
@@ -160,19 +161,6 @@ class FilterAct:
         """(D,) -> (7,)"""
         mean = self.policy.mean(observation)
         return mean + np.float32(self.gate) * (self.exported(observation, mean) - mean)
-
-
-def noisy(act: Act, noise: float, seed: int, scenario: int) -> Act:
-    """The same with Gaussian noise, drawn independently for every scenario: for implementations of ``collect``."""
-    if noise == 0.0:
-        return act
-    rng = np.random.default_rng([seed, scenario])
-
-    def act_with_noise(observation: Float32Array) -> Float32Array:
-        action = act(observation)
-        return action + noise * rng.standard_normal(action.shape, np.float32)
-
-    return act_with_noise
 
 
 def trace(family: ModeFamily, policy: ReferencePolicy) -> None:

@@ -16,8 +16,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from worker.ml.rewards import preference_transformer
-from worker.ml.rewards.bradley_terry import preference_loss
 from worker.ml.rewards.calibration import HeldOut
+from worker.ml.rewards.preference_loss import preference_loss
 from worker.ml.rewards.preference_transformer import PreferenceTransformer
 from worker.ml.rewards.reward_models import MlpReward, RewardModel
 from worker.ml.rewards.segments import LEFT, RIGHT, SegmentPairs

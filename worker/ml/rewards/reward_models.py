@@ -24,6 +24,11 @@ from worker.ml.rewards.segments import LEFT, RIGHT, SegmentPairs
 from worker.trajectory import Recorded, Trajectory
 from worker.type_aliases import Float32Array, FloatArray
 
+UNDONE = "undelivered"
+NEVER_WANTED = (UNDONE, "spilled", "spilled_on_person", "high_force_n", "force_away_n", "action_change_squared")
+"""Signals that nobody wants more of. Their weights are never positive: that the task gets done takes longer than a
+clip, and slow clips, which show less of it done, must not be read as a wish that it is not done. What is rare in clips
+or about the same in all, like jerks and touches in passing, would else be liked by chance, and then sought."""
 CLIP = 8.0
 """Normalised step rewards are cut here: one broken step must not decide an episode."""
 _SMALLEST_SCALE = 1e-6

@@ -15,9 +15,10 @@ from worker.ml.rewards.calibration import HeldOut
 from worker.ml.rewards.network_training import MlpTraining, TransformerTraining, fit_mlp, fit_transformer
 from worker.ml.rewards.pooled_prior import Prior
 from worker.ml.rewards.predicted_reward import PredictedReward
-from worker.ml.rewards.reward_models import Normalisation, RewardModel, StructuredReward
+from worker.ml.rewards.reward_models import NEVER_WANTED, UNDONE, Normalisation, RewardModel, StructuredReward
 from worker.ml.rewards.segments import SegmentPairs
 from worker.ml.rewards.signal_predictor import SignalPredictor
+from worker.ml.rewards.signal_scale import SignalScale
 from worker.trajectory import SIGNALS, Trajectory
 from worker.type_aliases import FloatArray
 
@@ -27,16 +28,8 @@ MEMBERS = 8
 LARGEST_GRADIENT = 1e-6
 """At what counts as the posterior's mode."""
 CALIBRATION_FOLDS = 5
-OUTLIER_SHARE = 0.01
-"""Of the mean signals at either end: the single wildest clip does not say what is usual."""
-UNDONE = "undelivered"
-NEVER_WANTED = (UNDONE, "spilled", "spilled_on_person", "high_force_n", "force_away_n", "action_change_squared")
-"""Signals that nobody wants more of. Their weights are never positive: that the task gets done takes longer than a
-clip, and slow clips, which show less of it done, must not be read as a wish that it is not done. What is rare in clips
-or about the same in all, like jerks and touches in passing, would else be liked by chance, and then sought."""
 _PINNED = 1e6
 """Prior precision of a weight that is held at 0."""
-_SMALLEST_SPREAD = 1e-6
 
 
 @dataclass(frozen=True)
@@ -45,35 +38,6 @@ class FitResult:
 
     model: RewardModel
     metrics: dict[str, Any]
-
-
-@dataclass(frozen=True)
-class SignalScale:
-    """What the signals are like in the clips of a pool."""
-
-    spread: FloatArray
-    """(S,) root mean square of the summed differences of a pair; a column that never differs has 1"""
-    least_per_step: FloatArray
-    most_per_step: FloatArray
-    """(S,) the smallest and the largest mean of each signal over the steps of one clip or episode, outliers excepted"""
-
-    @classmethod
-    def of(cls, pairs: SegmentPairs, episode_means: npt.ArrayLike = ()) -> "SignalScale":
-        """From pairs like those that are asked, and the mean signals of whole episodes like those behind them, (N, S).
-
-        Both count as shown: an episode goes on after its clip, most often with less motion.
-        """
-        shown = pairs.shown[..., None]
-        width = pairs.signals.shape[-1]
-        means = pairs.signals.mean(axis=2, dtype=np.float64, where=shown).reshape(-1, width)
-        bounds = [_usual(each) for each in (means, np.reshape(episode_means, (-1, width))) if len(each)]
-        least, most = np.min([low for low, _ in bounds], axis=0), np.max([high for _, high in bounds], axis=0)
-        return cls(_spread_of(pairs.signal_differences()), least, most)
-
-
-def _usual(means: FloatArray) -> tuple[FloatArray, FloatArray]:
-    low, high = np.quantile(means, [OUTLIER_SHARE, 1.0 - OUTLIER_SHARE], axis=0)
-    return low, high
 
 
 def fit(
@@ -136,11 +100,6 @@ def _wider(measured: SignalScale, foreseen: SegmentPairs) -> SignalScale:
     """What hardly ever differs in a pool may be foreseen to differ: errors must not be blown up to standard size."""
     differences = np.sqrt((foreseen.signal_differences() ** 2).mean(axis=0))
     return replace(measured, spread=np.maximum(measured.spread, differences))
-
-
-def _spread_of(differences: FloatArray) -> FloatArray:
-    spread = np.sqrt((differences**2).mean(axis=0))
-    return np.where(spread > _SMALLEST_SPREAD, spread, 1.0)
 
 
 def _checked(pairs: SegmentPairs, targets: npt.ArrayLike) -> FloatArray:

@@ -1,0 +1,1 @@
+"""What the worker can be told, by subject."""

@@ -1,0 +1,18 @@
+"""Arguments that several commands have."""
+
+import argparse
+from typing import TypeAlias
+
+from app.installed_tasks import catalogue
+
+Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
+
+
+def add_processes(command: argparse.ArgumentParser) -> None:
+    """Add ``--processes``."""
+    command.add_argument("--processes", type=int, default=2)
+
+
+def add_task(command: argparse.ArgumentParser) -> None:
+    """Add ``--task``: one of those installed."""
+    command.add_argument("--task", choices=catalogue.names(), default=catalogue.usual())

@@ -1,0 +1,73 @@
+"""Every method for every user of every task, compared."""
+
+import argparse
+import sys
+from pathlib import Path
+
+from app.installed_tasks import catalogue
+from app.settings import Settings
+from worker.commands import options
+from worker.commands.arguments import Commands, add_processes
+from worker.experiments import benchmark
+from worker.experiments.benchmark_cell import INDIRECT_USERS, OPPOSED_USERS
+from worker.ml.methods.registry import METHODS
+
+OF_TERMS: options.Table = {
+    "labels": ("--labels", "the paper's offline training has 5000"),
+    "scenarios": ("--scenarios", "unseen ones"),
+    "reward": ("--reward", "the model that is learned from the labels"),
+    "rule": ("--rule", "which pairs are asked"),
+    "form": ("--form", "of the costs"),
+    "manner.mistakes": ("--mistakes", "share of answers that say the opposite"),
+    "manner.rationality": ("--rationality", "beta per spread of returns; without it users name the better clip"),
+    "methods.fine_tuning.steps": ("--prefft-steps", "environment steps of PrefFT, as in the paper"),
+    "methods.from_scratch.steps": ("--pbrl-steps", "environment steps of PbRL-HRI"),
+    "methods.printed_steps": ("--printed-steps", "gradient steps of the printed method"),
+}
+
+
+def add(commands: Commands) -> None:
+    """Add ``benchmark``."""
+    usual = benchmark.Selection()
+    command = commands.add_parser("benchmark", help=benchmark.__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    command.add_argument("--profile", choices=list(benchmark.PROFILES), default="full")
+    command.add_argument("--methods", nargs="+", choices=list(METHODS), default=list(usual.methods))
+    command.add_argument("--tasks", nargs="+", choices=catalogue.names(), default=list(usual.tasks))
+    command.add_argument(
+        "--users",
+        nargs="+",
+        type=options.taste,
+        default=list(usual.tastes),
+        help="names, or NAME=six weights and costs per signal: shy=1,3,2,2,1,1 or level=1,1,1,1,1,1,tilt_rad:0.3",
+    )
+    command.add_argument("--opposed", action="store_true", help="also the six users who truly differ")
+    command.add_argument(
+        "--indirect", action="store_true", help="also three users whose taste no mode axis moves directly"
+    )
+    command.add_argument("--population", type=int, default=0, help="also so many users drawn at random")
+    command.add_argument("--seeds", type=int, default=usual.seeds)
+    options.add(command, OF_TERMS, benchmark.PROFILES["full"], only_said=True)
+    add_processes(command)
+    command.add_argument(
+        "--work-directory", type=Path, help="finished cells; default: benchmark/ in the data directory"
+    )
+    command.add_argument(
+        "--output", type=Path, help="tables; default: docs/results/all_methods, or inside the work directory if quick"
+    )
+    command.add_argument("--report-only", action="store_true", help="run nothing, write the tables from what there is")
+    command.set_defaults(act=_benchmark)
+
+
+def _benchmark(said: argparse.Namespace) -> int:
+    terms = options.filled(benchmark.PROFILES[said.profile], OF_TERMS, said)
+    others = [
+        *(OPPOSED_USERS.values() if said.opposed else ()),
+        *(INDIRECT_USERS.values() if said.indirect else ()),
+        *benchmark.population(said.population),
+    ]
+    tastes = {taste.name: taste for taste in [*said.users, *others]}
+    selection = benchmark.Selection(said.methods, said.tasks, tuple(tastes.values()), said.seeds)
+    work = said.work_directory or Settings().data_dir / "benchmark"
+    output = said.output or (work / "quick" if said.profile == "quick" else Path("docs/results/all_methods"))
+    command = "python -m worker " + " ".join(sys.argv[1:] or ["benchmark"])
+    return benchmark.benchmark(selection, terms, work, output, said.processes, command, not said.report_only)

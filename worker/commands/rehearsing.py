@@ -1,0 +1,128 @@
+"""Studies with scripted participants: rehearsals, and the demo study that is shipped."""
+
+import argparse
+import sys
+import tempfile
+from pathlib import Path
+
+from app.db import Database
+from app.domain.choices import ClipQuality, Strategy
+from app.domain.protocol import EvaluationSettings
+from app.domain.study_settings import PAPER_PROTOCOL, StudySettings
+from app.services.archives import demo_archive
+from app.storage import ArtefactStore
+from worker.commands import options
+from worker.commands.arguments import Commands, add_task
+from worker.experiments.benchmark_cell import PAPER_USERS
+from worker.ml.teachers import Manner, Taste
+from worker.rehearsal import demo_study, rehearsal
+from worker.rehearsal.server import OwnStudio
+
+OF_SETTINGS: options.Table = {
+    "labels_per_participant": ("--labels", "labels per participant"),
+    "retrain_every_labels": ("--retrain-every", "labels between two reward models"),
+    "filter_milestones": ("--milestones", "labels after which a filter is trained early"),
+    "method": ("--method", "how the filter is trained"),
+    "reward_kind": ("--reward", "the model that is learned from the labels"),
+    "strategy": ("--strategy", "which pairs are asked"),
+    "pooled_prior": ("--pooled-prior", "start from those who finished before"),
+}
+OF_EVALUATION: options.Table = {
+    "methods": ("--methods", "to be rated, with --paper"),
+    "trials": ("--trials", "of each method, with --paper"),
+    "fine_tuning_steps": ("--fine-tuning-steps", "of PrefFT, with --paper"),
+}
+OF_MANNER: options.Table = {
+    "rationality": ("--rationality", "log odds per typical difference; without it no doubt at all"),
+    "myopia": ("--myopia", "below 1 the end of a clip weighs more"),
+    "mistakes": ("--mistakes", "share of answers that say the opposite"),
+    "equal_share": ("--equal", "share of pairs that are called equal"),
+    "skip_share": ("--skip", "share of pairs called can't tell"),
+}
+
+
+def add(commands: Commands) -> None:
+    """Add ``rehearse`` and ``demo-study``."""
+    _add_rehearsal(commands)
+    _add_demo_study(commands)
+
+
+def _add_rehearsal(commands: Commands) -> None:
+    rehearse = commands.add_parser("rehearse", help=_rehearse.__doc__)
+    add_task(rehearse)
+    rehearse.add_argument(
+        "--users",
+        nargs="+",
+        type=options.taste,
+        default=[],
+        help="names, or NAME=six weights; default: the paper's three",
+    )
+    rehearse.add_argument(
+        "--omega", nargs=6, type=float, action="append", default=[], help="somebody with these six weights; repeatable"
+    )
+    rehearse.add_argument("--paper", action="store_true", help="the paper's whole protocol, robots rated in the end")
+    options.add(rehearse, OF_SETTINGS, StudySettings(strategy=Strategy.UNIFORM))
+    options.add(rehearse, OF_EVALUATION, EvaluationSettings())
+    rehearse.add_argument("--clip-scenarios", type=int, help="size of the pool; default: just enough pairs")
+    options.add(rehearse, OF_MANNER, Manner(skip_share=0.02))  # so that skipping is rehearsed as well
+    rehearse.add_argument("--pace", type=float, default=0.0, help="seconds of thought per pair")
+    rehearse.add_argument("--seed", type=int, default=0)
+    rehearse.add_argument("--directory", type=Path, help="keep everything here; default: a temporary directory")
+    rehearse.set_defaults(act=_rehearse)
+
+
+def _add_demo_study(commands: Commands) -> None:
+    command = commands.add_parser("demo-study", help=demo_study.__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    command.add_argument(
+        "--output", type=Path, default=demo_archive.ARCHIVE, help="the archive; default: what is shipped"
+    )
+    command.add_argument("--seed", type=int, default=demo_study.SEED)
+    command.set_defaults(act=_make_demo_study)
+
+
+def _rehearse(said: argparse.Namespace) -> int:
+    """Send scripted participants through the real pages and print what came out."""
+    settings = _settings(said)
+    with tempfile.TemporaryDirectory(prefix="rehearsal-") as temporary:
+        directory = said.directory or Path(temporary)
+        with OwnStudio(directory) as studio:
+            database = Database(studio.settings.sqlalchemy_url)
+            store = ArtefactStore(directory / "artefacts")
+            rehearsed = rehearsal.Rehearsal(database, store, studio.settings.base_url, said.pace)
+            done = rehearsed.run(said.task, _tastes(said), settings, _manner(said), said.seed)
+            database.dispose()
+        rehearsal.write(done, directory / "rehearsed")
+        sys.stdout.write(rehearsal.summary(done) + "\n")
+        if said.directory:
+            sys.stdout.write(f"Figures, tables, bundles and numbers are in {directory / 'rehearsed'}\n")
+    return 0
+
+
+def _make_demo_study(said: argparse.Namespace) -> int:
+    with tempfile.TemporaryDirectory(prefix="demo-study-") as directory:
+        rehearsed = demo_study.make(said.output, Path(directory), said.seed)
+    sys.stdout.write(rehearsal.summary(rehearsed) + "\n")
+    sys.stdout.write(f"{said.output}: {said.output.stat().st_size / 1e6:.1f} MB\n")
+    return 0
+
+
+def _tastes(said: argparse.Namespace) -> list[Taste]:
+    """Whoever was asked for; the paper's three when nobody was."""
+    own = [Taste.of_omega(omega) for omega in said.omega]
+    return [*said.users, *own] or list(PAPER_USERS.values())
+
+
+def _manner(said: argparse.Namespace) -> Manner:
+    return options.filled(Manner(), OF_MANNER, said)
+
+
+def _settings(said: argparse.Namespace) -> StudySettings:
+    chosen = {name: getattr(said, name) for name in OF_SETTINGS}
+    chosen["clip_quality"] = ClipQuality.QUICK  # nobody looks at them
+    enough = -(-said.labels_per_participant // StudySettings().pairs_per_scenario)
+    chosen["pool_scenarios"] = said.clip_scenarios or enough
+    if not said.paper:
+        return StudySettings(**chosen)
+    chosen["introduction_pairs"] = min(PAPER_PROTOCOL.introduction_pairs, said.labels_per_participant)
+    chosen["evaluation"] = EvaluationSettings(**{name: getattr(said, name) for name in OF_EVALUATION})
+    return StudySettings(**{**PAPER_PROTOCOL.model_dump(), **chosen})
