@@ -24,7 +24,7 @@ def test_the_web_server_loads_nothing_of_the_learning_stack() -> None:
 
 
 def test_the_worker_starts_without_the_learning_stack() -> None:
-    """Whoever starts it waits for less, and it stays small until somebody has answered; then it is loaded on the way."""
+    """Whoever starts it waits for less; what learns is loaded once somebody has answered."""
     heavy = ("torch", "scipy", "matplotlib", "pandas", "onnxruntime")
     code = f"import sys, worker.commands.service; print([name for name in {heavy!r} if name in sys.modules])"
     assert python(code) == "[]"
