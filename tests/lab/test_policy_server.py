@@ -26,7 +26,14 @@ def _as_a_new_process() -> Iterator[None]:
 
 def behind(folder: Path, url: str, more: str = "") -> Path:
     """The plane, with its policy at this address."""
-    text = (folder / "lab.toml").read_text().replace("[instructions]", "[modes]\nleave_out = [\"smooth\", \"hesitate\", \"push_x\", \"push_y\", \"speed_near\"]\n[instructions]")
+    text = (
+        (folder / "lab.toml")
+        .read_text()
+        .replace(
+            "[instructions]",
+            '[modes]\nleave_out = ["smooth", "hesitate", "push_x", "push_y", "speed_near"]\n[instructions]',
+        )
+    )
     (folder / "lab.toml").write_text(text.replace('file = "policy.onnx"', f'url = "{url}"\nanswer_s = 0.3\n{more}'))
     return folder
 

@@ -77,7 +77,9 @@ def checked(file: Path, sheet: Path) -> Checked:
             environment.close()
 
 
-def _run(described: LabDescription, environment: LabEnvironment, policy: OnnxPolicy | RemotePolicy, sheet: Path) -> Checked:
+def _run(
+    described: LabDescription, environment: LabEnvironment, policy: OnnxPolicy | RemotePolicy, sheet: Path
+) -> Checked:
     shown = set(np.linspace(0, described.episode_steps - 1, PICTURES).round().astype(int).tolist())
     rows: list[list[Picture]] = []
     trajectories, seconds = [], []

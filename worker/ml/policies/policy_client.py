@@ -9,14 +9,10 @@ from collections.abc import Mapping
 from contextlib import ExitStack
 from typing import Any
 
+import msgpack
 import numpy as np
-
-try:
-    import msgpack
-    from websockets.exceptions import InvalidHandshake, InvalidURI, WebSocketException
-    from websockets.sync.client import ClientConnection, connect
-except ImportError as missing:
-    raise ImportError(f"{missing}. Install what it needs with: python -m pip install websockets msgpack") from missing
+from websockets.exceptions import InvalidHandshake, InvalidURI, WebSocketException
+from websockets.sync.client import ClientConnection, connect
 
 LARGEST_BYTES = 64 << 20
 MOST_ACTIONS = 10_000
@@ -123,7 +119,9 @@ class PolicyServer:
             ) from error
         except ValueError as error:
             self.close()
-            raise PolicyServerFailed(f"the policy server at {self.url} sent what is not understood: {error}. {must}")
+            raise PolicyServerFailed(
+                f"the policy server at {self.url} sent what is not understood: {error}. {must}"
+            ) from error
         except (OSError, WebSocketException) as error:
             self.close()
             raise PolicyServerFailed(_lost(self.url, error)) from error
@@ -141,7 +139,9 @@ def chunk_of(answer: Mapping[str, Any], size: int) -> "np.ndarray[Any, np.dtype[
         raise PolicyServerFailed(f"the policy server's answer has no 'actions', only {_short(', '.join(answer))!r}.")
     actions = answer["actions"]
     if not isinstance(actions, np.ndarray | list):
-        raise PolicyServerFailed(f"the policy server's actions are a {type(actions).__name__}; send an array (H, {size}).")
+        raise PolicyServerFailed(
+            f"the policy server's actions are a {type(actions).__name__}; send an array (H, {size})."
+        )
     try:
         chunk = np.atleast_2d(np.asarray(actions, np.float64))
     except (TypeError, ValueError):
@@ -152,9 +152,7 @@ def chunk_of(answer: Mapping[str, Any], size: int) -> "np.ndarray[Any, np.dtype[
             f"{size} numbers each. Check that the server's robot is this one."
         )
     if not np.isfinite(chunk).all():
-        raise PolicyServerFailed(
-            "the policy server's actions hold a NaN or an infinity. Look at what it was asked, and at its normalisation."
-        )
+        raise PolicyServerFailed("the policy server's actions hold a NaN or an infinity. Look at what it was asked.")
     return chunk
 
 
@@ -172,8 +170,10 @@ def _map_to_array(found: dict[Any, Any]) -> Any:
     if b"__ndarray__" in found:
         kind = _kind(found)
         shape, data = found.get(b"shape"), found.get(b"data")
-        if not isinstance(data, bytes) or not isinstance(shape, list) or any(
-            not isinstance(each, int) or isinstance(each, bool) or each < 0 for each in shape
+        if (
+            not isinstance(data, bytes)
+            or not isinstance(shape, list)
+            or any(not isinstance(each, int) or isinstance(each, bool) or each < 0 for each in shape)
         ):
             raise ValueError("an array without data or shape")
         return np.frombuffer(data, kind).reshape(shape).copy()

@@ -187,8 +187,8 @@ class LabEnvironment:
         except Exception as error:  # whatever code from elsewhere may do
             raise LabTaskBroken(
                 "environment",
-                f"render() failed ({type(error).__name__}: {error}). Without a screen MuJoCo needs MUJOCO_GL=egl (Debian's "
-                "libegl1 and libegl-mesa0) or osmesa (libosmesa6) in the worker's environment.",
+                f"render() failed ({type(error).__name__}: {error}). Without a screen MuJoCo needs MUJOCO_GL=egl "
+                "(Debian's libegl1 and libegl-mesa0) or osmesa (libosmesa6) in the worker's environment.",
             ) from error
         if drawn.ndim != 3 or drawn.shape[2] != 3 or drawn.dtype != np.uint8:
             raise LabTaskBroken(
