@@ -2,7 +2,7 @@
 
     python examples/reacher/make_policy.py
 
-Nothing is learned: the angles at which an arm of two links (0.10 m and 0.11 m) touches a place are known in closed form.
+Nothing is learned: the angles at which an arm of two links (0.10 m and 0.11 m) touches a place have a closed form.
 """
 
 from pathlib import Path

@@ -2,7 +2,7 @@
 
     python examples/reacher/serve_policy.py [PORT]
 
-Everything a policy server of your own has to do is in here: metadata first, then for each observation a chunk of actions.
+All that a policy server of your own has to do is in here: metadata first, then a chunk of actions for each observation.
 """
 
 import logging
