@@ -268,6 +268,7 @@ def test_a_bundle_stands_between_a_policy_server_and_a_client(plane_of: Callable
     trajectory = made.environment.episode(made.filter, 3, made.policy.mean)
     folder = written(made.task, made.policy, trajectory, made.filter, tmp_path / "bundle")
     assert not (folder / "policy.onnx").exists()
+    assert "--upstream ws://HOST:PORT" in (folder / "MODEL_CARD.md").read_text()
     with served(folder, "--upstream", made.url, "--deadline-ms", "5000") as (url, process):
         client, second = PolicyServer(url), PolicyServer(url)
         client.connect()
