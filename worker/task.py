@@ -11,6 +11,36 @@ from worker.trajectory import COSTS, SIGNALS
 
 
 @dataclass(frozen=True)
+class Answered:
+    """What a policy server said of one observation when the task was explored, by which it is known again."""
+
+    observation: tuple[float, ...]
+    """(D,)"""
+    actions: tuple[tuple[float, ...], ...]
+    """(H, A) in [-1, 1]"""
+
+
+@dataclass(frozen=True)
+class LabInterface:
+    """What whoever runs a filter beside a laboratory's robot has to know, and learning has not."""
+
+    frame: str
+    own_size: int
+    """of the environment's own part of the observation, which comes first"""
+    low: tuple[float, ...]
+    """(A,) of the actions in the environment's own unit"""
+    high: tuple[float, ...]
+    moving: tuple[int, ...]
+    """the actions that are speeds or changes of position, from 0"""
+    gain: float
+    """by which the policy's actions are multiplied"""
+    inputs: tuple[tuple[str, tuple[int, ...]], ...]
+    """what a policy is sent: names with columns of the observation"""
+    prompt: str | None
+    execution_horizon: int
+
+
+@dataclass(frozen=True)
 class Task:
     """One thing the robot does for a person."""
 
@@ -41,3 +71,5 @@ class Task:
     """columns of the costs of its trajectories"""
     is_a_labs: bool = field(default=False, repr=False)
     """A laboratory's own environment and policy: filters act on what the policy says, which is not looked into."""
+    interface: LabInterface | None = field(default=None, repr=False)
+    """of a laboratory's"""

@@ -25,6 +25,8 @@ NO_PACKAGE = ""
 NAME = r"[a-z][a-z0-9_]{0,39}"
 LARGEST_RATE_HZ = 100.0
 
+ANY_FRAME = "the environment's own"
+
 _Columns = Annotated[str, Field(pattern=r"^([A-Za-z_]\w*)?(\[\d+:\d+\])?$", min_length=1)]
 """Columns of an observation: a key of a Dict, a range of columns as in [0:3], or both."""
 
@@ -54,6 +56,8 @@ class LabEnvironment(_Table):
     """go on to the last step although the environment says that the episode is over"""
     reset: Literal["seed", "rebuild"] = "seed"
     """rebuild: a new environment for every episode, where reset(seed) alone does not repeat an episode exactly"""
+    frame: Annotated[str, Field(min_length=1, max_length=80)] = ANY_FRAME
+    """in which frame observations and actions are; bundles say so, and refuse who says otherwise"""
 
     @model_validator(mode="after")
     def _one_of_both(self) -> Self:
@@ -62,15 +66,40 @@ class LabEnvironment(_Table):
         return self
 
 
+def _address(url: str) -> str:
+    if not re.match(r"wss?://[^\s/]+", url):
+        raise ValueError("must be the address of a websocket, such as ws://localhost:8000")
+    return url
+
+
 class LabPolicy(_Table):
     """The frozen policy."""
 
-    file: str = Field(min_length=1)
+    file: str | None = Field(default=None, min_length=1)
     """.onnx, .zip (Stable-Baselines3) or .safetensors (ours), beside the lab.toml"""
+    url: Annotated[str, AfterValidator(_address)] | None = None
+    """ws://host:port of a policy server, as openpi's"""
+    answer_s: float = Field(default=10.0, gt=0.0, le=600.0)
+    """how long the server may take for an answer"""
+    inputs: dict[Annotated[str, Field(min_length=1, max_length=80)], _Columns] = {}
+    """what the server is sent: names, each with columns of the observation; empty: its parts by their own names"""
+    prompt: str | None = Field(default=None, max_length=1000)
+    """sent along with every observation"""
+    execution_horizon: int = Field(default=1, ge=1, le=1000)
+    """of every chunk of actions so many are executed before the next is asked for"""
     gain: float = Field(default=1.0, gt=0.0, le=1.0)
     """its actions are multiplied by this, so that somebody may also want it quicker"""
     activation: Literal["relu", "tanh", "elu"] | None = None
     """of a Stable-Baselines3 network; None: what its algorithm uses unless told otherwise"""
+
+    @model_validator(mode="after")
+    def _one_of_both(self) -> Self:
+        if (self.file is None) == (self.url is None):
+            raise ValueError("needs either file or url (ws://host:port of a policy server)")
+        of_servers = {"answer_s", "inputs", "prompt", "execution_horizon"} & self.model_fields_set
+        if self.file and of_servers:
+            raise ValueError(f"{min(of_servers)} is for policy servers (url), and this policy is a file")
+        return self
 
 
 class Measured(_Table):
@@ -172,9 +201,10 @@ def read(file: Path) -> InstalledTask:
     if not file.is_file():
         raise TaskRefused(f"There is no file {file}.")
     description = parsed(LabDescription, file)
-    policy = file.parent / description.policy.file
-    if not policy.is_file():
-        raise TaskRefused(f"{file}: policy.file names {policy}, which does not exist.")
-    if policy.suffix not in {".onnx", ".zip", ".safetensors"}:
-        raise TaskRefused(f"{file}: policy.file must end in .onnx, .zip (Stable-Baselines3) or .safetensors.")
+    if description.policy.file is not None:
+        policy = file.parent / description.policy.file
+        if not policy.is_file():
+            raise TaskRefused(f"{file}: policy.file names {policy}, which does not exist.")
+        if policy.suffix not in {".onnx", ".zip", ".safetensors"}:
+            raise TaskRefused(f"{file}: policy.file must end in .onnx, .zip (Stable-Baselines3) or .safetensors.")
     return InstalledTask(description.name, NO_PACKAGE, file.parent.resolve(), description, picture="")

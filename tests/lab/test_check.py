@@ -96,6 +96,11 @@ def test_a_mistake_in_the_file_is_said_with_its_key_and_what_to_do(
     [
         ("self.render_mode, self.size = render_mode, size", "self.render_mode, self.size = None, size", "rgb_array"),
         ("np.full((self.size, self.size, 3), 255, np.uint8)", "np.full((self.size, self.size, 3), 255.0)", "float64"),
+        (
+            "picture = np.full",
+            "self.gl.context\n        picture = np.full",
+            "Without a screen MuJoCo needs MUJOCO_GL=egl",
+        ),
         ("spaces.Box(-0.1, 0.1, (2,))", "spaces.Discrete(4)", "one vector of continuous numbers"),
         ("spaces.Box(-0.1, 0.1, (2,))", "spaces.Box(-np.inf, np.inf, (2,))", "its actions have no bounds"),
         ("spaces.Box(-2.0, 2.0, (4,))", "spaces.Box(-2.0, 2.0, (2, 2))", "only vectors are known"),

@@ -120,15 +120,11 @@ def reference_policy(name: str, early: str = "") -> ReferencePolicy:
 
 
 def _lab_policy(name: str) -> ReferencePolicy:
-    from worker.ml.policies import lab_policy  # torch, which processes that film our tasks do without
+    from worker.compute import lab_policies  # torch, which processes that film our tasks do without
 
-    found, described = registry.found_out(name), registry.lab(name)
+    described = registry.lab(name)
     assert described is not None  # noqa: S101 -- callers do this for laboratories' tasks only
-    low, high = (np.array(each) for each in found.bounds)
-    said = described.policy
-    size = sum(each.size for each in found.observation)
-    file = registry.installed_task(name).folder / said.file
-    return lab_policy.load(file, found.own_size, size, (low, high), said.gain, said.activation)
+    return lab_policies.policy_of(described, registry.installed_task(name).folder, registry.found_out(name))
 
 
 def early_policies(name: str) -> list[str]:

@@ -11,8 +11,10 @@ from PIL import Image
 from app.installed_tasks import lab
 from app.installed_tasks.description import TaskRefused
 from app.installed_tasks.lab import LabDescription
+from worker.compute.lab_policies import policy_of
 from worker.experiments import lab_ranges
 from worker.ml.policies.onnx_policy import NotAPolicy, OnnxPolicy
+from worker.ml.policies.remote_policy import RemotePolicy
 from worker.scenarios import POLICY_TEST
 from worker.sim.lab.environment import LabEnvironment, Picture
 from worker.sim.lab.errors import LabTaskBroken
@@ -61,19 +63,23 @@ def checked(file: Path, sheet: Path) -> Checked:
     environment = None
     try:
         environment = LabEnvironment(described, installed.folder)
-        lab_ranges.first_found(described, environment, installed.folder)
-        policy = lab_ranges.policy_of(described, environment, installed.folder)
+        found = lab_ranges.first_found(described, environment, installed.folder)
+        policy = policy_of(described, installed.folder, found)
+        lab_ranges.asked_first(policy, environment, POLICY_TEST[0])
         return _run(described, environment, policy, sheet)
     except LabTaskBroken as error:
         return Checked((f"{file}: {error}",), (), None)
     except NotAPolicy as error:
-        return Checked((f"{file}: policy.file: {error}",), (), None)
+        key = "policy.url" if described.policy.file is None else "policy.file"
+        return Checked((f"{file}: {key}: {error}",), (), None)
     finally:
         if environment is not None:
             environment.close()
 
 
-def _run(described: LabDescription, environment: LabEnvironment, policy: OnnxPolicy, sheet: Path) -> Checked:
+def _run(
+    described: LabDescription, environment: LabEnvironment, policy: OnnxPolicy | RemotePolicy, sheet: Path
+) -> Checked:
     shown = set(np.linspace(0, described.episode_steps - 1, PICTURES).round().astype(int).tolist())
     rows: list[list[Picture]] = []
     trajectories, seconds = [], []

@@ -12,14 +12,16 @@ from pathlib import Path
 import numpy as np
 
 from app.installed_tasks.lab import LabDescription
+from worker.compute.lab_policies import policy_of
 from worker.lab_modes import widest_axes
-from worker.ml.policies import lab_policy
 from worker.ml.policies.onnx_policy import OnnxPolicy
+from worker.ml.policies.remote_policy import RemotePolicy
 from worker.modes import Axis
 from worker.scenarios import RESPONSE_SURFACE
 from worker.sim.lab.environment import LabEnvironment
 from worker.sim.lab.errors import LabTaskBroken
 from worker.sim.lab.found import Found, mark_of
+from worker.task import Answered
 from worker.trajectory import Trajectory
 from worker.type_aliases import Float32Array, FloatArray
 
@@ -65,13 +67,9 @@ def first_found(described: LabDescription, environment: LabEnvironment, folder: 
     )
 
 
-def policy_of(described: LabDescription, environment: LabEnvironment, folder: Path) -> OnnxPolicy:
-    """The laboratory's policy for its environment. Raises NotAPolicy."""
-    said = described.policy
-    size = environment.observation.size
-    return lab_policy.load(
-        folder / said.file, environment.own_size, size, environment.action_bounds, said.gain, said.activation
-    )
+def asked_first(policy: OnnxPolicy | RemotePolicy, environment: LabEnvironment, scenario: int) -> Answered | None:
+    """What a policy server says at the beginning of a scenario; None of a policy in a file. Raises NotAPolicy."""
+    return policy.first_answer(environment.first_observation(scenario)) if isinstance(policy, RemotePolicy) else None
 
 
 def find(
@@ -82,8 +80,10 @@ def find(
     scenarios: int = SCENARIOS,
 ) -> Found:
     """Ranges of every axis. Raises LabTaskBroken when the frozen policy never succeeds or no axis changes anything."""
-    found, policy = first_found(described, environment, folder), policy_of(described, environment, folder)
+    found = first_found(described, environment, folder)
+    policy = policy_of(described, folder, found)
     numbers = RESPONSE_SURFACE[-scenarios:]
+    found = replace(found, answered=asked_first(policy, environment, numbers[0]))
     reference = [environment.episode(policy.mean, scenario) for scenario in numbers]
     success = float(np.mean([each.success for each in reference]))
     if success == 0.0:
@@ -124,7 +124,7 @@ def _usable_end(
     end: float,
     described: LabDescription,
     environment: LabEnvironment,
-    policy: OnnxPolicy,
+    policy: OnnxPolicy | RemotePolicy,
     reference: Sequence[Trajectory],
 ) -> tuple[float, str]:
     """The end of an axis that can be used, 0.0 for none; and why it is not all of it."""
@@ -183,7 +183,7 @@ def _start_distance_m(found: Found, reference: Sequence[Trajectory]) -> float:
     return max(float(np.median(np.linalg.norm(starts[:, found.goal] - starts[:, found.tip], axis=1))), 1e-3)
 
 
-def _share_at_limit(found: Found, policy: OnnxPolicy, reference: Sequence[Trajectory]) -> float:
+def _share_at_limit(found: Found, policy: OnnxPolicy | RemotePolicy, reference: Sequence[Trajectory]) -> float:
     actions = np.concatenate([each.actions for each in reference])[:, found.moving]
     return float((np.abs(actions).max(axis=1) >= AT_LIMIT).mean())
 

@@ -97,11 +97,13 @@ def test_everything_promised_is_inside_and_nothing_else(written: bytes) -> None:
                 "filter.onnx",
                 "manifest.json",
                 "policy.onnx",
+                "policy_client.py",
                 "recorded/actions.npy",
                 "recorded/observations.npy",
                 "recorded/policy_means.npy",
                 "reward_model.safetensors",
                 "run_filter.py",
+                "serve_filter.py",
             ]
         )
 
@@ -178,7 +180,7 @@ def test_the_card_says_in_words_what_was_learned_from_the_labels(kind: str, unzi
 def test_the_bundle_runs_on_its_own_and_confirms_itself(unzipped: Path) -> None:
     finished = run(unzipped)
     assert finished.returncode == 0, finished.stderr
-    assert "9 files match" in finished.stdout
+    assert "11 files match" in finished.stdout
     assert "OK: policy and filter reproduce their recorded actions" in finished.stdout
 
 
@@ -365,7 +367,7 @@ class TestSignature:
         without = [sys.executable, "-I", "-c", code]
         finished = subprocess.run(without, cwd=directory, capture_output=True, text=True, check=False)
         assert finished.returncode == 0, finished.stderr
-        assert "9 files match" in finished.stdout
+        assert "11 files match" in finished.stdout
         assert "Signature: not checked" in finished.stdout
         insisting = [*without, "--key", key.fingerprint]
         assert subprocess.run(insisting, cwd=directory, capture_output=True, check=False).returncode == 1

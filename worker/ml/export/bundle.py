@@ -17,11 +17,14 @@ from typing import Any, Self
 import numpy as np
 from safetensors.numpy import save
 
-from worker.ml.export import run_filter
+from worker.ml.export import run_filter, serve_filter
+from worker.ml.export.interface import interface_of
 from worker.ml.export.model_card import model_card
 from worker.ml.filters.filter_module import FilterWeights
 from worker.ml.filters.filter_onnx import INPUTS, OUTPUT, OnnxFilter
+from worker.ml.policies import policy_client
 from worker.ml.policies.reference import ReferencePolicy
+from worker.ml.policies.remote_policy import RemotePolicy
 from worker.ml.policies.stored_policy import stored_policy
 from worker.ml.rewards.reward_models import CLIP, RewardModel
 from worker.spaces import Space
@@ -97,10 +100,12 @@ def write(contents: BundleContents) -> bytes:
     recording = contents.recording
     files = {
         "filter.onnx": contents.filter_onnx,
-        "policy.onnx": stored_policy(contents.policy),
+        **_policy_files(contents.policy),
         "reward_model.safetensors": contents.reward.to_bytes(),
         "action_encoder.safetensors": contents.weights.to_bytes(),
         "run_filter.py": Path(run_filter.__file__).read_bytes(),
+        "serve_filter.py": Path(serve_filter.__file__).read_bytes(),
+        "policy_client.py": Path(policy_client.__file__).read_bytes(),
         "recorded/observations.npy": _npy(recording.observations),
         "recorded/policy_means.npy": _npy(recording.policy_means),
         "recorded/actions.npy": _npy(exported.batch(recording.observations, recording.policy_means)),
@@ -146,6 +151,11 @@ def verify(stored: bytes) -> dict[str, Any]:
     return manifest
 
 
+def _policy_files(policy: ReferencePolicy) -> dict[str, bytes]:
+    """None of a policy that answers from a server."""
+    return {} if isinstance(policy, RemotePolicy) else {"policy.onnx": stored_policy(policy)}
+
+
 def _manifest(contents: BundleContents) -> dict[str, Any]:
     """Everything but the list of files."""
     provenance, weights = contents.provenance, contents.weights
@@ -164,6 +174,7 @@ def _manifest(contents: BundleContents) -> dict[str, Any]:
         "observation": described_space(contents.task.observation),
         "action": described_space(contents.task.action),
         "onnx": _onnx_interface(contents.filter_onnx, contents.task),
+        "interface": interface_of(contents.task, contents.policy),
         "normalisation": {
             "inside_filter": True,
             "observation_offset": contents.policy.offset.tolist(),
@@ -173,7 +184,7 @@ def _manifest(contents: BundleContents) -> dict[str, Any]:
             "reward_clip": CLIP,
         },
         "policy": {
-            "file": "policy.onnx",
+            "file": None if isinstance(contents.policy, RemotePolicy) else "policy.onnx",
             "weights_sha256": _sha256(save(contents.policy.weights)),
             "action_limit": contents.policy.action_limit,
         },

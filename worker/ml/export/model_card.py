@@ -56,6 +56,7 @@ def model_card(manifest: Mapping[str, Any]) -> str:
         _measured(manifest.get("evaluation")),
         _notes(manifest),
         _USE,
+        _server(manifest),
         _LIMITS,
     ]
     return "\n\n".join(section for section in sections if section) + "\n"
@@ -66,6 +67,16 @@ _REFERENCE = """## This is the reference policy
 **The filter in this bundle changes nothing: every action is the reference policy's own.** Nothing that was learned from
 this person's comparisons was surely better for them without a price in success, force, speed or spills; the notes say
 what was tried."""
+
+
+def _server(manifest: Mapping[str, Any]) -> str:
+    """Where the policy is, if it is not in the bundle."""
+    if manifest["policy"]["file"]:
+        return ""
+    return (
+        "The policy of this bundle answers from a server, so `policy.onnx` is not part of it:\n\n"
+        "```\npython -m pip install websockets msgpack\npython run_filter.py --serve 8001 --upstream ws://HOST:PORT\n```"
+    )
 
 
 def _what(manifest: Mapping[str, Any]) -> str:

@@ -11,6 +11,10 @@
         Filter your own recording of (N, D) observations. The reference policy's mean actions in them come from
         policy.onnx, or from an (N, A) file of your own with --policy-means policy_means.npy.
 
+    python run_filter.py --serve 8001 --upstream ws://localhost:8000
+        Stand between a policy server and a client, both in the websocket protocol of openpi; without --upstream the
+        policy is the bundle's own. serve_filter.py says how. Needs also: python -m pip install websockets msgpack
+
 In a control loop, load the filter once and call it at every step:
 
     import numpy, onnxruntime
@@ -23,6 +27,7 @@ Units, ranges and order of the numbers are in manifest.json.
 
 import argparse
 import hashlib
+import importlib
 import json
 import sys
 import time
@@ -61,6 +66,14 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--policy-means", type=Path, help="(N, A) .npy file of another policy's mean actions")
     parser.add_argument("--key", metavar="FINGERPRINT", help="refuse what this key has not signed")
     parser.add_argument("--output", type=Path, help="where to write the (N, A) filtered actions, as .npy")
+    parser.add_argument("--serve", type=int, metavar="PORT", help="filter in a loop over websockets (0: any free port)")
+    parser.add_argument("--upstream", metavar="URL", help="with --serve: the policy server, ws://host:port")
+    parser.add_argument(
+        "--host", default="127.0.0.1", help="with --serve: where to listen; nobody is asked who they are"
+    )
+    parser.add_argument("--deadline-ms", type=float, help="with --serve: of the policy's answers; default: one step")
+    parser.add_argument("--upstream-s", type=float, default=10.0, help="with --serve: after this the policy hangs")
+    parser.add_argument("--pause-s", type=float, default=1.0, help="with --serve: silence after which it stood still")
     options = parser.parse_args(arguments)
     directory = Path(__file__).resolve().parent
     try:
@@ -68,9 +81,13 @@ def main(arguments: list[str] | None = None) -> int:
             raise Problem("--observations and --output belong together; give both, or neither and no --policy-means.")
         manifest = verified_manifest(directory)
         check_signature(directory, options.key)
-        session, policy = load(directory / "filter.onnx"), load(directory / "policy.onnx")
+        session, policy = load(directory / "filter.onnx"), policy_of(manifest, directory)
+        if options.serve is not None:
+            return serve(manifest, session, policy, options)
         if options.output:
             means = options.policy_means or policy
+            if means is None:
+                raise Problem("this bundle's policy answers from a server; give what it said with --policy-means.")
             filter_files(manifest, session, options.observations, means, options.output)
         else:
             compare_with_recording(manifest, session, policy, directory / "recorded")
@@ -153,6 +170,23 @@ def load(path: Path) -> Any:
         raise Problem(f"onnxruntime {onnxruntime.__version__} cannot load {path.name}: {error}") from None
 
 
+def policy_of(manifest: dict[str, Any], directory: Path) -> Any:
+    """The policy's session; None where it answers from a server and is not in the bundle."""
+    return load(directory / "policy.onnx") if "policy.onnx" in manifest["files"] else None
+
+
+def serve(manifest: dict[str, Any], session: Any, policy: Any, options: argparse.Namespace) -> int:
+    """Filter in a loop: serve_filter.py, which lies beside this file."""
+    sys.path.insert(0, str(Path(__file__).resolve().parent))
+    try:
+        loop = importlib.import_module("serve_filter")
+    except ImportError as missing:
+        raise Problem(f"{missing}. Install what --serve needs: python -m pip install websockets msgpack") from None
+    means = None if policy is None else lambda observations: means_of(policy, observations)
+    code: int = loop.main(manifest, lambda seen, said: run(session, seen, said), means, options)
+    return code
+
+
 def run(session: Any, observations: Any, policy_means: Any) -> Any:
     """(N, D), (N, A) -> (N, A)"""
     return session.run(["action"], {"observation": observations, "policy_mean": policy_means})[0]
@@ -170,17 +204,17 @@ def compare_with_recording(manifest: dict[str, Any], session: Any, policy: Any, 
     started = time.perf_counter()
     actions = run(session, observations, policy_means)
     all_at_once_ms = 1000 * (time.perf_counter() - started)
-    difference = max(
-        float(np.abs(actions - recorded).max()),
-        float(np.abs(means_of(policy, observations) - policy_means).max()),
-    )
+    difference = float(np.abs(actions - recorded).max())
+    if policy is not None:
+        difference = max(difference, float(np.abs(means_of(policy, observations) - policy_means).max()))
     single_us = one_by_one_us(session, observations, policy_means)
     sys.stdout.write(f"{len(actions)} recorded steps in {all_at_once_ms:.1f} ms; one by one {single_us} us (median).\n")
     if not difference <= TOLERANCE:
         raise Problem(
             f"The actions differ from the recorded ones by up to {difference:.2e} (accepted: {TOLERANCE:.0e})."
         )
-    sys.stdout.write(f"OK: policy and filter reproduce their recorded actions (largest difference {difference:.1e}).\n")
+    what = "filter reproduces its" if policy is None else "policy and filter reproduce their"
+    sys.stdout.write(f"OK: {what} recorded actions (largest difference {difference:.1e}).\n")
 
 
 def one_by_one_us(session: Any, observations: Any, policy_means: Any) -> int:

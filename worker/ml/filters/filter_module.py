@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from worker.ml.filters.action_encoder import ResidualAdapter
 from worker.ml.filters.pbarl_printed import PrintedEncoder
-from worker.ml.policies.onnx_policy import OnnxPolicy
+from worker.ml.policies.gaussian import GaussianPolicy
 from worker.ml.policies.reference import ReferencePolicy
 from worker.ml.policies.torch_module import FrozenPolicy
 from worker.ml.rewards.reward_models import stored_config
@@ -154,7 +154,7 @@ def build(family: ModeFamily, policy: ReferencePolicy, weights: FilterWeights) -
     Raises ValueError when the weights name an axis that the task's family of modes does not have.
     """
     transform: nn.Module
-    if isinstance(policy, OnnxPolicy):
+    if not isinstance(policy, GaussianPolicy):
         if weights.method != "studio" or weights.encoder:
             raise ValueError("A policy that cannot be looked into has filters of modes alone.")
         return _frozen(ActionFilter(ActionModeTransform(family, weights.mode), weights.gate))

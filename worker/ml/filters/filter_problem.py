@@ -21,8 +21,9 @@ import torch
 from worker.ml.filters.action_encoder import ResidualAdapter
 from worker.ml.filters.filter_module import FilterWeights, build, state_of
 from worker.ml.filters.filter_onnx import OnnxFilter, to_onnx
-from worker.ml.policies.onnx_policy import OnnxPolicy
+from worker.ml.policies.gaussian import GaussianPolicy
 from worker.ml.policies.reference import ReferencePolicy
+from worker.ml.policies.remote_policy import RemotePolicy
 from worker.ml.rewards.reward_models import RewardModel
 from worker.modes import ModeFamily
 from worker.scenarios import GATE, RESIDUAL, first_of
@@ -165,7 +166,7 @@ class FilterAct:
 
 def trace(family: ModeFamily, policy: ReferencePolicy) -> None:
     """Export a mode without and with a residual, so that act_of() takes a hundredth of a second in this process."""
-    if isinstance(policy, OnnxPolicy):
+    if not isinstance(policy, GaussianPolicy):
         act_of(family, policy, FilterWeights())
         return
     untrained = ResidualAdapter(torch.from_numpy(policy.offset), torch.from_numpy(policy.scale))
@@ -178,6 +179,8 @@ def act_of(family: ModeFamily, policy: ReferencePolicy, weights: FilterWeights) 
     rng = np.random.default_rng(0)
     spread = 0.3 * rng.standard_normal((64, len(policy.offset)))
     observations = (policy.offset + spread).astype(np.float32)
-    return FilterAct(
-        policy, OnnxFilter(to_onnx(build(family, policy, weights), observations, policy.mean(observations)))
-    )
+    if isinstance(policy, RemotePolicy):  # a server is asked about nothing that was invented
+        means = rng.uniform(-1.0, 1.0, (len(observations), policy.action_size)).astype(np.float32)
+    else:
+        means = policy.mean(observations)
+    return FilterAct(policy, OnnxFilter(to_onnx(build(family, policy, weights), observations, means)))

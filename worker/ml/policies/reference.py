@@ -1,4 +1,4 @@
-"""The frozen policies there are: the studio's own Gaussian network, and graphs of laboratories."""
+"""The frozen policies there are: the studio's own Gaussian network, and graphs and servers of laboratories."""
 
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -6,8 +6,9 @@ from worker.ml.policies.gaussian import GaussianPolicy
 
 if TYPE_CHECKING:  # its runtime is loaded by whoever needs it
     from worker.ml.policies.onnx_policy import OnnxPolicy
+    from worker.ml.policies.remote_policy import RemotePolicy
 
-ReferencePolicy: TypeAlias = "GaussianPolicy | OnnxPolicy"
+ReferencePolicy: TypeAlias = "GaussianPolicy | OnnxPolicy | RemotePolicy"
 
 
 class NotLookedInto(ValueError):

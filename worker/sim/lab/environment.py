@@ -5,7 +5,6 @@ is over, which modes need (worker.lab_modes). Actions are in [-1, 1] and stretch
 """
 
 import math
-import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +17,7 @@ import numpy.typing as npt
 from app.installed_tasks.lab import LabDescription, Measured
 from worker.lab_modes import EPISODE_SHARE, PREVIOUS_ACTION
 from worker.sim.lab.errors import LabTaskBroken
+from worker.sim.lab.found import columns_of
 from worker.sim.lab.references import named_object
 from worker.spaces import Field, Space
 from worker.trajectory import Trajectory
@@ -175,9 +175,21 @@ class LabEnvironment:
             skin_tone=0,
         )
 
+    def first_observation(self, scenario: int) -> Float32Array:
+        """(D,) With which an episode begins."""
+        given, _ = self._made.reset(seed=scenario)
+        return self._vector(given, np.zeros(len(self._low), np.float32), 0)
+
     def picture(self) -> Picture:
         """(height, width, 3) as the environment draws itself; sides are even, as videos want them."""
-        drawn = np.asarray(self._made.render())
+        try:
+            drawn = np.asarray(self._made.render())
+        except Exception as error:  # whatever code from elsewhere may do
+            raise LabTaskBroken(
+                "environment",
+                f"render() failed ({type(error).__name__}: {error}). Without a screen MuJoCo needs MUJOCO_GL=egl "
+                "(Debian's libegl1 and libegl-mesa0) or osmesa (libosmesa6) in the worker's environment.",
+            ) from error
         if drawn.ndim != 3 or drawn.shape[2] != 3 or drawn.dtype != np.uint8:
             raise LabTaskBroken(
                 "environment",
@@ -255,17 +267,7 @@ class LabEnvironment:
     def _columns(self, key: str, said: str | None) -> tuple[int, ...]:
         if said is None:
             return ()
-        name, _, rest = said.partition("[")
-        own = Space(self.observation.fields[:-2])
-        try:
-            whole = range(own.size) if not name else range(*own.slice_of(name).indices(own.size))
-        except KeyError as error:
-            raise LabTaskBroken(key, str(error.args[0])) from error
-        found = re.fullmatch(r"(\d+):(\d+)\]", rest)
-        columns = tuple(whole)[int(found[1]) : int(found[2])] if found else tuple(whole)
-        if not columns:
-            raise LabTaskBroken(key, f"{said} has no columns; the observation has {own.size}.")
-        return columns
+        return columns_of(Space(self.observation.fields[:-2]), key, said)
 
     def _measure(self, key: str, said: Measured) -> Callable[[LabStep], Any]:
         if said.function is not None:

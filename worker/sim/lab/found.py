@@ -5,6 +5,7 @@ Kept in a file beside the lab.toml, so that whoever learns knows the task withou
 
 import hashlib
 import json
+import re
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -12,17 +13,28 @@ from typing import Any, Self
 from app.installed_tasks.lab import LabDescription
 from worker.lab_modes import LabModes
 from worker.modes import Axis
+from worker.sim.lab.errors import LabTaskBroken
 from worker.spaces import Field, Space
-from worker.task import Task
+from worker.task import Answered, LabInterface, Task
 from worker.whole_files import written_whole
 
 FOUND_FILE = "found.json"
+_OF_FILES = {"file", "gain", "activation"}
+_OF_SERVERS = {"inputs", "prompt", "execution_horizon"}
 
 
 def mark_of(described: LabDescription, folder: Path) -> str:
-    """A fingerprint of what was found depends on: everything but names and words, and the policy itself."""
+    """A fingerprint of what was found depends on: everything but names and words, and the policy itself.
+
+    Where a policy server stands says nothing about the policy; it is known again by an answer (Found.answered).
+    """
     kept = described.model_dump(mode="json", exclude={"title", "summary", "words", "instructions", "usual_clip_steps"})
-    policy = hashlib.sha256((folder / described.policy.file).read_bytes()).hexdigest()
+    kept["environment"].pop("frame")
+    kept["policy"] = described.policy.model_dump(mode="json", include=_OF_FILES) | described.policy.model_dump(
+        mode="json", include=_OF_SERVERS, exclude_defaults=True
+    )
+    file = described.policy.file
+    policy = "of a server" if file is None else hashlib.sha256((folder / file).read_bytes()).hexdigest()
     return hashlib.sha256(f"{json.dumps(kept, sort_keys=True)} {policy}".encode()).hexdigest()
 
 
@@ -48,6 +60,8 @@ class Found:
     notes: tuple[str, ...]
     reference: dict[str, float]
     """of the frozen policy's episodes: success, share of actions at their limit"""
+    answered: Answered | None = None
+    """what a policy server said when the task was explored"""
 
     def modes(self, axes: tuple[Axis, ...] | None = None) -> LabModes:
         """The ways to do the task."""
@@ -75,6 +89,23 @@ class Found:
             signals=described.signal_names,
             costs=described.cost_names,
             is_a_labs=True,
+            interface=self.interface(described),
+        )
+
+    def interface(self, described: LabDescription) -> LabInterface:
+        """What runs beside the robot has to know."""
+        low, high = self.bounds
+        said = described.policy
+        return LabInterface(
+            frame=described.environment.frame,
+            own_size=self.own_size,
+            low=low,
+            high=high,
+            moving=self.moving,
+            gain=said.gain,
+            inputs=inputs_of(described, self.observation),
+            prompt=said.prompt,
+            execution_horizon=said.execution_horizon,
         )
 
     def save(self, file: Path) -> None:
@@ -93,4 +124,34 @@ class Found:
         for name in ("moving", "tip", "goal", "notes"):
             stored[name] = tuple(stored[name])
         stored["bounds"] = tuple(map(tuple, stored["bounds"]))
+        if stored.get("answered"):
+            said = stored["answered"]
+            stored["answered"] = Answered(tuple(said["observation"]), tuple(map(tuple, said["actions"])))
         return cls(**stored)
+
+
+def inputs_of(described: LabDescription, observation: tuple[Field, ...]) -> tuple[tuple[str, tuple[int, ...]], ...]:
+    """What a policy server is sent: names with columns of the observation; without policy.inputs its own parts.
+
+    Raises LabTaskBroken.
+    """
+    own = Space(observation[:-2])
+    if not described.policy.inputs:
+        return tuple((field.name, tuple(range(own.size)[place])) for field, place in own.slices())
+    return tuple(
+        (name, columns_of(own, f'policy.inputs."{name}"', said)) for name, said in described.policy.inputs.items()
+    )
+
+
+def columns_of(own: Space, key: str, said: str) -> tuple[int, ...]:
+    """The columns that a lab.toml names as "part", "[0:3]" or "part[0:3]". Raises LabTaskBroken."""
+    name, _, rest = said.partition("[")
+    try:
+        whole = range(own.size) if not name else range(*own.slice_of(name).indices(own.size))
+    except KeyError as error:
+        raise LabTaskBroken(key, str(error.args[0])) from error
+    found = re.fullmatch(r"(\d+):(\d+)\]", rest)
+    columns = tuple(whole)[int(found[1]) : int(found[2])] if found else tuple(whole)
+    if not columns:
+        raise LabTaskBroken(key, f"{said} has no columns; the observation has {own.size}.")
+    return columns

@@ -1,0 +1,322 @@
+"""A bundle's filter as a loop between a client and a policy server: real servers, and the bundle's own files."""
+
+import contextlib
+import io
+import signal
+import subprocess
+import sys
+import threading
+import urllib.request
+import zipfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from app.installed_tasks import lab
+from app.installed_tasks.lab import LabDescription
+from tests.lab.policy_server import Answer, serving, to_goal
+from tests.worker import invented
+from worker.compute.lab_policies import policy_of
+from worker.experiments.lab_ranges import first_found
+from worker.ml.export import bundle
+from worker.ml.export.bundle import BundleContents, Provenance, RecordedSteps
+from worker.ml.export.interface import interface_of
+from worker.ml.export.serve_filter import FilterLoop, Refused, require_same
+from worker.ml.filters.filter_module import FilterWeights
+from worker.ml.filters.filter_problem import FilterAct, act_of
+from worker.ml.policies import remote_policy
+from worker.ml.policies.policy_client import PolicyServer, PolicyServerFailed, packed
+from worker.ml.policies.reference import ReferencePolicy
+from worker.ml.rewards.reward_models import StructuredReward
+from worker.sim.lab.environment import LabEnvironment
+from worker.task import Task
+from worker.trajectory import SIGNALS, Trajectory
+
+MODE = {"speed_far": -0.7, "smooth": 0.4, "push_y": 0.3}
+SEEN = {"observation": np.array([0.1, 0.2, 0.8, -0.6], np.float32)}
+
+
+class Plane:
+    """The plane of conftest with its policy at an address, and somebody's filter."""
+
+    def __init__(self, folder: Path, url: str) -> None:
+        text = (folder / "lab.toml").read_text()
+        (folder / "lab.toml").write_text(
+            text.replace('file = "policy.onnx"', f'url = "{url}"\nexecution_horizon = 4').replace(
+                "gain = 0.5", "gain = 0.8"
+            )
+        )
+        described = lab.read(folder / "lab.toml").description
+        assert isinstance(described, LabDescription)
+        self.environment = LabEnvironment(described, folder)
+        found = first_found(described, self.environment, folder)
+        self.task = found.task(described)
+        self.policy = policy_of(described, folder, found)
+        self.filter: FilterAct = act_of(self.task.modes, self.policy, FilterWeights(mode=MODE))
+        self.url = url
+
+    def loop(self, deadline_s: float = 5.0, pause_s: float = 60.0) -> FilterLoop:
+        return FilterLoop(
+            interface_of(self.task, self.policy),
+            self.filter.exported.batch,
+            PolicyServer(self.url),
+            deadline_s,
+            pause_s,
+        )
+
+
+@pytest.fixture
+def plane_of(plane: Path) -> Iterator[Callable[..., Plane]]:
+    """Makes it, with a policy server that gives these answers."""
+    with contextlib.ExitStack() as stack:
+
+        def make(answer: Answer = to_goal) -> Plane:
+            made = Plane(plane, stack.enter_context(serving(answer)))
+            stack.callback(made.environment.close)
+            return made
+
+        yield make
+    remote_policy.forget()
+
+
+def of(answer: dict[str, Any]) -> tuple[str, list[float]]:
+    return answer["filter"]["state"], np.round(answer["actions"][0], 6).tolist()
+
+
+def test_the_loop_acts_as_the_studio_did_when_the_filter_was_fitted(plane_of: Callable[..., Plane]) -> None:
+    made = plane_of()
+    trajectory = made.environment.episode(made.filter, 3)
+    loop = made.loop()
+    said = [loop.answer(packed({"observation": seen[:4]})) for seen in trajectory.observations[:-1]]
+    in_its_own_unit = 0.1 * trajectory.actions
+    np.testing.assert_allclose([each["actions"][0] for each in said], in_its_own_unit, atol=1e-6)
+    assert {each["filter"]["state"] for each in said} == {"ok"}
+    assert said[0]["server_timing"] == {"infer_ms": 0.1}, "what else the policy says is passed on"
+    again = loop.answer(packed({"observation": trajectory.observations[0, :4], "reset": True}))
+    np.testing.assert_allclose(again["actions"][0], in_its_own_unit[0], atol=1e-6)
+    loop.close()
+
+
+def test_a_late_policy_slows_the_robot_and_then_stops_it_until_it_is_in_time(plane_of: Callable[..., Plane]) -> None:
+    free = threading.Event()
+    free.set()
+
+    def answer(message: dict[str, Any]) -> dict[str, Any]:
+        free.wait()
+        return {"actions": to_goal(message)["actions"][:1]}
+
+    loop = plane_of(answer).loop(deadline_s=0.05)
+    state, first = of(loop.answer(packed(SEEN)))
+    assert state == "ok"
+    free.clear()
+    states, actions = zip(*(of(loop.answer(packed(SEEN))) for _ in range(5)), strict=True)
+    assert states == ("slow", "slow", "slow", "stop", "stop")
+    np.testing.assert_allclose(actions, np.outer([0.5, 0.25, 0.125, 0.0, 0.0], first), atol=1e-6)
+    free.set()
+    loop._deadline_s = 5.0
+    assert of(loop.answer(packed(SEEN)))[0] == "ok"
+    assert loop.counted.states == {"ok": 2, "slow": 3, "stop": 2}
+    loop.close()
+
+
+@pytest.mark.parametrize(
+    ("broken", "why"),
+    [
+        ("Traceback: out of memory", "out of memory"),
+        ({"actions": np.full((1, 2), np.nan)}, "NaN"),
+        ({"actions": np.zeros((1, 7))}, "the shape (1, 7), and (H, 2) is needed"),
+        (b"\xc1", "not understood"),
+    ],
+)
+def test_what_is_no_action_stops_the_robot_at_once_and_it_goes_on_when_the_policy_does(
+    plane_of: Callable[..., Plane], broken: Any, why: str
+) -> None:
+    answers = iter([None, broken, None])
+
+    def answer(message: dict[str, Any]) -> Any:
+        return next(answers) or {"actions": to_goal(message)["actions"][:1]}
+
+    loop = plane_of(answer).loop()
+    said = [loop.answer(packed(SEEN)) for _ in range(3)]
+    assert [each["filter"]["state"] for each in said] == ["ok", "stop", "ok"]
+    assert not said[1]["actions"].any()
+    assert why in said[1]["filter"]["why"]
+    loop.close()
+
+
+def test_a_policy_server_that_is_gone_stops_the_robot_until_it_is_back(plane: Path) -> None:
+    with serving(lambda message: {"actions": to_goal(message)["actions"][:1]}) as url:
+        made = Plane(plane, url)
+        loop = made.loop()
+        assert of(loop.answer(packed(SEEN)))[0] == "ok"
+    gone = [loop.answer(packed(SEEN)) for _ in range(2)]
+    assert [of(each) for each in gone] == [("stop", [0.0, 0.0])] * 2
+    assert "no policy server answers" in gone[1]["filter"]["why"]
+    with serving(port=int(url.rpartition(":")[2])):
+        assert of(loop.answer(packed(SEEN)))[0] == "ok"
+    loop.close()
+
+
+def test_a_client_that_was_silent_goes_on_from_standstill_with_a_new_chunk(plane_of: Callable[..., Plane]) -> None:
+    asked: list[int] = []
+
+    def answer(message: dict[str, Any]) -> dict[str, Any]:
+        asked.append(1)
+        return to_goal(message)
+
+    made = plane_of(answer)
+    for pause_s, chunks in ((60.0, 1), (1e-9, 4)):  # any silence is longer than that
+        asked.clear()
+        loop = made.loop(pause_s=pause_s)
+        said = [loop.answer(packed(SEEN)) for _ in range(4)]
+        assert len(asked) == chunks
+        assert {each["filter"]["state"] for each in said} == {"ok"}
+        assert loop.counted.pauses == chunks - 1
+        loop.close()
+
+
+@pytest.mark.parametrize(
+    ("message", "sentence"),
+    [
+        (b"\xc1", "the message cannot be read"),
+        (
+            {"image": np.zeros(3)},
+            "the message has image; this filter needs observation (4 x as the environment has it)",
+        ),
+        ({"observation": np.zeros(5)}, "observation has the shape (5,); this filter needs (4,)"),
+        ({"observation": "here"}, "observation is no array of numbers"),
+        ({"observation": np.full(4, np.nan)}, "observation holds a NaN"),
+        ({"observation": np.full(4, 500.0)}, "far outside [-2, 2]. This bundle belongs to the unit"),
+        (SEEN | {"interface": {"control_rate_hz": 50.0}}, "control_rate_hz 50.0; this bundle belongs to 10.0"),
+        (
+            SEEN | {"interface": {"frame": "tool"}},
+            "the client is of frame tool; this bundle belongs to the environment's",
+        ),
+        (SEEN | {"interface": {"task": "reach"}}, "of task reach; this bundle belongs to plane"),
+        (SEEN | {"interface": {"units": {"observation": "mm"}}}, "says observation in mm; this bundle belongs to as"),
+    ],
+)
+def test_what_a_bundle_does_not_belong_to_is_refused_in_a_sentence(
+    plane_of: Callable[..., Plane], message: Any, sentence: str
+) -> None:
+    loop = plane_of().loop()
+    with pytest.raises(Refused) as refused:
+        loop.answer(message if isinstance(message, bytes) else packed(message))
+    assert sentence in str(refused.value)
+    loop.close()
+
+
+def test_a_bundle_of_ours_says_units_frame_and_rate_and_takes_its_fields_by_name() -> None:
+    policy = invented.small_policy()
+    interface = interface_of(invented.TASK, policy)
+    assert (interface["frame"], interface["control_rate_hz"]) == ("robot base", 10.0)
+    require_same("somebody", interface | {"units": {"tool_position_m": "m", "action": "1"}}, interface)
+    with pytest.raises(Refused, match="says tool_position_m in mm; this bundle belongs to m"):
+        require_same("somebody", {"units": {"tool_position_m": "mm"}}, interface)
+    with pytest.raises(Refused, match="is of fingerprint"):
+        require_same("somebody", {"fingerprint": "00"}, interface)
+    act = act_of(invented.TASK.modes, policy, FilterWeights(mode={"speed_near": -0.5}))
+    loop = FilterLoop(interface, act.exported.batch, policy.mean, 5.0, 60.0)
+    seen = np.zeros(invented.TASK.observation.size, np.float32) + 0.1
+    parts = {field.name: seen[place] for field, place in invented.TASK.observation.slices()}
+    for message in ({"observation": seen}, parts):
+        np.testing.assert_allclose(loop.answer(packed(message))["actions"][0], act(seen), atol=1e-6)
+    with pytest.raises(Refused, match=r"tool_position_m is .* look at units and frame"):
+        loop.answer(packed(parts | {"tool_position_m": np.full(3, 500.0)}))
+    loop.close()
+
+
+# The bundle's own files, as somebody without this project runs them
+
+
+def written(task: Task, policy: ReferencePolicy, episode: Trajectory, act: FilterAct, folder: Path) -> Path:
+    contents = BundleContents(
+        task=task,
+        filter_onnx=act.exported.stored,
+        weights=FilterWeights(mode=MODE if task.is_a_labs else {"speed_near": -0.5}),
+        reward=StructuredReward(np.ones((8, len(task.signals)))),
+        policy=policy,
+        recording=RecordedSteps.of([episode]),
+        metrics={},
+        provenance=Provenance("demo", "P07", 1, 9, "ab" * 32, 11, "2026-01-02T03:04:05Z", "cd" * 32, "none"),
+    )
+    with zipfile.ZipFile(io.BytesIO(bundle.write(contents))) as archive:
+        archive.extractall(folder)
+    return folder
+
+
+@contextlib.contextmanager
+def served(folder: Path, *arguments: str) -> Iterator[tuple[str, "subprocess.Popen[str]"]]:
+    """Its address and its process, in which nothing of this project can be imported."""
+    command = [sys.executable, "-I", "run_filter.py", "--serve", "0", *arguments]
+    with subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        try:
+            for line in process.stdout:
+                if " at ws://" in line:
+                    break
+            yield line.partition(" at ")[2].partition(";")[0], process
+        finally:
+            process.kill()
+
+
+def test_a_bundle_stands_between_a_policy_server_and_a_client(plane_of: Callable[..., Plane], tmp_path: Path) -> None:
+    made = plane_of()
+    trajectory = made.environment.episode(made.filter, 3, made.policy.mean)
+    folder = written(made.task, made.policy, trajectory, made.filter, tmp_path / "bundle")
+    assert not (folder / "policy.onnx").exists()
+    assert "--upstream ws://HOST:PORT" in (folder / "MODEL_CARD.md").read_text()
+    with served(folder, "--upstream", made.url, "--deadline-ms", "5000") as (url, process):
+        client, second = PolicyServer(url), PolicyServer(url)
+        client.connect()
+        assert client.metadata["interface"]["task"] == "plane"
+        assert client.metadata["policy"] == {"robot": "point"}
+        with pytest.raises(PolicyServerFailed, match="somebody else is connected"):
+            second.connect()
+        with urllib.request.urlopen(url.replace("ws://", "http://") + "/healthz") as answer:  # noqa: S310 -- our own
+            assert answer.read() == b"OK\n"
+        said = [client.ask({"observation": seen[:4]})["actions"][0] for seen in trajectory.observations[:-1]]
+        np.testing.assert_allclose(said, 0.1 * trajectory.actions, atol=1e-6)
+        with pytest.raises(PolicyServerFailed, match=r"Refused: observation has the shape \(3,\)"):
+            client.ask({"observation": np.zeros(3)})
+        process.send_signal(signal.SIGTERM)
+        out, _ = process.communicate()
+    assert process.returncode == 0
+    assert "40 steps (40 ok), rate " in out
+    assert out.endswith("Ended.\n")
+
+
+def test_a_bundle_of_ours_is_served_with_its_own_policy(tmp_path: Path) -> None:
+    policy = invented.small_policy()
+    act = act_of(invented.TASK.modes, policy, FilterWeights(mode={"speed_near": -0.5}))
+    episode = invented.trajectory(np.random.default_rng(0), scenario=0)
+    assert invented.TASK.signals == SIGNALS
+    folder = written(invented.TASK, policy, episode, act, tmp_path / "bundle")
+    with served(folder) as (url, _):
+        client = PolicyServer(url)
+        for seen in episode.observations[:5]:
+            np.testing.assert_allclose(client.ask({"observation": seen})["actions"][0], act(seen), atol=1e-5)
+        client.close()
+
+
+def ended(folder: Path, *arguments: str) -> str:
+    command = [sys.executable, "-I", *arguments]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    return done.stderr
+
+
+def test_what_is_missing_is_said_before_anybody_connects(plane_of: Callable[..., Plane], tmp_path: Path) -> None:
+    made = plane_of()
+    folder = written(
+        made.task, made.policy, made.environment.episode(made.filter, 3, made.policy.mean), made.filter, tmp_path
+    )
+    assert "say where with --upstream" in ended(folder, "run_filter.py", "--serve", "0")
+    nobody = ("run_filter.py", "--serve", "0", "--upstream", "ws://127.0.0.1:9")
+    assert "no policy server answers at ws://127.0.0.1:9" in ended(folder, *nobody)
+    code = "import sys, runpy; sys.modules['websockets'] = None; sys.argv = ['run_filter.py', '--serve', '0']\n"
+    code += "runpy.run_path('run_filter.py', run_name='__main__')"
+    assert "python -m pip install websockets msgpack" in ended(folder, "-c", code)
