@@ -9,11 +9,11 @@ are given in the order of appearance (the first block is Robot A), so a letter s
 else. The scenarios are the same for all methods of a participant, one per repetition, and different for other
 participants.
 
-Head-to-heads come when all is rated. Every two robots meet as often as the study says, each time in another scenario, in
-two films that were rated. A round has every pair once, in a drawn order. The robots stand on a drawn circle, and a robot
-is left of those within half a circle after it; with every round the sides change. So in a round each robot is on the
-left as often as on the right (of an even number of robots: once more or less), and every two take turns. That is drawn
-from the participant's seed, for letters and sides say nothing about methods, and kept as rows.
+Head-to-heads come when all is rated. Every two meet as often as the study says, each time in another scenario, in
+films that were rated. A round has every pair once, in a drawn order. The robots stand on a drawn circle, and a robot is
+left of those within half a circle after it; with every round the sides change. So in a round each robot is on the left
+as often as on the right (of an even number of robots: once more or less), and every two take turns. That is drawn from
+the participant's seed, for letters and sides say nothing about methods, and kept as rows.
 
 Everything follows from the secret and the seeds, so that drawing twice is drawing once. The hash of the secret is part
 of what is locked, and the secret is shown after unblinding: whoever has both can draw the letters again.
