@@ -2,7 +2,8 @@
 
 Contents (stored as Report.contents): ``version``, ``blinded``, ``plan`` (standing, planned tests, in_words: see
 app.services.studies.preregistration), ``ratings`` (see statistics), ``guesses`` (see guesses; None where it is not
-asked), ``head_to_heads`` (see bradley_terry; None where there are none, or letters hide methods), ``answers`` and ``change`` (see answers).
+asked), ``head_to_heads`` (see bradley_terry; None where there are none, or letters hide methods), ``answers`` and
+``change`` (see answers).
 Figures by name, each as SVG and PNG (see figures).
 """
 
