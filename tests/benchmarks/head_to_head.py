@@ -60,7 +60,7 @@ def row(people: int, spread: float, effect: float, studies: int) -> dict[str, An
         for first, second in pairs:
             contrast = np.zeros(METHODS)
             contrast[[first, second]] = -1, 1
-            error, plain_error = (float(max(contrast @ each @ contrast, 1e-18)) ** 0.5 for each in (spreads, naive))
+            error, plain_error = (max(float(contrast @ each @ contrast), 1e-18) ** 0.5 for each in (spreads, naive))
             off = contrast @ (found - truth)
             tally["missed"] += abs(off) > stats.t.ppf(0.975, people - 1) * error
             tally["naive_missed"] += abs(off) > 1.96 * plain_error

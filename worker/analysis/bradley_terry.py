@@ -75,7 +75,7 @@ def strengths(wins: FloatArray) -> FloatArray:
         found += step / max(1.0, float(np.abs(step).max()))
         if np.abs(step).max() < 1e-10:
             break
-    return found - found.mean()
+    return np.asarray(found - found.mean(), np.float64)
 
 
 def covariance(wins: FloatArray, found: FloatArray) -> FloatArray:
