@@ -9,13 +9,13 @@ from sqlalchemy.orm import Session
 
 from app.db import now
 from app.domain.clips import Clip
-from app.domain.evaluation import Rating, Trial
+from app.domain.evaluation import HeadToHeadAnswer, Rating, Trial
 from app.domain.models import ModelKind
 from app.domain.participation import ConsentRecord, FormAnswer, ParticipantEvent, StageRecord
 from app.domain.preferences import Purpose, Query, Response
 from app.domain.protocol import EvaluatedMethod, EvaluationSettings
 from app.domain.studies import Participant, Study
-from app.services.evaluation import donors, evaluation_plan
+from app.services.evaluation import donors, evaluation_plan, head_to_heads
 from app.storage import ArtefactStore
 from tests import factories
 
@@ -27,7 +27,7 @@ def make_finished_study(
 ) -> Study:
     """The study, with participants P01, P02, ..."""
     study = factories.make_study(
-        session, "Feeding, finished", labels_per_participant=10, evaluation=EvaluationSettings()
+        session, "Feeding, finished", labels_per_participant=10, evaluation=EvaluationSettings(head_to_heads=1)
     )
     study.key_secret = sha256(study.slug.encode()).hexdigest()  # else each run had other letters, so other ratings
     study.unblinded_at = now() if unblinded else None
@@ -104,6 +104,18 @@ def _rate(session: Session, study: Study, person: Participant, random: Random) -
         session.add(_rating(trial, 1, *scores))
         if trial.ordinal == 1:
             session.add(_rating(trial, 2, scores[0], 6 - scores[1]))
+    for each in head_to_heads.of_participant(session, person.id):
+        each.shown_at = now()
+        left, right = (MEANS[methods[trial.letter]] for trial in (each.left_trial, each.right_trial))
+        session.add(
+            HeadToHeadAnswer(
+                head_to_head_id=each.id,
+                revision=1,
+                response="left" if random.random() < 0.5 + (left - right) / 4 else "right",
+                client_uuid=str(uuid5(NAMESPACE_URL, f"head-to-head/{each.id}")),
+                by_script=True,
+            )
+        )
     session.flush()
 
 

@@ -146,6 +146,10 @@ class Trial(Base):
     film: Mapped[Film | None] = relationship(lazy="raise")
 
 
+LONGEST_REASON = 1000
+"""Characters of what somebody writes about one trial or one head-to-head."""
+
+
 class Rating(Base):
     """What was said about a trial, 1 to 5. Append-only: the highest revision counts."""
 
@@ -165,4 +169,51 @@ class Rating(Base):
     response_time_ms: Mapped[int | None]
     by_script: Mapped[bool | None]
     """Whether the page's script sent it, and so saw to it that the film had been shown; None: it was not noted yet."""
+    reason: Mapped[str | None] = mapped_column(String(LONGEST_REASON))
+    """In their own words; None: not asked, or left empty."""
+    created_at: Mapped[datetime] = mapped_column(default=now)
+
+
+class HeadToHeadResponse(StrEnum):
+    """Which of two robots somebody would rather have."""
+
+    LEFT = "left"
+    RIGHT = "right"
+    EQUAL = "equal"
+
+
+class HeadToHead(Base):
+    """Two trials of different methods in one scenario, to be shown side by side once all are rated."""
+
+    __tablename__ = "head_to_head"
+    __table_args__ = (UniqueConstraint("participant_id", "ordinal"),)
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    participant_id: Mapped[int] = mapped_column(ForeignKey("participant.id"), index=True)
+    ordinal: Mapped[int]
+    left_trial_id: Mapped[int] = mapped_column(ForeignKey("trial.id"), index=True)
+    right_trial_id: Mapped[int] = mapped_column(ForeignKey("trial.id"), index=True)
+    shown_at: Mapped[datetime | None]
+
+    left_trial: Mapped[Trial] = relationship(lazy="raise", foreign_keys=left_trial_id)
+    right_trial: Mapped[Trial] = relationship(lazy="raise", foreign_keys=right_trial_id)
+
+
+class HeadToHeadAnswer(Base):
+    """Which of the two somebody would rather have. Append-only: the highest revision counts."""
+
+    __tablename__ = "head_to_head_answer"
+    __table_args__ = (UniqueConstraint("head_to_head_id", "revision"),)
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    head_to_head_id: Mapped[int] = mapped_column(ForeignKey("head_to_head.id"), index=True)
+    revision: Mapped[int]
+    response: Mapped[str] = mapped_column(String(8))
+    """One of HeadToHeadResponse."""
+    reason: Mapped[str | None] = mapped_column(String(LONGEST_REASON))
+    """In their own words; None: not asked, or left empty."""
+    client_uuid: Mapped[str] = mapped_column(String(36), unique=True)
+    response_time_ms: Mapped[int | None]
+    by_script: Mapped[bool]
+    """Whether the page's script sent it, and so saw to it that both films had been shown."""
     created_at: Mapped[datetime] = mapped_column(default=now)

@@ -3,7 +3,7 @@
 from enum import StrEnum
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
 from app.domain.choices import Choice
 from app.domain.described import Section, setting
@@ -120,6 +120,47 @@ class EvaluationSettings(BaseModel):
         ),
     )
 
+    head_to_heads: int = setting(
+        0,
+        Section.EVALUATION,
+        "Head-to-heads of every two methods",
+        "After the ratings two robots side by side in one scenario: which one? 0: none. At most one per trial.",
+        unit="head-to-heads",
+        ge=0,
+        le=20,
+    )
+    head_to_head_ties: bool = setting(
+        True,
+        Section.EVALUATION,
+        "Answers to a head-to-head",
+        options=(
+            ("no", "Left or right", "Who sees no difference has to choose all the same."),
+            ("yes", "Left, right or equal", "Equal counts as half a win for each."),
+        ),
+    )
+    ask_reasons: bool = setting(
+        False,
+        Section.EVALUATION,
+        "Ask for reasons in words",
+        options=(
+            ("no", "Do not ask", "Answering stays short."),
+            ("yes", "Ask every time", "Beside each rating and each head-to-head; it may be left empty."),
+        ),
+    )
+
+    @field_validator("head_to_heads")
+    @classmethod
+    def _filmed(cls, count: int, info: ValidationInfo) -> int:
+        """Each shows two films that were rated."""
+        if count and info.data.get("mode") is EvaluationMode.PHYSICAL:
+            raise ValueError("Two robots are shown side by side on video only. Choose 0 for robots in the room.")
+        if count > info.data.get("trials", count):
+            raise ValueError(
+                f"Each head-to-head shows two trials that were rated: with {info.data['trials']} of each method, "
+                f"enter {info.data['trials']} at most, or choose more trials."
+            )
+        return count
+
     @model_validator(mode="after")
     def _each_once(self) -> "EvaluationSettings":
         if len(set(self.methods)) != len(self.methods):
@@ -152,6 +193,11 @@ class EvaluationSettings(BaseModel):
     def trial_count(self) -> int:
         """Trials that one participant rates altogether."""
         return len(self.methods) * self.trials
+
+    @property
+    def head_to_head_count(self) -> int:
+        """Head-to-heads that one participant answers altogether."""
+        return len(self.methods) * (len(self.methods) - 1) // 2 * self.head_to_heads
 
 
 class Advisor(Choice):

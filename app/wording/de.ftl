@@ -336,6 +336,7 @@ evaluation-satisfaction-high = völlig zufrieden
 evaluation-personalisation = Wie stark ist sein Verhalten Ihrem Eindruck nach auf Sie zugeschnitten?
 evaluation-personalisation-low = überhaupt nicht auf mich zugeschnitten
 evaluation-personalisation-high = völlig auf mich zugeschnitten
+evaluation-reason = Warum? Gern in Ihren eigenen Worten
 evaluation-save = Speichern und weiter
 evaluation-save-change = Änderung speichern
 evaluation-changing = Sie ändern Ihre letzte Bewertung.
@@ -377,6 +378,17 @@ evaluation-done-text =
     { $count ->
         [one] Ihre Bewertung ist sicher gespeichert. Vielen Dank.
        *[other] Ihre { $count } Bewertungen sind sicher gespeichert. Vielen Dank.
+    }
+
+## Direkter Vergleich (Vorsilbe head-to-head-)
+
+head-to-head-explanation = Zwei der Roboter, die Sie bewertet haben, nebeneinander und ohne ihre Buchstaben. Links und rechts wechseln von Paar zu Paar.
+head-to-head-change-last = Meine letzte Antwort ändern
+head-to-head-changing = Sie ändern Ihre letzte Antwort; sie war: { $said }.
+head-to-head-done =
+    { $count ->
+        [one] Auch Ihr direkter Vergleich ist sicher gespeichert.
+       *[other] Auch Ihre { $count } direkten Vergleiche sind sicher gespeichert.
     }
 
 ## Vorschau

@@ -338,6 +338,7 @@ evaluation-satisfaction-high = completely satisfied
 evaluation-personalisation = How personalised does its behaviour feel to you?
 evaluation-personalisation-low = not personalised at all
 evaluation-personalisation-high = completely personalised
+evaluation-reason = Why? In your own words, if you like
 evaluation-save = Save and go on
 evaluation-save-change = Save the change
 evaluation-changing = You are changing your last rating.
@@ -379,6 +380,17 @@ evaluation-done-text =
     { $count ->
         [one] Your rating is safely stored. Thank you.
        *[other] Your { $count } ratings are safely stored. Thank you.
+    }
+
+## Head to head (prefix head-to-head-)
+
+head-to-head-explanation = Two of the robots you rated, side by side and without their letters. Left and right change from one pair to the next.
+head-to-head-change-last = Change my last answer
+head-to-head-changing = You are changing your last answer, which was: { $said }.
+head-to-head-done =
+    { $count ->
+        [one] Your comparison is safely stored, too.
+       *[other] Your { $count } comparisons are safely stored, too.
     }
 
 ## Preview by an experimenter

@@ -97,6 +97,7 @@ function mark(inHand) {
 
 function press(event) {
   if (event.ctrlKey || event.metaKey || event.altKey || event.repeat || !open || sending) return;
+  if (event.target.matches("textarea")) return;
   if (/^[1-5]$/.test(event.key)) {
     const scale = scales.find((each) => each.hasAttribute("data-active")) ?? scales.at(-1);
     scale.querySelector(`input[value="${event.key}"]`).checked = true;

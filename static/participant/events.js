@@ -6,6 +6,7 @@ export class Events {
   }
 
   note(kind, detail = {}) {
+    if (!this.path) return; // events are about pairs, and this page shows others
     const body = new URLSearchParams({ kind, ...detail });
     if (!navigator.sendBeacon?.(this.path, body)) {
       fetch(this.path, { method: "POST", body, keepalive: true }).catch(() => {});

@@ -21,7 +21,8 @@ const words = Object.fromEntries(
 );
 const answers = find("answers");
 const undo = find("undo");
-const why = find("why");
+const why = find("why"); // only where "can't tell" is an answer
+const written = answers.querySelector("[data-written]"); // a reason in words, where the study asks for it
 const buttons = [...answers.querySelectorAll("button")];
 const still = matchMedia("(prefers-reduced-motion: reduce)");
 const watchFirst = page.dataset.watchFirst === "yes";
@@ -57,13 +58,13 @@ async function start() {
     takeBack();
   });
   find("replay").addEventListener("click", replay);
-  why.addEventListener("click", (event) => {
+  why?.addEventListener("click", (event) => {
     const button = event.target.closest("button");
     if (!button) return;
     why.close();
     if (button.dataset.reason !== undefined) give("skip", skippedAfterMs, button.dataset.reason);
   });
-  listen(() => (why.open ? why : page));
+  listen(() => (why?.open ? why : page));
   addEventListener("pageshow", (event) => event.persisted && location.reload());
   events.watchVisibility(() => ({ query_id: watching?.queryId ?? "" }));
 
@@ -142,7 +143,11 @@ function videosOf(pair) {
 
 async function go(next) {
   if (next.state !== "pair" || next.practising !== turn.practising) {
-    location.replace(page.dataset.nextPath);
+    location.replace(next.next_path ?? page.dataset.nextPath);
+    return;
+  }
+  if (page.hasAttribute("data-changing")) {
+    location.replace(page.dataset.nextPath); // back from an answer that was changed
     return;
   }
   turn = next;
@@ -158,6 +163,7 @@ async function go(next) {
     delete figure.dataset.chosen;
   });
   answers.action = turn.pair.label_path;
+  if (written) written.value = "";
   undo.hidden = !turn.undo_path;
   undo.action = turn.undo_path ?? "";
   const progress = find("progress");
@@ -204,7 +210,7 @@ async function give(response, elapsed, reason, button = null) {
   const [leftWatchedMs, rightWatchedMs] = player.watchedMs;
   const entry = outbox.add(turn.pair.label_path, {
     response,
-    reason,
+    reason: written ? written.value : reason,
     response_time_ms: elapsed,
     replay_count: watching.replays,
     play_error_count: watching.playErrors,
@@ -223,6 +229,10 @@ async function give(response, elapsed, reason, button = null) {
 
 async function takeBack() {
   if (phase === "saving" || !turn.undo_path) return;
+  if (undo.method === "get") {
+    location.assign(turn.undo_path); // the answer stays until there is another
+    return;
+  }
   await send(outbox.add(turn.undo_path, {}), undo.querySelector("button"));
 }
 

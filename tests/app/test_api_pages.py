@@ -14,7 +14,7 @@ from sqlalchemy.orm import Session
 
 from app.db import Database, now
 from app.domain.clips import Clip
-from app.domain.evaluation import Rating, Trial
+from app.domain.evaluation import HeadToHead, HeadToHeadAnswer, Rating, Trial
 from app.domain.models import ModelKind
 from app.domain.participation import ConsentRecord, FormAnswer, ParticipantEvent, StageRecord
 from app.domain.people import AuditEvent, Experimenter
@@ -97,6 +97,11 @@ def somebody_does_everything(session: Session, store: ArtefactStore, study: Stud
         uuid = f"{person.id}-{len(given)}"
         more = Rating(trial_id=trial.id, revision=len(given) + 1, satisfaction=1, personalisation=1, client_uuid=uuid)
         session.add(more)
+        compared = session.scalars(select(HeadToHead.id).where(HeadToHead.participant_id == person.id)).first()
+        said = select(HeadToHeadAnswer.id).where(HeadToHeadAnswer.head_to_head_id == compared)
+        revision = len(session.scalars(said).all()) + 1
+        answered = {"head_to_head_id": compared, "revision": revision, "client_uuid": f"{person.id}-h{revision}"}
+        session.add(HeadToHeadAnswer(response="equal", by_script=True, **answered))
         donors.draw(session, study, person, EvaluatedMethod.AVERAGE, ("cautious",))
     factories.make_participant(session, study)
     session.add(Deviation(study_id=study.id, actor="pat", reason="later", before={}, after={}))

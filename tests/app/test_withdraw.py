@@ -10,7 +10,16 @@ from sqlalchemy import func, select
 
 from app.db import Base, Database, now
 from app.domain.clips import Clip
-from app.domain.evaluation import Assignment, Controller, DonorDraw, Film, Rating, Trial
+from app.domain.evaluation import (
+    Assignment,
+    Controller,
+    DonorDraw,
+    Film,
+    HeadToHead,
+    HeadToHeadAnswer,
+    Rating,
+    Trial,
+)
 from app.domain.models import Export, Model, ModelKind, Report, RunKind
 from app.domain.participation import ConsentRecord, FormAnswer, ParticipantEvent, StageRecord
 from app.domain.people import AuditEvent
@@ -78,6 +87,19 @@ def leave_traces(database: Database, store: ArtefactStore, participant_id: int) 
         session.flush()
         session.add(
             Rating(trial_id=trial.id, revision=1, satisfaction=5, personalisation=5, client_uuid=marked("rating")[:36])
+        )
+        compared = HeadToHead(participant_id=person.id, ordinal=1, left_trial_id=trial.id, right_trial_id=trial.id)
+        session.add(compared)
+        session.flush()
+        session.add(
+            HeadToHeadAnswer(
+                head_to_head_id=compared.id,
+                revision=1,
+                response="left",
+                reason=marked("why"),
+                client_uuid=marked("head-to-head")[:36],
+                by_script=True,
+            )
         )
         report_run = factories.make_run(session, study, kind=RunKind.REPORT, stage=marked("report-run"))
         session.add_all(

@@ -18,7 +18,7 @@ from app.web.texts.wording import Wording, built_in_texts, variables_of, wording
 TEMPLATES = sorted(
     [*(ROOT / "templates" / "participant").rglob("*.html"), ROOT / "templates" / "pieces" / "player.html"]
 )
-NAMES_FOR_CODE = r"{% block (page|page_data|body_class|sheet_class|width) %}.*?{% endblock %}"
+NAMES_FOR_CODE = r"{% block (page|page_data|body_class|sheet_class|stage_class|width) %}.*?{% endblock %}"
 DATA = r"data-[\w-]+(=\"[^\"]*\")?"
 SAID = re.compile(r"""say\(\s*["']([a-zA-Z0-9_-]+)["']\s*[,)]""")
 

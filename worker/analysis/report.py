@@ -2,7 +2,8 @@
 
 Contents (stored as Report.contents): ``version``, ``blinded``, ``plan`` (standing, planned tests, in_words: see
 app.services.studies.preregistration), ``ratings`` (see statistics), ``guesses`` (see guesses; None where it is not
-asked), ``answers`` and ``change`` (see answers).
+asked), ``head_to_heads`` (see bradley_terry; None where there are none, or letters hide methods), ``answers`` and
+``change`` (see answers).
 Figures by name, each as SVG and PNG (see figures).
 """
 
@@ -34,6 +35,8 @@ class Tables:
     """answers in the running accuracy"""
     guesses: Sequence[Row] | None = None
     """who named which robot as made for them; None: that is not asked"""
+    head_to_heads: Sequence[Row] | None = None
+    """rows of the table headtoheads; None: there are none, or the study is blinded"""
     version: int = 0
     """of the contents, see app.services.runs.reports"""
     columns: dict[str, Sequence[str]] = field(default_factory=dict)
@@ -57,10 +60,22 @@ def make_report(tables: Tables) -> tuple[dict[str, Any], dict[str, dict[str, byt
             compare=not tables.blinded,
         ),
         "guesses": None if tables.guesses is None else guess_report(tables.guesses, len(tables.groups)),
+        "head_to_heads": None if tables.head_to_heads is None else _head_to_heads(tables),
         "answers": answers.answer_report(tables.answers, tables.window),
         "change": answers.change_report(_frame(tables, "evaluations"), tables.participants),
     }
     return contents, figures.all_figures(contents)
+
+
+def _head_to_heads(tables: Tables) -> dict[str, Any]:
+    from worker.analysis.bradley_terry import head_to_head_report
+
+    rows = [
+        {**each, "left": each["left_method"], "right": each["right_method"]}
+        for each in tables.head_to_heads or ()
+        if each["counts"]
+    ]
+    return head_to_head_report(rows, tables.groups)
 
 
 def _frame(tables: Tables, name: str) -> "pd.DataFrame":

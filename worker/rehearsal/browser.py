@@ -15,6 +15,7 @@ from app.errors import AppError
 _QUERY = re.compile(r"/p/queries/(\d+)/label")
 _BREAK = re.compile(r"/p/break$")
 _RATING = re.compile(r"/p/evaluation/trials/(\d+)/rating")
+_HEAD_TO_HEAD = re.compile(r"/p/head-to-heads/(\d+)/answer")
 _LANGUAGE = re.compile(r"/p/language$")
 _END = "/p/finished"
 _MOST_PAGES = 12
@@ -107,6 +108,19 @@ class FormBrowser:
             raise WentAstray(f"There is no robot to rate on {self._page.address}.")
         points = {"satisfaction": str(satisfaction), "personalisation": str(personalisation)}
         self._send(form.target.group(0), {**form.fields, **points})
+
+    def head_to_head_id(self) -> int | None:
+        """The head-to-head on the page, after loading it anew; None while there is none."""
+        self._open("/p/next")
+        form = self._page.form_to(_HEAD_TO_HEAD)
+        return None if form is None else int(form.target.group(1))
+
+    def prefer(self, response: str) -> None:
+        """Answer the head-to-head and go on."""
+        form = self._page.form_to(_HEAD_TO_HEAD)
+        if form is None:
+            raise WentAstray(f"There are no two robots to compare on {self._page.address}.")
+        self._send(form.target.group(0), {**form.fields, "response": response})
 
     def go_to_the_end(self) -> None:
         """Through whatever forms are left, as they are."""

@@ -13,7 +13,7 @@ from sqlalchemy.orm import Session, joinedload
 
 from app.db import Database
 from app.domain.clips import Clip
-from app.domain.evaluation import Trial
+from app.domain.evaluation import HeadToHead, Trial
 from app.domain.models import ModelKind
 from app.domain.preferences import Query
 from app.domain.studies import Study
@@ -93,6 +93,21 @@ class ScriptedPerson:
         value = float(self._true_rewards(watched).sum())
         given = self._rater.rate(value, watched.success)
         return Rated(trial.film.method, *given, self._rater.share(value), bool(watched.success))
+
+    def prefer(self, head_to_head_id: int) -> str:
+        """Which of two robots this user would rather have: the one whose whole episode suits them better."""
+        with self._database.reading() as session:
+            asked = session.get_one(HeadToHead, head_to_head_id)
+            films = [
+                session.get_one(Trial, each, options=[joinedload(Trial.film)]).film
+                for each in (asked.left_trial_id, asked.right_trial_id)
+            ]
+            values = [
+                float(self._true_rewards(dataset.stored_trajectory(self._store, film.trajectory_sha256)).sum())
+                for film in films
+                if film is not None
+            ]
+        return "left" if values[0] > values[1] or (values[0] == values[1] and self._rng.random() < 0.5) else "right"
 
     def insight(self, participant_id: int) -> Insight | None:
         """What the newest reward model of this participant has understood; None while there is none."""

@@ -192,6 +192,9 @@ class Rehearsal:
             rated = person.rate(trial_id)
             visitor.rate(rated.satisfaction, rated.personalisation)
             outcome.rated.append(rated)
+        for _ in range(evaluation.head_to_head_count):
+            head_to_head_id = wait_until(PATIENCE_S, "no head-to-head", visitor.head_to_head_id)
+            visitor.prefer(person.prefer(head_to_head_id))
 
     def _answer_everything(
         self, visitor: FormBrowser, person: ScriptedPerson, outcome: RehearsedPerson, settings: StudySettings

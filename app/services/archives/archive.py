@@ -93,6 +93,9 @@ def tables_of(study_id: int) -> Iterator[tuple[Table, ColumnElement[bool]]]:
         keys = [key for key in table.foreign_keys if key.column.table in found and key.column.table is not table]
         if not keys or table.name in LEFT_OUT:
             continue
+        own = [key for key in keys if key.column.table.name == Participant.__tablename__ and not key.parent.nullable]
+        if own:  # what else must be there is theirs as well, and SQLite gives up on statements that are nested too deep
+            keys = [*own, *(key for key in keys if key.parent.nullable)]
         inside = [key.parent.in_(select(key.column).where(found[key.column.table])) for key in keys]
         # A row belongs to the study when one of its keys does, and none leads to a row that is left out.
         belongs = [or_(key.parent.is_(None), each) for key, each in zip(keys, inside, strict=True)]

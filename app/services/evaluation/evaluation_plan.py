@@ -9,6 +9,12 @@ are given in the order of appearance (the first block is Robot A), so a letter s
 else. The scenarios are the same for all methods of a participant, one per repetition, and different for other
 participants.
 
+Head-to-heads come when all is rated. Every two meet as often as the study says, each time in another scenario, in
+films that were rated. A round has every pair once, in a drawn order. The robots stand on a drawn circle, and a robot is
+left of those within half a circle after it; with every round the sides change. So in a round each robot is on the left
+as often as on the right (of an even number of robots: once more or less), and every two take turns. That is drawn from
+the participant's seed, for letters and sides say nothing about methods, and kept as rows.
+
 Everything follows from the secret and the seeds, so that drawing twice is drawing once. The hash of the secret is part
 of what is locked, and the secret is shown after unblinding: whoever has both can draw the letters again.
 """
@@ -17,14 +23,17 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from itertools import combinations
+from typing import NamedTuple
 
 from sqlalchemy import or_, select
 from sqlalchemy.orm import Session, joinedload
 
 from app.db import now
-from app.domain.evaluation import Assignment, Controller, Film, Rating, Trial
+from app.domain.evaluation import Assignment, Controller, Film, HeadToHead, Rating, Trial
 from app.domain.protocol import LETTERS, EvaluatedMethod, EvaluationMode, EvaluationSettings
 from app.domain.studies import Participant, Study
+from app.services.evaluation import head_to_heads
 from app.storage import ArtefactStore
 
 TRAINED = tuple(each for each in EvaluatedMethod if each not in (EvaluatedMethod.REFERENCE, EvaluatedMethod.PBARL))
@@ -52,6 +61,8 @@ class EvaluationState(StrEnum):
     """Physical: the robot moves."""
     RATING = "rating"
     """Physical: the robot has moved, and is to be rated."""
+    COMPARING = "comparing"
+    """Video: all is rated, and two robots are to be compared."""
     FINISHED = "finished"
 
 
@@ -66,6 +77,20 @@ class NextTrial:
     """Its film loaded. None while the robots are prepared, and at the end."""
     correctable: Trial | None
     """The trial rated last, whose rating can still be changed."""
+    compared: int = 0
+    to_compare: int = 0
+    head_to_heads: Sequence[HeadToHead] = ()
+    """Those without an answer, the one to be shown now first. Empty while there is something to rate."""
+    changeable: HeadToHead | None = None
+    """The one answered last, whose answer can still be changed."""
+
+
+class Meeting(NamedTuple):
+    """Which two robots meet, on which side, in the scenario of which repetition."""
+
+    left: str
+    right: str
+    repetition: int
 
 
 def settings_of(study: Study) -> EvaluationSettings | None:
@@ -93,8 +118,23 @@ def order_of_methods(secret: str, methods: Sequence[EvaluatedMethod], number: in
     return [drawn[index] for index in row]
 
 
+def meetings(seed: int, settings: EvaluationSettings) -> Sequence[Meeting]:
+    """The head-to-heads of the participant with this seed, in their order."""
+    letters, trials = LETTERS[: len(settings.methods)], range(1, settings.trials + 1)
+    circle = sorted(letters, key=lambda each: mark(str(seed), "circle", each))
+    scenarios = sorted(trials, key=lambda each: mark(str(seed), "scenarios", each))
+    pairs = list(enumerate(combinations(range(len(circle)), 2)))
+    found = []
+    for number in range(settings.head_to_heads):
+        for place, (one, other) in sorted(pairs, key=lambda each: mark(str(seed), "round", number, each)):
+            ahead = 2 * (other - one) <= len(circle)
+            left, right = (one, other) if ahead == (number % 2 == 0) else (other, one)
+            found.append(Meeting(circle[left], circle[right], scenarios[(number + place) % len(scenarios)]))
+    return found
+
+
 def draw(session: Session, study: Study, participant: Participant) -> None:
-    """Draw the participant's letters and trials; drawing again changes nothing."""
+    """Draw the participant's letters, trials and head-to-heads; drawing again changes nothing."""
     settings = settings_of(study)
     if settings is None or participant.withdrawn_at is not None:
         return
@@ -113,6 +153,11 @@ def draw(session: Session, study: Study, participant: Participant) -> None:
                 scenario=trial_scenario(participant, repetition),
             )
             session.add(trial)
+    session.flush()
+    known = {(trial.letter, trial.repetition): trial.id for trial in trials_of(session, participant.id)}
+    for ordinal, (left, right, repetition) in enumerate(meetings(participant.seed, settings), 1):
+        sides = {"left_trial_id": known[left, repetition], "right_trial_id": known[right, repetition]}
+        session.add(HeadToHead(participant_id=participant.id, ordinal=ordinal, **sides))
     session.flush()
 
 
@@ -154,14 +199,14 @@ def ratings_of(session: Session, participant_id: int) -> dict[int, Rating]:
 
 
 def next_turn(session: Session, store: ArtefactStore, participant: Participant) -> NextTrial:
-    """What the participant is to be shown; the study is loaded. Marks a film as shown."""
+    """What the participant is to be shown; the study is loaded. Marks a film, or two, as shown."""
     draw(session, participant.study, participant)
     trials, ratings = trials_of(session, participant.id), ratings_of(session, participant.id)
     rated = [trial for trial in trials if trial.id in ratings]
     open_trials = [trial for trial in trials if trial.id not in ratings]
     last = rated[-1] if rated else None
     if trials and not open_trials:
-        return NextTrial(EvaluationState.FINISHED, len(rated), len(trials), None, last)
+        return _next_head_to_head(session, store, participant, len(trials), last)
     state = _state(session, store, participant, trials)
     if state is EvaluationState.PREPARING:
         return NextTrial(state, len(rated), len(trials), None, last)
@@ -169,6 +214,27 @@ def next_turn(session: Session, store: ArtefactStore, participant: Participant) 
     if state is EvaluationState.WATCHING and trial.shown_at is None:
         trial.shown_at = now()
     return NextTrial(state, len(rated), len(trials), trial, last)
+
+
+def _next_head_to_head(
+    session: Session, store: ArtefactStore, participant: Participant, rated: int, last: Trial | None
+) -> NextTrial:
+    meant = head_to_heads.of_participant(session, participant.id)
+    answered = head_to_heads.answers_of(session, participant.id)
+    waiting = [each for each in meant if each.id not in answered]
+    changeable = next((each for each in reversed(meant) if each.id in answered), None)
+    state = EvaluationState.COMPARING if waiting else EvaluationState.FINISHED
+    if waiting and not _can_be_compared(store, waiting[0]):
+        state = EvaluationState.PREPARING
+    if state is EvaluationState.COMPARING and waiting[0].shown_at is None:
+        waiting[0].shown_at = now()
+    last = None if changeable else last
+    return NextTrial(state, rated, rated, None, last, len(meant) - len(waiting), len(meant), waiting, changeable)
+
+
+def _can_be_compared(store: ArtefactStore, each: HeadToHead) -> bool:
+    films = [trial.film for trial in (each.left_trial, each.right_trial)]
+    return all(film is not None and store.seems_whole(film.video_sha256) for film in films)
 
 
 def _state(

@@ -13,6 +13,7 @@ from app.domain.evaluation import Rating, Trial
 from app.domain.protocol import EvaluationMode
 from app.domain.studies import Participant
 from app.errors import AppError
+from app.services.evaluation import head_to_heads
 
 
 class TrialNotFound(AppError):
@@ -47,10 +48,11 @@ class RatingMisdirected(AppError):
 
 @dataclass(frozen=True)
 class Score:
-    """What somebody says about one trial: 1 to 5 each."""
+    """What somebody says about one trial: 1 to 5 each, and why in their own words."""
 
     satisfaction: int
     personalisation: int
+    reason: str | None = None
 
 
 def rate(
@@ -82,6 +84,7 @@ def rate(
         raise RatedAlready
     if ratings and not is_last_rated(session, trial):
         raise CorrectionTooLate
+    settings = participant.study.settings.evaluation
     rating = Rating(
         trial_id=trial.id,
         revision=corrects + 1,
@@ -90,6 +93,7 @@ def rate(
         client_uuid=str(client_uuid),
         response_time_ms=response_time_ms,
         by_script=by_script,
+        reason=score.reason if settings is not None and settings.ask_reasons else None,
     )
     return _append(session, trial, rating)
 
@@ -109,7 +113,9 @@ def find_rated(session: Session, participant: Participant, trial_id: int) -> tup
 
 
 def is_last_rated(session: Session, trial: Trial) -> bool:
-    """Whether no later trial has a rating."""
+    """Whether nothing that came later has an answer."""
+    if head_to_heads.have_begun(session, trial.participant_id):
+        return False
     later = select(Rating.id).join(Trial)
     later = later.where(Trial.participant_id == trial.participant_id, Trial.ordinal > trial.ordinal)
     return session.scalar(later.limit(1)) is None

@@ -10,7 +10,7 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session, aliased, joinedload
 
 from app.domain.clips import Clip, Rollout
-from app.domain.evaluation import DonorDraw, Rating, Trial
+from app.domain.evaluation import DonorDraw, HeadToHead, HeadToHeadAnswer, Rating, Trial
 from app.domain.models import Bundle, Model, ModelKind
 from app.domain.participation import ConsentRecord, FormAnswer, ParticipantEvent, StageRecord
 from app.domain.preferences import LEARNED_FROM, Exclusion, LabelEvent, Query
@@ -237,6 +237,7 @@ def ratings(session: Session, study: Study, window: Window = EVERYTHING) -> Keye
                     trial.scenario,
                     rating.satisfaction if rating else None,
                     rating.personalisation if rating else None,
+                    rating.reason if rating else None,
                     rating is not None and newest[trial.id] == rating.revision,
                     rating.revision if rating else None,
                     rating.response_time_ms if rating else None,
@@ -246,6 +247,47 @@ def ratings(session: Session, study: Study, window: Window = EVERYTHING) -> Keye
                     trial.started_at,
                     trial.finished_at,
                     trial.film.success if trial.film is not None and not blinded else None,
+                ),
+            )
+
+
+def headtoheads(session: Session, study: Study, window: Window = EVERYTHING) -> KeyedRows:
+    methods = {} if unblinding.is_blinded(study) else unblinding.methods_by_letter(session, study)
+    for person, wanted in _present(session, study, window):
+        rows = session.execute(
+            select(HeadToHead, HeadToHeadAnswer)
+            .outerjoin(
+                HeadToHeadAnswer, (HeadToHeadAnswer.head_to_head_id == HeadToHead.id) & wanted.known(HeadToHeadAnswer)
+            )
+            .where(HeadToHead.participant_id == person.id, wanted.known(HeadToHead))
+            .options(joinedload(HeadToHead.left_trial), joinedload(HeadToHead.right_trial))
+            .order_by(HeadToHead.ordinal, HeadToHeadAnswer.revision)
+        ).all()
+        newest = {each.id: given.revision for each, given in rows if given is not None}
+        for each, given in rows:
+            key = each.ordinal, *((given.revision, given.id) if given else (0, 0))
+            if key <= wanted.after:
+                continue
+            left, right = each.left_trial, each.right_trial
+            yield (
+                (person.number, *key),
+                (
+                    person.code,
+                    each.ordinal,
+                    left.letter,
+                    right.letter,
+                    methods.get((person.id, left.letter)),
+                    methods.get((person.id, right.letter)),
+                    left.repetition,
+                    left.scenario,
+                    given.response if given else None,
+                    given.reason if given else None,
+                    given is not None and newest[each.id] == given.revision,
+                    given.revision if given else None,
+                    given.response_time_ms if given else None,
+                    given.by_script if given else None,
+                    given.created_at if given else None,
+                    each.shown_at,
                 ),
             )
 

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from app.domain.clips import Clip
-from app.domain.evaluation import DonorDraw, DonorRule, Rating, Trial
+from app.domain.evaluation import DonorDraw, DonorRule, HeadToHead, HeadToHeadAnswer, HeadToHeadResponse, Rating, Trial
 from app.domain.models import Model, ModelKind
 from app.domain.participation import ConsentRecord, FormAnswer, ParticipantEvent, StageRecord
 from app.domain.preferences import LabelEvent, Purpose, Query, Response, SkipReason
@@ -214,6 +214,12 @@ TABLES: Sequence[Table] = (
             Column("scenario", I, "Situation; the same for all methods of a participant and repetition."),
             Column("satisfaction", I, "Overall satisfaction.", allowed="1 to 5; empty: not rated"),
             Column("personalisation", I, "How personalised the robot seemed.", allowed="1 to 5; empty: not rated"),
+            Column(
+                "reason",
+                T,
+                "Why, in their own words; empty: not asked, or left empty.",
+                allowed="up to 1000 characters",
+            ),
             Column("counts", B, "Whether this rating counts: false if it was corrected later, or if there is none."),
             Column("revision", I, "First, second, ... rating of this trial.", allowed="from 1"),
             Column(
@@ -229,6 +235,48 @@ TABLES: Sequence[Table] = (
         export_rows.ratings,
         (Trial, Rating),
         grows_by=Rating,
+    ),
+    Table(
+        "headtoheads",
+        "Every head-to-head of two rated robots with its answer; a changed answer has one row per revision.",
+        (
+            PARTICIPANT,
+            Column("order", I, "Place among all head-to-heads of this participant.", allowed="from 1"),
+            Column("left_letter", T, "Letter of the robot on the left; it was not shown.", allowed="A to E"),
+            Column("right_letter", T, "Letter of the robot on the right; it was not shown.", allowed="A to E"),
+            Column(
+                "left_method", T, "Method on the left; empty until the study is unblinded.", "", _words(EvaluatedMethod)
+            ),
+            Column(
+                "right_method",
+                T,
+                "Method on the right; empty until the study is unblinded.",
+                allowed=_words(EvaluatedMethod),
+            ),
+            Column("repetition", I, "Whose films these are: the repetition of both rated trials.", allowed="from 1"),
+            Column("scenario", I, "Situation; the same on both sides."),
+            Column(
+                "response",
+                T,
+                "Which one they would rather have; empty: not answered.",
+                allowed=_words(HeadToHeadResponse),
+            ),
+            Column(
+                "reason",
+                T,
+                "Why, in their own words; empty: not asked, or left empty.",
+                allowed="up to 1000 characters",
+            ),
+            Column("counts", B, "Whether this answer counts: false if it was changed later, or if there is none."),
+            Column("revision", I, "First, second, ... answer to this head-to-head.", allowed="from 1"),
+            Column("response_time_ms", I, "From the first frame of both films to the answer.", "ms"),
+            Column("by_script", B, WITHOUT_SCRIPT),
+            Column("answered_at", W, "When it reached the server."),
+            Column("shown_at", W, "When both films were first shown."),
+        ),
+        export_rows.headtoheads,
+        (HeadToHead, HeadToHeadAnswer),
+        grows_by=HeadToHeadAnswer,
     ),
     Table(
         "donors",

@@ -12,7 +12,7 @@ from sqlalchemy.orm import Session, joinedload
 
 from app.db import now
 from app.domain.clips import Clip, Rollout
-from app.domain.evaluation import Film, Rating, Trial
+from app.domain.evaluation import Film, HeadToHeadAnswer, Rating, Trial
 from app.domain.models import Bundle, Model, ModelKind, Run, RunKind, RunStatus, WorkerPresence
 from app.domain.participation import StageRecord
 from app.domain.people import StudyMember
@@ -175,6 +175,7 @@ def fingerprint(session: Session) -> str:
         select(func.max(Trial.started_at)).scalar_subquery(),
         select(func.max(Trial.finished_at)).scalar_subquery(),
         select(func.max(Film.id)).scalar_subquery(),
+        select(func.max(HeadToHeadAnswer.id)).scalar_subquery(),
     )
     return repr(tuple(session.execute(select(*newest)).one()))
 

@@ -10,7 +10,7 @@ from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
 from app.db import now
-from app.domain.evaluation import Rating, Trial
+from app.domain.evaluation import HeadToHead, HeadToHeadAnswer, Rating, Trial
 from app.domain.participation import StageRecord
 from app.domain.preferences import LabelEvent, Purpose, Query
 from app.domain.protocol import Stage
@@ -76,7 +76,10 @@ def _is_finished(session: Session, participant: Participant, stage: Stage, recor
         case Stage.PAIRS:
             return _answered(session, participant, set(Purpose) - {Purpose.PRACTICE}) >= settings.question_count
         case Stage.EVALUATION:
-            return settings.evaluation is None or _rated(session, participant) >= settings.evaluation.trial_count
+            return settings.evaluation is None or (
+                _rated(session, participant) >= settings.evaluation.trial_count
+                and _compared(session, participant) >= settings.evaluation.head_to_head_count
+            )
         case Stage.DEMOGRAPHICS | Stage.QUESTIONNAIRE | Stage.DEBRIEF:
             return stage in records and records[stage].finished_at is not None
 
@@ -99,6 +102,11 @@ def _answered(session: Session, participant: Participant, purposes: Sequence[Pur
 def _rated(session: Session, participant: Participant) -> int:
     rated = select(func.count(func.distinct(Rating.trial_id))).join(Trial).where(Trial.participant_id == participant.id)
     return session.scalar(rated) or 0
+
+
+def _compared(session: Session, participant: Participant) -> int:
+    given = select(func.count(func.distinct(HeadToHeadAnswer.head_to_head_id))).join(HeadToHead)
+    return session.scalar(given.where(HeadToHead.participant_id == participant.id)) or 0
 
 
 def _records(session: Session, participant: Participant) -> dict[Stage, StageRecord]:

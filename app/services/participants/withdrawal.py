@@ -129,15 +129,18 @@ def _rows_below(root_name: str, root_id: int) -> Iterator[tuple[Table, ColumnEle
     """
     root = Base.metadata.tables[root_name]
     found: dict[Table, ColumnElement[bool]] = {root: root.c.id == root_id}
+    depth = {root: 0}
     for table in Base.metadata.sorted_tables:
         if table is root:
             continue
         parents = [key for key in table.foreign_keys if key.column.table in found and key.column.table is not table]
         direct = [key for key in parents if key.column.table is root]
-        # The schema's own order is by chance, and a key that may be empty leads to some of the rows only.
-        parents.sort(key=lambda key: (bool(key.parent.nullable), key.parent.name))
+        # The schema's own order is by chance, and a key that may be empty leads to some of the rows only. The shortest
+        # way: SQLite gives up on statements within statements that are six deep.
+        parents.sort(key=lambda key: (bool(key.parent.nullable), depth[key.column.table], key.parent.name))
         for key in direct or parents[:1]:
             found[table] = key.parent.in_(select(key.column).where(found[key.column.table]))
+            depth[table] = depth[key.column.table] + 1
             yield table, found[table]
 
 

@@ -8,7 +8,7 @@ from fastapi import APIRouter, Form, Request
 from fastapi.responses import JSONResponse, RedirectResponse, Response
 from pydantic import BaseModel, BeforeValidator, Field
 
-from app.domain.evaluation import Film, Rating, Trial
+from app.domain.evaluation import LONGEST_REASON, Film, Rating, Trial
 from app.domain.protocol import LIKERT_POINTS, Stage
 from app.domain.studies import Awaited, Participant
 from app.services.answers import next_query
@@ -22,7 +22,15 @@ router = APIRouter(prefix="/p/evaluation")
 
 _DAY_MS = 24 * 3600 * 1000
 _Points = Annotated[int, Field(ge=1, le=LIKERT_POINTS)]
-_Milliseconds = Annotated[int | None, BeforeValidator(lambda value: value or None), Field(ge=0, le=_DAY_MS)]
+Milliseconds = Annotated[int | None, BeforeValidator(lambda value: value or None), Field(ge=0, le=_DAY_MS)]
+
+
+def _words(value: object) -> object:
+    """What was written, with plain line breaks; None for nothing."""
+    return value.replace("\r\n", "\n").strip() or None if isinstance(value, str) else value
+
+
+Reason = Annotated[Annotated[str, Field(max_length=LONGEST_REASON)] | None, BeforeValidator(_words)]
 
 InEvaluation = Annotated[Participant, is_in(Stage.EVALUATION)]
 AtEvaluation = Annotated[Participant, has_reached(Stage.EVALUATION)]
@@ -43,7 +51,8 @@ class RatingForm(BaseModel):
     personalisation: _Points
     client_uuid: UUID
     corrects: Annotated[int, Field(ge=0, le=10_000)] = 0
-    response_time_ms: _Milliseconds = None
+    response_time_ms: Milliseconds = None
+    reason: Reason = None
 
 
 @router.get("", name="show_evaluation")
@@ -56,6 +65,8 @@ def show_evaluation(
     next_query.waits(participant, Awaited.ROBOTS if turn.state is EvaluationState.PREPARING else None)
     if wants_json(request):
         return JSONResponse(_for_script(request, turn))
+    if turn.state is EvaluationState.COMPARING:
+        return go(request, "show_head_to_head")
     if turn.trial is None:
         context: dict[str, Any] = {"turn": turn, "preparation": robot_preparation.preparation(session, participant)}
         return participant_page(request, _TEMPLATES[EvaluationState.PREPARING], participant, context)
@@ -97,7 +108,7 @@ def rate_trial(
     """Store the rating; the transaction is committed before this response leaves."""
     if participant.completed_at is not None:
         raise ratings.CorrectionTooLate
-    score = ratings.Score(form.satisfaction, form.personalisation)
+    score = ratings.Score(form.satisfaction, form.personalisation, form.reason)
     ratings.rate(
         session,
         participant,
@@ -110,7 +121,7 @@ def rate_trial(
     )
     next_query.seen(participant)
     turn = evaluation_plan.next_turn(session, studio.store, participant)
-    name = "show_evaluation_done" if turn.state is EvaluationState.FINISHED else "show_evaluation"
+    name = next_page(turn)
     if wants_json(request):
         return JSONResponse({**_for_script(request, turn), "next_path": request.app.url_path_for(name)})
     return RedirectResponse(request.app.url_path_for(name), HTTPStatus.SEE_OTHER)
@@ -120,6 +131,12 @@ def rate_trial(
 def leave_evaluation(request: Request, participant: AtEvaluation) -> Response:
     """On to what comes after the evaluation."""
     return go(request, "show_next")
+
+
+def next_page(turn: NextTrial) -> str:
+    """The name of the page on which a participant goes on."""
+    names = {EvaluationState.COMPARING: "show_head_to_head", EvaluationState.FINISHED: "show_evaluation_done"}
+    return names.get(turn.state, "show_evaluation")
 
 
 def _trial_page(
@@ -134,6 +151,8 @@ def _trial_page(
         "film": None if trial.film is None else _film(request, trial.film),
         "client_uuid": uuid4(),
         "points": range(1, LIKERT_POINTS + 1),
+        "asks_reason": settings is not None and settings.ask_reasons,
+        "longest_reason": LONGEST_REASON,
     }
     return participant_page(request, template, participant, context)
 

@@ -94,6 +94,7 @@ def show_turn(request: Request, session: Session, studio: Studio, participant: P
         context["seconds_left"] = estimates.until_pair_s(session, participant.study)
     if turn.query is not None:
         context |= {"pair": _pair(request, turn.query), "client_uuid": uuid4(), "reasons": list(SkipReason)}
+        context |= {"responses": set(preferences.Response), "next_path": None, "given": None}
     return participant_page(request, f"participant/{_template(turn)}.html", participant, context)
 
 

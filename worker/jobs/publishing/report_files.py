@@ -13,7 +13,7 @@ from sqlalchemy import delete, func, select
 from sqlalchemy.orm import Session
 
 from app.db import now
-from app.domain.evaluation import Rating, Trial
+from app.domain.evaluation import HeadToHead, HeadToHeadAnswer, Rating, Trial
 from app.domain.models import Model, Report, Run, RunKind, RunStatus
 from app.domain.participation import FormAnswer
 from app.domain.preferences import Exclusion, LabelEvent, Query
@@ -70,6 +70,9 @@ def basis_of(session: Session, study: Study) -> str | None:
     newest = [
         session.scalar(select(func.max(LabelEvent.id)).join(Query).where(Query.participant_id.in_(people))),
         session.scalar(select(func.max(Rating.id)).join(Trial).where(Trial.participant_id.in_(people))),
+        session.scalar(
+            select(func.max(HeadToHeadAnswer.id)).join(HeadToHead).where(HeadToHead.participant_id.in_(people))
+        ),
         session.scalar(select(func.max(Model.id)).where(Model.participant_id.in_(people))),
     ]
     if not any(newest):
@@ -115,7 +118,7 @@ def tables_of(session: Session, study: Study) -> Tables:
     """What the statistics are computed from: the rows that are exported, and the dashboard's figures of each person."""
     settings, blinded = evaluation_plan.settings_of(study), unblinding.is_blinded(study)
     groups: Sequence[str] = [method.value for method in settings.methods] if settings else []
-    wanted = {name: export_tables.BY_NAME[name] for name in ("ratings", "evaluations")}
+    wanted = {name: export_tables.BY_NAME[name] for name in ("ratings", "evaluations", "headtoheads")}
     provenance = export_formats.provenance_of(session, study)
     rows = {name: list(export_formats.records(table, session, study, provenance)) for name, table in wanted.items()}
     people = [each for each in export_rows.everybody(session, study) if each.withdrawn_at is None]
@@ -130,6 +133,7 @@ def tables_of(session: Session, study: Study) -> Tables:
         columns={name: [column.name for column in table.all_columns] for name, table in wanted.items()},
         ratings=rows["ratings"],
         evaluations=rows["evaluations"],
+        head_to_heads=rows["headtoheads"] if settings and settings.head_to_heads and not blinded else None,
         guesses=_guesses(session, study) if _asks_whose(study) else None,
     )
 

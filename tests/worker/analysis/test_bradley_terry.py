@@ -1,0 +1,66 @@
+"""Bradley-Terry strengths against published and hand-computed values, and intervals that count people."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from worker.analysis.bradley_terry import covariance, head_to_head_report, strengths
+
+
+def answers(person: str, left: str, right: str, *said: str) -> list[dict[str, Any]]:
+    return [{"participant": person, "left": left, "right": right, "response": each} for each in said]
+
+
+def test_baseball_as_agresti_publishes_it() -> None:
+    """American League East 1987: Agresti, Categorical Data Analysis (1990), section 10.6; Baltimore is zero."""
+    wins = np.array(
+        [
+            [0, 7, 9, 7, 7, 9, 11],
+            [6, 0, 7, 5, 11, 9, 9],
+            [4, 6, 0, 7, 7, 8, 12],
+            [6, 8, 6, 0, 6, 7, 10],
+            [6, 2, 6, 7, 0, 7, 12],
+            [4, 4, 5, 6, 6, 0, 6],
+            [2, 4, 1, 3, 1, 7, 0],
+        ],
+        float,
+    )
+    found = strengths(wins)
+    assert (found - found[-1]).round(2).tolist() == [1.58, 1.44, 1.29, 1.25, 1.11, 0.68, 0.0]
+
+
+def test_two_methods_by_hand() -> None:
+    """18 of 24 is a log odds of log 3; people of 3, 3, 3 and 0 wins, variance 4/3 of sum (w - n p)^2 / (n p q)^2."""
+    rows = [row for person in range(6) for row in answers(str(person), "a", "b", *["left"] * 3, "right")]
+    report = head_to_head_report(rows, ["a", "b"])
+    assert report["comparisons"][0]["difference"] == pytest.approx(-np.log(3))
+    assert report["wins"] == [[0, 18], [6, 0]]
+    wins = np.array([[[0, w], [4 - w, 0]] for w in (4, 4, 4, 2, 2, 2)], float)
+    found = strengths(wins.sum(axis=0))
+    spread = covariance(wins, found)
+    information, scores = 24 * 0.75 * 0.25, 6 * 1.0
+    difference = spread[0, 0] + spread[1, 1] - 2 * spread[0, 1]
+    assert difference == pytest.approx(6 / 5 * scores / information**2)
+
+
+def test_an_equal_is_half_a_win_and_sides_do_not_matter() -> None:
+    one = [row for p in "wxyz" for row in answers(p, "a", "b", "left", "equal")]
+    other = [row for p in "wxyz" for row in answers(p, "b", "a", "right", "equal")]
+    first, second = (head_to_head_report(rows, ["a", "b"]) for rows in (one, other))
+    assert first["wins"] == second["wins"] == [[0, 6], [2, 0]]
+    assert first["comparisons"] == second["comparisons"]
+
+
+def test_the_same_answers_from_fewer_people_say_less() -> None:
+    many = [row for p in range(24) for row in answers(str(p), "a", "b", "left" if p % 3 else "right")]
+    few = [row for p in range(8) for row in answers(str(p), "a", "b", *["left" if p % 3 else "right"] * 3)]
+    wide, narrow = (head_to_head_report(rows, ["a", "b"])["comparisons"][0] for rows in (few, many))
+    assert wide["p"] > narrow["p"]
+
+
+def test_what_cannot_be_estimated_is_said() -> None:
+    always = [row for p in "uvwxyz" for row in answers(p, "a", "b", "left")]
+    assert "always preferred" in head_to_head_report(always, ["a", "b"])["not_computable"]
+    assert "4 are needed" in head_to_head_report(always[:2], ["a", "b"])["not_computable"]
+    assert head_to_head_report([], ["a", "b"])["answers"] == 0
