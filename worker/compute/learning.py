@@ -7,6 +7,7 @@ from typing import Any, cast, get_args
 import numpy as np
 import numpy.typing as npt
 
+from worker.analysis.promise import Outcome, outcome_of
 from worker.compute.simulation import reference_rollouts, run_episode, signal_predictor
 from worker.ml.filters.filter_problem import noisy
 from worker.ml.rewards import reward_training
@@ -28,6 +29,12 @@ def warm_up(task: str) -> None:
 def run_scenarios(task: str, act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
     """One rollout per scenario, with Gaussian noise of this deviation on every action."""
     return [run_episode(task, noisy(act, noise, seed, scenario), scenario) for scenario in scenarios]
+
+
+def outcomes(task: str, act: Act, scenarios: Sequence[int]) -> list[Outcome]:
+    """What could harm in one rollout per scenario."""
+    driven = (run_episode(task, act, scenario) for scenario in scenarios)
+    return [outcome_of(each, registry.task(task)) for each in driven]
 
 
 def fit_reward(

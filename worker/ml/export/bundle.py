@@ -188,6 +188,7 @@ def _manifest(contents: BundleContents) -> dict[str, Any]:
         "learned_weights": contents.metrics.get("weights"),
         "learned_costs": contents.metrics.get("costs"),
         "evaluation": contents.metrics.get("evaluation"),
+        "promise": contents.metrics.get("promise") or None,
         "notes": list(contents.metrics.get("notes", ())),
         "versions": {
             "python": platform.python_version(),

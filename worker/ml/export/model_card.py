@@ -52,6 +52,7 @@ def model_card(manifest: Mapping[str, Any]) -> str:
     sections = [
         _what(manifest),
         _REFERENCE if manifest.get("uses_reference_policy") else _way(manifest),
+        _promise(manifest),
         _matters(manifest),
         _measured(manifest.get("evaluation")),
         _notes(manifest),
@@ -92,6 +93,13 @@ def _way(manifest: Mapping[str, Any]) -> str:
     ]
     heading = f"## This person's way\n\nGate {manifest['gate']:.0%}, residual {manifest['residual_share']:.0%}."
     return "\n".join([heading, "", "| axis | value | range | meaning |", "|---|---|---|---|", *rows])
+
+
+def _promise(manifest: Mapping[str, Any]) -> str:
+    """What is promised about harm."""
+    promise = manifest.get("promise")
+    said = promise["sentence"] if promise else "Nothing is promised of this filter: it was not tested for harm."
+    return f"## Promise about harm\n\n{said} Scenarios are those of the simulation, not of a real room."
 
 
 def _matters(manifest: Mapping[str, Any]) -> str:

@@ -12,7 +12,7 @@ with act(observation (D,)) -> action (7,), and ``noise`` the standard deviation 
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -135,6 +135,8 @@ class FilterDraft:
     """in their order, except that the chosen mode's comes after the other modes'"""
     notes: tuple[str, ...] = ()
     seconds: Mapping[str, float] = field(default_factory=dict)
+    promise: Mapping[str, Any] = field(default_factory=dict)
+    """worker.analysis.promise.Promise with the tests by which it was earned, as plain values; empty: none is made"""
 
     def timed(self, stage: str, started: float) -> "FilterDraft":
         """The same with the seconds since ``started`` added to a stage."""
