@@ -22,6 +22,7 @@ from worker.ml.export import bundle
 from worker.ml.export.bundle import BundleContents, Provenance, RecordedSteps
 from worker.ml.filters import filter_problem, mode_search, printed_filter, residual
 from worker.ml.filters.filter_module import FilterWeights
+from worker.ml.filters.filter_onnx import SHIELD
 from worker.ml.filters.filter_problem import (
     FilterAct,
     FilterConfig,
@@ -112,7 +113,8 @@ class FilterFit:
         return residual.gate_residual(self.problem, draft, reference, self.collect, self.progress)
 
     def keep_promise(self, draft: FilterDraft) -> FilterDraft:
-        """As much of the filter as the promise about harm can be made of."""
+        """The filter behind its shield, as far as the promise about harm can be made of it."""
+        draft = draft.shielded()
         if moves_nothing(draft.weights):
             return harm_tests.untested(draft, self.promise, self.version)
         started = time.perf_counter()
@@ -162,6 +164,7 @@ class FilterFit:
             "evaluation": evaluation,
             "uses_reference": unchanged,
             "promise": self._promised(draft, unchanged),
+            "shield_active": _shield_active(proven),
             "rejected": proven.rejected,
             **_strengths(draft.weights),
             "mode": dict(draft.weights.mode),
@@ -262,6 +265,15 @@ def as_reference(draft: FilterDraft, preference: Mapping[str, float], against: S
     return replace(draft, weights=FilterWeights(gate=0.0), notes=(*draft.notes, note))
 
 
+def _shield_active(proven: Proven) -> float | None:
+    """In what share of the evaluation's steps the shield did something; None: there is none."""
+    if not proven.act.exported.is_shielded:
+        return None
+    steps = RecordedSteps.of(proven.driven)
+    (activity,) = proven.act.exported.run(steps.observations, steps.policy_means, [SHIELD])
+    return round(float((activity > 0.0).mean()), 4)
+
+
 def _strengths(weights: FilterWeights) -> dict[str, float]:
     return {"gate": weights.gate, "residual_share": weights.residual_share if weights.encoder else 0.0}
 
@@ -286,6 +298,7 @@ def draft_to_bytes(draft: FilterDraft) -> bytes:
         "promise": dict(draft.promise),
     }
     arrays: dict[str, Any] = {f"value/{name}": array for name, array in draft.value.items()}
+    arrays |= {f"tested/{name}": array for name, array in draft.tested.items()}
     arrays["weights"] = np.frombuffer(draft.weights.to_bytes(), np.uint8)
     arrays["record"] = np.array(json.dumps(record))
     target = io.BytesIO()
@@ -297,7 +310,12 @@ def draft_from_bytes(stored: bytes) -> FilterDraft:
     """Read what draft_to_bytes() wrote."""
     with np.load(io.BytesIO(stored), allow_pickle=False) as arrays:
         record = json.loads(str(arrays["record"]))
-        value = {name.removeprefix("value/"): arrays[name] for name in arrays.files if name.startswith("value/")}
+        value, tested = (
+            {name.removeprefix(part): arrays[name] for name in arrays.files if name.startswith(part)}
+            for part in ("value/", "tested/")
+        )
         weights = FilterWeights.from_bytes(arrays["weights"].tobytes())
     trials = tuple(GateTrial(**each) for each in record["trials"])
-    return FilterDraft(weights, value, trials, tuple(record["notes"]), record["seconds"], record.get("promise", {}))
+    return FilterDraft(
+        weights, value, trials, tuple(record["notes"]), record["seconds"], tested, record.get("promise", {})
+    )
