@@ -210,7 +210,7 @@ class StudySettings(BaseModel):
         le=0.5,
         new_row=True,
     )
-    harm_confidence: float = setting(0.95, Section.LEARNING, "Confidence of that promise", unit="%", ge=0.8, le=0.999)
+    harm_confidence: float = setting(0.95, Section.LEARNING, "Confidence of that promise", unit="%", ge=0.8, le=0.99)
     harm_force_n: float = setting(
         5.0,
         Section.LEARNING,

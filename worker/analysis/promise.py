@@ -21,7 +21,7 @@ from worker.trajectory import Trajectory
 
 HOPED_FOR = 0.2
 """Of the promised share: filters that harm so rarely are recognised soonest."""
-PATIENCE = 2.5
+PATIENCE = 1.75
 """After so many times the scenarios that suffice without harm, a strength has not earned the promise."""
 BATCH = 30
 """Scenarios between two looks; the same whatever the number of processes."""
