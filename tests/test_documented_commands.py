@@ -127,6 +127,8 @@ RUN: dict[str, str | Elsewhere | OnlyParsed] = {
     "render_speed": "--tasks feeding --films 1 --steps 1",
     "replayed_waiting": REAL_TIME,
     "retraining": ROLLOUTS,
+    "promises": ROLLOUTS,
+    "promise_error_rates": "--people 2",
     "rooms": Elsewhere("tests/architecture/test_rooms.py::test_the_picture_of_the_rooms_is_up_to_date"),
     "rounds": "1",
     "same_bits": OnlyParsed("trains every method; docs/results/same_bits.txt is what it prints"),

@@ -21,12 +21,17 @@ RESIDUAL = range(3_000_000, 4_000_000)
 """Rollouts from which the residual and the printed encoder learn."""
 EVALUATION = range(4_000_000, 5_000_000)
 """What is reported of a filter."""
+PROMISE = range(7_000_000, 9_000_000)
+"""Whether the promise about harm can be made of a filter. Every study has its own."""
+PROMISE_TEST = range(9_000_000, 10_000_000)
+"""Whether such promises were kept."""
 POOL = range(10_000_000, 100_000_000)
 """Clips of studies, and the pools of scripted users."""
 NORMALISATION = range(2_000_000_000, 2_000_001_000)
 """Over which reward models have mean 0 and deviation 1."""
 
 _POOL_OF_A_STUDY = 1_000
+_PROMISE_OF_A_STUDY = 4_000
 
 
 def first_of(block: range, count: int, skip: int = 0) -> range:
@@ -40,3 +45,9 @@ def of_pool(study_seed: int, index: int) -> int:
     """The scenario at one place of a study's pool."""
     pools = len(POOL) // _POOL_OF_A_STUDY
     return POOL.start + study_seed % pools * _POOL_OF_A_STUDY + index
+
+
+def of_promise(study_seed: int) -> range:
+    """A study's scenarios of the promise."""
+    blocks = len(PROMISE) // _PROMISE_OF_A_STUDY
+    return first_of(PROMISE, _PROMISE_OF_A_STUDY, skip=study_seed % blocks * _PROMISE_OF_A_STUDY)

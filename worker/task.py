@@ -63,6 +63,8 @@ class Task:
     """as in the folder's task.toml"""
     pieces: int = 8
     """of food or water in the usual portion"""
+    can_spill: bool = field(default=True, repr=False)
+    """whether there is anything to be spilled"""
     action: Space = field(default=JOINT_ACTION, repr=False)
     control_step_s: float = field(default=CONTROL_STEP_S, repr=False)
     signals: tuple[str, ...] = field(default=SIGNALS, repr=False)

@@ -199,6 +199,30 @@ class StudySettings(BaseModel):
         ge=0.0,
         le=0.5,
     )
+    harm_share: float = setting(
+        0.05,
+        Section.LEARNING,
+        "Scenarios in which a filter may be worse",
+        "Than the reference policy in the same scenario, by the limits that follow. Half the share takes twice as "
+        "long to show; a filter of which it cannot be shown is weakened.",
+        unit="%",
+        ge=0.01,
+        le=0.5,
+        new_row=True,
+    )
+    harm_confidence: float = setting(0.95, Section.LEARNING, "Confidence of that promise", unit="%", ge=0.8, le=0.99)
+    harm_force_n: float = setting(
+        5.0,
+        Section.LEARNING,
+        "Worse: more force on the person",
+        "Of the largest of an episode. To fail where the reference policy succeeds is always worse.",
+        unit="N",
+        ge=0.0,
+        le=50.0,
+    )
+    harm_spilled: float = setting(
+        0.25, Section.LEARNING, "Worse: more of the portion spilled", unit="%", ge=0.0, le=1.0
+    )
     evaluation_scenarios: int = setting(
         100, Section.LEARNING, "Scenarios that measure a filter", "Never seen in training.", ge=10, le=1000
     )

@@ -202,6 +202,7 @@ class TestWatching:
             for words in ("Speed of the spoon", "\u22123.4", "[\u22124.2, \u22122.7]", "speed squared (m²/s²)")
         )
         assert 'interval-worse" viewBox' in page
+        assert "With 95 % confidence, in at most 5 % of scenarios it is worse." in page
         assert "bundles/1.zip" in experimenter.get("/studies/pilot").text
 
     @pytest.mark.parametrize(
@@ -210,6 +211,7 @@ class TestWatching:
             {},
             {"evaluation": None},
             {"evaluation": {"success": 1}},
+            {"promise": {"sentence": 3}},
             {"evaluation": {"costs": {"C_d": {}}}, "gate": "high"},
         ],
     )

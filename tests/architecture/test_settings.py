@@ -20,6 +20,7 @@ from app.services.studies import preregistration
 from app.web.experimenter import results
 from worker import responses
 from worker.analysis import figures, hypothesis_tests, statistics
+from worker.analysis.promise import Promise
 from worker.experiments import benchmark_cell, rollout_cache
 from worker.experiments.benchmark_cell import BenchmarkConfig
 from worker.ml import acquisition
@@ -45,6 +46,10 @@ def default(config: type, name: str) -> Any:
     [
         (default(FilterConfig, "success_tolerance"), USUAL.success_tolerance),
         (default(FilterConfig, "evaluation_scenarios"), USUAL.evaluation_scenarios),
+        (default(Promise, "share"), USUAL.harm_share),
+        (default(Promise, "confidence"), USUAL.harm_confidence),
+        (default(Promise, "force_n"), USUAL.harm_force_n),
+        (default(Promise, "spilled"), USUAL.harm_spilled),
         (default(FineTuning, "steps"), EVALUATION.fine_tuning_steps),
         (default(BenchmarkConfig, "labels"), USUAL.labels_per_participant),
         (default(BenchmarkConfig, "rule"), USUAL.strategy),

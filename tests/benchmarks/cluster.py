@@ -82,6 +82,7 @@ def _settings(labels: int) -> StudySettings:
         filter_milestones=(),
         pool_scenarios=4,
         evaluation_scenarios=10,
+        harm_share=0.5,
         clip_quality=ClipQuality.QUICK,
         strategy=Strategy.UNIFORM,
     )

@@ -47,6 +47,7 @@ def main() -> None:
         "filter_milestones": (6,),
         "pool_scenarios": 2,
         "evaluation_scenarios": 10,
+        "harm_share": 0.5,
         "retrain_every_labels": 6,
         "evaluation": EvaluationSettings(fine_tuning_steps=options.steps, trials=TRIALS),
     }

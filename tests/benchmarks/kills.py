@@ -57,6 +57,7 @@ SETTINGS: dict[str, Any] = {
     "labels_per_participant": 10,
     "retrain_every_labels": 5,
     "evaluation_scenarios": 10,
+    "harm_share": 0.5,
     "evaluation": None,
     "break_every": 0,
     "practice_pairs": 0,

@@ -3,9 +3,9 @@
     python -m tests.benchmarks.retraining --output docs/results/retraining
 
 Per task: 200 answers of a scripted user, then twice what the worker does after a milestone: reward model, mode,
-residual, gates, 100 unseen scenarios, ONNX export, bundle. Beforehand what the worker does while people answer: it
-makes the reference policy's rollouts, in one process behind everything else. Run it alone on the machine: these are
-plain seconds.
+residual, gates, promise about harm, 100 unseen scenarios, ONNX export, bundle. Beforehand what the worker does while
+people answer: it makes the reference policy's rollouts, in one process behind everything else. Run it alone on the
+machine: these are plain seconds.
 """
 
 import argparse
@@ -23,6 +23,7 @@ from tqdm import tqdm
 from app.domain.study_settings import StudySettings
 from app.installed_tasks import catalogue
 from worker.analysis import result_pages
+from worker.analysis.promise import Outcome
 from worker.compute import learning
 from worker.compute.filter_fitting import FilterFit
 from worker.compute.pools import Compute, Lane
@@ -34,7 +35,7 @@ from worker.ml.filters.filter_problem import FilterConfig
 from worker.ml.teachers import TASTES
 from worker.trajectory import Trajectory
 
-STAGES = ("reward", "mode", "residual", "gates", "evaluation_and_bundle")
+STAGES = ("reward", "mode", "residual", "gates", "promise", "evaluation_and_bundle")
 PROVENANCE = Provenance("benchmark", "P01", 1, 200, "", 0, "2000-01-01T00:00:00+00:00", "", "none")
 
 
@@ -63,13 +64,14 @@ def _measured(task: str, user: str, options: argparse.Namespace) -> list[dict[st
     bench = BenchmarkUser(Cell(task, TASTES[user], "pbarl", 0), BenchmarkConfig(), cached, options.work_directory)
     compute = Compute(options.processes)
     references: dict[tuple[str, range], list[Trajectory]] = {}
+    outcomes: dict[tuple[str, int], list[Outcome]] = {}
     try:
         started = time.perf_counter()
         for lane in (Lane.REWARDS, Lane.LEARNING):
             compute.warm_up(lane, partial(learning.warm_up, task))
-        make_ready(compute, references, task, StudySettings())
+        make_ready(compute, references, outcomes, task, StudySettings(), 0)
         ahead = round(time.perf_counter() - started, 1)
-        runs = [{**_run(task, user, bench, compute, references), "made_ready": ahead} for _ in range(2)]
+        runs = [{**_run(task, user, bench, compute, references, outcomes), "made_ready": ahead} for _ in range(2)]
     finally:
         compute.close()
     return runs
@@ -81,6 +83,7 @@ def _run(
     bench: BenchmarkUser,
     compute: Compute,
     references: dict[tuple[str, range], list[Trajectory]],
+    outcomes: dict[tuple[str, int], list[Outcome]],
 ) -> dict[str, Any]:
     marks = [time.perf_counter()]
 
@@ -91,13 +94,24 @@ def _run(
     reward, _ = compute.run(Lane.REWARDS, _no_beat, learning.fit_reward, task, "structured", *answers)
     mark()
     fitting = FilterFit(
-        task, compute, _no_beat, reward, 0, FilterConfig(), progress=lambda stage, share: None, references=references
+        task,
+        compute,
+        _no_beat,
+        reward,
+        0,
+        FilterConfig(),
+        progress=lambda stage, share: None,
+        references=references,
+        version=len(StudySettings().milestones),
+        outcomes=outcomes,
     )
     draft = fitting.find_mode(bench.pool)
     mark()
     draft = fitting.train_residual(draft)
     mark()
     draft = fitting.gate_residual(draft)
+    mark()
+    draft = fitting.keep_promise(draft)
     mark()
     finished = fitting.finish(draft, PROVENANCE, {})
     mark()

@@ -83,6 +83,7 @@ def make_study(context: WorkerContext, name: str = "On a plane") -> tuple[int, i
         clip_steps=40,
         filter_milestones=(),
         evaluation_scenarios=30,
+        harm_share=0.5,
         strategy="uniform",
     )
     with context.database.writing() as session:

@@ -7,20 +7,22 @@ import io
 import json
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from worker.analysis.evaluation import evaluate
+from worker.analysis.promise import Outcome, Promise, sentence
 from worker.analysis.proof import case_against
-from worker.compute import learning, simulation
+from worker.compute import harm_tests, learning, simulation
 from worker.compute.pools import Computing, Lane
 from worker.compute.simulation import surface_file
 from worker.ml.export import bundle
 from worker.ml.export.bundle import BundleContents, Provenance, RecordedSteps
 from worker.ml.filters import filter_problem, mode_search, printed_filter, residual
 from worker.ml.filters.filter_module import FilterWeights
+from worker.ml.filters.filter_onnx import SHIELD
 from worker.ml.filters.filter_problem import (
     FilterAct,
     FilterConfig,
@@ -31,7 +33,7 @@ from worker.ml.filters.filter_problem import (
 )
 from worker.ml.filters.response_surface import ResponseSurface
 from worker.ml.rewards.loading import load_reward_model
-from worker.scenarios import EVALUATION, RESIDUAL, first_of
+from worker.scenarios import EVALUATION, RESIDUAL, first_of, of_promise
 from worker.tasks import registry
 from worker.trajectory import Trajectory
 from worker.type_aliases import Act
@@ -81,6 +83,12 @@ class FilterFit:
     progress: ReportProgress
     references: dict[tuple[str, range], list[Trajectory]]
     """rollouts of the frozen policy that other fittings have already made"""
+    promise: Promise = field(default_factory=Promise)
+    study_seed: int = 0
+    version: int = 1
+    """of this person's filters"""
+    outcomes: dict[tuple[str, int], list[Outcome]] = field(default_factory=dict)
+    """of the frozen policy, by task and first scenario"""
 
     @property
     def problem(self) -> FilterProblem:
@@ -104,6 +112,39 @@ class FilterFit:
         reference = self._gate_reference()
         return residual.gate_residual(self.problem, draft, reference, self.collect, self.progress)
 
+    def keep_promise(self, draft: FilterDraft) -> FilterDraft:
+        """The filter behind its shield, as far as the promise about harm can be made of it."""
+        draft = draft.shielded()
+        if moves_nothing(draft.weights):
+            return harm_tests.untested(draft, self.promise, self.version)
+        started = time.perf_counter()
+        strengths, scenarios = (1.0, *self.config.gates), of_promise(self.study_seed)
+
+        def drive(weights: FilterWeights, some: range) -> Sequence[Outcome]:
+            self.progress("testing what the filter may do to people", 0.86)
+            return self._outcomes(filter_problem.act_of(self.problem.task.modes, self.problem.policy, weights), some)
+
+        kept = harm_tests.weakened_until_promised(
+            draft, self.promise, self.version, strengths, scenarios, drive, self._reference_outcomes
+        )
+        return kept.timed("promise", started)
+
+    def _outcomes(self, act: Act, scenarios: range) -> list[Outcome]:
+        chunks = [(self.task, act, scenarios[first : first + CHUNK]) for first in range(0, len(scenarios), CHUNK)]
+        parts = self.compute.run_all(Lane.LEARNING, self.beat, learning.outcomes, chunks)
+        return [outcome for part in parts for outcome in part]
+
+    def _reference_outcomes(self, scenarios: range) -> Sequence[Outcome]:
+        """What the frozen policy does in scenarios of the promise: made once per study and worker."""
+        block = of_promise(self.study_seed)
+        key, last = (self.task, block.start), block.index(scenarios[-1]) + 1
+        known = self.outcomes.get(key, [])
+        if len(known) < last:
+            policy = simulation.reference_policy(self.task).mean
+            known = known + self._outcomes(policy, block[len(known) : last])
+            self.outcomes[key] = known
+        return known[last - len(scenarios) : last]
+
     def fit_printed(self) -> FilterDraft:
         """The paper's PbARL as printed, on transitions of the frozen policy. Not gated: it is what it is."""
         transitions = self.reference(first_of(RESIDUAL, PRINTED_ROLLOUTS))
@@ -118,9 +159,12 @@ class FilterFit:
         started = time.perf_counter()
         proven = self.prove(draft)
         draft, evaluation = proven.draft, proven.evaluation
+        unchanged = moves_nothing(draft.weights)
         metrics: dict[str, Any] = {
             "evaluation": evaluation,
-            "uses_reference": moves_nothing(draft.weights),
+            "uses_reference": unchanged,
+            "promise": self._promised(draft, unchanged),
+            "shield_active": _shield_active(proven),
             "rejected": proven.rejected,
             **_strengths(draft.weights),
             "mode": dict(draft.weights.mode),
@@ -146,6 +190,13 @@ class FilterFit:
             provenance=provenance,
         )
         return Finished(draft.weights.to_bytes(), bundle.write(contents), metrics)
+
+    def _promised(self, draft: FilterDraft, unchanged: bool) -> dict[str, Any]:
+        """The promise with its sentence; empty for a filter of which none is made."""
+        if not draft.promise:
+            return {}
+        said = sentence(draft.promise, uses_reference=unchanged, task=self.problem.task)
+        return {**draft.promise, "sentence": said}
 
     def prove(self, draft: FilterDraft) -> Proven:
         """Drive through unseen scenarios; a studio's filter that does not meet the burden of proof
@@ -214,6 +265,15 @@ def as_reference(draft: FilterDraft, preference: Mapping[str, float], against: S
     return replace(draft, weights=FilterWeights(gate=0.0), notes=(*draft.notes, note))
 
 
+def _shield_active(proven: Proven) -> float | None:
+    """In what share of the evaluation's steps the shield did something; None: there is none."""
+    if not proven.act.exported.is_shielded:
+        return None
+    steps = RecordedSteps.of(proven.driven)
+    (activity,) = proven.act.exported.run(steps.observations, steps.policy_means, [SHIELD])
+    return round(float((activity > 0.0).mean()), 4)
+
+
 def _strengths(weights: FilterWeights) -> dict[str, float]:
     return {"gate": weights.gate, "residual_share": weights.residual_share if weights.encoder else 0.0}
 
@@ -231,8 +291,14 @@ def _warnings(evaluation: dict[str, Any], tolerance: float) -> list[str]:
 
 def draft_to_bytes(draft: FilterDraft) -> bytes:
     """A draft as one .npz file of plain arrays."""
-    record = {"trials": [asdict(trial) for trial in draft.trials], "notes": draft.notes, "seconds": dict(draft.seconds)}
+    record = {
+        "trials": [asdict(trial) for trial in draft.trials],
+        "notes": draft.notes,
+        "seconds": dict(draft.seconds),
+        "promise": dict(draft.promise),
+    }
     arrays: dict[str, Any] = {f"value/{name}": array for name, array in draft.value.items()}
+    arrays |= {f"tested/{name}": array for name, array in draft.tested.items()}
     arrays["weights"] = np.frombuffer(draft.weights.to_bytes(), np.uint8)
     arrays["record"] = np.array(json.dumps(record))
     target = io.BytesIO()
@@ -244,7 +310,12 @@ def draft_from_bytes(stored: bytes) -> FilterDraft:
     """Read what draft_to_bytes() wrote."""
     with np.load(io.BytesIO(stored), allow_pickle=False) as arrays:
         record = json.loads(str(arrays["record"]))
-        value = {name.removeprefix("value/"): arrays[name] for name in arrays.files if name.startswith("value/")}
+        value, tested = (
+            {name.removeprefix(part): arrays[name] for name in arrays.files if name.startswith(part)}
+            for part in ("value/", "tested/")
+        )
         weights = FilterWeights.from_bytes(arrays["weights"].tobytes())
     trials = tuple(GateTrial(**each) for each in record["trials"])
-    return FilterDraft(weights, value, trials, tuple(record["notes"]), record["seconds"])
+    return FilterDraft(
+        weights, value, trials, tuple(record["notes"]), record["seconds"], tested, record.get("promise", {})
+    )

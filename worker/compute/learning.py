@@ -10,6 +10,7 @@ from typing import Any, cast, get_args
 import numpy as np
 import numpy.typing as npt
 
+from worker.analysis.promise import Outcome, outcome_of
 from worker.compute.simulation import reference_rollouts, run_episode, signal_predictor
 from worker.ml.rewards.loading import load_reward_model
 from worker.ml.rewards.pooled_prior import prior_of
@@ -42,6 +43,12 @@ def noisy(act: Act, noise: float, seed: int, scenario: int) -> Act:
         return action + noise * rng.standard_normal(action.shape, np.float32)
 
     return act_with_noise
+
+
+def outcomes(task: str, act: Act, scenarios: Sequence[int]) -> list[Outcome]:
+    """What could harm in one rollout per scenario."""
+    driven = (run_episode(task, act, scenario) for scenario in scenarios)
+    return [outcome_of(each, registry.task(task)) for each in driven]
 
 
 def fit_reward(

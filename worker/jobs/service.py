@@ -201,14 +201,18 @@ class _Rounds:
             if study.id not in self._prepared:
                 self._prepared.add(study.id)
                 lanes.compute.warm_up(Lane.REWARDS, partial(learning.warm_up, study.task))
-                threading.Thread(target=self._make_references, args=(study.task, study.settings), daemon=True).start()
+                threading.Thread(
+                    target=self._make_references, args=(study.task, study.settings, study.seed), daemon=True
+                ).start()
 
-    def _make_references(self, task: str, settings: StudySettings) -> None:
+    def _make_references(self, task: str, settings: StudySettings, study_seed: int) -> None:
         """What the first filter would otherwise wait for."""
         from worker.jobs.learning import reference_rollouts  # seconds, for which nothing else shall wait
 
         try:
-            reference_rollouts.make_ready(self._context.compute, self._context.references, task, settings)
+            context = self._context
+            made = context.references, context.outcomes
+            reference_rollouts.make_ready(context.compute, *made, task, settings, study_seed)
         except Interrupted:
             return
         except ComputeLost:

@@ -76,6 +76,8 @@ class FilterVersion:
     notes: Sequence[str]
     uses_reference: bool
     """It changes nothing: what was learned was not surely better, or not without a price."""
+    promise: str
+    """What is promised about harm, in a sentence; empty: nothing is."""
     scenarios: int | None
     success: Change | None
     preference: Change | None
@@ -107,6 +109,10 @@ class _Evaluation(_Metrics):
     costs: dict[str, _Difference] = Field(default_factory=dict)
 
 
+class _Promise(_Metrics):
+    sentence: str = ""
+
+
 class _Filter(_Metrics):
     evaluation: _Evaluation = Field(default_factory=_Evaluation)
     gate: float | None = None
@@ -114,6 +120,7 @@ class _Filter(_Metrics):
     method: str | None = None
     notes: list[str] = Field(default_factory=list)
     uses_reference: bool = False
+    promise: _Promise = Field(default_factory=_Promise)
 
 
 class _Weight(_Metrics):
@@ -145,6 +152,7 @@ def filter_version(model: Model, bundle: Bundle | None) -> FilterVersion:
         mode=sorted(metrics.mode.items()),
         notes=metrics.notes,
         uses_reference=metrics.uses_reference,
+        promise=metrics.promise.sentence,
         scenarios=evaluation.scenarios,
         success=_change("Success", "", evaluation.success, more_is_better=True),
         preference=_change("Preference, as the model sees it", "", evaluation.preference, more_is_better=True),

@@ -15,15 +15,20 @@ def test_a_draft_comes_back_as_it_was_stored() -> None:
         encoder={"layer": np.arange(6, dtype=np.float32).reshape(2, 3)},
     )
     trial = GateTrial(gate=0.7, residual_share=0.0, preference=0.4, success_change=-0.01, p95_force_n=2.0)
-    draft = FilterDraft(weights, {"value": np.ones(3, np.float32)}, (trial,), ("a note",), {"mode": 1.5})
+    tested, promised = {"change_low": np.zeros(7, np.float32)}, {"share": 0.05, "tests": []}
+    draft = FilterDraft(
+        weights, {"value": np.ones(3, np.float32)}, (trial,), ("a note",), {"mode": 1.5}, tested, promised
+    )
     again = filter_fitting.draft_from_bytes(filter_fitting.draft_to_bytes(draft))
     assert again.weights.mode == draft.weights.mode
-    assert (again.weights.gate, again.trials, again.notes, again.seconds) == (
+    assert (again.weights.gate, again.trials, again.notes, again.seconds, again.promise) == (
         draft.weights.gate,
         draft.trials,
         draft.notes,
         draft.seconds,
+        draft.promise,
     )
+    np.testing.assert_array_equal(again.tested["change_low"], tested["change_low"])
     np.testing.assert_array_equal(again.weights.encoder["layer"], weights.encoder["layer"])
     np.testing.assert_array_equal(again.value["value"], draft.value["value"])
 

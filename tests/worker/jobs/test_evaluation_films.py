@@ -47,6 +47,7 @@ def settle(database: Database, study: Study, **evaluation: Any) -> None:
             "labels_per_participant": LABELS,
             "filter_milestones": (),
             "evaluation_scenarios": 10,
+            "harm_share": 0.5,
             "evaluation": EvaluationSettings(**evaluation),
         }
         settings = study.settings.model_copy(update=changed)

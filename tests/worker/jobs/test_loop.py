@@ -55,6 +55,7 @@ def outcome(studio: OwnStudio, database: Database) -> RehearsedPerson:
         pool_scenarios=SCENARIOS,
         behaviours_per_scenario=BEHAVIOURS,
         evaluation_scenarios=10,
+        harm_share=0.5,
         clip_quality=ClipQuality.QUICK,
     )
     killers = [_Killer(studio, database, RunKind.CLIPS), _Killer(studio, database, RunKind.FILTER)]

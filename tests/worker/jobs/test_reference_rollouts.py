@@ -10,11 +10,13 @@ from app.db import Database
 from app.domain.choices import Method
 from app.domain.study_settings import StudySettings
 from app.storage import ArtefactStore
+from worker.analysis.promise import Outcome
 from worker.compute.filter_fitting import FilterFit
 from worker.compute.pools import Compute
 from worker.jobs.learning.filters import filter_config
-from worker.jobs.learning.reference_rollouts import make_ready, reference_blocks
+from worker.jobs.learning.reference_rollouts import make_ready, promise_block, reference_blocks
 from worker.jobs.runtime.context import WorkerContext
+from worker.scenarios import of_promise
 
 SETTINGS = StudySettings(evaluation_scenarios=10)
 
@@ -36,6 +38,8 @@ def fitting(context: WorkerContext) -> FilterFit:
         config=filter_config(SETTINGS),
         progress=lambda stage, share: None,
         references=context.references,
+        study_seed=5,
+        outcomes=context.outcomes,
     )
 
 
@@ -44,10 +48,12 @@ def test_they_are_those_a_filter_would_make_for_itself(context: WorkerContext) -
     evaluation = reference_blocks("feeding", SETTINGS)[-1]
     own = fitting(context).reference(evaluation)
     del context.references["feeding", evaluation]
-    make_ready(context.compute, context.references, "feeding", SETTINGS)
+    make_ready(context.compute, context.references, context.outcomes, "feeding", SETTINGS, 5)
     cast("Compute", context.compute).close()  # whatever was missing now could not be made any more
     for scenarios in reference_blocks("feeding", SETTINGS):
         assert [each.scenario for each in fitting(context).reference(scenarios)] == list(scenarios)
+    drawn = promise_block(SETTINGS, 5)
+    assert fitting(context)._reference_outcomes(drawn) == context.outcomes["feeding", drawn.start]
     for ahead, mine in zip(fitting(context).reference(evaluation), own, strict=True):
         np.testing.assert_array_equal(ahead.observations, mine.observations)
         np.testing.assert_array_equal(ahead.actions, mine.actions)
@@ -56,9 +62,12 @@ def test_they_are_those_a_filter_would_make_for_itself(context: WorkerContext) -
 def test_what_is_there_is_not_made_again(context: WorkerContext) -> None:
     for scenarios in reference_blocks("feeding", SETTINGS):
         context.references["feeding", scenarios] = []
+    met = [Outcome(0.0, 0.0, True)] * len(promise_block(SETTINGS, 5))
+    context.outcomes["feeding", of_promise(5).start] = met
     cast("Compute", context.compute).close()
-    make_ready(context.compute, context.references, "feeding", SETTINGS)
+    make_ready(context.compute, context.references, context.outcomes, "feeding", SETTINGS, 5)
     assert set(map(len, context.references.values())) == {0}
+    assert list(context.outcomes.values()) == [met]
 
 
 def test_the_printed_method_which_has_no_gates_needs_the_evaluation_s_only() -> None:

@@ -23,6 +23,7 @@ from worker.analysis.evaluation import evaluate
 from worker.ml.export import bundle
 from worker.ml.export.bundle import BundleContents, BundleDamaged, Provenance, RecordedSteps
 from worker.ml.export.model_card import model_card
+from worker.ml.filters import shield
 from worker.ml.filters.filter_module import FilterWeights, build
 from worker.ml.filters.filter_onnx import to_onnx
 from worker.ml.policies.gaussian import GaussianPolicy
@@ -230,6 +231,39 @@ def test_without_policy_means_the_bundle_asks_its_own_policy(unzipped: Path, con
     assert finished.returncode == 0, finished.stderr
     recorded = np.load(unzipped / "recorded/actions.npy")[:5]
     np.testing.assert_allclose(np.load(unzipped / "a.npy"), recorded, atol=1e-5)
+
+
+def test_a_shield_is_told_in_manifest_card_and_script(contents: BundleContents, tmp_path: Path) -> None:
+    recording, family = contents.recording, invented.TASK.modes
+    limits = shield.widest(invented.TASK.observation, 7)
+    limits["observation_high"][0] = np.median(recording.observations[:, 0])
+    limits["observation_ramp"][0] = 1e-3
+    weights = contents.weights.changed(shield=limits)
+    stored = to_onnx(build(family, POLICY, weights), recording.observations, recording.policy_means)
+    sentence = "With 95 % confidence, in at most 5 % of scenarios it does nothing of the kind."
+    metrics = {**contents.metrics, "shield_active": 0.5, "promise": {"share": 0.05, "sentence": sentence}}
+    written = bundle.write(replace(contents, weights=weights, filter_onnx=stored, metrics=metrics))
+    with zipfile.ZipFile(io.BytesIO(written)) as archive:
+        archive.extractall(tmp_path)
+        card = archive.read("MODEL_CARD.md").decode()
+    manifest = bundle.verify(written)
+    assert [output["name"] for output in manifest["onnx"]["outputs"]] == ["action", "shield"]
+    (high, *_) = manifest["shield"]["limits"]["observation"][0]["high"]
+    assert high == limits["observation_high"][0]
+    assert "active in 50.0% of the control steps" in card
+    assert sentence in card
+    assert run(tmp_path).returncode == 0
+    np.save(tmp_path / "o.npy", recording.observations)
+    finished = run(tmp_path, "--observations", "o.npy", "--output", "a.npy")
+    assert f"the shield was active in 20 of {len(recording.observations)} rows" in finished.stdout
+
+
+def test_a_filter_without_promise_and_shield_says_so(contents: BundleContents) -> None:
+    manifest = bundle.verify(bundle.write(contents))
+    assert (manifest["promise"], manifest["shield"]) == (None, None)
+    card = model_card(manifest)
+    assert "Nothing is promised of this filter" in card
+    assert "## Shield" not in card
 
 
 def test_the_exported_policy_is_the_shipped_one() -> None:

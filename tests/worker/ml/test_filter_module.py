@@ -10,7 +10,7 @@ import torch
 
 from tests.worker import invented
 from worker.ml.filters.action_encoder import REACH, ResidualAdapter
-from worker.ml.filters.filter_module import FilterWeights, build, state_of
+from worker.ml.filters.filter_module import ActionFilter, FilterWeights, build, state_of
 from worker.ml.filters.filter_onnx import ExportDiffers, OnnxFilter, largest_difference, to_onnx
 from worker.ml.policies.torch_module import FrozenPolicy
 from worker.modes import ApproachModes
@@ -157,5 +157,6 @@ def test_a_mode_of_another_task_is_refused_by_the_names_of_its_axes() -> None:
 
 def test_the_frozen_policy_stays_frozen_inside_the_filter() -> None:
     module = build(FAMILY, POLICY, FilterWeights(mode=MODE, encoder=adapter_state()))
+    assert isinstance(module, ActionFilter)
     assert not any(parameter.requires_grad for parameter in module.parameters())
     assert isinstance(module.transform.policy, FrozenPolicy)

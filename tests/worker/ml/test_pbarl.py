@@ -54,7 +54,8 @@ class World:
         signals = np.zeros((STEPS, len(SIGNALS)), np.float32)
         signals[:, SPEED] = (actions**2).mean(axis=1)
         episode = invented.trajectory(rng, steps=STEPS, scenario=scenario, signals=signals, actions=actions)
-        return replace(episode, observations=seen, success=bool(signals[:, SPEED].mean() >= self.slowest))
+        success = bool(signals[:, SPEED].mean() >= self.slowest)
+        return replace(episode, observations=seen, reference_actions=POLICY.mean(seen[:-1]), success=success)
 
 
 def reward(weight: float) -> StructuredReward:

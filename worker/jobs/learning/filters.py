@@ -12,6 +12,7 @@ from app.errors import AppError
 from app.services.answers import accuracy
 from app.services.exports.export_formats import provenance_of
 from app.services.monitoring import dashboard
+from worker.analysis.promise import Promise
 from worker.compute import filter_fitting, learning
 from worker.compute.filter_fitting import FilterFit
 from worker.compute.pools import Lane
@@ -23,7 +24,7 @@ from worker.ml.export import bundle
 from worker.ml.export.bundle import Provenance
 from worker.ml.filters.filter_problem import FilterConfig, FilterDraft
 
-STAGES = {Method.STUDIO: ("mode", "residual", "gate"), Method.PRINTED: ("printed",)}
+STAGES = {Method.STUDIO: ("mode", "residual", "gate", "promise"), Method.PRINTED: ("printed",)}
 
 
 class NothingToLearnFrom(AppError):
@@ -112,8 +113,8 @@ def fit_stage(
         pool = [dataset.shown(context.store, clip) for clip in clips]
         result = fit.find_mode(pool) if stage == "mode" else fit.fit_printed()
     else:
-        before = load_draft(context, draft)
-        result = fit.train_residual(before) if stage == "residual" else fit.gate_residual(before)
+        stages = {"residual": fit.train_residual, "gate": fit.gate_residual, "promise": fit.keep_promise}
+        result = stages[stage](load_draft(context, draft))
     return context.store.put(filter_fitting.draft_to_bytes(result))
 
 
@@ -181,12 +182,24 @@ def filter_config(settings: StudySettings) -> FilterConfig:
     )
 
 
+def promise_of(settings: StudySettings) -> Promise:
+    """What a study promises about the harm its filters may do."""
+    return Promise(
+        share=settings.harm_share,
+        confidence=settings.harm_confidence,
+        force_n=settings.harm_force_n,
+        spilled=settings.harm_spilled,
+    )
+
+
 def fitting(context: WorkerContext, run_id: int, job: Job, reward: str, *, shared: bool = False) -> FilterFit:
     """What fits a filter to a stored reward model. ``shared``: not the person's own, so the study's seed is used."""
     with context.database.reading() as session:
         study = session.get_one(Study, job.study_id)
         task, settings = study.task, study.settings
-        seed = study.seed if shared else session.get_one(Participant, job.participant).seed
+        study_seed = study.seed
+        seed = study_seed if shared else session.get_one(Participant, job.participant).seed
+        version = 1 if shared else records.next_version(session, job.participant)
     return FilterFit(
         task=task,
         compute=context.compute,
@@ -196,4 +209,8 @@ def fitting(context: WorkerContext, run_id: int, job: Job, reward: str, *, share
         config=filter_config(settings),
         progress=lambda stage, share: context.report(run_id, stage, share),
         references=context.references,
+        promise=promise_of(settings),
+        study_seed=study_seed,
+        version=version,
+        outcomes=context.outcomes,
     )

@@ -23,7 +23,7 @@ from worker.jobs.runtime.context import Step, WorkerContext
 from worker.jobs.runtime.records import Job
 from worker.ml.teachers import OMEGA
 
-STAGES = ("mode", "residual", "gate")
+STAGES = ("mode", "residual", "gate", "promise")
 
 
 class LoanEnded(AppError):

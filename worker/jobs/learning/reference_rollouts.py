@@ -2,18 +2,24 @@
 
 from app.domain.choices import Method
 from app.domain.study_settings import StudySettings
+from worker.analysis.promise import Outcome
 from worker.compute import learning, simulation
 from worker.compute.filter_fitting import CHUNK
 from worker.compute.pools import Computing, Lane
-from worker.jobs.learning.filters import filter_config
+from worker.jobs.learning.filters import filter_config, promise_of
 from worker.ml.filters import filter_problem
-from worker.scenarios import EVALUATION, first_of
+from worker.scenarios import EVALUATION, first_of, of_promise
 from worker.tasks import registry
 from worker.trajectory import Trajectory
 
 
 def make_ready(
-    compute: Computing, references: dict[tuple[str, range], list[Trajectory]], task: str, settings: StudySettings
+    compute: Computing,
+    references: dict[tuple[str, range], list[Trajectory]],
+    outcomes: dict[tuple[str, int], list[Outcome]],
+    task: str,
+    settings: StudySettings,
+    study_seed: int,
 ) -> None:
     """Make what is missing behind everything else that is learning, a few episodes at a time.
 
@@ -30,6 +36,13 @@ def make_ready(
             some = scenarios[len(made) : len(made) + CHUNK]
             made += compute.run(Lane.PATIENT, _no_beat, learning.run_scenarios, task, act, some, 0.0, 0)
         references.setdefault(key, made)
+    for_promise = promise_block(settings, study_seed)
+    place, met = (task, of_promise(study_seed).start), list[Outcome]()
+    while len(outcomes.get(place, ())) < len(for_promise) and len(met) < len(for_promise):
+        some = for_promise[len(met) : len(met) + CHUNK]
+        met += compute.run(Lane.PATIENT, _no_beat, learning.outcomes, task, act, some)
+    if len(outcomes.get(place, ())) < len(met):
+        outcomes[place] = met
 
 
 def reference_blocks(task: str, settings: StudySettings) -> list[range]:
@@ -37,6 +50,14 @@ def reference_blocks(task: str, settings: StudySettings) -> list[range]:
     config = filter_config(settings)
     gate = [config.gate_block(registry.task(task))] if settings.method is Method.STUDIO else []
     return [*gate, first_of(EVALUATION, config.evaluation_scenarios)]
+
+
+def promise_block(settings: StudySettings, study_seed: int) -> range:
+    """The scenarios that suffice for the last filter of a person in such a study, if none of them is harmed."""
+    if settings.method is not Method.STUDIO:
+        return range(0)
+    promise = promise_of(settings)
+    return of_promise(study_seed)[: promise.batches(promise.needed(promise.error_of(0, len(settings.milestones))))]
 
 
 def _no_beat() -> None:

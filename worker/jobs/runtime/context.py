@@ -13,6 +13,7 @@ from app.db import Database
 from app.files.interface import StorageUnavailable
 from app.signing import SigningKey
 from app.storage import ArtefactStore, hash_of_file
+from worker.analysis.promise import Outcome
 from worker.compute.pools import Computing
 from worker.jobs.runtime import records
 from worker.trajectory import Trajectory
@@ -58,6 +59,8 @@ class WorkerContext:
     """signs bundles and archives; None: they stay unsigned"""
     references: dict[tuple[str, range], list[Trajectory]] = field(default_factory=dict)
     """rollouts of the frozen policy by scenarios: the same for everybody, so each worker makes them once"""
+    outcomes: dict[tuple[str, int], list[Outcome]] = field(default_factory=dict)
+    """what could harm in the frozen policy's rollouts for the promise, by task and first scenario"""
 
     def noting(self, noted: set[str]) -> "WorkerContext":
         """The same context, remembering the artefacts that are stored through it."""

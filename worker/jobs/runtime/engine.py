@@ -23,7 +23,7 @@ from app.sqlite import BUSY_TIMEOUT_S
 
 log = logging.getLogger("worker")
 
-VERSION = "4"
+VERSION = "5"
 """Raised when steps or names of workflows change, so that a half-finished one could not be resumed: it begins anew."""
 
 QUEUES = {

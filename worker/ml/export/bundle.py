@@ -20,8 +20,9 @@ from safetensors.numpy import save
 from worker.ml.export import run_filter, serve_filter
 from worker.ml.export.interface import interface_of
 from worker.ml.export.model_card import model_card
+from worker.ml.filters import shield
 from worker.ml.filters.filter_module import FilterWeights
-from worker.ml.filters.filter_onnx import INPUTS, OUTPUT, OnnxFilter
+from worker.ml.filters.filter_onnx import INPUTS, OUTPUT, SHIELD, OnnxFilter
 from worker.ml.policies import policy_client
 from worker.ml.policies.reference import ReferencePolicy
 from worker.ml.policies.remote_policy import RemotePolicy
@@ -193,12 +194,14 @@ def _manifest(contents: BundleContents) -> dict[str, Any]:
         "mode_axes": [asdict(axis) for axis in contents.task.modes.axes],
         "gate": weights.gate,
         "residual_share": weights.residual_share if weights.encoder else 0.0,
+        "shield": _shield(contents),
         "reward_kind": contents.reward.kind,
         "signals": list(contents.task.signals),
         "uses_reference_policy": bool(contents.metrics.get("uses_reference")),
         "learned_weights": contents.metrics.get("weights"),
         "learned_costs": contents.metrics.get("costs"),
         "evaluation": contents.metrics.get("evaluation"),
+        "promise": contents.metrics.get("promise") or None,
         "notes": list(contents.metrics.get("notes", ())),
         "versions": {
             "python": platform.python_version(),
@@ -206,6 +209,15 @@ def _manifest(contents: BundleContents) -> dict[str, Any]:
             **{name: version(name) for name in _LIBRARIES},
         },
     }
+
+
+def _shield(contents: BundleContents) -> dict[str, Any] | None:
+    """The limits inside the filter, and in how many of the evaluation's steps they were left; None: no shield."""
+    limits, task = contents.weights.shield, contents.task
+    if not limits:
+        return None
+    described = shield.described(task.observation, task.action, limits)
+    return {"output": SHIELD, "limits": described, "active_share": contents.metrics.get("shield_active")}
 
 
 def described_space(space: Space) -> dict[str, Any]:
@@ -226,16 +238,17 @@ def described_space(space: Space) -> dict[str, Any]:
 
 
 def _onnx_interface(stored: bytes, task: Task) -> dict[str, Any]:
-    sizes = {INPUTS[0]: task.observation.size, INPUTS[1]: task.action.size, OUTPUT: task.action.size}
+    sizes = {INPUTS[0]: task.observation.size, INPUTS[1]: task.action.size, OUTPUT: task.action.size, SHIELD: 1}
+    exported = OnnxFilter(stored)
 
     def described(name: str) -> dict[str, Any]:
         return {"name": name, "type": "float32", "shape": ["batch", sizes[name]]}
 
     return {
         "file": "filter.onnx",
-        "opset": OnnxFilter(stored).opset,
+        "opset": exported.opset,
         "inputs": [described(name) for name in INPUTS],
-        "outputs": [described(OUTPUT)],
+        "outputs": [described(name) for name in (OUTPUT, *([SHIELD] if exported.is_shielded else []))],
     }
 
 

@@ -52,6 +52,8 @@ def model_card(manifest: Mapping[str, Any]) -> str:
     sections = [
         _what(manifest),
         _REFERENCE if manifest.get("uses_reference_policy") else _way(manifest),
+        _promise(manifest),
+        _shield(manifest),
         _matters(manifest),
         _measured(manifest.get("evaluation")),
         _notes(manifest),
@@ -103,6 +105,27 @@ def _way(manifest: Mapping[str, Any]) -> str:
     ]
     heading = f"## This person's way\n\nGate {manifest['gate']:.0%}, residual {manifest['residual_share']:.0%}."
     return "\n".join([heading, "", "| axis | value | range | meaning |", "|---|---|---|---|", *rows])
+
+
+def _promise(manifest: Mapping[str, Any]) -> str:
+    """What is promised about harm."""
+    promise = manifest.get("promise")
+    said = promise["sentence"] if promise else "Nothing is promised of this filter: it was not tested for harm."
+    return f"## Promise about harm\n\n{said} Scenarios are those of the simulation, not of a real room."
+
+
+def _shield(manifest: Mapping[str, Any]) -> str:
+    """What the filter does outside what was tested."""
+    shield = manifest.get("shield")
+    if not shield:
+        return ""
+    active = shield["active_share"]
+    measured = "" if active is None else f" On the unseen scenarios it was active in {active:.1%} of the control steps."
+    return (
+        "## Shield\n\nWhere observation, force, or the change of the action leave what was tested, the action returns"
+        " smoothly to the reference policy's. How far is the graph's output `shield`, from 0 (not at all) to 1; the"
+        f" limits are in the manifest.{measured}"
+    )
 
 
 def _matters(manifest: Mapping[str, Any]) -> str:

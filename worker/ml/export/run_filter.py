@@ -192,6 +192,15 @@ def run(session: Any, observations: Any, policy_means: Any) -> Any:
     return session.run(["action"], {"observation": observations, "policy_mean": policy_means})[0]
 
 
+def shielded(session: Any, observations: Any, policy_means: Any) -> list[str]:
+    """In how many rows the shield was active. Filters of earlier versions have none."""
+    if "shield" not in [output.name for output in session.get_outputs()]:
+        return []
+    feed = {"observation": observations, "policy_mean": policy_means}
+    rows = int((session.run(["shield"], feed)[0] > 0).sum())
+    return [f"the shield was active in {rows} of {len(observations)} rows."] if rows else []
+
+
 def means_of(policy: Any, observations: Any) -> Any:
     """(N, D) -> (N, A)"""
     return policy.run(["policy_mean"], {"observation": observations})[0]
@@ -237,6 +246,8 @@ def filter_files(manifest: dict[str, Any], session: Any, observed: Path, means: 
     for line in unusual(manifest["observation"], observations):
         sys.stdout.write(f"Note: {line}\n")
     actions = run(session, observations, policy_means)
+    for line in shielded(session, observations, policy_means):
+        sys.stdout.write(f"Note: {line}\n")
     try:
         with output.open("wb") as target:
             np.save(target, actions, allow_pickle=False)

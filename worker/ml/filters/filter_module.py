@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from worker.ml.filters.action_encoder import ResidualAdapter
 from worker.ml.filters.pbarl_printed import PrintedEncoder
+from worker.ml.filters.shield import Shield
 from worker.ml.policies.gaussian import GaussianPolicy
 from worker.ml.policies.reference import ReferencePolicy
 from worker.ml.policies.torch_module import FrozenPolicy
@@ -23,6 +24,9 @@ from worker.modes import ModeFamily
 from worker.type_aliases import Float32Array
 
 Method = Literal["studio", "printed"]
+
+
+_SHIELD = "shield/"
 
 
 @dataclass(frozen=True)
@@ -37,6 +41,8 @@ class FilterWeights:
     """share of the encoder's residual that is used; 0 means the mode alone"""
     encoder: Mapping[str, Float32Array] = field(default_factory=dict)
     """state of ResidualAdapter or PrintedEncoder; empty: none was trained"""
+    shield: Mapping[str, Float32Array] = field(default_factory=dict)
+    """limits of the shield (shield.limits_of); empty: there is none"""
 
     def changed(self, **values: Any) -> Self:
         """The same with some values replaced."""
@@ -51,14 +57,17 @@ class FilterWeights:
             "mode": dict(self.mode),
             "residual_share": self.residual_share,
         }
-        tensors = {name: np.ascontiguousarray(array) for name, array in self.encoder.items()}
+        limits = {f"{_SHIELD}{name}": array for name, array in self.shield.items()}
+        tensors = {name: np.ascontiguousarray(array) for name, array in {**self.encoder, **limits}.items()}
         return save(tensors, metadata={"config": json.dumps(config, sort_keys=True)})
 
     @classmethod
     def from_bytes(cls, stored: bytes) -> Self:
         """Read what to_bytes() wrote."""
         config = stored_config(stored)
-        return cls(config["method"], config["mode"], config["gate"], config["residual_share"], load(stored))
+        tensors = load(stored)
+        limits = {name.removeprefix(_SHIELD): tensors.pop(name) for name in [*tensors] if name.startswith(_SHIELD)}
+        return cls(config["method"], config["mode"], config["gate"], config["residual_share"], tensors, limits)
 
 
 class ModeTransform(nn.Module):
@@ -130,6 +139,7 @@ class ActionFilter(nn.Module):
     """observation (B, D), policy_mean (B, 7) -> action (B, 7) in [-1, 1]. Deterministic."""
 
     gate: Tensor
+    outputs: tuple[str, ...] = ("action",)
 
     def __init__(self, transform: nn.Module, gate: float) -> None:
         super().__init__()
@@ -148,7 +158,31 @@ class ActionFilter(nn.Module):
         return action
 
 
-def build(family: ModeFamily, policy: ReferencePolicy, weights: FilterWeights) -> ActionFilter:
+class ShieldedFilter(nn.Module):
+    """observation (B, D), policy_mean (B, A) -> action (B, A), the shield's activity (B, 1)."""
+
+    outputs: tuple[str, ...] = ("action", "shield")
+
+    def __init__(self, inner: ActionFilter, shield: Shield) -> None:
+        super().__init__()
+        self.inner, self.shield = inner, shield
+
+    @property
+    def structure(self) -> object:
+        """See ActionFilter."""
+        place = self.shield.place
+        return self.inner.structure, None if place is None else (place.start, place.stop)
+
+    def forward(self, observation: Tensor, policy_mean: Tensor) -> tuple[Tensor, Tensor]:
+        """See the class."""
+        action, activity = self.shield(observation, policy_mean, self.inner(observation, policy_mean))
+        return action.clamp(-1.0, 1.0), activity
+
+
+AnyFilter = ActionFilter | ShieldedFilter
+
+
+def build(family: ModeFamily, policy: ReferencePolicy, weights: FilterWeights) -> AnyFilter:
     """The module for these weights around this policy, in evaluation mode, on the CPU.
 
     Raises ValueError when the weights name an axis that the task's family of modes does not have.
@@ -157,7 +191,7 @@ def build(family: ModeFamily, policy: ReferencePolicy, weights: FilterWeights) -
     if not isinstance(policy, GaussianPolicy):
         if weights.method != "studio" or weights.encoder:
             raise ValueError("A policy that cannot be looked into has filters of modes alone.")
-        return _frozen(ActionFilter(ActionModeTransform(family, weights.mode), weights.gate))
+        return _finished(ActionModeTransform(family, weights.mode), family, weights)
     frozen = FrozenPolicy(policy.weights)
     if weights.method == "printed":
         encoder = PrintedEncoder(frozen.offset, frozen.scale)
@@ -169,10 +203,14 @@ def build(family: ModeFamily, policy: ReferencePolicy, weights: FilterWeights) -
             adapter = ResidualAdapter(frozen.offset, frozen.scale)
             load_state(adapter, weights.encoder)
         transform = ModeTransform(family, frozen, weights.mode, adapter, weights.residual_share)
-    return _frozen(ActionFilter(transform, weights.gate))
+    return _finished(transform, family, weights)
 
 
-def _frozen(module: ActionFilter) -> ActionFilter:
+def _finished(transform: nn.Module, family: ModeFamily, weights: FilterWeights) -> AnyFilter:
+    inner = ActionFilter(transform, weights.gate)
+    module: AnyFilter = inner
+    if weights.shield:
+        module = ShieldedFilter(inner, Shield(family.observation, weights.shield))
     return module.eval().requires_grad_(False)
 
 

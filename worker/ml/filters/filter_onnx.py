@@ -16,11 +16,11 @@ import onnxscript.optimizer
 import torch
 from onnx_ir.passes.common import ClearMetadataAndDocStringPass
 
-from worker.ml.filters.filter_module import ActionFilter
+from worker.ml.filters.filter_module import AnyFilter
 from worker.type_aliases import Float32Array
 
 INPUTS = ("observation", "policy_mean")
-OUTPUT = "action"
+OUTPUT, SHIELD = "action", "shield"
 LARGEST_DIFFERENCE = 1e-5
 
 _templates: dict[tuple[object, ...], onnx.ModelProto] = {}
@@ -32,7 +32,7 @@ class ExportDiffers(RuntimeError):
     """The exported filter does not compute what the trained one does; nothing was published."""
 
 
-def to_onnx(module: ActionFilter, observations: Float32Array, policy_means: Float32Array) -> bytes:
+def to_onnx(module: AnyFilter, observations: Float32Array, policy_means: Float32Array) -> bytes:
     """Export with a free batch size, then compare with torch on these inputs, (N, D) and (N, 7).
 
     Tracing takes seconds, so it is done once per structure and process; after that the numbers are put into the traced
@@ -56,12 +56,15 @@ def to_onnx(module: ActionFilter, observations: Float32Array, policy_means: Floa
 
 
 def largest_difference(
-    stored: bytes, module: ActionFilter, observations: Float32Array, policy_means: Float32Array
+    stored: bytes, module: AnyFilter, observations: Float32Array, policy_means: Float32Array
 ) -> float:
     """Between the exported and the torch filter, over these inputs."""
     with torch.no_grad():
-        expected = module(torch.from_numpy(observations), torch.from_numpy(policy_means)).numpy()
-    return float(np.abs(OnnxFilter(stored).batch(observations, policy_means) - expected).max())
+        said = module(torch.from_numpy(observations), torch.from_numpy(policy_means))
+    expected = said if isinstance(said, tuple) else (said,)
+    exported = OnnxFilter(stored).run(observations, policy_means)
+    pairs = zip(exported, expected, strict=True)
+    return max(float(np.abs(each - wanted.numpy()).max()) for each, wanted in pairs)
 
 
 class OnnxFilter:
@@ -78,9 +81,20 @@ class OnnxFilter:
 
     def batch(self, observations: Float32Array, policy_means: Float32Array) -> Float32Array:
         """(B, D), (B, 7) -> (B, 7)"""
+        return self.run(observations, policy_means, [OUTPUT])[0]
+
+    def run(
+        self, observations: Float32Array, policy_means: Float32Array, names: Sequence[str] | None = None
+    ) -> list[Float32Array]:
+        """(B, D), (B, 7) -> these outputs, or all there are: the actions (B, 7) and a shield's activity (B, 1)."""
         feed = dict(zip(INPUTS, (_float32(observations), _float32(policy_means)), strict=True))
-        actions: Float32Array = self._session.run([OUTPUT], feed)[0]
-        return actions
+        outputs: list[Float32Array] = self._session.run(names, feed)
+        return outputs
+
+    @property
+    def is_shielded(self) -> bool:
+        """Whether the file says what its shield does. Those of earlier versions have none."""
+        return SHIELD in [each.name for each in self._session.get_outputs()]
 
     @property
     def opset(self) -> int:
@@ -103,7 +117,7 @@ def _session(stored: bytes) -> Any:
     return onnxruntime.InferenceSession(stored, options, providers=["CPUExecutionProvider"])
 
 
-def _trace(module: ActionFilter, observations: Float32Array, policy_means: Float32Array) -> onnx.ModelProto:
+def _trace(module: AnyFilter, observations: Float32Array, policy_means: Float32Array) -> onnx.ModelProto:
     """The graph, with every parameter and buffer as an initializer of the same name."""
     example = (torch.from_numpy(observations.copy()), torch.from_numpy(policy_means.copy()))
     batch = torch.export.Dim("batch", min=1)
@@ -114,7 +128,7 @@ def _trace(module: ActionFilter, observations: Float32Array, policy_means: Float
             dynamo=True,
             optimize=False,
             input_names=list(INPUTS),
-            output_names=[OUTPUT],
+            output_names=list(module.outputs),
             dynamic_shapes=({0: batch}, {0: batch}),
             verbose=False,
         )

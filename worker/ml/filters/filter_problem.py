@@ -13,7 +13,7 @@ over processes.
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -21,6 +21,7 @@ import torch
 from worker.ml.filters.action_encoder import ResidualAdapter
 from worker.ml.filters.filter_module import FilterWeights, build, state_of
 from worker.ml.filters.filter_onnx import OnnxFilter, to_onnx
+from worker.ml.filters.shield import widest
 from worker.ml.policies.gaussian import GaussianPolicy
 from worker.ml.policies.reference import ReferencePolicy
 from worker.ml.policies.remote_policy import RemotePolicy
@@ -137,11 +138,19 @@ class FilterDraft:
     """in their order, except that the chosen mode's comes after the other modes'"""
     notes: tuple[str, ...] = ()
     seconds: Mapping[str, float] = field(default_factory=dict)
+    tested: Mapping[str, Float32Array] = field(default_factory=dict)
+    """what the filter stayed within when it was tried (shield.limits_of)"""
+    promise: Mapping[str, Any] = field(default_factory=dict)
+    """worker.analysis.promise.Promise with the tests by which it was earned, as plain values; empty: none is made"""
 
     def timed(self, stage: str, started: float) -> "FilterDraft":
         """The same with the seconds since ``started`` added to a stage."""
         spent = self.seconds.get(stage, 0.0) + time.perf_counter() - started
         return replace(self, seconds={**self.seconds, stage: round(spent, 3)})
+
+    def shielded(self) -> "FilterDraft":
+        """The same with a shield around what was tested."""
+        return replace(self, weights=self.weights.changed(shield=self.tested))
 
 
 def _affordable(episodes: int, task: Task) -> int:
@@ -165,13 +174,14 @@ class FilterAct:
 
 
 def trace(family: ModeFamily, policy: ReferencePolicy) -> None:
-    """Export a mode without and with a residual, so that act_of() takes a hundredth of a second in this process."""
-    if not isinstance(policy, GaussianPolicy):
-        act_of(family, policy, FilterWeights())
-        return
-    untrained = ResidualAdapter(torch.from_numpy(policy.offset), torch.from_numpy(policy.scale))
-    for encoder in ({}, state_of(untrained)):
-        act_of(family, policy, FilterWeights(encoder=encoder))
+    """Export a mode without and with a residual and shield: act_of() then takes a hundredth of a second here."""
+    encoders: list[Mapping[str, Float32Array]] = [{}]
+    if isinstance(policy, GaussianPolicy):
+        untrained = ResidualAdapter(torch.from_numpy(policy.offset), torch.from_numpy(policy.scale))
+        encoders.append(state_of(untrained))
+    for encoder in encoders:
+        for limits in ({}, widest(family.observation, policy.action_size)):
+            act_of(family, policy, FilterWeights(encoder=encoder, shield=limits))
 
 
 def act_of(family: ModeFamily, policy: ReferencePolicy, weights: FilterWeights) -> FilterAct:

@@ -18,6 +18,7 @@ from worker.ml.filters.filter_problem import (
 )
 from worker.ml.filters.gate import acceptable, signal_changes, successes, try_on
 from worker.ml.filters.response_surface import CAUTION, ResponseSurface, best_mode
+from worker.ml.filters.shield import limits_of
 from worker.trajectory import Trajectory
 from worker.type_aliases import FloatArray
 
@@ -41,7 +42,7 @@ def find_mode(
     started = time.perf_counter()
     wishes = problem.reward.signal_weights(pool)
     tried: list[tuple[GateTrial, FloatArray]] = []
-    accepted: list[tuple[GateTrial, FloatArray]] = []
+    accepted: list[tuple[GateTrial, FloatArray, Sequence[Trajectory]]] = []
     for attempt in range(problem.config.mode_attempts):
         if len(accepted) == problem.config.modes_to_choose_from:
             break
@@ -54,26 +55,27 @@ def find_mode(
         trial, driven = try_on(problem, _act_in(problem, mode), 1.0, 0.0, reference, collect)
         tried.append((trial, mode))
         if acceptable(problem, trial, reference):
-            accepted.append((trial, mode))
+            accepted.append((trial, mode, driven))
         surface = surface.with_observed(mode, signal_changes(reference, driven), successes(driven))
     if not tried:
         return _without_mode("The labels do not yet say clearly what to change; the mode is off.", [], started)
     for gate in problem.config.gates if not accepted else ():
         progress(f"checking the mode at {gate:.0%} on held-out scenarios", 0.32)
         act = replace(_act_in(problem, tried[-1][1]), gate=gate)
-        weakened = try_on(problem, act, gate, 0.0, reference, collect)[0], tried[-1][1]
-        tried.append(weakened)
-        if acceptable(problem, weakened[0], reference):
-            accepted = [weakened]
+        weakened, driven = try_on(problem, act, gate, 0.0, reference, collect)
+        tried.append((weakened, tried[-1][1]))
+        if acceptable(problem, weakened, reference):
+            accepted = [(*tried[-1], driven)]
             break
     trials = [trial for trial, _ in tried]
     if not accepted:
         note = "No mode was better while keeping the task and the forces; the mode is off."
         return _without_mode(note, trials, started)
-    chosen, mode = max(accepted, key=lambda each: each[0].preference)
+    chosen, mode, driven = max(accepted, key=lambda each: each[0].preference)
     weights = FilterWeights(mode=problem.task.modes.named(mode), gate=chosen.gate)
     ordered = (*(trial for trial in trials if trial is not chosen), chosen)
-    return FilterDraft(weights, trials=ordered).timed("mode", started)
+    tested = limits_of(problem.task.observation, problem.task.action, driven, reference)
+    return FilterDraft(weights, trials=ordered, tested=tested).timed("mode", started)
 
 
 def _act_in(problem: FilterProblem, mode: FloatArray) -> FilterAct:

@@ -23,4 +23,4 @@ def fit_studio(
     """All stages in a row. ``reference``: rollouts of the reference policy on the problem's gate scenarios."""
     draft = find_mode(problem, surface, pool, reference, collect, progress)
     draft = train_residual(problem, draft, collect, progress)
-    return gate_residual(problem, draft, reference, collect, progress)
+    return gate_residual(problem, draft, reference, collect, progress).shielded()

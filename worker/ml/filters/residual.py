@@ -22,6 +22,7 @@ from worker.ml.filters.filter_problem import (
 )
 from worker.ml.filters.fitted_q import ActionValue, Transitions, evaluate_filter, spread_within_states
 from worker.ml.filters.gate import acceptable, try_on
+from worker.ml.filters.shield import limits_of
 from worker.ml.policies.torch_module import FrozenPolicy
 from worker.trajectory import Trajectory
 from worker.type_aliases import Act, FloatArray
@@ -113,20 +114,22 @@ def gate_residual(
     started = time.perf_counter()
     without = [trial for trial in draft.trials[-1:] if acceptable(problem, trial, reference)]
     to_beat = without[0].preference if without else 0.0
-    kept, trials = 0.0, list[GateTrial]()
+    kept, trials, tested = 0.0, list[GateTrial](), draft.tested
     for share in problem.config.residual_shares:
         progress(f"checking {share:.0%} of the residual on held-out scenarios", 0.75 + 0.1 * len(trials))
         weights = draft.weights.changed(residual_share=share)
         act = act_of(problem.task.modes, problem.policy, weights)
-        trials.append(try_on(problem, act, weights.gate, share, reference, collect)[0])
-        if acceptable(problem, trials[-1], reference) and trials[-1].preference > to_beat:
-            kept = share
+        trial, driven = try_on(problem, act, weights.gate, share, reference, collect)
+        trials.append(trial)
+        if acceptable(problem, trial, reference) and trial.preference > to_beat:
+            kept, tested = share, limits_of(problem.task.observation, problem.task.action, driven, reference)
             break
     weights = draft.weights.changed(residual_share=kept)
     notes = draft.notes
     if kept == 0.0:
         notes = (*notes, "The residual did not help on held-out scenarios and is off.")
-    return replace(draft, weights=weights, trials=(*draft.trials, *trials), notes=notes).timed("gate_residual", started)
+    draft = replace(draft, weights=weights, trials=(*draft.trials, *trials), notes=notes, tested=tested)
+    return draft.timed("gate_residual", started)
 
 
 def _flat(rounds: Sequence[Sequence[Trajectory]]) -> list[Trajectory]:

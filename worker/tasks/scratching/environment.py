@@ -94,6 +94,7 @@ SCRATCHING = Task(
     ),
     calibrated_speed_weight=1.41,
     speed_counts_near=False,
+    can_spill=False,
     printed_betas=(1.0, 1.0, 0.1, 1.0),
 )
 """Strokes are what the person asked for, so only the approach's speed is a cost. With strokes counted, no weight made
