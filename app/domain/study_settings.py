@@ -211,14 +211,14 @@ class StudySettings(BaseModel):
         new_row=True,
     )
     harm_confidence: float = setting(0.95, Section.LEARNING, "Confidence of that promise", unit="%", ge=0.8, le=0.99)
-    harm_force_n: float = setting(
-        5.0,
+    harm_force_n: int = setting(
+        5,
         Section.LEARNING,
         "Worse: more force on the person",
         "Of the largest of an episode. To fail where the reference policy succeeds is always worse.",
         unit="N",
-        ge=0.0,
-        le=50.0,
+        ge=0,
+        le=50,
     )
     harm_spilled: float = setting(
         0.25, Section.LEARNING, "Worse: more of the portion spilled", unit="%", ge=0.0, le=1.0

@@ -33,13 +33,20 @@ def test_the_defaults_make_a_study(experimenter: TestClient, database: Database)
 
 def test_what_is_typed_is_what_is_stored(experimenter: TestClient, database: Database) -> None:
     form = typed(
-        experimenter, labels_per_participant="60", filter_milestones="20, 40", success_tolerance="5 %", method="printed"
+        experimenter,
+        labels_per_participant="60",
+        filter_milestones="20, 40",
+        success_tolerance="5 %",
+        method="printed",
+        harm_share="2.5 %",
+        harm_force_n="3",
     )
     experimenter.post("/studies/new", data=form)
     with database.reading() as session:
         settings = session.scalars(select(Study)).one().settings
     assert (settings.labels_per_participant, settings.milestones) == (60, (20, 40, 60))
     assert (settings.success_tolerance, settings.method) == (0.05, "printed")
+    assert (settings.harm_share, settings.harm_force_n) == (0.025, 3)
 
 
 def test_two_studies_of_one_name_have_two_addresses(experimenter: TestClient) -> None:
