@@ -94,8 +94,8 @@ def test_defaults_keep_their_own_bounds() -> None:
 def test_the_form_has_the_bounds_of_the_settings(field: str, end: str, bound: float) -> None:
     beyond = bound + (-1 if end == "minimum" else 1) * (0.01 if BY_NAME[field].kind is Kind.PERCENT else 1)
     assert complaint(field, beyond) is not None
-    if field == "clip_steps" and end == "maximum":
-        return  # an episode of the task that is filled in is over before
+    if field in {"clip_steps", "evaluation_head_to_heads"} and end == "maximum":
+        return  # the episodes and trials that are filled in are over before
     assert complaint(field, bound) is None
     if beyond >= 0:  # a minus is no number to the form
         number = f"{bound * 100:g} %" if BY_NAME[field].kind is Kind.PERCENT else str(int(bound))
