@@ -249,6 +249,13 @@ def make_robots(session: Session, store: ArtefactStore, study: Study, participan
     return trials
 
 
+def rate_everything(session: Session, trials: Sequence[Trial]) -> None:
+    """A rating of each of these."""
+    for trial in trials:
+        session.add(Rating(trial_id=trial.id, revision=1, satisfaction=4, personalisation=3, client_uuid=str(uuid4())))
+    session.flush()
+
+
 def make_rated_trials(session: Session, participant: Participant, count: int) -> None:
     """More trials of the participant, with a rating each."""
     known = session.scalar(select(func.count(Trial.id)).where(Trial.participant_id == participant.id)) or 0
@@ -256,7 +263,7 @@ def make_rated_trials(session: Session, participant: Participant, count: int) ->
         trial = Trial(participant_id=participant.id, ordinal=ordinal, letter="A", repetition=ordinal, scenario=ordinal)
         session.add(trial)
         session.flush()
-        session.add(Rating(trial_id=trial.id, revision=1, satisfaction=4, personalisation=3, client_uuid=str(uuid4())))
+        rate_everything(session, [trial])
 
 
 def finish_everything(session: Session, participant: Participant, study: Study) -> None:

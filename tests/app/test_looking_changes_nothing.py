@@ -18,6 +18,7 @@ from app.domain.preferences import Query
 from app.domain.protocol import EvaluationSettings
 from app.domain.studies import Study
 from app.services.accounts import api_tokens
+from app.services.evaluation import head_to_heads
 from app.services.participants import recruitment_panel
 from app.storage import ArtefactStore
 from tests import factories
@@ -29,6 +30,7 @@ REACHED = {
     ("participant", "completed_at"),
     ("query", "served_at"),
     ("trial", "shown_at"),
+    ("head_to_head", "shown_at"),
     ("stage_record", "row"),
     ("participant_event", "row"),
 }
@@ -65,6 +67,8 @@ class Place:
     """The personal link of somebody who is being asked."""
     rater: str
     """That of somebody who is shown robots."""
+    chooser: str
+    """That of somebody who has rated them and is shown two side by side."""
     api_token: str
 
     def changed_by(
@@ -83,7 +87,7 @@ class Place:
 @pytest.fixture
 def place(studio_app: FastAPI, database: Database, store: ArtefactStore, password: str) -> Place:
     with database.writing() as session:
-        settings = EvaluationSettings(methods=("reference", "pbarl"))
+        settings = EvaluationSettings(methods=("reference", "pbarl"), head_to_heads=1)
         study = factories.make_study(session, evaluation=settings, panel_parameter="")
         person, person_token = factories.make_participant(session, study)
         factories.make_queries(session, store, person, 4)
@@ -93,6 +97,10 @@ def place(studio_app: FastAPI, database: Database, store: ArtefactStore, passwor
         factories.answer_everything(session, store, study, rater)
         trial = factories.make_robots(session, store, study, rater)[0]
         factories.make_controller(session, store, rater, "pbarl")
+        chooser, chooser_token = factories.make_participant(session, study)
+        factories.answer_everything(session, store, study, chooser)
+        factories.rate_everything(session, factories.make_robots(session, store, study, chooser))
+        head_to_head = head_to_heads.of_participant(session, chooser.id)[0]
         file = store.put(b"PK an export")
         export = Export(
             study_id=study.id,
@@ -114,6 +122,7 @@ def place(studio_app: FastAPI, database: Database, store: ArtefactStore, passwor
             "letter": "A",
             "export_id": str(export.id),
             "trial_id": str(trial.id),
+            "head_to_head_id": str(head_to_head.id),
             "query_id": str(query.id),
             "sha256": query.left_clip.video_sha256,
             "table": "labels",
@@ -124,7 +133,7 @@ def place(studio_app: FastAPI, database: Database, store: ArtefactStore, passwor
         join_token = recruitment_panel.open_joining(session, study, "pat")
         token = api_tokens.create(session, session.scalars(select(Experimenter)).one(), "a notebook")[1]
     addresses = list(_addresses(studio_app, words, join_token, person_token))
-    return Place(addresses, database, f"/p/{person_token}", f"/p/{rater_token}", token)
+    return Place(addresses, database, f"/p/{person_token}", f"/p/{rater_token}", f"/p/{chooser_token}", token)
 
 
 def _addresses(application: FastAPI, words: dict[str, str], join_token: str, person_token: str) -> Iterator[str]:
@@ -157,7 +166,7 @@ def test_a_stranger_changes_nothing(place: Place, new_browser: Callable[[], Test
     assert changes(before, everything(place.database)) == set()
 
 
-@pytest.mark.parametrize("who", ["person", "rater"])
+@pytest.mark.parametrize("who", ["person", "rater", "chooser"])
 def test_a_participant_changes_only_what_they_have_reached_and_that_once(
     place: Place, client: TestClient, who: str
 ) -> None:
