@@ -382,8 +382,8 @@ evaluation-done-text =
 
 ## Direkter Vergleich (Vorsilbe head-to-head-)
 
-head-to-head-explanation = Zwei der Roboter, die Sie bewertet haben, nebeneinander und ohne ihre Buchstaben. Links und rechts wechseln von Paar zu Paar.
-head-to-head-change-last = Meine letzte Antwort ändern
+head-to-head-explanation = Zwei der Roboter, die Sie bewertet haben, nebeneinander und ohne ihre Buchstaben. Die Seiten wechseln von Paar zu Paar.
+head-to-head-change-last = Letzte Antwort ändern
 head-to-head-changing = Sie ändern Ihre letzte Antwort; sie war: { $said }.
 head-to-head-done =
     { $count ->

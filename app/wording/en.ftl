@@ -384,8 +384,8 @@ evaluation-done-text =
 
 ## Head to head (prefix head-to-head-)
 
-head-to-head-explanation = Two of the robots you rated, side by side and without their letters. Left and right change from one pair to the next.
-head-to-head-change-last = Change my last answer
+head-to-head-explanation = Two of the robots you rated, side by side and without their letters. They change sides from one pair to the next.
+head-to-head-change-last = Change last answer
 head-to-head-changing = You are changing your last answer, which was: { $said }.
 head-to-head-done =
     { $count ->

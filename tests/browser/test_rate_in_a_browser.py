@@ -9,7 +9,7 @@ from playwright.sync_api import Page, Route, expect
 from sqlalchemy import select
 
 from app.db import Database
-from app.domain.evaluation import Rating, Trial
+from app.domain.evaluation import HeadToHeadAnswer, Rating, Trial
 from app.domain.protocol import EvaluatedMethod, EvaluationMode, EvaluationSettings
 from app.domain.studies import Participant, Study
 from app.storage import ArtefactStore
@@ -44,6 +44,12 @@ class Invited:
         with self.database.reading() as session:
             rows = session.scalars(select(Rating).order_by(Rating.id))
             return [(row.revision, row.satisfaction, row.personalisation) for row in rows]
+
+    def head_to_heads(self) -> list[tuple[int, str]]:
+        """Revision and response of every answer about two robots, in its order."""
+        with self.database.reading() as session:
+            rows = session.scalars(select(HeadToHeadAnswer).order_by(HeadToHeadAnswer.id))
+            return [(row.revision, row.response) for row in rows]
 
 
 @pytest.fixture
@@ -127,6 +133,32 @@ def test_a_rating_given_while_the_network_is_away_arrives_once_it_is_back(
     away = False
     expect(page.get_by_role("heading", name="Robot B")).to_be_visible()
     assert invited.ratings() == [(1, 2, 5)]
+
+
+def test_head_to_heads_are_answered_and_changed_by_keyboard_alone(
+    invite: Callable[..., Invited], new_page: NewPage
+) -> None:
+    invited = invite(head_to_heads=2, head_to_head_ties=True, trials=2)
+    page = new_page()
+    page.goto(invited.link)
+    for letter in "AABB":
+        expect(page.get_by_role("heading", name=f"Robot {letter}")).to_be_visible()
+        rate(page, "34")
+    expect(page.locator("[data-count]")).to_have_text("0 of 2")
+    expect(page.locator("[data-phase=ready]")).to_be_visible()
+    assert serious_findings(page) == []
+    page.keyboard.press("ArrowLeft")
+    expect(page.locator("[data-count]")).to_have_text("1 of 2")
+    expect(page.locator("[data-phase=ready]")).to_be_visible()
+    page.keyboard.press("z")
+    expect(page.get_by_text("You are changing your last answer, which was: Left.")).to_be_visible()
+    expect(page.locator("[data-phase=ready]")).to_be_visible()
+    page.keyboard.press("ArrowDown")
+    expect(page.locator("[data-count]")).to_have_text("1 of 2")
+    expect(page.locator("[data-phase=ready]")).to_be_visible()
+    page.keyboard.press("ArrowRight")
+    expect(page.get_by_role("heading", name="All robots are rated")).to_be_visible()
+    assert invited.head_to_heads() == [(1, "left"), (2, "equal"), (1, "right")]
 
 
 @pytest.mark.parametrize("viewport", [PHONE, LAPTOP], ids=["phone", "laptop"])
