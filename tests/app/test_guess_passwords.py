@@ -234,7 +234,7 @@ class TestProxies:
             "127.0.0.1,10.0.0.0/8"
         )
 
-    @pytest.mark.parametrize(("trusted", "last"), [("", 429), ("127.0.0.1", 401)])
+    @pytest.mark.parametrize(("trusted", "last"), [("", 429), pytest.param("127.0.0.1", 401, marks=pytest.mark.long)])
     def test_where_a_request_comes_from_is_believed_only_from_a_trusted_proxy(
         self, settings: Settings, password: str, trusted: str, last: int
     ) -> None:

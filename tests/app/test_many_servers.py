@@ -28,6 +28,7 @@ from tests.waiting import PATIENCE_S, free_port, until
 
 SERVERS, PEOPLE, LABELS, JOINING = 2, 6, 12, 20
 SCRIPT = {"Accept": "application/json"}
+SEVERAL = pytest.mark.skipif(databases.SERVER is None, reason="with SQLite there is one web server")
 
 
 @pytest.fixture
@@ -55,7 +56,7 @@ def study(database: Database) -> Study:
     return study
 
 
-@pytest.mark.skipif(databases.SERVER is None, reason="with SQLite there is one web server")
+@SEVERAL
 def test_attempts_to_log_in_are_limited_for_all_of_them_together(database: Database) -> None:
     servers = [SharedAttempts(database, "password", 3) for _ in range(3)]
     assert [server.allow("192.0.2.1", "ana") for server in servers * 2] == [True] * 3 + [False] * 3
@@ -96,6 +97,7 @@ def test_all_machines_go_by_the_clock_of_the_database(database: Database, monkey
     assert abs(now() - datetime.now(UTC)) < timedelta(seconds=30)
 
 
+@SEVERAL
 def test_an_answer_sent_to_all_of_them_at_once_is_kept_once(
     addresses: list[str], database: Database, store: ArtefactStore, study: Study
 ) -> None:
@@ -146,6 +148,7 @@ def _label_everywhere(addresses: list[str], token: str) -> list[set[str]]:
     return said
 
 
+@SEVERAL
 def test_people_who_join_at_once_get_numbers_of_their_own(
     addresses: list[str], database: Database, study: Study
 ) -> None:

@@ -85,7 +85,8 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Studio]:
     studio = Studio(tmp_path_factory.mktemp("running"), free_port())
     assert until(lambda: "worker-1 is ready" in studio.said and answers(studio.address))
     yield studio
-    studio.stop(signal.SIGTERM)
+    if studio.process.poll() is None:
+        studio.stop(signal.SIGTERM)
 
 
 def answers(address: str) -> bool:
@@ -109,16 +110,6 @@ def test_whoever_waits_for_a_page_goes_before_the_worker(running: Studio) -> Non
     assert os.getpriority(os.PRIO_PROCESS, web) < os.getpriority(os.PRIO_PROCESS, worker)
     assert os.getsid(web) == os.getsid(worker), "Linux compares priorities within a session only (autogroups)"
     assert len({os.getpgid(each) for each in (web, worker, running.process.pid)}) == 3, "Ctrl-C reaches one of them"
-
-
-def test_ctrl_c_stops_both_programs(start: Start) -> None:
-    studio = start()
-    assert until(lambda: "worker-1 is ready" in studio.said and answers(studio.address))
-    programs = [studio.child("app\0web"), studio.child("worker")]
-    assert studio.stop() == 0
-    assert "Stopped." in studio.said
-    assert "Traceback" not in studio.said
-    assert all(gone(pid) for pid in programs)
 
 
 @pytest.mark.long
@@ -187,3 +178,12 @@ def test_a_port_in_use_is_explained(running: Studio, tmp_path: Path) -> None:
     assert second.ended() == 1
     assert "choose another: PORT=8001 make run" in second.said
     assert "Traceback" not in second.said
+
+
+def test_ctrl_c_stops_both_programs(running: Studio) -> None:
+    """The last of those that share it."""
+    programs = [running.child("app\0web"), running.child("worker")]
+    assert running.stop() == 0
+    assert "Stopped." in running.said
+    assert "Traceback" not in running.said
+    assert all(gone(pid) for pid in programs)

@@ -197,6 +197,29 @@ def _mean_mark(axes: Axes, place: int, each: Mapping[str, Any]) -> None:
     axes.plot(at, each["participant_mean"], "D", color=colour, markersize=6, zorder=5)
 
 
+def head_to_head_strengths(contents: Mapping[str, Any]) -> Figure | None:
+    """Bradley-Terry strengths (log odds, sum zero) with 95 % intervals, the strongest on top."""
+    found = (contents.get("head_to_heads") or {}).get("strengths")
+    if not found:
+        return None
+    ordered = sorted(found, key=lambda each: float(each["strength"]), reverse=True)
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(5.6, 0.45 * len(ordered) + 0.9), layout="constrained")
+        axes = figure.subplots()
+        axes.axvline(0, color=INK, linewidth=0.8)
+        for row, each in enumerate(ordered):
+            axes.plot([each["low"], each["high"]], [row, row], color=GREY, linewidth=1.2, zorder=2)
+            axes.plot(each["strength"], row, "D", color=LINE_COLOURS[2], markersize=6.5, zorder=3)
+        axes.set_yticks(range(len(ordered)), [name_of(each["group"]) for each in ordered])
+        axes.set_ylim(len(ordered) - 0.4, -0.6)
+        axes.set_xlabel("Strength (log odds against the average robot; right: preferred)")
+        axes.xaxis.grid(True, color=PALE, linewidth=0.6)
+        axes.set_axisbelow(True)
+        axes.tick_params(axis="y", length=0)
+        axes.spines["left"].set_visible(False)
+    return figure
+
+
 def learning_curves(contents: Mapping[str, Any]) -> Figure | None:
     """Running share of answers that the model had foreseen: each person thin, the mean over people thick."""
     curves = [np.array(each["curve"]) for each in contents["answers"]["participants"] if len(each["curve"]) > 1]
@@ -320,6 +343,7 @@ def _in_two_lines(group: str) -> str:
 _FIGURES: dict[str, Callable[[Mapping[str, Any]], Figure | None]] = {
     "ratings": ratings_as_in_the_paper,
     "ratings_of_each_person": ratings_of_each_person,
+    "head_to_heads": head_to_head_strengths,
     "learning_curves": learning_curves,
     "success_against_preference": success_against_preference,
     "cost_changes": cost_changes,

@@ -59,6 +59,10 @@ FIGURES = {
         "The same ratings, person by person",
         "Each line is one person: their mean rating of each robot. Diamonds: mean over people, 95 % interval.",
     ),
+    "head_to_heads": (
+        "Strengths",
+        "Where 0 is the average robot; lines: 95 % intervals that count people, not answers.",
+    ),
     "learning_curves": (
         "How well the models predicted the answers",
         "Every answer was predicted by a model that had not seen it; pairs drawn at random only.",

@@ -46,6 +46,17 @@ def contents() -> dict[str, Any]:
         answers=answers,
         evaluations=evaluations,
         groups=METHODS,
+        head_to_heads=[
+            {
+                "participant": f"P{number:02d}",
+                "left_method": METHODS[first],
+                "right_method": METHODS[second],
+                "response": "right" if number % 4 else "left",
+                "counts": True,
+            }
+            for number in range(1, 9)
+            for first, second in ((0, 1), (1, 2), (0, 2))
+        ],
     )
     return make_report(tables)[0]
 
@@ -55,6 +66,7 @@ def test_every_figure_is_drawn_and_is_the_same_bytes_every_time(contents: dict[s
     assert set(first) == {
         "ratings",
         "ratings_of_each_person",
+        "head_to_heads",
         "learning_curves",
         "success_against_preference",
         "cost_changes",
@@ -68,6 +80,13 @@ def test_text_in_svg_is_text_and_png_has_300_dpi(contents: dict[str, Any]) -> No
     assert b">PbARL</text>" in files["svg"]
     width = int.from_bytes(files["png"][16:20])
     assert width > 6 * figures.DPI
+
+
+def test_the_strongest_robot_is_on_top(contents: dict[str, Any]) -> None:
+    svg = figures.all_figures(contents)["head_to_heads"]["svg"].decode()
+    found = sorted(contents["head_to_heads"]["strengths"], key=lambda each: -each["strength"])
+    names = [figures.name_of(each["group"]) for each in found]
+    assert sorted(names, key=lambda name: svg.index(f">{name}</text>")) == names
 
 
 def test_significant_comparisons_have_a_star_and_others_say_so(contents: dict[str, Any]) -> None:

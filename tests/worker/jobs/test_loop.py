@@ -29,7 +29,7 @@ from worker.rehearsal.server import OwnStudio
 LABELS = 12
 SCENARIOS, BEHAVIOURS = 2, 4
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.long]
 
 
 @pytest.fixture(scope="module")

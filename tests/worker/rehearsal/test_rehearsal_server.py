@@ -60,7 +60,7 @@ def rehearsal(directory: Path) -> list[str]:
 
 
 @pytest.mark.parametrize("command", [own_studio], indirect=True)
-@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGKILL])
+@pytest.mark.parametrize("number", [pytest.param(signal.SIGHUP, marks=pytest.mark.long), signal.SIGKILL])
 def test_a_signal_that_ends_the_command_ends_its_web_server_and_its_worker(
     command: "subprocess.Popen[bytes]", number: int, tmp_path: Path
 ) -> None:
