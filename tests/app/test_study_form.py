@@ -123,6 +123,14 @@ def test_a_complaint_stands_beside_its_field_and_opens_its_group(
         assert session.scalars(select(Study)).all() == []
 
 
+def test_a_complaint_about_methods_that_do_not_go_together_says_which_do(experimenter: TestClient) -> None:
+    form = typed(experimenter, evaluation="yes", evaluation_ask_which_is_theirs="yes")
+    answer = experimenter.post("/studies/new", data=form | {"evaluation_methods": ["pbarl", "prefft"]})
+    assert answer.status_code == 422
+    assert "choose PbARL, and beside it only" in answer.text
+    assert "Choose two methods" not in answer.text
+
+
 def test_a_page_that_is_not_there_leads_back_to_the_studies(experimenter: TestClient) -> None:
     answer = experimenter.get("/studies/nowhere")
     assert answer.status_code == 404

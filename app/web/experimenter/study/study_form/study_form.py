@@ -204,7 +204,9 @@ def _settings(errors: dict[str, str], values: Mapping[str, Any]) -> StudySetting
         for error in found.errors():
             place = _field(error["loc"])
             field = BY_NAME.get(place)
-            errors.setdefault(place, (field and field.shown.complaint) or _in_words(field, error["msg"]))
+            said_by_us = error["type"] == "value_error"
+            usual = field.shown.complaint if field and not said_by_us else None
+            errors.setdefault(place, usual or _in_words(field, error["msg"]))
     return None
 
 
@@ -275,6 +277,5 @@ def _in_words(field: FormField | None, message: str) -> str:
             bound = message.rsplit(" ", 1)[-1]
             in_percent = field is not None and field.kind is Kind.PERCENT
             return f"Enter {ours} {float(bound) * 100:g} %." if in_percent else f"Enter {ours} {bound}."
-    return message.removeprefix("Value error, ").removeprefix("Input ").capitalize() + (
-        "" if message[-1] == "." else "."
-    )
+    plain = message.removeprefix("Value error, ").removeprefix("Input ")
+    return plain[:1].upper() + plain[1:] + ("" if plain.endswith(".") else ".")
