@@ -114,9 +114,11 @@ def status_of(database: Database, job: Job) -> str | None:
 
 
 def lived(settings: Settings, database: Database, store: ArtefactStore) -> Path:
-    """A worker has been at work before; where its engine's file is."""
-    with worker(settings, database, store):
-        assert until(lambda: last_seen(database) is not None)
+    """A worker has been there before, when nothing was due; where its engine's file is."""
+    with pytest.MonkeyPatch.context() as before:
+        before.setattr(reconcile, "due", lambda *_: iter(()))
+        with worker(settings, database, store):
+            assert until(lambda: last_seen(database) is not None)
     path = engine.file_of(settings)
     assert path is not None
     return path
