@@ -9,16 +9,20 @@ from fastapi.testclient import TestClient
 from pydantic import ValidationError
 from sqlalchemy import select
 
-from app.db import Database
+from app.db import Database, now
 from app.domain.participation import FormAnswer
 from app.domain.protocol import EvaluatedMethod, EvaluationSettings, FormItem, Language
 from app.domain.studies import Participant, Study
 from app.domain.study_settings import StudySettings
 from app.questionnaires import library
 from app.questionnaires.library import Instrument
+from app.services.exports import codebook, export_formats, export_tables
 from app.storage import ArtefactStore
 from tests import factories
 from tests.app.conftest import JSON
+from tests.finished_study import make_finished_study
+from worker.analysis.scales import scale_reports
+from worker.jobs.publishing import report_files
 
 ENGLISH = (Language.ENGLISH,)
 BROOKE = (5, 4, 2, 1, 2, 3, 2, 4, 5, 2)
@@ -242,3 +246,81 @@ def test_every_robot_is_described_after_its_trials_and_before_the_next(begin: Be
         ("B", "7"),
     ]
     assert person.where() == "/p/finished"
+
+
+# --- what comes out --------------------------------------------------------------------------------------------------
+
+
+def rows_of(table: str, database: Database, study: Study) -> list[dict[str, Any]]:
+    with database.reading() as session:
+        found = session.get_one(Study, study.id)
+        provenance = export_formats.provenance_of(session, found)
+        return list(export_formats.records(export_tables.BY_NAME[table], session, found, provenance))
+
+
+def test_items_are_exported_as_given_and_scores_by_the_key(begin: Begin) -> None:
+    person = begin(instruments=("sus", "tia"), languages=ENGLISH)
+    given = {item.name: str(value) for item, value in zip(library.every()["sus"].items, BROOKE, strict=True)}
+    person.browser.post("/p/questionnaire/sus", data=given | {"complex": "1"})
+    person.browser.post("/p/questionnaire/sus", data=given)
+    person.browser.post("/p/questionnaire/tia", data={"item_03": "5", "item_17": "2", "item_09": "4"})
+    items = [row for row in rows_of("forms", person.database, person.study) if row["form"] == "sus"]
+    assert [(row["value"], row["superseded"]) for row in items if row["item"] == "complex"] == [
+        ("1", True),
+        ("4", False),
+    ]
+    found = {(row["instrument"], row["score"]): row for row in rows_of("scores", person.database, person.study)}
+    assert found["sus", "usability"]["value"] == pytest.approx(55)
+    assert (found["sus", "usability"]["lowest"], found["sus", "usability"]["highest"]) == (0, 100)
+    assert found["tia", "familiarity"]["value"] == 3.5
+    trust = found["tia", "trust_in_automation"]
+    assert (trust["value"], trust["items"], trust["answered"]) == (None, 2, 1)
+
+
+def test_a_method_stands_beside_a_robots_scores_only_after_unblinding(database: Database, store: ArtefactStore) -> None:
+    with database.writing() as session:
+        study = make_finished_study(session, store, people=3, labels=4, unblinded=False)
+    for table in ("forms", "scores"):
+        about = [row for row in rows_of(table, database, study) if row["letter"]]
+        assert about
+        assert {row["method"] for row in about} == {None}
+    with database.writing() as session:
+        session.get_one(Study, study.id).unblinded_at = now()
+    methods = {(row["letter"] is None, row["method"]) for row in rows_of("scores", database, study)}
+    assert methods == {(True, None), (False, "reference"), (False, "prefft"), (False, "pbarl")}
+
+
+@pytest.mark.parametrize("unblinded", [False, True])
+def test_the_report_has_scores_per_robot_with_reliability(
+    database: Database, store: ArtefactStore, unblinded: bool
+) -> None:
+    with database.writing() as session:
+        study = make_finished_study(session, store, people=6, labels=4, unblinded=unblinded)
+        tables = report_files.tables_of(session, study)
+    (tia,) = scale_reports(tables.instruments, tables.groups, compare=not tables.blinded)
+    at_the_end, about_robots = tia["parts"]
+    trust = {score["name"]: score for score in about_robots["scores"]}["trust_in_automation"]
+    assert (at_the_end["people"], trust["left_out"]) == (6, 3), "the second person left it out for each of three robots"
+    assert about_robots["groups"] == (["reference", "prefft", "pbarl"] if unblinded else ["A", "B", "C"])
+    assert len(trust["comparisons"]) == (3 if unblinded else 0)
+    competence = about_robots["scores"][0]
+    exported = [row for row in rows_of("scores", database, study) if row["score"] == competence["name"]]
+    group = "method" if unblinded else "letter"
+    for mean, agreement in zip(competence["means"], competence["reliability"], strict=True):
+        values = [row["value"] for row in exported if row[group] == mean["group"]]
+        assert mean["participant_mean"] == pytest.approx(sum(values) / 6)
+        assert 0.5 < agreement["alpha"] < 1
+
+
+def test_the_codebook_has_key_words_source_and_whose_translation_it_is() -> None:
+    published = library.every()["sus"].published("de")
+    words = {f"de:{library.text_name('sus', part)}": f"deutsch {part}" for part in published}
+    settings = StudySettings(instruments=("sus", "tia"), wording=words)
+    text = codebook.markdown(settings)
+    assert "Brooke, J. (1996)" in text
+    assert "CC BY-SA 4.0" in text
+    assert "complex (reversed)" in text
+    assert "In Deutsch some are this study's own" in text.split("## System Usability")[1].split("## Trust")[0]
+    assert "this study's own" not in text.split("## Trust")[1]
+    (sus, _) = codebook.entries(settings)
+    assert sus["asked_as"]["de"]["easy"] == "deutsch easy"

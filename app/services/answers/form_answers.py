@@ -1,8 +1,9 @@
 """Answers to the questions of forms and standard questionnaires: append-only, the newest of a question counts."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
-from sqlalchemy import select
+from sqlalchemy import ColumnElement, select, true
 from sqlalchemy.orm import Session
 
 from app.domain.participation import FormAnswer
@@ -20,6 +21,38 @@ def newest(session: Session, participant: Participant, form: str, letter: str | 
         FormAnswer.participant_id == participant.id, FormAnswer.form == form, FormAnswer.letter == letter
     )
     return {answer.item: answer.value for answer in session.scalars(given.order_by(FormAnswer.id))}
+
+
+@dataclass(frozen=True)
+class FilledIn:
+    """One standard questionnaire as one person has filled it in, about one robot or about none."""
+
+    instrument: Instrument
+    letter: str | None
+    answers: Mapping[str, float | None]
+    """By item, as they were given; None: left out."""
+
+    @property
+    def scores(self) -> Mapping[str, float | None]:
+        """By name, by the scoring key; None where too much was left out."""
+        return {each.name: self.instrument.score(each, self.answers) for each in self.instrument.scores}
+
+
+def filled_in(session: Session, participant_id: int, which: ColumnElement[bool] | None = None) -> Sequence[FilledIn]:
+    """Every standard questionnaire that somebody has sent, in a fixed order. ``which``: of these rows only."""
+    rows = select(FormAnswer).where(
+        FormAnswer.participant_id == participant_id,
+        true() if which is None else which,
+        FormAnswer.form.in_(library.every()),
+    )
+    found: dict[tuple[str, str], dict[str, float | None]] = {}
+    for row in session.scalars(rows.order_by(FormAnswer.id)):
+        possible = row.value in library.every()[row.form].answers.points
+        found.setdefault((row.letter or "", row.form), {})[row.item] = float(row.value or 0) if possible else None
+    return [
+        FilledIn(library.every()[form], letter or None, answers)
+        for (letter, form), answers in sorted(found.items(), key=lambda each: each[0])
+    ]
 
 
 def append(
