@@ -209,7 +209,7 @@ def test_german_pages_show_the_german_wording(begin: Begin) -> None:
     person = begin(instruments=("tia",), language=Language.GERMAN)
     page = person.browser.get("/p/questionnaire/tia").text
     assert "Ich kann mich auf das System verlassen." in page
-    assert "stimme weder zu noch nicht zu" in page
+    assert "Stimme weder zu noch nicht zu" in page
     assert "I can rely" not in page
 
 
