@@ -25,6 +25,7 @@ from worker.analysis.scales import scale_reports
 from worker.jobs.publishing import report_files
 
 ENGLISH = (Language.ENGLISH,)
+ON_PURPOSE = {"on_purpose": "yes"}
 BROOKE = (5, 4, 2, 1, 2, 3, 2, 4, 5, 2)
 """The filled-in form of Brooke (1996): its contributions 4, 1, 1, 4, 1, 2, 1, 1, 4, 3 make 22, and a score of 55."""
 
@@ -180,7 +181,10 @@ def test_pages_follow_one_another_and_the_stage_ends_with_the_last(begin: Begin)
     assert browser.get("/p/questionnaire").headers["location"] == "/p/questionnaire/tia", (
         "one comes back to where one was"
     )
-    assert browser.post("/p/questionnaire/tia", data={"item_09": "4"}).headers["location"] == "/p/questionnaire"
+    assert (
+        browser.post("/p/questionnaire/tia", data={"item_09": "4", **ON_PURPOSE}).headers["location"]
+        == "/p/questionnaire"
+    )
     assert browser.post("/p/questionnaire", data={"comments": "fine"}).headers["location"] == "/p/next"
     assert person.where() == "/p/finished"
     rows = person.stored()
@@ -195,6 +199,19 @@ def test_sending_again_changes_only_what_was_changed(begin: Begin) -> None:
     person.browser.post("/p/questionnaire/nasa_tlx", data={"effort": "35", "frustration": "10"})
     stored = [(item, value) for _, _, item, value in person.stored() if value is not None]
     assert stored == [("effort", "35"), ("frustration", "5"), ("frustration", "10")]
+
+
+def test_who_leaves_something_out_is_asked_once_more_and_nothing_is_lost_meanwhile(begin: Begin) -> None:
+    person = begin(instruments=("nasa_tlx",), languages=ENGLISH)
+    sent = {item.name: "50" for item in library.every()["nasa_tlx"].items} | {"effort": ""}
+    again = person.browser.post("/p/questionnaire/nasa_tlx", data=sent).headers["location"]
+    assert again == "/p/questionnaire/nasa_tlx?on_purpose"
+    assert sum(value == "50" for _, _, _, value in person.stored()) == 5
+    page = person.browser.get(again).text
+    assert "One answer is missing." in page
+    assert page.count("checked") >= 5
+    assert person.browser.post("/p/questionnaire/nasa_tlx", data=sent | ON_PURPOSE).headers["location"] == "/p/next"
+    assert person.where() == "/p/finished"
 
 
 def test_an_answer_that_is_no_point_is_refused_and_nothing_is_kept(begin: Begin) -> None:
@@ -240,7 +257,7 @@ def test_every_robot_is_described_after_its_trials_and_before_the_next(begin: Be
         assert rated["next_path"] == path
         assert browser.get("/p/evaluation").headers["location"] == path
         assert f"Robot {letter}" in browser.get(path).text
-        browser.post(path, data={"scary": "2" if letter == "A" else "7"})
+        browser.post(path, data={"scary": "2" if letter == "A" else "7", **ON_PURPOSE})
     assert [(letter, value) for _, letter, item, value in person.stored() if item == "scary"] == [
         ("A", "2"),
         ("B", "7"),

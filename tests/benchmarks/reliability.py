@@ -104,11 +104,11 @@ def write(folder: Path, rows: Sequence[dict[str, Any]]) -> None:
         "items",
         "people",
         "true",
-        "α of many",
-        "mean α",
+        "alpha of many",
+        "mean alpha",
         "interval misses, %",
-        "mean ω",
-        "ω computed, %",
+        "mean omega",
+        "omega computed, %",
     )
     lines = ["| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
     lines += ["| " + " | ".join(str(each[name]) for name in COLUMNS) + " |" for each in rows]

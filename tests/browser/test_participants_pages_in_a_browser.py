@@ -157,6 +157,8 @@ def test_a_standard_questionnaire_is_filled_in_with_the_keyboard_and_fits_a_phon
     page.keyboard.press("ArrowUp")
     expect(trust.get_by_role("radio", name="Strongly agree")).to_be_checked()
     page.get_by_role("button", name="Save and go on").press("Enter")
+    expect(page.get_by_role("alert")).to_contain_text("18 answers are missing")
+    page.get_by_role("button", name="Save and go on").press("Enter")
     expect(page).to_have_url(re.compile("/p/finished$"))
     with invited.database.reading() as session:
         given = form_answers.newest(session, session.get_one(Participant, invited.participant.id), "tia")
@@ -182,6 +184,8 @@ def test_scales_of_many_points_fit_every_screen_and_say_what_their_ends_mean(
     assert min(sizes) >= 24, "WCAG 2.5.8"
     assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
     assert serious_findings(page) == []
+    page.get_by_role("button", name="Save and go on").click()
+    expect(page.get_by_role("alert")).to_be_visible()
     page.get_by_role("button", name="Save and go on").click()
     expect(page.get_by_role("group", name="Happy")).to_be_visible()
     assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")

@@ -29,6 +29,8 @@ router = APIRouter(prefix="/p")
 AtQuestionnaire = Annotated[Participant, has_reached(Stage.QUESTIONNAIRE)]
 Name = Annotated[str, Path(pattern=r"^[a-z][a-z0-9_]{0,19}$")]
 Letter = Annotated[str, Path(pattern=r"^[A-E]$")]
+ON_PURPOSE = "on_purpose"
+"""Sent with a page that has said what is missing, and then goes on without it."""
 MANY = 12
 """More points than this stand in several rows on a phone."""
 
@@ -43,13 +45,15 @@ class Asked:
     """What is stored, and what is shown: the point, or its name."""
     low: str
     high: str
+    is_named: bool
+    """False: it is called by its two ends, which stand above the points anyway."""
     value: str
     problem: str | None
 
 
 @router.get("/questionnaire/{instrument}", name="show_scale")
 def show_scale(request: Request, instrument: Name, participant: AtQuestionnaire, session: WritingSession) -> Response:
-    """One of the standard questionnaires at the end."""
+    """One of the standard questionnaires at the end; once more, where something was left out."""
     asked = _asked_at_the_end(participant.study.settings, instrument)
     return _page(request, participant, asked, None, _given(session, participant, asked, None), {})
 
@@ -65,6 +69,8 @@ def save_scale(
     if wrong:
         return _page(request, participant, asked, None, typed, wrong)
     forms.record_instrument(session, participant, asked, typed, None)
+    if _may_be_oversight(asked, typed):
+        return _once_more(request)
     following = settings.instruments[settings.instruments.index(instrument) + 1 :]
     if following:
         return _to_scale(request, following[0])
@@ -100,6 +106,8 @@ def save_robot_scale(
     if wrong:
         return _page(request, participant, asked, letter, typed, wrong)
     forms.record_instrument(session, participant, asked, typed, letter)
+    if _may_be_oversight(asked, typed):
+        return _once_more(request)
     turn = evaluation_plan.next_turn(session, studio.store, participant)
     return RedirectResponse(next_path(request, turn), HTTPStatus.SEE_OTHER)
 
@@ -129,6 +137,16 @@ def _path(request: Request, instrument: str) -> str:
 
 def _to_scale(request: Request, instrument: str) -> RedirectResponse:
     return RedirectResponse(_path(request, instrument), HTTPStatus.SEE_OTHER)
+
+
+def _may_be_oversight(instrument: Instrument, typed: Mapping[str, str]) -> bool:
+    """Whether to ask once more: validated questionnaires lose their score with an item that was overlooked."""
+    return ON_PURPOSE not in typed and any(not typed.get(item.name) for item in instrument.items)
+
+
+def _once_more(request: Request) -> RedirectResponse:
+    """The same page, which says what is missing. What was sent is stored already."""
+    return RedirectResponse(f"{request.url.path}?{ON_PURPOSE}", HTTPStatus.SEE_OTHER)
 
 
 def _asked_at_the_end(settings: StudySettings, instrument: str) -> Instrument:
@@ -173,6 +191,8 @@ def _page(
         "action": request.url.path,
         "instruction": words["instruction"],
         "fields": [_item(item, instrument, words, values, wrong.get(item.name), wording) for item in instrument.items],
+        "on_purpose": ON_PURPOSE if ON_PURPOSE in request.query_params else None,
+        "left_out": sum(not values.get(item.name) for item in instrument.items),
         "labelled": bool(instrument.answers.labels.en),
         "many": len(instrument.answers.points) > MANY,
         "first_wrong": next(iter(wrong), None),
@@ -213,6 +233,7 @@ def _item(
         points=list(zip(points, labels, strict=True)),
         low=low,
         high=high,
+        is_named=item.name in words,
         value=values.get(item.name, ""),
         problem=wording(problem) if problem else None,
     )
