@@ -30,16 +30,11 @@ def _without_words(instrument: str, language: Language, missing: tuple[str, ...]
     """Why a questionnaire cannot be asked in a language, and what to do."""
     known = library.every()[instrument]
     prefix = "" if language == usual else f"{language.value}:"
-    example = f"{prefix}{library.text_name(instrument, missing[0])} = ..."
-    why = (
-        f"{known.title} has no {language.label} words here."
-        if len(missing) == len(known.published(language.value))
-        else f"{known.title} lacks {language.label} words for: {', '.join(missing)}."
-    )
-    leave_out = "" if language == usual else f" Leave {language.label} out of the languages people may choose, or"
+    lines = ", ".join(f"{prefix}{library.text_name(instrument, part)}" for part in missing)
+    leave_out = "" if language == usual else f"leave {language.label} out of the languages people may choose, or "
     return (
-        f"{why}{leave_out or ' If you may use its words,'} enter {'its' if not leave_out else 'your own'} "
-        f"{len(missing)} texts under “Other texts in your own words”, one a line, from {example}"
+        f"{known.title} lacks words in {language.label}. Choose another questionnaire, {leave_out}"
+        f"enter your own under “Other texts in your own words”, one line each, as name = text. Missing: {lines}."
     )
 
 

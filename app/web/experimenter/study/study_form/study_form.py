@@ -275,6 +275,5 @@ def _in_words(field: FormField | None, message: str) -> str:
             bound = message.rsplit(" ", 1)[-1]
             in_percent = field is not None and field.kind is Kind.PERCENT
             return f"Enter {ours} {float(bound) * 100:g} %." if in_percent else f"Enter {ours} {bound}."
-    return message.removeprefix("Value error, ").removeprefix("Input ").capitalize() + (
-        "" if message[-1] == "." else "."
-    )
+    said = message.removeprefix("Value error, ").removeprefix("Input ")
+    return said[:1].upper() + said[1:] + ("" if message[-1] == "." else ".")
