@@ -90,7 +90,7 @@ def _fill_in(session: Session, person: Participant, letter: str | None, mean: fl
     level = mean + random.gauss(0, 0.8)
     points = {item.name: min(5, max(1, round(level + random.gauss(0, 0.6)))) for item in known.items}
     values = {item.name: str(6 - points[item.name] if item.reversed else points[item.name]) for item in known.items}
-    left_out = {"item_09": None} if person.number == 2 else {}
+    left_out: dict[str, str | None] = {"item_09": None} if person.number == 2 else {}
     form_answers.append(session, person, "tia", values | left_out, letter)
 
 

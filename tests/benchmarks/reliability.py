@@ -44,7 +44,8 @@ COLUMNS = (
 def loadings(kind: str, items: int) -> FloatArray:
     """Of standardised noise, so that the sum has the reliability that is meant."""
     shape = np.linspace(0.5, 1.5, items) if kind == "unequal" else np.ones(items)
-    return shape * (TRUE_RELIABILITY / (1 - TRUE_RELIABILITY) * items) ** 0.5 / shape.sum()
+    total = float((TRUE_RELIABILITY / (1 - TRUE_RELIABILITY) * items) ** 0.5)
+    return np.asarray(shape * total / shape.sum(), np.float64)
 
 
 def invented(kind: str, items: int, people: int, rng: np.random.Generator) -> FloatArray:
