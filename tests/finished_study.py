@@ -15,6 +15,8 @@ from app.domain.participation import ConsentRecord, FormAnswer, ParticipantEvent
 from app.domain.preferences import Purpose, Query, Response
 from app.domain.protocol import EvaluatedMethod, EvaluationSettings
 from app.domain.studies import Participant, Study
+from app.questionnaires import library
+from app.services.answers import form_answers
 from app.services.evaluation import donors, evaluation_plan, head_to_heads
 from app.storage import ArtefactStore
 from tests import factories
@@ -27,7 +29,11 @@ def make_finished_study(
 ) -> Study:
     """The study, with participants P01, P02, ..."""
     study = factories.make_study(
-        session, "Feeding, finished", labels_per_participant=10, evaluation=EvaluationSettings(head_to_heads=1)
+        session,
+        "Feeding, finished",
+        labels_per_participant=10,
+        instruments=("tia",),
+        evaluation=EvaluationSettings(head_to_heads=1, instruments=("tia",)),
     )
     study.key_secret = sha256(study.slug.encode()).hexdigest()  # else each run had other letters, so other ratings
     study.unblinded_at = now() if unblinded else None
@@ -74,7 +80,18 @@ def _forms(session: Session, person: Participant) -> None:
     session.add(FormAnswer(participant_id=person.id, form="demographics", item="age", value=str(20 + person.number)))
     text = '=HYPERLINK("http://example.com")' if person.number == 1 else 'nice, "really" nice'
     session.add(FormAnswer(participant_id=person.id, form="questionnaire", item="comments", value=text))
+    _fill_in(session, person, None, 3.0)
     session.add(ParticipantEvent(participant_id=person.id, kind="break_begun", detail={"answered": 5}))
+
+
+def _fill_in(session: Session, person: Participant, letter: str | None, mean: float) -> None:
+    """A standard questionnaire; the second person leaves one item out."""
+    known, random = library.every()["tia"], Random(f"{person.number}{letter}")  # noqa: S311
+    level = mean + random.gauss(0, 0.8)
+    points = {item.name: min(5, max(1, round(level + random.gauss(0, 0.6)))) for item in known.items}
+    values = {item.name: str(6 - points[item.name] if item.reversed else points[item.name]) for item in known.items}
+    left_out: dict[str, str | None] = {"item_09": None} if person.number == 2 else {}
+    form_answers.append(session, person, "tia", values | left_out, letter)
 
 
 def _evaluate(session: Session, study: Study, person: Participant, random: Random) -> None:
@@ -104,6 +121,8 @@ def _rate(session: Session, study: Study, person: Participant, random: Random) -
         session.add(_rating(trial, 1, *scores))
         if trial.ordinal == 1:
             session.add(_rating(trial, 2, scores[0], 6 - scores[1]))
+    for letter, method in methods.items():
+        _fill_in(session, person, letter, MEANS[method])
     for each in head_to_heads.of_participant(session, person.id):
         each.shown_at = now()
         left, right = (MEANS[methods[trial.letter]] for trial in (each.left_trial, each.right_trial))

@@ -45,7 +45,9 @@ class FormAnswer(Base):
     id: Mapped[int] = mapped_column(primary_key=True)
     participant_id: Mapped[int] = mapped_column(ForeignKey("participant.id"), index=True)
     form: Mapped[str] = mapped_column(String(20))
-    """demographics or questionnaire"""
+    """demographics, questionnaire, or the name of a standard questionnaire (app.questionnaires)"""
+    letter: Mapped[str | None] = mapped_column(String(1))
+    """The robot of the blinded evaluation that it is about; None: about none."""
     item: Mapped[str] = mapped_column(String(40))
     value: Mapped[str | None] = mapped_column(Text)
     """None: left out on purpose."""

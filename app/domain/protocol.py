@@ -7,6 +7,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validat
 
 from app.domain.choices import Choice
 from app.domain.described import Section, setting
+from app.questionnaires import library
 
 
 class Language(Choice):
@@ -62,6 +63,21 @@ class EvaluatedMethod(Choice):
         "The personal filter of another participant, drawn by lot; of a usual type of user while there is none.",
     )
     AVERAGE = "average", "Average", "One filter for everybody, of what earlier participants want on average."
+
+
+STANDARD_QUESTIONNAIRES = tuple((each.name, each.title, each.about) for each in library.every().values())
+"""(name, title, what to know before choosing it), as the form offers them."""
+MOST_INSTRUMENTS = 10
+
+
+def check_instruments(names: tuple[str, ...]) -> tuple[str, ...]:
+    """The same, each of which exists and comes once. Raises ValueError."""
+    unknown = next((name for name in names if name not in library.every()), None)
+    if unknown is not None:
+        raise ValueError(f"There is no standard questionnaire called {unknown[:40]}.")
+    if len(set(names)) < len(names):
+        raise ValueError("Each standard questionnaire can be chosen once only.")
+    return names
 
 
 LETTERS = "ABCDE"
@@ -147,6 +163,17 @@ class EvaluationSettings(BaseModel):
             ("yes", "Ask every time", "Beside each rating and each head-to-head; it may be left empty."),
         ),
     )
+
+    instruments: tuple[str, ...] = setting(
+        (),
+        Section.EVALUATION,
+        "Standard questionnaires about each robot",
+        "After the last trial of each robot, about that robot. Short ones: everybody fills them in for every robot.",
+        options=STANDARD_QUESTIONNAIRES,
+        max_length=MOST_INSTRUMENTS,
+    )
+
+    _check_instruments = field_validator("instruments")(check_instruments)
 
     @field_validator("head_to_heads")
     @classmethod

@@ -3,23 +3,39 @@
 The form, the schema of the API and what locking fixes follow from these fields, which stand in the order of the page.
 """
 
-from pydantic import BaseModel, ConfigDict, model_validator
+from pydantic import BaseModel, ConfigDict, field_validator, model_validator
 
 from app.domain.choices import ClipQuality, Method, RewardKind, Strategy
 from app.domain.described import Section, Use, setting
 from app.domain.protocol import (
+    MOST_INSTRUMENTS,
     PAPER_DEMOGRAPHICS,
+    STANDARD_QUESTIONNAIRES,
     USUAL_QUESTIONNAIRE,
     Advisor,
     EvaluationSettings,
     FormItem,
     Language,
     PlannedTest,
+    check_instruments,
 )
 from app.installed_tasks.description import LONGEST_CLIP_STEPS, SHORTEST_CLIP_STEPS
+from app.questionnaires import library
 
 USUAL_CLIP_STEPS = 60
 """Of a task that is not installed here."""
+
+
+def _without_words(instrument: str, language: Language, missing: tuple[str, ...], usual: Language) -> str:
+    """Why a questionnaire cannot be asked in a language, and what to do."""
+    known = library.every()[instrument]
+    prefix = "" if language == usual else f"{language.value}:"
+    lines = ", ".join(f"{prefix}{library.text_name(instrument, part)}" for part in missing)
+    leave_out = "" if language == usual else f"leave {language.label} out of the languages people may choose, or "
+    return (
+        f"{known.title} lacks words in {language.label}. Choose another questionnaire, {leave_out}"
+        f"enter your own under “Other texts in your own words”, one line each, as name = text. Missing: {lines}."
+    )
 
 
 class StudySettings(BaseModel):
@@ -89,6 +105,15 @@ class StudySettings(BaseModel):
         Section.CONSENT,
         "Questions at the end",
         "Written in the same way. felt_understood, felt_safe, would_use and comments need no question.",
+    )
+    instruments: tuple[str, ...] = setting(
+        (),
+        Section.CONSENT,
+        "Standard questionnaires at the end",
+        "Before the questions at the end, a page each, worded and scored as published. A language that is not named "
+        "here needs your own words below: scale-sus-easy = text, with de: before it for German only.",
+        options=STANDARD_QUESTIONNAIRES,
+        max_length=MOST_INSTRUMENTS,
     )
     wording: dict[str, str] = setting(
         {},
@@ -293,6 +318,39 @@ class StudySettings(BaseModel):
         if self.evaluation and twice in [each.name for each in self.evaluation.closing_questions]:
             raise ValueError(f"{twice} is asked by the evaluation already. Leave it out of the questions at the end.")
         return self
+
+    _check_instruments = field_validator("instruments")(check_instruments)
+
+    @model_validator(mode="after")
+    def _worded(self) -> "StudySettings":
+        """Nobody is shown half a questionnaire in another language."""
+        for name in self.all_instruments:
+            for language in self.offered_languages:
+                missing = self.missing_words(name, language)
+                if missing:
+                    raise ValueError(_without_words(name, language, missing, self.language))
+        return self
+
+    @property
+    def all_instruments(self) -> tuple[str, ...]:
+        """Standard questionnaires that are filled in, at the end or about each robot, each once."""
+        return tuple(dict.fromkeys((*self.instruments, *(self.evaluation.instruments if self.evaluation else ()))))
+
+    def own_words(self, instrument: str, part: str, language: Language) -> str | None:
+        """What the study says itself for a part of a questionnaire, in this language; None: what is published.
+
+        A text without a language holds in the study's own.
+        """
+        name = library.text_name(instrument, part)
+        own = self.wording.get(name) if language == self.language else None
+        return self.wording.get(f"{language.value}:{name}", own) or None
+
+    def missing_words(self, instrument: str, language: Language) -> tuple[str, ...]:
+        """Parts of a questionnaire that nobody has put into this language."""
+        published = library.every()[instrument].published(language.value)
+        return tuple(
+            part for part, text in published.items() if not text and not self.own_words(instrument, part, language)
+        )
 
     @property
     def closing_form(self) -> tuple[FormItem, ...]:

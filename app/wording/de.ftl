@@ -43,6 +43,13 @@ consent-copy-file = einwilligung
 
 demographics-title = Zu Ihrer Person
 demographics-lead = Einige Fragen zu Ihnen, damit wir beschreiben können, wer teilgenommen hat. Sie können jede Frage auslassen.
+scale-left-out =
+    { $count ->
+        [one] Eine Antwort fehlt.
+       *[other] { $count } Antworten fehlen.
+    } Sie können sie jetzt ergänzen oder ohne sie weitermachen.
+scale-page = Seite { $place } von { $places }
+scale-robot-title = Über Roboter { $letter }
 questionnaire-title = Wie war es?
 questionnaire-lead = Sie haben es fast geschafft. Zum Schluss noch einige Fragen; Sie können jede auslassen.
 form-save = Speichern und weiter

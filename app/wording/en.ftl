@@ -45,6 +45,16 @@ consent-copy-file = consent
 
 demographics-title = About you
 demographics-lead = A few questions about you, so that we can describe who took part. You may skip any of them.
+scale-left-out =
+    { $count ->
+        [one] One answer is missing.
+       *[other] { $count } answers are missing.
+    } You may give { $count ->
+        [one] it
+       *[other] them
+    } now, or go on without.
+scale-page = Page { $place } of { $places }
+scale-robot-title = About Robot { $letter }
 questionnaire-title = How was it?
 questionnaire-lead = You are almost done. A few last questions; you may skip any of them.
 form-save = Save and go on

@@ -17,7 +17,9 @@ from app.domain.people import Experimenter
 from app.domain.preferences import Query
 from app.domain.protocol import EvaluationSettings
 from app.domain.studies import Study
+from app.questionnaires import library
 from app.services.accounts import api_tokens
+from app.services.answers import form_answers
 from app.services.evaluation import head_to_heads
 from app.services.participants import recruitment_panel
 from app.storage import ArtefactStore
@@ -87,8 +89,8 @@ class Place:
 @pytest.fixture
 def place(studio_app: FastAPI, database: Database, store: ArtefactStore, password: str) -> Place:
     with database.writing() as session:
-        settings = EvaluationSettings(methods=("reference", "pbarl"), head_to_heads=1)
-        study = factories.make_study(session, evaluation=settings, panel_parameter="")
+        settings = EvaluationSettings(methods=("reference", "pbarl"), head_to_heads=1, instruments=("tia",))
+        study = factories.make_study(session, evaluation=settings, instruments=("tia",), panel_parameter="")
         person, person_token = factories.make_participant(session, study)
         factories.make_queries(session, store, person, 4)
         model = factories.make_model(session, study, person, ModelKind.FILTER, factories.filter_metrics())
@@ -100,6 +102,9 @@ def place(studio_app: FastAPI, database: Database, store: ArtefactStore, passwor
         chooser, chooser_token = factories.make_participant(session, study)
         factories.answer_everything(session, store, study, chooser)
         factories.rate_everything(session, factories.make_robots(session, store, study, chooser))
+        given = {item.name: "3" for item in library.every()["tia"].items}
+        for letter in "AB":
+            form_answers.append(session, chooser, "tia", given, letter)
         head_to_head = head_to_heads.of_participant(session, chooser.id)[0]
         file = store.put(b"PK an export")
         export = Export(
@@ -120,6 +125,7 @@ def place(studio_app: FastAPI, database: Database, store: ArtefactStore, passwor
             "code": person.code,
             "version": "1",
             "letter": "A",
+            "instrument": "tia",
             "export_id": str(export.id),
             "trial_id": str(trial.id),
             "head_to_head_id": str(head_to_head.id),

@@ -80,8 +80,10 @@ def test_without_answers_the_page_says_what_it_waits_for(database: Database, exp
 def test_planned_tests_are_marked_and_all_others_are_exploratory(experimenter: TestClient, finished: Finished) -> None:
     text = results(experimenter, finished(locked=True))
     comparisons, scales, kinds = 3, 2, 4
+    questionnaire = comparisons * 6 * 2
+    """Six scores of the standard questionnaire, two tests: never planned, for plans are about ratings."""
     assert text.count('tag-planned">planned') == comparisons * scales
-    assert text.count(">exploratory<") == comparisons * scales * (kinds - 1)
+    assert text.count(">exploratory<") == comparisons * scales * (kinds - 1) + questionnaire
     assert "Planned tests were locked before the first answer." in text
 
 

@@ -6,6 +6,10 @@ import pytest
 from playwright.sync_api import Page, expect
 
 from app.domain.protocol import PAPER_DEMOGRAPHICS
+from app.domain.studies import Participant, Study
+from app.services.answers import form_answers
+from app.storage import ArtefactStore
+from tests import factories
 from tests.browser.conftest import Invited, NewPage, serious_findings, wait_ready
 
 pytestmark = pytest.mark.browser
@@ -136,3 +140,59 @@ def test_a_form_leads_to_the_answer_that_needs_another_look(invited: Invited, ne
         "5: a lot",
     ]
     assert serious_findings(page) == []
+
+
+@pytest.mark.parametrize("invited", [{"labels_per_participant": 10, "instruments": ("tia",)}], indirect=True)
+def test_a_standard_questionnaire_is_filled_in_with_the_keyboard_and_fits_a_phone(
+    invited: Invited, new_page: NewPage, store: ArtefactStore
+) -> None:
+    answer_all(invited, store)
+    page = new_page(viewport=SMALL)
+    page.goto(invited.link)
+    expect(page.get_by_role("group", name="I trust the system.")).to_be_visible()
+    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    assert serious_findings(page) == []
+    trust = page.get_by_role("group", name="I trust the system.")
+    trust.get_by_role("radio", name="No answer").focus()
+    page.keyboard.press("ArrowUp")
+    expect(trust.get_by_role("radio", name="Strongly agree")).to_be_checked()
+    page.get_by_role("button", name="Save and go on").press("Enter")
+    expect(page.get_by_role("alert")).to_contain_text("18 answers are missing")
+    page.get_by_role("button", name="Save and go on").press("Enter")
+    expect(page).to_have_url(re.compile("/p/finished$"))
+    with invited.database.reading() as session:
+        given = form_answers.newest(session, session.get_one(Participant, invited.participant.id), "tia")
+    assert (given["item_09"], given["item_14"]) == ("5", None)
+
+
+@pytest.mark.parametrize(
+    "invited",
+    [{"labels_per_participant": 10, "instruments": ("nasa_tlx", "rosas"), "languages": ("en",)}],
+    indirect=True,
+)
+@pytest.mark.parametrize("viewport", [SMALL, {"width": 1366, "height": 768}], ids=["phone", "laptop"])
+def test_scales_of_many_points_fit_every_screen_and_say_what_their_ends_mean(
+    invited: Invited, new_page: NewPage, store: ArtefactStore, viewport: dict[str, int]
+) -> None:
+    answer_all(invited, store)
+    page = new_page(viewport=viewport)
+    page.goto(invited.link)
+    effort = page.get_by_role("group", name=re.compile("^Effort"))
+    expect(effort.get_by_role("radio")).to_have_count(21 + 1)
+    expect(effort.get_by_role("radio", name="100: very high")).to_be_visible()
+    sizes = page.locator(".points .option").evaluate_all("all => all.map(each => each.getBoundingClientRect().width)")
+    assert min(sizes) >= 24, "WCAG 2.5.8"
+    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    assert serious_findings(page) == []
+    page.get_by_role("button", name="Save and go on").click()
+    expect(page.get_by_role("alert")).to_be_visible()
+    page.get_by_role("button", name="Save and go on").click()
+    expect(page.get_by_role("group", name="Happy")).to_be_visible()
+    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    assert serious_findings(page) == []
+
+
+def answer_all(invited: Invited, store: ArtefactStore) -> None:
+    with invited.database.writing() as session:
+        person = session.get_one(Participant, invited.participant.id)
+        factories.answer_everything(session, store, session.get_one(Study, invited.study.id), person)

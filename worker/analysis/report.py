@@ -2,8 +2,8 @@
 
 Contents (stored as Report.contents): ``version``, ``blinded``, ``plan`` (standing, planned tests, in_words: see
 app.services.studies.preregistration), ``ratings`` (see statistics), ``guesses`` (see guesses; None where it is not
-asked), ``head_to_heads`` (see bradley_terry; None where there are none, or letters hide methods), ``answers`` and
-``change`` (see answers).
+asked), ``head_to_heads`` (see bradley_terry; None where there are none, or letters hide methods), ``instruments`` (see
+scales), ``answers`` and ``change`` (see answers).
 Figures by name, each as SVG and PNG (see figures).
 """
 
@@ -35,6 +35,8 @@ class Tables:
     """answers in the running accuracy"""
     guesses: Sequence[Row] | None = None
     """who named which robot as made for them; None: that is not asked"""
+    instruments: Sequence[Row] = ()
+    """standard questionnaires with what people filled in, see scales"""
     head_to_heads: Sequence[Row] | None = None
     """rows of the table headtoheads; None: there are none, or the study is blinded"""
     version: int = 0
@@ -48,6 +50,7 @@ def make_report(tables: Tables) -> tuple[dict[str, Any], dict[str, dict[str, byt
     # Takes seconds, and the worker, which only names this function, needs none of it.
     from worker.analysis import answers, figures, statistics
     from worker.analysis.guesses import guess_report
+    from worker.analysis.scales import scale_reports
 
     contents = {
         "version": tables.version,
@@ -61,6 +64,7 @@ def make_report(tables: Tables) -> tuple[dict[str, Any], dict[str, dict[str, byt
         ),
         "guesses": None if tables.guesses is None else guess_report(tables.guesses, len(tables.groups)),
         "head_to_heads": None if tables.head_to_heads is None else _head_to_heads(tables),
+        "instruments": scale_reports(tables.instruments, tables.groups, compare=not tables.blinded),
         "answers": answers.answer_report(tables.answers, tables.window),
         "change": answers.change_report(_frame(tables, "evaluations"), tables.participants),
     }

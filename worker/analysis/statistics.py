@@ -80,11 +80,19 @@ def rating_report(ratings: pd.DataFrame, groups: Sequence[str], *, by: str = "me
         "measured_error_percent": list(MEASURED_ERROR_PERCENT),
         "error_bars": ERROR_BARS,
         "star_below": STAR_BELOW,
-        "scales": {scale: _scale_report(rows, scale, by, groups, compare) for scale in SCALES},
+        "scales": {scale: scale_report(rows, scale, by, groups, compare) for scale in SCALES},
     }
 
 
-def _scale_report(rows: pd.DataFrame, scale: str, by: str, groups: Sequence[str], compare: bool) -> Result:
+def scale_report(
+    rows: pd.DataFrame,
+    scale: str,
+    by: str,
+    groups: Sequence[str],
+    compare: bool,
+    possible: tuple[float, float] = POINTS,
+) -> Result:
+    """Means, people and comparisons of one scale, a column of ``rows``; ``possible``: its lowest and highest value."""
     comparisons: list[Result] = [
         {"first": first, "second": second, **_tests(rows, scale, by, first, second)}
         for first, second in (combinations(groups, 2) if compare else ())
@@ -92,7 +100,7 @@ def _scale_report(rows: pd.DataFrame, scale: str, by: str, groups: Sequence[str]
     for test in TESTS[1:]:
         _correct([comparison[test] for comparison in comparisons])
     return {
-        "means": [_mean_of(rows[rows[by] == group], scale, group) for group in groups],
+        "means": [_mean_of(rows[rows[by] == group], scale, group, possible) for group in groups],
         "people": _people(rows, scale, by),
         "comparisons": comparisons,
     }
@@ -106,10 +114,10 @@ def _people(rows: pd.DataFrame, scale: str, by: str) -> list[Result]:
     return [{"participant": participant, "means": theirs} for participant, theirs in found.items()]
 
 
-def _mean_of(rows: pd.DataFrame, scale: str, group: str) -> Result:
+def _mean_of(rows: pd.DataFrame, scale: str, group: str, possible: tuple[float, float]) -> Result:
     """Of one group: all ratings as the paper has them, and the mean over people with its 95 % interval."""
     values, people = _floats(rows[scale]), _floats(rows.groupby("participant")[scale].mean())
-    low, high = mean_interval(people, possible=POINTS)
+    low, high = mean_interval(people, possible)
     return {
         "group": group,
         "ratings": len(values),

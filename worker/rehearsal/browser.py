@@ -16,9 +16,10 @@ _QUERY = re.compile(r"/p/queries/(\d+)/label")
 _BREAK = re.compile(r"/p/break$")
 _RATING = re.compile(r"/p/evaluation/trials/(\d+)/rating")
 _HEAD_TO_HEAD = re.compile(r"/p/head-to-heads/(\d+)/answer")
+_SCALE = re.compile(r"/p/(?:questionnaire|evaluation/robots/[A-E])/[a-z0-9_]+$")
 _LANGUAGE = re.compile(r"/p/language$")
 _END = "/p/finished"
-_MOST_PAGES = 12
+_MOST_PAGES = 60
 """Forms between the pairs and the end."""
 
 
@@ -97,7 +98,7 @@ class FormBrowser:
 
     def trial_id(self) -> int | None:
         """The trial to be rated on the page, after loading it anew; None while the robots are prepared."""
-        self._open("/p/next")
+        self._open_after_scales()
         form = self._page.form_to(_RATING)
         return None if form is None else int(form.target.group(1))
 
@@ -111,7 +112,7 @@ class FormBrowser:
 
     def head_to_head_id(self) -> int | None:
         """The head-to-head on the page, after loading it anew; None while there is none."""
-        self._open("/p/next")
+        self._open_after_scales()
         form = self._page.form_to(_HEAD_TO_HEAD)
         return None if form is None else int(form.target.group(1))
 
@@ -130,6 +131,16 @@ class FormBrowser:
                 return
             self._send_first({})
         raise WentAstray(f"The way to the end ended at {self._page.address}.")
+
+    def _open_after_scales(self) -> None:
+        """Standard questionnaires about robots are sent as they are, without answers: nobody scripted has a view."""
+        self._open("/p/next")
+        for _ in range(_MOST_PAGES):
+            form = self._page.form_to(_SCALE)
+            if form is None:
+                return
+            self._send(form.target.group(0), form.fields)
+        raise WentAstray(f"The way through the questionnaires ended at {self._page.address}.")
 
     def _send_first(self, filled_in: dict[str, str]) -> None:
         """Send the page's first form, that for the language left out, with these fields filled in."""

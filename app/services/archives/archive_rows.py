@@ -50,6 +50,7 @@ _PATTERNS: Mapping[tuple[str, str], str] = {
     ("run", "workflow_id"): r"[ -~]+",
     ("assignment", "letter"): r"[A-E]",
     ("trial", "letter"): r"[A-E]",
+    ("form_answer", "letter"): r"[A-E]",
 }
 SHA256 = re.compile(r"[0-9a-f]{64}")
 
@@ -173,7 +174,7 @@ def _check_value(table_name: str, column: Column[Any], value: Any) -> None:
     if (
         not _fits(column, value)
         or (words is not None and value not in {each.value for each in words})
-        or (pattern is not None and not re.fullmatch(pattern, value))
+        or (pattern is not None and value is not None and not re.fullmatch(pattern, value))
     ):
         raise _Wrong(f"{column.name} has a value that it cannot have")
 

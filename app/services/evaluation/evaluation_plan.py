@@ -33,6 +33,8 @@ from app.db import now
 from app.domain.evaluation import Assignment, Controller, Film, HeadToHead, Rating, Trial
 from app.domain.protocol import LETTERS, EvaluatedMethod, EvaluationMode, EvaluationSettings
 from app.domain.studies import Participant, Study
+from app.questionnaires.library import Instrument
+from app.services.answers import form_answers
 from app.services.evaluation import head_to_heads
 from app.storage import ArtefactStore
 
@@ -61,6 +63,8 @@ class EvaluationState(StrEnum):
     """Physical: the robot moves."""
     RATING = "rating"
     """Physical: the robot has moved, and is to be rated."""
+    DESCRIBING = "describing"
+    """All trials of a robot are rated, and there is a standard questionnaire about it."""
     COMPARING = "comparing"
     """Video: all is rated, and two robots are to be compared."""
     FINISHED = "finished"
@@ -83,6 +87,10 @@ class NextTrial:
     """Those without an answer, the one to be shown now first. Empty while there is something to rate."""
     changeable: HeadToHead | None = None
     """The one answered last, whose answer can still be changed."""
+    described: str | None = None
+    """The letter of the robot that a questionnaire is about now."""
+    instrument: Instrument | None = None
+    """That questionnaire."""
 
 
 class Meeting(NamedTuple):
@@ -205,6 +213,11 @@ def next_turn(session: Session, store: ArtefactStore, participant: Participant) 
     rated = [trial for trial in trials if trial.id in ratings]
     open_trials = [trial for trial in trials if trial.id not in ratings]
     last = rated[-1] if rated else None
+    about = _to_describe(session, participant, rated, open_trials)
+    if about is not None:
+        letter, instrument = about
+        state = EvaluationState.DESCRIBING
+        return NextTrial(state, len(rated), len(trials), None, last, described=letter, instrument=instrument)
     if trials and not open_trials:
         return _next_head_to_head(session, store, participant, len(trials), last)
     state = _state(session, store, participant, trials)
@@ -214,6 +227,19 @@ def next_turn(session: Session, store: ArtefactStore, participant: Participant) 
     if state is EvaluationState.WATCHING and trial.shown_at is None:
         trial.shown_at = now()
     return NextTrial(state, len(rated), len(trials), trial, last)
+
+
+def _to_describe(
+    session: Session, participant: Participant, rated: Sequence[Trial], waiting: Sequence[Trial]
+) -> tuple[str, Instrument] | None:
+    """The first questionnaire that is still to be filled in about a robot all of whose trials are rated."""
+    settings = settings_of(participant.study)
+    unfinished = {trial.letter for trial in waiting}
+    for letter in dict.fromkeys(trial.letter for trial in rated if trial.letter not in unfinished):
+        found = form_answers.first_open(session, participant, settings.instruments if settings else (), letter)
+        if found is not None:
+            return letter, found
+    return None
 
 
 def _next_head_to_head(

@@ -14,7 +14,12 @@ from app.domain.evaluation import DonorDraw, HeadToHead, HeadToHeadAnswer, Ratin
 from app.domain.models import Bundle, Model, ModelKind
 from app.domain.participation import ConsentRecord, FormAnswer, ParticipantEvent, StageRecord
 from app.domain.preferences import LEARNED_FROM, Exclusion, LabelEvent, Query
+from app.domain.protocol import LETTERS
 from app.domain.studies import Deviation, Participant, Study, code_of
+from app.questionnaires import library
+from app.questionnaires.library import Score
+from app.services.answers import form_answers
+from app.services.answers.form_answers import FilledIn
 from app.services.evaluation import unblinding
 from app.services.exports.paging import EVERYTHING, KeyedRows, Window
 from app.services.runs import model_metrics
@@ -189,15 +194,47 @@ def labels(session: Session, study: Study, window: Window = EVERYTHING) -> Keyed
 
 
 def forms(session: Session, study: Study, window: Window = EVERYTHING) -> KeyedRows:
+    methods = {} if unblinding.is_blinded(study) else unblinding.methods_by_letter(session, study)
     for person, wanted in _present(session, study, window):
         theirs = select(FormAnswer).where(FormAnswer.participant_id == person.id, wanted.known(FormAnswer))
         answers = session.scalars(theirs.order_by(FormAnswer.id)).all()
-        newest = {(each.form, each.item): each.id for each in answers}
+        newest = {(each.form, each.letter, each.item): each.id for each in answers}
         for each in answers:
-            superseded = newest[each.form, each.item] != each.id
+            superseded = newest[each.form, each.letter, each.item] != each.id
             if (each.id,) > wanted.after:
-                values = (person.code, each.form, each.item, each.value, superseded, each.created_at)
-                yield (person.number, each.id), values
+                method = methods.get((person.id, each.letter or ""))
+                about = (person.code, each.form, each.letter, method)
+                yield (person.number, each.id), (*about, each.item, each.value, superseded, each.created_at)
+
+
+def scores(session: Session, study: Study, window: Window = EVERYTHING) -> KeyedRows:
+    """Of every standard questionnaire that was sent; the key is the place among all that somebody could have."""
+    methods = {} if unblinding.is_blinded(study) else unblinding.methods_by_letter(session, study)
+    places = {
+        (letter, form, score.name): place
+        for place, (letter, form, score) in enumerate(
+            (letter, form, score)
+            for letter in (None, *LETTERS)
+            for form, instrument in library.every().items()
+            for score in instrument.scores
+        )
+    }
+    for person, wanted in _present(session, study, window):
+        for each in form_answers.filled_in(session, person.id, wanted.known(FormAnswer)):
+            for score in each.instrument.scores:
+                key = (places[each.letter, each.instrument.name, score.name],)
+                if key > wanted.after:
+                    yield (
+                        (person.number, *key),
+                        (person.code, *_score(each, score, methods.get((person.id, each.letter or "")))),
+                    )
+
+
+def _score(each: FilledIn, score: Score, method: str | None) -> Sequence[Any]:
+    answered = sum(each.answers.get(name) is not None for name in score.items)
+    low, high = each.instrument.range_of(score)
+    value = each.scores[score.name]
+    return (each.instrument.name, each.letter, method, score.name, value, low, high, len(score.items), answered)
 
 
 def consent(session: Session, study: Study, window: Window = EVERYTHING) -> KeyedRows:

@@ -10,6 +10,7 @@ from app.domain.participation import ConsentRecord, FormAnswer, ParticipantEvent
 from app.domain.preferences import LabelEvent, Purpose, Query, Response, SkipReason
 from app.domain.protocol import FROM_OTHERS, EvaluatedMethod, Stage
 from app.domain.studies import Deviation, Participant
+from app.questionnaires import library
 from app.services.exports import export_rows
 from app.services.exports.export_formats import Column, ColumnKind, Table
 
@@ -154,18 +155,47 @@ TABLES: Sequence[Table] = (
     ),
     Table(
         "forms",
-        "Answers to demographics and questionnaire. The study's settings have the questions.",
+        "Answers to demographics, questionnaire and standard questionnaires, item by item as they were given.",
         (
             PARTICIPANT,
-            Column("form", T, "Which form.", allowed="demographics, questionnaire"),
+            Column(
+                "form",
+                T,
+                "Which form: the study's own, whose questions are in its settings, or a standard questionnaire.",
+                allowed=", ".join(("demographics", "questionnaire", *library.every())),
+            ),
+            Column("letter", T, "The robot of the evaluation that it is about; empty: about none.", "", "A to E"),
+            Column(
+                "method", T, "Which method that was; empty until the study is unblinded.", "", _words(EvaluatedMethod)
+            ),
             Column("item", T, "Name of the question."),
-            Column("value", T, "What was entered (likert: 1 to 5); empty: skipped."),
+            Column("value", T, "What was entered (likert: 1 to 5), nothing reversed; empty: skipped."),
             Column("superseded", B, "Whether a later answer to the same question counts instead."),
             Column("created_at", W, "When it reached the server."),
         ),
         export_rows.forms,
         (FormAnswer,),
         grows_by=FormAnswer,
+    ),
+    Table(
+        "scores",
+        "Scores of standard questionnaires, by their keys, which questionnaires.md in the file of all data has.",
+        (
+            PARTICIPANT,
+            Column("instrument", T, "Which questionnaire.", allowed=", ".join(library.every())),
+            Column("letter", T, "The robot of the evaluation that it is about; empty: about none.", "", "A to E"),
+            Column(
+                "method", T, "Which method that was; empty until the study is unblinded.", "", _words(EvaluatedMethod)
+            ),
+            Column("score", T, "Which scale or subscale."),
+            Column("value", N, "The score; empty: too much was left out for one."),
+            Column("lowest", N, "The lowest value it can have."),
+            Column("highest", N, "The highest value it can have."),
+            Column("items", I, "Items that it is made of."),
+            Column("answered", I, "How many of them were answered."),
+        ),
+        export_rows.scores,
+        (FormAnswer,),
     ),
     Table(
         "consent",

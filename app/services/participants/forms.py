@@ -4,13 +4,13 @@ import re
 from collections.abc import Mapping, Sequence
 from enum import StrEnum
 
-from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from app.domain.participation import FormAnswer
 from app.domain.protocol import LIKERT_POINTS, FormItem, Stage
 from app.domain.studies import Participant
 from app.domain.study_settings import StudySettings
+from app.questionnaires.library import Instrument
+from app.services.answers import form_answers
 
 MOST_CHARACTERS = 4000
 _NUMBER = re.compile(r"[+\-\N{MINUS SIGN}]?[0-9]{1,12}([.,][0-9]{1,12})?")
@@ -32,8 +32,7 @@ def items_of(settings: StudySettings, form: Stage) -> Sequence[FormItem]:
 
 def answers_of(session: Session, participant: Participant, form: Stage) -> dict[str, str | None]:
     """The newest answer to every question that was put; None where it was left out."""
-    given = select(FormAnswer).where(FormAnswer.participant_id == participant.id, FormAnswer.form == form)
-    return {answer.item: answer.value for answer in session.scalars(given.order_by(FormAnswer.id))}
+    return form_answers.newest(session, participant, form)
 
 
 def problems(items: Sequence[FormItem], given: Mapping[str, str]) -> dict[str, AnswerProblem]:
@@ -46,11 +45,22 @@ def record(
     session: Session, participant: Participant, form: Stage, items: Sequence[FormItem], given: Mapping[str, str]
 ) -> None:
     """Append what differs from the answers so far; the answers have no problems."""
-    known = answers_of(session, participant, form)
-    for item in items:
-        value = _stored(item, given.get(item.name, "").strip())
-        if item.name not in known or known[item.name] != value:
-            session.add(FormAnswer(participant_id=participant.id, form=form, item=item.name, value=value))
+    values = {item.name: _stored(item, given.get(item.name, "").strip()) for item in items}
+    form_answers.append(session, participant, form, values)
+
+
+def wrong_points(instrument: Instrument, given: Mapping[str, str]) -> dict[str, AnswerProblem]:
+    """Items of a standard questionnaire whose answer is none of its points, nor left out."""
+    allowed = {"", *instrument.answers.points}
+    return {item.name: AnswerProblem.CHOICE for item in instrument.items if given.get(item.name, "") not in allowed}
+
+
+def record_instrument(
+    session: Session, participant: Participant, instrument: Instrument, given: Mapping[str, str], letter: str | None
+) -> None:
+    """Keep the answers to a whole questionnaire, about the robot of this letter or about none."""
+    values = {item.name: given.get(item.name) or None for item in instrument.items}
+    form_answers.append(session, participant, instrument.name, values, letter)
 
 
 def _problem(item: FormItem, text: str) -> AnswerProblem | None:

@@ -13,9 +13,10 @@ from app.db import now
 from app.domain.evaluation import HeadToHead, HeadToHeadAnswer, Rating, Trial
 from app.domain.participation import StageRecord
 from app.domain.preferences import LabelEvent, Purpose, Query
-from app.domain.protocol import Stage
+from app.domain.protocol import LETTERS, Stage
 from app.domain.studies import Participant
 from app.domain.study_settings import StudySettings
+from app.services.answers import form_answers
 
 
 def stages_of(settings: StudySettings) -> Sequence[Stage]:
@@ -24,7 +25,7 @@ def stages_of(settings: StudySettings) -> Sequence[Stage]:
         Stage.DEMOGRAPHICS: bool(settings.demographics),
         Stage.PRACTICE: settings.practice_pairs > 0,
         Stage.EVALUATION: settings.evaluation is not None,
-        Stage.QUESTIONNAIRE: bool(settings.closing_form),
+        Stage.QUESTIONNAIRE: bool(settings.closing_form or settings.instruments),
         Stage.DEBRIEF: settings.debrief,
     }
     return [stage for stage in Stage if asked_for.get(stage, True)]
@@ -79,6 +80,10 @@ def _is_finished(session: Session, participant: Participant, stage: Stage, recor
             return settings.evaluation is None or (
                 _rated(session, participant) >= settings.evaluation.trial_count
                 and _compared(session, participant) >= settings.evaluation.head_to_head_count
+                and all(
+                    form_answers.first_open(session, participant, settings.evaluation.instruments, letter) is None
+                    for letter in LETTERS[: len(settings.evaluation.methods)]
+                )
             )
         case Stage.DEMOGRAPHICS | Stage.QUESTIONNAIRE | Stage.DEBRIEF:
             return stage in records and records[stage].finished_at is not None

@@ -65,8 +65,8 @@ def show_evaluation(
     next_query.waits(participant, Awaited.ROBOTS if turn.state is EvaluationState.PREPARING else None)
     if wants_json(request):
         return JSONResponse(_for_script(request, turn))
-    if turn.state is EvaluationState.COMPARING:
-        return go(request, "show_head_to_head")
+    if turn.state in (EvaluationState.COMPARING, EvaluationState.DESCRIBING):
+        return RedirectResponse(next_path(request, turn), HTTPStatus.SEE_OTHER)
     if turn.trial is None:
         context: dict[str, Any] = {"turn": turn, "preparation": robot_preparation.preparation(session, participant)}
         return participant_page(request, _TEMPLATES[EvaluationState.PREPARING], participant, context)
@@ -121,10 +121,10 @@ def rate_trial(
     )
     next_query.seen(participant)
     turn = evaluation_plan.next_turn(session, studio.store, participant)
-    name = next_page(turn)
+    path = next_path(request, turn)
     if wants_json(request):
-        return JSONResponse({**_for_script(request, turn), "next_path": request.app.url_path_for(name)})
-    return RedirectResponse(request.app.url_path_for(name), HTTPStatus.SEE_OTHER)
+        return JSONResponse({**_for_script(request, turn), "next_path": path})
+    return RedirectResponse(path, HTTPStatus.SEE_OTHER)
 
 
 @router.get("/next", name="leave_evaluation")
@@ -133,10 +133,13 @@ def leave_evaluation(request: Request, participant: AtEvaluation) -> Response:
     return go(request, "show_next")
 
 
-def next_page(turn: NextTrial) -> str:
-    """The name of the page on which a participant goes on."""
+def next_path(request: Request, turn: NextTrial) -> str:
+    """The path of the page on which a participant goes on."""
+    if turn.state is EvaluationState.DESCRIBING and turn.instrument is not None:
+        asked = {"letter": turn.described, "instrument": turn.instrument.name}
+        return str(request.app.url_path_for("show_robot_scale", **asked))
     names = {EvaluationState.COMPARING: "show_head_to_head", EvaluationState.FINISHED: "show_evaluation_done"}
-    return names.get(turn.state, "show_evaluation")
+    return str(request.app.url_path_for(names.get(turn.state, "show_evaluation")))
 
 
 def _trial_page(

@@ -6,13 +6,14 @@ from http import HTTPStatus
 from typing import Annotated
 
 from fastapi import APIRouter, Request
-from fastapi.responses import Response
+from fastapi.responses import RedirectResponse, Response
 
 from app.domain.protocol import LIKERT_POINTS, FormItem, Stage
 from app.domain.studies import Participant
 from app.services.participants import forms, stages
 from app.services.participants.forms import MOST_CHARACTERS, AnswerProblem
 from app.web.http.deps import Typed, WritingSession
+from app.web.participant import scales
 from app.web.participant.pages import back_from, go, has_reached, participant_page
 from app.web.texts.form_questions import choice_of, label_of, question_of
 from app.web.texts.languages import wording_of
@@ -54,7 +55,12 @@ def save_demographics(request: Request, participant: AtDemographics, session: Wr
 
 @router.get("/questionnaire", name="show_questionnaire")
 def show_questionnaire(request: Request, participant: AtQuestionnaire, session: WritingSession) -> Response:
-    """Questions about how it was."""
+    """Questions about how it was; standard questionnaires come before the study's own."""
+    before = scales.open_scale(request, session, participant)
+    if before is None and not participant.study.settings.closing_form:
+        before = RedirectResponse(scales.last_scale_path(request, participant.study.settings) or "/p/next", 303)
+    if before is not None:
+        return before
     return _form(request, participant, Stage.QUESTIONNAIRE, _answered(session, participant, Stage.QUESTIONNAIRE), {})
 
 
@@ -78,6 +84,8 @@ def _save(
     if wrong:
         return _form(request, participant, form, typed, wrong)
     forms.record(session, participant, form, items, typed)
+    if form is Stage.QUESTIONNAIRE:
+        return scales.finished(request, session, participant)
     stages.finish(session, participant, form)
     return go(request, "show_next")
 
@@ -91,6 +99,7 @@ def _form(
 ) -> Response:
     settings = participant.study.settings
     wording = wording_of(request, participant)
+    before = scales.last_scale_path(request, settings) if form is Stage.QUESTIONNAIRE else None
     fields = [_field(wording, item, values, wrong.get(item.name)) for item in forms.items_of(settings, form)]
     context = {
         "form": form.value,
@@ -100,7 +109,7 @@ def _form(
         "first_wrong": next(iter(wrong), None),
         "problem_count": len(wrong),
         "most_characters": MOST_CHARACTERS,
-        "back_path": back_from(request, settings, form),
+        "back_path": before or back_from(request, settings, form),
     }
     status = HTTPStatus.UNPROCESSABLE_ENTITY if wrong else HTTPStatus.OK
     return participant_page(request, "participant/form.html", participant, context, status)

@@ -18,7 +18,7 @@ from app.services.evaluation.evaluation_plan import EvaluationState, NextTrial
 from app.services.evaluation.ratings import CorrectionTooLate
 from app.web.error_pages import wants_json
 from app.web.http.deps import RowId, StudioDep, WritingSession
-from app.web.participant.evaluation import Milliseconds, Reason, next_page
+from app.web.participant.evaluation import Milliseconds, Reason, next_path
 from app.web.participant.pages import go, has_reached, is_in, participant_page
 
 router = APIRouter(prefix="/p/head-to-heads")
@@ -92,7 +92,7 @@ def answer_head_to_head(
     next_query.seen(participant)
     turn = evaluation_plan.next_turn(session, studio.store, participant)
     next_query.waits(participant, Awaited.ROBOTS if turn.state is EvaluationState.PREPARING else None)
-    path = request.app.url_path_for(next_page(turn))
+    path = next_path(request, turn)
     if not wants_json(request):
         return RedirectResponse(path, HTTPStatus.SEE_OTHER)
     return JSONResponse(_for_script(request, turn, turn.head_to_heads, None) | {"next_path": path})
@@ -114,7 +114,7 @@ def _page(
         "longest_reason": LONGEST_REASON,
         "client_uuid": uuid4(),
         "undo_uuid": None,
-        "next_path": request.app.url_path_for(next_page(turn)),
+        "next_path": next_path(request, turn),
     }
     return participant_page(request, "participant/head_to_head.html", participant, context)
 

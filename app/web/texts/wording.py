@@ -126,7 +126,7 @@ def broken_texts(own: Mapping[str, str]) -> dict[str, str]:
     for key, text in own.items():
         prefix, _, name = key.rpartition(":")
         try:
-            if not _built_in(Language.ENGLISH).has_message(name) and not name.startswith(("form-", "fact-")):
+            if not _built_in(Language.ENGLISH).has_message(name) and not name.startswith(("form-", "fact-", "scale-")):
                 raise WordingBroken("there is no text of this name")
             if prefix not in {"", *Language}:
                 raise WordingBroken(f"there is no language {prefix}")

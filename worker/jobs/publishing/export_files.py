@@ -19,7 +19,7 @@ from app.domain.studies import Deviation, Study
 from app.paths import DOCS
 from app.services.archives import archive, archive_reading, sealing
 from app.services.evaluation import unblinding
-from app.services.exports import export_formats, export_requests, export_rows, export_tables
+from app.services.exports import codebook, export_formats, export_requests, export_rows, export_tables
 from app.services.exports.csv_cells import json_text
 from app.services.exports.export_formats import ColumnKind, RowProvenance, Table
 from app.services.exports.export_requests import ExportKind
@@ -112,6 +112,8 @@ def write_data(session: Session, context: WorkerContext, study: Study, path: Pat
             _write_table(target, session, study, table, provenance)
         target.writestr("dictionary.csv", export_formats.dictionary_csv(export_tables.TABLES))
         target.writestr("dictionary.md", export_formats.dictionary_markdown(export_tables.TABLES))
+        target.writestr("questionnaires.json", _json(codebook.entries(study.settings)))
+        target.writestr("questionnaires.md", codebook.markdown(study.settings))
         pictures = _write_report(target, session, context, study, missing)
         people = _write_pairs(target, session, context, study, missing)
         about = _provenance(session, study, provenance) | {"missing": missing}
@@ -256,6 +258,7 @@ Exported {moment} by PbARL Studio {version}. Lock hash of settings and plan: {lo
 |---|---|
 | tables | `csv/`, `jsonl/`, `parquet/`: the same rows three times |
 | what every column means | `dictionary.csv`, `dictionary.md` |
+| standard questionnaires: words, scoring keys, sources | `questionnaires.md`, `questionnaires.json` |
 | settings, seed, lock, deviations | `provenance.json` |
 | statistics and figures ({figures}) | `report/` |
 | preference pairs as arrays ({people}) | `pairs/`, explained in `pairs/README.md` |
@@ -276,5 +279,5 @@ Stored files that were missing or damaged when this was made, by their hashes; a
 """
 
 
-def _json(value: Any) -> str:
+def _json(value: object) -> str:
     return json.dumps(value, indent=2, ensure_ascii=False) + "\n"

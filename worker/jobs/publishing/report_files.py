@@ -20,7 +20,9 @@ from app.domain.preferences import Exclusion, LabelEvent, Query
 from app.domain.protocol import LETTERS, MADE_FOR_YOU, EvaluatedMethod, Stage
 from app.domain.run_keys import BASIS, RunKey
 from app.domain.studies import Participant, Study
-from app.services.answers import accuracy, answer_figures
+from app.questionnaires import library
+from app.questionnaires.library import Instrument
+from app.services.answers import accuracy, answer_figures, form_answers
 from app.services.evaluation import evaluation_plan, unblinding
 from app.services.exports import export_formats, export_rows, export_tables
 from app.services.participants import forms, withdrawal
@@ -79,6 +81,9 @@ def basis_of(session: Session, study: Study) -> str | None:
         return None
     words = select(func.max(Exclusion.id)).join(LabelEvent).join(Query).where(Query.participant_id.in_(people))
     newest.append(session.scalar(words))
+    if study.settings.all_instruments:
+        filled_in = select(func.max(FormAnswer.id)).where(FormAnswer.participant_id.in_(people))
+        newest.append(session.scalar(filled_in.where(FormAnswer.form.in_(study.settings.all_instruments))))
     if _asks_whose(study):
         said = select(func.max(FormAnswer.id)).where(FormAnswer.participant_id.in_(people))
         newest.append(session.scalar(said.where(FormAnswer.item == MADE_FOR_YOU)))
@@ -135,7 +140,31 @@ def tables_of(session: Session, study: Study) -> Tables:
         evaluations=rows["evaluations"],
         head_to_heads=rows["headtoheads"] if settings and settings.head_to_heads and not blinded else None,
         guesses=_guesses(session, study) if _asks_whose(study) else None,
+        instruments=_instruments(session, study),
     )
+
+
+def _instruments(session: Session, study: Study) -> list[dict[str, Any]]:
+    """Every standard questionnaire of the study with what everybody filled in; about a robot by method or letter."""
+    methods = None if unblinding.is_blinded(study) else unblinding.methods_by_letter(session, study)
+    rows: dict[str, list[dict[str, Any]]] = {name: [] for name in study.settings.all_instruments}
+    for person in export_rows.everybody(session, study):
+        for each in form_answers.filled_in(session, person.id) if person.withdrawn_at is None else ():
+            group = each.letter if methods is None or each.letter is None else methods.get((person.id, each.letter))
+            keyed = {item.name: each.instrument.keyed(item.name, each.answers) for item in each.instrument.items}
+            row = {"participant": person.code, "group": group, "scores": each.scores, "items": keyed}
+            rows.setdefault(each.instrument.name, []).append(row)
+    return [_instrument(library.every()[name], filled_in) for name, filled_in in rows.items()]
+
+
+def _instrument(known: Instrument, filled_in: list[dict[str, Any]]) -> dict[str, Any]:
+    scores = []
+    for score in known.scores:
+        low, high = known.range_of(score)
+        words = {"name": score.name, "title": score.title, "items": list(score.items)}
+        scores.append(words | {"lowest": low, "highest": high})
+    words = {"name": known.name, "title": known.title, "measures": known.measures}
+    return words | {"scores": scores, "filled_in": filled_in}
 
 
 def _asks_whose(study: Study) -> bool:

@@ -44,6 +44,7 @@ _KINDS: Mapping[Any, Kind] = {
     str: Kind.TEXT,
     dict[str, str]: Kind.TEXTS,
     tuple[int, ...]: Kind.COUNTS,
+    tuple[str, ...]: Kind.SEVERAL,
     tuple[FormItem, ...]: Kind.QUESTIONS,
     EvaluationSettings | None: Kind.PART,
 }

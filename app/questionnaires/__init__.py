@@ -1,0 +1,1 @@
+"""Standard questionnaires, one data file each."""
