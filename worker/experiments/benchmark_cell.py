@@ -20,11 +20,13 @@ import torch
 import worker
 from worker.compute import learning, simulation
 from worker.compute.simulation import surface_file
+from worker.experiments.benchmark_person import BenchmarkPerson
 from worker.experiments.rollout_cache import BEHAVIOURS_PER_SCENARIO, RolloutCache, policy_mark
 from worker.ml import acquisition
 from worker.ml.filters.filter_problem import FilterConfig, FilterProblem
 from worker.ml.filters.response_surface import ResponseSurface
 from worker.ml.methods import registry as methods
+from worker.ml.methods.people import Labels
 from worker.ml.methods.registry import MethodConfig, Setting
 from worker.ml.rewards import reward_training
 from worker.ml.rewards.action_ranking import can_rank
@@ -187,6 +189,20 @@ class BenchmarkUser:
             collect=self._collect,
             make_env=registry.environment_class(self.cell.task),
             config=self.terms.methods,
+            person=self._person(),
+        )
+
+    def _person(self) -> BenchmarkPerson:
+        return BenchmarkPerson(
+            self.cell.taste,
+            Labels(self.labelled, self.targets),
+            self.scale,
+            self.terms.manner,
+            self.pool,
+            self.rows,
+            self.clip_steps,
+            self._rewards_of,
+            lambda labels: self._fitted(self.terms.reward, labels),
         )
 
     def _collect(self, act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
@@ -224,7 +240,9 @@ class BenchmarkUser:
         return SegmentPairs.cut([(self.pool[left], self.pool[right]) for left, right in rows], 0, self.clip_steps)
 
     def _true_rewards(self, trajectory: Trajectory) -> FloatArray:
-        taste = self.cell.taste
+        return self._rewards_of(self.cell.taste, trajectory)
+
+    def _rewards_of(self, taste: Taste, trajectory: Trajectory) -> FloatArray:
         return preference_rewards(
             self.task, trajectory.costs, trajectory.signals, taste.omega, self.terms.form, taste.per_signal
         )
@@ -243,9 +261,12 @@ class BenchmarkUser:
         return self.reward if can_rank(self.reward) else self._fit("mlp")
 
     def _fit(self, kind: reward_training.RewardKind) -> RewardModel:
+        return self._fitted(kind, Labels(self.labelled, self.targets))
+
+    def _fitted(self, kind: reward_training.RewardKind, labels: Labels) -> RewardModel:
         return reward_training.fit(
-            self.labelled,
-            self.targets,
+            labels.pairs,
+            labels.targets,
             kind,
             self.cell.seed,
             scale=self.scale,
