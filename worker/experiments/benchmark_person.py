@@ -42,8 +42,9 @@ class BenchmarkPerson:
 
     def prefers(self, left: Trajectory, right: Trajectory, rng: np.random.Generator) -> float:
         """See Person."""
-        rewards = (self.true_rewards(self.taste, each) for each in (left, right))
-        return float(TARGETS[self._of_episodes.answer(*rewards, rng)])
+        first, second = (self.true_rewards(self.taste, each) for each in (left, right))
+        target = TARGETS[self._of_episodes.answer(first, second, rng)]
+        return 0.5 if target is None else target
 
     def perceived(self, driven: Trajectory, noise: float, rng: np.random.Generator) -> float:
         """See Person."""

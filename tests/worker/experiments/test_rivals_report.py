@@ -34,7 +34,7 @@ def test_episodes_survive_the_table() -> None:
 
 def test_a_better_rival_is_named_with_what_it_does_to_the_task() -> None:
     noise = 0.01 * np.random.default_rng(0).standard_normal(100)
-    lossy = np.arange(100) >= 10.0
+    lossy = (np.arange(100) >= 10).astype(float)
     page = rivals_report.page(
         [
             row("pbarl", 0.10 + noise, np.ones(100)),

@@ -60,7 +60,7 @@ def test_nothing_is_tried_that_is_not_safe() -> None:
     tried: list[FloatArray] = []
 
     def safe(count: int, rng: np.random.Generator) -> FloatArray:
-        return anywhere(count, rng) * np.array([0.5, 1.0])
+        return np.asarray(anywhere(count, rng) * np.array([0.5, 1.0]))
 
     def duel(first: FloatArray, second: FloatArray) -> float:
         tried.extend([first, second])

@@ -41,7 +41,7 @@ class BehaviourFlow:
             time = np.full((*action.shape[:-1], 1), step / EULER_STEPS, np.float32)
             known = np.concatenate([seen, action, time], axis=-1)
             action = action + self._velocity(known) / EULER_STEPS
-        return np.clip(action, -1.0, 1.0, dtype=np.float32)
+        return np.asarray(np.clip(action, -1.0, 1.0), np.float32)
 
     def _velocity(self, known: Float32Array) -> Float32Array:
         flat = known.reshape(-1, known.shape[-1])

@@ -107,7 +107,7 @@ def train(people: Sequence[tuple[Tensor, Tensor]], config: Latent, seed: int) ->
             divergence = 0.5 * (mean**2 + (2 * log_deviation).exp() - 1 - 2 * log_deviation).sum(-1)
             loss = (surprise + config.divergence_weight * divergence).mean() / signed.shape[1]
             optimiser.zero_grad()
-            loss.backward()  # type: ignore[no-untyped-call]  # torch's own
+            loss.backward()
             optimiser.step()
             schedule.step()
     return encoder, decoder

@@ -285,8 +285,8 @@ METHODS: Mapping[str, FitMethod] = {
     "clusters_3": partial(fit_clusters, count=3),
     "latent_people": fit_latent,
 }
-"""Two episodes whose sight is blurred by 0.11 (0.35) spreads of a pair are ordered wrongly in about 5 (15) of 100 pairs,
-if their differences are normal: as often as answers are, and three times as often."""
+"""Episodes seen with a blur of 0.11 (0.35) spreads of a pair are ordered wrongly in about 5 (15) of 100 pairs, if their
+differences are normal: as often as answers are, and three times as often."""
 WITHOUT_LABELS = ("reference", "average")
 """Nobody's own answers are used."""
 

@@ -26,7 +26,7 @@ class Corrected:
     def __call__(self, observations: Float32Array, inputs: Float32Array) -> Float32Array:
         """See Decoder."""
         action = self.policy.mean(observations) + np.float32(self.bound) * inputs
-        return np.clip(action, -1.0, 1.0, dtype=np.float32)
+        return np.asarray(np.clip(action, -1.0, 1.0), np.float32)
 
 
 def fit(

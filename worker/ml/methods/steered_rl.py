@@ -131,8 +131,8 @@ class _Decoded(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """See gymnasium.Env."""
-        self._seen, *rest = self.env.step(self._decoder(self._seen, action))
-        return self._seen, *rest
+        self._seen, reward, ended, cut, info = self.env.step(self._decoder(self._seen, action))
+        return self._seen, reward, ended, cut, info
 
 
 def _paid(reward: EpisodeReward, decoder: Decoder, config: Steering) -> EpisodeReward:
