@@ -119,6 +119,7 @@ def code_mark() -> str:
 def run_cell(cell: Cell, terms: BenchmarkConfig, work: Path) -> Path:
     """Label, fit, evaluate; the result is written to a file that is either complete or absent."""
     torch.set_num_threads(1)
+    made_with = code_mark()
     rollout_cache = RolloutCache(cell.task, work / "rollouts")
     bench = BenchmarkUser(cell, terms, rollout_cache, work)
     started = time.perf_counter()
@@ -140,7 +141,7 @@ def run_cell(cell: Cell, terms: BenchmarkConfig, work: Path) -> Path:
             "wall_s": round(wall_s, 2),
         },
         "notes": fitted.notes,
-        "code": code_mark(),
+        "code": made_with,
         "versions": {"python": platform.python_version(), "numpy": np.__version__, "torch": torch.__version__},
     }
     return _write(cell.path(terms, work), record, driven, bench.reward.returns(driven))
