@@ -130,6 +130,8 @@ RUN: dict[str, str | Elsewhere | OnlyParsed] = {
     "retraining": ROLLOUTS,
     "promises": ROLLOUTS,
     "promise_error_rates": "--people 2",
+    "rivals": "--report-only",
+    "rivals_error_rates": "--tables 1",
     "rooms": Elsewhere("tests/architecture/test_rooms.py::test_the_picture_of_the_rooms_is_up_to_date"),
     "rounds": "1",
     "same_bits": OnlyParsed("trains every method; docs/results/same_bits.txt is what it prints"),

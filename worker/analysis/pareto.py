@@ -35,6 +35,28 @@ class _Axis:
         return [round(number * step, 6) for number in range(first, last + 1)]
 
 
+@dataclass(frozen=True)
+class _Look:
+    """Of one method's marks: there are more methods than colours, so the next lot are squares, then hollow."""
+
+    colour: str
+    lap: int
+
+    @classmethod
+    def of(cls, index: int) -> "_Look":
+        return cls(COLOURS[index % len(COLOURS)], index // len(COLOURS))
+
+    def drawn(self, x: float, y: float, title: str = "") -> str:
+        inside = f"<title>{escape(title)}</title>" if title else ""
+        if self.lap == 0:
+            return f'<circle cx="{x:.1f}" cy="{y:.1f}" r="5" fill="{self.colour}">{inside}</circle>'
+        fill = self.colour if self.lap == 1 else "#ffffff"
+        return (
+            f'<rect x="{x - 5:.1f}" y="{y - 5:.1f}" width="10" height="10" fill="{fill}" stroke="{self.colour}">'
+            f"{inside}</rect>"
+        )
+
+
 def pareto_svg(task: str, rows: Sequence[Row], known: Sequence[str]) -> str:
     """``rows``: of comparison.table_rows() for one task. Up and to the right is better; bars are 95 % intervals.
 
@@ -42,17 +64,17 @@ def pareto_svg(task: str, rows: Sequence[Row], known: Sequence[str]) -> str:
     """
     users = list(dict.fromkeys(row["user"] for row in rows))
     methods = list(dict.fromkeys(row["method"] for row in rows))
-    colours = {method: COLOURS[index % len(COLOURS)] for index, method in enumerate(known)}
+    looks = {method: _Look.of(index) for index, method in enumerate(known)}
     width = LEFT + len(users) * (PANEL + GAP)
     columns = max(1, int((width - LEFT) // LEGEND_WIDTH))
     height = TOP + PANEL + BOTTOM + LEGEND_LINE * math.ceil(len(methods) / columns)
     body = [_text(LEFT, 22, f"{task}: success, and change of the true preference", size=14)]
     for index, user in enumerate(users):
         own = [row for row in rows if row["user"] == user]
-        body += _panel(LEFT + index * (PANEL + GAP), user, own, colours)
+        body += _panel(LEFT + index * (PANEL + GAP), user, own, looks)
     for index, method in enumerate(methods):
         x, y = LEFT + index % columns * LEGEND_WIDTH, TOP + PANEL + BOTTOM + index // columns * LEGEND_LINE
-        body.append(f'<circle cx="{x + 5:.1f}" cy="{y - 4:.1f}" r="5" fill="{colours[method]}"/>')
+        body.append(looks[method].drawn(x + 5, y - 4))
         body.append(_text(x + 15, y, method, size=11))
     head = (
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:.0f} {height:.0f}" role="img" '
@@ -62,7 +84,7 @@ def pareto_svg(task: str, rows: Sequence[Row], known: Sequence[str]) -> str:
     return "\n".join([head, *body, "</svg>"]) + "\n"
 
 
-def _panel(left: float, user: str, rows: Sequence[Row], colours: dict[str, str]) -> list[str]:
+def _panel(left: float, user: str, rows: Sequence[Row], looks: dict[str, _Look]) -> list[str]:
     across = _axis([100 * row[f"success{end}"] for row in rows for end in ("_low", "_high")], left, left + PANEL)
     up = _axis([row[f"true_preference_delta{end}"] for row in rows for end in ("_low", "_high")], TOP + PANEL, TOP)
     parts = [f'<rect x="{left}" y="{TOP}" width="{PANEL}" height="{PANEL}" fill="none" stroke="#999999"/>']
@@ -75,18 +97,18 @@ def _panel(left: float, user: str, rows: Sequence[Row], colours: dict[str, str])
         parts.append(_line(left, up(0), left + PANEL, up(0), "#cccccc", "4 3"))
     parts.append(_text(left + PANEL / 2, TOP + PANEL + 34, "success, %", size=11, anchor="middle"))
     for row in rows:
-        parts += _mark(row, across, up, colours[row["method"]])
+        parts += _mark(row, across, up, looks[row["method"]])
     return parts
 
 
-def _mark(row: Row, across: _Axis, up: _Axis, colour: str) -> Iterable[str]:
+def _mark(row: Row, across: _Axis, up: _Axis, look: _Look) -> Iterable[str]:
     x, y = across(100 * row["success"]), up(row["true_preference_delta"])
     low, high = (across(100 * row[f"success_{end}"]) for end in ("low", "high"))
     bottom, top = (up(row[f"true_preference_delta_{end}"]) for end in ("low", "high"))
     return [
-        _line(low, y, high, y, colour),
-        _line(x, bottom, x, top, colour),
-        f'<circle cx="{x:.1f}" cy="{y:.1f}" r="5" fill="{colour}"><title>{escape(row["method"])}</title></circle>',
+        _line(low, y, high, y, look.colour),
+        _line(x, bottom, x, top, look.colour),
+        look.drawn(x, y, row["method"]),
     ]
 
 

@@ -29,9 +29,12 @@ from worker.experiments import benchmark_cell
 from worker.experiments.benchmark_cell import INDIRECT_USERS, OPPOSED_USERS, PAPER_USERS, BenchmarkConfig, Cell
 from worker.experiments.rollout_cache import RolloutCache, policy_mark
 from worker.ml.filters.filter_problem import FilterConfig
+from worker.ml.methods.latent_people import Latent
 from worker.ml.methods.pbrl_hri import FromScratch
 from worker.ml.methods.prefft import FineTuning
+from worker.ml.methods.prefft_lagrangian import Constraint
 from worker.ml.methods.registry import METHODS, MethodConfig
+from worker.ml.methods.steered_rl import Steering
 from worker.ml.teachers import Manner, Taste, random_taste
 from worker.sim.costs import preference_rewards, stakes
 from worker.tasks import registry
@@ -68,6 +71,11 @@ PROFILES = {
             from_scratch=FromScratch(steps=2_400, random_steps=800),
             value_rollouts=12,
             value_steps=200,
+            steering=Steering(steps=2_400, warm_up_steps=800, critic_first_updates=100, flow_steps=100),
+            constraint=Constraint(scenarios=10, every_steps=1_000),
+            others=4,
+            others_labels=20,
+            latent=Latent(steps=100),
         ),
     ),
 }

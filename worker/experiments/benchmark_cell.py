@@ -20,11 +20,13 @@ import torch
 import worker
 from worker.compute import learning, simulation
 from worker.compute.simulation import surface_file
+from worker.experiments.benchmark_person import BenchmarkPerson
 from worker.experiments.rollout_cache import BEHAVIOURS_PER_SCENARIO, RolloutCache, policy_mark
 from worker.ml import acquisition
 from worker.ml.filters.filter_problem import FilterConfig, FilterProblem
 from worker.ml.filters.response_surface import ResponseSurface
 from worker.ml.methods import registry as methods
+from worker.ml.methods.people import Labels
 from worker.ml.methods.registry import MethodConfig, Setting
 from worker.ml.rewards import reward_training
 from worker.ml.rewards.action_ranking import can_rank
@@ -117,6 +119,7 @@ def code_mark() -> str:
 def run_cell(cell: Cell, terms: BenchmarkConfig, work: Path) -> Path:
     """Label, fit, evaluate; the result is written to a file that is either complete or absent."""
     torch.set_num_threads(1)
+    made_with = code_mark()
     rollout_cache = RolloutCache(cell.task, work / "rollouts")
     bench = BenchmarkUser(cell, terms, rollout_cache, work)
     started = time.perf_counter()
@@ -138,7 +141,7 @@ def run_cell(cell: Cell, terms: BenchmarkConfig, work: Path) -> Path:
             "wall_s": round(wall_s, 2),
         },
         "notes": fitted.notes,
-        "code": code_mark(),
+        "code": made_with,
         "versions": {"python": platform.python_version(), "numpy": np.__version__, "torch": torch.__version__},
     }
     return _write(cell.path(terms, work), record, driven, bench.reward.returns(driven))
@@ -187,6 +190,20 @@ class BenchmarkUser:
             collect=self._collect,
             make_env=registry.environment_class(self.cell.task),
             config=self.terms.methods,
+            person=self._person(),
+        )
+
+    def _person(self) -> BenchmarkPerson:
+        return BenchmarkPerson(
+            self.cell.taste,
+            Labels(self.labelled, self.targets),
+            self.scale,
+            self.terms.manner,
+            self.pool,
+            self.rows,
+            self.clip_steps,
+            self._rewards_of,
+            lambda labels: self._fitted(self.terms.reward, labels),
         )
 
     def _collect(self, act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
@@ -224,7 +241,9 @@ class BenchmarkUser:
         return SegmentPairs.cut([(self.pool[left], self.pool[right]) for left, right in rows], 0, self.clip_steps)
 
     def _true_rewards(self, trajectory: Trajectory) -> FloatArray:
-        taste = self.cell.taste
+        return self._rewards_of(self.cell.taste, trajectory)
+
+    def _rewards_of(self, taste: Taste, trajectory: Trajectory) -> FloatArray:
         return preference_rewards(
             self.task, trajectory.costs, trajectory.signals, taste.omega, self.terms.form, taste.per_signal
         )
@@ -243,9 +262,12 @@ class BenchmarkUser:
         return self.reward if can_rank(self.reward) else self._fit("mlp")
 
     def _fit(self, kind: reward_training.RewardKind) -> RewardModel:
+        return self._fitted(kind, Labels(self.labelled, self.targets))
+
+    def _fitted(self, kind: reward_training.RewardKind, labels: Labels) -> RewardModel:
         return reward_training.fit(
-            self.labelled,
-            self.targets,
+            labels.pairs,
+            labels.targets,
             kind,
             self.cell.seed,
             scale=self.scale,

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from tests.worker import invented
+from tests.worker.ml.invented_person import InventedPerson
 from worker.compute import learning
 from worker.ml.filters import response_surface
 from worker.ml.filters.filter_module import load_state
@@ -18,9 +19,12 @@ from worker.ml.filters.filter_problem import FilterConfig, FilterProblem
 from worker.ml.filters.fitted_q import ActionValue
 from worker.ml.methods import pbrl_hri, preference_rl, prefft, registry
 from worker.ml.methods.best_of_n import BestOfN, fit_best_of_n
+from worker.ml.methods.latent_people import Latent
 from worker.ml.methods.pbrl_hri import FromScratch
 from worker.ml.methods.prefft import FineTuning
-from worker.ml.methods.registry import METHODS, MethodConfig, Setting
+from worker.ml.methods.prefft_lagrangian import Constraint
+from worker.ml.methods.registry import METHODS, MethodConfig, NobodyToAsk, Setting
+from worker.ml.methods.steered_rl import Steering
 from worker.ml.rewards.reward_models import MlpReward, StructuredReward
 from worker.trajectory import SIGNALS, Trajectory
 from worker.type_aliases import Act
@@ -75,6 +79,11 @@ SMALL = MethodConfig(
     candidates=4,
     value_rollouts=4,
     value_steps=20,
+    steering=Steering(steps=240, warm_up_steps=120, critic_first_updates=20, hidden=16, flow_steps=20),
+    constraint=Constraint(scenarios=3, every_steps=160),
+    others=4,
+    others_labels=10,
+    latent=Latent(steps=5),
 )
 
 
@@ -106,6 +115,7 @@ def setting(action_reward: MlpReward) -> Setting:
         collect=collect,
         make_env=World,
         config=SMALL,
+        person=InventedPerson(),
     )
 
 
@@ -131,6 +141,8 @@ def test_every_method_gives_an_act_that_travels_and_is_the_same_again(name: str,
         ("best_of_n", 4 * STEPS, 33),
         ("prefft", 240, 33),
         ("pbrl_hri", 240 + 4 * STEPS, 33),
+        ("residual_rl", 240, 33),
+        ("prefft_lagrangian", 240 + (3 + 3) * STEPS, 33),
     ],
 )
 def test_every_environment_step_a_method_asks_for_is_counted(
@@ -240,3 +252,13 @@ def test_best_of_n_chooses_what_is_liked_among_what_the_policy_would_do(best_of:
 def test_an_unknown_method_is_refused(setting: Setting) -> None:
     with pytest.raises(KeyError):
         registry.fit("magic", setting)
+
+
+@pytest.mark.parametrize("name", ["sliders", "preferential_bo", "clusters_3", "latent_people"])
+def test_who_can_only_give_labels_is_not_served_by_methods_that_ask_for_more(name: str, setting: Setting) -> None:
+    with pytest.raises(NobodyToAsk, match="more than labels"):
+        registry.fit(name, replace(setting, person=None))
+
+
+def test_the_average_person_takes_nobodys_own_labels(setting: Setting) -> None:
+    assert registry.fit("average", setting).labels == 0

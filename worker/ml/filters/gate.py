@@ -42,9 +42,14 @@ def successes(trajectories: Sequence[Trajectory]) -> FloatArray:
 
 def acceptable(problem: FilterProblem, trial: GateTrial, reference: Sequence[Trajectory]) -> bool:
     """Whether it raises the learned return and keeps the task and the forces within the tolerances."""
+    return trial.preference > 0.0 and keeps_task(problem, trial, reference)
+
+
+def keeps_task(problem: FilterProblem, trial: GateTrial, reference: Sequence[Trajectory]) -> bool:
+    """Whether success and forces stay within the tolerances."""
     config = problem.config
     gentle = trial.p95_force_n <= max(config.force_limit_n, _p95_force_n(reference))
-    return trial.preference > 0.0 and trial.success_change >= -config.success_tolerance and gentle
+    return trial.success_change >= -config.success_tolerance and gentle
 
 
 def _p95_force_n(trajectories: Sequence[Trajectory]) -> float:

@@ -79,8 +79,11 @@ class PreferenceRl:
         finished: Float32Array = self.replay.rows[: self.replay.count, : self.config.observation.size].numpy()
         return finished
 
-    def learn(self, learner: Learner, checkpoint: Checkpoint | None = None) -> None:
-        """The rest of the steps: first the critics alone, on the warm-up's episodes, then everything."""
+    def learn(self, learner: Learner, checkpoint: Checkpoint | None = None, watch: "Watch | None" = None) -> None:
+        """The rest of the steps: first the critics alone, on the warm-up's episodes, then everything.
+
+        ``watch`` is called before every step of the environments.
+        """
         config = self.config
         for _ in range(0 if learner.updates else config.critic_first_updates):
             learner.update(self.replay, actor=False)
@@ -88,14 +91,20 @@ class PreferenceRl:
         while self.steps < config.total_steps:
             if checkpoint:
                 self._keep_state(learner, checkpoint)
+            if watch:
+                watch(self, learner)
             with torch.no_grad():
                 actions: Float32Array = learner.actor.sample(torch.from_numpy(self.states))[0].numpy()
-            self._step(actions)
+            self._step(self.explored(actions))
             learner.set_learning_rate(self.steps / config.total_steps)
             owed += config.updates_per_step * len(self.envs)
             while owed >= 1:
                 learner.update(self.replay)
                 owed -= 1
+
+    def explored(self, actions: Float32Array) -> Float32Array:
+        """What is tried of what the actor says, (N, A) -> (N, A), for subclasses that explore in their own way."""
+        return actions
 
     def restore(self, learner: Learner, tensors: dict[str, Tensor], counts: dict[str, Any]) -> None:
         """Go on from a checkpoint of learn(); the episodes that were in flight then begin anew."""
@@ -147,3 +156,6 @@ class PreferenceRl:
     def _reset(self, env: Env) -> Float32Array:
         state: Float32Array = env.reset(seed=int(self.rng.integers(TRAINING_SCENARIOS)))[0]
         return state
+
+
+Watch = Callable[[PreferenceRl, Learner], None]

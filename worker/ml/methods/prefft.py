@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from worker.ml.methods.preference_rl import EpisodeReward, MakeEnv, PreferenceRl
+from worker.ml.methods.preference_rl import EpisodeReward, MakeEnv, PreferenceRl, Watch
 from worker.ml.policies.checkpoint import Checkpoint
 from worker.ml.policies.gaussian import LAYERS, LOG_STD_HIGH, LOG_STD_LOW, GaussianPolicy
 from worker.ml.policies.sac import Actor, Learner, SacConfig
@@ -56,6 +56,7 @@ def fine_tune(
     config: FineTuning,
     seed: int,
     checkpoint: Checkpoint | None = None,
+    watch: Watch | None = None,
 ) -> GaussianPolicy:
     """The policy after ``config.steps`` environment steps: the running average of the actor, as everywhere in sac.
 
@@ -73,7 +74,7 @@ def fine_tune(
         else:
             learner = _new_learner(policy, replace(settings, target_entropy=kept[1]["target_entropy"]), config)
             training.restore(learner, *kept)
-        training.learn(learner, checkpoint)
+        training.learn(learner, checkpoint, watch)
         training.close()
     return learner.average.policy()
 

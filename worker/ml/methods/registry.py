@@ -18,11 +18,27 @@ from worker.ml.filters.filter_problem import Collect, FilterDraft, FilterProblem
 from worker.ml.filters.pbarl_printed import PrintedConfig
 from worker.ml.filters.printed_filter import fit_printed
 from worker.ml.filters.response_surface import ResponseSurface
-from worker.ml.methods import pbrl_hri, prefft
+from worker.ml.methods import (
+    bayesian_modes,
+    clusters,
+    dsrl,
+    kept_task,
+    latent_people,
+    pbrl_hri,
+    prefft,
+    prefft_lagrangian,
+    residual_rl,
+    sliders,
+)
+from worker.ml.methods.behaviour_flow import fit_flow
 from worker.ml.methods.best_of_n import fit_best_of_n
+from worker.ml.methods.latent_people import Latent
 from worker.ml.methods.pbrl_hri import FromScratch
+from worker.ml.methods.people import Person
 from worker.ml.methods.preference_rl import Env, MakeEnv, PolicyAct, learned
 from worker.ml.methods.prefft import TIED, FineTuning
+from worker.ml.methods.prefft_lagrangian import Constraint, Price
+from worker.ml.methods.steered_rl import Steering
 from worker.ml.policies.checkpoint import Checkpoint
 from worker.ml.policies.reference import looked_into
 from worker.ml.rewards.reward_models import RewardModel
@@ -45,6 +61,16 @@ class MethodConfig:
     value_rollouts: int = 150
     value_noise: float = 0.25
     value_steps: int = 3_000
+    steering: Steering = field(default_factory=Steering)
+    constraint: Constraint = field(default_factory=Constraint)
+    others: int = 60
+    """people whose answers clusters and latents are learned from; they count for nobody"""
+    others_labels: int = 100
+    latent: Latent = field(default_factory=Latent)
+
+
+class NobodyToAsk(ValueError):
+    """This method asks the person for more than labels, which only the benchmark's scripted users answer."""
 
 
 @dataclass(frozen=True)
@@ -66,6 +92,18 @@ class Setting:
     config: MethodConfig = MethodConfig()
     checkpoint: Checkpoint | None = None
     """where a training that takes minutes keeps what a restart needs, and says how far it is"""
+    person: Person | None = None
+    """who can be asked for more than labels; None: nobody"""
+
+    def asked(self) -> Person:
+        """The person. Raises NobodyToAsk."""
+        if self.person is None:
+            raise NobodyToAsk(NobodyToAsk.__doc__)
+        return self.person
+
+    def with_reward(self, reward: RewardModel) -> "Setting":
+        """The same with another model of what is wanted."""
+        return replace(self, problem=replace(self.problem, reward=reward))
 
 
 @dataclass(frozen=True)
@@ -87,7 +125,7 @@ def fit(name: str, setting: Setting) -> Fitted:
     """Fit the method of this name in METHODS; raises KeyError for another."""
     method, meter, started = METHODS[name], _Meter(), time.process_time()
     act, notes = method(meter.on(setting))
-    labels = 0 if name == "reference" else setting.labels
+    labels = 0 if name in WITHOUT_LABELS else setting.labels
     return Fitted(act, labels, meter.steps, round(time.process_time() - started, 2), notes)
 
 
@@ -102,7 +140,7 @@ def fit_reference(setting: Setting) -> tuple[Act, tuple[str, ...]]:
 def fit_pbarl(setting: Setting) -> tuple[Act, tuple[str, ...]]:
     """The studio's default: mode, gate, residual encoder, gate."""
     problem = setting.problem
-    gate = setting.reference(problem.config.gate_block(problem.task))
+    gate = setting.reference(_gate(setting))
     draft = pbarl.fit_studio(problem, setting.surface(), setting.pool, gate, setting.collect)
     weights = draft.weights
     mode = ", ".join(f"{axis} {value:+.2f}" for axis, value in weights.mode.items()) or "off"
@@ -142,7 +180,7 @@ def fit_prefft(setting: Setting, tie_weight: float) -> tuple[Act, tuple[str, ...
 def fit_pbrl_hri(setting: Setting) -> tuple[Act, tuple[str, ...]]:
     """SAC from scratch on the distance and the learned reward."""
     problem, config = setting.problem, setting.config.from_scratch
-    reference = setting.reference(problem.config.gate_block(problem.task))
+    reference = setting.reference(_gate(setting))
     reward = pbrl_hri.sketchy(reference, learned(problem.reward))
     policy = pbrl_hri.train(
         setting.make_env, looked_into(problem.policy), reward, problem.task.observation, config, problem.seed
@@ -161,6 +199,71 @@ def fit_best_of(setting: Setting) -> tuple[Act, tuple[str, ...]]:
     return act, (f"n = {config.candidates} samples and the mean, ranked by value.",)
 
 
+def fit_prefft_lagrangian(setting: Setting) -> tuple[Act, tuple[str, ...]]:
+    """PrefFT with a price on the task being undone, moved until success is kept."""
+    problem, config, constraint = setting.problem, setting.config.fine_tuning, setting.config.constraint
+    reference = setting.reference(first_of(RESIDUAL, constraint.scenarios))
+    price = Price(learned(problem.reward), constraint, reference, setting.collect, problem.seed)
+    policy = prefft_lagrangian.fine_tune(
+        setting.make_env, looked_into(problem.policy), price, problem.task.observation, config, problem.seed
+    )
+    prices = ", ".join(f"{each:.2f}" for each in price.prices)
+    return PolicyAct(policy), (f"SAC for {config.steps} steps; prices of an undone step: {prices}.",)
+
+
+def fit_residual_rl(setting: Setting) -> tuple[Act, tuple[str, ...]]:
+    """Policy Decorator: a bounded correction of the frozen policy."""
+    problem, config = setting.problem, setting.config.steering
+    reward, policy = learned(problem.reward), looked_into(problem.policy)
+    act = residual_rl.fit(setting.make_env, policy, reward, problem.task.observation, config, problem.seed)
+    return act, (f"SAC for {config.steps} steps; corrections of at most {config.residual_bound:g}.",)
+
+
+def fit_dsrl(setting: Setting, flow: bool) -> tuple[Act, tuple[str, ...]]:
+    """DSRL over the frozen policy's own noise, or over that of a flow fitted to the pool."""
+    problem, config = setting.problem, setting.config.steering
+    reward, policy = learned(problem.reward), looked_into(problem.policy)
+    largest = config.largest_noise
+    decoder = (
+        fit_flow(setting.pool, policy, largest, config.flow_hidden, config.flow_steps, problem.seed)
+        if flow
+        else dsrl.OwnNoise(policy, largest)
+    )
+    act = dsrl.fit(setting.make_env, decoder, policy, reward, problem.task.observation, config, problem.seed)
+    return act, (f"SAC for {config.steps} steps; noise of at most {largest:g}.",)
+
+
+def fit_preferential_bo(setting: Setting) -> tuple[Act, tuple[str, ...]]:
+    """Modes compared in duels of whole episodes, one per label of everybody else."""
+    problem, surface = setting.problem, setting.surface()
+    mode = bayesian_modes.best_mode_by_duels(setting.asked(), problem, surface, setting.collect, setting.labels)
+    return kept_task.strongest(problem, mode, setting.reference(_gate(setting)), setting.collect)
+
+
+def fit_sliders(setting: Setting, noise: float) -> tuple[Act, tuple[str, ...]]:
+    """A mode that the person sets, watching two episodes per label of everybody else."""
+    mode = sliders.set_by(setting.asked(), setting.problem, setting.collect, noise, 2 * setting.labels)
+    return kept_task.strongest(setting.problem, mode, setting.reference(_gate(setting)), setting.collect)
+
+
+def fit_clusters(setting: Setting, count: int) -> tuple[Act, tuple[str, ...]]:
+    """The studio's filter for the nearest of ``count`` kinds of people."""
+    config = setting.config
+    reward, notes = clusters.nearest(setting.asked(), config.others, config.others_labels, count, setting.problem.seed)
+    act, more = fit_pbarl(setting.with_reward(reward))
+    return act, (*notes, *more)
+
+
+def fit_latent(setting: Setting) -> tuple[Act, tuple[str, ...]]:
+    """The studio's filter for the reward that a population latent gives the person."""
+    config, problem = setting.config, setting.problem
+    reference = setting.reference(_gate(setting))
+    reward = latent_people.model_of(
+        setting.asked(), reference, config.others, config.others_labels, config.latent, problem.seed
+    )
+    return fit_pbarl(setting.with_reward(reward))
+
+
 METHODS: Mapping[str, FitMethod] = {
     "reference": fit_reference,
     "pbarl": fit_pbarl,
@@ -171,10 +274,28 @@ METHODS: Mapping[str, FitMethod] = {
     "prefft_anchored": partial(fit_prefft, tie_weight=TIED),
     "pbrl_hri": fit_pbrl_hri,
     "best_of_n": fit_best_of,
+    "prefft_lagrangian": fit_prefft_lagrangian,
+    "residual_rl": fit_residual_rl,
+    "dsrl": partial(fit_dsrl, flow=False),
+    "dsrl_flow": partial(fit_dsrl, flow=True),
+    "preferential_bo": fit_preferential_bo,
+    "sliders": partial(fit_sliders, noise=0.11),
+    "sliders_noisy": partial(fit_sliders, noise=0.35),
+    "average": partial(fit_clusters, count=1),
+    "clusters_3": partial(fit_clusters, count=3),
+    "latent_people": fit_latent,
 }
+"""Episodes seen with a blur of 0.11 (0.35) spreads of a pair are ordered wrongly in about 5 (15) of 100 pairs, if their
+differences are normal: as often as answers are, and three times as often."""
+WITHOUT_LABELS = ("reference", "average")
+"""Nobody's own answers are used."""
 
 
 # -- inside ------------------------------------------------------------------------------------------------------------
+
+
+def _gate(setting: Setting) -> range:
+    return setting.problem.config.gate_block(setting.problem.task)
 
 
 def _exported(problem: FilterProblem, draft: FilterDraft) -> Act:
