@@ -154,14 +154,15 @@ def settings_of(material: Material, ready: Sequence[Ready]) -> StudySettings:
     _, most_behaviours = bounds_of(StudySettings, "behaviours_per_scenario")
     _, most_scenarios = bounds_of(StudySettings, "pool_scenarios")
     scenarios = min(most_scenarios, len(per_scenario))
-    # Scenarios may have different numbers of clips; the settings know one number, and promise no pair that is not there.
+    # Scenarios may have different numbers of clips; the settings know one, and promise no pair that is not there.
     behaviours = max(each for each in range(2, most_behaviours + 1) if each == 2 or scenarios * _pairs(each) <= pairs)
+    most_labels = StudySettings.model_fields["labels_per_participant"].default
     usual: dict[str, Any] = {
         "strategy": Strategy.UNIFORM,
         "pool_scenarios": scenarios,
         "behaviours_per_scenario": behaviours,
         "clip_steps": min(max(longest, fewest_steps), most_steps),
-        "labels_per_participant": min(StudySettings.model_fields["labels_per_participant"].default, scenarios * _pairs(behaviours)),
+        "labels_per_participant": min(most_labels, scenarios * _pairs(behaviours)),
         "filter_milestones": (),
     }
     try:

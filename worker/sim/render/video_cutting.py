@@ -1,5 +1,6 @@
 """A stretch of somebody else's MP4 as a clip, one picture per step: read with FFmpeg's MP4 reader and no other."""
 
+import io
 from collections.abc import Callable, Iterator
 from itertools import chain, islice
 from math import ceil
@@ -18,19 +19,27 @@ Pictures = Iterator[av.VideoFrame]
 
 def cut_by_time(path: Path, from_s: float, steps: int, rate_hz: int) -> PlayableVideo:
     """Of a video of many episodes the pictures at from_s, from_s + 1 / rate_hz, ... Raises ValueError."""
+    return _cut(path, from_s, lambda pictures: _at_steps(pictures, from_s, steps, rate_hz), steps, rate_hz)
 
-    def at_steps(pictures: Pictures) -> Pictures:
-        step = 0
-        for each in pictures:
-            if each.time is None:
-                raise ValueError("a video whose pictures have no time")
-            while step < steps and each.time >= from_s + (step - 0.5) / rate_hz:
-                yield each
-                step += 1
-            if step == steps:
-                return
 
-    return _cut(path, from_s, at_steps, steps, rate_hz)
+def at_steps(clip: bytes, steps: int, rate_hz: int, width: int, height: int) -> Iterator[Frame]:
+    """The pictures of a stored clip at 0, 1 / rate_hz, ...: (height, width, 3) each. Raises ValueError."""
+    with av.open(io.BytesIO(clip), "r", format="mp4") as container:
+        pictures = _at_steps(container.decode(container.streams.video[0]), 0.0, steps, rate_hz)
+        scaled = (each.reformat(width=width, height=height) for each in pictures)
+        yield from _as_many(scaled, steps, rate_hz, width, height)
+
+
+def _at_steps(pictures: Pictures, from_s: float, steps: int, rate_hz: int) -> Pictures:
+    step = 0
+    for each in pictures:
+        if each.time is None:
+            raise ValueError("a video whose pictures have no time")
+        while step < steps and each.time >= from_s + (step - 0.5) / rate_hz:
+            yield each
+            step += 1
+        if step == steps:
+            return
 
 
 def cut_by_number(path: Path, steps: int, rate_hz: int) -> PlayableVideo:
