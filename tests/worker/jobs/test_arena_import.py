@@ -19,6 +19,7 @@ from app.storage import ArtefactStore
 from tests import stored_files
 from tests.worker.at_hand import AtHand
 from worker.jobs.clips import plain_pickle
+from worker.jobs.clips.arena_folder import ArenaFolder
 from worker.jobs.clips.import_clips import ClipsInvalid, import_clips
 from worker.jobs.clips.own_clips import Choices
 from worker.jobs.clips.plain_pickle import PickleRefused
@@ -188,18 +189,24 @@ WRONG: dict[str, tuple[Callable[[Path], None], str]] = {
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_what_is_wrong_is_said_and_nothing_is_imported(name: str, context: WorkerContext, folder: Path) -> None:
+def test_what_is_wrong_is_said(name: str, folder: Path) -> None:
     spoil, words = WRONG[name]
     spoil(folder)
     with pytest.raises(ClipsInvalid) as refused:
-        import_clips(context.database, context.store, folder, LEFT)
+        list(ArenaFolder(folder, LEFT).clips())
     assert words in str(refused.value)
-    with context.database.reading() as session:
-        assert session.scalar(select(func.count(Study.id))) == 0
-    assert stored_files.names(context.store) == set()
     assert not Path("was-run").exists()
 
 
-def test_which_camera_must_be_said(context: WorkerContext, folder: Path) -> None:
+def test_nothing_is_kept_of_what_is_wrong_at_its_end(context: WorkerContext, folder: Path) -> None:
+    (folder / "evaluation_sessions/session-3/C_paligemma_vq_droid/proprio_and_actions.npz").write_bytes(b"PK")
+    with pytest.raises(ClipsInvalid, match="session-3/C_paligemma"):
+        import_clips(context.database, context.store, folder, LEFT)
+    with context.database.reading() as session:
+        assert session.scalar(select(func.count(Study.id))) == 0
+    assert stored_files.names(context.store) == set()
+
+
+def test_which_camera_must_be_said(folder: Path) -> None:
     with pytest.raises(ClipsInvalid, match=r"left, right, wrist. Say which camera is shown, with --camera"):
-        import_clips(context.database, context.store, folder)
+        list(ArenaFolder(folder, Choices()).clips())

@@ -106,7 +106,7 @@ def test_a_film_has_one_picture_for_every_row(exported: Path, clips: list[Clip])
     assert (info["fps"], info["total_episodes"]) == (10, len(clips))
     for number, clip in enumerate(clips):
         film = exported / f"videos/observation.images.clip/chunk-000/file-{number:03d}.mp4"
-        with av.open(str(film)) as container:
+        with av.open(str(film), "r") as container:
             times = [each.time for each in container.decode(video=0)]
         assert np.allclose(times, np.arange(clip.step_count) / 10)
         assert (exported / f"clips/{clip.video_sha256}.mp4").exists()

@@ -17,13 +17,13 @@ from app.domain.studies import Deviation, Study
 from app.paths import DOCS
 from app.services.archives import archive, archive_reading, sealing
 from app.services.evaluation import unblinding
-from app.services.exports import export_formats, export_requests, export_rows, export_tables
+from app.services.exports import export_formats, export_requests, export_rows, export_tables, parquet_file
 from app.services.exports.export_formats import RowProvenance, Table
 from app.services.exports.export_requests import ExportKind
 from app.services.runs import reports
 from app.services.studies import preregistration
 from app.storage import ArtefactMissing
-from worker.jobs.publishing import lerobot_files, parquet_tables, preference_arrays
+from worker.jobs.publishing import lerobot_files, preference_arrays
 from worker.jobs.publishing.scripted_words import scripted_in_words
 from worker.jobs.runtime import records
 from worker.jobs.runtime.context import Step, WorkerContext
@@ -61,7 +61,7 @@ def _made(context: WorkerContext, export_id: int, run_id: int) -> str | None:
         path = folder / "export.zip"
         context.report(run_id, "writing the file", 0.1)
         with context.database.reading() as session:
-            missing = _WRITERS[kind](session, context, session.get_one(Study, study_id), path)
+            missing = _write(kind, session, context, session.get_one(Study, study_id), path)
         byte_count, sha256 = path.stat().st_size, context.store.take(path)
     with context.database.writing() as session:
         if records.withdrawn_ids(session, study_id) != gone:
@@ -71,6 +71,12 @@ def _made(context: WorkerContext, export_id: int, run_id: int) -> str | None:
         export.artefact_sha256, export.byte_count, export.finished_at = sha256, byte_count, now()
         export.missing = dict(missing) or None
     return sha256
+
+
+def _write(kind: ExportKind, session: Session, context: WorkerContext, study: Study, path: Path) -> Missing:
+    if kind is ExportKind.LEROBOT:
+        return lerobot_files.write(session, context, study, path)
+    return (write_data if kind is ExportKind.DATA else _write_archive)(session, context, study, path)
 
 
 def _write_archive(session: Session, context: WorkerContext, study: Study, path: Path) -> Missing:
@@ -115,8 +121,7 @@ def _write_table(
         with target.open(f"{kind}/{table.name}.{kind}", "w") as stream:
             for line in write(table, session, study, provenance):
                 stream.write(line.encode())
-    with target.open(f"parquet/{table.name}.parquet", "w") as stream:
-        parquet_tables.write(table, session, study, provenance, stream)
+    target.writestr(f"parquet/{table.name}.parquet", parquet_file.content(table, session, study, provenance))
 
 
 def _write_report(
@@ -232,13 +237,6 @@ Stored files that were missing or damaged when this was made, by their hashes; a
 
 {missing}
 """
-
-
-_WRITERS = {
-    ExportKind.DATA: write_data,
-    ExportKind.LEROBOT: lerobot_files.write,
-    ExportKind.ARCHIVE: _write_archive,
-}
 
 
 def _json(value: Any) -> str:

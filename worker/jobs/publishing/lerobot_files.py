@@ -23,10 +23,10 @@ from sqlalchemy.orm import Session, contains_eager
 from app.domain.clips import Clip, Rollout
 from app.domain.studies import Study
 from app.errors import AppError
-from app.services.exports import export_formats, export_rows, export_tables
+from app.services.exports import export_formats, export_rows, export_tables, parquet_file
 from app.storage import ArtefactMissing
 from worker.jobs.learning import dataset
-from worker.jobs.publishing import lerobot_card, lerobot_statistics, parquet_tables
+from worker.jobs.publishing import lerobot_card, lerobot_statistics
 from worker.jobs.runtime.context import WorkerContext
 from worker.ml.rewards.segments import Stretch
 from worker.responses import TARGETS
@@ -299,9 +299,9 @@ def _write_tables(session: Session, target: zipfile.ZipFile, study: Study) -> li
     """Every table of the export that has rows; returns their names."""
     provenance, written = export_formats.provenance_of(session, study), []
     for table in export_tables.TABLES:
-        found = parquet_tables.arrow_table(table, session, study, provenance)
-        if len(found):
-            _write_parquet(target, f"tables/{table.name}.parquet", found)
+        if next(iter(table.rows(session, study)), None) is not None:
+            content = parquet_file.content(table, session, study, provenance)
+            target.writestr(f"tables/{table.name}.parquet", content)
             written.append(table.name)
     return written
 
