@@ -49,7 +49,7 @@ def download_table(
     if table not in export_tables.BY_NAME:
         raise TableUnknown
     wanted = export_tables.BY_NAME[table]
-    note_reading(studio, session, caller, "table", study, f"{slug}/{table}")
+    note_reading(studio, session, caller, "table", study, f"{slug}/{table}.{kind}")
     tag = f'W/"{_fingerprint(wanted, session, study)}-{kind}"'
     headers = {"etag": tag, "cache-control": "private, no-cache"}
     if tag in (each.strip() for each in if_none_match.split(",")):

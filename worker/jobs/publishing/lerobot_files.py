@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as parquet
 from sqlalchemy import select
@@ -208,6 +207,8 @@ def _with_columns(writing: _Writing) -> dict[str, list[Any]]:
 
 def _write_metadata(writing: _Writing) -> None:
     """info.json, stats.json, tasks and episodes."""
+    import pandas as pd  # takes long, and a worker that exports nothing starts without
+
     vectors = {name: np.concatenate(found) for name, found in _with_columns(writing).items()}
     statistics = {name: lerobot_statistics.of_vectors(each) for name, each in vectors.items()}
     statistics[CAMERA] = lerobot_statistics.of_pixels(np.concatenate(writing.pixels), writing.frames)
