@@ -225,7 +225,7 @@ def test_whatever_tells_something_of_people_is_kept_with_who_read_it(
         with database.reading() as session:
             assert session.scalar(select(func.count(AuditEvent.id))) == (before or 0) + 1, address
         asked.append(path)
-    assert len(asked) == 5, asked
+    assert len(asked) == 6, asked
 
 
 def test_a_file_is_asked_for(call: Call, study: Study) -> None:

@@ -164,10 +164,16 @@ def _write_films(writing: _Writing, clip: Clip, film: bytes) -> None:
     shown = f"clips/{clip.video_sha256}.mp4"
     if shown not in writing.target.namelist():
         writing.target.writestr(shown, film, zipfile.ZIP_STORED)
-    pictures = list(video_cutting.at_steps(film, clip.step_count, writing.rate_hz, width, height))
+    pixels: list[Any] = []
+
+    def pictures() -> Iterator[video.Frame]:
+        for each in video_cutting.at_steps(film, clip.step_count, writing.rate_hz, width, height):
+            pixels.append(lerobot_statistics.sampled(each, clip.step_count))
+            yield each
+
     name = VIDEO_PATH.format(video_key=CAMERA, **_file(len(writing.episodes)))
-    writing.target.writestr(name, video.encode_mp4(pictures, width, height, writing.rate_hz), zipfile.ZIP_STORED)
-    writing.pixels.append(lerobot_statistics.sampled(np.stack(pictures)))
+    writing.target.writestr(name, video.encode_mp4(pictures(), width, height, writing.rate_hz), zipfile.ZIP_STORED)
+    writing.pixels.append(np.concatenate(pixels))
 
 
 def _file(number: int) -> dict[str, int]:

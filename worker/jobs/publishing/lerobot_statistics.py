@@ -25,10 +25,11 @@ def of_pixels(pixels: Values, pictures: int) -> dict[str, Any]:
     return {name: each[:, None, None].tolist() for name, each in found.items()} | {"count": [pictures]}
 
 
-def sampled(frames: Values) -> Values:
-    """(T, H, W, 3) pictures -> (N, 3) some of their pixels, the same ones every time."""
-    pixels = frames.reshape(-1, 3)
-    return np.asarray(pixels[:: max(1, len(pixels) // SAMPLED_PIXELS)])
+def sampled(picture: Values, pictures: int) -> Values:
+    """One of so many pictures, (H, W, 3) -> (N, 3) some of its pixels, always the same ones."""
+    pixels = picture.reshape(-1, 3)
+    wanted = max(1, SAMPLED_PIXELS // pictures)
+    return np.array(pixels[:: max(1, len(pixels) // wanted)])
 
 
 def as_columns(statistics: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
