@@ -114,6 +114,7 @@ RUN: dict[str, str | Elsewhere | OnlyParsed] = {
     "fuzz_api": "--requests 20",
     "head_to_head": OnlyParsed("computes each truth from 200 000 people; what it measures has tests of its own"),
     "reliability": OnlyParsed("computes each truth from 400 000 people; what it measures has tests of its own"),
+    "in_lerobot": OnlyParsed("needs the library lerobot, in an environment of its own"),
     "in_imitation": OnlyParsed("needs the library imitation, in an environment of its own"),
     "kills": REAL_TIME,
     "labellers": "--labellers 2 --thought 0.2 --people 1 --labels 40 --seconds 1 --rounds 1 --settling 0",

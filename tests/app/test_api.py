@@ -1,18 +1,22 @@
 """The same data for programs: by token, with the rights of its account, in pages, and with problems in words."""
 
+import io
 import json
 from collections.abc import Callable
 from typing import Any
 
+import pandas as pd
 import pytest
 from fastapi import FastAPI
 from fastapi.routing import iter_route_contexts
 from fastapi.testclient import TestClient
+from jsonschema import Draft202012Validator
 from sqlalchemy import func, select
 
 from app.db import Database, now
 from app.domain.models import ModelKind, Report
 from app.domain.people import ApiToken, AuditEvent, Experimenter, Role
+from app.domain.preferences import Query, Response
 from app.domain.studies import Participant, Study
 from app.services.accounts import api_tokens
 from app.services.exports import export_tables
@@ -42,7 +46,7 @@ def call(client: TestClient, token: str) -> Call:
     """Asks the API with the token."""
 
     def ask(path: str, method: str = "GET", **options: Any) -> Any:
-        headers = {"Authorization": f"Bearer {token}"}
+        headers = {"Authorization": f"Bearer {token}", **options.pop("headers", {})}
         return client.request(method, f"/api/v1{path}", headers=headers, **options)
 
     return ask
@@ -134,6 +138,37 @@ def test_every_exported_table_can_be_read(call: Call, study: Study, table: str) 
     described = next(each for each in call(f"/studies/{study.slug}/tables").json() if each["name"] == table)
     names = [column["name"] for column in described["columns"]]
     assert all(list(row) == names for row in answer.json()["rows"])
+    document = call("/openapi.json").json()
+    schema = document["paths"]["/studies/{slug}/tables/{table}"]["get"]["responses"]["200"]["content"]
+    page = schema["application/json"]["schema"]["discriminator"]["mapping"][table]
+    Draft202012Validator({"$ref": page, "components": document["components"]}).validate(answer.json())
+
+
+@pytest.mark.parametrize("kind", ["csv", "parquet"])
+def test_a_whole_table_is_one_file_and_comes_again_only_when_it_has_changed(
+    kind: str, call: Call, experimenter: TestClient, study: Study, database: Database
+) -> None:
+    address = f"/studies/{study.slug}/tables/labels.{kind}"
+    first = call(address)
+    rows = _read(kind, first.content)
+    lines = experimenter.get(f"/studies/{study.slug}/export/labels.jsonl").text.splitlines()
+    assert list(rows["response"]) == [json.loads(line)["response"] for line in lines]
+    same = call(address, headers={"If-None-Match": f'"other", {first.headers["etag"]}'})
+    assert (same.status_code, same.content, same.headers["etag"]) == (304, b"", first.headers["etag"])
+    with database.writing() as session:
+        query = session.scalars(select(Query).order_by(Query.id)).first()
+        assert query is not None
+        factories.make_label(session, query, Response.EQUAL)
+    changed = call(address, headers={"If-None-Match": first.headers["etag"]})
+    assert changed.status_code == 200
+    assert len(_read(kind, changed.content)) == len(rows) + 1
+    other = {"csv": "parquet", "parquet": "csv"}[kind]
+    there = call(address.replace(kind, other), headers={"If-None-Match": changed.headers["etag"]})
+    assert there.status_code == 200, "the same rows in another format are another file"
+
+
+def _read(kind: str, content: bytes) -> pd.DataFrame:
+    return (pd.read_csv if kind == "csv" else pd.read_parquet)(io.BytesIO(content))
 
 
 def test_bundles_are_listed_and_downloaded(call: Call, database: Database, store: ArtefactStore) -> None:
@@ -183,14 +218,14 @@ def test_whatever_tells_something_of_people_is_kept_with_who_read_it(
             or path in {*impersonal, *files}
         ):
             continue
-        address = path.format(slug=study.slug, code="P01", version=1, table="labels")
+        address = path.format(slug=study.slug, code="P01", version=1, table="labels", kind="csv")
         with database.reading() as session:
             before = session.scalar(select(func.count(AuditEvent.id)))
         assert call(address).status_code == 200, address
         with database.reading() as session:
             assert session.scalar(select(func.count(AuditEvent.id))) == (before or 0) + 1, address
         asked.append(path)
-    assert len(asked) == 5, asked
+    assert len(asked) == 6, asked
 
 
 def test_a_file_is_asked_for(call: Call, study: Study) -> None:

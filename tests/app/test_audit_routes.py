@@ -233,6 +233,7 @@ def place(database: Database, store: ArtefactStore, experimenter: TestClient, tm
         Act("api show_report", "report read by the API", f"{API}{S}/report"),
         Act("api show_figure", "report read by the API", f"{API}{S}/report/figures/ratings.svg"),
         Act("api read_table", "table read by the API", f"{API}{S}/tables/labels"),
+        Act("api download_table", "table read by the API", f"{API}{S}/tables/labels.csv"),
         Act("api request_export", "data export requested", f"{API}{S}/exports", {"kind": "data"}),
         Act("api download_export", "data export downloaded", f"{API}{S}/exports/{export_id}.zip"),
         Act("revoke_token", "API token revoked", f"/tokens/{token_id}/revoke", {}),

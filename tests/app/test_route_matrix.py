@@ -126,7 +126,9 @@ MATRIX: dict[str, Rule] = {
     **dict.fromkeys(("api show_account", "api list_studies"), TOKEN),
     **dict.fromkeys(("api show_study", "api list_participants", "api list_members", "api list_bundles"), TOKEN_LOOKS),
     **dict.fromkeys(("api show_report", "api show_figure", "api list_tables", "api list_exports"), TOKEN_LOOKS),
-    **dict.fromkeys(("api read_table", "api download_bundle", "api download_export"), TOKEN_READS_DATA),
+    **dict.fromkeys(
+        ("api read_table", "api download_table", "api download_bundle", "api download_export"), TOKEN_READS_DATA
+    ),
     **dict.fromkeys(
         ("api admit_member", "api remove_member", "api add_participants", "api revoke_link", "api request_export"),
         TOKEN_WRITES,

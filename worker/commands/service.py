@@ -10,6 +10,7 @@ from app.storage import ArtefactStore, keep_private
 from worker.commands.arguments import Commands
 from worker.jobs import service
 from worker.jobs.clips import import_clips
+from worker.jobs.clips.own_clips import Choices
 
 
 def add(commands: Commands) -> None:
@@ -18,16 +19,31 @@ def add(commands: Commands) -> None:
     serve.set_defaults(act=lambda _options: service.run(Settings()))
 
     clips = commands.add_parser("import-clips", help="make a study of your own recordings (docs/own_clips.md)")
-    clips.add_argument("path", type=Path, help="folder or zip file")
+    clips.add_argument("path", type=Path, help="folder or zip file of your own, LeRobotDataset v3, or RoboArena dump")
+    clips.add_argument("--name", help="of the study")
+    clips.add_argument("--camera", help="which of several is shown")
+    clips.add_argument("--episodes", type=_range, metavar="FIRST:END", help="of a LeRobotDataset, as in Python")
+    clips.add_argument("--signals", type=_listed, default=(), metavar="FEATURE,...", help="what people may judge by")
+    clips.add_argument("--rate", type=int, default=Choices.rate_hz, help="steps per second of a RoboArena dump")
     clips.set_defaults(act=_import_clips)
+
+
+def _range(text: str) -> range:
+    first, _, end = text.partition(":")
+    return range(int(first), int(end))
+
+
+def _listed(text: str) -> tuple[str, ...]:
+    return tuple(text.split(","))
 
 
 def _import_clips(said: argparse.Namespace) -> int:
     settings = Settings()
     keep_private(settings)
     database = Database(settings.sqlalchemy_url)
+    choices = Choices(said.name, said.camera, said.episodes, said.signals, said.rate)
     try:
-        slug = import_clips.import_clips(database, ArtefactStore.of(settings), said.path)
+        slug = import_clips.import_clips(database, ArtefactStore.of(settings), said.path, choices)
     finally:
         database.dispose()
     sys.stdout.write(f"Imported: {settings.base_url}/studies/{slug}\n")

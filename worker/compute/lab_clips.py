@@ -11,8 +11,6 @@ from worker.sim.render.clip import RenderedClip
 from worker.trajectory import Trajectory
 from worker.type_aliases import Act, Float32Array
 
-SLOWEST_FPS = 12
-"""Below this pictures are held, for players are bad at videos of few pictures per second."""
 SAME_WITHIN = 1e-3
 """Largest difference of an observation between an episode and the same actions again."""
 
@@ -43,7 +41,7 @@ def film_again(environment: LabEnvironment, recorded: Trajectory, first_step: in
 
 def rendered(pictures: Sequence[Picture], rate_hz: float) -> RenderedClip:
     """Pictures that were taken so many times a second, at the pace at which they were."""
-    held = max(1, int(np.ceil(SLOWEST_FPS / rate_hz)))
+    held = max(1, int(np.ceil(video.SLOWEST_FPS / rate_hz)))
     fps = max(1, round(rate_hz * held))
     height, width = pictures[0].shape[:2]
     count = len(pictures) * held

@@ -20,6 +20,8 @@ class ExportKind(StrEnum):
 
     DATA = "data"
     """Tables, figures and arrays, for analysis."""
+    LEROBOT = "lerobot"
+    """Clips, trajectories and preferences as a LeRobotDataset, which is a dataset folder of Hugging Face as well."""
     ARCHIVE = "archive"
     """The study itself, for another installation."""
 

@@ -5,10 +5,11 @@ from typing import Any
 from fastapi import Depends, FastAPI
 
 from app.services.exports import export_formats
-from app.web.api import data_routes, study_routes
+from app.web.api import data_routes, study_routes, table_files
 from app.web.api import schemas as answers
 from app.web.api.callers import PREFIX
 from app.web.api.problems import add_problems, document_problems, only_known_parameters
+from app.web.api.typed_rows import document_rows
 
 DESCRIPTION = """\
 Everything that the pages show and the exports hold, for programs.
@@ -24,7 +25,8 @@ unblinded, methods of the evaluation are letters here as everywhere.
 
 Tables come in pages: follow `next`, whose `cursor` says where to go on. Together the pages are the table as it was when
 the first one was asked for. There is no `offset` any more (what people answer between two pages would shift it), and a
-parameter that an address does not know is refused with 422 instead of being ignored.
+parameter that an address does not know is refused with 422 instead of being ignored. A whole table as CSV or Parquet is
+one file; send its `ETag` back as `If-None-Match`, and while nothing has changed the answer is 304 without a file.
 """
 
 _PROBLEMS: dict[int | str, dict[str, Any]] = {
@@ -59,7 +61,8 @@ def create_api(path_for: Any, max_body_bytes: int) -> FastAPI:
     )
     api.state.path_for = path_for
     add_problems(api)
-    for part in (study_routes, data_routes):
+    for part in (study_routes, table_files, data_routes):
         api.include_router(part.router, responses=_PROBLEMS, dependencies=[Depends(only_known_parameters)])
     document_problems(api)
+    document_rows(api)
     return api

@@ -202,7 +202,8 @@ def list_exports(slug: Slug, _caller: Caller, session: ReadingSession) -> list[a
 def request_export(
     slug: Slug, wanted: answers.NewExport, caller: ActingCaller, session: WritingSession
 ) -> answers.ExportAnswer:
-    """Ask for the whole data of a study as one zip file, or for an archive that another installation imports."""
+    """Ask for a zip file: the whole data of a study, its clips and preferences as a LeRobotDataset, or an archive that
+    another installation imports."""
     study = studies.find_study(session, slug)
     return _export(session, study, export_requests.request(session, study, ExportKind(wanted.kind), caller.name))
 

@@ -152,7 +152,7 @@ class NewExport(BaseModel):
 
     model_config = ConfigDict(extra="forbid", json_schema_extra={"example": {"kind": "data"}})
 
-    kind: Literal["data", "archive"] = "data"
+    kind: Literal["data", "lerobot", "archive"] = "data"
 
 
 class ExportAnswer(BaseModel):

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import pyarrow.parquet as parquet
 import pytest
 from fastapi.testclient import TestClient
 from sqlalchemy import select
@@ -28,6 +29,7 @@ from app.services.exports import export_requests, export_tables
 from app.services.exports.export_requests import ExportKind
 from app.storage import ArtefactStore
 from tests import stored_files
+from tests.worker.conftest import filmed
 from worker.compute.pools import Compute
 from worker.jobs import reconcile
 from worker.jobs.learning import dataset
@@ -153,6 +155,7 @@ def test_a_lost_or_damaged_recording_is_left_out_and_said_to_be(
 ) -> None:
     with context.database.writing() as session:
         session.get_one(Study, study.id).unblinded_at = study.created_at
+        filmed(session, context.store)
         lost = session.get_one(Rollout, pairs[0][0].rollout_id).trajectory_sha256
         others = len(session.scalars(select(Rollout.trajectory_sha256).distinct()).all()) - 1
     damage(context.store, lost)
@@ -162,6 +165,9 @@ def test_a_lost_or_damaged_recording_is_left_out_and_said_to_be(
         assert list(arrays["ordinals"]) == [2, 3]
         assert lost in made.read("README.md").decode()
         assert lost in json.dumps(json.loads(made.read("provenance.json"))["missing"])
+    elif kind is ExportKind.LEROBOT:
+        assert json.loads(made.read("meta/info.json"))["total_episodes"] == others
+        assert len(parquet.read_table(io.BytesIO(made.read("preferences/preferences.parquet")))) == 2
     else:
         manifest = json.loads(made.read("manifest.json"))
         assert lost in manifest["missing"]

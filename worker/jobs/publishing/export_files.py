@@ -8,8 +8,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import pyarrow as pa
-import pyarrow.parquet as parquet
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
@@ -19,29 +17,27 @@ from app.domain.studies import Deviation, Study
 from app.paths import DOCS
 from app.services.archives import archive, archive_reading, sealing
 from app.services.evaluation import unblinding
-from app.services.exports import codebook, export_formats, export_requests, export_rows, export_tables
-from app.services.exports.csv_cells import json_text
-from app.services.exports.export_formats import ColumnKind, RowProvenance, Table
+from app.services.exports import (
+    codebook,
+    export_formats,
+    export_requests,
+    export_rows,
+    export_tables,
+    parquet_file,
+)
+from app.services.exports.export_formats import RowProvenance, Table
 from app.services.exports.export_requests import ExportKind
 from app.services.runs import reports
 from app.services.studies import preregistration
 from app.storage import ArtefactMissing
-from worker.jobs.publishing import preference_arrays
+from worker.jobs.publishing import lerobot_files, preference_arrays
+from worker.jobs.publishing.scripted_words import scripted_in_words
 from worker.jobs.runtime import records
 from worker.jobs.runtime.context import Step, WorkerContext
 from worker.jobs.runtime.records import Job
 
 Missing = Mapping[str, Sequence[str]]
 """Hashes of stored files that could not be had, by what they are."""
-
-_ARROW = {
-    ColumnKind.TEXT: pa.string(),
-    ColumnKind.INTEGER: pa.int64(),
-    ColumnKind.NUMBER: pa.float64(),
-    ColumnKind.BOOLEAN: pa.bool_(),
-    ColumnKind.TIME: pa.timestamp("ms", "UTC"),
-    ColumnKind.JSON: pa.string(),
-}
 
 
 def due(session: Session, study: Study) -> list[Job]:
@@ -72,8 +68,7 @@ def _made(context: WorkerContext, export_id: int, run_id: int) -> str | None:
         path = folder / "export.zip"
         context.report(run_id, "writing the file", 0.1)
         with context.database.reading() as session:
-            write = write_data if kind is ExportKind.DATA else _write_archive
-            missing = write(session, context, session.get_one(Study, study_id), path)
+            missing = _write(kind, session, context, session.get_one(Study, study_id), path)
         byte_count, sha256 = path.stat().st_size, context.store.take(path)
     with context.database.writing() as session:
         if records.withdrawn_ids(session, study_id) != gone:
@@ -83,6 +78,12 @@ def _made(context: WorkerContext, export_id: int, run_id: int) -> str | None:
         export.artefact_sha256, export.byte_count, export.finished_at = sha256, byte_count, now()
         export.missing = dict(missing) or None
     return sha256
+
+
+def _write(kind: ExportKind, session: Session, context: WorkerContext, study: Study, path: Path) -> Missing:
+    if kind is ExportKind.LEROBOT:
+        return lerobot_files.write(session, context, study, path)
+    return (write_data if kind is ExportKind.DATA else _write_archive)(session, context, study, path)
 
 
 def _write_archive(session: Session, context: WorkerContext, study: Study, path: Path) -> Missing:
@@ -129,27 +130,7 @@ def _write_table(
         with target.open(f"{kind}/{table.name}.{kind}", "w") as stream:
             for line in write(table, session, study, provenance):
                 stream.write(line.encode())
-    with target.open(f"parquet/{table.name}.parquet", "w") as stream:
-        parquet.write_table(arrow_table(table, session, study, provenance), stream)
-
-
-def arrow_table(table: Table, session: Session, study: Study, provenance: RowProvenance) -> pa.Table:
-    """The table with typed columns; json columns are text, and meanings are kept with the columns."""
-    columns = table.all_columns
-    rows = [(*values, *provenance.values) for values in table.rows(session, study)]
-    arrays = [
-        pa.array([_arrow_value(column.kind, row[place]) for row in rows], _ARROW[column.kind])
-        for place, column in enumerate(columns)
-    ]
-    fields = [
-        pa.field(column.name, _ARROW[column.kind], metadata={"meaning": column.meaning, "unit": column.unit})
-        for column in columns
-    ]
-    return pa.Table.from_arrays(arrays, schema=pa.schema(fields))
-
-
-def _arrow_value(kind: ColumnKind, value: Any) -> Any:
-    return json_text(value) if kind is ColumnKind.JSON and value is not None else value
+    target.writestr(f"parquet/{table.name}.parquet", parquet_file.content(table, session, study, provenance))
 
 
 def _write_report(
@@ -229,23 +210,12 @@ def _readme(
         version=provenance.software_version,
         moment=provenance.exported_at.isoformat(timespec="seconds"),
         blinded=blinded,
-        scripted=_scripted_in_words(about["scripted"]),
+        scripted=scripted_in_words(about["scripted"]),
         plan=about["plan_in_words"],
         deviations="\n".join(listed) or "None.",
         missing="\n".join(lost) or "Nothing.",
         figures=", ".join(pictures) or "none yet",
         people=", ".join(people) or "nobody yet",
-    )
-
-
-def _scripted_in_words(scripted: Mapping[str, str]) -> str:
-    """A paragraph for whoever might take them for people; nothing when all are."""
-    if not scripted:
-        return ""
-    played = ", ".join(f"{code} ({user})" for code, user in scripted.items())
-    return (
-        f"\n**These participants are not people: {played}.** A program answered and rated for them"
-        " (`scripted_as` in the table `participants`).\n"
     )
 
 

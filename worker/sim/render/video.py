@@ -22,6 +22,8 @@ CHROMA_OFFSET = -6
 ASSEMBLER = "sse4.2"
 """With its code for AVX-512 the encoder's result depends on what was in memory before, and on the processor. Every
 processor that NumPy runs on has this; encoding takes 3 % longer."""
+SLOWEST_FPS = 12
+"""Below this pictures are held, for players are bad at videos of few pictures per second."""
 MOST_PIXELS, MOST_PICTURES = 4096 * 2304, 20_000
 """Of a video that somebody else has made."""
 
@@ -83,13 +85,13 @@ def playable(content: bytes) -> PlayableVideo:
             codec = (stream.codec_context.name, stream.codec_context.pix_fmt)
             usual = codec == ("h264", "yuv420p") and "mp4" in container.format.name
             fps = round(float(stream.average_rate or 0))
-            decoded = _Decoded(container.decode(stream))
+            decoded = Decoded(container.decode(stream))
             first = next(decoded, None)
             if first is None or fps < 1:
                 raise ValueError("a video without frames")
             height, width = (size // 2 * 2 for size in (first.height, first.width))  # yuv420p wants even
-            poster = _picture(first, width, height)
-            pictures = (_picture(each, width, height) for each in chain([first], decoded))
+            poster = rgb(first, width, height)
+            pictures = (rgb(each, width, height) for each in chain([first], decoded))
             video = content if usual else encode_mp4(pictures, width, height, fps)
             decoded.count_the_rest()
     except (av.FFmpegError, IndexError) as error:
@@ -97,8 +99,8 @@ def playable(content: bytes) -> PlayableVideo:
     return PlayableVideo(video, encode_poster(poster), width, height, fps, round(1000 * decoded.count / fps))
 
 
-class _Decoded:
-    """Pictures of a video, counted. Raises ValueError when they are too large or too many."""
+class Decoded:
+    """Pictures of a video that others have made, counted. Raises ValueError when they are too large or too many."""
 
     def __init__(self, pictures: Iterator[av.VideoFrame]) -> None:
         self._pictures = pictures
@@ -122,7 +124,8 @@ class _Decoded:
             pass
 
 
-def _picture(decoded: av.VideoFrame, width: int, height: int) -> Frame:
+def rgb(decoded: av.VideoFrame, width: int, height: int) -> Frame:
+    """(height, width, 3), cropped to that. Raises ValueError for a smaller picture."""
     picture = np.asarray(decoded.to_ndarray(format="rgb24"), np.uint8)[:height, :width]
     if picture.shape[:2] != (height, width):
         raise ValueError("a video whose pictures change their size")
