@@ -44,7 +44,7 @@ from app.web.http.request_log import RequestLog
 from app.web.http.security import Guard
 from app.web.http.session_queue import SessionQueue
 from app.web.http.shared_pages import SharedPages
-from app.web.participant import consent, entry, evaluation, finish, forms, head_to_heads, joining, pairs, withdrawal
+from app.web.participant import consent, entry, evaluation, finish, forms, head_to_heads, joining, pairs, self_setting, withdrawal
 from app.web.texts import languages
 from app.web.texts.templating import make_environment
 
@@ -60,6 +60,7 @@ PARTICIPANT_PARTS = (
     forms,
     evaluation,
     head_to_heads,
+    self_setting,
     finish,
     withdrawal,
     entry,
