@@ -44,7 +44,18 @@ from app.web.http.request_log import RequestLog
 from app.web.http.security import Guard
 from app.web.http.session_queue import SessionQueue
 from app.web.http.shared_pages import SharedPages
-from app.web.participant import consent, entry, evaluation, finish, forms, head_to_heads, joining, pairs, self_setting, withdrawal
+from app.web.participant import (
+    consent,
+    entry,
+    evaluation,
+    finish,
+    forms,
+    head_to_heads,
+    joining,
+    pairs,
+    self_setting,
+    withdrawal,
+)
 from app.web.texts import languages
 from app.web.texts.templating import make_environment
 

@@ -179,7 +179,8 @@ class EvaluationSettings(BaseModel):
         if self.ask_which_is_theirs and set(self.methods) - of_others != {EvaluatedMethod.PBARL}:
             raise ValueError(
                 "Which robot was made for somebody can be asked only where one was: choose PbARL, and beside it only "
-                "the reference, somebody else's filter or the average. A robot that people set themselves is theirs as well."
+                "the reference, somebody else's filter or the average. A robot that people set themselves is theirs "
+                "as well."
             )
         return self
 

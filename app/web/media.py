@@ -66,7 +66,8 @@ async def show_poster(request: Request, sha256: Sha256, studio: StudioDep) -> Re
 
 
 def _require_may_watch(request: Request, session: Session, sha256: str) -> None:
-    """A participant may watch clips and previews of their own study and their own films, an experimenter those of their studies.
+    """A participant may watch clips and previews of their own study and their own films, an experimenter clips and
+    films of theirs.
 
     Raises ClipNotFound.
     """

@@ -157,7 +157,7 @@ def _attempt_due(run: _Attempted | None, moment: datetime) -> int | None:
 
 
 def _missing_clips(session: Session, study: Study) -> list[Job]:
-    """Clips of every scenario; of the first ones also whole episodes, as soon as they were rolled out; then previews."""
+    """Clips of every scenario; of the first ones also whole episodes, once they were rolled out; then previews."""
     if study.material is not None:
         return []  # brought along by the study
     settings, jobs = study.settings, []

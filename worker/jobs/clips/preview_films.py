@@ -33,9 +33,7 @@ def due_ahead(session: Session, study: Study) -> list[Job]:
     """The next films that are made ahead; none where nobody sets a robot."""
     if not self_setting.is_set(study):
         return []
-    made = select(PreviewFilm.number).where(
-        PreviewFilm.study_id == study.id, PreviewFilm.self_setting_id.is_(None)
-    )
+    made = select(PreviewFilm.number).where(PreviewFilm.study_id == study.id, PreviewFilm.self_setting_id.is_(None))
     missing = sorted(set(range(preview_plan.COUNT)) - set(session.scalars(made)))
     batches = dict.fromkeys(number // BATCH for number in missing)
     return [Job(RunKey(RunKind.CLIPS, study.id, subject=PREVIEW, number=each), study.id) for each in [*batches][:1]]
@@ -129,9 +127,7 @@ def _save(
         session.add(PreviewFilm(study_id=study_id, self_setting_id=setting_id, number=number, mode=mode, **columns))
 
 
-def _is_filmed(
-    session: Session, study_id: int, sliders: Sequence[self_setting.Slider], setting: SelfSetting
-) -> bool:
+def _is_filmed(session: Session, study_id: int, sliders: Sequence[self_setting.Slider], setting: SelfSetting) -> bool:
     """Whether the person can be shown exactly this setting."""
     mine = select(SelfSetting.id).where(SelfSetting.participant_id == setting.participant_id)
     films = select(PreviewFilm).where(PreviewFilm.study_id == study_id)
