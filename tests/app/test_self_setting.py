@@ -251,7 +251,7 @@ def test_the_film_is_the_nearest_and_the_page_says_where_it_differs(there: AtSli
     there.move(press=3)
     page = there.browser.get("/p/setting").text
     assert "nearest to yours" in page
-    assert "In the film: more firmly, as far as it goes" in page
+    assert "In the film: farther, as far as it goes" in page
 
 
 def test_a_film_of_somebody_s_own_setting_is_shown_to_them_alone(
