@@ -103,8 +103,8 @@ def somebody_does_everything(session: Session, store: ArtefactStore, study: Stud
         revision = len(session.scalars(said).all()) + 1
         answered = {"head_to_head_id": compared, "revision": revision, "client_uuid": f"{person.id}-h{revision}"}
         session.add(HeadToHeadAnswer(response="equal", by_script=True, **answered))
-        known = self_setting.newest(session, person.id)
-        revision = known.revision + 1 if known else 1
+        last = self_setting.newest(session, person.id)
+        revision = last.revision + 1 if last else 1
         uuid = f"{person.id}-s{revision}"
         mode = {"speed_far": 0.1, "press": 0.0}
         session.add(

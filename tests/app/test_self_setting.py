@@ -20,9 +20,10 @@ from app.domain.protocol import EvaluatedMethod, EvaluationMode, EvaluationSetti
 from app.domain.self_setting import PreviewFilm, SelfSetting
 from app.domain.studies import Participant, Study
 from app.services.evaluation import self_setting
-from app.services.evaluation.self_setting import MOST_REVISIONS, STOPS, Slider
+from app.services.evaluation.self_setting import STOPS, Slider
 from app.services.exports.export_tables import TABLES
 from app.services.participants import withdrawal
+from app.services.participants.sliders import MOST_REVISIONS
 from app.storage import ArtefactStore
 from app.web.texts import slider_words
 from app.web.texts.wording import Wording
@@ -51,7 +52,8 @@ class AtSliders:
     def move(self, *, uuid: UUID | None = None, script: bool = True, **changed: Any) -> Answer:
         """Let go of sliders (by axis), or with ``goes_on`` go on."""
         more = {name: changed.pop(name) for name in ("goes_on", "moved", "response_time_ms") if name in changed}
-        fields = {f"axis-{axis}": stop for axis, stop in {**MIDDLE, **changed}.items() if stop is not None}
+        stops: dict[str, Any] = MIDDLE | changed
+        fields = {f"axis-{axis}": stop for axis, stop in stops.items() if stop is not None}
         data = {"client_uuid": str(uuid or uuid4()), **fields, **more}
         return self.browser.post("/p/setting", data=data, headers=JSON if script else {})
 

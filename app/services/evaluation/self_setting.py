@@ -1,17 +1,16 @@
-"""A robot set with sliders: where its sliders can stand, what is saved of them, and which film shows a setting.
+"""A robot set with sliders: where its sliders can stand, and which film shows a setting.
 
 A slider has STOPS places on either side of the reference policy's own way, so an eighth of an axis' range lies between
 two of them; people tell two executions apart from about half of it (worker.compute.behaviours.DIFFERENT_ENOUGH).
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from http import HTTPStatus
 from typing import Any
-from uuid import UUID
 
 from sqlalchemy import or_, select
-from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
 from app.domain.participation import StageRecord
@@ -20,33 +19,18 @@ from app.domain.self_setting import PreviewFilm, SelfSetting
 from app.domain.studies import Participant, Study
 from app.errors import AppError
 from app.services.evaluation import evaluation_plan
-from app.services.participants import stages
 from app.storage import ArtefactStore
 
 STOPS = 4
 """Places of a slider on either side of the middle."""
-MOST_REVISIONS = 2000
-"""Of one participant; a browser gone wild is stopped there, and can still go on."""
 _SAME = 1e-6
 """Of an axis' range: settings that differ by less are one."""
-
-
-class SettingOver(AppError):
-    """You have gone on already, and the setting that you had then counts. Please go on with what you are shown."""
-
-    status = HTTPStatus.CONFLICT
 
 
 class SettingInvalid(AppError):
     """Some slider is missing, or stands where it cannot stand. Please reload the page and set the robot again."""
 
     status = HTTPStatus.UNPROCESSABLE_ENTITY
-
-
-class SettingChangedTooOften(AppError):
-    """The sliders were moved so often that no more is saved. Please go on with the setting as it is."""
-
-    status = HTTPStatus.CONFLICT
 
 
 @dataclass(frozen=True)
@@ -112,53 +96,6 @@ def mode_at(sliders: Sequence[Slider], stops: Mapping[str, int]) -> dict[str, fl
     return {each.name: each.value_at(stops[each.name]) for each in sliders}
 
 
-def save(
-    session: Session,
-    store: ArtefactStore,
-    participant: Participant,
-    stops: Mapping[str, int],
-    client_uuid: UUID,
-    *,
-    goes_on: bool,
-    moved: str | None = None,
-    response_time_ms: int | None = None,
-    by_script: bool = False,
-) -> None:
-    """Keep a setting; sent again, it is the same one. ``goes_on``: the person is content, and the stage is over.
-
-    The study is loaded. Raises SettingInvalid, SettingOver and SettingChangedTooOften.
-    """
-    session.scalar(select(Participant.id).where(Participant.id == participant.id).with_for_update())  # one at a time
-    if _was_sent(session, participant, client_uuid):
-        return
-    if stages.current_stage(session, participant) is not Stage.SELF_SETTING:
-        raise SettingOver
-    mode = mode_at(sliders_of(participant.study), stops)
-    known = newest(session, participant.id)
-    revision = known.revision + 1 if known else 1
-    if revision > MOST_REVISIONS and not goes_on:
-        raise SettingChangedTooOften
-    shown = preview_of(session, store, participant, mode)
-    row = SelfSetting(
-        participant_id=participant.id,
-        revision=revision,
-        mode=mode,
-        moved=moved if moved in mode else None,
-        filmed=shown is not None and shown.exact,
-        client_uuid=str(client_uuid),
-        response_time_ms=response_time_ms,
-        by_script=by_script,
-    )
-    try:
-        with session.begin_nested():
-            session.add(row)
-    except IntegrityError as error:  # the unique constraints are the last judge
-        if not _was_sent(session, participant, client_uuid):
-            raise SettingInvalid from error
-    if goes_on:
-        stages.finish(session, participant, Stage.SELF_SETTING)
-
-
 def preview_of(
     session: Session, store: ArtefactStore, participant: Participant, mode: Mapping[str, float]
 ) -> Preview | None:
@@ -186,7 +123,7 @@ def distance(sliders: Sequence[Slider], one: Mapping[str, float], other: Mapping
         for each in sliders
         if each.high > each.low
     )
-    return float(sum(share * share for share in shares)) ** 0.5
+    return math.sqrt(sum(share * share for share in shares))
 
 
 def are_same(sliders: Sequence[Slider], one: Mapping[str, float], other: Mapping[str, float]) -> bool:
@@ -205,11 +142,3 @@ def who_have_set(session: Session, study: Study) -> set[int]:
     through = select(StageRecord.participant_id).join(Participant, Participant.id == StageRecord.participant_id)
     through = through.where(Participant.study_id == study.id, StageRecord.stage == Stage.SELF_SETTING)
     return set(session.scalars(through.where(StageRecord.finished_at.is_not(None))))
-
-
-def _was_sent(session: Session, participant: Participant, client_uuid: UUID) -> bool:
-    """Whether this very setting is stored already. Raises SettingInvalid for somebody else's."""
-    known = session.scalar(select(SelfSetting).where(SelfSetting.client_uuid == str(client_uuid)))
-    if known is not None and known.participant_id != participant.id:
-        raise SettingInvalid
-    return known is not None

@@ -16,7 +16,7 @@ from app.domain.studies import Awaited, Participant
 from app.services.answers import next_query
 from app.services.evaluation import self_setting
 from app.services.evaluation.self_setting import Preview
-from app.services.participants import stages
+from app.services.participants import sliders, stages
 from app.storage import ArtefactStore
 from app.web.error_pages import wants_json
 from app.web.http.deps import StudioDep, Typed, WritingSession
@@ -70,7 +70,7 @@ def save_self_setting(
 ) -> Response:
     """Keep the setting; the transaction is committed before this response leaves."""
     form = _form(typed)
-    self_setting.save(
+    sliders.save(
         session,
         studio.store,
         participant,
@@ -116,18 +116,18 @@ def _form(typed: Mapping[str, str]) -> SettingForm:
 def _mode_of(session: Session, participant: Participant) -> dict[str, float]:
     """As it stands now: the last setting, or the reference policy's own way."""
     given = self_setting.newest(session, participant.id)
-    sliders = self_setting.sliders_of(participant.study)
-    stops = self_setting.stops_of(sliders, given.mode if given else {})
-    return self_setting.mode_at(sliders, stops) if sliders else {}
+    axes = self_setting.sliders_of(participant.study)
+    stops = self_setting.stops_of(axes, given.mode if given else {})
+    return self_setting.mode_at(axes, stops) if axes else {}
 
 
 def _for_script(
     request: Request, participant: Participant, mode: Mapping[str, float], preview: Preview | None
 ) -> dict[str, Any]:
     """The film to be shown, and where the sliders stand in it."""
-    sliders = self_setting.sliders_of(participant.study)
+    axes = self_setting.sliders_of(participant.study)
     if preview is None:
-        return {"film": None, "exact": False, "filmed": {}, "stops": self_setting.stops_of(sliders, mode)}
+        return {"film": None, "exact": False, "filmed": {}, "stops": self_setting.stops_of(axes, mode)}
     film = preview.film
     return {
         "film": {
@@ -135,17 +135,17 @@ def _for_script(
             "poster": request.app.url_path_for("show_poster", sha256=film.poster_sha256),
         },
         "exact": preview.exact,
-        "filmed": self_setting.stops_of(sliders, film.mode),
-        "stops": self_setting.stops_of(sliders, mode),
+        "filmed": self_setting.stops_of(axes, film.mode),
+        "stops": self_setting.stops_of(axes, mode),
     }
 
 
 def _sliders(request: Request, participant: Participant, mode: Mapping[str, float]) -> list[dict[str, Any]]:
     """What the page needs of each: its words, places, and what each place is called."""
     wording, found = wording_of(request, participant), []
-    sliders = self_setting.sliders_of(participant.study)
-    stops = self_setting.stops_of(sliders, mode)
-    for each in sliders:
+    axes = self_setting.sliders_of(participant.study)
+    stops = self_setting.stops_of(axes, mode)
+    for each in axes:
         words = slider_words.words_of(wording, participant.study.task, each.name)
         places = range(each.lowest, each.highest + 1)
         found.append(

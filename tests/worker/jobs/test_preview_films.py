@@ -29,6 +29,7 @@ from worker.jobs.runtime.context import WorkerContext
 from worker.ml.export.run_controller import Controller
 from worker.ml.filters.filter_module import FilterWeights
 from worker.scenarios import of_preview
+from worker.tasks import registry
 
 MODE = {"speed_far": 0.3, "speed_near": -0.6, "from_below": 0.0, "to_side": 0.6, "press": 0.0}
 
@@ -71,7 +72,7 @@ def settings_due(database: Database) -> list[str]:
 
 @pytest.mark.parametrize("task", ["feeding", "drinking", "scratching"])
 def test_films_ahead_show_every_slider_alone_and_fill_the_space_between(task: str) -> None:
-    family = simulation.task(task).modes
+    family = registry.task(task).modes
     modes = preview_plan.modes(family)
     low, high = (np.array([getattr(axis, end) for axis in family.axes]) for end in ("low", "high"))
     assert modes.shape == (preview_plan.COUNT, len(family.axes))
@@ -103,7 +104,7 @@ def test_films_are_made_ahead_once_with_the_axes_of_the_task(
         known = session.get_one(Study, study.id)
         films = session.scalars(select(PreviewFilm).order_by(PreviewFilm.number)).all()
         assert preview_films.due_ahead(session, known) == []
-    assert [each.name for each in self_setting.sliders_of(known)] == list(simulation.task("feeding").modes.names)
+    assert [each.name for each in self_setting.sliders_of(known)] == list(registry.task("feeding").modes.names)
     assert [set(film.mode.values()) for film in films] == [{0.0}, {0.0, -0.5}]
     assert all(context.store.has(film.video_sha256) for film in films)
 
@@ -116,7 +117,7 @@ def test_the_newest_setting_of_whoever_is_at_the_sliders_is_filmed(
     settle(context.database, study, methods=("pbarl", "self_set"))
     assert settings_due(context.database) == []
     with context.database.writing() as session:
-        axes = {axis.name: [axis.low, axis.high] for axis in simulation.task("feeding").modes.axes}
+        axes = {axis.name: [axis.low, axis.high] for axis in registry.task("feeding").modes.axes}
         session.get_one(Study, study.id).mode_axes = axes
     set_robot(context.database, participant, {**MODE, "press": 0.4}, finished=False)
     setting = set_robot(context.database, participant, MODE, finished=False)

@@ -20,6 +20,7 @@ from worker.jobs.clips.stored_video import video_columns
 from worker.jobs.runtime.context import Step, WorkerContext
 from worker.jobs.runtime.records import Job
 from worker.scenarios import of_preview
+from worker.tasks import registry
 
 BATCH = 8
 """Films of one job; filmed AT_A_TIME, so that somebody's own setting need not wait for all."""
@@ -77,7 +78,7 @@ def make(context: WorkerContext, job: Job, run_id: int, step: Step) -> None:
 def _film_ahead(context: WorkerContext, run_id: int, study_id: int, numbers: list[int]) -> None:
     with context.database.reading() as session:
         study = session.get_one(Study, study_id)
-    family = simulation.task(study.task).modes
+    family = registry.task(study.task).modes
     planned = preview_plan.modes(family)
     wanted = [(number, family.named(planned[number])) for number in numbers]
     films = _filmed(context, run_id, study, [mode for _, mode in wanted])
