@@ -51,7 +51,9 @@ class AtSliders:
 
     def move(self, *, uuid: UUID | None = None, script: bool = True, **changed: Any) -> Answer:
         """Let go of sliders (by axis), or with ``goes_on`` go on."""
-        more = {name: changed.pop(name) for name in ("goes_on", "moved", "response_time_ms") if name in changed}
+        more: dict[str, Any] = {
+            name: changed.pop(name) for name in ("goes_on", "moved", "response_time_ms") if name in changed
+        }
         stops: dict[str, Any] = {**MIDDLE, **changed}
         fields = {f"axis-{axis}": stop for axis, stop in stops.items() if stop is not None}
         data: dict[str, Any] = {"client_uuid": str(uuid or uuid4()), **fields, **more}

@@ -38,7 +38,7 @@ CLIPS_AHEAD = 2
 """Scenarios per study in the making at a time: enough to keep busy, few enough that studies share fairly."""
 
 RETRY_AFTER = timedelta(seconds=10)
-_ONE_AT_A_TIME = (RunKind.REWARD, RunKind.FILTER)
+_ONE_AT_A_TIME = (RunKind.REWARD, RunKind.FILTER, RunKind.CLIPS)
 """Of one participant: the next one waits, and has then seen more."""
 _AT_WORK = (Study.deleted_at.is_(None), Study.put_away_at.is_(None))
 
@@ -59,6 +59,7 @@ def due(session: Session, lost: Mapping[str, int] | None = None) -> Iterator[tup
     known = session.execute(select(Run.workflow_id, Run.status, Run.attempt, Run.finished_at))
     runs = {name: _Attempted(status, attempt, finished) for name, status, attempt, finished in known}
     learning = select(Run.participant_id, Run.kind).where(Run.kind.in_(_ONE_AT_A_TIME), Run.status == RunStatus.RUNNING)
+    learning = learning.where(Run.participant_id.is_not(None))
     at_work = {(person, kind) for person, kind in session.execute(learning.where(~_is_silent()))}
     succeeded = {name for name, run in runs.items() if run.status == RunStatus.SUCCEEDED}
     for study in session.scalars(select(Study).where(Study.deleted_at.is_(None)).order_by(Study.id)).all():

@@ -25,6 +25,7 @@ from worker.jobs.clips import preview_films
 from worker.jobs.clips.evaluation_films import make_films
 from worker.jobs.clips.pool_clips import build_clips
 from worker.jobs.learning.baselines import train_method
+from worker.jobs.runtime import records
 from worker.jobs.runtime.context import WorkerContext
 from worker.ml.export.run_controller import Controller
 from worker.ml.filters.filter_module import FilterWeights
@@ -123,6 +124,12 @@ def test_the_newest_setting_of_whoever_is_at_the_sliders_is_filmed(
     setting = set_robot(context.database, participant, MODE, finished=False)
     assert settings_due(context.database) == [f"clips/participant-{participant.id}/setting-{setting.id}"]
     (job,) = (job for job in due(context.database, RunKind.CLIPS) if job.about.subject == "setting")
+    with context.database.writing() as session:
+        records.begin_run(session, job, seed=1)
+    later = set_robot(context.database, participant, {**MODE, "press": 0.4}, finished=False)
+    assert settings_due(context.database) == [], "one at a time, so that the next one is the newest"
+    with context.database.writing() as session:
+        session.delete(session.get_one(SelfSetting, later.id))
     done(context, job, build_clips)
     assert settings_due(context.database) == []
     with context.database.reading() as session:
