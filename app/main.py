@@ -54,6 +54,7 @@ from app.web.participant import (
     joining,
     pairs,
     scales,
+    self_setting,
     withdrawal,
 )
 from app.web.texts import languages
@@ -72,6 +73,7 @@ PARTICIPANT_PARTS = (
     forms,
     evaluation,
     head_to_heads,
+    self_setting,
     finish,
     withdrawal,
     entry,

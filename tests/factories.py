@@ -21,6 +21,7 @@ from app.domain.models import Bundle, Model, ModelKind, Run, RunKind, RunStatus
 from app.domain.people import Experimenter, Role, StudyRole
 from app.domain.preferences import LabelEvent, Query, Response
 from app.domain.protocol import EvaluationMode, Stage
+from app.domain.self_setting import PreviewFilm
 from app.domain.studies import Participant, Study
 from app.domain.study_settings import StudySettings
 from app.services.evaluation import evaluation_plan
@@ -31,6 +32,8 @@ from app.storage import ArtefactStore
 FPS = 10
 FRAMES = 20
 WIDTH, HEIGHT = 320, 240
+AXES = {"speed_far": [-0.5, 0.4], "press": [-0.4, 0.4], "hesitate": [0.0, 0.6]}
+"""Of make_previews: the last one has one direction."""
 
 
 def make_study(session: Session, name: str = "Feeding at home", **settings: Any) -> Study:
@@ -249,6 +252,28 @@ def make_robots(session: Session, store: ArtefactStore, study: Study, participan
     return trials
 
 
+def make_previews(session: Session, store: ArtefactStore, study: Study, modes: Sequence[dict[str, float]]) -> None:
+    """What people who set a robot themselves are shown: the axes, and a film of each of these modes."""
+    study.mode_axes = dict(AXES)
+    for number, mode in enumerate(modes):
+        video, poster = moving_picture(number)
+        session.add(
+            PreviewFilm(
+                study_id=study.id,
+                number=number,
+                mode=dict.fromkeys(AXES, 0.0) | mode,
+                video_sha256=store.put(video),
+                poster_sha256=store.put(poster),
+                width=WIDTH,
+                height=HEIGHT,
+                fps=FPS,
+                duration_ms=1000 * FRAMES // FPS,
+                byte_count=len(video),
+            )
+        )
+    session.flush()
+
+
 def rate_everything(session: Session, trials: Sequence[Trial]) -> None:
     """A rating of each of these."""
     for trial in trials:
@@ -275,7 +300,7 @@ def finish_everything(session: Session, participant: Participant, study: Study) 
         make_label(session, query)
     if study.settings.evaluation is not None:
         make_rated_trials(session, participant, study.settings.evaluation.trial_count)
-    for stage in (Stage.DEMOGRAPHICS, Stage.QUESTIONNAIRE, Stage.DEBRIEF):
+    for stage in (Stage.SELF_SETTING, Stage.DEMOGRAPHICS, Stage.QUESTIONNAIRE, Stage.DEBRIEF):
         stages.finish(session, participant, stage)
         session.flush()
 

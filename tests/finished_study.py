@@ -14,6 +14,7 @@ from app.domain.models import ModelKind
 from app.domain.participation import ConsentRecord, FormAnswer, ParticipantEvent, StageRecord
 from app.domain.preferences import Purpose, Query, Response
 from app.domain.protocol import EvaluatedMethod, EvaluationSettings
+from app.domain.self_setting import SelfSetting
 from app.domain.studies import Participant, Study
 from app.questionnaires import library
 from app.services.answers import form_answers
@@ -123,6 +124,17 @@ def _rate(session: Session, study: Study, person: Participant, random: Random) -
             session.add(_rating(trial, 2, scores[0], 6 - scores[1]))
     for letter, method in methods.items():
         _fill_in(session, person, letter, MEANS[method])
+    session.add(
+        SelfSetting(
+            participant_id=person.id,
+            revision=1,
+            mode={"speed_far": -0.25, "press": 0.0},
+            moved="speed_far",
+            filmed=True,
+            client_uuid=str(uuid5(NAMESPACE_URL, f"setting/{person.id}")),
+            by_script=True,
+        )
+    )
     for each in head_to_heads.of_participant(session, person.id):
         each.shown_at = now()
         left, right = (MEANS[methods[trial.letter]] for trial in (each.left_trial, each.right_trial))

@@ -136,6 +136,7 @@ RUN: dict[str, str | Elsewhere | OnlyParsed] = {
     "rooms": Elsewhere("tests/architecture/test_rooms.py::test_the_picture_of_the_rooms_is_up_to_date"),
     "rounds": "1",
     "same_bits": OnlyParsed("trains every method; docs/results/same_bits.txt is what it prints"),
+    "sliders": OnlyParsed("moves the sliders of a running studio; tests/app/test_self_setting.py has what it sends"),
     "save_latency": "52 1",  # beyond the first break
     "sim_speed": "--resets 1 --episodes 1",
 }

@@ -21,6 +21,8 @@ RESIDUAL = range(3_000_000, 4_000_000)
 """Rollouts from which the residual and the printed encoder learn."""
 EVALUATION = range(4_000_000, 5_000_000)
 """What is reported of a filter."""
+PREVIEW = range(6_900_000, 7_000_000)
+"""What people watch who set a robot themselves. Every study has one."""
 PROMISE = range(7_000_000, 9_000_000)
 """Whether the promise about harm can be made of a filter. Every study has its own."""
 PROMISE_TEST = range(9_000_000, 10_000_000)
@@ -45,6 +47,11 @@ def of_pool(study_seed: int, index: int) -> int:
     """The scenario at one place of a study's pool."""
     pools = len(POOL) // _POOL_OF_A_STUDY
     return POOL.start + study_seed % pools * _POOL_OF_A_STUDY + index
+
+
+def of_preview(study_seed: int) -> int:
+    """The scenario of a study's previews."""
+    return PREVIEW[study_seed % len(PREVIEW)]
 
 
 def of_promise(study_seed: int) -> range:

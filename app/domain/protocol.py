@@ -25,6 +25,7 @@ class Stage(StrEnum):
     INSTRUCTIONS = "instructions"
     PRACTICE = "practice"
     PAIRS = "pairs"
+    SELF_SETTING = "self_setting"
     EVALUATION = "evaluation"
     QUESTIONNAIRE = "questionnaire"
     DEBRIEF = "debrief"
@@ -63,6 +64,11 @@ class EvaluatedMethod(Choice):
         "The personal filter of another participant, drawn by lot; of a usual type of user while there is none.",
     )
     AVERAGE = "average", "Average", "One filter for everybody, of what earlier participants want on average."
+    SELF_SET = (
+        "self_set",
+        "Set by yourself",
+        "The ways of moving that the participant chose with sliders, after comparing; no promise about harm is made.",
+    )
 
 
 STANDARD_QUESTIONNAIRES = tuple((each.name, each.title, each.about) for each in library.every().values())
@@ -200,7 +206,8 @@ class EvaluationSettings(BaseModel):
         if self.ask_which_is_theirs and set(self.methods) - of_others != {EvaluatedMethod.PBARL}:
             raise ValueError(
                 "Which robot was made for somebody can be asked only where one was: choose PbARL, and beside it only "
-                "the reference, somebody else's filter or the average."
+                "the reference, somebody else's filter or the average. A robot that people set themselves is theirs "
+                "as well."
             )
         return self
 
@@ -215,6 +222,11 @@ class EvaluationSettings(BaseModel):
     def shows_others(self) -> bool:
         """Whether people are shown what others have taught."""
         return any(method in FROM_OTHERS for method in self.methods)
+
+    @property
+    def has_sliders(self) -> bool:
+        """Whether people set a robot themselves."""
+        return EvaluatedMethod.SELF_SET in self.methods
 
     @property
     def trial_count(self) -> int:

@@ -2,6 +2,8 @@
 
 clips/study-1/scenario-17                       the clips of a scenario of the pool
 clips/study-1/whole-17                          its whole episodes, for the introduction
+clips/study-1/preview-2                         films ahead for people who set a robot themselves, the third batch
+clips/participant-3/setting-17                  a film of somebody's setting 17
 clips/study-1/again-5-1763811000                lost files of rollout 5, lost at that moment
 reward/participant-3/labels-20                  a reward model of 20 labels
 reward/participant-3/labels-200/answer-345      of all labels, the last of them answer 345
@@ -19,9 +21,16 @@ from dataclasses import dataclass, replace
 
 from app.domain.models import RunKind
 
-ROWS = {"answer": "label_event", "exclusion": "exclusion", "clips/again": "rollout", "films/again": "film"}
+ROWS = {
+    "answer": "label_event",
+    "exclusion": "exclusion",
+    "clips/again": "rollout",
+    "clips/setting": "self_setting",
+    "films/again": "film",
+}
 """Tables whose ids stand in keys, by what they stand behind."""
 SCENARIO, WHOLE, AGAIN = "scenario", "whole", "again"
+PREVIEW, SETTING = "preview", "setting"
 BEFORE_AFTER, TRIALS, CONTROLLERS = "before-after", "trials", "controllers"
 BASIS = "basis"
 

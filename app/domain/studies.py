@@ -57,6 +57,9 @@ class Study(Base):
     unblinded_at: Mapped[datetime | None]
     key_secret: Mapped[str] = mapped_column(String(64), default=new_key_secret)
     """Decides which letter hides which method. Shown to nobody before the study is unblinded."""
+    mode_axes: Mapped[dict[str, Any] | None]
+    """The ways in which the task's executions differ, as the worker knows them: name -> [low, high], in their order; 0
+    is the reference policy's own way. None until the first preview is filmed."""
     put_away_at: Mapped[datetime | None]
     """Since then the study is not in the list, takes nobody in, and the worker does nothing for it."""
     deleted_at: Mapped[datetime | None]
@@ -101,6 +104,7 @@ class Awaited(StrEnum):
     """What a waiting page waits for."""
 
     PAIR = "pair"
+    PREVIEW = "preview"
     ROBOTS = "robots"
     DEBRIEF = "debrief"
 

@@ -69,6 +69,17 @@ class Words(BaseModel):
     """Always 0 in this task; a weight of them says nothing."""
 
 
+class SliderWords(BaseModel):
+    """What participants read beside the slider of one axis."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    label: Word
+    low: Word
+    """its left end, the negative values; where there are none it is not shown"""
+    high: Word
+
+
 class DescribedTask(BaseModel):
     """What both ways to describe a task say: a folder of code with ``task.toml``, and a ``lab.toml``."""
 
@@ -83,6 +94,9 @@ class DescribedTask(BaseModel):
     words: Words
     instructions: dict[LanguageCode, Text]
     """What participants read of the task, by language; an empty line makes a paragraph."""
+    sliders: dict[str, dict[LanguageCode, SliderWords]] = {}
+    """What participants who set a robot themselves read beside the slider of an axis, by axis and language; where it is
+    missing, the words that all tasks share."""
 
     @model_validator(mode="after")
     def _shown_within_the_episode(self) -> Self:

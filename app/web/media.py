@@ -13,6 +13,7 @@ from sqlalchemy.orm import Session
 from app.domain.clips import Clip, Rollout
 from app.domain.evaluation import Film
 from app.domain.people import Experimenter
+from app.domain.self_setting import PreviewFilm, SelfSetting
 from app.domain.studies import Participant, Study
 from app.errors import AppError
 from app.services.accounts import browser_sessions
@@ -38,6 +39,16 @@ class ClipNotFound(AppError):
 _SHA256 = bindparam("sha256", type_=String)
 _CLIP = select(Clip.id).join(Rollout).where(or_(Clip.video_sha256 == _SHA256, Clip.poster_sha256 == _SHA256)).limit(1)
 _FILM = select(Film.id).where(or_(Film.video_sha256 == _SHA256, Film.poster_sha256 == _SHA256)).limit(1)
+_PREVIEW = (
+    select(PreviewFilm.id)
+    .outerjoin(SelfSetting, SelfSetting.id == PreviewFilm.self_setting_id)
+    .where(
+        or_(PreviewFilm.video_sha256 == _SHA256, PreviewFilm.poster_sha256 == _SHA256),
+        PreviewFilm.study_id == bindparam("study_id"),
+        or_(PreviewFilm.self_setting_id.is_(None), SelfSetting.participant_id == bindparam("participant_id")),
+    )
+    .limit(1)
+)
 _CLIP_OF_STUDY = _CLIP.where(Rollout.study_id == bindparam("study_id"))
 _FILM_OF_PARTICIPANT = _FILM.where(Film.participant_id == bindparam("participant_id"))
 
@@ -55,7 +66,8 @@ async def show_poster(request: Request, sha256: Sha256, studio: StudioDep) -> Re
 
 
 def _require_may_watch(request: Request, session: Session, sha256: str) -> None:
-    """A participant may watch clips of their own study and their own films, an experimenter those of their studies.
+    """A participant may watch clips and previews of their own study and their own films, an experimenter clips and
+    films of theirs.
 
     Raises ClipNotFound.
     """
@@ -69,6 +81,7 @@ def _looked_for(request: Request, session: Session) -> Iterator[tuple[Select[int
         whose = {"study_id": participant.study_id, "participant_id": participant.id}
         yield _CLIP_OF_STUDY, whose
         yield _FILM_OF_PARTICIPANT, whose
+        yield _PREVIEW, whose
     experimenter = _experimenter(request, session)
     if experimenter is not None:
         theirs = select(Study.id).where(membership.visible_to(experimenter))

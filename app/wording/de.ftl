@@ -22,6 +22,7 @@ consent-body =
     - Sie vergleichen { $count } Paare. Machen Sie so viele Pausen, wie Sie möchten, auch tagelange: Ihr Link bringt Sie dorthin zurück, wo Sie waren.
     - Gespeichert werden Ihre Antworten, wann Sie sie gegeben haben und wie lange Sie dafür gebraucht haben, unter dem Kürzel { $code }. Wir fragen nicht nach Ihrem Namen und benutzen weder Kamera noch Mikrofon. Wenn Sie über ein Teilnahmeportal kommen, speichern wir auch die Kennung, unter der Sie dort geführt werden.
     - Die Teilnahme ist freiwillig. Sie können jederzeit ohne Angabe von Gründen aufhören: Schließen Sie einfach die Seite. Wenn Sie unten auf einer Seite „Teilnahme widerrufen“ wählen, wird alles über Sie gelöscht.
+consent-setting = Nach dem Vergleichen stellen Sie selbst einen Roboter mit Reglern ein. Wir speichern, was Sie einstellen, und daraus entsteht dieser Roboter.
 consent-others = Zum Schluss bewerten Sie mehrere Roboter. Darunter können Roboter sein, die von anderen Menschen gelernt haben, und der Roboter, der von Ihnen gelernt hat, kann anderen gezeigt werden. Von wem ein Roboter gelernt hat, erfährt niemand, der ihn bewertet. Wenn Sie Ihre Teilnahme widerrufen, bekommt niemand Ihren Roboter neu zu sehen; wer schon angefangen hat, ihn zu bewerten, sieht ihn weiterhin. Auf Sie zurückführen lässt er sich dann nicht mehr.
 consent-duration = Dauer: { $duration }
 consent-payment = Vergütung: { $payment }
@@ -225,6 +226,9 @@ error-trial-not-shown = Diesen Roboter haben Sie noch nicht gesehen. Bitte mache
 error-rated-already = Diesen Roboter haben Sie schon bewertet, und diese Bewertung zählt. Ihre letzte Bewertung können Sie noch ändern.
 error-correction-too-late = Nur die letzte Bewertung lässt sich ändern, und dies ist eine frühere.
 error-rating-misdirected = Diese Bewertung wurde schon zu einem anderen Roboter abgegeben. Bitte laden Sie die Seite neu und bewerten Sie noch einmal.
+error-setting-over = Sie sind schon weitergegangen, und es gilt die Einstellung, die Sie dabei hatten.
+error-setting-invalid = Ein Regler fehlt oder steht, wo er nicht stehen kann. Bitte laden Sie die Seite neu und stellen Sie den Roboter noch einmal ein.
+error-setting-changed-too-often = Die Regler wurden so oft verschoben, dass nichts mehr gespeichert wird. Bitte gehen Sie mit der Einstellung weiter, wie sie ist.
 error-foreign-form = Diese Anfrage kam von einer anderen Website und wurde abgelehnt. Bitte benutzen Sie die Seiten dieser Website.
 error-page-not-found = Unter dieser Adresse gibt es keine Seite. Wenn ein Link Sie hierher geführt hat, prüfen Sie bitte, ob er vollständig ist.
 error-not-understood = In diesem Formular fehlt etwas, oder etwas ist nicht gültig. Bitte gehen Sie zurück und prüfen Sie es.
@@ -397,6 +401,62 @@ head-to-head-done =
         [one] Auch Ihr direkter Vergleich ist sicher gespeichert.
        *[other] Auch Ihre { $count } direkten Vergleiche sind sicher gespeichert.
     }
+
+## Einen Roboter mit Reglern einstellen (Vorsilbe setting-)
+
+setting-title = Stellen Sie selbst einen Roboter ein
+setting-lead = Verschieben Sie die Regler, bis der Roboter die Aufgabe so ausführt, wie es Ihnen am besten gefällt. Sobald Sie einen Regler loslassen, folgt der Film.
+setting-film = Der Roboter mit diesen Reglern
+setting-exact = Der Film zeigt genau Ihre Einstellung.
+setting-near = Der Film zeigt von den gefilmten Einstellungen die, die Ihrer am nächsten kommt. Ihre wird gerade gefilmt und erscheint von selbst.
+setting-filmed = Im Film: { $place }
+setting-sliders = Regler
+setting-middle = in der Mitte, unverändert
+setting-unchanged = unverändert
+setting-place = { $end }, { $degree }
+setting-degree-1 = ein wenig
+setting-degree-2 = merklich
+setting-degree-3 = deutlich
+setting-degree-4 = so weit es geht
+setting-less = weniger
+setting-more = mehr
+setting-reset = Alle unverändert
+setting-show = Film zeigen
+setting-go-on = Diese Einstellung behalten und weiter
+setting-final = Ihre Einstellung wird gespeichert, während Sie die Regler verschieben. Sobald Sie weitergehen, lässt sie sich nicht mehr ändern.
+setting-saved = Gespeichert.
+setting-refused = Das wurde nicht gespeichert, weil Sie schon weitergegangen sind. Die Seite wird neu geladen …
+setting-waiting-title = Die Regler werden vorbereitet
+setting-waiting-text = Als Nächstes stellen Sie selbst einen Roboter ein, und ein Film zeigt, was jeder Regler bewirkt. Die Filme entstehen noch.
+setting-waiting-close = Sie können diese Seite schließen: Ihre Antworten sind sicher gespeichert, und Ihr Link führt Sie hierher zurück. Wenn Sie die Seite geöffnet lassen, geht es hier automatisch weiter.
+setting-speed_far = Tempo unterwegs
+setting-speed_far-low = langsamer
+setting-speed_far-high = schneller
+setting-speed_near = Tempo nahe am Ziel
+setting-speed_near-low = langsamer
+setting-speed_near-high = schneller
+setting-speed_early = Tempo am Anfang
+setting-speed_early-low = langsamer
+setting-speed_early-high = schneller
+setting-speed_late = Tempo gegen Ende
+setting-speed_late-low = langsamer
+setting-speed_late-high = schneller
+setting-smooth = Gleichmäßigkeit der Bewegung
+setting-smooth-low = weniger gleichmäßig
+setting-smooth-high = gleichmäßiger
+setting-hesitate = Verweilen kurz vor dem Ziel
+setting-hesitate-low = kürzer
+setting-hesitate-high = länger
+setting-from_below = Höhe, aus der er kommt
+setting-from_below-low = mehr von oben
+setting-from_below-high = mehr von unten
+setting-to_side = Seite, von der er kommt
+setting-to_side-low = mehr von rechts
+setting-to_side-high = mehr von links
+setting-press = Druck
+setting-press-low = sanfter
+setting-press-high = fester
+setting-push = Unterwegs in Richtung { $name } gedrückt
 
 ## Vorschau
 

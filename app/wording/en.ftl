@@ -24,6 +24,7 @@ consent-body =
     - You compare { $count } pairs. Take as many breaks as you like, even for days: your link brings you back to where you were.
     - We store your answers, when you gave them and how long you took, under the code { $code }. We do not ask for your name, and we use neither camera nor microphone. If a recruitment panel sent you here, we also keep the ID it uses for you.
     - Taking part is voluntary. You may stop at any time without giving a reason: just close the page. If you choose “Withdraw from the study” at the foot of a page, everything about you is erased.
+consent-setting = After comparing you set a robot yourself with sliders. We store what you set, and the robot is made from it.
 consent-others = At the end you rate several robots. Some of them may have learned from other people, and other people may be shown the robot that learned from you. Nobody who rates a robot is told whom it learned from. If you withdraw, nobody new is shown yours; whoever has begun to rate it goes on seeing it, and it can no longer be traced back to you.
 consent-duration = Duration: { $duration }
 consent-payment = Payment: { $payment }
@@ -230,6 +231,9 @@ error-trial-not-shown = You have not seen this robot yet. Please go on with the 
 error-rated-already = You have already rated this robot, and that rating counts. You can still change your last rating.
 error-correction-too-late = Only the last rating can be changed, and this is an earlier one.
 error-rating-misdirected = This rating was already given to another robot. Please reload the page and rate again.
+error-setting-over = You have gone on already, and the setting you had then counts.
+error-setting-invalid = Some slider is missing, or stands where it cannot stand. Please reload the page and set the robot again.
+error-setting-changed-too-often = The sliders were moved so often that no more is saved. Please go on with the setting as it is.
 error-foreign-form = This request came from another website and was refused. Please use the pages of this site.
 error-page-not-found = There is no page at this address. If a link brought you here, please check that it is complete.
 error-not-understood = Something on this form is missing or not valid. Please go back and check it.
@@ -402,6 +406,62 @@ head-to-head-done =
         [one] Your comparison is safely stored, too.
        *[other] Your { $count } comparisons are safely stored, too.
     }
+
+## Setting a robot with sliders (prefix setting-)
+
+setting-title = Set a robot yourself
+setting-lead = Move the sliders until the robot does the task the way you like it best. Each time you let one go, the film follows.
+setting-film = The robot with these sliders
+setting-exact = The film shows exactly your setting.
+setting-near = The film shows the setting nearest to yours that has been filmed. Yours is being filmed and will appear by itself.
+setting-filmed = In the film: { $place }
+setting-sliders = Sliders
+setting-middle = in the middle, unchanged
+setting-unchanged = unchanged
+setting-place = { $end }, { $degree }
+setting-degree-1 = a little
+setting-degree-2 = noticeably
+setting-degree-3 = clearly
+setting-degree-4 = as far as it goes
+setting-less = less
+setting-more = more
+setting-reset = All unchanged
+setting-show = Show the film
+setting-go-on = Keep this setting and go on
+setting-final = Your setting is saved as you move the sliders. Once you go on it can no longer be changed.
+setting-saved = Saved.
+setting-refused = This was not saved, because you have gone on already. The page is loading again …
+setting-waiting-title = The sliders are being prepared
+setting-waiting-text = Next you set a robot yourself, and a film shows what each slider does. The films are still being made.
+setting-waiting-close = You may close this page: your answers are safely stored, and your link brings you back here. If you leave the page open, it continues by itself.
+setting-speed_far = Speed on the way
+setting-speed_far-low = slower
+setting-speed_far-high = faster
+setting-speed_near = Speed close to the goal
+setting-speed_near-low = slower
+setting-speed_near-high = faster
+setting-speed_early = Speed at first
+setting-speed_early-low = slower
+setting-speed_early-high = faster
+setting-speed_late = Speed towards the end
+setting-speed_late-low = slower
+setting-speed_late-high = faster
+setting-smooth = Evenness of the motion
+setting-smooth-low = less even
+setting-smooth-high = more even
+setting-hesitate = Lingering just before it arrives
+setting-hesitate-low = shorter
+setting-hesitate-high = longer
+setting-from_below = Height from which it comes
+setting-from_below-low = more from above
+setting-from_below-high = more from below
+setting-to_side = Side from which it comes
+setting-to_side-low = more from your right
+setting-to_side-high = more from your left
+setting-press = Pressure
+setting-press-low = more gently
+setting-press-high = more firmly
+setting-push = Pushed along { $name } on the way
 
 ## Preview by an experimenter
 

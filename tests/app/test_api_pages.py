@@ -20,9 +20,10 @@ from app.domain.participation import ConsentRecord, FormAnswer, ParticipantEvent
 from app.domain.people import AuditEvent, Experimenter
 from app.domain.preferences import LabelEvent, Query, Response
 from app.domain.protocol import EvaluatedMethod
+from app.domain.self_setting import SelfSetting
 from app.domain.studies import Deviation, Participant, Study
 from app.services.accounts import api_tokens
-from app.services.evaluation import donors
+from app.services.evaluation import donors, self_setting
 from app.services.exports import export_tables
 from app.services.participants import withdrawal
 from app.storage import ArtefactStore
@@ -102,6 +103,15 @@ def somebody_does_everything(session: Session, store: ArtefactStore, study: Stud
         revision = len(session.scalars(said).all()) + 1
         answered = {"head_to_head_id": compared, "revision": revision, "client_uuid": f"{person.id}-h{revision}"}
         session.add(HeadToHeadAnswer(response="equal", by_script=True, **answered))
+        last = self_setting.newest(session, person.id)
+        revision = last.revision + 1 if last else 1
+        uuid = f"{person.id}-s{revision}"
+        mode = {"speed_far": 0.1, "press": 0.0}
+        session.add(
+            SelfSetting(
+                participant_id=person.id, revision=revision, mode=mode, filmed=True, client_uuid=uuid, by_script=True
+            )
+        )
         donors.draw(session, study, person, EvaluatedMethod.AVERAGE, ("cautious",))
     factories.make_participant(session, study)
     session.add(Deviation(study_id=study.id, actor="pat", reason="later", before={}, after={}))

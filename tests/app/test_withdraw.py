@@ -24,6 +24,7 @@ from app.domain.models import Export, Model, ModelKind, Report, RunKind
 from app.domain.participation import ConsentRecord, FormAnswer, ParticipantEvent, StageRecord
 from app.domain.people import AuditEvent
 from app.domain.preferences import Exclusion, LabelEvent
+from app.domain.self_setting import PreviewFilm, SelfSetting
 from app.domain.studies import Participant, Study
 from app.services.participants import withdrawal
 from app.settings import Settings
@@ -99,6 +100,32 @@ def leave_traces(database: Database, store: ArtefactStore, participant_id: int) 
                 reason=marked("why"),
                 client_uuid=marked("head-to-head")[:36],
                 by_script=True,
+            )
+        )
+        factories.make_previews(session, store, study, [{}])
+        chosen = SelfSetting(
+            participant_id=person.id,
+            revision=1,
+            mode={marked("axis"): 0.1},
+            filmed=False,
+            client_uuid=marked("setting")[:36],
+            by_script=True,
+        )
+        session.add(chosen)
+        session.flush()
+        session.add(
+            PreviewFilm(
+                study_id=study.id,
+                self_setting_id=chosen.id,
+                number=0,
+                mode=chosen.mode,
+                video_sha256=store.put(marked("preview").encode()),
+                poster_sha256=store.put(marked("preview-poster").encode()),
+                width=1,
+                height=1,
+                fps=1,
+                duration_ms=1,
+                byte_count=1,
             )
         )
         report_run = factories.make_run(session, study, kind=RunKind.REPORT, stage=marked("report-run"))

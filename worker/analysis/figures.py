@@ -31,6 +31,7 @@ NAMES = {
     "pbarl_printed": "PbARL as printed",
     "somebody_else": "Somebody else's filter",
     "average": "Average filter",
+    "self_set": "Set by the person",
 }
 COST_NAMES = {
     "C_d": "Distance (C_d)",

@@ -19,9 +19,9 @@ from app.domain.models import Run, RunKind, RunStatus
 from app.domain.preferences import LabelEvent, Query, count_labels
 from app.domain.run_keys import SCENARIO, WHOLE, RunKey
 from app.domain.studies import Participant, Study
-from app.services.evaluation import evaluation_plan
+from app.services.evaluation import evaluation_plan, self_setting
 from worker import scenarios
-from worker.jobs.clips import repairs
+from worker.jobs.clips import preview_films, repairs
 from worker.jobs.publishing import export_files, report_files
 from worker.jobs.runtime import due_evaluation
 from worker.jobs.runtime.due_work import (
@@ -38,7 +38,7 @@ CLIPS_AHEAD = 2
 """Scenarios per study in the making at a time: enough to keep busy, few enough that studies share fairly."""
 
 RETRY_AFTER = timedelta(seconds=10)
-_ONE_AT_A_TIME = (RunKind.REWARD, RunKind.FILTER)
+_ONE_AT_A_TIME = (RunKind.REWARD, RunKind.FILTER, RunKind.CLIPS)
 """Of one participant: the next one waits, and has then seen more."""
 _AT_WORK = (Study.deleted_at.is_(None), Study.put_away_at.is_(None))
 
@@ -59,6 +59,7 @@ def due(session: Session, lost: Mapping[str, int] | None = None) -> Iterator[tup
     known = session.execute(select(Run.workflow_id, Run.status, Run.attempt, Run.finished_at))
     runs = {name: _Attempted(status, attempt, finished) for name, status, attempt, finished in known}
     learning = select(Run.participant_id, Run.kind).where(Run.kind.in_(_ONE_AT_A_TIME), Run.status == RunStatus.RUNNING)
+    learning = learning.where(Run.participant_id.is_not(None))
     at_work = {(person, kind) for person, kind in session.execute(learning.where(~_is_silent()))}
     succeeded = {name for name, run in runs.items() if run.status == RunStatus.SUCCEEDED}
     for study in session.scalars(select(Study).where(Study.deleted_at.is_(None)).order_by(Study.id)).all():
@@ -73,6 +74,7 @@ def due(session: Session, lost: Mapping[str, int] | None = None) -> Iterator[tup
 
 
 def _all_due(session: Session, study: Study, succeeded: Collection[str]) -> Iterator[Job]:
+    yield from preview_films.due_now(session, study)
     yield from _missing_clips(session, study)
     yield from _stale_models(session, study, succeeded)
     yield from report_files.due(session, study)
@@ -156,7 +158,7 @@ def _attempt_due(run: _Attempted | None, moment: datetime) -> int | None:
 
 
 def _missing_clips(session: Session, study: Study) -> list[Job]:
-    """Clips of every scenario; of the first ones also whole episodes, as soon as they were rolled out."""
+    """Clips of every scenario; of the first ones also whole episodes, once they were rolled out; then previews."""
     if study.material is not None:
         return []  # brought along by the study
     settings, jobs = study.settings, []
@@ -168,7 +170,7 @@ def _missing_clips(session: Session, study: Study) -> list[Job]:
             jobs.append(Job(RunKey(RunKind.CLIPS, study.id, subject=SCENARIO, number=seed), study.id))
         elif index < settings.introduction_scenarios and whole.get(seed, 0) < settings.behaviours_per_scenario:
             jobs.append(Job(RunKey(RunKind.CLIPS, study.id, subject=WHOLE, number=seed), study.id))
-    return jobs[:CLIPS_AHEAD]
+    return jobs[:CLIPS_AHEAD] or preview_films.due_ahead(session, study)
 
 
 def _clips_by_scenario(session: Session, study: Study, step_count: int | None) -> dict[int, int]:
@@ -186,6 +188,7 @@ def _stale_models(session: Session, study: Study, succeeded: Collection[str]) ->
     jobs, settings = [], study.settings
     answers, exclusions = last_answers(session, present_ids(study)), last_exclusions(session, present_ids(study))
     begun = evaluation_plan.begun(session, study)
+    have_set = self_setting.who_have_set(session, study) if self_setting.is_set(study) else set()
     for participant_id, count in sorted(count_labels(session, present_ids(study)).items()):
         known = answers_known(settings, count, answers[participant_id], exclusions.get(participant_id))
         labels = reward_due(settings, count)
@@ -196,5 +199,7 @@ def _stale_models(session: Session, study: Study, succeeded: Collection[str]) ->
             if milestone and str(reward) in succeeded and study.material is None:  # no simulator, no filter
                 jobs.append(Job(replace(reward, kind=RunKind.FILTER, labels=milestone), study.id))
         if count >= settings.labels_per_participant and study.material is None:
-            jobs += due_evaluation.due(study, reward, succeeded, participant_id in begun)
+            jobs += due_evaluation.due(
+                study, reward, succeeded, participant_id in begun, has_set=participant_id in have_set
+            )
     return jobs

@@ -3,6 +3,7 @@
 import re
 import secrets
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from html.parser import HTMLParser
 from typing import Self
@@ -15,6 +16,7 @@ from app.errors import AppError
 _QUERY = re.compile(r"/p/queries/(\d+)/label")
 _BREAK = re.compile(r"/p/break$")
 _RATING = re.compile(r"/p/evaluation/trials/(\d+)/rating")
+_SETTING = re.compile(r"/p/setting$")
 _HEAD_TO_HEAD = re.compile(r"/p/head-to-heads/(\d+)/answer")
 _SCALE = re.compile(r"/p/(?:questionnaire|evaluation/robots/[A-E])/[a-z0-9_]+$")
 _LANGUAGE = re.compile(r"/p/language$")
@@ -122,6 +124,19 @@ class FormBrowser:
         if form is None:
             raise WentAstray(f"There are no two robots to compare on {self._page.address}.")
         self._send(form.target.group(0), {**form.fields, "response": response})
+
+    def is_at_sliders(self) -> bool | None:
+        """Whether the sliders are on the page, after loading it anew; None while there are none."""
+        self._open("/p/next")
+        return self._page.form_to(_SETTING) is not None or None
+
+    def set_robot(self, stops: Mapping[str, int]) -> None:
+        """Move the sliders to these places, by axis, and go on."""
+        form = self._page.form_to(_SETTING)
+        if form is None:
+            raise WentAstray(f"There are no sliders on {self._page.address}.")
+        moved = {f"axis-{axis}": str(stop) for axis, stop in stops.items()}
+        self._send(form.target.group(0), {**form.fields, **moved, "goes_on": "true"})
 
     def go_to_the_end(self) -> None:
         """Through whatever forms are left, as they are."""

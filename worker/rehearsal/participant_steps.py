@@ -17,13 +17,17 @@ from app.domain.evaluation import HeadToHead, Trial
 from app.domain.models import ModelKind
 from app.domain.preferences import Query
 from app.domain.studies import Study
+from app.services.evaluation import self_setting
 from app.storage import ArtefactStore
+from worker.compute import simulation
+from worker.compute.behaviours import Behaviour
 from worker.jobs.learning import dataset
 from worker.jobs.runtime import records
 from worker.ml.rewards.loading import load_reward_model
 from worker.ml.rewards.reward_models import RewardModel
 from worker.ml.scripted_ratings import RatingManner, ScriptedRater
 from worker.ml.teachers import Manner, ScriptedTeacher, Taste, segment_returns
+from worker.scenarios import of_preview
 from worker.sim.costs import preference_rewards
 from worker.tasks import registry
 from worker.trajectory import Trajectory
@@ -108,6 +112,23 @@ class ScriptedPerson:
                 if film is not None
             ]
         return "left" if values[0] > values[1] or (values[0] == values[1] and self._rng.random() < 0.5) else "right"
+
+    def set_robot(self) -> dict[str, int]:
+        """Where this user leaves the sliders: each is moved once, and left where the film suits them best."""
+        with self._database.reading() as session:
+            study = session.get_one(Study, self._study_id)
+        sliders, scenario = self_setting.sliders_of(study), of_preview(study.seed)
+        stops = {slider.name: 0 for slider in sliders}
+
+        def suits(moved: dict[str, int]) -> float:
+            act = simulation.act_as(study.task, Behaviour(self_setting.mode_at(sliders, moved)))
+            episode = simulation.run_episode(study.task, act, scenario)
+            return float(self._true_rewards(episode).sum())
+
+        for slider in sliders:
+            tried = [stops | {slider.name: stop} for stop in range(slider.lowest, slider.highest + 1, 2)]
+            stops = max(tried, key=suits)
+        return stops
 
     def insight(self, participant_id: int) -> Insight | None:
         """What the newest reward model of this participant has understood; None while there is none."""

@@ -184,6 +184,9 @@ class Rehearsal:
         evaluation = settings.evaluation
         if evaluation is None or evaluation.mode is not EvaluationMode.VIDEO:
             return
+        if evaluation.has_sliders:
+            wait_until(PATIENCE_S, "no sliders", visitor.is_at_sliders)
+            visitor.set_robot(person.set_robot())
         came = time.monotonic()
         for number in range(evaluation.trial_count):
             trial_id = wait_until(PATIENCE_S, "no robot to rate", visitor.trial_id)

@@ -21,6 +21,7 @@ from app.domain.evaluation import DonorDraw, DonorRule, Donors, HeadToHeadRespon
 from app.domain.models import ModelKind, RunKind, RunStatus
 from app.domain.preferences import Purpose, Response, SkipReason
 from app.domain.protocol import EvaluatedMethod, Stage
+from app.domain.self_setting import PreviewFilm, SelfSetting
 from app.domain.studies import PREVIEW_NUMBERS, Participant, Study
 from app.domain.study_settings import StudySettings
 from app.services.archives.archive import LARGEST_ROW_BYTES, REMADE, SECRETS, ArchiveInvalid, Manifest, artefacts
@@ -109,6 +110,8 @@ class RowCheck:
             self._check_study(row)
         if table.name == DonorDraw.__tablename__:
             _check_donors(row)
+        if table.name in (SelfSetting.__tablename__, PreviewFilm.__tablename__) and not _is_mode(row.get("mode")):
+            raise _Wrong("mode has a value that it cannot have")
         _check_left_out(table.name, row)
         for _, sha256 in artefacts(table.name, row):
             if not SHA256.fullmatch(sha256) or (sha256 not in self._manifest.files and self._is_here(sha256)):
@@ -154,6 +157,9 @@ class RowCheck:
             raise _Wrong("this version cannot read the study's settings") from error
         if row.get("deleted_at") is not None:
             raise _Wrong("the study was deleted")
+        axes = row.get("mode_axes")
+        if axes is not None and not _are_axes(axes):
+            raise _Wrong("mode_axes has a value that it cannot have")
         material = row.get("material")
         if material is not None and not _describes_recordings(material):
             raise _Wrong("it does not say what its clips are made of")
@@ -230,6 +236,31 @@ def _check_donors(row: Mapping[str, Any]) -> None:
         Donors.model_validate(row.get("stored_donors"))
     except ValidationError as error:
         raise _Wrong("stored_donors has a value that it cannot have") from error
+
+
+def _is_mode(mode: Any) -> bool:
+    """Numbers by the names of axes."""
+    return isinstance(mode, dict) and all(_is_axis(name) and _is_number(value) for name, value in mode.items())
+
+
+def _are_axes(axes: Mapping[str, Any]) -> bool:
+    """Ranges around 0 by the names of axes."""
+    return all(
+        _is_axis(name)
+        and isinstance(ends, list)
+        and len(ends) == 2
+        and all(map(_is_number, ends))
+        and ends[0] <= 0 <= ends[1]
+        for name, ends in axes.items()
+    )
+
+
+def _is_axis(name: str) -> bool:
+    return re.fullmatch(r"[a-z][a-z0-9_]{0,59}", name) is not None
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def _describes_recordings(material: Mapping[str, Any]) -> bool:

@@ -21,6 +21,7 @@ NAMES = {
     EvaluatedMethod.PBARL_PRINTED: "PbARL as printed",
     EvaluatedMethod.SOMEBODY_ELSE: "somebody else's filter",
     EvaluatedMethod.AVERAGE: "average filter",
+    EvaluatedMethod.SELF_SET: "set by the person",
 }
 """What people call the methods, once they may know."""
 

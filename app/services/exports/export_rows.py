@@ -15,12 +15,13 @@ from app.domain.models import Bundle, Model, ModelKind
 from app.domain.participation import ConsentRecord, FormAnswer, ParticipantEvent, StageRecord
 from app.domain.preferences import LEARNED_FROM, Exclusion, LabelEvent, Query
 from app.domain.protocol import LETTERS
+from app.domain.self_setting import SelfSetting
 from app.domain.studies import Deviation, Participant, Study, code_of
 from app.questionnaires import library
 from app.questionnaires.library import Score
 from app.services.answers import form_answers
 from app.services.answers.form_answers import FilledIn
-from app.services.evaluation import unblinding
+from app.services.evaluation import self_setting, unblinding
 from app.services.exports.paging import EVERYTHING, KeyedRows, Window
 from app.services.runs import model_metrics
 
@@ -327,6 +328,21 @@ def headtoheads(session: Session, study: Study, window: Window = EVERYTHING) -> 
                     each.shown_at,
                 ),
             )
+
+
+def settings(session: Session, study: Study, window: Window = EVERYTHING) -> KeyedRows:
+    sliders, through = self_setting.sliders_of(study), self_setting.who_have_set(session, study)
+    for person, wanted in _present(session, study, window):
+        rows = select(SelfSetting).where(SelfSetting.participant_id == person.id, wanted.known(SelfSetting))
+        given = session.scalars(rows.order_by(SelfSetting.revision)).all()
+        for each in given:
+            stops = self_setting.stops_of(sliders, each.mode)
+            counts = each is given[-1] and person.id in through
+            saved = counts, each.moved, each.filmed, each.response_time_ms, each.by_script, each.created_at
+            for place, (axis, value) in enumerate(each.mode.items(), 1):
+                key = each.revision, place, each.id
+                if key > wanted.after:
+                    yield (person.number, *key), (person.code, each.revision, axis, stops.get(axis), value, *saved)
 
 
 def donors(session: Session, study: Study, window: Window = EVERYTHING) -> KeyedRows:

@@ -9,6 +9,7 @@ from app.domain.models import Model, ModelKind
 from app.domain.participation import ConsentRecord, FormAnswer, ParticipantEvent, StageRecord
 from app.domain.preferences import LabelEvent, Purpose, Query, Response, SkipReason
 from app.domain.protocol import FROM_OTHERS, EvaluatedMethod, Stage
+from app.domain.self_setting import SelfSetting
 from app.domain.studies import Deviation, Participant
 from app.questionnaires import library
 from app.services.exports import export_rows
@@ -307,6 +308,33 @@ TABLES: Sequence[Table] = (
         export_rows.headtoheads,
         (HeadToHead, HeadToHeadAnswer),
         grows_by=HeadToHeadAnswer,
+    ),
+    Table(
+        "settings",
+        "Every setting of the sliders that a participant let go of, for the method self_set; one row per axis.",
+        (
+            PARTICIPANT,
+            Column("revision", I, "First, second, ... setting of this participant.", allowed="from 1"),
+            Column("axis", T, "Axis of the task's execution modes."),
+            Column(
+                "place",
+                I,
+                "Where the slider stood; 0 is the reference policy's own way, which is where all begin.",
+                allowed="-4 to 4; 0 to 4 where an axis has one direction",
+            ),
+            Column("value", N, "The axis' value, in its own unit."),
+            Column("counts", B, "Whether this is what the robot was made of: the last one of who has gone on."),
+            Column(
+                "moved", T, "Whose slider was let go of; empty: several, none, or a browser without script.", allowed=""
+            ),
+            Column("filmed", B, "Whether exactly this setting had been filmed when it was saved."),
+            Column("response_time_ms", I, "From the opening of the page, or the setting before, to this one.", "ms"),
+            Column("by_script", B, WITHOUT_SCRIPT),
+            Column("saved_at", W, "When it reached the server."),
+        ),
+        export_rows.settings,
+        (SelfSetting,),
+        grows_by=SelfSetting,
     ),
     Table(
         "donors",

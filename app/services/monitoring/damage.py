@@ -96,6 +96,7 @@ _WORDS = {
     "Rollout": "rollout",
     "Clip": "clip",
     "Film": "film",
+    "PreviewFilm": "preview film",
     "Controller": "controller",
     "Model": "model",
     "Bundle": "bundle",

@@ -34,6 +34,7 @@ STAGES_IN_WORDS: Mapping[Stage, str] = {
     Stage.INSTRUCTIONS: "reading the instructions",
     Stage.PRACTICE: "practising",
     Stage.PAIRS: "comparing",
+    Stage.SELF_SETTING: "setting a robot",
     Stage.EVALUATION: "rating robots",
     Stage.QUESTIONNAIRE: "last questions",
     Stage.DEBRIEF: "debrief",

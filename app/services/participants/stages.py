@@ -24,6 +24,7 @@ def stages_of(settings: StudySettings) -> Sequence[Stage]:
     asked_for = {
         Stage.DEMOGRAPHICS: bool(settings.demographics),
         Stage.PRACTICE: settings.practice_pairs > 0,
+        Stage.SELF_SETTING: settings.evaluation is not None and settings.evaluation.has_sliders,
         Stage.EVALUATION: settings.evaluation is not None,
         Stage.QUESTIONNAIRE: bool(settings.closing_form or settings.instruments),
         Stage.DEBRIEF: settings.debrief,
@@ -85,7 +86,7 @@ def _is_finished(session: Session, participant: Participant, stage: Stage, recor
                     for letter in LETTERS[: len(settings.evaluation.methods)]
                 )
             )
-        case Stage.DEMOGRAPHICS | Stage.QUESTIONNAIRE | Stage.DEBRIEF:
+        case Stage.DEMOGRAPHICS | Stage.SELF_SETTING | Stage.QUESTIONNAIRE | Stage.DEBRIEF:
             return stage in records and records[stage].finished_at is not None
 
 

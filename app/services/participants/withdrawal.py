@@ -15,6 +15,7 @@ from app.domain import participation, preferences  # noqa: F401  (their tables b
 from app.domain.clips import Clip, Rollout
 from app.domain.evaluation import Controller, Film
 from app.domain.models import Bundle, Export, Model, Report, Run, RunKind
+from app.domain.self_setting import PreviewFilm
 from app.domain.studies import Participant, Study
 from app.domain.study_settings import StudySettings
 from app.services import audit
@@ -30,6 +31,8 @@ ARTEFACT_COLUMNS: tuple[InstrumentedAttribute[Any], ...] = (
     Film.trajectory_sha256,
     Film.video_sha256,
     Film.poster_sha256,
+    PreviewFilm.video_sha256,
+    PreviewFilm.poster_sha256,
     Controller.artefact_sha256,
     Model.artefact_sha256,
     Bundle.artefact_sha256,

@@ -19,6 +19,7 @@ ADDRESSES = {
     Stage.CONSENT: "show_consent",
     Stage.DEMOGRAPHICS: "show_demographics",
     Stage.INSTRUCTIONS: "show_instructions",
+    Stage.SELF_SETTING: "show_self_setting",
     Stage.EVALUATION: "show_evaluation",
     Stage.QUESTIONNAIRE: "show_questionnaire",
     Stage.DEBRIEF: "show_debrief",

@@ -31,14 +31,20 @@ def consent_text(wording: Wording, participant: Participant) -> ConsentText:
     return ConsentText(
         title=wording("consent-title"),
         welcome=wording("consent-welcome"),
-        body=_with_list(body, [*_shown_to_others(wording, settings), *_facts_in_words(wording, facts)]),
+        body=_with_list(body, [*_set_and_shown(wording, settings), *_facts_in_words(wording, facts)]),
         version=wording("consent-version", version=settings.consent_version),
     )
 
 
-def _shown_to_others(wording: Wording, settings: StudySettings) -> list[str]:
-    """In every study where it happens, whatever its own text says."""
-    return [wording("consent-others")] if settings.evaluation and settings.evaluation.shows_others else []
+def _set_and_shown(wording: Wording, settings: StudySettings) -> list[str]:
+    """That people set a robot themselves, and are shown others': in every study where it happens, whatever its own text
+    says."""
+    evaluation = settings.evaluation
+    happens = {
+        "consent-setting": evaluation is not None and evaluation.has_sliders,
+        "consent-others": evaluation is not None and evaluation.shows_others,
+    }
+    return [wording(key) for key, is_so in happens.items() if is_so]
 
 
 def fact_of(wording: Wording, settings: StudySettings, name: str) -> str:

@@ -6,7 +6,7 @@ from app.domain.run_keys import WHOLE
 from app.domain.studies import Study
 from worker.compute import simulation
 from worker.compute.pools import Lane
-from worker.jobs.clips import repairs
+from worker.jobs.clips import preview_films, repairs
 from worker.jobs.clips.stored_video import video_columns
 from worker.jobs.runtime import records
 from worker.jobs.runtime.context import Step, WorkerContext
@@ -18,9 +18,12 @@ AT_A_TIME = 2
 
 
 def build_clips(context: WorkerContext, job: Job, run_id: int, step: Step) -> None:
-    """Film what is still missing of the scenario that the job names: clips, or whole episodes."""
+    """Film what is still missing of the scenario that the job names: clips, or whole episodes; or previews."""
     if repairs.is_about(job):
         repairs.make_again(context, job, run_id, step)
+        return
+    if preview_films.is_about(job):
+        preview_films.make(context, job, run_id, step)
         return
     film = _film_whole if job.about.subject == WHOLE else _film
     with context.database.reading() as session:

@@ -15,7 +15,8 @@ from app.domain.choices import RewardKind
 from app.domain.models import ModelKind
 from app.domain.protocol import FROM_OTHERS, EvaluatedMethod
 from app.domain.studies import Participant, Study
-from app.services.evaluation import evaluation_plan
+from app.errors import AppError
+from app.services.evaluation import evaluation_plan, self_setting
 from app.services.participants import withdrawal
 from worker.analysis.evaluation import evaluate
 from worker.compute import baseline_fitting, learning
@@ -27,6 +28,7 @@ from worker.jobs.learning.lent_filters import LoanEnded
 from worker.jobs.runtime import due_work, records
 from worker.jobs.runtime.context import Step, WorkerContext
 from worker.jobs.runtime.records import Job
+from worker.ml.filters.filter_module import FilterWeights
 from worker.ml.policies.checkpoint import ask_to_pause, share_done
 from worker.ml.rewards.loading import load_reward_model
 from worker.scenarios import EVALUATION, first_of
@@ -38,12 +40,18 @@ TRAINING_SHARE = 0.9
 """Of the progress; the rest is the drive through unseen scenarios."""
 
 
+class NotSetYet(AppError):
+    """The participant has not set a robot with the sliders yet."""
+
+
 def train_method(context: WorkerContext, job: Job, run_id: int, step: Step) -> None:
     """Train the method that the job names, drive it through unseen scenarios, and keep it."""
     method = EvaluatedMethod(job.about.subject)
     reward = step("reward", _choose_reward, context, run_id, job)
     if method in FROM_OTHERS:
         trained = lent_filters.make(context, job, run_id, step, method)
+    elif method is EvaluatedMethod.SELF_SET:
+        trained = step("setting", _as_set, context, run_id, job)
     else:
         trained = step("train", _train, context, run_id, job, method.value, reward)
     if not trained:
@@ -81,6 +89,24 @@ def _train(context: WorkerContext, run_id: int, job: Job, method: str, reward: s
             return {"artefact": context.store.put(fitted.controller), "notes": list(fitted.notes), "seconds": seconds}
     context.store.unfinished.forget(folder)
     return {}
+
+
+def _as_set(context: WorkerContext, run_id: int, job: Job) -> dict[str, object]:
+    """The mode that the person has set with sliders, around the reference policy, as a controller. Nothing is learned.
+
+    Raises NotSetYet.
+    """
+    started = time.perf_counter()
+    with context.database.reading() as session:
+        task = session.get_one(Study, job.study_id).task
+        setting = self_setting.newest(session, job.participant)
+    if setting is None:
+        raise NotSetYet
+    weights = FilterWeights(mode=setting.mode).to_bytes()
+    beat = context.beat(run_id)
+    controller = context.compute.run(Lane.LEARNING, beat, baseline_fitting.controller_of_filter, task, weights)
+    notes = ["Set with sliders by the person; not tested for harm, and no promise is made of it."]
+    return {"artefact": context.store.put(controller), "notes": notes, "seconds": time.perf_counter() - started}
 
 
 def _is_outdated(context: WorkerContext, job: Job) -> bool:

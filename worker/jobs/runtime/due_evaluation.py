@@ -4,21 +4,25 @@ from collections.abc import Collection
 from dataclasses import replace
 
 from app.domain.models import RunKind
-from app.domain.protocol import EvaluationMode
+from app.domain.protocol import EvaluatedMethod, EvaluationMode
 from app.domain.run_keys import BEFORE_AFTER, CONTROLLERS, TRIALS, RunKey
 from app.domain.studies import Study
 from app.services.evaluation import evaluation_plan
 from worker.jobs.runtime.records import Job
 
 
-def due(study: Study, reward: RunKey, succeeded: Collection[str], robots_shown: bool) -> list[Job]:
+def due(
+    study: Study, reward: RunKey, succeeded: Collection[str], robots_shown: bool, *, has_set: bool = False
+) -> list[Job]:
     """What is to be trained, filmed or packed for somebody who has given all labels. ``reward``: their last model's.
 
+    ``has_set``: they are through with the sliders, where there are any, so the robot that they have set can be made.
     Whoever has been shown robots rates those: other ones, learned without an excluded answer, would be for nobody.
     """
     if str(reward) not in succeeded:
         return []
     jobs = [] if robots_shown else _methods(study, reward)
+    jobs = [job for job in jobs if has_set or job.about.subject != EvaluatedMethod.SELF_SET]
     if str(replace(reward, kind=RunKind.FILTER)) in succeeded:
         jobs += _films(study, reward, succeeded, robots_shown)
     return jobs

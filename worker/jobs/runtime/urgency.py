@@ -54,7 +54,7 @@ class Urgency(NamedTuple):
     step: int
 
 
-_STEPS = {RunKind.REWARD: 0, RunKind.FILTER: 1, RunKind.METHOD: 2, RunKind.FILMS: 3}
+_STEPS = {RunKind.CLIPS: 0, RunKind.REWARD: 0, RunKind.FILTER: 1, RunKind.METHOD: 2, RunKind.FILMS: 3}
 _LAST_STEP = 4
 
 
@@ -113,8 +113,8 @@ class WhoWaits:
         people = [each for each in self.people.values() if each.study_id == study_id]
         if not people:
             return Urgency(Level.UNOPENED, _BEGINNING, 0)
-        comparing = [each for each in people if each.present and each.awaited in (None, Awaited.PAIR)]
-        waiting = [each.waiting_since for each in comparing if each.awaited and each.waiting_since]
+        comparing = [each for each in people if each.present and each.awaited in (None, Awaited.PAIR, Awaited.PREVIEW)]
+        waiting = [each.waiting_since for each in comparing if each.awaited == Awaited.PAIR and each.waiting_since]
         if waiting:
             return Urgency(Level.WAITING, min(waiting), 0)
         return Urgency(Level.ANSWERING if comparing else Level.POOL, _BEGINNING, 0)
