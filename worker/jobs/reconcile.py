@@ -185,7 +185,7 @@ def _clips_by_scenario(session: Session, study: Study, step_count: int | None) -
 def _stale_models(session: Session, study: Study, succeeded: Collection[str]) -> list[Job]:
     jobs, settings = [], study.settings
     answers, exclusions = last_answers(session, present_ids(study)), last_exclusions(session, present_ids(study))
-    begun = evaluation_plan.begun(session, study)
+    begun, rating = evaluation_plan.begun(session, study), _rating(session, study)
     for participant_id, count in sorted(count_labels(session, present_ids(study)).items()):
         known = answers_known(settings, count, answers[participant_id], exclusions.get(participant_id))
         labels = reward_due(settings, count)
@@ -195,6 +195,13 @@ def _stale_models(session: Session, study: Study, succeeded: Collection[str]) ->
             milestone = filter_due(settings, count)
             if milestone and str(reward) in succeeded and study.material is None:  # no simulator, no filter
                 jobs.append(Job(replace(reward, kind=RunKind.FILTER, labels=milestone), study.id))
-        if count >= settings.labels_per_participant and study.material is None:
-            jobs += due_evaluation.due(study, reward, succeeded, participant_id in begun)
+        if count >= settings.labels_per_participant and study.material is None and participant_id in rating:
+            arm = rating[participant_id]
+            jobs += due_evaluation.due(study, reward, succeeded, participant_id in begun, arm)
     return jobs
+
+
+def _rating(session: Session, study: Study) -> dict[int, str | None]:
+    """The arm of everybody who was not sent away before the evaluation."""
+    going_on = select(Participant.id, Participant.arm).where(Participant.study_id == study.id)
+    return dict(session.execute(going_on.where(Participant.ended_as.is_(None))).all())

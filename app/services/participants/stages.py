@@ -64,7 +64,7 @@ def finish(session: Session, participant: Participant, stage: Stage) -> None:
 
 
 def _is_finished(session: Session, participant: Participant, stage: Stage, records: dict[Stage, StageRecord]) -> bool:
-    settings = participant.study.settings
+    settings = participant.settings
     match stage:
         case Stage.CONSENT:
             agreed = participant.consented_at is not None
