@@ -352,6 +352,8 @@ class StudySettings(BaseModel):
         )
         if wrong is None and self.end_after_misses > self.catch_pairs:
             wrong = f"Nobody can miss {self.end_after_misses} of {self.catch_pairs} catch pairs."
+        if wrong is None and not self.arms and set(self.planned_tests) & {PlannedTest.WELCH_T, PlannedTest.PERMUTATION}:
+            wrong = "Welch\N{RIGHT SINGLE QUOTATION MARK}s and the permutation test compare arms, and there are none."
         if wrong is not None:
             raise ValueError(wrong)
         return self

@@ -35,6 +35,8 @@ class Tables:
     """answers in the running accuracy"""
     guesses: Sequence[Row] | None = None
     """who named which robot as made for them; None: that is not asked"""
+    between: bool = False
+    """whether people in different arms met different methods"""
     head_to_heads: Sequence[Row] | None = None
     """rows of the table headtoheads; None: there are none, or the study is blinded"""
     version: int = 0
@@ -58,6 +60,7 @@ def make_report(tables: Tables) -> tuple[dict[str, Any], dict[str, dict[str, byt
             tables.groups,
             by="letter" if tables.blinded else "method",
             compare=not tables.blinded,
+            between=tables.between,
         ),
         "guesses": None if tables.guesses is None else guess_report(tables.guesses, len(tables.groups)),
         "head_to_heads": None if tables.head_to_heads is None else _head_to_heads(tables),
