@@ -1,4 +1,4 @@
-"""Arms of studies between subjects, how people came into them, and who was sent away before the end."""
+"""Arms of studies between subjects, who was sent away before the end, and plans of how many people are needed."""
 
 from collections.abc import Sequence
 
@@ -26,6 +26,19 @@ def upgrade() -> None:
         sa.PrimaryKeyConstraint("id", name=op.f("pk_allocation")),
         sa.UniqueConstraint("participant_id", name=op.f("uq_allocation_participant_id")),
     )
+    op.create_table(
+        "power_plan",
+        sa.Column("id", sa.Integer(), nullable=False),
+        sa.Column("study_id", sa.Integer(), nullable=False),
+        sa.Column("asked_by", sa.String(80), nullable=False),
+        sa.Column("asked_at", sa.DateTime(timezone=True), nullable=False),
+        sa.Column("basis", sa.String(64), nullable=False),
+        sa.Column("stored_inputs", sa.JSON(), nullable=False),
+        sa.Column("contents", sa.JSON(), nullable=True),
+        sa.ForeignKeyConstraint(["study_id"], ["study.id"], name=op.f("fk_power_plan_study_id_study")),
+        sa.PrimaryKeyConstraint("id", name=op.f("pk_power_plan")),
+    )
+    op.create_index(op.f("ix_power_plan_study_id"), "power_plan", ["study_id"])
     op.add_column("participant", sa.Column("arm", sa.String(40), nullable=True))
     op.add_column("participant", sa.Column("ended_as", sa.String(20), nullable=True))
 
@@ -33,4 +46,5 @@ def upgrade() -> None:
 def downgrade() -> None:
     op.drop_column("participant", "ended_as")
     op.drop_column("participant", "arm")
+    op.drop_table("power_plan")
     op.drop_table("allocation")

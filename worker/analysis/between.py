@@ -71,43 +71,47 @@ def permutation(first: FloatArray, second: FloatArray) -> dict[str, Any]:
         return not_computable(reason)
     values = np.concatenate([first, second])
     n, size = len(values), len(first)
-    exact, mask = _divisions(n, size)
-    found = np.abs(_statistics(values, mask))
-    seen = float(np.abs(_statistics(values, (np.arange(n) < size)[None]))[0])
+    exact, first_group = _divisions(n, size)
+    found, mine = np.abs(_statistics(values, first_group)), (np.arange(n) < size)[None].astype(np.float64)
+    seen = float(np.abs(_statistics(values, mine))[0])
     return {
         "n_first": size,
         "n_second": n - size,
         "difference": plain(second.mean() - first.mean()),
         "p": float((found >= seen - 1e-9).mean()),
         "exact": exact,
-        "ways": len(mask),
+        "ways": len(first_group),
     }
 
 
 @lru_cache(maxsize=8)
-def _divisions(n: int, size: int) -> tuple[bool, Any]:
-    """Whether these are all, and the ways to divide n people, (ways, n): who is in the first group."""
+def _divisions(n: int, size: int) -> tuple[bool, FloatArray]:
+    """Whether these are all, and the ways to divide n people, (ways, n): 1 for who is in the first group, else 0."""
     if math.comb(n, size) > MOST_EXACT:
         ranks = np.random.default_rng(_SEED).random((MOST_EXACT, n)).argsort(axis=1)
-        return False, np.vstack([np.arange(n) < size, ranks < size])
+        return False, np.vstack([np.arange(n) < size, ranks < size]).astype(np.float64)
     chosen = np.array(list(combinations(range(n), size)))
-    mask = np.zeros((len(chosen), n), bool)
-    mask[np.arange(len(chosen))[:, None], chosen] = True
-    return True, mask
+    first_group = np.zeros((len(chosen), n))
+    first_group[np.arange(len(chosen))[:, None], chosen] = 1.0
+    return True, first_group
 
 
-def _statistics(values: FloatArray, first: Any) -> FloatArray:
-    """Welch's t of every division. ``first`` (ways, people): who is in the first group. No spread at all: infinite."""
-    second = ~first
-    counts = [group.sum(axis=1) for group in (first, second)]
-    means = [group @ values / count for group, count in zip((first, second), counts, strict=True)]
+def _statistics(values: FloatArray, first_group: FloatArray) -> FloatArray:
+    """Welch's t of every division, (ways,). No spread within the groups: infinite."""
+    centred = values - values.mean()
+    size = first_group[0].sum()
+    counts = (size, len(values) - size)
+    sums, squares = first_group @ centred, first_group @ centred**2
+    means = sums / counts[0], -sums / counts[1]
+    rest = squares, (centred**2).sum() - squares
     errors = sum(
-        np.maximum(group @ values**2 - count * mean**2, 0.0) / (count - 1) / count
-        for group, count, mean in zip((first, second), counts, means, strict=True)
+        np.maximum(square - count * mean**2, 0.0) / (count - 1) / count
+        for square, count, mean in zip(rest, counts, means, strict=True)
     )
     difference = means[1] - means[0]
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(np.abs(difference) < 1e-12, 0.0, difference / np.sqrt(np.where(errors < 1e-12, 0.0, errors)))
+        t = difference / np.sqrt(np.where(errors < 1e-12, 0.0, errors))
+    return np.where(np.abs(difference) < 1e-12, 0.0, t)
 
 
 def why_not(first: FloatArray, second: FloatArray) -> str | None:

@@ -22,7 +22,7 @@ from app.domain.studies import Participant, Study
 from app.services.evaluation import evaluation_plan
 from worker import scenarios
 from worker.jobs.clips import repairs
-from worker.jobs.publishing import export_files, report_files
+from worker.jobs.publishing import export_files, power_plans, report_files
 from worker.jobs.runtime import due_evaluation
 from worker.jobs.runtime.due_work import (
     answers_known,
@@ -77,6 +77,7 @@ def _all_due(session: Session, study: Study, succeeded: Collection[str]) -> Iter
     yield from _stale_models(session, study, succeeded)
     yield from report_files.due(session, study)
     yield from export_files.due(session, study)
+    yield from power_plans.due(session, study)
 
 
 def abandoned(session: Session, in_hand: Collection[str]) -> list[tuple[Job, int]]:
