@@ -25,8 +25,9 @@ def context(database: Database, store: ArtefactStore) -> WorkerContext:
     return WorkerContext(database, store, Compute(1))
 
 
-def at_once(_name: str, function: Callable[..., Any], *arguments: Any) -> Any:
-    """A step of the engine."""
+def at_once(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
+    """A step of the engine, whatever its name."""
+    assert name
     return function(*arguments)
 
 
@@ -51,9 +52,7 @@ def test_a_plan_is_due_until_it_is_simulated_and_only_of_the_study_as_it_is(
         assert not [job for job, _ in reconcile.due(session) if job.kind == "power"]
     assert contents is not None
     assert contents["paired"]
-    assert (
-        [row["people"] for row in contents["rows"]] == power_plans.numbers_of_people(12) == [4, 5, 6, 7, 9, 10, 11, 12]
-    )
+    assert [row["people"] for row in contents["rows"]] == [4, 5, 6, 7, 9, 10, 11, 12]
     assert contents["rows"][-1]["ratings"]["power"] == 1.0
     assert contents["enough"]["ratings"] <= 12
     with database.writing() as session:
