@@ -1,15 +1,19 @@
 """Plans of how many people a study needs, simulated as somebody has asked for them."""
 
+from typing import TYPE_CHECKING
+
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from app.domain.power_plan import PowerPlan
 from app.domain.studies import Study
 from app.services.studies import power
-from worker.analysis.power import Truth, enough, power_at
 from worker.compute.pools import Lane
 from worker.jobs.runtime.context import Step, WorkerContext
 from worker.jobs.runtime.records import Job
+
+if TYPE_CHECKING:
+    from worker.analysis.power import Truth
 
 STUDIES = 500
 """Simulated for each number of people: the power is then known within .04."""
@@ -27,6 +31,8 @@ def due(session: Session, study: Study) -> list[Job]:
 
 def make(context: WorkerContext, job: Job, run_id: int, step: Step) -> None:
     """Simulate, one step for every number of people: whoever kills the worker loses one of them."""
+    from worker.analysis.power import Truth, enough  # takes seconds, and a worker that starts needs none of it
+
     with context.database.reading() as session:
         plan = session.get_one(PowerPlan, job.number)
         study = session.get_one(Study, plan.study_id)
@@ -62,7 +68,9 @@ def numbers_of_people(most: int) -> list[int]:
     return sorted({round(FEWEST + (most - FEWEST) * place / (STEPS - 1)) for place in range(STEPS)})
 
 
-def _simulate(context: WorkerContext, run_id: int, truth: Truth, people: int, seed: int) -> dict[str, object]:
+def _simulate(context: WorkerContext, run_id: int, truth: "Truth", people: int, seed: int) -> dict[str, object]:
+    from worker.analysis.power import power_at
+
     return context.compute.run(Lane.LEARNING, context.beat(run_id), power_at, truth, people, STUDIES, seed)
 
 
