@@ -1,8 +1,9 @@
 """Order and period effects where everybody meets several methods: the analysis of variance of a crossover.
 
 One number per person and block (the mean of its ratings). Model: person + method + period, and beside it the method
-that came right before (first-order carryover); F tests of the period and of the carryover, each after everything else
-(Jones and Kenward 2014, Design and Analysis of Cross-Over Trials, ch. 5). What a method is to somebody may differ from
+that came right before (first-order carryover). F tests of the period, after person and method, and of the carryover,
+after the period as well (the first period has no method before it, so the two cannot be told apart there;
+Jones and Kenward 2014, Design and Analysis of Cross-Over Trials, ch. 5). What a method is to somebody may differ from
 person to person: that is noise of these numbers. Measured error rates: docs/results/between.md.
 """
 
@@ -39,7 +40,7 @@ def order_report(rows: pd.DataFrame, scale: str) -> dict[str, Any]:
     base = np.hstack([_dummies(cells["participant"], whole=True), _dummies(cells["method"])])
     periods, before = _dummies(cells["period"]), _dummies(cells["before"])
     return report | {
-        "period": _f_test(values, np.hstack([base, before]), periods),
+        "period": _f_test(values, base, periods),
         "carryover": _f_test(values, np.hstack([base, periods]), before),
         "by_period": _estimates(values, base, periods),
     }

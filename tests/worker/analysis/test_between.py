@@ -84,12 +84,10 @@ def test_period_and_carryover_are_statsmodels_analysis_of_variance() -> None:
     cells["period"] = cells.groupby("participant").cumcount()
     cells["before"] = cells.groupby("participant")["method"].shift(1, fill_value="")
     base = "satisfaction ~ C(participant) + C(method)"
-    fits = [
-        formulas.ols(base + more, cells).fit() for more in (" + C(before)", " + C(period)", " + C(period) + C(before)")
-    ]
+    fits = [formulas.ols(base + more, cells).fit() for more in ("", " + C(period)", " + C(period) + C(before)")]
     report = order_report(rows, "satisfaction")
-    for name, without in (("period", fits[0]), ("carryover", fits[1])):
-        expected = anova_lm(without, fits[2])
+    for name, without, whole in (("period", fits[0], fits[1]), ("carryover", fits[1], fits[2])):
+        expected = anova_lm(without, whole)
         assert report[name]["F"] == pytest.approx(expected["F"][1])
         assert report[name]["p"] == pytest.approx(expected["Pr(>F)"][1])
     estimate = report["by_period"][1]
