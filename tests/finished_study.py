@@ -11,7 +11,7 @@ from app.db import now
 from app.domain.clips import Clip
 from app.domain.evaluation import HeadToHeadAnswer, Rating, Trial
 from app.domain.models import ModelKind
-from app.domain.participation import ConsentRecord, FormAnswer, ParticipantEvent, StageRecord
+from app.domain.participation import Allocation, ConsentRecord, FormAnswer, ParticipantEvent, StageRecord
 from app.domain.preferences import Purpose, Query, Response
 from app.domain.protocol import EvaluatedMethod, EvaluationSettings
 from app.domain.self_setting import SelfSetting
@@ -78,6 +78,7 @@ def _change_of_mind(session: Session, query: Query) -> None:
 def _forms(session: Session, person: Participant) -> None:
     session.add(ConsentRecord(participant_id=person.id, version="1", language="en", text="I agree.\nReally."))
     session.add(StageRecord(participant_id=person.id, stage="consent", finished_at=now()))
+    session.add(Allocation(participant_id=person.id, place=person.number, lot=0.5, considered={}))
     session.add(FormAnswer(participant_id=person.id, form="demographics", item="age", value=str(20 + person.number)))
     text = '=HYPERLINK("http://example.com")' if person.number == 1 else 'nice, "really" nice'
     session.add(FormAnswer(participant_id=person.id, form="questionnaire", item="comments", value=text))

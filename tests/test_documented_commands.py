@@ -107,6 +107,8 @@ RUN: dict[str, str | Elsewhere | OnlyParsed] = {
     "chosen_modes": ROLLOUTS,
     "comparison_report": "results/paper_form",
     "contact_sheet": "sheets feeding --films 1 --steps 5 --no-people",
+    "arms": "--arrivals 20 --studies 1 --to .",
+    "between": "--studies 2 --to .",
     "error_rates": Elsewhere("tests/worker/analysis/test_error_rates.py::test_the_command_writes_every_table"),
     "feedback_efficiency": OnlyParsed("begins with 240 rollouts of unseen scenarios, and draws all its figures"),
     "feedback_report": "results",

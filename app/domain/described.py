@@ -19,6 +19,7 @@ class Section(Choice):
     CONSENT = "consent", "Consent and questions"
     PAIRS = "pairs", "Pairs"
     EVALUATION = "evaluation", "Blinded evaluation and debrief"
+    DESIGN = "design", "Arms and who takes part"
     PANEL = "panel", "Recruitment panel and the end"
     LEARNING = "learning", "Learning"
     CLIPS = "clips", "Clips"
@@ -31,6 +32,7 @@ class Use(Choice):
     CLIPS = "clips", "Fixed: clips have been made."
     PAIRS = "pairs", "Fixed: participants have been given pairs."
     EVALUATION = "evaluation", "Fixed: somebody has reached the evaluation."
+    ARMS = "arms", "Fixed: somebody has been allocated to an arm."
 
 
 @dataclass(frozen=True)

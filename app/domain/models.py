@@ -22,6 +22,8 @@ class RunKind(StrEnum):
     """Videos of methods on unseen scenarios."""
     REPORT = "report"
     EXPORT = "export"
+    POWER = "power"
+    """A simulation of how many people a study needs."""
 
 
 class RunStatus(StrEnum):

@@ -1,4 +1,4 @@
-"""What one person has done besides comparing: stages, consent, forms, and what happened on the way."""
+"""What one person has done besides comparing: stages, consent, forms, their arm, and what happened on the way."""
 
 from datetime import datetime
 from typing import Any
@@ -64,3 +64,19 @@ class ParticipantEvent(Base):
     at: Mapped[datetime] = mapped_column(default=now)
     kind: Mapped[str] = mapped_column(String(40))
     detail: Mapped[dict[str, Any]]
+
+
+class Allocation(Base):
+    """How somebody came into their arm (participant.arm): the counts then, and the lot. Written once."""
+
+    __tablename__ = "allocation"
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    participant_id: Mapped[int] = mapped_column(ForeignKey("participant.id"), unique=True)
+    place: Mapped[int]
+    """Among the people of the arm, from 1: decides in which order they meet the methods."""
+    lot: Mapped[float]
+    """In [0, 1), from the study's secret and the participant's number; picks among the arms that were behind."""
+    considered: Mapped[dict[str, Any]]
+    """By arm: completed, on_their_way, and whether it was open."""
+    created_at: Mapped[datetime] = mapped_column(default=now)

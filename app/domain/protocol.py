@@ -265,6 +265,8 @@ class PlannedTest(Choice):
         "Mixed model",
         "Level and difference vary between people; the paired t, unless ratings are missing.",
     )
+    WELCH_T = "welch_t", "Welch t", "Between arms: one number per person, spreads may differ."
+    PERMUTATION = "permutation", "Permutation", "Between arms, without assuming a normal distribution."
 
 
 CONSENT_FACTS = ("duration", "payment", "ethics", "contact")

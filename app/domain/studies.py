@@ -143,12 +143,21 @@ class Participant(Base):
     scripted_as: Mapped[str | None] = mapped_column(String(120))
     """The user a program plays here, such as "cautious"; None: a person."""
     completed_at: Mapped[datetime | None]
+    arm: Mapped[str | None] = mapped_column(String(40))
+    """Of a study between subjects, once they were allocated (designs.Allocation says how)."""
+    ended_as: Mapped[str | None] = mapped_column(String(20))
+    """One of designs.Ending: thanked and sent back before the end."""
     withdrawn_at: Mapped[datetime | None]
     """Everything else about the person is erased then; this row stays as the tombstone."""
     erased_at: Mapped[datetime | None]
     """When the worker had removed the last traces as well: its own notes, late results, freed pages of databases."""
 
     study: Mapped[Study] = relationship(lazy="raise")
+
+    @property
+    def settings(self) -> StudySettings:
+        """The study's, as they hold in this person's arm; the study is loaded."""
+        return self.study.settings.in_arm(self.arm)
 
     @property
     def code(self) -> str:

@@ -7,6 +7,7 @@ from pydantic import BaseModel, ConfigDict, field_validator, model_validator
 
 from app.domain.choices import ClipQuality, Method, RewardKind, Strategy
 from app.domain.described import Section, Use, setting
+from app.domain.designs import MOST_ARMS, Arm, Screen, why_no_arms, why_no_screening
 from app.domain.protocol import (
     MOST_INSTRUMENTS,
     PAPER_DEMOGRAPHICS,
@@ -180,6 +181,52 @@ class StudySettings(BaseModel):
         "Show people their own robot at the end",
         "Before and after, side by side, and what it learned.",
     )
+    arms: tuple[Arm, ...] = setting(
+        (),
+        Section.DESIGN,
+        "Arms, for a study between subjects",
+        "One per line, with the methods that its people meet: own | pbarl. Then: usual | reference. Names are for you; "
+        "participants never see them. Empty: everybody meets every method.",
+        fixed_by=Use.ARMS,
+        max_length=MOST_ARMS,
+    )
+    stopped_arms: tuple[str, ...] = setting(
+        (), Section.DESIGN, "Arms that take nobody in any more", "Names, with commas.", max_length=MOST_ARMS
+    )
+    arm_quota: int = setting(
+        0,
+        Section.DESIGN,
+        "People who complete each arm",
+        "Then the arm is closed; whoever drops out is replaced. 0: as many as come.",
+        unit="people",
+        ge=0,
+        le=100_000,
+    )
+    arm_away_minutes: int = setting(
+        60,
+        Section.DESIGN,
+        "Counted as dropped out after",
+        "Without a sign. Whoever comes back goes on, and is counted again.",
+        unit="minutes",
+        ge=5,
+        le=43_200,
+    )
+    screening: tuple[Screen, ...] = setting(
+        (),
+        Section.DESIGN,
+        "Who may take part",
+        "By questions at the start, one per line: age | 18 to 75. Of a choice: hand | left; right. Others are thanked "
+        "and sent back. No answer: they may.",
+    )
+    end_after_misses: int = setting(
+        0,
+        Section.DESIGN,
+        "Missed catch pairs that end it",
+        "At so many wrong answers somebody is thanked and sent back. 0: never.",
+        unit="pairs",
+        ge=0,
+        le=20,
+    )
     panel_parameter: str = setting(
         "PROLIFIC_PID",
         Section.PANEL,
@@ -190,6 +237,10 @@ class StudySettings(BaseModel):
         pattern=r"^([A-Za-z][A-Za-z0-9_]{0,39})?$",
     )
     completion_code: str = setting("", Section.PANEL, "Completion code", "Shown at the end.", max_length=80)
+    screen_out_code: str = setting(
+        "", Section.PANEL, "Code of who may not take part", "Also where no arm is open.", max_length=80
+    )
+    attention_code: str = setting("", Section.PANEL, "Code of who missed catch pairs", max_length=80)
     return_url: str = setting(
         "",
         Section.PANEL,
@@ -351,6 +402,27 @@ class StudySettings(BaseModel):
         return tuple(
             part for part, text in published.items() if not text and not self.own_words(instrument, part, language)
         )
+
+    @model_validator(mode="after")
+    def _arms_and_screening(self) -> "StudySettings":
+        wrong = why_no_arms(self.arms, self.stopped_arms, self.evaluation) or why_no_screening(
+            self.screening, self.demographics
+        )
+        if wrong is None and self.end_after_misses > self.catch_pairs:
+            wrong = f"Nobody can miss {self.end_after_misses} of {self.catch_pairs} catch pairs."
+        if wrong is None and not self.arms and set(self.planned_tests) & {PlannedTest.WELCH_T, PlannedTest.PERMUTATION}:
+            wrong = "Welch\N{RIGHT SINGLE QUOTATION MARK}s and the permutation test compare arms, and there are none."
+        if wrong is not None:
+            raise ValueError(wrong)
+        return self
+
+    def in_arm(self, name: str | None) -> "StudySettings":
+        """The settings as they hold for the people of an arm: their evaluation has the arm's methods alone."""
+        arm = next((each for each in self.arms if each.name == name), None)
+        if arm is None or self.evaluation is None:
+            return self
+        theirs = self.evaluation.model_copy(update={"methods": arm.methods})
+        return self.model_copy(update={"evaluation": theirs})
 
     @property
     def closing_form(self) -> tuple[FormItem, ...]:

@@ -171,6 +171,11 @@ finished-robot-making = Your robot is being prepared
 finished-robot-making-text = It is learning from your answers. You do not need to wait for it.
 finished-robot-progress = How far your robot is
 finished-undo = Take back my last answer
+ended-title = Thank you for your interest
+ended-screened-out = This study needs other people just now, so it ends here for you. You have done nothing wrong.
+ended-full = As many people as are needed are taking part already, so the study ends here for you. You have done nothing wrong.
+ended-inattentive = Several of your answers did not fit what the videos showed, so the study ends here for you.
+ended-kept = What you have answered is kept. If you would rather have it erased, choose “Withdraw from the study” below.
 
 ## Withdrawing
 

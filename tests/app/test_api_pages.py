@@ -16,7 +16,7 @@ from app.db import Database, now
 from app.domain.clips import Clip
 from app.domain.evaluation import HeadToHead, HeadToHeadAnswer, Rating, Trial
 from app.domain.models import ModelKind
-from app.domain.participation import ConsentRecord, FormAnswer, ParticipantEvent, StageRecord
+from app.domain.participation import Allocation, ConsentRecord, FormAnswer, ParticipantEvent, StageRecord
 from app.domain.people import AuditEvent, Experimenter
 from app.domain.preferences import LabelEvent, Query, Response
 from app.domain.protocol import EvaluatedMethod
@@ -113,7 +113,8 @@ def somebody_does_everything(session: Session, store: ArtefactStore, study: Stud
             )
         )
         donors.draw(session, study, person, EvaluatedMethod.AVERAGE, ("cautious",))
-    factories.make_participant(session, study)
+    newcomer, _ = factories.make_participant(session, study)
+    session.add(Allocation(participant_id=newcomer.id, place=newcomer.number, lot=0.5, considered={}))
     session.add(Deviation(study_id=study.id, actor="pat", reason="later", before={}, after={}))
 
 

@@ -16,6 +16,7 @@ from sqlalchemy import select
 from app.db import Database, now
 from app.domain.models import Export, ModelKind, Report, RunKind, RunStatus
 from app.domain.people import AuditEvent, Experimenter
+from app.domain.power_plan import PowerInputs
 from app.domain.preferences import Query
 from app.domain.protocol import EvaluationMode, EvaluationSettings
 from app.domain.studies import Participant, Study
@@ -29,6 +30,7 @@ from tests.app.study_pages import typed
 from tests.conftest import PASSWORD
 
 SLUG = "feeding-at-home"
+POWER = {name: str(value) for name, value in PowerInputs().model_dump(mode="json").items()}
 S, P = f"/studies/{SLUG}", f"/studies/{SLUG}/participants/P01"
 API = "/api/v1"
 
@@ -53,6 +55,7 @@ NOT_PERSONAL = {
     "show_texts": "our own texts",
     "show_settings": "the study's settings",
     "show_lock": "the study's settings",
+    "show_power": "what is supposed about people who have not come",
     "download_lock": "the study's settings",
     "show_translations": "the study's own texts",
     "show_members": "who has an account; every change of it is recorded",
@@ -194,6 +197,7 @@ def place(database: Database, store: ArtefactStore, experimenter: TestClient, tm
         Act("create_study", "study created", "/studies/new", new_study),
         Act("change_settings", "settings changed", f"{S}/settings", settings_form),
         Act("open_preview", "preview opened", f"{S}/preview", {}),
+        Act("ask_power", "power plan asked for", f"{S}/power", POWER),
         Act("lock_study", "study locked", f"{S}/lock", {"typed": SLUG}),
         Act("add_participants", "participant added", f"{S}/participants", {"count": 1}),
         Act("show_links", "personal links viewed", f"{S}/links/KEY"),

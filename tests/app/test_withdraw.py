@@ -21,7 +21,7 @@ from app.domain.evaluation import (
     Trial,
 )
 from app.domain.models import Export, Model, ModelKind, Report, RunKind
-from app.domain.participation import ConsentRecord, FormAnswer, ParticipantEvent, StageRecord
+from app.domain.participation import Allocation, ConsentRecord, FormAnswer, ParticipantEvent, StageRecord
 from app.domain.people import AuditEvent
 from app.domain.preferences import Exclusion, LabelEvent
 from app.domain.self_setting import PreviewFilm, SelfSetting
@@ -135,6 +135,7 @@ def leave_traces(database: Database, store: ArtefactStore, participant_id: int) 
                 FormAnswer(participant_id=person.id, form="demographics", item="gender", value=marked("form")),
                 ParticipantEvent(participant_id=person.id, kind=marked("kind")[:40], detail={"x": marked("event")}),
                 StageRecord(participant_id=person.id, stage=marked("stage")[:20]),
+                Allocation(participant_id=person.id, place=1, lot=0.5, considered={marked("arm"): {}}),
                 Report(
                     study_id=study.id,
                     run_id=report_run.id,

@@ -19,7 +19,7 @@ from app.services.participants import time_left
 from app.services.studies import preregistration
 from app.web.experimenter import results
 from worker import responses
-from worker.analysis import figures, hypothesis_tests, statistics
+from worker.analysis import between, figures, hypothesis_tests, statistics
 from worker.analysis.promise import Promise
 from worker.experiments import benchmark_cell, rollout_cache
 from worker.experiments.benchmark_cell import BenchmarkConfig
@@ -74,7 +74,7 @@ def test_what_is_usual_without_a_study_is_what_is_usual_in_one(assumed: object, 
         (Strategy, get_args(acquisition.Strategy)),
         (ClipQuality, STYLES),
         (Response, responses.TARGETS),
-        (PlannedTest, hypothesis_tests.TESTS),
+        (PlannedTest, (*hypothesis_tests.TESTS, *between.BETWEEN_TESTS)),
         (PlannedTest, preregistration.TEST_NAMES),
         (EvaluatedMethod, unblinding.NAMES),
         (EvaluatedMethod, results.METHOD_NAMES),

@@ -16,7 +16,13 @@ def d_z_interval(t: float, n: int) -> tuple[float, float]:
 
     Steiger & Fouladi (1997). ``n``: number of pairs.
     """
-    return _noncentrality(t, n - 1, 1 - _TAIL) / n**0.5, _noncentrality(t, n - 1, _TAIL) / n**0.5
+    low, high = noncentrality_interval(t, n - 1)
+    return low / n**0.5, high / n**0.5
+
+
+def noncentrality_interval(t: float, degrees_of_freedom: int) -> tuple[float, float]:
+    """The noncentral t distributions in whose tails this t just lies."""
+    return _noncentrality(t, degrees_of_freedom, 1 - _TAIL), _noncentrality(t, degrees_of_freedom, _TAIL)
 
 
 def _noncentrality(t: float, degrees_of_freedom: int, share_below: float) -> float:

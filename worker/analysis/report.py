@@ -37,6 +37,8 @@ class Tables:
     """who named which robot as made for them; None: that is not asked"""
     instruments: Sequence[Row] = ()
     """standard questionnaires with what people filled in, see scales"""
+    between: bool = False
+    """whether people in different arms met different methods"""
     head_to_heads: Sequence[Row] | None = None
     """rows of the table headtoheads; None: there are none, or the study is blinded"""
     version: int = 0
@@ -61,6 +63,7 @@ def make_report(tables: Tables) -> tuple[dict[str, Any], dict[str, dict[str, byt
             tables.groups,
             by="letter" if tables.blinded else "method",
             compare=not tables.blinded,
+            between=tables.between,
         ),
         "guesses": None if tables.guesses is None else guess_report(tables.guesses, len(tables.groups)),
         "head_to_heads": None if tables.head_to_heads is None else _head_to_heads(tables),

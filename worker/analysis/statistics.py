@@ -11,7 +11,9 @@ Layout of what ``rating_report`` returns, which is ``contents["ratings"]`` of a 
     measured_error_percent[]            people, and per test: how often it errs where nothing differs
     scales.<scale>.means[]              group, ratings, participants, mean, sd, participant_mean, low, high
     scales.<scale>.people[]             participant, means {group: that person's mean}
-    scales.<scale>.comparisons[]        first, second, and a result for each of TESTS
+    scales.<scale>.comparisons[]        first, second, and a result for each of TESTS; between subjects also of
+                                        between.BETWEEN_TESTS
+    scales.<scale>.order                order and period effects, see order_effects; None while letters hide methods
 
 Every result of a test has either its numbers or ``not_computable``: the reason in words. A difference is always second
 minus first. Nothing here is NaN or infinite; what is unknown is None.
@@ -25,6 +27,7 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
+from worker.analysis.between import BETWEEN_TESTS, hedges_g, only_one_of, permutation, welch_t
 from worker.analysis.effect_sizes import d_z_interval, holm, rank_biserial, rank_biserial_interval
 from worker.analysis.hypothesis_tests import (
     FEWEST_PAIRED,
@@ -36,6 +39,7 @@ from worker.analysis.hypothesis_tests import (
     two_sample_t,
     wilcoxon,
 )
+from worker.analysis.order_effects import order_report
 from worker.type_aliases import FloatArray
 
 Result = dict[str, Any]
@@ -63,11 +67,14 @@ ERROR_BARS = (
 )
 
 
-def rating_report(ratings: pd.DataFrame, groups: Sequence[str], *, by: str = "method", compare: bool = True) -> Result:
+def rating_report(
+    ratings: pd.DataFrame, groups: Sequence[str], *, by: str = "method", compare: bool = True, between: bool = False
+) -> Result:
     """Means and tests of both scales. See the layout above.
 
     ``by``: the column that names the groups; ``compare``: False while letters hide methods, for then a letter is
-    another method for every participant and a test between letters would say nothing about methods.
+    another method for every participant and a test between letters would say nothing about methods. ``between``: with
+    the tests of people who met different methods.
     """
     rows = ratings.dropna(subset=list(SCALES))
     rows = rows[rows[by].isin(list(groups))]
@@ -80,7 +87,7 @@ def rating_report(ratings: pd.DataFrame, groups: Sequence[str], *, by: str = "me
         "measured_error_percent": list(MEASURED_ERROR_PERCENT),
         "error_bars": ERROR_BARS,
         "star_below": STAR_BELOW,
-        "scales": {scale: scale_report(rows, scale, by, groups, compare) for scale in SCALES},
+        "scales": {scale: scale_report(rows, scale, by, groups, compare, between=between) for scale in SCALES},
     }
 
 
@@ -91,19 +98,32 @@ def scale_report(
     groups: Sequence[str],
     compare: bool,
     possible: tuple[float, float] = POINTS,
+    between: bool = False,
 ) -> Result:
     """Means, people and comparisons of one scale, a column of ``rows``; ``possible``: its lowest and highest value."""
     comparisons: list[Result] = [
         {"first": first, "second": second, **_tests(rows, scale, by, first, second)}
         for first, second in (combinations(groups, 2) if compare else ())
     ]
-    for test in TESTS[1:]:
+    people = _people(rows, scale, by)
+    for comparison in comparisons if between else ():
+        comparison |= _between(people, comparison["first"], comparison["second"])
+    for test in (*TESTS[1:], *(BETWEEN_TESTS if between else ())):
         _correct([comparison[test] for comparison in comparisons])
     return {
         "means": [_mean_of(rows[rows[by] == group], scale, group, possible) for group in groups],
-        "people": _people(rows, scale, by),
+        "people": people,
         "comparisons": comparisons,
+        "order": order_report(rows, scale) if compare and "order" in rows else None,
     }
+
+
+def _between(people: Sequence[Result], first: str, second: str) -> dict[str, Result]:
+    groups = only_one_of({each["participant"]: each["means"] for each in people}, first, second)
+    results = {"welch_t": welch_t(*groups), "permutation": permutation(*groups)}
+    if "p" in results["welch_t"]:
+        results["welch_t"] |= hedges_g(*groups)
+    return results
 
 
 def _people(rows: pd.DataFrame, scale: str, by: str) -> list[Result]:

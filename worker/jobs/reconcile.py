@@ -22,7 +22,7 @@ from app.domain.studies import Participant, Study
 from app.services.evaluation import evaluation_plan, self_setting
 from worker import scenarios
 from worker.jobs.clips import preview_films, repairs
-from worker.jobs.publishing import export_files, report_files
+from worker.jobs.publishing import export_files, power_plans, report_files
 from worker.jobs.runtime import due_evaluation
 from worker.jobs.runtime.due_work import (
     answers_known,
@@ -79,6 +79,7 @@ def _all_due(session: Session, study: Study, succeeded: Collection[str]) -> Iter
     yield from _stale_models(session, study, succeeded)
     yield from report_files.due(session, study)
     yield from export_files.due(session, study)
+    yield from power_plans.due(session, study)
 
 
 def abandoned(session: Session, in_hand: Collection[str]) -> list[tuple[Job, int]]:
@@ -187,7 +188,7 @@ def _clips_by_scenario(session: Session, study: Study, step_count: int | None) -
 def _stale_models(session: Session, study: Study, succeeded: Collection[str]) -> list[Job]:
     jobs, settings = [], study.settings
     answers, exclusions = last_answers(session, present_ids(study)), last_exclusions(session, present_ids(study))
-    begun = evaluation_plan.begun(session, study)
+    begun, rating = evaluation_plan.begun(session, study), _rating(session, study)
     have_set = self_setting.who_have_set(session, study) if self_setting.is_set(study) else set()
     for participant_id, count in sorted(count_labels(session, present_ids(study)).items()):
         known = answers_known(settings, count, answers[participant_id], exclusions.get(participant_id))
@@ -198,8 +199,13 @@ def _stale_models(session: Session, study: Study, succeeded: Collection[str]) ->
             milestone = filter_due(settings, count)
             if milestone and str(reward) in succeeded and study.material is None:  # no simulator, no filter
                 jobs.append(Job(replace(reward, kind=RunKind.FILTER, labels=milestone), study.id))
-        if count >= settings.labels_per_participant and study.material is None:
-            jobs += due_evaluation.due(
-                study, reward, succeeded, participant_id in begun, has_set=participant_id in have_set
-            )
+        if count >= settings.labels_per_participant and study.material is None and participant_id in rating:
+            arm, shown = rating[participant_id], participant_id in begun
+            jobs += due_evaluation.due(study, reward, succeeded, shown, arm, has_set=participant_id in have_set)
     return jobs
+
+
+def _rating(session: Session, study: Study) -> dict[int, str | None]:
+    """The arm of everybody who was not sent away before the evaluation."""
+    going_on = select(Participant.id, Participant.arm).where(Participant.study_id == study.id)
+    return dict(session.execute(going_on.where(Participant.ended_as.is_(None))).all())

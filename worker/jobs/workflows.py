@@ -53,6 +53,7 @@ BODIES: dict[RunKind, Callable[[WorkerContext, Job, int, Step], None]] = {
     RunKind.FILMS: Imported("worker.jobs.clips.evaluation_films:make_films"),
     RunKind.REPORT: Imported("worker.jobs.publishing.report_files:make"),
     RunKind.EXPORT: Imported("worker.jobs.publishing.export_files:make"),
+    RunKind.POWER: Imported("worker.jobs.publishing.power_plans:make"),
 }
 
 

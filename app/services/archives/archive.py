@@ -30,6 +30,7 @@ from sqlalchemy.orm import Session
 from app.db import Base, now
 from app.domain.models import Export, Report, Run, RunKind
 from app.domain.people import ApiToken, BrowserSession, StudyMember
+from app.domain.power_plan import PowerPlan
 from app.domain.studies import Participant, Study
 from app.errors import AppError
 from app.services.archives import sealing
@@ -43,11 +44,11 @@ FORMAT, VERSION = "pbarl-studio-archive", 2
 MANIFEST, SEALED = "manifest.json", "sealed"
 LARGEST_MANIFEST_BYTES = 8 << 20
 LARGEST_ROW_BYTES = 4 << 20
-LEFT_OUT = {each.__tablename__ for each in (BrowserSession, StudyMember, ApiToken, Report, Export)}
+LEFT_OUT = {each.__tablename__ for each in (BrowserSession, StudyMember, ApiToken, Report, Export, PowerPlan)}
 """Who may come in is a matter of each installation; reports and files are made again."""
 SECRETS = {"study": {"join_token"}, "participant": {"token_sha256", "link_revoked_at"}}
 """Columns that never leave: with them somebody could answer in somebody else's name; and links are new elsewhere."""
-REMADE = (RunKind.REPORT, RunKind.EXPORT)
+REMADE = (RunKind.REPORT, RunKind.EXPORT, RunKind.POWER)
 _ROWS_AT_ONCE = 500
 _SHA256 = r"^[0-9a-f]{64}$"
 

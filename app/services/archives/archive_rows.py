@@ -17,6 +17,7 @@ from sqlalchemy import JSON, Boolean, Column, Float, Integer, String, Table
 
 from app.db import Base, UtcDateTime
 from app.domain import run_keys
+from app.domain.designs import Ending
 from app.domain.evaluation import DonorDraw, DonorRule, Donors, HeadToHeadResponse
 from app.domain.models import ModelKind, RunKind, RunStatus
 from app.domain.preferences import Purpose, Response, SkipReason
@@ -43,12 +44,14 @@ _WORDS: Mapping[tuple[str, str], type[StrEnum]] = {
     ("controller", "method"): EvaluatedMethod,
     ("donor_draw", "method"): EvaluatedMethod,
     ("donor_draw", "rule"): DonorRule,
+    ("participant", "ended_as"): Ending,
     ("head_to_head_answer", "response"): HeadToHeadResponse,
 }
 _PATTERNS: Mapping[tuple[str, str], str] = {
     ("study", "task"): r"[a-z][a-z0-9_]{0,39}",  # names a folder of the worker
     ("study", "key_secret"): r"[0-9a-f]{64}",
     ("run", "workflow_id"): r"[ -~]+",
+    ("participant", "arm"): r"[a-z][a-z0-9_]{0,39}",
     ("assignment", "letter"): r"[A-E]",
     ("trial", "letter"): r"[A-E]",
     ("form_answer", "letter"): r"[A-E]",

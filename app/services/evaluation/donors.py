@@ -77,6 +77,7 @@ def candidates(session: Session, study: Study, participant: Participant) -> Sequ
         Participant.id != participant.id,
         Participant.withdrawn_at.is_(None),
         Participant.is_preview.is_(False),
+        Participant.ended_as.is_(None),
         scripted if participant.scripted_as is not None else ~scripted,
         has_filter,
     )

@@ -3,11 +3,11 @@
 How it is drawn. As in the paper every method is met in one block of trials (three by default), and the order of the
 blocks varies. The orders are the rows of a Williams design: over one cycle of participants (2, 4, 6 or 10 of them for
 2, 4, 3 or 5 methods) every method comes equally often at every place and equally often right after every other one.
-Which row a participant gets follows from their number: each cycle goes through all rows once, in an order drawn from
-the study's secret, which nobody sees before unblinding; the seed, which everybody sees, tells nothing about it. Letters
-are given in the order of appearance (the first block is Robot A), so a letter says when a method was met and nothing
-else. The scenarios are the same for all methods of a participant, one per repetition, and different for other
-participants.
+Which row a participant gets follows from their number, between subjects from their place in their arm, where only the
+arm's methods count: each cycle goes through all rows once, in an order drawn from the study's secret, which nobody sees
+before unblinding; the seed, which everybody sees, tells nothing about it. Letters are given in the order of appearance
+(the first block is Robot A), so a letter says when a method was met and nothing else. The scenarios are the same for
+all methods of a participant, one per repetition, and different for other participants.
 
 Head-to-heads come when all is rated. Every two meet as often as the study says, each time in another scenario, in
 films that were rated. A round has every pair once, in a drawn order. The robots stand on a drawn circle, and a robot is
@@ -31,6 +31,7 @@ from sqlalchemy.orm import Session, joinedload
 
 from app.db import now
 from app.domain.evaluation import Assignment, Controller, Film, HeadToHead, Rating, Trial
+from app.domain.participation import Allocation
 from app.domain.protocol import LETTERS, EvaluatedMethod, EvaluationMode, EvaluationSettings
 from app.domain.studies import Participant, Study
 from app.questionnaires.library import Instrument
@@ -106,6 +107,14 @@ def settings_of(study: Study) -> EvaluationSettings | None:
     return study.settings.evaluation if study.material is None else None
 
 
+def settings_for(study: Study, arm: str | None) -> EvaluationSettings | None:
+    """The same as it holds for somebody in this arm; None as well before they have one."""
+    settings = study.settings
+    if study.material is not None or (settings.arms and arm is None):
+        return None
+    return settings.in_arm(arm).evaluation
+
+
 def williams_rows(count: int) -> Sequence[tuple[int, ...]]:
     """Orders of ``count`` treatments in which each comes equally often at each place and after each other one.
 
@@ -143,13 +152,13 @@ def meetings(seed: int, settings: EvaluationSettings) -> Sequence[Meeting]:
 
 def draw(session: Session, study: Study, participant: Participant) -> None:
     """Draw the participant's letters, trials and head-to-heads; drawing again changes nothing."""
-    settings = settings_of(study)
+    settings = settings_for(study, participant.arm)
     if settings is None or participant.withdrawn_at is not None:
         return
     session.scalar(select(Participant.id).where(Participant.id == participant.id).with_for_update())  # one at a time
     if session.scalar(select(Assignment.id).where(Assignment.participant_id == participant.id).limit(1)) is not None:
         return
-    methods = order_of_methods(study.key_secret, settings.methods, participant.number)
+    methods = order_of_methods(study.key_secret, settings.methods, _turn(session, participant))
     for block, (letter, method) in enumerate(zip(LETTERS, methods, strict=False)):
         session.add(Assignment(participant_id=participant.id, letter=letter, method=method))
         for repetition in range(1, settings.trials + 1):
@@ -167,6 +176,12 @@ def draw(session: Session, study: Study, participant: Participant) -> None:
         sides = {"left_trial_id": known[left, repetition], "right_trial_id": known[right, repetition]}
         session.add(HeadToHead(participant_id=participant.id, ordinal=ordinal, **sides))
     session.flush()
+
+
+def _turn(session: Session, participant: Participant) -> int:
+    """Whose turn the orders are: the place in the arm, so that they are balanced there; else the number."""
+    place = session.scalar(select(Allocation.place).where(Allocation.participant_id == participant.id))
+    return place or participant.number
 
 
 def trial_scenario(participant: Participant, repetition: int) -> int:
@@ -266,7 +281,7 @@ def _can_be_compared(store: ArtefactStore, each: HeadToHead) -> bool:
 def _state(
     session: Session, store: ArtefactStore, participant: Participant, trials: Sequence[Trial]
 ) -> EvaluationState:
-    settings = settings_of(participant.study)
+    settings = settings_for(participant.study, participant.arm)
     ratings = ratings_of(session, participant.id)
     trial = next((each for each in trials if each.id not in ratings), None)
     if settings is None or trial is None or not is_ready(session, store, settings, participant.id, trial):

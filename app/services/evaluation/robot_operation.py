@@ -79,7 +79,7 @@ class Desk:
 
 def desk_of(session: Session, store: ArtefactStore, study: Study, participant: Participant) -> Desk:
     """The participant's trials and controllers. Raises NotPhysical."""
-    settings = evaluation_plan.settings_of(study)
+    settings = evaluation_plan.settings_for(study, participant.arm)
     if settings is None or settings.mode is not EvaluationMode.PHYSICAL:
         raise NotPhysical
     trials = evaluation_plan.trials_of(session, participant.id)

@@ -44,7 +44,7 @@ class _Part:
 def preparation(session: Session, participant: Participant) -> Preparation:
     """How far the robots are, counted from what is there and what is at work; the study is loaded."""
     study = participant.study
-    settings = evaluation_plan.settings_of(study)
+    settings = evaluation_plan.settings_for(study, participant.arm)
     methods = settings.methods if settings else ()
     trained = {method: _is_trained(session, participant, ModelKind.METHOD, method) for method in methods}
     training = [method for method in methods if method in evaluation_plan.TRAINED]
@@ -97,7 +97,7 @@ def _training(session: Session, participant: Participant, method: EvaluatedMetho
 def _showing(session: Session, participant: Participant, what: str) -> _Part:
     """The first films, or all controllers: the others are made while the first robot is rated."""
     usual = estimates.usual_s(session, participant.study, RunKind.FILMS, what)
-    settings = evaluation_plan.settings_of(participant.study)
+    settings = evaluation_plan.settings_for(participant.study, participant.arm)
     if what == CONTROLLERS or usual is None or settings is None:
         return _part(session, participant, RunKind.FILMS, what)
     return _Part(usual, usual * min(1.0, estimates.FILMS_AT_A_TIME / settings.trial_count), 0.0)

@@ -66,18 +66,20 @@ def unblind(session: Session, study: Study, typed: str, actor: str) -> None:
 
 def rated_and_wanted(session: Session, study: Study) -> tuple[int, int]:
     """Trials rated, and trials that all participants are to rate: what unblinding too early would spoil."""
-    settings = study.settings.evaluation
-    people = select(func.count(Participant.id)).where(
+    settings = study.settings
+    people = select(Participant.arm, func.count(Participant.id)).where(
         Participant.study_id == study.id, Participant.withdrawn_at.is_(None), Participant.is_preview.is_(False)
     )
+    people = people.where(Participant.ended_as.is_(None)).group_by(Participant.arm)
+    theirs = {arm: settings.in_arm(arm).evaluation for arm, _ in session.execute(people)}
     rated = (
         select(func.count(func.distinct(Rating.trial_id)))
         .join(Trial)
         .join(Participant, Participant.id == Trial.participant_id)
         .where(Participant.study_id == study.id, Participant.is_preview.is_(False))
     )
-    per_person = settings.trial_count if settings else 0
-    return session.scalar(rated) or 0, (session.scalar(people) or 0) * per_person
+    wanted = sum(count * (each.trial_count if (each := theirs[arm]) else 0) for arm, count in session.execute(people))
+    return session.scalar(rated) or 0, wanted
 
 
 def methods_by_letter(session: Session, study: Study) -> dict[tuple[int, str], str]:

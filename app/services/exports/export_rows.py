@@ -12,7 +12,7 @@ from sqlalchemy.orm import Session, aliased, joinedload
 from app.domain.clips import Clip, Rollout
 from app.domain.evaluation import DonorDraw, HeadToHead, HeadToHeadAnswer, Rating, Trial
 from app.domain.models import Bundle, Model, ModelKind
-from app.domain.participation import ConsentRecord, FormAnswer, ParticipantEvent, StageRecord
+from app.domain.participation import Allocation, ConsentRecord, FormAnswer, ParticipantEvent, StageRecord
 from app.domain.preferences import LEARNED_FROM, Exclusion, LabelEvent, Query
 from app.domain.protocol import LETTERS
 from app.domain.self_setting import SelfSetting
@@ -25,7 +25,7 @@ from app.services.evaluation import self_setting, unblinding
 from app.services.exports.paging import EVERYTHING, KeyedRows, Window
 from app.services.runs import model_metrics
 
-_OfPerson = TypeVar("_OfPerson", ConsentRecord, ParticipantEvent, StageRecord)
+_OfPerson = TypeVar("_OfPerson", Allocation, ConsentRecord, ParticipantEvent, StageRecord)
 AT_ONCE = 200
 """Clips: there may be tens of thousands, and a page wants a hundred."""
 
@@ -62,7 +62,7 @@ def participants(session: Session, study: Study, window: Window = EVERYTHING) ->
 
 def _participant(study: Study, each: Participant) -> Sequence[Any]:
     if each.withdrawn_at is not None:
-        return (each.code, "withdrawn", *[None] * 9, each.withdrawn_at, each.scripted_as)
+        return (each.code, "withdrawn", *[None] * 9, each.withdrawn_at, each.scripted_as, None, None)
     status = "completed" if each.completed_at else "consented" if each.consented_at else "invited"
     return (
         each.code,
@@ -78,7 +78,17 @@ def _participant(study: Study, each: Participant) -> Sequence[Any]:
         each.panel_id,
         None,
         each.scripted_as,
+        None if unblinding.is_blinded(study) else each.arm,
+        each.ended_as,
     )
+
+
+def allocations(session: Session, study: Study, window: Window = EVERYTHING) -> KeyedRows:
+    if unblinding.is_blinded(study):
+        return
+    for person, each in _theirs(session, study, window, Allocation):
+        values = (person.arm, each.place, each.lot, each.considered, each.created_at)
+        yield (person.number, each.id), (person.code, *values)
 
 
 def stages(session: Session, study: Study, window: Window = EVERYTHING) -> KeyedRows:

@@ -4,9 +4,10 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from app.domain.clips import Clip
+from app.domain.designs import Ending
 from app.domain.evaluation import DonorDraw, DonorRule, HeadToHead, HeadToHeadAnswer, HeadToHeadResponse, Rating, Trial
 from app.domain.models import Model, ModelKind
-from app.domain.participation import ConsentRecord, FormAnswer, ParticipantEvent, StageRecord
+from app.domain.participation import Allocation, ConsentRecord, FormAnswer, ParticipantEvent, StageRecord
 from app.domain.preferences import LabelEvent, Purpose, Query, Response, SkipReason
 from app.domain.protocol import FROM_OTHERS, EvaluatedMethod, Stage
 from app.domain.self_setting import SelfSetting
@@ -51,9 +52,32 @@ TABLES: Sequence[Table] = (
             Column(
                 "scripted_as", T, "The user that a program played; no person has answered or rated. Empty: a person."
             ),
+            Column("arm", T, "Between subjects: the arm; empty until the study is unblinded."),
+            Column("ended_as", T, "Why they were sent back before the end.", allowed=_words(Ending)),
         ),
         export_rows.participants,
         (Participant,),
+    ),
+    Table(
+        "allocations",
+        "Between subjects: how each participant came into their arm; no rows until the study is unblinded.",
+        (
+            PARTICIPANT,
+            Column("arm", T, "Into which arm."),
+            Column("place", I, "In the arm, from 1; decides in which order they met its methods."),
+            Column(
+                "lot",
+                N,
+                "Picked among the open arms with the fewest people completed or on their way. The first 13 hexadecimal "
+                "digits of SHA-256 of <secret>/evaluation/arm/<number of the participant>, divided by 16^13.",
+                allowed="0 to 1",
+            ),
+            Column("considered", J, "By arm, as it was then: completed, on_their_way, open."),
+            Column("allocated_at", W, "When."),
+        ),
+        export_rows.allocations,
+        (Allocation,),
+        grows_by=Allocation,
     ),
     Table(
         "stages",

@@ -34,7 +34,7 @@ def stages_of(settings: StudySettings) -> Sequence[Stage]:
 
 def current_stage(session: Session, participant: Participant) -> Stage | None:
     """The first stage that is not finished, remembering that it was entered; None when all are. The study is loaded."""
-    stages = stages_of(participant.study.settings)
+    stages = stages_of(participant.settings)
     records = _records(session, participant)
     current = next((stage for stage in stages if not _is_finished(session, participant, stage, records)), None)
     passed = stages if current is None else stages[: stages.index(current)]
@@ -48,7 +48,7 @@ def current_stage(session: Session, participant: Participant) -> Stage | None:
 
 def reached(session: Session, participant: Participant, stage: Stage) -> bool:
     """Whether the participant is in this stage or through with it, so that its page may be shown (again)."""
-    stages = stages_of(participant.study.settings)
+    stages = stages_of(participant.settings)
     current = current_stage(session, participant)
     return stage in stages and (current is None or stages.index(stage) <= stages.index(current))
 
@@ -66,7 +66,7 @@ def finish(session: Session, participant: Participant, stage: Stage) -> None:
 
 
 def _is_finished(session: Session, participant: Participant, stage: Stage, records: dict[Stage, StageRecord]) -> bool:
-    settings = participant.study.settings
+    settings = participant.settings
     match stage:
         case Stage.CONSENT:
             agreed = participant.consented_at is not None

@@ -68,6 +68,7 @@ def fixed_settings(session: Session, study: Study) -> Mapping[str, str]:
         Use.CLIPS: select(Rollout.id).where(Rollout.study_id == study.id),
         Use.PAIRS: select(Query.id).where(Query.participant_id.in_(real)),
         Use.EVALUATION: select(Assignment.id).where(Assignment.participant_id.in_(real)),
+        Use.ARMS: real.where(Participant.arm.is_not(None)),
     }
     happened = {use for use, sign in signs.items() if session.scalar(sign.limit(1)) is not None}
     return {name: use.label for name, use in FIXED_BY.items() if use in happened}

@@ -23,6 +23,8 @@ TEST_NAMES: Mapping[str, str] = {
     PlannedTest.PAIRED_T: "Paired t",
     PlannedTest.WILCOXON: "Wilcoxon signed-rank",
     PlannedTest.MIXED_MODEL: "Linear mixed model",
+    PlannedTest.WELCH_T: "Welch t, between people",
+    PlannedTest.PERMUTATION: "Permutation, between people",
 }
 
 

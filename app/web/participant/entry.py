@@ -13,7 +13,7 @@ from app.domain.protocol import Stage
 from app.domain.studies import Participant
 from app.services.accounts import browser_sessions
 from app.services.answers import next_query
-from app.services.participants import enrolment, stages
+from app.services.participants import admission, completion, enrolment, stages
 from app.services.studies.retirement import StudyDeleted, StudyPutAway
 from app.web.error_pages import wants_json
 from app.web.http.deps import (
@@ -45,6 +45,9 @@ def _next(request: Request, studio: Studio, session: Session, participant: Parti
     if participant.study.put_away_at is not None:
         return _closed(request, participant)
     stage = stages.current_stage(session, participant)
+    admission.settle(session, participant, stage)
+    if participant.ended_as is not None and not wants_json(request):
+        return _ended(request, participant)
     for_script = wants_json(request) and stages.reached(session, participant, Stage.PAIRS)
     if stage in (Stage.PRACTICE, Stage.PAIRS) or for_script:
         return pairs.show_turn(request, session, studio, participant)
@@ -64,6 +67,16 @@ def finish_instructions(request: Request, participant: AtInstructions, session: 
     """Store that the instructions were read, then start."""
     stages.finish(session, participant, Stage.INSTRUCTIONS)
     return go(request, "show_next")
+
+
+def _ended(request: Request, participant: Participant) -> Response:
+    """Thanks before the end: that the study does not go on, and the way back to the panel with a code of its own."""
+    context = {
+        "code": completion.code_of(participant),
+        "return_address": completion.return_address(participant),
+        "first_time": False,
+    }
+    return participant_page(request, "participant/ended.html", participant, context)
 
 
 def _closed(request: Request, participant: Participant) -> Response:

@@ -48,7 +48,7 @@ def show_finished(
     request: Request, participant: CurrentParticipant, session: WritingSession, studio: StudioDep
 ) -> Response:
     """Thanks: the completion code, or the way back, which is taken by itself the first time only."""
-    if stages.current_stage(session, participant) is not None:
+    if stages.current_stage(session, participant) is not None or participant.ended_as is not None:
         raise NotYet
     next_query.seen(participant)
     first_time = completion.complete(participant)

@@ -85,8 +85,9 @@ def is_in(stage: Stage) -> Any:
 
 
 def _closed(request: Request, participant: Participant) -> bool:
-    """In a study that is put away no page is shown; what somebody sends from an open one is still kept."""
-    return participant.study.put_away_at is not None and request.method == "GET"
+    """Put away, or over for this person: no page is shown; what somebody sends from an open one is still kept."""
+    over = participant.study.put_away_at is not None or participant.ended_as is not None
+    return over and request.method == "GET"
 
 
 def back_from(request: Request, settings: StudySettings, stage: Stage) -> str | None:

@@ -13,11 +13,12 @@ from sqlalchemy.orm import Session
 
 from app.domain import preferences
 from app.domain.preferences import Purpose, SkipReason
+from app.domain.protocol import Stage
 from app.domain.studies import Awaited, Participant
 from app.services import participant_events
 from app.services.answers import labelling, next_query
 from app.services.participant_events import EventKind
-from app.services.participants import time_left
+from app.services.participants import admission, time_left
 from app.services.participants.time_left import TimeLeft
 from app.services.runs import estimates
 from app.web.error_pages import wants_json
@@ -118,6 +119,7 @@ async def label_query(request: Request, query_id: RowId, answering: AnsweringPar
 
     def label(session: Session, participant: Participant) -> Response:
         labelling.record_label(session, participant, query_id, form.response, form.client_uuid, watching, form.reason)
+        admission.settle(session, participant, Stage.PAIRS)
         return _go_on(request, session, answering.studio, participant)
 
     return await answering.act(label)
@@ -197,7 +199,7 @@ def _turn_for_script(
     left = time_left.time_left(session, participant, turn.progress, studio.usual_times)
     practising = progress.practising
     return {
-        "state": _state(turn),
+        "state": "finished" if participant.ended_as is not None else _state(turn),
         "practising": practising,
         "answered": progress.practised if practising else progress.answered,
         "wanted": progress.practice_wanted if practising else progress.wanted,

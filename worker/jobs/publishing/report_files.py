@@ -138,6 +138,7 @@ def tables_of(session: Session, study: Study) -> Tables:
         columns={name: [column.name for column in table.all_columns] for name, table in wanted.items()},
         ratings=rows["ratings"],
         evaluations=rows["evaluations"],
+        between=bool(study.settings.arms),
         head_to_heads=rows["headtoheads"] if settings and settings.head_to_heads and not blinded else None,
         guesses=_guesses(session, study) if _asks_whose(study) else None,
         instruments=_instruments(session, study),

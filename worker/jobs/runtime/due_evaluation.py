@@ -12,7 +12,13 @@ from worker.jobs.runtime.records import Job
 
 
 def due(
-    study: Study, reward: RunKey, succeeded: Collection[str], robots_shown: bool, *, has_set: bool = False
+    study: Study,
+    reward: RunKey,
+    succeeded: Collection[str],
+    robots_shown: bool,
+    arm: str | None = None,
+    *,
+    has_set: bool = False,
 ) -> list[Job]:
     """What is to be trained, filmed or packed for somebody who has given all labels. ``reward``: their last model's.
 
@@ -21,16 +27,16 @@ def due(
     """
     if str(reward) not in succeeded:
         return []
-    jobs = [] if robots_shown else _methods(study, reward)
+    jobs = [] if robots_shown else _methods(study, reward, arm)
     jobs = [job for job in jobs if has_set or job.about.subject != EvaluatedMethod.SELF_SET]
     if str(replace(reward, kind=RunKind.FILTER)) in succeeded:
-        jobs += _films(study, reward, succeeded, robots_shown)
+        jobs += _films(study, reward, succeeded, robots_shown, arm)
     return jobs
 
 
-def _methods(study: Study, reward: RunKey) -> list[Job]:
+def _methods(study: Study, reward: RunKey, arm: str | None) -> list[Job]:
     """What is to be trained for somebody whose last reward model, that of ``reward``, is there."""
-    settings = evaluation_plan.settings_of(study)
+    settings = evaluation_plan.settings_for(study, arm)
     return [
         Job(replace(reward, kind=RunKind.METHOD, subject=method), study.id)
         for method in (settings.methods if settings else ())
@@ -38,19 +44,19 @@ def _methods(study: Study, reward: RunKey) -> list[Job]:
     ]
 
 
-def _all_trained(study: Study, reward: RunKey, succeeded: Collection[str]) -> bool:
+def _all_trained(study: Study, reward: RunKey, succeeded: Collection[str], arm: str | None) -> bool:
     """Whether everything that is due has been done."""
-    return all(job.key in succeeded for job in _methods(study, reward))
+    return all(job.key in succeeded for job in _methods(study, reward, arm))
 
 
-def _films(study: Study, reward: RunKey, succeeded: Collection[str], robots_shown: bool = False) -> list[Job]:
+def _films(study: Study, reward: RunKey, succeeded: Collection[str], robots_shown: bool, arm: str | None) -> list[Job]:
     """What is to be filmed or packed for somebody whose last filter is there. ``reward``: their last model's.
 
     ``robots_shown``: they have begun to rate, so that what they rate stays.
     """
     wanted = [BEFORE_AFTER] if study.material is None else []
-    settings = None if robots_shown else evaluation_plan.settings_of(study)
-    if settings and _all_trained(study, reward, succeeded):
+    settings = None if robots_shown else evaluation_plan.settings_for(study, arm)
+    if settings and _all_trained(study, reward, succeeded, arm):
         wanted.append(TRIALS if settings.mode is EvaluationMode.VIDEO else CONTROLLERS)
     return [
         Job(replace(reward, kind=RunKind.FILMS, subject=what), study.id)

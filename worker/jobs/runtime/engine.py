@@ -34,6 +34,7 @@ QUEUES = {
     RunKind.FILMS: 1,
     RunKind.REPORT: 1,
     RunKind.EXPORT: 1,
+    RunKind.POWER: 1,
 }
 """How many jobs of each kind one worker does at a time."""
 RESERVE = 2
@@ -41,7 +42,7 @@ RESERVE = 2
 AWAITED = {RunKind.CLIPS, RunKind.REWARD}
 """What somebody may be waiting for who is answering: begun within AWAITED_POLL_S, anything else within POLL_S.
 
-Asking the engine for all seven kinds five times a second took a tenth of a core, whether there was work or not."""
+Asking the engine for all kinds five times a second took a tenth of a core, whether there was work or not."""
 AWAITED_POLL_S, POLL_S = 0.3, 1.0
 
 SILENCE = timedelta(seconds=60)

@@ -101,7 +101,9 @@ class WhoWaits:
 
     def urgency(self, job: Job) -> Urgency:
         """How soon the job is to be done."""
-        if job.kind == RunKind.EXPORT or (job.kind == RunKind.REPORT and job.study_id in self.just_unblinded):
+        if job.kind in (RunKind.EXPORT, RunKind.POWER) or (
+            job.kind == RunKind.REPORT and job.study_id in self.just_unblinded
+        ):
             return Urgency(Level.ASKED, _BEGINNING, 0)
         if job.kind == RunKind.REPORT:
             return Urgency(Level.UNREAD, _BEGINNING, 0)

@@ -12,12 +12,13 @@ from fastapi.sse import EventSourceResponse, ServerSentEvent
 from jinja2 import Environment
 from sqlalchemy.orm import Session
 
+from app.db import now
 from app.domain.people import Experimenter, Role
 from app.domain.studies import Study
 from app.services import audit
 from app.services.monitoring import dashboard, form_summaries, study_state
 from app.services.monitoring.tallies import Tallies
-from app.services.participants import debrief, enrolment
+from app.services.participants import arms, debrief, enrolment
 from app.services.runs import publishing
 from app.services.studies import membership, studies
 from app.web.experimenter.dashboard import charts, form_words, live
@@ -112,6 +113,7 @@ def show_study(
 ) -> Response:
     """One study: its pool and everybody in it."""
     context = _study_context(session, studio, slug, view) | {"experimenter": experimenter, "parts": STUDY_PARTS}
+    context["arms"] = arms.loads(session, context["study"], now())
     return page(request, "experimenter/study.html", context)
 
 

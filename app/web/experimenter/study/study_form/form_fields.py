@@ -9,6 +9,7 @@ from pydantic import BaseModel
 
 from app.domain.choices import Choice
 from app.domain.described import Section, Shown, settings_of
+from app.domain.designs import Arm, Screen
 from app.domain.protocol import EvaluationSettings, FormItem
 from app.domain.study_settings import StudySettings
 
@@ -25,6 +26,12 @@ class Kind(StrEnum):
     PARAGRAPHS = "paragraphs"
     QUESTIONS = "questions"
     """One per line."""
+    ARMS = "arms"
+    """One per line, with its methods."""
+    SCREENS = "screens"
+    """One per line: a question, and who may take part."""
+    NAMES = "names"
+    """With commas between."""
     TEXTS = "texts"
     """One per line, with its name."""
     CHOICE = "choice"
@@ -35,7 +42,8 @@ class Kind(StrEnum):
     """A switch that turns on the settings after it."""
 
 
-WIDE = {Kind.TASK, Kind.PARAGRAPHS, Kind.QUESTIONS, Kind.TEXTS, Kind.PART}
+LINES = {Kind.PARAGRAPHS, Kind.QUESTIONS, Kind.TEXTS, Kind.ARMS, Kind.SCREENS}
+WIDE = {*LINES, Kind.TASK, Kind.PART}
 """These have the whole width of the page."""
 _KINDS: Mapping[Any, Kind] = {
     bool: Kind.SWITCH,
@@ -46,6 +54,9 @@ _KINDS: Mapping[Any, Kind] = {
     tuple[int, ...]: Kind.COUNTS,
     tuple[str, ...]: Kind.SEVERAL,
     tuple[FormItem, ...]: Kind.QUESTIONS,
+    tuple[Arm, ...]: Kind.ARMS,
+    tuple[Screen, ...]: Kind.SCREENS,
+    tuple[str, ...]: Kind.NAMES,
     EvaluationSettings | None: Kind.PART,
 }
 

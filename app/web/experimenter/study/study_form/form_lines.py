@@ -1,7 +1,8 @@
-"""Lists that are typed one per line: the questions of a form, and texts in the study's own words.
+"""Lists that are typed one per line: questions of a form, arms, who may take part, texts in the study's own words.
 
 A question is ``name | kind | question | more``: for a choice the choices, with semicolons; for a scale (likert) what
-its two ends mean. A text is ``name = text``; it goes on in lines that begin with spaces.
+its two ends mean. An arm is ``name | methods``, with semicolons. Who may take part is ``name | 18 to 75``, or of a
+choice the answers, with semicolons. A text is ``name = text``; it goes on in lines that begin with spaces.
 """
 
 import re
@@ -9,8 +10,10 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from pydantic import ValidationError
 
-from app.domain.protocol import FormItem
+from app.domain.designs import Arm, Screen
+from app.domain.protocol import EvaluatedMethod, FormItem
 
+_SPAN = re.compile(r"^(-?[0-9]+(?:\.[0-9]+)?) to (-?[0-9]+(?:\.[0-9]+)?)$")
 _TEXT = re.compile(r"^((?:[a-z]{2}:)?[a-z][a-z0-9-]*)\s*=\s?(.*)$")
 
 
@@ -34,6 +37,58 @@ def items_of(typed: str) -> tuple[FormItem, ...]:
 def lines_of(items: Iterable[FormItem]) -> str:
     """Questions as they are typed."""
     return "\n".join(" | ".join(_parts(item)) for item in items)
+
+
+def arms_of(typed: str) -> tuple[Arm, ...]:
+    """The arms. Raises LineBroken."""
+    return tuple(_arm(number, *_halves(number, line)) for number, line in _filled(typed))
+
+
+def lines_of_arms(arms: Iterable[Arm]) -> str:
+    """Arms as they are typed."""
+    return "\n".join(f"{each.name} | {'; '.join(each.methods)}" for each in arms)
+
+
+def screens_of(typed: str) -> tuple[Screen, ...]:
+    """Who may take part. Raises LineBroken."""
+    return tuple(_screen(number, *_halves(number, line)) for number, line in _filled(typed))
+
+
+def lines_of_screens(screens: Iterable[Screen]) -> str:
+    """Screens as they are typed."""
+    return "\n".join(f"{each.name} | {'; '.join(each.answers) or f'{each.low:g} to {each.high:g}'}" for each in screens)
+
+
+def _filled(typed: str) -> Sequence[tuple[int, str]]:
+    return [(number, line) for number, line in enumerate(_lines(typed), 1) if line.strip()]
+
+
+def _halves(number: int, line: str) -> tuple[str, str]:
+    name, bar, rest = (part.strip() for part in line.partition("|"))
+    if not (name and bar and rest):
+        raise LineBroken(f"Line {number}: write a name, “|”, and what belongs to it.")
+    return name, rest
+
+
+def _arm(number: int, name: str, rest: str) -> Arm:
+    methods = [each.strip() for each in rest.split(";") if each.strip()]
+    unknown = [each for each in methods if each not in set(EvaluatedMethod)]
+    if unknown:
+        raise LineBroken(f"Line {number}: there is no method {unknown[0]}; there are {', '.join(EvaluatedMethod)}.")
+    try:
+        return Arm.model_validate({"name": name, "methods": methods})
+    except ValidationError as found:
+        raise LineBroken(f"Line {number}: {_why(found)}") from found
+
+
+def _screen(number: int, name: str, rest: str) -> Screen:
+    span = _SPAN.match(rest)
+    answers = [] if span else [each.strip() for each in rest.split(";") if each.strip()]
+    low, high = (float(span[1]), float(span[2])) if span else (None, None)
+    try:
+        return Screen.model_validate({"name": name, "low": low, "high": high, "answers": answers})
+    except ValidationError as found:
+        raise LineBroken(f"Line {number}: {_why(found)}") from found
 
 
 def texts_of(typed: str) -> dict[str, str]:
@@ -85,6 +140,8 @@ def _why(found: ValidationError) -> str:
         return "a name has small letters, digits and underscores, and begins with a letter."
     if place:
         return f"{str(place).replace('_', ' ')}: {error['msg'].lower()}."
+    if error["type"] == "value_error" and not error["msg"].endswith("nothing else has any."):
+        return error["msg"].removeprefix("Value error, ")
     return "a choice needs its choices, with “;” between them."
 
 

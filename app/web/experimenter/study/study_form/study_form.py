@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 from fastapi import Form
 from pydantic import ConfigDict, Field, ValidationError, create_model
 
+from app.domain.designs import Arm, Screen
 from app.domain.protocol import FormItem
 from app.domain.studies import NAME_LENGTH, SEED_LIMIT, longest_clip_steps, usual_clip_steps
 from app.domain.study_settings import PAPER_PROTOCOL, StudySettings
 from app.installed_tasks import catalogue
 from app.web.experimenter.study.study_form import form_lines
-from app.web.experimenter.study.study_form.form_fields import BY_NAME, FIELDS, FormField, Kind
+from app.web.experimenter.study.study_form.form_fields import BY_NAME, FIELDS, LINES, FormField, Kind
 from app.web.texts.own_texts import CONSENT
 from app.web.texts.wording import broken_texts
 
@@ -27,7 +28,7 @@ def _typed_as(kind: Kind) -> tuple[Any, Any]:
     """Type and default of a field, as pydantic wants them."""
     if kind is Kind.SEVERAL:
         return (_Several, [])
-    return (_Lines if kind in (Kind.PARAGRAPHS, Kind.QUESTIONS, Kind.TEXTS) else _Text, "")
+    return (_Lines if kind in LINES else _Text, "")
 
 
 _definitions: Any = {each.name: _typed_as(each.kind) for each in FIELDS}
@@ -142,6 +143,12 @@ def _as_typed(kind: Kind, value: Any) -> str | list[str]:
             return [str(each) for each in value]
         case Kind.QUESTIONS:
             return form_lines.lines_of(value)
+        case Kind.ARMS:
+            return form_lines.lines_of_arms(value)
+        case Kind.SCREENS:
+            return form_lines.lines_of_screens(value)
+        case Kind.NAMES:
+            return ", ".join(value)
         case Kind.TEXTS:
             return form_lines.lines_of_texts(value)
     return str(value)
@@ -177,6 +184,8 @@ def _value(errors: dict[str, str], field: FormField, form: StudyForm) -> Any:
     """What was typed into a field, as its setting is stored; None, and an error, where that cannot be told."""
     typed = getattr(form, field.name)
     no_items: tuple[FormItem, ...] = ()
+    no_arms: tuple[Arm, ...] = ()
+    no_screens: tuple[Screen, ...] = ()
     match field.kind:
         case Kind.SWITCH:
             return typed == "yes"
@@ -192,6 +201,12 @@ def _value(errors: dict[str, str], field: FormField, form: StudyForm) -> Any:
             return tuple(typed)
         case Kind.QUESTIONS:
             return _read(errors, field.name, form_lines.items_of, typed, no_items)
+        case Kind.ARMS:
+            return _read(errors, field.name, form_lines.arms_of, typed, no_arms)
+        case Kind.SCREENS:
+            return _read(errors, field.name, form_lines.screens_of, typed, no_screens)
+        case Kind.NAMES:
+            return tuple(name.strip() for name in typed.split(",") if name.strip())
         case Kind.TEXT | Kind.CHOICE:
             return typed.strip()
     return None

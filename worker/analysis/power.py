@@ -1,0 +1,140 @@
+"""How likely a study of this very design is to find an effect, for several numbers of people: by simulation.
+
+What somebody says of a method is 3 (the middle of the scale) + their own level + what the method is to them + the noise
+of one rating, rounded and cut to 1 to 5. One method is better than all the others by the effect on average. A share of
+those who begin drops out, and counts in no test. Every invented study is tested as the page of results would: means of
+each person by the paired t-test, or between arms by Welch's; head-to-heads by Bradley-Terry strengths; corrected by
+Holm over all comparisons of the design. Intervals of the power are Wilson's, 95 %: they say how far the simulation may
+be off.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from worker.analysis.agreement import wilson_interval
+from worker.analysis.between import welch_t
+from worker.analysis.bradley_terry import covariance, strengths, why_not
+from worker.analysis.effect_sizes import holm
+from worker.analysis.hypothesis_tests import FEWEST_PAIRED, paired_t
+from worker.type_aliases import FloatArray
+
+ALPHA, WANTED = 0.05, 0.8
+_MIDDLE, _TIE = 3.0, 0.5
+"""Of the scale; and the difference, in points, below which two robots side by side are called equal."""
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What is simulated. Effects, levels, spreads and noise in points of the scale."""
+
+    methods: int
+    better: int
+    """Which method is better than the others."""
+    compared: int
+    """With which other one its difference is to be found."""
+    arms: tuple[tuple[int, ...], ...]
+    """Methods that the people of each arm meet; one arm: everybody meets all."""
+    trials: int
+    head_to_heads: int
+    ties: bool
+    effect: float
+    spread: float
+    """Standard deviation over people of the difference between two methods."""
+    levels: float
+    """Standard deviation over people of how they rate altogether."""
+    noise: float
+    dropout: float
+
+
+def power_at(truth: Truth, people: int, studies: int, seed: int) -> dict[str, Any]:
+    """people, completed (mean), and for ``ratings`` and ``head_to_heads`` (None without): power, low, high."""
+    rng = np.random.default_rng([seed, people])
+    found, found_side_by_side, completed = 0, 0, 0
+    for _ in range(studies):
+        stayed = int(rng.binomial(people, 1 - truth.dropout))
+        completed += stayed
+        worth, arms = _worth(truth, stayed, rng)
+        found += _is_found(truth, _ratings_p(truth, worth, arms, rng))
+        if truth.head_to_heads:
+            found_side_by_side += _is_found(truth, _head_to_heads_p(truth, worth, arms, rng))
+    return {
+        "people": people,
+        "completed": completed / studies,
+        "ratings": _power(found, studies),
+        "head_to_heads": _power(found_side_by_side, studies) if truth.head_to_heads else None,
+    }
+
+
+def enough(rows: Sequence[dict[str, Any]], what: str) -> int | None:
+    """The smallest number of people from which on the power is as wanted at all larger numbers, by its lower end."""
+    fewest = None
+    for row in reversed(rows):
+        if row[what] is None or row[what]["low"] < WANTED:
+            break
+        fewest = row["people"]
+    return fewest
+
+
+def _power(found: int, studies: int) -> dict[str, float]:
+    low, high = wilson_interval(found, studies)
+    return {"power": found / studies, "low": low, "high": high}
+
+
+def _worth(truth: Truth, people: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    """What each method is to each person, (people, methods), and who meets which: True or False."""
+    means = np.full(truth.methods, -truth.effect / 2)
+    means[truth.better] = truth.effect / 2
+    worth = _MIDDLE + means + rng.normal(0.0, truth.spread / 2**0.5, (people, truth.methods))
+    worth += rng.normal(0.0, truth.levels, people)[:, None]
+    meets = np.zeros((len(truth.arms), truth.methods), bool)
+    for arm, methods in enumerate(truth.arms):
+        meets[arm, list(methods)] = True
+    return worth, meets[np.arange(people) % len(truth.arms)]
+
+
+def _ratings_p(truth: Truth, worth: FloatArray, meets: Any, rng: np.random.Generator) -> list[float | None]:
+    said = worth[:, :, None] + rng.normal(0.0, truth.noise, (*worth.shape, truth.trials))
+    means = np.clip(np.rint(said), 1, 5).mean(axis=2).round(12)
+    found: list[float | None] = []
+    for first, second in combinations(range(truth.methods), 2):
+        both = meets[:, first] & meets[:, second]
+        if both.sum() >= FEWEST_PAIRED:
+            result = paired_t((means[both, second] - means[both, first]).round(12))
+        else:
+            alone = [means[meets[:, one] & ~meets[:, other], one] for one, other in ((first, second), (second, first))]
+            result = welch_t(*alone)
+        found.append(result.get("p"))
+    return found
+
+
+def _head_to_heads_p(truth: Truth, worth: FloatArray, meets: Any, rng: np.random.Generator) -> list[float | None]:
+    pairs = list(combinations(range(truth.methods), 2))
+    wins = np.zeros((len(worth), truth.methods, truth.methods))
+    for first, second in pairs:
+        noise = rng.normal(0.0, truth.noise * 2**0.5, (len(worth), truth.head_to_heads))
+        felt = (worth[:, first] - worth[:, second])[:, None] + noise
+        won = (np.where(truth.ties & (np.abs(felt) < _TIE), 0.5, felt > 0)).sum(axis=1)
+        both = meets[:, first] & meets[:, second]
+        wins[:, first, second], wins[:, second, first] = both * won, both * (truth.head_to_heads - won)
+    if why_not(wins):
+        return [None for _ in pairs]
+    found = strengths(wins.sum(axis=0))
+    spread, people = covariance(wins, found), len(wins)
+    p_values: list[float | None] = []
+    for first, second in pairs:
+        error = max(spread[first, first] + spread[second, second] - 2 * spread[first, second], 1e-12) ** 0.5
+        p_values.append(float(2 * stats.t.sf(abs(found[second] - found[first]) / error, people - 1)))
+    return p_values
+
+
+def _is_found(truth: Truth, p_values: Sequence[float | None]) -> bool:
+    """Whether the comparison is significant after Holm's correction; in whichever direction."""
+    pairs = list(combinations(range(truth.methods), 2))
+    wanted = (min(truth.better, truth.compared), max(truth.better, truth.compared))
+    p = holm(p_values)[pairs.index(wanted)]
+    return p is not None and p < ALPHA
