@@ -5,7 +5,7 @@ import itertools
 import pytest
 
 from app.services.evaluation.evaluation_plan import COMPARISON_SCENARIOS, TRIAL_SCENARIOS
-from worker import scenarios
+from worker.domain import scenarios
 
 BLOCKS = {name: block for name, block in vars(scenarios).items() if isinstance(block, range)}
 OF_THE_EVALUATION = {"trials": TRIAL_SCENARIOS, "comparisons": COMPARISON_SCENARIOS}

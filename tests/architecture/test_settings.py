@@ -18,9 +18,10 @@ from app.services.evaluation import unblinding
 from app.services.participants import time_left
 from app.services.studies import preregistration
 from app.web.experimenter import results
-from worker import responses
 from worker.analysis import between, figures, hypothesis_tests, statistics
 from worker.analysis.promise import Promise
+from worker.domain import responses
+from worker.domain.spaces import CONTROL_STEP_S
 from worker.experiments import benchmark_cell, rollout_cache
 from worker.experiments.benchmark_cell import BenchmarkConfig
 from worker.ml import acquisition
@@ -30,7 +31,6 @@ from worker.ml.methods.prefft import FineTuning
 from worker.ml.methods.registry import METHODS
 from worker.ml.rewards import reward_training
 from worker.sim.render.clip import STYLES
-from worker.spaces import CONTROL_STEP_S
 
 USUAL = StudySettings()
 EVALUATION = EvaluationSettings()

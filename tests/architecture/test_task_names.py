@@ -8,8 +8,8 @@ import pytest
 from app.domain.protocol import Language
 from app.installed_tasks import catalogue
 from app.web.texts.task_words import words_of
+from worker.domain.trajectory import COSTS, SIGNALS
 from worker.tasks import registry
-from worker.trajectory import COSTS, SIGNALS
 
 ROOT = Path(__file__).parents[2]
 NAMES = tuple(re.findall(r"^(\w+) = worker\.tasks\.", catalogue.OUR_ENTRY_POINTS.read_text(), re.MULTILINE))

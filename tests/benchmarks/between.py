@@ -20,7 +20,7 @@ from worker.analysis import result_pages
 from worker.analysis.between import permutation, welch_t
 from worker.analysis.hypothesis_tests import two_sample_t
 from worker.analysis.order_effects import order_report
-from worker.type_aliases import FloatArray
+from worker.domain.type_aliases import FloatArray
 
 RESULTS = Path("docs/results")
 ALPHA, TRIALS, NOISE = 0.05, 3, 0.8

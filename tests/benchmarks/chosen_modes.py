@@ -31,6 +31,7 @@ from worker.analysis import result_pages
 from worker.compute import simulation
 from worker.compute.pools import Compute, Lane
 from worker.compute.simulation import surface_file
+from worker.domain.task import Task
 from worker.experiments.benchmark_cell import BenchmarkConfig, BenchmarkUser, Cell
 from worker.experiments.rollout_cache import RolloutCache
 from worker.ml import acquisition
@@ -39,7 +40,6 @@ from worker.ml.rewards import bradley_terry, pooled_prior
 from worker.ml.rewards.reward_models import RewardModel
 from worker.ml.teachers import TASTES, Manner, Taste, User
 from worker.sim.costs import signal_weights, stakes
-from worker.task import Task
 from worker.tasks import registry
 
 FIRST_SEED = 100

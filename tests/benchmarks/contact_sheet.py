@@ -17,10 +17,10 @@ from PIL import Image
 
 from app.installed_tasks import catalogue
 from tests.benchmarks.films import films
+from worker.domain.trajectory import BODIES, SKIN_TONES, Trajectory
 from worker.sim.human import BODY_SHAPES
 from worker.sim.render.clip import ClipRenderer
 from worker.tasks.registry import filmed_task
-from worker.trajectory import BODIES, SKIN_TONES, Trajectory
 
 FRAMES = 5
 TILE = (400, 300)

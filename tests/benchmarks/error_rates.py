@@ -23,7 +23,7 @@ from tests.benchmarks import error_rates_of_intervals
 from worker.analysis import result_pages
 from worker.analysis.effect_sizes import holm
 from worker.analysis.hypothesis_tests import TESTS, mixed_model, paired_t, two_sample_t, wilcoxon
-from worker.type_aliases import FloatArray
+from worker.domain.type_aliases import FloatArray
 
 Cells = list[list[FloatArray]]
 """By person and group: ratings; empty where somebody was gone by then."""

@@ -33,6 +33,10 @@ from tests.benchmarks.feedback_report import LINEAR, NAMED, Row
 from tests.benchmarks.pool_rollouts import Pool, pool_rollouts
 from worker.compute import learning, simulation
 from worker.compute.simulation import surface_file
+from worker.domain.responses import TARGETS
+from worker.domain.scenarios import EVALUATION, first_of
+from worker.domain.trajectory import Trajectory
+from worker.domain.type_aliases import Float32Array, FloatArray
 from worker.ml import acquisition
 from worker.ml.filters.gate import signal_changes, successes
 from worker.ml.filters.response_surface import ResponseSurface, best_mode
@@ -41,12 +45,8 @@ from worker.ml.rewards.pooled_prior import Prior
 from worker.ml.rewards.reward_models import RewardModel
 from worker.ml.rewards.signal_scale import SignalScale
 from worker.ml.teachers import TASTES, Manner, ScriptedTeacher, Taste, User, random_taste
-from worker.responses import TARGETS
-from worker.scenarios import EVALUATION, first_of
 from worker.sim.costs import preference_rewards, signal_weights
 from worker.tasks import registry
-from worker.trajectory import Trajectory
-from worker.type_aliases import Float32Array, FloatArray
 
 Indices = npt.NDArray[np.int64]
 

@@ -3,8 +3,8 @@
 from collections.abc import Iterator
 
 from worker.compute import simulation
+from worker.domain.trajectory import Trajectory
 from worker.sim.rollout import rollout
-from worker.trajectory import Trajectory
 
 FIRST_SCENARIO = 7_000
 

@@ -18,7 +18,7 @@ from scipy import stats
 from worker.analysis import result_pages
 from worker.analysis.bradley_terry import covariance, strengths, why_not
 from worker.analysis.effect_sizes import holm
-from worker.type_aliases import FloatArray
+from worker.domain.type_aliases import FloatArray
 
 RESULTS = Path("docs/results")
 METHODS, ROUNDS, TIE = 3, 3, 0.3

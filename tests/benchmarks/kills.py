@@ -42,7 +42,7 @@ from tests.benchmarks.kills_seen import Findings, Onlooker
 from tests.processes import compute_processes
 from tests.waiting import free_port
 from tests.worker.conftest import STEPS, make_trajectory
-from worker import scenarios
+from worker.domain import scenarios
 from worker.jobs import reconcile
 from worker.jobs.runtime.records import ATTEMPTS
 from worker.rehearsal.server import OwnStudio, wait_until

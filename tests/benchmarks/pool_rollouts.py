@@ -17,11 +17,11 @@ from tqdm import tqdm
 
 from app.installed_tasks import catalogue
 from worker.compute import simulation
+from worker.domain.type_aliases import Float32Array
 from worker.ml.acquisition import matched_pairs
 from worker.ml.rewards.segments import SegmentPairs
 from worker.sim.rollout import rollout
 from worker.tasks import registry
-from worker.type_aliases import Float32Array
 
 Indices = npt.NDArray[np.int64]
 

@@ -25,16 +25,16 @@ from worker.analysis.comparison import Row
 from worker.analysis.evaluation import success_change
 from worker.analysis.table_files import to_csv
 from worker.compute import learning
+from worker.domain.scenarios import EVALUATION, RESIDUAL, first_of
+from worker.domain.trajectory import Trajectory
 from worker.experiments.benchmark_cell import PAPER_USERS, BenchmarkConfig, BenchmarkUser, Cell
 from worker.experiments.rollout_cache import RolloutCache
 from worker.ml.filters.filter_problem import act_of
 from worker.ml.filters.gate import successes
 from worker.ml.filters.pbarl_printed import PrintedConfig
 from worker.ml.filters.printed_filter import fit_printed
-from worker.scenarios import EVALUATION, RESIDUAL, first_of
 from worker.sim.costs import preference_rewards, stakes
 from worker.tasks import registry
-from worker.trajectory import Trajectory
 
 TITLE = "# PbARL as printed, reading by reading"
 LOSSES = ("rec", "pref", "kl", "dyn")

@@ -28,15 +28,15 @@ from worker.analysis import result_pages
 from worker.analysis.promise import HARMS, Promise, harms, outcome_of
 from worker.compute import filter_fitting, learning, simulation
 from worker.compute.filter_fitting import FilterFit, moves_nothing
+from worker.domain.scenarios import PROMISE_TEST, first_of
+from worker.domain.trajectory import Trajectory
+from worker.domain.type_aliases import FloatArray
 from worker.experiments.benchmark_cell import BenchmarkConfig, BenchmarkUser, Cell
 from worker.experiments.rollout_cache import RolloutCache
 from worker.ml.filters import filter_problem
 from worker.ml.filters.filter_module import FilterWeights
 from worker.ml.filters.filter_problem import FilterConfig, FilterDraft
 from worker.ml.teachers import random_taste
-from worker.scenarios import PROMISE_TEST, first_of
-from worker.trajectory import Trajectory
-from worker.type_aliases import FloatArray
 from worker.whole_files import written_whole
 
 TITLE = "# Is the promise about harm kept?"

@@ -15,7 +15,7 @@ import numpy as np
 
 from worker.analysis import result_pages
 from worker.analysis.reliability import alpha, reliability_report
-from worker.type_aliases import FloatArray
+from worker.domain.type_aliases import FloatArray
 
 RESULTS = Path("docs/results")
 PEOPLE, ITEMS = (8, 16, 24, 48), (3, 6, 10)

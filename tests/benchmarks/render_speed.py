@@ -17,9 +17,9 @@ from functools import partial
 
 from app.installed_tasks import catalogue
 from tests.benchmarks.films import films
+from worker.domain.trajectory import Trajectory
 from worker.sim.render.clip import STYLES, ClipRenderer
 from worker.tasks.registry import filmed_task
-from worker.trajectory import Trajectory
 
 
 def main() -> None:

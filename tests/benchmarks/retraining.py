@@ -27,13 +27,13 @@ from worker.analysis.promise import Outcome
 from worker.compute import learning
 from worker.compute.filter_fitting import FilterFit
 from worker.compute.pools import Compute, Lane
+from worker.domain.trajectory import Trajectory
 from worker.experiments.benchmark_cell import BenchmarkConfig, BenchmarkUser, Cell
 from worker.experiments.rollout_cache import RolloutCache
 from worker.jobs.learning.reference_rollouts import make_ready
 from worker.ml.export.bundle import Provenance
 from worker.ml.filters.filter_problem import FilterConfig
 from worker.ml.teachers import TASTES
-from worker.trajectory import Trajectory
 
 STAGES = ("reward", "mode", "residual", "gates", "promise", "evaluation_and_bundle")
 PROVENANCE = Provenance("benchmark", "P01", 1, 200, "", 0, "2000-01-01T00:00:00+00:00", "", "none")

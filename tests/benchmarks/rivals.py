@@ -23,6 +23,7 @@ from app.installed_tasks import catalogue
 from tests.benchmarks import rivals_report
 from worker.analysis import result_pages
 from worker.commands import options as spoken
+from worker.domain.type_aliases import FloatArray
 from worker.experiments import benchmark_cell
 from worker.experiments.benchmark import PROFILES
 from worker.experiments.benchmark_cell import PAPER_USERS, BenchmarkConfig, Cell
@@ -30,7 +31,6 @@ from worker.ml.methods.registry import METHODS
 from worker.ml.teachers import Taste
 from worker.sim.costs import preference_rewards, stakes
 from worker.tasks import registry
-from worker.type_aliases import FloatArray
 from worker.whole_files import written_whole
 
 CHEAP_FIRST = (

@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 from worker.analysis import aggregate, result_pages
 from worker.analysis.table_files import to_csv
-from worker.type_aliases import FloatArray
+from worker.domain.type_aliases import FloatArray
 
 TITLE = "# How often do the intervals of the table of rivals miss?"
 STRATA, SCENARIOS = 9, 20

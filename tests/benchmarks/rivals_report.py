@@ -18,7 +18,7 @@ from worker.analysis.aggregate import (
     profile,
 )
 from worker.analysis.evaluation import mean_change, success_change
-from worker.type_aliases import FloatArray
+from worker.domain.type_aliases import FloatArray
 
 TITLE = "# Is the default better than rivals of today?"
 DEFAULT = "pbarl"

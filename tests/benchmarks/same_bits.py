@@ -24,6 +24,7 @@ import torch
 
 from app.installed_tasks import catalogue
 from worker.compute import simulation
+from worker.domain.trajectory import Trajectory
 from worker.experiments.benchmark_cell import BenchmarkConfig, BenchmarkUser, Cell
 from worker.experiments.rollout_cache import RolloutCache
 from worker.ml.filters import pbarl
@@ -35,7 +36,6 @@ from worker.ml.methods.registry import MethodConfig
 from worker.ml.rewards import reward_training
 from worker.ml.teachers import TASTES, User
 from worker.sim.rollout import rollout
-from worker.trajectory import Trajectory
 
 LIBRARIES = ("numpy", "scipy", "onnxruntime", "pybullet", "av", "pillow")
 SEED = 0

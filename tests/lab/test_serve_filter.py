@@ -20,6 +20,8 @@ from app.installed_tasks.lab import LabDescription
 from tests.lab.policy_server import Answer, serving, to_goal
 from tests.worker import invented
 from worker.compute.lab_policies import policy_of
+from worker.domain.task import Task
+from worker.domain.trajectory import SIGNALS, Trajectory
 from worker.experiments.lab_ranges import first_found
 from worker.ml.export import bundle
 from worker.ml.export.bundle import BundleContents, Provenance, RecordedSteps
@@ -32,8 +34,6 @@ from worker.ml.policies.policy_client import PolicyServer, PolicyServerFailed, p
 from worker.ml.policies.reference import ReferencePolicy
 from worker.ml.rewards.reward_models import StructuredReward
 from worker.sim.lab.environment import LabEnvironment
-from worker.task import Task
-from worker.trajectory import SIGNALS, Trajectory
 
 MODE = {"speed_far": -0.7, "smooth": 0.4, "push_y": 0.3}
 SEEN = {"observation": np.array([0.1, 0.2, 0.8, -0.6], np.float32)}

@@ -29,6 +29,8 @@ from tests.lab.conftest import forget, way_to_goal, write_plane
 from tests.worker.at_hand import AtHand, at_once
 from worker.__main__ import main
 from worker.compute import simulation
+from worker.domain.trajectory import Trajectory
+from worker.domain.type_aliases import Float32Array
 from worker.experiments import fit_response_surface
 from worker.jobs.clips.pool_clips import build_clips
 from worker.jobs.learning import dataset
@@ -40,8 +42,6 @@ from worker.jobs.runtime.records import Job
 from worker.ml.export import bundle
 from worker.sim.lab.errors import LabTaskBroken
 from worker.tasks import registry
-from worker.trajectory import Trajectory
-from worker.type_aliases import Float32Array
 
 SCENARIOS, BEHAVIOURS = 5, 4
 LABELS = SCENARIOS * BEHAVIOURS * (BEHAVIOURS - 1) // 2

@@ -22,11 +22,11 @@ from app.domain.study_settings import StudySettings
 from app.settings import Settings
 from app.storage import ArtefactStore
 from worker.compute.pools import Compute
+from worker.domain.trajectory import COSTS, SIGNALS, Trajectory
 from worker.jobs.runtime.context import WorkerContext
 from worker.jobs.runtime.lanes import Lanes
 from worker.jobs.workflows import JobRunner
 from worker.sim.render.video import encode_mp4
-from worker.trajectory import COSTS, SIGNALS, Trajectory
 
 STEPS = 20
 

@@ -7,13 +7,13 @@ import numpy as np
 import numpy.typing as npt
 
 from app.domain import run_keys
+from worker.domain.trajectory import COSTS, SIGNALS, Trajectory
 from worker.jobs.runtime.records import Job
 from worker.ml import dense_network
 from worker.ml.policies.gaussian import GaussianPolicy
 from worker.ml.rewards.segments import SegmentPairs
 from worker.ml.rewards.signal_predictor import SignalPredictor
 from worker.tasks.feeding.environment import FEEDING
-from worker.trajectory import COSTS, SIGNALS, Trajectory
 
 TASK = FEEDING
 D, A, S = TASK.observation.size, 7, len(SIGNALS)

@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from worker.domain.trajectory import COSTS, SIGNALS, Trajectory
+from worker.domain.type_aliases import Float32Array, FloatArray
 from worker.sim.arm import Tool, transform
 from worker.sim.human import ARM_JOINTS, BODY_SHAPES, RIGHT, arm_points_m
 from worker.sim.jaco import JACO
 from worker.tasks.drinking.environment import CUP
 from worker.tasks.feeding.environment import SPOON
-from worker.trajectory import COSTS, SIGNALS, Trajectory
-from worker.type_aliases import Float32Array, FloatArray
 
 POSTURE_RAD = np.array([-3.01, 3.73, 0.0, 4.89, 1.43, 1.76, 0.41])
 """The spoon is level between its start and the mouth."""

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import trim_mean
 
-from worker.type_aliases import FloatArray
+from worker.domain.type_aliases import FloatArray
 
 DRAWS, CHUNK = 2_000, 100
 """of the bootstrap, and so many at once"""

@@ -17,7 +17,7 @@ from scipy import stats
 
 from worker.analysis.effect_sizes import noncentrality_interval
 from worker.analysis.hypothesis_tests import not_computable, plain
-from worker.type_aliases import FloatArray
+from worker.domain.type_aliases import FloatArray
 
 BETWEEN_TESTS = ("welch_t", "permutation")
 """Names as in app.domain.protocol.PlannedTest."""

@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import connected_components
 
 from worker.analysis.effect_sizes import holm
 from worker.analysis.hypothesis_tests import not_computable, plain
-from worker.type_aliases import FloatArray
+from worker.domain.type_aliases import FloatArray
 
 FEWEST_PEOPLE = 4
 """Below, a covariance over people says nothing."""

@@ -16,8 +16,8 @@ import numpy as np
 
 from worker.analysis.agreement import wilson_interval
 from worker.analysis.evaluation import mean_change, success_change
-from worker.trajectory import COSTS
-from worker.type_aliases import FloatArray
+from worker.domain.trajectory import COSTS
+from worker.domain.type_aliases import FloatArray
 
 Row = dict[str, Any]
 

@@ -6,7 +6,7 @@ import numpy as np
 from scipy import optimize, stats
 
 from worker.analysis.agreement import Z_95
-from worker.type_aliases import FloatArray
+from worker.domain.type_aliases import FloatArray
 
 _TAIL = 0.025
 

@@ -12,9 +12,9 @@ import numpy as np
 import numpy.typing as npt
 
 from worker.analysis.agreement import Z_95, wilson_interval
-from worker.task import Task
-from worker.trajectory import COSTS, SIGNALS, Trajectory
-from worker.type_aliases import FloatArray
+from worker.domain.task import Task
+from worker.domain.trajectory import COSTS, SIGNALS, Trajectory
+from worker.domain.type_aliases import FloatArray
 
 
 def evaluate(

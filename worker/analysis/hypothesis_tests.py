@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from worker.type_aliases import FloatArray
+from worker.domain.type_aliases import FloatArray
 
 Result = dict[str, Any]
 

@@ -15,7 +15,7 @@ import pandas as pd
 from scipy import stats
 
 from worker.analysis.hypothesis_tests import not_computable, plain
-from worker.type_aliases import FloatArray
+from worker.domain.type_aliases import FloatArray
 
 FEWEST_PEOPLE = 4
 

@@ -21,7 +21,7 @@ from worker.analysis.between import welch_t
 from worker.analysis.bradley_terry import covariance, strengths, why_not
 from worker.analysis.effect_sizes import holm
 from worker.analysis.hypothesis_tests import FEWEST_PAIRED, paired_t
-from worker.type_aliases import FloatArray
+from worker.domain.type_aliases import FloatArray
 
 ALPHA, WANTED = 0.05, 0.8
 _MIDDLE, _TIE = 3.0, 0.5

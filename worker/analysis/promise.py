@@ -16,8 +16,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from worker.task import Task
-from worker.trajectory import Trajectory
+from worker.domain.task import Task
+from worker.domain.trajectory import Trajectory
 
 HOPED_FOR = 0.2
 """Of the promised share: filters that harm so rarely are recognised soonest."""

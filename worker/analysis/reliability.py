@@ -17,7 +17,7 @@ import numpy as np
 from scipy import stats
 
 from worker.analysis.hypothesis_tests import not_computable, plain
-from worker.type_aliases import FloatArray
+from worker.domain.type_aliases import FloatArray
 
 FEWEST = 3
 """Filled-in questionnaires."""

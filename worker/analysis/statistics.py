@@ -40,7 +40,7 @@ from worker.analysis.hypothesis_tests import (
     wilcoxon,
 )
 from worker.analysis.order_effects import order_report
-from worker.type_aliases import FloatArray
+from worker.domain.type_aliases import FloatArray
 
 Result = dict[str, Any]
 

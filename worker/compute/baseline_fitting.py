@@ -14,6 +14,8 @@ import numpy.typing as npt
 import torch
 
 from worker.compute import learning, simulation
+from worker.domain.trajectory import Trajectory
+from worker.domain.type_aliases import Act
 from worker.ml.export import blinded_controller as controller
 from worker.ml.export.blinded_controller import Blinded
 from worker.ml.export.run_controller import Controller
@@ -30,8 +32,6 @@ from worker.ml.rewards.action_ranking import can_rank
 from worker.ml.rewards.loading import load_reward_model
 from worker.ml.rewards.reward_models import RewardModel
 from worker.tasks import registry as tasks
-from worker.trajectory import Trajectory
-from worker.type_aliases import Act
 
 COMPARED_EPISODES = 2
 """Episodes of the reference policy in whose observations a controller is compared with the method it was made of."""

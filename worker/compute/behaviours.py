@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from worker.spaces import CONTROL_STEP_S
-from worker.task import Task
+from worker.domain.spaces import CONTROL_STEP_S
+from worker.domain.task import Task
 
 DIFFERENT_ENOUGH = 0.45
 """Two modes of one scenario differ by at least this share of some axis' range, so that a person can see it."""

@@ -18,6 +18,9 @@ from worker.analysis.proof import case_against
 from worker.compute import harm_tests, learning, simulation
 from worker.compute.pools import Computing, Lane
 from worker.compute.simulation import surface_file
+from worker.domain.scenarios import EVALUATION, RESIDUAL, first_of, of_promise
+from worker.domain.trajectory import Trajectory
+from worker.domain.type_aliases import Act
 from worker.ml.export import bundle
 from worker.ml.export.bundle import BundleContents, Provenance, RecordedSteps
 from worker.ml.filters import filter_problem, mode_search, printed_filter, residual
@@ -33,10 +36,7 @@ from worker.ml.filters.filter_problem import (
 )
 from worker.ml.filters.response_surface import ResponseSurface
 from worker.ml.rewards.loading import load_reward_model
-from worker.scenarios import EVALUATION, RESIDUAL, first_of, of_promise
 from worker.tasks import registry
-from worker.trajectory import Trajectory
-from worker.type_aliases import Act
 
 CHUNK = 3
 """Scenarios per call of a compute process: small enough to spread evenly, large enough not to matter."""

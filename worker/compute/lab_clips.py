@@ -4,12 +4,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from worker.domain.trajectory import Trajectory
+from worker.domain.type_aliases import Act, Float32Array
 from worker.sim.lab.environment import LabEnvironment, Picture
 from worker.sim.lab.errors import LabTaskBroken
 from worker.sim.render import video
 from worker.sim.render.clip import RenderedClip
-from worker.trajectory import Trajectory
-from worker.type_aliases import Act, Float32Array
 
 SAME_WITHIN = 1e-3
 """Largest difference of an observation between an episode and the same actions again."""

@@ -12,14 +12,14 @@ import numpy.typing as npt
 
 from worker.analysis.promise import Outcome, outcome_of
 from worker.compute.simulation import reference_rollouts, run_episode, signal_predictor
+from worker.domain.trajectory import Trajectory
+from worker.domain.type_aliases import Act, Float32Array
 from worker.ml.rewards.loading import load_reward_model
 from worker.ml.rewards.pooled_prior import prior_of
 from worker.ml.rewards.reward_models import NEVER_WANTED, RewardModel
 from worker.ml.rewards.segments import SegmentPairs
 from worker.ml.rewards.signal_scale import SignalScale
 from worker.tasks import registry
-from worker.trajectory import Trajectory
-from worker.type_aliases import Act, Float32Array
 
 
 def warm_up(task: str) -> None:

@@ -5,7 +5,7 @@ from itertools import product
 import numpy as np
 import numpy.typing as npt
 
-from worker.modes import ModeFamily
+from worker.domain.modes import ModeFamily
 
 COUNT = 64
 _CANDIDATES = 512

@@ -6,14 +6,14 @@ from dataclasses import replace
 import numpy as np
 
 from worker.compute.simulation import reference_rollouts
+from worker.domain.trajectory import SIGNALS
+from worker.domain.type_aliases import FloatArray
 from worker.ml.rewards.loading import load_reward_model
 from worker.ml.rewards.reward_models import UNDONE, StructuredReward
 from worker.ml.rewards.signal_scale import SignalScale
 from worker.ml.teachers import OMEGA, User
 from worker.sim.costs import signal_weights
 from worker.tasks import registry
-from worker.trajectory import SIGNALS
-from worker.type_aliases import FloatArray
 
 
 def of_people(task: str, rewards: Sequence[bytes], scale: SignalScale) -> bytes:

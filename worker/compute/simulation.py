@@ -16,20 +16,20 @@ import numpy.typing as npt
 from app.installed_tasks import catalogue
 from worker.compute import lab_clips
 from worker.compute.behaviours import Behaviour, SlowWaves, draw_behaviours
+from worker.domain.scenarios import NORMALISATION
+from worker.domain.task import Task
+from worker.domain.trajectory import Trajectory
+from worker.domain.type_aliases import Act, Float32Array
 from worker.ml.policies.gaussian import GaussianPolicy
 from worker.ml.policies.reference import ReferencePolicy
 from worker.ml.rewards.signal_predictor import SignalPredictor
-from worker.scenarios import NORMALISATION
 from worker.sim.assistive import AssistiveEnv
 from worker.sim.lab.environment import LabEnvironment
 from worker.sim.render.clip import STYLES, ClipRenderer, RenderedClip
 from worker.sim.render.scene import Scene
 from worker.sim.rollout import rollout
-from worker.task import Task
 from worker.tasks import registry
 from worker.tasks.registry import checkpoint, environment_class, filmed_task, task
-from worker.trajectory import Trajectory
-from worker.type_aliases import Act, Float32Array
 
 REFERENCE_COUNT = 40
 

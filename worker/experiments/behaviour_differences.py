@@ -14,14 +14,14 @@ import numpy.typing as npt
 from tqdm import tqdm
 
 from worker.compute import simulation
+from worker.domain.scenarios import POOL
+from worker.domain.task import Task
+from worker.domain.trajectory import SIGNALS, Trajectory
 from worker.ml.acquisition import matched_pairs
 from worker.ml.teachers import OMEGA, OPPOSED, User
-from worker.scenarios import POOL
 from worker.sim.costs import CostForm, preference_rewards
 from worker.sim.rollout import rollout
-from worker.task import Task
 from worker.tasks import registry
-from worker.trajectory import SIGNALS, Trajectory
 
 FIRST_SCENARIO = POOL.start + 700_000
 SCENARIOS, AXIS_SCENARIOS, SHOWN_STEPS = 100, 20, (60, 100)

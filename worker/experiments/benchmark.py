@@ -25,6 +25,7 @@ from worker.analysis.comparison import Cells, EvaluatedCell, Row, compared, pool
 from worker.analysis.pareto import pareto_svg
 from worker.analysis.table_files import tables, to_csv
 from worker.compute.pools import Compute, Lane
+from worker.domain.trajectory import COSTS
 from worker.experiments import benchmark_cell
 from worker.experiments.benchmark_cell import INDIRECT_USERS, OPPOSED_USERS, PAPER_USERS, BenchmarkConfig, Cell
 from worker.experiments.rollout_cache import RolloutCache, policy_mark
@@ -39,7 +40,6 @@ from worker.ml.teachers import Manner, Taste, random_taste
 from worker.sim.costs import preference_rewards, stakes
 from worker.tasks import registry
 from worker.tasks.registry import checkpoint
-from worker.trajectory import COSTS
 from worker.whole_files import written_whole
 
 INTERRUPTED = 130

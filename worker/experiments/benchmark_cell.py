@@ -20,6 +20,10 @@ import torch
 import worker
 from worker.compute import learning, simulation
 from worker.compute.simulation import surface_file
+from worker.domain.responses import TARGETS
+from worker.domain.scenarios import EVALUATION, POOL, first_of
+from worker.domain.trajectory import Trajectory
+from worker.domain.type_aliases import Act, FloatArray
 from worker.experiments.benchmark_person import BenchmarkPerson
 from worker.experiments.rollout_cache import BEHAVIOURS_PER_SCENARIO, RolloutCache, policy_mark
 from worker.ml import acquisition
@@ -35,13 +39,9 @@ from worker.ml.rewards.reward_models import RewardModel
 from worker.ml.rewards.segments import SegmentPairs
 from worker.ml.rewards.signal_scale import SignalScale
 from worker.ml.teachers import INDIRECT, OPPOSED, TASTES, Manner, ScriptedTeacher, Taste, User
-from worker.responses import TARGETS
-from worker.scenarios import EVALUATION, POOL, first_of
 from worker.sim.costs import CostForm, preference_rewards
 from worker.tasks import registry
 from worker.tasks.registry import installed_task
-from worker.trajectory import Trajectory
-from worker.type_aliases import Act, FloatArray
 from worker.whole_files import written_whole
 
 SMALLEST_POOL = 48

@@ -10,14 +10,14 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
+from worker.domain.responses import TARGETS
+from worker.domain.trajectory import Trajectory
+from worker.domain.type_aliases import FloatArray
 from worker.ml.methods.people import Labels
 from worker.ml.rewards.reward_models import RewardModel
 from worker.ml.rewards.segments import SegmentPairs
 from worker.ml.rewards.signal_scale import SignalScale
 from worker.ml.teachers import Manner, ScriptedTeacher, Taste, random_taste
-from worker.responses import TARGETS
-from worker.trajectory import Trajectory
-from worker.type_aliases import FloatArray
 
 TrueRewards = Callable[[Taste, Trajectory], FloatArray]
 """r^H of every step, (T,)"""

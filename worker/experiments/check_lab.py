@@ -12,13 +12,13 @@ from app.installed_tasks import lab
 from app.installed_tasks.description import TaskRefused
 from app.installed_tasks.lab import LabDescription
 from worker.compute.lab_policies import policy_of
+from worker.domain.scenarios import POLICY_TEST
+from worker.domain.trajectory import Trajectory
 from worker.experiments import lab_ranges
 from worker.ml.policies.onnx_policy import NotAPolicy, OnnxPolicy
 from worker.ml.policies.remote_policy import RemotePolicy
-from worker.scenarios import POLICY_TEST
 from worker.sim.lab.environment import LabEnvironment, Picture
 from worker.sim.lab.errors import LabTaskBroken
-from worker.trajectory import Trajectory
 
 EPISODES, PICTURES = 3, 6
 SLOW_EPISODE_S = 5.0

@@ -20,17 +20,17 @@ from tqdm import tqdm
 
 from worker.compute import simulation
 from worker.compute.pools import Compute, Lane
+from worker.domain.scenarios import RESPONSE_SURFACE, RESPONSE_SURFACE_SOUGHT, first_of
+from worker.domain.task import Task
+from worker.domain.type_aliases import FloatArray
 from worker.experiments import lab_ranges
 from worker.ml.filters import response_surface
 from worker.ml.filters.response_surface import ResponseSurface, best_mode
 from worker.ml.rewards.reward_models import NEVER_WANTED
 from worker.ml.teachers import random_taste
-from worker.scenarios import RESPONSE_SURFACE, RESPONSE_SURFACE_SOUGHT, first_of
 from worker.sim.costs import signal_weights
 from worker.sim.lab.found import FOUND_FILE
-from worker.task import Task
 from worker.tasks import registry
-from worker.type_aliases import FloatArray
 from worker.whole_files import written_whole
 
 SCENARIOS = 300

@@ -13,17 +13,17 @@ import numpy as np
 
 from app.installed_tasks.lab import LabDescription
 from worker.compute.lab_policies import policy_of
-from worker.lab_modes import widest_axes
+from worker.domain.lab_modes import widest_axes
+from worker.domain.modes import Axis
+from worker.domain.scenarios import RESPONSE_SURFACE
+from worker.domain.task import Answered
+from worker.domain.trajectory import Trajectory
+from worker.domain.type_aliases import Float32Array, FloatArray
 from worker.ml.policies.onnx_policy import OnnxPolicy
 from worker.ml.policies.remote_policy import RemotePolicy
-from worker.modes import Axis
-from worker.scenarios import RESPONSE_SURFACE
 from worker.sim.lab.environment import LabEnvironment
 from worker.sim.lab.errors import LabTaskBroken
 from worker.sim.lab.found import Found, mark_of
-from worker.task import Answered
-from worker.trajectory import Trajectory
-from worker.type_aliases import Float32Array, FloatArray
 
 SCENARIOS = 15
 HALVINGS = 3

@@ -7,9 +7,9 @@ from pathlib import Path
 
 from worker.compute import simulation
 from worker.compute.behaviours import Behaviour
+from worker.domain.trajectory import Trajectory
 from worker.sim.rollout import rollout
 from worker.tasks import registry
-from worker.trajectory import Trajectory
 from worker.whole_files import written_whole
 
 BEHAVIOURS_PER_SCENARIO = 6

@@ -9,12 +9,12 @@ import sys
 import numpy as np
 
 from worker.compute import simulation
-from worker.scenarios import RESIDUAL, first_of
+from worker.domain.scenarios import RESIDUAL, first_of
+from worker.domain.trajectory import COSTS
+from worker.domain.type_aliases import Act
 from worker.sim.costs import BASE_WEIGHTS, cost_items
 from worker.sim.rollout import rollout
 from worker.tasks import registry
-from worker.trajectory import COSTS
-from worker.type_aliases import Act
 
 FACTORS = (0.8, 0.9, 1.0, 1.1, 1.2)
 SCENARIOS = 200

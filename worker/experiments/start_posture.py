@@ -7,11 +7,11 @@ import sys
 
 import numpy as np
 
+from worker.domain.type_aliases import FloatArray
 from worker.sim.arm import tool_jacobian
 from worker.sim.assistive import ARM, AssistiveEnv
 from worker.sim.seated_person import PERSON
 from worker.tasks.registry import environment_class
-from worker.type_aliases import FloatArray
 
 SCENARIOS = 4
 """Targets of so many scenarios lie on the way."""

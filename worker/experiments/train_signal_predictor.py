@@ -16,10 +16,10 @@ from tqdm import tqdm
 
 from worker.compute import simulation
 from worker.compute.pools import Compute, Lane
+from worker.domain.scenarios import SIGNAL_PREDICTOR, SIGNAL_PREDICTOR_TEST, first_of
 from worker.experiments.rollout_cache import BEHAVIOURS_PER_SCENARIO, RolloutCache
 from worker.ml.rewards import signal_training
 from worker.ml.rewards.signal_training import PredictorTraining
-from worker.scenarios import SIGNAL_PREDICTOR, SIGNAL_PREDICTOR_TEST, first_of
 from worker.tasks import registry
 
 SCENARIOS = 150

@@ -20,7 +20,7 @@ from app.domain.preferences import LabelEvent, Query, count_labels
 from app.domain.run_keys import SCENARIO, WHOLE, RunKey
 from app.domain.studies import Participant, Study
 from app.services.evaluation import evaluation_plan, self_setting
-from worker import scenarios
+from worker.domain import scenarios
 from worker.jobs.clips import preview_films, repairs
 from worker.jobs.publishing import export_files, power_plans, report_files
 from worker.jobs.runtime import due_evaluation

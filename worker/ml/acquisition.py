@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from worker.type_aliases import FloatArray
+from worker.domain.type_aliases import FloatArray
 
 Strategy = Literal["uniform", "disagreement", "entropy", "information_gain", "contested"]
 Indices = npt.NDArray[np.int64]

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from worker.type_aliases import Float32Array
+from worker.domain.type_aliases import Float32Array
 
 Layers = tuple[tuple[Float32Array, Float32Array], ...]
 """Per layer a matrix (..., in, out) and a bias (..., 1, out); leading axes are members of an ensemble."""

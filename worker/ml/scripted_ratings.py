@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from worker.type_aliases import FloatArray
+from worker.domain.type_aliases import FloatArray
 
 POINTS = 5
 

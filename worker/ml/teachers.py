@@ -14,9 +14,9 @@ from typing import Self
 import numpy as np
 import numpy.typing as npt
 
-from worker.responses import Response
-from worker.trajectory import COSTS, SIGNALS
-from worker.type_aliases import FloatArray
+from worker.domain.responses import Response
+from worker.domain.trajectory import COSTS, SIGNALS
+from worker.domain.type_aliases import FloatArray
 
 
 class User(StrEnum):
@@ -32,7 +32,7 @@ OMEGA: Mapping[User, tuple[float, ...]] = {
     User.CAUTIOUS: (1.0, 2.0, 1.5, 2.5, 3.0, 2.0),
     User.IMPATIENT: (2.0, 0.5, 0.75, 0.5, 1.5, 0.5),
 }
-"""The paper's omega, in the order of worker.trajectory.COSTS."""
+"""The paper's omega, in the order of worker.domain.trajectory.COSTS."""
 
 
 @dataclass(frozen=True)

@@ -21,17 +21,17 @@ from app.services.evaluation import self_setting
 from app.storage import ArtefactStore
 from worker.compute import simulation
 from worker.compute.behaviours import Behaviour
+from worker.domain.scenarios import of_preview
+from worker.domain.trajectory import Trajectory
+from worker.domain.type_aliases import FloatArray
 from worker.jobs.learning import dataset
 from worker.jobs.runtime import records
 from worker.ml.rewards.loading import load_reward_model
 from worker.ml.rewards.reward_models import RewardModel
 from worker.ml.scripted_ratings import RatingManner, ScriptedRater
 from worker.ml.teachers import Manner, ScriptedTeacher, Taste, segment_returns
-from worker.scenarios import of_preview
 from worker.sim.costs import preference_rewards
 from worker.tasks import registry
-from worker.trajectory import Trajectory
-from worker.type_aliases import FloatArray
 
 CALIBRATION_PAIRS = 200
 Rows = npt.NDArray[np.intp]

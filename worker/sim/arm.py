@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from worker.domain.type_aliases import FloatArray
 from worker.sim.bullet import Bullet, Link
 from worker.sim.geometry import IDENTITY, Shape, capsule_between, compose, quaternion_of_euler
-from worker.type_aliases import FloatArray
 
 Point = tuple[float, float, float]
 Rotation = tuple[Point, Point, Point]

@@ -1,7 +1,7 @@
 """What every task shares: a robot arm with a tool, a seated person, and measuring what the one does to the other.
 
 A task subclasses `AssistiveEnv` and says where its target is, what lies around, and what counts (see worker/tasks
-and docs/new_task.md). World frame: see human.py. Observations are in the robot base frame, see worker/spaces.py.
+and docs/new_task.md). World frame: see human.py. Observations are in the robot base frame, see worker/domain/spaces.py.
 """
 
 from abc import abstractmethod
@@ -12,6 +12,10 @@ from typing import Any, ClassVar, NamedTuple
 import gymnasium
 import numpy as np
 
+from worker.domain.spaces import CONTROL_STEP_S, JOINT_ACTION, Space
+from worker.domain.task import Task
+from worker.domain.trajectory import BODIES
+from worker.domain.type_aliases import Float32Array, FloatArray
 from worker.sim import human
 from worker.sim.arm import RobotArm, Start, Tool, start_postures
 from worker.sim.bullet import Bullet, Contact
@@ -20,10 +24,6 @@ from worker.sim.human import Impairment, Person
 from worker.sim.jaco import JACO
 from worker.sim.measures import StepMeasures, StepOutcome, TaskReward
 from worker.sim.seated_person import HEAD, PERSON, add_person
-from worker.spaces import CONTROL_STEP_S, JOINT_ACTION, Space
-from worker.task import Task
-from worker.trajectory import BODIES
-from worker.type_aliases import Float32Array, FloatArray
 
 Reward = Callable[[StepMeasures], float]
 

@@ -10,9 +10,9 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from worker.domain.type_aliases import FloatArray
 from worker.sim.engine import pybullet
 from worker.sim.geometry import IDENTITY, Shape, Vector
-from worker.type_aliases import FloatArray
 
 GRAVITY_M_S2 = 9.81
 CONTACT_MARGIN_M = 0.001

@@ -17,9 +17,9 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from worker.task import Task
-from worker.trajectory import COSTS, SIGNALS
-from worker.type_aliases import Float32Array, FloatArray
+from worker.domain.task import Task
+from worker.domain.trajectory import COSTS, SIGNALS
+from worker.domain.type_aliases import Float32Array, FloatArray
 
 CostForm = Literal["paper", "calibrated"]
 

@@ -7,8 +7,8 @@ from typing import Literal
 
 import numpy as np
 
+from worker.domain.type_aliases import FloatArray
 from worker.sim.engine import pybullet
-from worker.type_aliases import FloatArray
 
 Vector = Sequence[float] | FloatArray
 IDENTITY = (0.0, 0.0, 0.0, 1.0)

@@ -12,9 +12,9 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from worker.domain.trajectory import BODIES, SKIN_TONES
+from worker.domain.type_aliases import FloatArray
 from worker.sim.geometry import quaternion_of_euler
-from worker.trajectory import BODIES, SKIN_TONES
-from worker.type_aliases import FloatArray
 
 Point = tuple[float, float, float]
 Impairment = Literal["none", "tremor", "weakness", "limits"]

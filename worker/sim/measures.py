@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
-from worker.type_aliases import FloatArray
+from worker.domain.type_aliases import FloatArray
 
 NEAR_M = 0.20
 """Closer than this the speed counts as speed near the person."""

@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from worker.domain.trajectory import COSTS, SIGNALS, Trajectory
+from worker.domain.type_aliases import Act
 from worker.sim.assistive import AssistiveEnv
-from worker.trajectory import COSTS, SIGNALS, Trajectory
-from worker.type_aliases import Act
 
 
 def rollout(env: AssistiveEnv, act: Act, scenario: int, reference: Act | None = None) -> Trajectory:

@@ -43,7 +43,7 @@ TRAINED = tuple(each for each in EvaluatedMethod if each not in (EvaluatedMethod
 """Methods that are made for the evaluation alone; the reference is there, and pbarl is the participant's filter."""
 
 TRIAL_SCENARIOS = range(6_000_000, 6_800_000)
-"""Scenarios of trials; nothing else uses them (worker.scenarios has the others)."""
+"""Scenarios of trials; nothing else uses them (worker.domain.scenarios has the others)."""
 COMPARISON_SCENARIOS = range(6_800_000, 6_900_000)
 """Scenarios in which somebody's robot is shown before and after."""
 COMPARED = 2

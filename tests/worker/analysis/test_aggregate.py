@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from worker.analysis import aggregate
-from worker.type_aliases import FloatArray
+from worker.domain.type_aliases import FloatArray
 
 
 def strata(*means: tuple[float, ...], scenarios: int = 50, spread: float = 0.0) -> list[FloatArray]:

@@ -10,7 +10,7 @@ from app.services.answers import accuracy
 from tests.worker import invented
 from worker.analysis.agreement import wilson_interval
 from worker.analysis.evaluation import evaluate, mean_change, success_change
-from worker.trajectory import COSTS, Trajectory
+from worker.domain.trajectory import COSTS, Trajectory
 
 
 def test_wilson_s_interval_matches_published_values() -> None:

@@ -13,13 +13,13 @@ from worker.analysis.proof import case_against
 from worker.compute import learning
 from worker.compute.filter_fitting import FilterFit, Finished
 from worker.compute.pools import Compute
+from worker.domain.trajectory import SIGNALS, Trajectory
+from worker.domain.type_aliases import Act
 from worker.ml.export import bundle
 from worker.ml.export.bundle import Provenance
 from worker.ml.filters.filter_module import FilterWeights
 from worker.ml.filters.filter_problem import FilterConfig, FilterDraft
 from worker.ml.rewards.reward_models import StructuredReward
-from worker.trajectory import SIGNALS, Trajectory
-from worker.type_aliases import Act
 
 
 def measured(low: float, high: float, **worse: float) -> dict[str, Any]:

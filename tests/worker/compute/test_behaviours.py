@@ -9,8 +9,8 @@ import pytest
 from app.installed_tasks import catalogue
 from worker.compute import simulation
 from worker.compute.behaviours import DIFFERENT_ENOUGH, Behaviour, draw_behaviours
+from worker.domain.trajectory import Trajectory
 from worker.tasks import registry
-from worker.trajectory import Trajectory
 
 EARLY = ["success_40", "success_70"]
 

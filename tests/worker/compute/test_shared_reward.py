@@ -5,13 +5,13 @@ import pytest
 
 from worker.compute import shared_reward
 from worker.compute.simulation import reference_rollouts
+from worker.domain.trajectory import SIGNALS
 from worker.ml.rewards.loading import load_reward_model
 from worker.ml.rewards.reward_models import StructuredReward
 from worker.ml.rewards.signal_scale import SignalScale
 from worker.ml.teachers import OMEGA, User
 from worker.sim.costs import preference_rewards
 from worker.tasks import registry
-from worker.trajectory import SIGNALS
 
 TASK = "feeding"
 SCALE = SignalScale(np.ones(len(SIGNALS)), np.full(len(SIGNALS), -1e6), np.full(len(SIGNALS), 1e6))

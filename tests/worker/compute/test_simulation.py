@@ -10,8 +10,8 @@ import pytest
 
 from worker.compute import simulation
 from worker.compute.behaviours import Behaviour
+from worker.domain.trajectory import Trajectory
 from worker.tasks import registry
-from worker.trajectory import Trajectory
 
 
 def test_filming_loads_neither_torch_nor_the_engine_nor_the_database() -> None:

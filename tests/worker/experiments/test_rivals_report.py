@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tests.benchmarks import rivals_report
-from worker.type_aliases import FloatArray
+from worker.domain.type_aliases import FloatArray
 
 
 def row(method: str, gains: FloatArray, successes: FloatArray, seed: int = 0) -> Mapping[str, Any]:

@@ -12,8 +12,8 @@ from app.domain.preferences import Exclusion, LabelEvent, Query, Response
 from app.domain.studies import Participant
 from app.storage import ArtefactStore
 from tests.worker.conftest import STEPS, make_trajectory
+from worker.domain.responses import TARGETS
 from worker.jobs.learning import dataset
-from worker.responses import TARGETS
 
 AddClips = Callable[..., list[Clip]]
 Answer = Callable[[Clip, Clip, Response], Query]

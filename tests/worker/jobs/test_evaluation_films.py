@@ -21,6 +21,7 @@ from app.domain.studies import Participant, Study
 from app.services.evaluation import evaluation_plan
 from app.storage import ArtefactStore
 from tests.worker.at_hand import AtHand, at_once
+from worker.domain.trajectory import SIGNALS
 from worker.jobs import reconcile
 from worker.jobs.clips.evaluation_films import make_films
 from worker.jobs.learning.baselines import train_method
@@ -30,7 +31,6 @@ from worker.jobs.runtime.records import Job
 from worker.ml.filters.filter_module import FilterWeights
 from worker.ml.methods import prefft
 from worker.ml.rewards.reward_models import StructuredReward
-from worker.trajectory import SIGNALS
 
 LABELS = 10
 

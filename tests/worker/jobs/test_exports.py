@@ -31,12 +31,12 @@ from app.storage import ArtefactStore
 from tests import stored_files
 from tests.worker.conftest import filmed
 from worker.compute.pools import Compute
+from worker.domain.trajectory import SIGNALS
 from worker.jobs import reconcile
 from worker.jobs.learning import dataset
 from worker.jobs.publishing import export_files
 from worker.jobs.runtime import records
 from worker.jobs.runtime.context import WorkerContext
-from worker.trajectory import SIGNALS
 
 DOCS = Path(__file__).resolve().parents[3] / "docs"
 AddClips = Callable[..., list[Clip]]

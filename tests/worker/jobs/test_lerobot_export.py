@@ -26,12 +26,12 @@ from app.services.exports.export_requests import ExportKind
 from app.storage import ArtefactStore
 from tests.worker.conftest import filmed
 from worker.compute.pools import Compute
+from worker.domain.trajectory import SIGNALS
 from worker.jobs.clips.import_clips import import_clips
 from worker.jobs.learning import dataset
 from worker.jobs.publishing import export_files
 from worker.jobs.runtime import records
 from worker.jobs.runtime.context import WorkerContext
-from worker.trajectory import SIGNALS
 
 AddClips = Callable[..., list[Clip]]
 Answer = Callable[[Clip, Clip, Response], Query]

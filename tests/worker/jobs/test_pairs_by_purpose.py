@@ -16,13 +16,13 @@ from app.domain.studies import Participant, Study, longest_clip_steps
 from app.storage import ArtefactStore
 from tests.worker.conftest import STEPS, make_trajectory
 from tests.worker.invented import job_of
-from worker import scenarios
 from worker.compute.pools import Compute
+from worker.domain import scenarios
+from worker.domain.trajectory import SIGNALS
 from worker.jobs import reconcile
 from worker.jobs.learning import dataset, query_plan, query_selection, reward_models
 from worker.jobs.runtime import records
 from worker.jobs.runtime.context import WorkerContext
-from worker.trajectory import SIGNALS
 
 WHOLE = longest_clip_steps("feeding") or 0
 ENDS = ("undelivered", "spilled_on_person", "high_force_n")

@@ -21,6 +21,7 @@ from tests.worker.at_hand import AtHand
 from tests.worker.jobs.test_evaluation_films import LABELS, done, due, learn, names, settle
 from worker.compute import baseline_fitting, preview_plan, simulation
 from worker.compute.behaviours import DIFFERENT_ENOUGH
+from worker.domain.scenarios import of_preview
 from worker.jobs.clips import preview_films
 from worker.jobs.clips.evaluation_films import make_films
 from worker.jobs.clips.pool_clips import build_clips
@@ -29,7 +30,6 @@ from worker.jobs.runtime import records
 from worker.jobs.runtime.context import WorkerContext
 from worker.ml.export.run_controller import Controller
 from worker.ml.filters.filter_module import FilterWeights
-from worker.scenarios import of_preview
 from worker.tasks import registry
 
 MODE = {"speed_far": 0.3, "speed_near": -0.6, "from_below": 0.0, "to_side": 0.6, "press": 0.0}

@@ -8,10 +8,10 @@ import pytest
 from app.domain.preferences import Purpose
 from app.domain.study_settings import StudySettings
 from tests.worker import invented
+from worker.domain.trajectory import SIGNALS
+from worker.domain.type_aliases import Float32Array
 from worker.jobs.learning import query_plan
 from worker.ml.rewards.segments import SegmentPairs, Stretch
-from worker.trajectory import SIGNALS
-from worker.type_aliases import Float32Array
 
 WHOLE_STUDY = StudySettings(practice_pairs=2, introduction_pairs=10, repeated_pairs=20, catch_pairs=5)
 DELIVERED_AT = 10

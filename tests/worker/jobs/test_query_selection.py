@@ -19,13 +19,13 @@ from app.storage import ArtefactDamaged, ArtefactStore
 from tests import stored_files
 from tests.waiting import until
 from worker.compute.pools import Compute
+from worker.domain.trajectory import SIGNALS
 from worker.jobs.learning import dataset, query_selection, reward_models
 from worker.jobs.runtime import records
 from worker.jobs.runtime.context import WorkerContext
 from worker.ml import acquisition
 from worker.ml.rewards import reward_training
 from worker.ml.rewards.reward_models import StructuredReward
-from worker.trajectory import SIGNALS
 
 AddClips = Callable[..., list[Clip]]
 Answer = Callable[[Clip, Clip, Response], Query]

@@ -15,7 +15,7 @@ from app.domain.protocol import EvaluationSettings
 from app.domain.studies import Participant, Study
 from app.domain.study_settings import StudySettings
 from tests.worker.invented import job_of
-from worker import scenarios
+from worker.domain import scenarios
 from worker.jobs import reconcile
 from worker.jobs.runtime import due_work, records
 

@@ -20,6 +20,7 @@ from app.services.archives import demo_archive
 from app.storage import ArtefactStore
 from tests.worker.at_hand import AtHand
 from worker.compute import simulation
+from worker.domain.scenarios import EVALUATION
 from worker.jobs.learning import reward_models
 from worker.jobs.runtime import records
 from worker.jobs.runtime.context import WorkerContext
@@ -28,7 +29,6 @@ from worker.ml.filters.filter_module import FilterWeights
 from worker.ml.filters.filter_problem import FilterAct, act_of
 from worker.ml.rewards.loading import load_reward_model
 from worker.ml.rewards.reward_models import StructuredReward
-from worker.scenarios import EVALUATION
 from worker.sim.rollout import rollout
 from worker.tasks import registry
 

@@ -13,10 +13,10 @@ from app.storage import ArtefactStore
 from worker.analysis.promise import Outcome
 from worker.compute.filter_fitting import FilterFit
 from worker.compute.pools import Compute
+from worker.domain.scenarios import of_promise
 from worker.jobs.learning.filters import filter_config
 from worker.jobs.learning.reference_rollouts import make_ready, promise_block, reference_blocks
 from worker.jobs.runtime.context import WorkerContext
-from worker.scenarios import of_promise
 
 SETTINGS = StudySettings(evaluation_scenarios=10)
 

@@ -17,6 +17,7 @@ from app.storage import ArtefactStore
 from tests import factories, stored_files
 from tests.worker.at_hand import AtHand, at_once
 from worker.compute import simulation
+from worker.domain.trajectory import Trajectory
 from worker.jobs import reconcile
 from worker.jobs.clips import repairs
 from worker.jobs.clips.evaluation_films import make_films
@@ -25,7 +26,6 @@ from worker.jobs.clips.repairs import FilmLost, NotTheSameAgain
 from worker.jobs.runtime import records
 from worker.jobs.runtime.context import WorkerContext
 from worker.jobs.runtime.records import Job
-from worker.trajectory import Trajectory
 
 pytestmark = pytest.mark.slow
 

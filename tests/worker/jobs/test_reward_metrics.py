@@ -13,13 +13,13 @@ from app.storage import ArtefactStore
 from tests.worker.jobs import test_query_selection
 from worker.compute.pools import Compute
 from worker.compute.simulation import surface_file
+from worker.domain.trajectory import COSTS, SIGNALS
 from worker.jobs.learning import dataset, query_selection, reward_metrics
 from worker.jobs.runtime.context import WorkerContext
 from worker.ml.filters.response_surface import ResponseSurface
 from worker.ml.rewards.reward_models import StructuredReward
 from worker.ml.stopping import expected_regret
 from worker.tasks.registry import task
-from worker.trajectory import COSTS, SIGNALS
 
 AddClips = Callable[..., list[Clip]]
 

@@ -7,12 +7,12 @@ from functools import cached_property
 import numpy as np
 
 from tests.worker import invented
+from worker.domain.trajectory import SIGNALS, Trajectory
+from worker.domain.type_aliases import FloatArray
 from worker.ml.methods.people import Labels
 from worker.ml.rewards import reward_training
 from worker.ml.rewards.reward_models import RewardModel
 from worker.ml.rewards.signal_scale import SignalScale
-from worker.trajectory import SIGNALS, Trajectory
-from worker.type_aliases import FloatArray
 
 SPEED = SIGNALS.index("speed_m_s")
 

@@ -16,6 +16,7 @@ import torch
 
 from tests.waiting import PATIENCE_S
 from tests.worker import invented
+from worker.domain.type_aliases import Act
 from worker.ml.export import blinded_controller
 from worker.ml.export.blinded_controller import Blinded
 from worker.ml.export.run_controller import Controller
@@ -26,7 +27,6 @@ from worker.ml.filters.pbarl_printed import PrintedEncoder
 from worker.ml.methods.best_of_n import BestOfN
 from worker.ml.methods.preference_rl import PolicyAct
 from worker.ml.policies.torch_module import FrozenPolicy
-from worker.type_aliases import Act
 
 POLICY = invented.small_policy()
 FROZEN = FrozenPolicy(POLICY.weights)

@@ -20,6 +20,7 @@ from app.signing import SigningKey
 from tests.waiting import PATIENCE_S
 from tests.worker import invented
 from worker.analysis.evaluation import evaluate
+from worker.domain.trajectory import SIGNALS
 from worker.ml.export import bundle
 from worker.ml.export.bundle import BundleContents, BundleDamaged, Provenance, RecordedSteps
 from worker.ml.export.model_card import model_card
@@ -31,7 +32,6 @@ from worker.ml.policies.policy_onnx import policy_to_onnx
 from worker.ml.rewards import reward_training
 from worker.ml.rewards.loading import load_reward_model
 from worker.ml.rewards.reward_models import StructuredReward
-from worker.trajectory import SIGNALS
 
 POLICY = invented.small_policy()
 

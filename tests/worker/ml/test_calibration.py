@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from tests.worker import invented
+from worker.domain.trajectory import SIGNALS
 from worker.ml.rewards.calibration import HeldOut, expected_calibration_error, fit_temperature, report
 from worker.ml.rewards.network_training import MlpTraining
 from worker.ml.rewards.reward_training import fit
-from worker.trajectory import SIGNALS
 
 
 def answered(logits: np.ndarray[tuple[int, ...], np.dtype[np.float64]], seed: int = 0) -> HeldOut:

@@ -9,11 +9,11 @@ import pytest
 import torch
 
 from tests.worker import invented
+from worker.domain.modes import ApproachModes
 from worker.ml.filters.action_encoder import REACH, ResidualAdapter
 from worker.ml.filters.filter_module import ActionFilter, FilterWeights, build, state_of
 from worker.ml.filters.filter_onnx import ExportDiffers, OnnxFilter, largest_difference, to_onnx
 from worker.ml.policies.torch_module import FrozenPolicy
-from worker.modes import ApproachModes
 
 POLICY = invented.small_policy()
 SEEN = invented.observations(40, np.random.default_rng(0))

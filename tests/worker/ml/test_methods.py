@@ -13,6 +13,8 @@ import torch
 from tests.worker import invented
 from tests.worker.ml.invented_person import InventedPerson
 from worker.compute import learning
+from worker.domain.trajectory import SIGNALS, Trajectory
+from worker.domain.type_aliases import Act
 from worker.ml.filters import response_surface
 from worker.ml.filters.filter_module import load_state
 from worker.ml.filters.filter_problem import FilterConfig, FilterProblem
@@ -26,8 +28,6 @@ from worker.ml.methods.prefft_lagrangian import Constraint
 from worker.ml.methods.registry import METHODS, MethodConfig, NobodyToAsk, Setting
 from worker.ml.methods.steered_rl import Steering
 from worker.ml.rewards.reward_models import MlpReward, StructuredReward
-from worker.trajectory import SIGNALS, Trajectory
-from worker.type_aliases import Act
 
 POLICY = invented.small_policy()
 SPEED, DISTANCE = SIGNALS.index("speed_m_s"), SIGNALS.index("distance_m")

@@ -10,15 +10,15 @@ import torch
 
 from tests.worker import invented
 from worker.compute import learning
+from worker.domain.scenarios import GATE, first_of
+from worker.domain.trajectory import SIGNALS, Trajectory
+from worker.domain.type_aliases import Act
 from worker.ml.filters import mode_search, pbarl, residual, response_surface
 from worker.ml.filters.filter_module import FilterWeights
 from worker.ml.filters.filter_problem import FilterConfig, FilterDraft, FilterProblem, act_of
 from worker.ml.filters.residual import learn_round
 from worker.ml.filters.response_surface import ResponseSurface
 from worker.ml.rewards.reward_models import StructuredReward
-from worker.scenarios import GATE, first_of
-from worker.trajectory import SIGNALS, Trajectory
-from worker.type_aliases import Act
 
 POLICY = invented.small_policy()
 FAMILY = invented.TASK.modes

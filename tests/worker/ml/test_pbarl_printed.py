@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from tests.worker import invented
+from worker.domain.trajectory import SIGNALS
 from worker.ml.filters import pbarl_printed
 from worker.ml.filters.filter_module import build
 from worker.ml.filters.filter_problem import FilterProblem
@@ -17,7 +18,6 @@ from worker.ml.policies.torch_module import FrozenPolicy
 from worker.ml.rewards.network_training import MlpTraining, TransformerTraining
 from worker.ml.rewards.reward_models import StructuredReward
 from worker.ml.rewards.reward_training import fit
-from worker.trajectory import SIGNALS
 
 POLICY = invented.small_policy()
 

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from tests.worker import invented
+from worker.domain.trajectory import SIGNALS
 from worker.ml.rewards.pooled_prior import Prior, prior_of
 from worker.ml.rewards.reward_models import StructuredReward
 from worker.ml.rewards.reward_training import fit, posterior
 from worker.ml.rewards.signal_scale import SignalScale
-from worker.trajectory import SIGNALS
 
 SIZE = len(SIGNALS)
 

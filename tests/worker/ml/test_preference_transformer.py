@@ -7,6 +7,8 @@ import pytest
 import torch
 
 from tests.worker import invented
+from worker.domain.trajectory import SIGNALS
+from worker.domain.type_aliases import FloatArray
 from worker.ml.rewards import preference_transformer
 from worker.ml.rewards.action_ranking import HistoryMemory, ranker_at
 from worker.ml.rewards.loading import load_reward_model
@@ -15,8 +17,6 @@ from worker.ml.rewards.preference_transformer import PreferenceTransformer
 from worker.ml.rewards.reward_models import StructuredReward
 from worker.ml.rewards.reward_training import fit
 from worker.ml.rewards.segments import SegmentPairs
-from worker.trajectory import SIGNALS
-from worker.type_aliases import FloatArray
 
 STEPS = 10
 

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from worker.domain.trajectory import SIGNALS
 from worker.ml.filters.response_surface import ResponseSurface, best_mode, fit, monomials
 from worker.tasks.feeding.environment import FEEDING
-from worker.trajectory import SIGNALS
 
 FAMILY = FEEDING.modes
 SPEED, HEIGHT = SIGNALS.index("speed_m_s"), SIGNALS.index("height_above_target_m")

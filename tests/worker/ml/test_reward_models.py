@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from tests.worker import invented
+from worker.domain.trajectory import SIGNALS
 from worker.ml.rewards import bradley_terry, preference_loss, reward_training
 from worker.ml.rewards.loading import load_reward_model
 from worker.ml.rewards.network_training import MlpTraining, TransformerTraining
@@ -15,7 +16,6 @@ from worker.ml.rewards.reward_models import CLIP, RewardModel, StructuredReward,
 from worker.ml.rewards.reward_training import fit, posterior
 from worker.ml.rewards.segments import SegmentPairs
 from worker.ml.rewards.signal_scale import SignalScale
-from worker.trajectory import SIGNALS
 
 KINDS: tuple[reward_training.RewardKind, ...] = ("structured", "predicted", "mlp", "preference_transformer")
 QUICK = MlpTraining(steps=100, members=3, hidden=16, learning_rate=5e-3)

@@ -10,6 +10,8 @@ import torch
 from tests.worker import invented
 from tests.worker.ml.invented_person import InventedPerson
 from tests.worker.ml.test_methods import POLICY, REWARD, World, collect
+from worker.domain.trajectory import SIGNALS, Trajectory
+from worker.domain.type_aliases import Act, FloatArray
 from worker.ml.filters.filter_problem import FilterProblem
 from worker.ml.methods import bayesian_modes, clusters, latent_people, residual_rl, sliders
 from worker.ml.methods.behaviour_flow import fit_flow
@@ -21,8 +23,6 @@ from worker.ml.methods.residual_rl import Corrected
 from worker.ml.methods.steered_rl import Steering
 from worker.ml.policies.sac import Replay
 from worker.ml.rewards.reward_models import UNDONE
-from worker.trajectory import SIGNALS, Trajectory
-from worker.type_aliases import Act, FloatArray
 
 SEEN = invented.observations(200, np.random.default_rng(9))
 PROBLEM = FilterProblem(invented.TASK, POLICY, REWARD, 0)

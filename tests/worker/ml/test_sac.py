@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import torch
 
+from worker.domain.spaces import Field, Space
 from worker.ml.policies import pretraining, sac
 from worker.ml.policies.gaussian import GaussianPolicy
-from worker.spaces import Field, Space
 
 
 class Reach(gymnasium.Env[Any, Any]):

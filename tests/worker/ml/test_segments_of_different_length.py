@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from tests.worker import invented
+from worker.domain.trajectory import Trajectory
 from worker.ml.rewards import reward_training
 from worker.ml.rewards.network_training import MlpTraining, TransformerTraining
 from worker.ml.rewards.reward_models import RewardModel
 from worker.ml.rewards.segments import SegmentPairs, Stretch
-from worker.trajectory import Trajectory
 
 SHORT, LONG = 20, 33
 KINDS: tuple[reward_training.RewardKind, ...] = ("structured", "mlp", "preference_transformer")

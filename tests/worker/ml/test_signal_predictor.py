@@ -11,6 +11,7 @@ import torch
 from app.installed_tasks import catalogue
 from tests.worker import invented
 from worker.compute import learning, simulation
+from worker.domain.trajectory import SIGNALS, Trajectory
 from worker.experiments import train_signal_predictor
 from worker.experiments.rollout_cache import RolloutCache
 from worker.ml.rewards import reward_training, signal_training
@@ -23,7 +24,6 @@ from worker.ml.rewards.signal_predictor import UNSENSED, SignalPredictor
 from worker.ml.rewards.signal_scale import SignalScale
 from worker.ml.rewards.signal_training import PredictorTraining
 from worker.sim.rollout import rollout
-from worker.trajectory import SIGNALS, Trajectory
 
 QUICK = PredictorTraining(hidden=16, steps=60, batch=64, learning_rate=1e-2)
 SPEED, FORCE = SIGNALS.index("speed_m_s"), SIGNALS.index("force_at_target_n")

@@ -13,6 +13,7 @@ from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_for_sb3
 
 from app.installed_tasks import catalogue
+from worker.domain.trajectory import BODIES, SIGNALS
 from worker.ml.policies.gaussian import GaussianPolicy
 from worker.sim import human
 from worker.sim.arm import start_postures
@@ -21,7 +22,6 @@ from worker.sim.bullet import Bullet
 from worker.sim.geometry import rotation_of
 from worker.sim.seated_person import PERSON, add_person
 from worker.tasks.registry import checkpoint, environment_class
-from worker.trajectory import BODIES, SIGNALS
 
 STILL = np.zeros(7, np.float32)
 

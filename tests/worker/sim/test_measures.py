@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from worker.domain.trajectory import COSTS, SIGNALS
 from worker.sim.costs import base_weights, cost_items, preference_rewards, signal_weights, stakes
 from worker.sim.measures import StepMeasures, StepOutcome, TaskReward
 from worker.tasks.feeding.environment import FEEDING
 from worker.tasks.scratching.environment import SCRATCHING
-from worker.trajectory import COSTS, SIGNALS
 
 STILL = StepMeasures(
     tool_m=np.array([0.0, -0.4, 1.2]),

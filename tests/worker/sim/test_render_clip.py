@@ -8,6 +8,7 @@ import numpy.typing as npt
 import pytest
 
 from tests.worker.waving import itching_trajectory, pouring_trajectory, waving_trajectory
+from worker.domain.trajectory import Trajectory
 from worker.sim.arm import Tool
 from worker.sim.geometry import Shape, rotation_of
 from worker.sim.human import BROAD, RIGHT
@@ -24,7 +25,6 @@ from worker.sim.render.task_look import TaskLook
 from worker.tasks.feeding.environment import SPOON
 from worker.tasks.registry import filmed_task, look
 from worker.tasks.scratching.environment import SCRATCHER
-from worker.trajectory import Trajectory
 
 Picture = npt.NDArray[np.uint8]
 QUICK = STYLES["quick"]

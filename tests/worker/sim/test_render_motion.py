@@ -5,6 +5,7 @@ import pytest
 
 from app.installed_tasks import catalogue
 from tests.worker.waving import MOUNT, itching_trajectory, waving_trajectory
+from worker.domain.trajectory import Trajectory
 from worker.sim.human import BROAD, LEFT, RIGHT
 from worker.sim.jaco import JACO
 from worker.sim.render.camera import lamp, scene_camera
@@ -13,7 +14,6 @@ from worker.sim.render.rectangles import GRID_PX, cover, on_grid
 from worker.sim.render.task_look import TaskLook
 from worker.tasks.feeding.environment import SPOON
 from worker.tasks.registry import look
-from worker.trajectory import Trajectory
 
 MOUTH_M = np.array(BROAD.neck_pivot_m) + BROAD.mouth_from_neck_m
 

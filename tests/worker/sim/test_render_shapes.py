@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from app.installed_tasks import catalogue
+from worker.domain.trajectory import SKIN_TONES
 from worker.sim import human
 from worker.sim.arm import Tool
 from worker.sim.geometry import Shape
@@ -43,7 +44,6 @@ from worker.tasks.drinking import cup_mesh
 from worker.tasks.drinking.environment import PELLETS, pellet_radius_m, resting_places_m
 from worker.tasks.feeding.spoon_mesh import spoon
 from worker.tasks.registry import filmed_task, look
-from worker.trajectory import SKIN_TONES
 
 BALL = sphere((0.0, 0.0, 0.0), 0.1)
 

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from worker.domain.trajectory import OutdatedTrajectory, Trajectory
 from worker.sim.rollout import rollout
 from worker.tasks.feeding.environment import FEEDING, FeedingEnv
 from worker.tasks.feeding.food import BALLS
-from worker.trajectory import OutdatedTrajectory, Trajectory
 
 EPISODE_STEPS = FEEDING.episode_steps
 

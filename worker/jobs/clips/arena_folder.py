@@ -14,6 +14,8 @@ import yaml
 
 from app.domain.studies import NAME_LENGTH
 from app.services.archives import unpacking
+from worker.domain.trajectory import Recording
+from worker.domain.type_aliases import Float32Array, FloatArray
 from worker.jobs.clips import derived_signals, plain_pickle
 from worker.jobs.clips.own_clips import (
     FEWEST_STEPS,
@@ -26,8 +28,6 @@ from worker.jobs.clips.own_clips import (
     naming,
 )
 from worker.sim.render.video_cutting import cut_by_number
-from worker.trajectory import Recording
-from worker.type_aliases import Float32Array, FloatArray
 
 SESSIONS, METADATA = "evaluation_sessions", "metadata.yaml"
 LARGEST_METADATA_BYTES, LARGEST_ARRAYS_BYTES = 1 << 20, 64 << 20

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from worker.domain.type_aliases import Float32Array
 from worker.jobs.clips.own_clips import Signal
-from worker.type_aliases import Float32Array
 
 TIME = Signal(name="time_s", unit="s", meaning="how long it takes")
 OF_STATES = (

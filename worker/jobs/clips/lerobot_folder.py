@@ -19,6 +19,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from app.domain.described import bounds_of
 from app.domain.studies import NAME_LENGTH
 from app.domain.study_settings import StudySettings
+from worker.domain.trajectory import Recording
+from worker.domain.type_aliases import Float32Array
 from worker.jobs.clips import derived_signals, parquet_columns
 from worker.jobs.clips.own_clips import (
     FEWEST_STEPS,
@@ -34,8 +36,6 @@ from worker.jobs.clips.own_clips import (
 )
 from worker.jobs.clips.parquet_columns import ParquetRefused
 from worker.sim.render.video_cutting import cut_by_time
-from worker.trajectory import Recording
-from worker.type_aliases import Float32Array
 
 INFO = "meta/info.json"
 DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"

@@ -15,6 +15,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from app.domain.studies import NAME_LENGTH
 from app.services.archives import unpacking
+from worker.domain.trajectory import Recording
+from worker.domain.type_aliases import Float32Array
 from worker.jobs.clips.own_clips import (
     FEWEST_STEPS,
     TASK,
@@ -26,8 +28,6 @@ from worker.jobs.clips.own_clips import (
     in_words,
 )
 from worker.sim.render.video import playable
-from worker.trajectory import Recording
-from worker.type_aliases import Float32Array
 
 MANIFEST = "manifest.json"
 LARGEST_MANIFEST_BYTES, LARGEST_TRAJECTORY_BYTES, LARGEST_VIDEO_BYTES = 8 << 20, 64 << 20, 256 << 20

@@ -21,10 +21,10 @@ from app.errors import AppError
 from app.services import audit
 from app.services.studies import studies
 from app.storage import ArtefactStore
+from worker.domain.trajectory import Recording
 from worker.jobs.clips.stored_video import video_columns
 from worker.jobs.learning.dataset import IMPORTED
 from worker.sim.render.video import PlayableVideo
-from worker.trajectory import Recording
 
 TASK = "own_clips"
 """What the robot does, where the recordings do not say it."""

@@ -9,7 +9,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as parquet
 
-from worker.type_aliases import Float32Array
+from worker.domain.type_aliases import Float32Array
 
 LARGEST_FILE_BYTES = 1 << 30
 MOST_ROWS = 5_000_000

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.lib import format as npy
 
-from worker.type_aliases import FloatArray
+from worker.domain.type_aliases import FloatArray
 
 MOST_VALUES = 1 << 20
 """Of one array in it."""

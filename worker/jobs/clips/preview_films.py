@@ -16,10 +16,10 @@ from app.services.evaluation import self_setting
 from worker.compute import preview_plan, simulation
 from worker.compute.behaviours import Behaviour
 from worker.compute.pools import Lane
+from worker.domain.scenarios import of_preview
 from worker.jobs.clips.stored_video import video_columns
 from worker.jobs.runtime.context import Step, WorkerContext
 from worker.jobs.runtime.records import Job
-from worker.scenarios import of_preview
 from worker.tasks import registry
 
 BATCH = 8

@@ -21,10 +21,10 @@ from app.domain.studies import Participant, Study
 from app.errors import AppError
 from worker.compute import simulation
 from worker.compute.pools import Lane
+from worker.domain.trajectory import Trajectory
 from worker.jobs.clips.stored_video import video_columns
 from worker.jobs.runtime.context import Step, WorkerContext
 from worker.jobs.runtime.records import Job
-from worker.trajectory import Trajectory
 
 
 class NotTheSameAgain(AppError):

@@ -22,6 +22,8 @@ from worker.analysis.evaluation import evaluate
 from worker.compute import baseline_fitting, learning
 from worker.compute.baseline_fitting import Baseline
 from worker.compute.pools import Lane
+from worker.domain.scenarios import EVALUATION, first_of
+from worker.domain.trajectory import Trajectory
 from worker.jobs.learning import dataset, lent_filters
 from worker.jobs.learning.filters import NothingToLearnFrom, reward_to_follow
 from worker.jobs.learning.lent_filters import LoanEnded
@@ -31,8 +33,6 @@ from worker.jobs.runtime.records import Job
 from worker.ml.filters.filter_module import FilterWeights
 from worker.ml.policies.checkpoint import ask_to_pause, share_done
 from worker.ml.rewards.loading import load_reward_model
-from worker.scenarios import EVALUATION, first_of
-from worker.trajectory import Trajectory
 
 CHUNK = 10
 """Unseen scenarios between two signs of life."""

@@ -17,13 +17,13 @@ from app.domain.studies import Participant, Study
 from app.errors import AppError
 from app.files.interface import Files
 from app.storage import ArtefactStore
+from worker.domain.responses import TARGETS
+from worker.domain.trajectory import OutdatedTrajectory, Recorded, Recording, Trajectory
+from worker.domain.type_aliases import Float32Array
 from worker.ml import acquisition
 from worker.ml.rewards.segments import SegmentPairs, Stretch
 from worker.ml.rewards.signal_scale import SignalScale
-from worker.responses import TARGETS
 from worker.tasks import registry
-from worker.trajectory import OutdatedTrajectory, Recorded, Recording, Trajectory
-from worker.type_aliases import Float32Array
 
 
 class RecordedByAnOlderVersion(AppError):

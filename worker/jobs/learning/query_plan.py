@@ -14,9 +14,9 @@ import numpy.typing as npt
 
 from app.domain.preferences import Purpose
 from app.domain.study_settings import StudySettings
+from worker.domain.trajectory import SIGNALS
 from worker.ml.acquisition import balanced_sides
 from worker.ml.rewards.segments import SegmentPairs, Stretch
-from worker.trajectory import SIGNALS
 
 REPEAT_DISTANCE = 10
 """Answers from a pair to its repetition at least, so that nobody remembers the answer; fewer only where a study is too

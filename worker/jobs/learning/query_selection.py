@@ -16,6 +16,8 @@ from app.domain.preferences import LEARNED_FROM, Purpose, Query
 from app.domain.studies import Participant, Study
 from app.storage import ArtefactStore
 from worker.compute import learning
+from worker.domain.task import Task
+from worker.domain.type_aliases import FloatArray
 from worker.jobs.learning import dataset, query_plan
 from worker.jobs.learning.query_plan import Slot
 from worker.jobs.runtime import records
@@ -24,9 +26,7 @@ from worker.ml import acquisition
 from worker.ml.rewards.segments import Stretch
 from worker.ml.teachers import OMEGA, User
 from worker.sim.costs import preference_rewards
-from worker.task import Task
 from worker.tasks import registry
-from worker.type_aliases import FloatArray
 
 log = logging.getLogger("worker.jobs.learning.query_selection")
 

@@ -6,11 +6,11 @@ from worker.analysis.promise import Outcome
 from worker.compute import learning, simulation
 from worker.compute.filter_fitting import CHUNK
 from worker.compute.pools import Computing, Lane
+from worker.domain.scenarios import EVALUATION, first_of, of_promise
+from worker.domain.trajectory import Trajectory
 from worker.jobs.learning.filters import filter_config, promise_of
 from worker.ml.filters import filter_problem
-from worker.scenarios import EVALUATION, first_of, of_promise
 from worker.tasks import registry
-from worker.trajectory import Trajectory
 
 
 def make_ready(

@@ -8,6 +8,8 @@ import numpy as np
 
 from app.domain.studies import Participant, Study
 from worker.compute.simulation import surface_file
+from worker.domain.trajectory import COSTS
+from worker.domain.type_aliases import FloatArray
 from worker.jobs.learning import dataset
 from worker.jobs.runtime.context import WorkerContext
 from worker.ml.filters.response_surface import ResponseSurface
@@ -16,8 +18,6 @@ from worker.ml.rewards.reward_models import RewardModel, StructuredReward
 from worker.ml.rewards.segments import LEFT, SegmentPairs, Stretch
 from worker.ml.stopping import expected_regret
 from worker.tasks import registry
-from worker.trajectory import COSTS
-from worker.type_aliases import FloatArray
 
 FEWEST_CLIPS = 12
 """Fewer say nothing about six costs."""

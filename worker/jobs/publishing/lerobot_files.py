@@ -24,11 +24,11 @@ from app.domain.studies import Study
 from app.errors import AppError
 from app.services.exports import export_formats, export_rows, export_tables, parquet_file
 from app.storage import ArtefactMissing
+from worker.domain.responses import TARGETS
 from worker.jobs.learning import dataset
 from worker.jobs.publishing import lerobot_card, lerobot_statistics
 from worker.jobs.runtime.context import WorkerContext
 from worker.ml.rewards.segments import Stretch
-from worker.responses import TARGETS
 from worker.sim.render import video, video_cutting
 from worker.tasks import registry
 

@@ -13,10 +13,10 @@ from app.domain.preferences import Label
 from app.domain.studies import Participant, Study
 from app.services.exports import export_formats
 from app.storage import ArtefactMissing, ArtefactStore
+from worker.domain.responses import TARGETS
+from worker.domain.type_aliases import Float32Array
 from worker.jobs.learning import dataset
 from worker.ml.rewards.segments import SegmentPairs, Stretch
-from worker.responses import TARGETS
-from worker.type_aliases import Float32Array
 
 LAYOUT = 1
 """Version of the layout in docs/arrays.md."""

@@ -15,8 +15,8 @@ from app.signing import SigningKey
 from app.storage import ArtefactStore, hash_of_file
 from worker.analysis.promise import Outcome
 from worker.compute.pools import Computing
+from worker.domain.trajectory import Trajectory
 from worker.jobs.runtime import records
-from worker.trajectory import Trajectory
 
 
 class Step(Protocol):

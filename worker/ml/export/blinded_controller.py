@@ -18,6 +18,8 @@ import numpy as np
 import onnx
 from onnx import ModelProto, NodeProto, TensorProto, helper
 
+from worker.domain.task import Task
+from worker.domain.type_aliases import Act, Float32Array
 from worker.ml.export import run_controller
 from worker.ml.export.bundle import described_space
 from worker.ml.export.run_controller import INPUT, OUTPUT, Controller
@@ -26,8 +28,6 @@ from worker.ml.filters.filter_problem import FilterAct
 from worker.ml.methods.preference_rl import PolicyAct
 from worker.ml.policies.reference import ReferencePolicy
 from worker.ml.policies.stored_policy import stored_policy
-from worker.task import Task
-from worker.type_aliases import Act, Float32Array
 
 SCHEMA_VERSION = 1
 LENGTH_BYTES = 1 << 20

@@ -17,6 +17,10 @@ from typing import Any, Self
 import numpy as np
 from safetensors.numpy import save
 
+from worker.domain.spaces import Space
+from worker.domain.task import Task
+from worker.domain.trajectory import Trajectory
+from worker.domain.type_aliases import Float32Array
 from worker.ml.export import run_filter, serve_filter
 from worker.ml.export.interface import interface_of
 from worker.ml.export.model_card import model_card
@@ -28,10 +32,6 @@ from worker.ml.policies.reference import ReferencePolicy
 from worker.ml.policies.remote_policy import RemotePolicy
 from worker.ml.policies.stored_policy import stored_policy
 from worker.ml.rewards.reward_models import CLIP, RewardModel
-from worker.spaces import Space
-from worker.task import Task
-from worker.trajectory import Trajectory
-from worker.type_aliases import Float32Array
 
 SCHEMA_VERSION = 1
 MANIFEST, SIGNATURE = "manifest.json", "signature.json"

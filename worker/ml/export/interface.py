@@ -4,13 +4,13 @@ import hashlib
 import json
 from typing import Any
 
+from worker.domain.spaces import Space
+from worker.domain.task import LabInterface, Task
 from worker.ml.policies.reference import ReferencePolicy
 from worker.ml.policies.remote_policy import RemotePolicy
-from worker.spaces import Space
-from worker.task import LabInterface, Task
 
 ROBOT_FRAME = "robot base"
-"""Of the studio's own tasks; see worker.spaces."""
+"""Of the studio's own tasks; see worker.domain.spaces."""
 
 
 def interface_of(task: Task, policy: ReferencePolicy) -> dict[str, Any]:

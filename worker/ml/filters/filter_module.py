@@ -13,6 +13,8 @@ import torch
 from safetensors.numpy import load, save
 from torch import Tensor, nn
 
+from worker.domain.modes import ModeFamily
+from worker.domain.type_aliases import Float32Array
 from worker.ml.filters.action_encoder import ResidualAdapter
 from worker.ml.filters.pbarl_printed import PrintedEncoder
 from worker.ml.filters.shield import Shield
@@ -20,8 +22,6 @@ from worker.ml.policies.gaussian import GaussianPolicy
 from worker.ml.policies.reference import ReferencePolicy
 from worker.ml.policies.torch_module import FrozenPolicy
 from worker.ml.rewards.reward_models import stored_config
-from worker.modes import ModeFamily
-from worker.type_aliases import Float32Array
 
 Method = Literal["studio", "printed"]
 

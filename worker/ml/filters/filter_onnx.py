@@ -16,8 +16,8 @@ import onnxscript.optimizer
 import torch
 from onnx_ir.passes.common import ClearMetadataAndDocStringPass
 
+from worker.domain.type_aliases import Float32Array
 from worker.ml.filters.filter_module import AnyFilter
-from worker.type_aliases import Float32Array
 
 INPUTS = ("observation", "policy_mean")
 OUTPUT, SHIELD = "action", "shield"

@@ -18,6 +18,11 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 
+from worker.domain.modes import ModeFamily
+from worker.domain.scenarios import GATE, RESIDUAL, first_of
+from worker.domain.task import Task
+from worker.domain.trajectory import Trajectory
+from worker.domain.type_aliases import Act, Float32Array
 from worker.ml.filters.action_encoder import ResidualAdapter
 from worker.ml.filters.filter_module import FilterWeights, build, state_of
 from worker.ml.filters.filter_onnx import OnnxFilter, to_onnx
@@ -26,11 +31,6 @@ from worker.ml.policies.gaussian import GaussianPolicy
 from worker.ml.policies.reference import ReferencePolicy
 from worker.ml.policies.remote_policy import RemotePolicy
 from worker.ml.rewards.reward_models import RewardModel
-from worker.modes import ModeFamily
-from worker.scenarios import GATE, RESIDUAL, first_of
-from worker.task import Task
-from worker.trajectory import Trajectory
-from worker.type_aliases import Act, Float32Array
 
 ReportProgress = Callable[[str, float], None]
 """What is being done in human words, and the share of the whole fit that is done."""

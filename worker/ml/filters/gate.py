@@ -4,9 +4,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from worker.domain.trajectory import Trajectory
+from worker.domain.type_aliases import Act, FloatArray
 from worker.ml.filters.filter_problem import Collect, FilterProblem, GateTrial
-from worker.trajectory import Trajectory
-from worker.type_aliases import Act, FloatArray
 
 
 def try_on(

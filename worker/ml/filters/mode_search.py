@@ -6,6 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from worker.domain.trajectory import Trajectory
+from worker.domain.type_aliases import FloatArray
 from worker.ml.filters.filter_module import FilterWeights
 from worker.ml.filters.filter_problem import (
     Collect,
@@ -19,8 +21,6 @@ from worker.ml.filters.filter_problem import (
 from worker.ml.filters.gate import acceptable, signal_changes, successes, try_on
 from worker.ml.filters.response_surface import CAUTION, ResponseSurface, best_mode
 from worker.ml.filters.shield import limits_of
-from worker.trajectory import Trajectory
-from worker.type_aliases import FloatArray
 
 
 def find_mode(

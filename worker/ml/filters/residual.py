@@ -9,6 +9,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from worker.domain.trajectory import Trajectory
+from worker.domain.type_aliases import Act, FloatArray
 from worker.ml.filters.action_encoder import ResidualAdapter, kl_divergence
 from worker.ml.filters.filter_module import ModeTransform, load_state, state_of
 from worker.ml.filters.filter_problem import (
@@ -24,8 +26,6 @@ from worker.ml.filters.fitted_q import ActionValue, Transitions, evaluate_filter
 from worker.ml.filters.gate import acceptable, try_on
 from worker.ml.filters.shield import limits_of
 from worker.ml.policies.torch_module import FrozenPolicy
-from worker.trajectory import Trajectory
-from worker.type_aliases import Act, FloatArray
 
 Learn = Callable[[FilterProblem, FilterDraft, Sequence[Sequence[Trajectory]]], FilterDraft]
 """One round of residual learning from all rollouts so far."""

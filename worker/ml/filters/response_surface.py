@@ -15,10 +15,10 @@ import numpy.typing as npt
 from safetensors.numpy import load, save
 from scipy.special import expit, logit
 
+from worker.domain.modes import ModeFamily
+from worker.domain.trajectory import SIGNALS
+from worker.domain.type_aliases import FloatArray
 from worker.ml.rewards.reward_models import stored_config
-from worker.modes import ModeFamily
-from worker.trajectory import SIGNALS
-from worker.type_aliases import FloatArray
 
 RIDGE = 1.0
 OUTLIER_SHARE = 0.005

@@ -14,9 +14,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from worker.spaces import Space
-from worker.trajectory import Trajectory
-from worker.type_aliases import Float32Array
+from worker.domain.spaces import Space
+from worker.domain.trajectory import Trajectory
+from worker.domain.type_aliases import Float32Array
 
 FORCE, DISTANCE = "force_on_person_n", "tool_to_target_m"
 """Fields of our tasks; a laboratory's have neither, and are limited by what was seen and done alone."""

@@ -15,12 +15,12 @@ import numpy.typing as npt
 from scipy.linalg import cho_factor, cho_solve
 from scipy.special import expit, log_expit
 
+from worker.domain.scenarios import RESIDUAL, first_of
+from worker.domain.type_aliases import FloatArray
 from worker.ml.filters.filter_problem import Collect, FilterProblem
 from worker.ml.filters.response_surface import CAUTION, SUCCESS_TOLERANCE, ResponseSurface
 from worker.ml.methods.kept_task import in_mode
 from worker.ml.methods.people import Person
-from worker.scenarios import RESIDUAL, first_of
-from worker.type_aliases import FloatArray
 
 BATCH = 10
 """duels between two fits, as everybody's labels"""

@@ -13,11 +13,11 @@ import numpy as np
 import torch
 from torch import nn
 
+from worker.domain.trajectory import Trajectory
+from worker.domain.type_aliases import Float32Array
 from worker.ml import dense_network
 from worker.ml.dense_network import Layers
 from worker.ml.policies.gaussian import GaussianPolicy
-from worker.trajectory import Trajectory
-from worker.type_aliases import Float32Array
 
 EULER_STEPS = 4
 BATCH = 256

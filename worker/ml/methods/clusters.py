@@ -10,10 +10,10 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.cluster.vq import kmeans2
 
+from worker.domain.type_aliases import FloatArray
 from worker.ml.methods.people import Labels, Person
 from worker.ml.rewards.reward_models import RewardModel
 from worker.ml.rewards.segments import SegmentPairs
-from worker.type_aliases import FloatArray
 
 FEWEST = 1e-3
 """Nobody's answer is held for less likely than this: they slip."""

@@ -2,11 +2,11 @@
 
 from collections.abc import Sequence
 
+from worker.domain.trajectory import Trajectory
+from worker.domain.type_aliases import FloatArray
 from worker.ml.filters.filter_module import FilterWeights
 from worker.ml.filters.filter_problem import Collect, FilterAct, FilterProblem, act_of
 from worker.ml.filters.gate import keeps_task, try_on
-from worker.trajectory import Trajectory
-from worker.type_aliases import FloatArray
 
 
 def in_mode(problem: FilterProblem, mode: FloatArray, gate: float = 1.0) -> FilterAct:

@@ -14,10 +14,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from worker.domain.trajectory import SIGNALS, Trajectory
+from worker.domain.type_aliases import FloatArray
 from worker.ml.methods.people import Labels, Person
 from worker.ml.rewards.reward_models import NEVER_WANTED, UNDONE, StructuredReward
-from worker.trajectory import SIGNALS, Trajectory
-from worker.type_aliases import FloatArray
 
 MEMBERS = 8
 _NEVER_WANTED = [SIGNALS.index(name) for name in NEVER_WANTED]

@@ -12,11 +12,11 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from worker.domain.spaces import Space
+from worker.domain.trajectory import SIGNALS, Trajectory
 from worker.ml.methods.preference_rl import EpisodeReward, MakeEnv, PreferenceRl
 from worker.ml.policies.gaussian import GaussianPolicy
 from worker.ml.policies.sac import Learner, SacConfig
-from worker.spaces import Space
-from worker.trajectory import SIGNALS, Trajectory
 
 _DISTANCE = SIGNALS.index("distance_m")
 

@@ -6,11 +6,11 @@ from typing import Protocol
 
 import numpy as np
 
+from worker.domain.trajectory import Trajectory
+from worker.domain.type_aliases import FloatArray
 from worker.ml.rewards.reward_models import RewardModel
 from worker.ml.rewards.segments import SegmentPairs
 from worker.ml.rewards.signal_scale import SignalScale
-from worker.trajectory import Trajectory
-from worker.type_aliases import FloatArray
 
 
 @dataclass(frozen=True)

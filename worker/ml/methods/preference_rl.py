@@ -14,12 +14,12 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from worker.domain.trajectory import SIGNALS
+from worker.domain.type_aliases import Float32Array
 from worker.ml.policies.checkpoint import Checkpoint, Paused
 from worker.ml.policies.reference import ReferencePolicy
 from worker.ml.policies.sac import Learner, Replay, SacConfig
 from worker.ml.rewards.reward_models import RewardModel
-from worker.trajectory import SIGNALS
-from worker.type_aliases import Float32Array
 
 Env = gymnasium.Env[Any, Any]
 MakeEnv = Callable[[], Env]

@@ -16,12 +16,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from worker.domain.spaces import Space
 from worker.ml.methods.preference_rl import EpisodeReward, MakeEnv, PreferenceRl, Watch
 from worker.ml.policies.checkpoint import Checkpoint
 from worker.ml.policies.gaussian import LAYERS, LOG_STD_HIGH, LOG_STD_LOW, GaussianPolicy
 from worker.ml.policies.sac import Actor, Learner, SacConfig
 from worker.ml.policies.torch_module import FrozenPolicy
-from worker.spaces import Space
 
 UNIT_EVERY_UPDATES = 400
 """How often the unit of Q is measured anew."""

@@ -13,6 +13,9 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from worker.domain.spaces import Space
+from worker.domain.trajectory import SIGNALS, Trajectory
+from worker.domain.type_aliases import Float32Array
 from worker.ml.filters.filter_problem import Collect
 from worker.ml.filters.gate import successes
 from worker.ml.methods import prefft
@@ -21,9 +24,6 @@ from worker.ml.methods.prefft import FineTuning
 from worker.ml.policies.gaussian import GaussianPolicy
 from worker.ml.policies.sac import Learner, Replay
 from worker.ml.rewards.reward_models import UNDONE
-from worker.spaces import Space
-from worker.trajectory import SIGNALS, Trajectory
-from worker.type_aliases import Float32Array
 
 _UNDONE = SIGNALS.index(UNDONE)
 

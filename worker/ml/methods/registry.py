@@ -13,6 +13,9 @@ from typing import Any
 
 import gymnasium
 
+from worker.domain.scenarios import RESIDUAL, first_of
+from worker.domain.trajectory import Trajectory
+from worker.domain.type_aliases import Act
 from worker.ml.filters import filter_problem, pbarl
 from worker.ml.filters.filter_problem import Collect, FilterDraft, FilterProblem
 from worker.ml.filters.pbarl_printed import PrintedConfig
@@ -42,9 +45,6 @@ from worker.ml.methods.steered_rl import Steering
 from worker.ml.policies.checkpoint import Checkpoint
 from worker.ml.policies.reference import looked_into
 from worker.ml.rewards.reward_models import RewardModel
-from worker.scenarios import RESIDUAL, first_of
-from worker.trajectory import Trajectory
-from worker.type_aliases import Act
 
 
 @dataclass(frozen=True)

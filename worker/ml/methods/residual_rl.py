@@ -9,11 +9,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from worker.domain.spaces import Space
+from worker.domain.type_aliases import Float32Array
 from worker.ml.methods.preference_rl import EpisodeReward, MakeEnv
 from worker.ml.methods.steered_rl import SteeredAct, Steering, steer
 from worker.ml.policies.gaussian import GaussianPolicy
-from worker.spaces import Space
-from worker.type_aliases import Float32Array
 
 
 @dataclass(frozen=True)

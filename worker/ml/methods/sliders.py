@@ -10,11 +10,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from worker.domain.scenarios import RESIDUAL, first_of
+from worker.domain.type_aliases import FloatArray
 from worker.ml.filters.filter_problem import Collect, FilterProblem
 from worker.ml.methods.kept_task import in_mode
 from worker.ml.methods.people import Person
-from worker.scenarios import RESIDUAL, first_of
-from worker.type_aliases import FloatArray
 
 POSITIONS = 5
 """of one slider that are tried beside the present one"""

@@ -7,7 +7,7 @@ Actor-critic with demonstrations in every batch and a fading imitation loss, in 
 import torch
 from torch import Tensor
 
-from worker.type_aliases import Float32Array
+from worker.domain.type_aliases import Float32Array
 
 
 class Demonstrations:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 from safetensors.numpy import load_file, save_file
 
-from worker.type_aliases import Float32Array
+from worker.domain.type_aliases import Float32Array
 
 if TYPE_CHECKING:
     pass

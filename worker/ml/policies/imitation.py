@@ -8,9 +8,9 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
+from worker.domain.type_aliases import Float32Array
 from worker.ml.policies.demonstrations import Demonstrations
 from worker.ml.policies.sac import Actor, SacConfig
-from worker.type_aliases import Float32Array
 
 Demonstrate = Callable[[Float32Array], Float32Array]
 """observation (D,) -> action (A,)"""

@@ -11,10 +11,10 @@ import numpy as np
 import torch
 from safetensors import SafetensorError
 
+from worker.domain.type_aliases import Float32Array, FloatArray
 from worker.ml.policies.gaussian import GaussianPolicy
 from worker.ml.policies.onnx_policy import NotAPolicy, OnnxPolicy, adapted, mlp_to_onnx
 from worker.ml.policies.policy_onnx import policy_to_onnx
-from worker.type_aliases import Float32Array, FloatArray
 
 LARGEST_BYTES = 256 << 20
 _WEIGHTS = "policy.pth"

@@ -10,8 +10,8 @@ import onnx
 import onnxruntime
 from onnx import TensorProto, helper, numpy_helper
 
+from worker.domain.type_aliases import Float32Array, FloatArray
 from worker.ml.policies.policy_onnx import INPUT, IR_VERSION, OPSET, OUTPUT
-from worker.type_aliases import Float32Array, FloatArray
 
 
 class NotAPolicy(ValueError):

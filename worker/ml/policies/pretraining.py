@@ -19,13 +19,13 @@ import torch
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
+from worker.domain.scenarios import POLICY_SELECTION, POLICY_TEST, POLICY_TRAINING
+from worker.domain.spaces import Field
+from worker.domain.type_aliases import Float32Array
 from worker.ml.policies.demonstrations import Demonstrations
 from worker.ml.policies.gaussian import GaussianPolicy
 from worker.ml.policies.imitation import Demonstrate, collect, imitate
 from worker.ml.policies.sac import Actor, Env, Learner, Replay, SacConfig
-from worker.scenarios import POLICY_SELECTION, POLICY_TEST, POLICY_TRAINING
-from worker.spaces import Field
-from worker.type_aliases import Float32Array
 from worker.whole_files import written_whole
 
 TrainingProgress = Callable[[int, dict[str, float]], None]

@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from worker.domain.task import Answered
+from worker.domain.type_aliases import Float32Array, FloatArray
 from worker.ml.policies.onnx_policy import NotAPolicy
 from worker.ml.policies.policy_client import PolicyServer, PolicyServerFailed, chunk_of, packed
-from worker.task import Answered
-from worker.type_aliases import Float32Array, FloatArray
 
 REMEMBERED = 2000
 """Answers that are kept: a pool asks about each state twice, for the action and for the reference policy's."""

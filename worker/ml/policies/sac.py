@@ -16,10 +16,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from worker.domain.spaces import Space
+from worker.domain.type_aliases import Float32Array
 from worker.ml.policies.demonstrations import Demonstrations, imitation_loss
 from worker.ml.policies.gaussian import LOG_STD_HIGH, LOG_STD_LOW, GaussianPolicy
-from worker.spaces import Space
-from worker.type_aliases import Float32Array
 
 Env = gymnasium.Env[Any, Any]
 

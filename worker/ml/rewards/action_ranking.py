@@ -16,11 +16,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from worker.domain.trajectory import Trajectory
 from worker.ml.rewards import preference_transformer
 from worker.ml.rewards.predicted_reward import PredictedReward
 from worker.ml.rewards.preference_transformer import INPUT_CLIP, PreferenceTransformer
 from worker.ml.rewards.reward_models import MlpReward, RewardModel
-from worker.trajectory import Trajectory
 
 Ranker = Callable[[Tensor, Tensor], Tensor]
 """states (B, n, D), actions (B, n, 7) -> learned reward (B, n)"""

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from worker.domain.type_aliases import FloatArray
 from worker.ml.rewards.bradley_terry import probability_of_answer, probability_right
-from worker.type_aliases import FloatArray
 
 FEWEST_ANSWERS = 10
 """Below, nothing is fitted: the temperature stays 1."""

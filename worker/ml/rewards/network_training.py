@@ -15,13 +15,13 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from worker.domain.type_aliases import Float32Array, FloatArray
 from worker.ml.rewards import preference_transformer
 from worker.ml.rewards.calibration import HeldOut
 from worker.ml.rewards.preference_loss import preference_loss
 from worker.ml.rewards.preference_transformer import PreferenceTransformer
 from worker.ml.rewards.reward_models import MlpReward, RewardModel
 from worker.ml.rewards.segments import LEFT, RIGHT, SegmentPairs
-from worker.type_aliases import Float32Array, FloatArray
 
 Logits = Callable[[Tensor, Tensor, int], Tensor]
 """Inputs (B, 2, T, F), which steps were shown (B, 2, T), and the first step to look at -> every member's log odds that

@@ -11,8 +11,8 @@ from typing import Self
 import numpy as np
 import numpy.typing as npt
 
+from worker.domain.type_aliases import FloatArray
 from worker.ml.rewards.reward_models import RewardModel, StructuredReward
-from worker.type_aliases import FloatArray
 
 DEVIATION = 4.0
 """Of every weight when nobody is known: wide, because a narrow prior spreads what is wanted over all signals that go

@@ -4,9 +4,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
+from worker.domain.type_aliases import Float32Array, FloatArray
 from worker.ml.rewards.reward_models import StructuredReward
 from worker.ml.rewards.signal_predictor import SignalPredictor
-from worker.type_aliases import Float32Array, FloatArray
 
 PREFIX = "predictor."
 """of the predictor's tensors: the file of a reward model needs nothing beside it"""

@@ -25,9 +25,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from worker.domain.type_aliases import Float32Array, FloatArray
 from worker.ml.rewards.reward_models import RewardModel
 from worker.ml.rewards.segments import LEFT, RIGHT, Mask, SegmentPairs
-from worker.type_aliases import Float32Array, FloatArray
 
 Weights = Mapping[str, Tensor]
 """By name, each (E, in, out), or (E, 1, out) for a bias; layers are numbered."""

@@ -18,11 +18,11 @@ import numpy as np
 import numpy.typing as npt
 from safetensors.numpy import save
 
+from worker.domain.trajectory import Recorded, Trajectory
+from worker.domain.type_aliases import Float32Array, FloatArray
 from worker.ml import dense_network
 from worker.ml.rewards.bradley_terry import preference_logits, probability_right
 from worker.ml.rewards.segments import LEFT, RIGHT, SegmentPairs
-from worker.trajectory import Recorded, Trajectory
-from worker.type_aliases import Float32Array, FloatArray
 
 UNDONE = "undelivered"
 NEVER_WANTED = (UNDONE, "spilled", "spilled_on_person", "high_force_n", "force_away_n", "action_change_squared")

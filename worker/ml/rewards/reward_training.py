@@ -9,6 +9,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import minimize
 
+from worker.domain.trajectory import SIGNALS, Trajectory
+from worker.domain.type_aliases import FloatArray
 from worker.ml.rewards import calibration
 from worker.ml.rewards.bradley_terry import probability_of_answer, probability_right, slope_of_answer
 from worker.ml.rewards.calibration import HeldOut
@@ -19,8 +21,6 @@ from worker.ml.rewards.reward_models import NEVER_WANTED, UNDONE, Normalisation,
 from worker.ml.rewards.segments import SegmentPairs
 from worker.ml.rewards.signal_predictor import SignalPredictor
 from worker.ml.rewards.signal_scale import SignalScale
-from worker.trajectory import SIGNALS, Trajectory
-from worker.type_aliases import FloatArray
 
 RewardKind = Literal["structured", "predicted", "mlp", "preference_transformer"]
 

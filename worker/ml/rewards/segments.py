@@ -7,8 +7,8 @@ from typing import NamedTuple, Self
 import numpy as np
 import numpy.typing as npt
 
-from worker.trajectory import Recorded
-from worker.type_aliases import Float32Array
+from worker.domain.trajectory import Recorded
+from worker.domain.type_aliases import Float32Array
 
 Mask = npt.NDArray[np.bool_]
 LEFT, RIGHT = 0, 1

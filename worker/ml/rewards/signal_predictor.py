@@ -14,9 +14,9 @@ from typing import Self
 import numpy as np
 from safetensors.numpy import load, save
 
+from worker.domain.trajectory import SIGNALS
+from worker.domain.type_aliases import Float32Array, FloatArray
 from worker.ml import dense_network
-from worker.trajectory import SIGNALS
-from worker.type_aliases import Float32Array, FloatArray
 
 UNSENSED = (
     "force_at_target_n",

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from worker.domain.type_aliases import FloatArray
 from worker.ml.rewards.segments import SegmentPairs
-from worker.type_aliases import FloatArray
 
 OUTLIER_SHARE = 0.01
 """Of the mean signals at either end: the single wildest clip does not say what is usual."""

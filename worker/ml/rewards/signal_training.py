@@ -8,10 +8,10 @@ import torch
 from torch import nn
 from torch.nn import functional
 
+from worker.domain.trajectory import SIGNALS, Trajectory
+from worker.domain.type_aliases import FloatArray
 from worker.ml import dense_network
 from worker.ml.rewards.signal_predictor import INPUT_CLIP, SignalPredictor
-from worker.trajectory import SIGNALS, Trajectory
-from worker.type_aliases import FloatArray
 
 OUTLIER_SHARE = 0.001
 _SMALLEST_INPUT = 1e-3

@@ -1,7 +1,7 @@
 """A laboratory's environment behind one interface: vectors in, vectors out, signals measured, pictures taken.
 
 Observations are the environment's own, flattened, and behind them the action before and the share of the episode that
-is over, which modes need (worker.lab_modes). Actions are in [-1, 1] and stretched to the environment's own range.
+is over, which modes need (worker.domain.lab_modes). Actions are in [-1, 1], stretched to the environment's own range.
 """
 
 import math
@@ -15,13 +15,13 @@ import numpy as np
 import numpy.typing as npt
 
 from app.installed_tasks.lab import LabDescription, Measured
-from worker.lab_modes import EPISODE_SHARE, PREVIOUS_ACTION
+from worker.domain.lab_modes import EPISODE_SHARE, PREVIOUS_ACTION
+from worker.domain.spaces import Field, Space
+from worker.domain.trajectory import Trajectory
+from worker.domain.type_aliases import Act, Float32Array, FloatArray
 from worker.sim.lab.errors import LabTaskBroken
 from worker.sim.lab.found import columns_of
 from worker.sim.lab.references import named_object
-from worker.spaces import Field, Space
-from worker.trajectory import Trajectory
-from worker.type_aliases import Act, Float32Array, FloatArray
 
 Picture = npt.NDArray[np.uint8]
 UNBOUNDED = 1e6

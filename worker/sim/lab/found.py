@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any, Self
 
 from app.installed_tasks.lab import LabDescription
-from worker.lab_modes import LabModes
-from worker.modes import Axis
+from worker.domain.lab_modes import LabModes
+from worker.domain.modes import Axis
+from worker.domain.spaces import Field, Space
+from worker.domain.task import Answered, LabInterface, Task
 from worker.sim.lab.errors import LabTaskBroken
-from worker.spaces import Field, Space
-from worker.task import Answered, LabInterface, Task
 from worker.whole_files import written_whole
 
 FOUND_FILE = "found.json"

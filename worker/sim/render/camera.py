@@ -11,8 +11,8 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
+from worker.domain.type_aliases import FloatArray
 from worker.sim.render.task_look import TaskLook
-from worker.type_aliases import FloatArray
 
 Rectangle = tuple[float, float, float, float]
 """left, top, right, bottom in pixels of the whole picture."""

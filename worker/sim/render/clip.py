@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from PIL import Image
 
+from worker.domain.trajectory import Trajectory
 from worker.sim.arm import RobotArm, Tool
 from worker.sim.render import video
 from worker.sim.render.camera import Camera, scene_camera
@@ -20,7 +21,6 @@ from worker.sim.render.moving_parts import FilmedPerson, Shoot, moving_lamp_dept
 from worker.sim.render.passes import Depth, Frame, Shot, Supersampling
 from worker.sim.render.scene import Scene
 from worker.sim.render.task_look import TaskLook
-from worker.trajectory import Trajectory
 
 STILL_PICTURES = 4
 """So many still pictures of 7 MB are kept, one per task and body."""

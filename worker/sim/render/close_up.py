@@ -4,12 +4,12 @@ from itertools import pairwise
 
 import numpy as np
 
+from worker.domain.type_aliases import FloatArray
 from worker.sim.geometry import rotation_of
 from worker.sim.human import RIGHT, arm_points_m
 from worker.sim.render.camera import Camera, close_up_camera
 from worker.sim.render.interpolation import ClipMotion
 from worker.sim.render.task_look import TaskLook
-from worker.type_aliases import FloatArray
 
 
 def close_up(look: TaskLook, motion: ClipMotion, width: int, height: int) -> Camera:

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image, ImageChops, ImageFilter
 
+from worker.domain.type_aliases import FloatArray
 from worker.sim.render import skin
 from worker.sim.render.camera import Camera, Rectangle
 from worker.sim.render.mesh_set import MeshSet
@@ -32,7 +33,6 @@ from worker.sim.render.passes import (
     seen_from_lamp,
 )
 from worker.sim.render.rectangles import Pixels, cover, on_grid
-from worker.type_aliases import FloatArray
 
 STILL_LAMP_SIZE, MOVING_LAMP_SIZE = 640, 176
 

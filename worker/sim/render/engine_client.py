@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from worker.domain.type_aliases import FloatArray
 from worker.sim.engine import pybullet
 from worker.sim.geometry import IDENTITY, Vector
-from worker.type_aliases import FloatArray
 
 
 class Drawing(NamedTuple):

@@ -3,9 +3,9 @@
 import numpy as np
 from PIL import Image
 
+from worker.domain.type_aliases import FloatArray
 from worker.sim.render.camera import Camera
 from worker.sim.render.meshes.distance_fields import smooth_step
-from worker.type_aliases import FloatArray
 
 NOTICED_FROM_N, STRONG_FROM_N = 2.0, 15.0
 RADIUS_PX = 34

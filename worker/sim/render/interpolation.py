@@ -4,13 +4,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from worker.domain.spaces import CONTROL_STEP_S
+from worker.domain.trajectory import Trajectory
+from worker.domain.type_aliases import FloatArray
 from worker.sim.arm import RobotArm, Tool, transform
 from worker.sim.geometry import rotation_of
 from worker.sim.human import BODY_SHAPES, FACE_IN_HEAD, BodyShape
 from worker.sim.render.meshes.distance_fields import smooth_step
-from worker.spaces import CONTROL_STEP_S
-from worker.trajectory import Trajectory
-from worker.type_aliases import FloatArray
 
 SWALLOWING_S = 0.22
 SWALLOWED_WITHIN_M = 0.06

@@ -9,13 +9,13 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
+from worker.domain.trajectory import SKIN_TONES
+from worker.domain.type_aliases import FloatArray
 from worker.sim.geometry import IDENTITY
 from worker.sim.render.camera import Camera, Rectangle, flat
 from worker.sim.render.engine_client import DrawingClient
 from worker.sim.render.meshes.colours import Palette
 from worker.sim.render.meshes.mesh import Mesh
-from worker.trajectory import SKIN_TONES
-from worker.type_aliases import FloatArray
 
 GONE_M = (0.0, 0.0, -1000.0)
 """Where food that was eaten or lost is kept, out of sight."""

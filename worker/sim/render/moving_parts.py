@@ -6,6 +6,7 @@ from functools import partial
 
 import numpy as np
 
+from worker.domain.type_aliases import FloatArray
 from worker.sim.human import LEFT, RIGHT
 from worker.sim.render.camera import lamp
 from worker.sim.render.compositing import MOVING_LAMP_SIZE, STILL_LAMP_SIZE
@@ -14,7 +15,6 @@ from worker.sim.render.mesh_set import CUBE, MeshSet
 from worker.sim.render.passes import BODY_LIGHT, DEPTH_ONLY, Depth, Part
 from worker.sim.render.scene import UPPER_LINKS, Kit, Sitter
 from worker.sim.render.task_look import TaskLook
-from worker.type_aliases import FloatArray
 
 HOLD_RAD = 0.0025
 """An arm that has turned by less than this since it was last drawn stays as it is: half a pixel."""

@@ -7,9 +7,9 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
+from worker.domain.type_aliases import FloatArray
 from worker.sim.render.camera import Camera, Rectangle, lamp
 from worker.sim.render.mesh_set import Lighting, MeshSet
-from worker.type_aliases import FloatArray
 
 Colours = npt.NDArray[np.uint8]
 Depth = npt.NDArray[np.float32]

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from worker.type_aliases import FloatArray
+from worker.domain.type_aliases import FloatArray
 
 Pixels = tuple[int, int, int, int]
 """left, top, right, bottom"""

@@ -6,6 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
+from worker.domain.type_aliases import FloatArray
 from worker.sim import human
 from worker.sim.arm import RobotArm, Tool
 from worker.sim.geometry import rotation_of
@@ -19,7 +20,6 @@ from worker.sim.render.meshes.head_mesh import Mouth
 from worker.sim.render.meshes.mesh import Mesh, ball
 from worker.sim.render.meshes.tool_mesh import plain_look
 from worker.sim.render.task_look import TaskLook
-from worker.type_aliases import FloatArray
 
 UPPER_LINKS = 3
 """So many of the robot's links are drawn apart from the rest, which is nearer to the person and smaller."""

@@ -5,9 +5,9 @@ import math
 import numpy as np
 from PIL import Image, ImageFilter
 
+from worker.domain.type_aliases import FloatArray
 from worker.sim.render.camera import Camera, Rectangle
 from worker.sim.render.passes import Colours, Depth, as_bytes, distance_m
-from worker.type_aliases import FloatArray
 
 IN_SHADOW = 0.75
 """Brightness in full shadow, relative to that in the light."""

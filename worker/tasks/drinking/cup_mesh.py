@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from worker.domain.type_aliases import FloatArray
 from worker.sim.render.meshes.arm_mesh import Detail, Grip
 from worker.sim.render.meshes.distance_fields import smooth_step
 from worker.sim.render.meshes.mesh import Mesh, joined, tube
 from worker.tasks.drinking.environment import CUP_BASE_RADIUS_M, CUP_HEIGHT_M, CUP_RIM_RADIUS_M, HELD_BEFORE_HAND_M
-from worker.type_aliases import FloatArray
 
 CUP_OUTSIDE_M = 0.0040
 """Thickness of the drawn glass."""

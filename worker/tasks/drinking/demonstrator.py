@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from worker.domain.spaces import Space
+from worker.domain.type_aliases import Float32Array, FloatArray
 from worker.sim.arm import RobotArm, Tool, tool_jacobian
 from worker.sim.assistive import ACTION_UNIT_RAD
 from worker.sim.jaco import JACO
-from worker.spaces import Space
 from worker.tasks.drinking.environment import CUP, DRINKING
-from worker.type_aliases import Float32Array, FloatArray
 
 UP = np.array([0.0, 0.0, 1.0])
 DAMPING = 0.05

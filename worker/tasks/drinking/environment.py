@@ -8,7 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from worker.modes import ApproachModes, Axis
+from worker.domain.modes import ApproachModes, Axis
+from worker.domain.spaces import SHARED_FIELDS, Field, Space
+from worker.domain.task import Task
+from worker.domain.trajectory import BODIES
+from worker.domain.type_aliases import FloatArray
 from worker.sim.arm import Start, Tool, start_postures
 from worker.sim.assistive import ARM, MOTOR_FORCE_NM, POSITION_GAIN, AssistiveEnv, Reward, StepMotion
 from worker.sim.bullet import Bullet
@@ -16,11 +20,7 @@ from worker.sim.geometry import IDENTITY, Vector, rotation_of
 from worker.sim.human import Impairment
 from worker.sim.jaco import JACO, PI
 from worker.sim.measures import StepMeasures, StepOutcome, TaskReward
-from worker.spaces import SHARED_FIELDS, Field, Space
-from worker.task import Task
 from worker.tasks.drinking.water import CUP_LAYER, IMMOVABLE_LAYER, WATER_LAYER, Cup, Water, heap
-from worker.trajectory import BODIES
-from worker.type_aliases import FloatArray
 
 OBSERVATION = Space(
     (

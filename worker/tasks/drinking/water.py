@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from worker.domain.type_aliases import FloatArray
 from worker.sim.bullet import Bullet
 from worker.sim.geometry import Shape, quaternion_of_euler
 from worker.sim.measures import StepOutcome
-from worker.type_aliases import FloatArray
 
 PELLET_MASS_KG = 0.001
 DRUNK_WITHIN_M = 0.03

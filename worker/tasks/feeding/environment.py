@@ -5,17 +5,17 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from worker.modes import ApproachModes, Axis
+from worker.domain.modes import ApproachModes, Axis
+from worker.domain.spaces import SHARED_FIELDS, Field, Space
+from worker.domain.task import Task
+from worker.domain.type_aliases import FloatArray
 from worker.sim.arm import Start, Tool, start_postures
 from worker.sim.assistive import ARM, AssistiveEnv, Reward, StepMotion
 from worker.sim.bullet import Bullet
 from worker.sim.geometry import Shape, rotation_of
 from worker.sim.jaco import JACO, PI
 from worker.sim.measures import StepOutcome, TaskReward
-from worker.spaces import SHARED_FIELDS, Field, Space
-from worker.task import Task
 from worker.tasks.feeding.food import BALL_RADIUS_M, BALLS, PORTION_NEEDED, Portion
-from worker.type_aliases import FloatArray
 
 OBSERVATION = Space(
     (

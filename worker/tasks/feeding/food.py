@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from worker.domain.type_aliases import FloatArray
 from worker.sim.bullet import Bullet
 from worker.sim.measures import StepOutcome
-from worker.type_aliases import FloatArray
 
 BALLS = 8
 BALL_RADIUS_M, BALL_MASS_KG = 0.006, 0.001

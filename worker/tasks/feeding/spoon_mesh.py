@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from worker.domain.type_aliases import FloatArray
 from worker.sim.render.meshes.arm_mesh import Detail
 from worker.sim.render.meshes.mesh import Mesh, curve, joined, tube
-from worker.type_aliases import FloatArray
 
 
 def spoon(detail: Detail) -> Mesh:

@@ -7,7 +7,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from worker.modes import ApproachModes, Axis
+from worker.domain.modes import ApproachModes, Axis
+from worker.domain.spaces import SHARED_FIELDS, Field, Space
+from worker.domain.task import Task
+from worker.domain.trajectory import BODIES
+from worker.domain.type_aliases import FloatArray
 from worker.sim import human
 from worker.sim.arm import Start, Tool
 from worker.sim.assistive import ARM, MOTOR_FORCE_NM, POSITION_GAIN, AssistiveEnv, Reward, StepMotion
@@ -17,11 +21,7 @@ from worker.sim.human import ArmRange, Impairment
 from worker.sim.jaco import PI
 from worker.sim.measures import HIGH_FORCE_N, StepMeasures, StepOutcome, TaskReward
 from worker.sim.seated_person import PERSON
-from worker.spaces import SHARED_FIELDS, Field, Space
-from worker.task import Task
 from worker.tasks.scratching.yielding_arm import FOREARM, UPPER_ARM, YieldingArm, add_placeholder
-from worker.trajectory import BODIES
-from worker.type_aliases import FloatArray
 
 OBSERVATION = Space(
     (

@@ -11,12 +11,12 @@ from functools import cache
 
 import numpy as np
 
+from worker.domain.type_aliases import FloatArray
 from worker.sim import human
 from worker.sim.bullet import Bullet, Link
 from worker.sim.geometry import IDENTITY, Shape, capsule_between, compose
 from worker.sim.human import BODY_SHAPES, Person
 from worker.sim.seated_person import HEAD_SHAPES, PERSON, STILL_SHAPES, arm_shapes
-from worker.type_aliases import FloatArray
 
 UPPER_ARM, FOREARM = "right_upper_arm", "right_forearm"
 UPPER_ARM_MASS_KG, FOREARM_MASS_KG, JOINT_MASS_KG = 2.1, 1.7, 0.05

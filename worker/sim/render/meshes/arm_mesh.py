@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from worker.domain.type_aliases import FloatArray
 from worker.sim.arm import Joint, RobotArm, rotation
 from worker.sim.render.meshes.colours import Palette
 from worker.sim.render.meshes.mesh import Mesh, joined, tube
-from worker.type_aliases import FloatArray
 
 
 @dataclass(frozen=True)

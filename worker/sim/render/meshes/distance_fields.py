@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from worker.type_aliases import FloatArray
+from worker.domain.type_aliases import FloatArray
 
 DistanceField = Callable[[FloatArray], FloatArray]
 Point = Sequence[float]

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from worker.domain.type_aliases import FloatArray
 from worker.sim.render.meshes.distance_fields import (
     DistanceField,
     carve,
@@ -15,7 +16,6 @@ from worker.sim.render.meshes.distance_fields import (
     union,
 )
 from worker.sim.render.meshes.mesh import turned
-from worker.type_aliases import FloatArray
 
 
 def short_hair() -> DistanceField:

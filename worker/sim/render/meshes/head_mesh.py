@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from worker.domain.type_aliases import FloatArray
 from worker.sim.human import BROAD, BodyShape
 from worker.sim.render.meshes.colours import Palette
 from worker.sim.render.meshes.distance_fields import (
@@ -35,7 +36,6 @@ from worker.sim.render.meshes.mesh import (
     turned,
     without_hidden,
 )
-from worker.type_aliases import FloatArray
 
 MOUTH = np.asarray(BROAD.mouth_from_neck_m)
 LIPS = MOUTH + np.array([0.0, -0.0005, 0.0])

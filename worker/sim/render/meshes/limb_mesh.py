@@ -9,6 +9,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from worker.domain.type_aliases import FloatArray
 from worker.sim import human
 from worker.sim.human import BodyShape
 from worker.sim.render.meshes.colours import Palette
@@ -24,7 +25,6 @@ from worker.sim.render.meshes.distance_fields import (
     union,
 )
 from worker.sim.render.meshes.mesh import Mesh, curve, joined, softly_lit, surface, tube
-from worker.type_aliases import FloatArray
 
 SLEEVE_SHARE = 0.50
 """Down to here, as a share of the upper arm, the arm is in its sleeve."""

@@ -10,8 +10,8 @@ from itertools import combinations
 import numpy as np
 import numpy.typing as npt
 
+from worker.domain.type_aliases import FloatArray
 from worker.sim.render.meshes.distance_fields import DistanceField
-from worker.type_aliases import FloatArray
 
 Faces = npt.NDArray[np.int32]
 Paint = Callable[[FloatArray], FloatArray]

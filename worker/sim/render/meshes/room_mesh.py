@@ -1,9 +1,9 @@
 """A calm, light room: nothing behind the path of the spoon that draws the eye."""
 
+from worker.domain.type_aliases import FloatArray
 from worker.sim.render.meshes.colours import Palette
 from worker.sim.render.meshes.distance_fields import DistanceField, cone, smooth_step, union
 from worker.sim.render.meshes.mesh import Mesh, joined, panel, softly_lit
-from worker.type_aliases import FloatArray
 
 LEFT, RIGHT, FRONT, BACK, CEILING = -2.2, 1.6, -2.6, 1.5, 3.0
 

@@ -5,9 +5,9 @@ Each task's own stands beside its environment in the task's folder and travels f
 
 from dataclasses import dataclass, field
 
-from worker.modes import ModeFamily
-from worker.spaces import CONTROL_STEP_S, JOINT_ACTION, Space
-from worker.trajectory import COSTS, SIGNALS
+from worker.domain.modes import ModeFamily
+from worker.domain.spaces import CONTROL_STEP_S, JOINT_ACTION, Space
+from worker.domain.trajectory import COSTS, SIGNALS
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from worker.spaces import Space
+from worker.domain.spaces import Space
 
 
 @dataclass(frozen=True)

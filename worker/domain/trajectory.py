@@ -6,7 +6,7 @@ from typing import IO, Protocol, Self
 
 import numpy as np
 
-from worker.type_aliases import Float32Array
+from worker.domain.type_aliases import Float32Array
 
 COSTS = ("C_d", "C_v", "C_f", "C_hf", "C_fd", "C_fdv")
 """The paper's six preference items (r^H), unweighted and non-negative, one column each."""

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from worker.modes import Axis, ModeFamily
+from worker.domain.modes import Axis, ModeFamily
 
 PREVIOUS_ACTION, EPISODE_SHARE = "previous_action", "episode_share"
 BY_DISTANCE, BY_TIME = ("far", "near"), ("early", "late")
