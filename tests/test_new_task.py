@@ -176,7 +176,7 @@ def test_the_web_server_reads_it_without_importing_it_or_what_it_needs(installed
         ("task.toml", 'summary = "', "summary = ", "task.toml is not valid TOML: "),
         ("task.toml", "press = ", 'press = "{', "task.toml is not valid TOML: "),
         ("task.toml", "Imagine that", "Imagine {that}", "task.toml: instructions.en must not have braces"),
-        ("task.toml", "en = ", "english = ", "task.toml: instructions.english.[key] must be the code of a language"),
+        ("task.toml", "en = ", "english = ", ".english.[key] must be the code of a language"),
         ("picture.svg", 'viewBox="0 0 240 150"', "", 'picture.svg: its viewBox must be "0 0 240 150"'),
         ("picture.svg", "<circle", "<script", "picture.svg: a picture has no script; use circle"),
         ("picture.svg", "<circle ", '<circle onclick="x" ', "picture.svg: a picture has no onclick; use circle"),
