@@ -170,7 +170,7 @@ ended-title = Vielen Dank für Ihr Interesse
 ended-screened-out = Diese Studie richtet sich im Moment an andere Personen und endet deshalb hier für Sie. Sie haben nichts falsch gemacht.
 ended-full = Es nehmen bereits so viele Personen teil, wie gebraucht werden; deshalb endet die Studie hier für Sie. Sie haben nichts falsch gemacht.
 ended-inattentive = Mehrere Ihrer Antworten passten nicht zu dem, was auf den Videos zu sehen war; deshalb endet die Studie hier für Sie.
-ended-kept = Ihre Antworten bleiben gespeichert. Wenn sie gelöscht werden sollen, wählen Sie unten „Von der Studie zurücktreten“.
+ended-kept = Ihre Antworten bleiben gespeichert. Wenn sie gelöscht werden sollen, wählen Sie unten „Teilnahme widerrufen“.
 
 ## Widerruf
 
