@@ -12,6 +12,7 @@ import app.domain.participation
 import app.domain.people
 import app.domain.power_plan
 import app.domain.preferences
+import app.domain.self_setting
 import app.domain.studies  # noqa: F401  (all of them fill Base.metadata)
 from app.db import Base, UtcDateTime
 from app.errors import AppError

@@ -22,7 +22,9 @@ from app.domain.preferences import LabelEvent, Query, Response
 from app.domain.protocol import EvaluatedMethod
 from app.domain.self_setting import SelfSetting
 from app.domain.studies import Deviation, Participant, Study
+from app.questionnaires import library
 from app.services.accounts import api_tokens
+from app.services.answers import form_answers
 from app.services.evaluation import donors, self_setting
 from app.services.exports import export_tables
 from app.services.participants import withdrawal
@@ -88,6 +90,7 @@ def somebody_does_everything(session: Session, store: ArtefactStore, study: Stud
         factories.make_label(session, factories.make_query(session, person, clip, first))
         session.add(ConsentRecord(participant_id=person.id, version="2", language="en", text="Once more."))
         session.add(FormAnswer(participant_id=person.id, form="demographics", item="age", value="99"))
+        _fill_in(session, person, "1")
         session.add(ParticipantEvent(participant_id=person.id, kind="page_hidden", detail={}))
         known = session.scalars(select(StageRecord.stage).where(StageRecord.participant_id == person.id)).all()
         session.add(StageRecord(participant_id=person.id, stage=f"stage {len(known)}"))
@@ -114,8 +117,13 @@ def somebody_does_everything(session: Session, store: ArtefactStore, study: Stud
         )
         donors.draw(session, study, person, EvaluatedMethod.AVERAGE, ("cautious",))
     newcomer, _ = factories.make_participant(session, study)
+    _fill_in(session, newcomer, "5")
     session.add(Allocation(participant_id=newcomer.id, place=newcomer.number, lot=0.5, considered={}))
     session.add(Deviation(study_id=study.id, actor="pat", reason="later", before={}, after={}))
+
+
+def _fill_in(session: Session, person: Participant, value: str) -> None:
+    form_answers.append(session, person, "tia", {item.name: value for item in library.every()["tia"].items})
 
 
 def _undo(session: Session, query: Query) -> None:

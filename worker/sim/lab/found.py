@@ -20,6 +20,8 @@ from worker.whole_files import written_whole
 
 FOUND_FILE = "found.json"
 _OF_FILES = {"file", "gain", "activation"}
+_WORDS = {"title", "summary", "words", "instructions", "sliders", "usual_clip_steps"}
+"""Nothing that was found depends on these."""
 _OF_SERVERS = {"inputs", "prompt", "execution_horizon"}
 
 
@@ -28,7 +30,7 @@ def mark_of(described: LabDescription, folder: Path) -> str:
 
     Where a policy server stands says nothing about the policy; it is known again by an answer (Found.answered).
     """
-    kept = described.model_dump(mode="json", exclude={"title", "summary", "words", "instructions", "usual_clip_steps"})
+    kept = described.model_dump(mode="json", exclude=_WORDS)
     kept["environment"].pop("frame")
     kept["policy"] = described.policy.model_dump(mode="json", include=_OF_FILES) | described.policy.model_dump(
         mode="json", include=_OF_SERVERS, exclude_defaults=True
