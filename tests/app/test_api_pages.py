@@ -145,7 +145,8 @@ def test_pages_are_together_the_table_as_it_was_at_the_first_one(
         with database.writing() as session:
             somebody_does_everything(session, store, session.get_one(Study, study.id))
 
-    assert read_all(get, address(study, table), meanwhile) == before
+    limit = max(2, len(before) // 8)
+    assert read_all(get, address(study, table, limit), meanwhile) == before
     assert plain(get(address(study, table, 1000)).json()["rows"]) != before
 
 
