@@ -184,6 +184,15 @@ class TestWhoIsSentBack:
             assert browser.get("/p/finished").headers["location"] == "/p/next"
             assert browser.get("/p/withdraw").status_code == 200
 
+    def test_and_the_experimenter_sees_why(
+        self, come: Callable[..., Any], experimenter: TestClient, database: Database
+    ) -> None:
+        browser, person = come({"age": "17", "hand": "right"}, **SCREENED)
+        browser.get("/p/next")
+        with database.reading() as session:
+            slug = session.get_one(Study, person.study_id).slug
+        assert experimenter.get(f"/studies/{slug}").text.count("screened out") == 2, "in the list, and counted"
+
     def test_where_no_arm_is_open_after_the_questions_and_nobody_reads_the_name_of_an_arm(
         self, come: Callable[..., Any], database: Database
     ) -> None:

@@ -16,6 +16,7 @@ from sqlalchemy.orm import Session, aliased
 from app.db import now
 from app.domain.choices import Strategy
 from app.domain.clips import Clip, Rollout
+from app.domain.designs import Ending
 from app.domain.evaluation import Controller, Film
 from app.domain.models import Bundle, Export, Model, ModelKind
 from app.domain.participation import StageRecord
@@ -192,7 +193,7 @@ def where_they_are(
 def stage_counts(where: Mapping[int, str]) -> Sequence[tuple[str, int]]:
     """How many are in each stage, in the order of the stages; stages without anybody are left out."""
     counted = Counter(where.values())
-    order = (INVITED, *STAGES_IN_WORDS.values(), FINISHED, WITHDRAWN)
+    order = (INVITED, *STAGES_IN_WORDS.values(), FINISHED, *(each.label for each in Ending), WITHDRAWN)
     return [(stage, counted[stage]) for stage in order if counted[stage]]
 
 
@@ -226,6 +227,8 @@ def answers_today(session: Session, study: Study) -> int:
 def _where(settings: StudySettings, person: Participant, answered: int, records: Sequence[StageRecord]) -> str:
     if person.withdrawn_at is not None:
         return WITHDRAWN
+    if person.ended_as is not None:
+        return Ending(person.ended_as).label
     if person.completed_at is not None:
         return FINISHED
     way = stages.stages_of(settings)
