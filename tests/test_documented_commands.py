@@ -147,7 +147,7 @@ TOOLS = {
     "alembic": "check",
     "pip": "show pbarl-studio",
     "pre-commit": "validate-config",
-    "pytest": "--collect-only -q tests/architecture",
+    "pytest": "--collect-only -q tests/architecture/test_scenarios.py",
 }
 """What shows that a tool does its work here."""
 

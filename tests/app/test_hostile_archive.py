@@ -325,7 +325,9 @@ def _peak(act: Callable[[], Any]) -> int:
 
 
 @pytest.mark.parametrize("name", ["manifest.json", "rows/study.jsonl", "files/" + "0" * 64, "sealed", "letter.txt"])
-@pytest.mark.parametrize("compression", [zipfile.ZIP_DEFLATED, zipfile.ZIP_STORED, zipfile.ZIP_LZMA])
+@pytest.mark.parametrize(
+    "compression", [zipfile.ZIP_DEFLATED, pytest.param(zipfile.ZIP_STORED, marks=pytest.mark.long), zipfile.ZIP_LZMA]
+)
 def test_noughts_by_the_hundred_megabytes_fill_no_memory(
     database: Database, store: ArtefactStore, packed: Path, name: str, compression: int
 ) -> None:
