@@ -181,7 +181,7 @@ def running(redirect_uri: str) -> Iterator[IdentityProvider]:
     provider = IdentityProvider("", Client(redirect_uri), user, key, key)
     server = make_server("127.0.0.1", 0, _application(provider))
     provider.issuer = f"http://127.0.0.1:{server.server_port}"
-    thread = threading.Thread(target=server.serve_forever)
+    thread = threading.Thread(target=server.serve_forever, args=(0.02,))
     thread.start()
     try:
         yield provider

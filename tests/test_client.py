@@ -147,7 +147,7 @@ def elsewhere() -> Iterator[tuple[str, list[str]]]:
             """Nothing."""
 
     server = HTTPServer(("127.0.0.1", 0), Sending)
-    threading.Thread(target=server.serve_forever).start()
+    threading.Thread(target=server.serve_forever, args=(0.02,)).start()
     yield f"http://127.0.0.1:{server.server_port}", asked
     server.shutdown()
     server.server_close()

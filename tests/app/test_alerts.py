@@ -69,7 +69,7 @@ class MailBox(MailHandler):
 @pytest.fixture
 def webhook() -> Iterator[Webhook]:
     with Webhook() as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
+        threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
         yield server
         server.shutdown()
 

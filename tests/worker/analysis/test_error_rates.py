@@ -13,9 +13,10 @@ from worker.analysis.statistics import MEASURED_ERROR_PERCENT, RECOMMENDED
 
 STUDIES = 250
 MISSING = replace(SPREAD, name="spread .5, trials missing", missing=0.3, dropouts=0.1)
+LONG = [pytest.param(truth, marks=pytest.mark.long) for truth in (UNEQUAL, MISSING)]
 
 
-@pytest.mark.parametrize("truth", [SPREAD, UNEQUAL, MISSING], ids=lambda truth: truth.name)
+@pytest.mark.parametrize("truth", [SPREAD, *LONG], ids=lambda truth: truth.name)
 def test_tests_that_count_people_err_as_often_as_they_promise(truth: Truth) -> None:
     """Within three standard errors; three comparisons of one study are not independent, so counted as one."""
     most = 5.0 + 3 * (5.0 * 95.0 / STUDIES) ** 0.5

@@ -19,6 +19,7 @@ def sought(number: int, work: Path) -> list[Block]:
     return fit_response_surface.sought_blocks(FEEDING, surface, number, work)
 
 
+@pytest.mark.long
 def test_modes_that_people_want_lie_at_the_edges_where_random_modes_are_rare(tmp_path: Path) -> None:
     axes = FEEDING.modes.axes
     low, high = np.array([axis.low for axis in axes]), np.array([axis.high for axis in axes])

@@ -143,6 +143,7 @@ def test_own_noise_is_what_the_frozen_policy_would_draw() -> None:
     np.testing.assert_allclose(decoder(SEEN, np.ones((len(SEEN), 7), np.float32)), expected, atol=1e-4)
 
 
+@pytest.mark.long
 def test_steering_follows_the_learned_reward() -> None:
     space = invented.TASK.observation
     before = POLICY.mean(SEEN)[:, 0].mean()
@@ -210,6 +211,7 @@ def test_a_person_gets_the_model_of_their_own_kind_and_the_average_of_nobody_in_
         assert agreement(InventedPerson(speed), 1) < 0.8
 
 
+@pytest.mark.long
 def test_a_latent_that_was_learned_from_others_tells_their_kinds_apart() -> None:
     reference = collect(POLICY.mean, range(4), 0.3, 0)
     for speed in (-1.0, 1.0):
