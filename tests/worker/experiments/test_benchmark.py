@@ -48,6 +48,7 @@ def report(work: Path, output: Path, terms: BenchmarkConfig = TINY) -> int:
     return benchmark.benchmark(Selection(), terms, work, output, 1, "the command", run=False)
 
 
+@pytest.mark.long
 def test_the_tables_are_written_from_whatever_is_finished(work: Path, tmp_path: Path) -> None:
     assert report(work, tmp_path) == 0
     table = rows(tmp_path / "table1.csv")
@@ -78,11 +79,13 @@ def test_pictures_show_users_for_whom_methods_can_be_compared() -> None:
     assert compared(alone) == alone
 
 
+@pytest.mark.long
 def test_cells_of_other_terms_are_not_mixed_in(work: Path, tmp_path: Path) -> None:
     assert report(work, tmp_path, replace(TINY, labels=13)) == 0
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.long
 def test_a_cell_run_again_gives_the_same_numbers(work: Path, tmp_path: Path) -> None:
     report(work, tmp_path / "before")
     benchmark_cell.run_cell(Cell("feeding", SHY, "pbarl", 0), TINY, work)
