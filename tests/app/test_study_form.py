@@ -123,6 +123,18 @@ def test_a_complaint_stands_beside_its_field_and_opens_its_group(
         assert session.scalars(select(Study)).all() == []
 
 
+def test_several_questionnaires_are_ticked_and_kept(experimenter: TestClient, database: Database) -> None:
+    page = experimenter.get("/studies/new").text
+    assert re.findall(r'type="(\w+)" name="(?:evaluation_)?instruments" value="sus"', page) == ["checkbox"] * 2
+    chosen = {"languages": ["en"], "instruments": ["sus", "nasa_tlx"], "evaluation_instruments": ["rosas_sf"]}
+    form = typed(experimenter, evaluation="yes", **chosen)
+    assert experimenter.post("/studies/new", data=form).status_code == 303
+    settings = only_study(database).settings
+    assert settings.instruments == ("sus", "nasa_tlx")
+    assert settings.evaluation is not None
+    assert settings.evaluation.instruments == ("rosas_sf",)
+
+
 def test_a_complaint_about_methods_that_do_not_go_together_says_which_do(experimenter: TestClient) -> None:
     form = typed(experimenter, evaluation="yes", evaluation_ask_which_is_theirs="yes")
     answer = experimenter.post("/studies/new", data=form | {"evaluation_methods": ["pbarl", "prefft"]})

@@ -65,6 +65,8 @@ def test_no_pair_can_be_answered_before_the_script_is_there(invited: Invited, ne
     left = page.locator(".answer-left")
     expect(left).to_be_disabled()
     assert page.locator("video[controls]").count() == 0
+    page.wait_for_function("document.readyState != 'loading'")
+    left.scroll_into_view_if_needed()  # waits until the page has its style and nothing moves any more
     left.tap(force=True)
     page.keyboard.press("ArrowLeft")
     page.keyboard.press("Enter")

@@ -52,7 +52,6 @@ _KINDS: Mapping[Any, Kind] = {
     str: Kind.TEXT,
     dict[str, str]: Kind.TEXTS,
     tuple[int, ...]: Kind.COUNTS,
-    tuple[str, ...]: Kind.SEVERAL,
     tuple[FormItem, ...]: Kind.QUESTIONS,
     tuple[Arm, ...]: Kind.ARMS,
     tuple[Screen, ...]: Kind.SCREENS,
@@ -129,6 +128,8 @@ def _fields(model: type[BaseModel], whole: str | None = None) -> Iterator[FormFi
     for name, annotation, shown in settings_of(model):
         kind, chosen = _kind(annotation), _choice(annotation)
         options = shown.options or [(each.value, each.label, each.hint) for each in chosen or ()]
+        if kind is Kind.NAMES and options:
+            kind = Kind.SEVERAL
         if whole is not None:
             yield FormField(f"{whole}_{name}", kind, shown, options, setting=whole, part=name)
             continue
