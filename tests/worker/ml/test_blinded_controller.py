@@ -49,17 +49,19 @@ def printed_weights() -> FilterWeights:
         return FilterWeights(method="printed", encoder=state_of(PrintedEncoder(FROZEN.offset, FROZEN.scale)))
 
 
-ACTS: dict[str, Act] = {
-    "reference": PolicyAct(POLICY),
-    "fine-tuned": PolicyAct(invented.small_policy(seed=5)),
-    "studio": act_of(invented.TASK.modes, POLICY, studio_weights()),
-    "printed": act_of(invented.TASK.modes, POLICY, printed_weights()),
-}
+@pytest.fixture(scope="module")
+def acts() -> dict[str, Act]:
+    return {
+        "reference": PolicyAct(POLICY),
+        "fine-tuned": PolicyAct(invented.small_policy(seed=5)),
+        "studio": act_of(invented.TASK.modes, POLICY, studio_weights()),
+        "printed": act_of(invented.TASK.modes, POLICY, printed_weights()),
+    }
 
 
 @pytest.fixture(scope="module")
-def models() -> dict[str, bytes]:
-    return {name: blinded_controller.of_act(act, SEEN) for name, act in ACTS.items()}
+def models(acts: dict[str, Act]) -> dict[str, bytes]:
+    return {name: blinded_controller.of_act(act, SEEN) for name, act in acts.items()}
 
 
 def zipped(model: bytes, letter: str = "B") -> bytes:
@@ -149,8 +151,8 @@ def test_a_damaged_controller_says_so(models: dict[str, bytes], tmp_path: Path) 
     assert "controller.onnx is not the file that was exported" in ran.stderr
 
 
-def test_the_same_contents_give_the_same_bytes(models: dict[str, bytes]) -> None:
-    assert blinded_controller.of_act(ACTS["printed"], SEEN) == models["printed"]
+def test_the_same_contents_give_the_same_bytes(acts: dict[str, Act], models: dict[str, bytes]) -> None:
+    assert blinded_controller.of_act(acts["printed"], SEEN) == models["printed"]
     digests = {hashlib.sha256(zipped(models["printed"])).hexdigest() for _ in range(2)}
     assert len(digests) == 1
 

@@ -1,6 +1,8 @@
 """The shield inside the filter: idle where all is as tested, the reference policy beyond, and one in torch and ONNX."""
 
+from collections.abc import Mapping
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -29,12 +31,21 @@ def driven(number: int, weights: FilterWeights | None) -> Trajectory:
     return replace(episode, actions=actions, reference_actions=means)
 
 
+BARE = FilterWeights(mode=MODE)
 REFERENCE = [driven(number, None) for number in range(4)]
-TESTED = [driven(number, FilterWeights(mode=MODE)) for number in range(4)]
-LIMITS = limits_of(TASK.observation, TASK.action, TESTED, REFERENCE)
-BARE, SHIELDED = FilterWeights(mode=MODE), FilterWeights(mode=MODE, shield=LIMITS)
-SEEN = np.concatenate([each.observations[:-1] for each in TESTED])
+SEEN = np.concatenate([each.observations[:-1] for each in REFERENCE])
 MEANS = POLICY.mean(SEEN)
+
+
+@cache
+def limits() -> Mapping[str, np.ndarray]:
+    """What four episodes of the bare filter have shown: noise, so the same observations as the reference policy's."""
+    tested = [driven(number, BARE) for number in range(4)]
+    return limits_of(TASK.observation, TASK.action, tested, REFERENCE)
+
+
+def shielded() -> FilterWeights:
+    return replace(BARE, shield=limits())
 
 
 def said(weights: FilterWeights, seen: np.ndarray = SEEN, means: np.ndarray = MEANS) -> list[np.ndarray]:
@@ -48,8 +59,8 @@ def far_out(column: int, value: float) -> np.ndarray:
 
 
 def test_where_everything_was_tested_nothing_is_changed() -> None:
-    usual = SEEN[:, FORCE] <= LIMITS["observation_high"][FORCE]
-    action, activity = said(SHIELDED)
+    usual = SEEN[:, FORCE] <= limits()["observation_high"][FORCE]
+    action, activity = said(shielded())
     np.testing.assert_array_equal(activity[usual], 0.0)
     np.testing.assert_allclose(action[usual], said(BARE)[0][usual], atol=1e-6)
 
@@ -58,26 +69,26 @@ def test_where_everything_was_tested_nothing_is_changed() -> None:
 def test_where_nobody_has_been_the_reference_policy_acts(column: int) -> None:
     seen = far_out(column, 40.0)
     means = POLICY.mean(seen)
-    action, activity = said(SHIELDED, seen, means)
+    action, activity = said(shielded(), seen, means)
     np.testing.assert_array_equal(activity, 1.0)
     np.testing.assert_allclose(action, means, atol=1e-6)
 
 
 def test_what_has_never_been_done_is_not_done() -> None:
     means = np.clip(MEANS + 0.9, -1, 1)
-    action, activity = said(SHIELDED, SEEN, means)
+    action, activity = said(shielded(), SEEN, means)
     wild = activity[:, 0] == 1.0
     assert wild.any()
     np.testing.assert_allclose(action[wild], means[wild], atol=1e-6)
 
 
 def test_near_the_person_no_action_is_larger_than_tested() -> None:
-    timid, lax = ({**LIMITS, "near_action": np.array(each, np.float32)} for each in ((0.0, 0.01), (9.0, 1.0)))
+    timid, lax = ({**limits(), "near_action": np.array(each, np.float32)} for each in ((0.0, 0.01), (9.0, 1.0)))
 
     def activities(distance_m: float) -> list[np.ndarray]:
         seen = SEEN.copy()
         seen[:, TO_TARGET] = (distance_m, 0.0, 0.0)
-        return [said(replace(BARE, shield=limits), seen, POLICY.mean(seen))[1] for limits in (timid, lax)]
+        return [said(replace(BARE, shield=each), seen, POLICY.mean(seen))[1] for each in (timid, lax)]
 
     near, far = activities(0.1), activities(0.26)
     np.testing.assert_array_equal(near[0], 1.0)
@@ -87,11 +98,11 @@ def test_near_the_person_no_action_is_larger_than_tested() -> None:
 
 def test_it_sets_in_smoothly() -> None:
     """Along a growing force neither the activity nor its slope jumps."""
-    start = float(LIMITS["observation_high"][FORCE])
+    start = float(limits()["observation_high"][FORCE])
     forces = np.linspace(start - 0.5, start + FORCE_RAMP_N + 0.5, 3001)
     seen = np.repeat(SEEN[:1], len(forces), axis=0)
     seen[:, FORCE] = forces
-    (_, activity) = said(SHIELDED, seen, POLICY.mean(seen))
+    (_, activity) = said(shielded(), seen, POLICY.mean(seen))
     steps = np.diff(activity[:, 0].astype(np.float64))
     assert (activity[0], activity[-1]) == (0.0, 1.0)
     assert steps.min() >= -1e-6
@@ -101,30 +112,32 @@ def test_it_sets_in_smoothly() -> None:
 @pytest.mark.parametrize("scale", [1.0, 1.2, 2.0])
 def test_torch_and_onnx_agree_inside_at_and_outside_the_limits(scale: float) -> None:
     seen = (scale * SEEN).astype(np.float32)
-    module, means = build(TASK.modes, POLICY, SHIELDED), POLICY.mean(seen)
+    module, means = build(TASK.modes, POLICY, shielded()), POLICY.mean(seen)
     assert largest_difference(to_onnx(module, seen, means), module, seen, means) <= 1e-5
     with torch.no_grad():
         action, activity = module(torch.from_numpy(seen), torch.from_numpy(means))
-    exported = said(SHIELDED, seen, means)
+    exported = said(shielded(), seen, means)
     np.testing.assert_allclose(exported[0], action.numpy(), atol=1e-5)
     np.testing.assert_allclose(exported[1], activity.numpy(), atol=1e-5)
 
 
 def test_limits_are_stored_with_the_filter_and_older_filters_have_none() -> None:
-    again = FilterWeights.from_bytes(SHIELDED.to_bytes())
+    again = FilterWeights.from_bytes(shielded().to_bytes())
     assert again.encoder == {}
-    np.testing.assert_array_equal(again.shield["observation_high"], LIMITS["observation_high"])
+    np.testing.assert_array_equal(again.shield["observation_high"], limits()["observation_high"])
     assert FilterWeights.from_bytes(BARE.to_bytes()).shield == {}
-    assert [OnnxFilter(act_of(TASK.modes, POLICY, each).exported.stored).is_shielded for each in (BARE, SHIELDED)] == [
+    assert [
+        OnnxFilter(act_of(TASK.modes, POLICY, each).exported.stored).is_shielded for each in (BARE, shielded())
+    ] == [
         False,
         True,
     ]
 
 
 def test_limits_are_told_by_the_names_of_the_fields() -> None:
-    told = described(TASK.observation, TASK.action, LIMITS)
+    told = described(TASK.observation, TASK.action, limits())
     force = next(each for each in told["observation"] if each["name"] == "force_on_person_n")
-    assert force["high"] == [pytest.approx(float(LIMITS["observation_high"][FORCE]))]
+    assert force["high"] == [pytest.approx(float(limits()["observation_high"][FORCE]))]
     assert force["ramp"] == [FORCE_RAMP_N]
     assert len(told["change_of_action"][0]["low"]) == 7
     assert told["size_of_action_near_person"]["high"] > 0
