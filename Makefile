@@ -46,6 +46,9 @@ types: $(VENV)/dev.stamp ## Static types, strict
 contracts: $(VENV)/dev.stamp ## Who may import whom
 	$(VENV)/bin/lint-imports
 
+# Compiled modules are kept, whatever this machine usually does: the tests start hundreds of programs.
+pytest pytest-postgresql pytest-s3 test-long validate: export PYTHONDONTWRITEBYTECODE :=
+
 # One thread each: processes whose libraries take every core spend their time waiting for each other.
 pytest: $(VENV)/dev.stamp browser ## The test suite
 	OMP_NUM_THREADS=1 $(PY) -m pytest -n 4 --dist loadfile --no-loadscope-reorder
