@@ -15,8 +15,8 @@ from uuid import uuid4
 import psycopg
 from sqlalchemy import Connection, Pool, create_engine, event, make_url, text
 
-from app import sqlite, upgrading
-from app.db import Base, Database
+from app import upgrading
+from app.db import Base, Database, sqlite
 from app.settings import Settings
 
 SERVER = os.environ.get("TEST_DATABASE_URL")
