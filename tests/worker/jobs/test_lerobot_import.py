@@ -159,6 +159,7 @@ def _elsewhere(folder: Path) -> None:
 
 VIDEOS = "videos/observation.images.front"
 VIDEO = f"{VIDEOS}/chunk-000/file-000.mp4"
+STARTS = f"{VIDEOS}/from_timestamp"
 WRONG: dict[str, tuple[Callable[[Path], None], str]] = {
     "version 2.1": (info(codebase_version="v2.1"), "Convert it with LeRobot"),
     "no JSON": (lambda folder: _write(folder / INFO, b"{" * 100_000), "is not JSON"),
@@ -178,8 +179,8 @@ WRONG: dict[str, tuple[Callable[[Path], None], str]] = {
     "fewer rows": (table(DATA, lambda t: t.slice(1)), "episode 0: has 11 rows"),
     "rows in disorder": (table(DATA, column("frame_index", first(7))), "episode 0: has 12 rows in its file, in order"),
     "a far file": (table(EPISODES, column("data/file_index", first(10**12))), "numbers that cannot be"),
-    "before the beginning": (table(EPISODES, column(f"{VIDEOS}/from_timestamp", first(-1.0))), "numbers that cannot be"),
-    "after the end": (table(EPISODES, column(f"{VIDEOS}/from_timestamp", first(1e6))), "ends before this episode"),
+    "before the beginning": (table(EPISODES, column(STARTS, first(-1.0))), "numbers that cannot be"),
+    "after the end": (table(EPISODES, column(STARTS, first(1e6))), "ends before this episode"),
     "an endless episode": (table(EPISODES, column("length", first(10**9))), "Leave it out with --episodes"),
     "an episode twice": (table(EPISODES, column("episode_index", first(1))), "names an episode twice"),
     "no video": (lambda folder: _write(folder / VIDEO, b"no video"), f"{VIDEO}, episode 0: not an MP4"),
