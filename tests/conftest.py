@@ -31,6 +31,8 @@ from app.storage import ArtefactStore
 from tests import buckets, databases
 from tests.databases import make_tables
 
+databases.share_compiled_statements()
+
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Tell the tests that work on a studio's database, and skip what makes no sense on the one they are given.
