@@ -35,7 +35,8 @@ def participants(session: Session, study: Study) -> Iterator[str]:
         f"{flow.not_consented} of those invited had not consented.",
         f"{count(flow.withdrawn, 'person', 'people')} withdrew and had all their data erased; they are in no other "
         "number.",
-        f"**{flow.scripted} of the participants were played by a program: no person answered or rated there.**"
+        f"**{count(flow.scripted, 'of the participants was', 'of the participants were')} played by a program: no "
+        "person answered or rated there.**"
         if flow.scripted
         else "",
     )
@@ -55,11 +56,13 @@ def participants(session: Session, study: Study) -> Iterator[str]:
 
 def _ended(flow: Flow) -> str:
     words = {
-        Ending.SCREENED_OUT: "were screened out by their answers at the start",
-        Ending.FULL: "were sent back because no arm was open",
-        Ending.INATTENTIVE: "were sent back because they missed too many catch pairs",
+        Ending.SCREENED_OUT: "screened out by answers at the start",
+        Ending.FULL: "sent back because no arm was open",
+        Ending.INATTENTIVE: "sent back because of too many missed catch pairs",
     }
-    return "".join(f"{flow.ended[ending]} {words[ending]}, " for ending in Ending if flow.ended[ending])
+    return "".join(
+        f"{count(flow.ended[ending], 'was', 'were')} {words[ending]}, " for ending in Ending if flow.ended[ending]
+    )
 
 
 def _row_of_arm(study: Study, name: str, flow: Flow) -> Sequence[str]:

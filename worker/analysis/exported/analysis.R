@@ -786,8 +786,6 @@ main <- function(source, target) {
     if (is.null(found)) {
       file.create(path)
     } else {
-      numbers <- vapply(found, is.numeric, TRUE)
-      found[numbers] <- lapply(found[numbers], function(each) ifelse(is.na(each), NA, format(each, digits = 15, trim = TRUE)))
       write.csv(found, path, row.names = FALSE, na = "", fileEncoding = "UTF-8")
     }
   }
