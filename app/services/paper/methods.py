@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from sqlalchemy.orm import Session
 
 from app.domain.choices import Method, Strategy
-from app.domain.protocol import EvaluatedMethod, EvaluationMode, EvaluationSettings
+from app.domain.protocol import EvaluatedMethod, EvaluationMode, EvaluationSettings, Language
 from app.domain.studies import Study
 from app.installed_tasks import catalogue
 from app.questionnaires import library
@@ -20,7 +20,7 @@ from app.services.studies import preregistration
 from app.services.studies.preregistration import TEST_NAMES, Plan
 
 METHODS = {
-    EvaluatedMethod.REFERENCE: "the pre-trained policy, personalised for nobody",
+    EvaluatedMethod.REFERENCE: "personalised for nobody",
     EvaluatedMethod.PREFFT: "that policy fine-tuned on the participant's learned reward",
     EvaluatedMethod.PREFFT_ANCHORED: "that policy fine-tuned on the participant's learned reward and kept near its "
     "former actions",
@@ -33,6 +33,7 @@ METHODS = {
     "before rating",
 }
 """What each was, in words for a paper."""
+LANGUAGES = {Language.ENGLISH: "English", Language.GERMAN: "German"}
 
 
 def methods_part(session: Session, study: Study) -> Iterator[str]:
@@ -90,7 +91,7 @@ def _design(study: Study) -> Iterator[str]:
 
 
 def _method(study: Study, evaluation: EvaluationSettings, method: EvaluatedMethod) -> str:
-    more = f", {evaluation.fine_tuning_steps} steps" if method.value.startswith("prefft") else ""
+    more = f", {evaluation.fine_tuning_steps:,} steps" if method.value.startswith("prefft") else ""
     if method is EvaluatedMethod.PBARL:
         printed = study.settings.method is Method.PRINTED
         more = ", trained as printed" if printed else ", trained in the studio's own configuration"
@@ -102,11 +103,19 @@ def _procedure(study: Study) -> Iterator[str]:
     installed = catalogue.find(study.task)
     title = installed.description.title if installed else study.task
     made = (
-        f"simulated clips of {settings.clip_steps / 10:g} s ({settings.clip_quality.label.lower()}), from "
-        f"{settings.pool_scenarios} scenarios with {settings.behaviours_per_scenario} ways of doing each"
+        f"simulated clips of {settings.clip_steps / 10:g} s "
+        f"({settings.clip_quality.hint.split(';')[0].rstrip('.')}), from {settings.pool_scenarios} scenarios with {settings.behaviours_per_scenario} ways of doing each"
         if study.material is None
         else "clips that were recorded elsewhere and imported"
     )
+    on_top = [
+        *([f"{count(settings.repeated_pairs, 'pair')} asked twice"] if settings.repeated_pairs else []),
+        *(
+            [f"{count(settings.catch_pairs, 'catch pair')} (a clean success beside a clear failure)"]
+            if settings.catch_pairs
+            else []
+        ),
+    ]
     yield paragraph(
         f"The task was {quoted(title)}. Participants saw {made}, two side by side, and answered “"
         f"{quoted(settings.question)}” with left, right, equal or can't tell.",
@@ -116,9 +125,8 @@ def _procedure(study: Study) -> Iterator[str]:
             if settings.introduction_count
             else "."
         ),
-        f"On top of these came {count(settings.repeated_pairs, 'pair')} asked twice and "
-        f"{count(settings.catch_pairs, 'catch pair')} (a clean success beside a clear failure)"
-        + (f", after {count(settings.practice_pairs, 'practice pair')}." if settings.practice_pairs else "."),
+        f"{count(settings.practice_pairs, 'practice pair')} came before." if settings.practice_pairs else "",
+        f"On top of these came {listed(on_top)}." if on_top else "",
         f"Breaks were offered every {settings.break_every} answers." if settings.break_every else "",
         "Answers opened after both clips had been played once." if settings.answer_after_first_play else "",
     )
@@ -140,8 +148,8 @@ def _procedure(study: Study) -> Iterator[str]:
         if study.material is None
         else "",
     )
-    languages = listed((each.label for each in settings.offered_languages), "or")
-    yield f"Pages were in {languages}, as participants chose."
+    languages = [LANGUAGES[each] for each in settings.offered_languages]
+    yield f"Pages were in {listed(languages, 'or')}{', as participants chose' if len(languages) > 1 else ''}."
 
 
 def _measures(study: Study) -> Iterator[str]:
@@ -198,12 +206,15 @@ def _deviations(study: Study, plan: Plan) -> Iterator[str]:
 
 
 def _analysis(study: Study, plan: Plan) -> Iterator[str]:
-    if evaluation_plan.settings_of(study) is None:
+    evaluation = evaluation_plan.settings_of(study)
+    if evaluation is None:
         yield "No tests were planned: nothing was compared."
         return
-    planned = listed(TEST_NAMES[test] for test in plan.planned) if plan.planned else "none"
+    planned = listed(TEST_NAMES[test] for test in plan.planned)
     yield paragraph(
-        f"Planned tests: {planned}. Every other test is exploratory.",
+        f"Planned tests: {planned}. Every other test is exploratory."
+        if plan.planned
+        else "No test was planned; all are exploratory.",
         "Tests compared every two methods on each scale, two-sided; p values were corrected by Holm's method over the "
         "comparisons of one scale and one test, those included that could not be computed. The two-sample t-test, "
         "which counts every rating as if a different person had given it, was computed as in the paper on PbARL and "
@@ -215,6 +226,16 @@ def _analysis(study: Study, plan: Plan) -> Iterator[str]:
         "Between arms: Welch's t-test (Hedges' g) and a permutation test of its statistic, without people who met both "
         "methods."
         if study.settings.arms
+        else "",
+        "Order and carryover: F tests of the analysis of variance of a crossover (person, method, period; then the "
+        "method before).",
+        "Head-to-heads: Bradley-Terry strengths, an equal answer as half a win for each, with a sandwich covariance "
+        "over people, and Holm's method over their comparisons."
+        if evaluation.head_to_heads
+        else "",
+        "Questionnaires: scores as published, with Cronbach's alpha and McDonald's omega, and paired tests between "
+        "methods."
+        if study.settings.all_instruments
         else "",
         "Intervals are 95 % intervals.",
     )

@@ -16,9 +16,9 @@ from app.services.evaluation import unblinding
 from app.services.exports import codebook, export_formats
 from app.services.paper import recruitment
 from app.services.paper.methods import METHODS
-from app.services.paper.people import rule_in_words
+from app.services.paper.people import rule_in_words, sample_size
 from app.services.paper.prose import count, day, listed, paragraph, percent, quoted
-from app.services.studies import locking, power, preregistration
+from app.services.studies import locking, preregistration
 from app.services.studies.preregistration import TEST_NAMES, PlanStanding
 
 FILE_NAME = "preregistration.md"
@@ -174,21 +174,10 @@ def _sampling(session: Session, study: Study, settings: StudySettings) -> Mappin
 
 
 def _rationale(session: Session, study: Study) -> str:
-    """Of the newest finished simulation of this very design."""
-    plans = power.of_study(session, study)
-    plan = next((each for each in plans if each.contents is not None and power.is_current(study, each)), None)
-    if plan is None or plan.contents is None:
+    found = sample_size(session, study)
+    if not found:
         return f"{YOURS} No simulation of this design is stored (page “How many people”)."
-    inputs, contents = plan.inputs, plan.contents
-    enough = contents["enough"]["ratings"]
-    found = f"reached from {enough} people on" if enough else f"not reached with {inputs.most_people} people"
-    return (
-        f"By simulation of this design ({contents['studies']} studies for each number of people): "
-        f"{unblinding.NAMES[inputs.better]} better than {unblinding.NAMES[inputs.compared]} by {inputs.effect:g} "
-        f"points of 5, differing between people by {inputs.spread:g} (SD), levels of people {inputs.levels:g} (SD), "
-        f"noise of a rating {inputs.noise:g} (SD), {inputs.dropout_percent:g} % dropouts. A power of 80 % for ratings "
-        f"is {found}."
-    )
+    return found[0].upper() + found[1:]
 
 
 def _variables(study: Study, settings: StudySettings) -> Mapping[str, str]:

@@ -17,6 +17,7 @@ from app.services.monitoring.form_summaries import Summary
 from app.services.paper import recruitment
 from app.services.paper.prose import NOT_RECORDED, count, day, listed, number, paragraph, percent, quoted, table
 from app.services.paper.recruitment import Flow
+from app.services.studies import power
 
 LONGEST_LISTED = 30
 """Characters of a free answer that is counted in the text; longer ones may say who somebody is."""
@@ -46,12 +47,32 @@ def participants(session: Session, study: Study) -> Iterator[str]:
         yield table(("arm", "methods", "allocated", "sent back", "not finished", "completed"), rows)
     elif settings.arms:
         yield "Numbers by arm are given after unblinding."
+    size = sample_size(session, study)
+    yield f"Sample size: {size or 'no simulation of power was stored; **add how it was chosen**.'}"
     yield paragraph(
         f"Ethics approval: {quoted(settings.consent_ethics) or NOT_RECORDED}.",
         f"Compensation: {quoted(settings.consent_payment) or NOT_RECORDED}.",
         f"How people were recruited and paid beyond that: {NOT_RECORDED}.",
     )
     yield from _demographics(session, study)
+
+
+def sample_size(session: Session, study: Study) -> str:
+    """What the newest finished simulation of this very design says; empty: there is none."""
+    plans = power.of_study(session, study)
+    plan = next((each for each in plans if each.contents is not None and power.is_current(study, each)), None)
+    if plan is None or plan.contents is None:
+        return ""
+    inputs, contents = plan.inputs, plan.contents
+    enough = contents["enough"]["ratings"]
+    found = f"reached from {enough} people on" if enough else f"not reached with {inputs.most_people} people"
+    return (
+        f"by simulation of this design ({contents['studies']} studies for each number of people): "
+        f"{unblinding.NAMES[inputs.better]} better than {unblinding.NAMES[inputs.compared]} by {inputs.effect:g} "
+        f"points of 5, differing between people by {inputs.spread:g} (SD), levels of people {inputs.levels:g} (SD), "
+        f"noise of a rating {inputs.noise:g} (SD), {inputs.dropout_percent:g} % dropouts. A power of 80 % for ratings "
+        f"is {found}."
+    )
 
 
 def _ended(flow: Flow) -> str:
@@ -94,12 +115,12 @@ def _question(each: Summary) -> str:
         ends = f"range {number(found.low, 0)} to {number(found.high, 0)}"
         return f"{name}: mean {number(found.mean)}{spread}, {ends} (n = {each.answered}{left_out})"
     if each.counts:
-        counts = ", ".join(f"{quoted(value)} {times}" for value, times in each.counts)
+        counts = ", ".join(f"{quoted(value)} ({times})" for value, times in each.counts)
         return f"{name}: {counts} (n = {each.answered}{left_out})"
     texts = [" ".join(text.lower().split()) for _, text in each.texts]
     if any(len(text) > LONGEST_LISTED for text in texts):
         return f"{name}: free answers, not listed here (n = {each.answered}{left_out})"
-    counts = ", ".join(f"{quoted(text)} {times}" for text, times in sorted(Counter(texts).items()))
+    counts = ", ".join(f"{quoted(text)} ({times})" for text, times in sorted(Counter(texts).items()))
     return f"{name}, as typed: {counts or 'nothing'} (n = {each.answered}{left_out})"
 
 

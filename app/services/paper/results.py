@@ -200,12 +200,13 @@ def _n(test: str, result: Result) -> str:
     if "n_first" in result:
         return f"n = {result['n_first']} and {result['n_second']} {'ratings' if test == 'two_sample_t' else 'people'}"
     more = f", {result['n_ratings']} ratings" if "n_ratings" in result else ""
-    more += f", {result['n_without_ties']} of them not equal" if "n_without_ties" in result else ""
+    moved = result.get("n_without_ties", result["n"])
+    more += f", {moved} of them not equal" if moved != result["n"] else ""
     return f"n = {result['n']} people{more}"
 
 
 def _all_tests(comparisons: Sequence[Result], plan: Plan) -> str:
-    rows = []
+    rows: list[Sequence[str]] = []
     for comparison in comparisons:
         for test in (each for each in TEST_NAMES if each in comparison):
             result = comparison[test]

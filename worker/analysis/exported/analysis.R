@@ -236,19 +236,28 @@ reliability <- function(items) {
   found
 }
 
-# Of one factor, by maximum likelihood; NA where that cannot be fitted. The likelihood is maximised over the unique
-# variances, as Lawley and Maxwell do; factanal() bounds them at 0.005, which few people's answers can need.
+# Of one factor, by maximum likelihood over the unique variances, at least 0.005 of each item (as factanal() does, which
+# gives up where its optimiser has done what it can). NA where it cannot be fitted.
 omega <- function(covariance, people) {
   correlation <- cov2cor(covariance)
   if (people <= nrow(covariance) || min(eigen(correlation, TRUE, TRUE)$values) < 1e-8) return(NA_real_)
-  fit <- tryCatch(
-    factanal(covmat = correlation, factors = 1, n.obs = people, control = list(lower = 0.005, opt = list(factr = 10))),
-    error = function(e) NULL
-  )
-  if (is.null(fit)) return(NA_real_)
+  k <- nrow(correlation)
+  spectrum <- function(unique) eigen(correlation / sqrt(outer(unique, unique)), symmetric = TRUE)
+  loadings <- function(unique) {
+    found <- spectrum(unique)
+    sqrt(unique) * found$vectors[, 1] * sqrt(max(found$values[1] - 1, 0))
+  }
+  misfit <- function(unique) {
+    rest <- spectrum(unique)$values[-1]
+    sum(rest - log(rest) - 1)
+  }
+  gradient <- function(unique) diag(outer(loadings(unique), loadings(unique)) + diag(unique) - correlation) / unique^2
+  start <- (1 - 0.5 / k) / diag(solve(correlation))
+  exact <- list(factr = 1, pgtol = 1e-10, maxit = 10000, parscale = rep(0.01, k))
+  unique <- optim(start, misfit, gradient, method = "L-BFGS-B", lower = 0.005, upper = 1, control = exact)$par
   scale <- sqrt(diag(covariance))
-  common <- sum(fit$loadings[, 1] * scale)^2
-  common / (common + sum(fit$uniquenesses * scale^2))
+  common <- sum(loadings(unique) * scale)^2
+  common / (common + sum(unique * scale^2))
 }
 
 # --- ratings ---

@@ -18,10 +18,11 @@ import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
-import statsmodels.api as sm
 from scipy import optimize, special, stats
 from scipy.sparse.csgraph import connected_components
-from statsmodels.multivariate.factor import Factor
+from statsmodels.genmod.families import Binomial
+from statsmodels.genmod.generalized_linear_model import GLM
+from statsmodels.regression.linear_model import OLS
 from statsmodels.stats.meta_analysis import combine_effects
 
 SCALES = ("satisfaction", "personalisation")
@@ -310,21 +311,38 @@ def reliability(items):
 
 
 def omega(covariance, people):
-    """Of one factor, by maximum likelihood; None where that cannot be fitted."""
+    """Of one factor, by maximum likelihood over the unique variances, at least 0.005 of each item (as R's factanal).
+
+    None where it cannot be fitted: too few people, or items that determine each other.
+    """
     scale = np.sqrt(np.diag(covariance))
     correlation = covariance / np.outer(scale, scale)
     if people <= len(covariance) or np.linalg.eigvalsh(correlation)[0] < 1e-8:
         return None
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        try:
-            fit = Factor(corr=correlation, n_factor=1, method="ml", nobs=people).fit()
-        except (np.linalg.LinAlgError, ValueError):
-            return None
-    loadings, unique = np.asarray(fit.loadings)[:, 0] * scale, np.asarray(fit.uniqueness) * scale**2
-    if not (np.isfinite(loadings).all() and np.isfinite(unique).all() and (unique >= 0).all()):
-        return None
-    return loadings.sum() ** 2 / (loadings.sum() ** 2 + unique.sum())
+
+    def spectrum(unique):
+        return np.linalg.eigh(correlation / np.sqrt(np.outer(unique, unique)))
+
+    def loadings(unique):
+        values, vectors = spectrum(unique)
+        return np.sqrt(unique) * vectors[:, -1] * math.sqrt(max(values[-1] - 1, 0))
+
+    def misfit(unique):
+        rest, found = spectrum(unique)[0][:-1], loadings(unique)
+        gradient = np.diag(np.outer(found, found) + np.diag(unique) - correlation) / unique**2
+        return (rest - np.log(rest) - 1).sum(), gradient
+
+    start = (1 - 0.5 / len(covariance)) / np.diag(np.linalg.inv(correlation))
+    unique = optimize.minimize(
+        misfit,
+        start,
+        jac=True,
+        method="L-BFGS-B",
+        bounds=[(0.005, 1.0)] * len(start),
+        options={"ftol": 1e-15, "gtol": 1e-10, "maxiter": 10_000, "maxfun": 100_000},
+    ).x
+    common = (loadings(unique) * scale).sum() ** 2
+    return common / (common + (unique * scale**2).sum())
 
 
 # --- ratings ---
@@ -426,10 +444,12 @@ def order_effects(study):
         base = [pd.get_dummies(blocks["participant"]), pd.get_dummies(blocks["method"], drop_first=True)]
         period = pd.get_dummies(blocks["period"], drop_first=True, prefix="period")
         before = pd.get_dummies(blocks["before"], drop_first=True, prefix="before")
-        fits = [
-            sm.OLS(blocks[scale], pd.concat(columns, axis=1).astype(float)).fit()
-            for columns in (base, [*base, period], [*base, period, before])
-        ]
+        with warnings.catch_warnings():  # the first period has no method before it, so some columns follow from others
+            warnings.simplefilter("ignore")
+            fits = [
+                OLS(blocks[scale], pd.concat(columns, axis=1).astype(float)).fit()
+                for columns in (base, [*base, period], [*base, period, before])
+            ]
         for name, without, whole in (("period", *fits[:2]), ("carryover", *fits[1:])):
             if whole.df_resid < 2 or whole.df_resid == without.df_resid or whole.ssr < 1e-12:
                 continue
@@ -488,7 +508,7 @@ def strengths(study):
     )
     won = answers["response"].map({"left": 1.0, "equal": 0.5, "right": 0.0}).to_numpy(float)
     clusters = pd.factorize(answers["participant"])[0]
-    fit = sm.GLM(won, design[:, 1:], family=sm.families.Binomial()).fit(
+    fit = GLM(won, design[:, 1:], family=Binomial()).fit(
         cov_type="cluster", cov_kwds={"groups": clusters, "use_correction": False}, tol=1e-12, maxiter=100
     )
     centre = (np.eye(len(groups)) - 1 / len(groups))[:, 1:]
