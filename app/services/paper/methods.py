@@ -104,7 +104,8 @@ def _procedure(study: Study) -> Iterator[str]:
     title = installed.description.title if installed else study.task
     made = (
         f"simulated clips of {settings.clip_steps / 10:g} s "
-        f"({settings.clip_quality.hint.split(';')[0].rstrip('.')}), from {settings.pool_scenarios} scenarios with {settings.behaviours_per_scenario} ways of doing each"
+        f"({settings.clip_quality.hint.split(';')[0].rstrip('.')}), from {settings.pool_scenarios} scenarios with "
+        f"{settings.behaviours_per_scenario} ways of doing each"
         if study.material is None
         else "clips that were recorded elsewhere and imported"
     )
