@@ -232,6 +232,7 @@ def gate(studio_app: FastAPI, database: Database, store: ArtefactStore, new_brow
             "letter": "A",
             "kind": "csv",
             "table": "labels",
+            "script": "analysis.py",
             "name": "ratings",
             "account_id": "2000",  # nobody: what is asked here is whether one may ask
         }

@@ -1,1 +1,1 @@
-"""Text for the paper and its preregistration"""
+"""Text for a paper and its preregistration."""

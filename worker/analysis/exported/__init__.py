@@ -1,1 +1,1 @@
-"""Scripts for analysts; they know only files"""
+"""Scripts for analysts; they know only files."""
