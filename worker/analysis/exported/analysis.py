@@ -476,7 +476,7 @@ def head_to_heads(study):
 
 def wins(study):
     """How often row was preferred to column; equal is half a win for each."""
-    if study.blinded:
+    if study.blinded or study.head_to_heads.empty:
         return []
     table = pd.DataFrame(0.0, index=study.groups, columns=study.groups)
     for each in head_to_heads(study).itertuples():
