@@ -128,6 +128,10 @@ def test_everything_is_the_same_under_another_key(
         "api ",
         "report.json",
         "archive sealed",
+        "/results/methods_and_results.md",
+        "/preregistration.md",
+        "data methods_and_results.md",
+        "data analysis.py",
     ):
         assert part in seen, part
     _exchange(database, study)
@@ -156,10 +160,12 @@ def test_the_same_look_finds_the_key_once_the_study_is_unblinded(
     before = everything()
     assert LETTER_AND_METHOD.search(before["data csv/ratings.csv"].decode())
     assert LETTER_AND_METHOD.search(before["archive rows/assignment.jsonl"].decode())
+    assert "# Results" in before["data methods_and_results.md"].decode()
     _exchange(database, study)
     after = everything()
     changed = {path for path in before if before[path] != after[path]}
     assert {f"/studies/{study.slug}/unblind", "data csv/ratings.csv", "data report/report.json"} <= changed
+    assert {f"/studies/{study.slug}/results/methods_and_results.md", "data methods_and_results.md"} <= changed
 
 
 def _stop_the_clock(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -173,7 +179,7 @@ def _addresses(application: FastAPI, prefix: str, slug: str) -> Iterator[str]:
     """Every address that can be looked at or downloaded; endless streams and what does not exist yet left out."""
     tables = [{"table": table.name, "kind": kind} for table in export_tables.TABLES for kind in ("csv", "jsonl")]
     drawn = [{"name": name, "kind": kind} for name in ("ratings", "ratings_of_each_person") for kind in ("svg", "png")]
-    single = {"slug": slug, "code": "P01", "version": "1", "letter": "A", "query_id": "1"}
+    single = {"slug": slug, "code": "P01", "version": "1", "letter": "A", "query_id": "1", "script": "analysis.py"}
     for route in iter_route_contexts(application.routes):
         path = route.path or ""
         left_out = ("/live", "/links/", "/export/files/", "/exports/{", "/controllers/")

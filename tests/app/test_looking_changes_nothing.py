@@ -132,6 +132,7 @@ def place(studio_app: FastAPI, database: Database, store: ArtefactStore, passwor
             "query_id": str(query.id),
             "sha256": query.left_clip.video_sha256,
             "table": "labels",
+            "script": "analysis.py",
             "name": "ratings",
             "key": "x" * 20,
             "number": "1",

@@ -97,6 +97,7 @@ MATRIX: dict[str, Rule] = {
     **dict.fromkeys(("download_lock", "show_translations", "show_links", "show_sheet", "download_links"), LOOKING),
     **dict.fromkeys(("show_joining", "show_erasing", "show_put_away", "show_unblinding", "show_results"), LOOKING),
     **dict.fromkeys(("show_figure", "show_exports", "show_power"), LOOKING),
+    **dict.fromkeys(("download_methods_text", "download_analysis", "download_preregistration"), LOOKING),
     **dict.fromkeys(("exclude_answer", "include_answer", "change_settings", "open_preview", "lock_study"), EDITING),
     **dict.fromkeys(("ask_power",), EDITING),
     **dict.fromkeys(("save_translations", "add_participants", "renew_link", "revoke_link", "renew_links"), EDITING),
@@ -231,6 +232,7 @@ def gate(studio_app: FastAPI, database: Database, store: ArtefactStore, new_brow
             "letter": "A",
             "kind": "csv",
             "table": "labels",
+            "script": "analysis.py",
             "name": "ratings",
             "account_id": "2000",  # nobody: what is asked here is whether one may ask
         }

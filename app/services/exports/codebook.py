@@ -7,6 +7,7 @@ from app.domain.protocol import Language
 from app.domain.study_settings import StudySettings
 from app.questionnaires import library
 from app.questionnaires.library import Instrument
+from app.services.exports.csv_cells import csv_line
 
 MISSING = {
     "none": "A score is empty when one of its items was left out.",
@@ -26,6 +27,26 @@ def markdown(settings: StudySettings) -> str:
     """The same for people."""
     chapters = [_chapter(settings, library.every()[name]) for name in settings.all_instruments]
     return "\n".join(["# Standard questionnaires of this study\n", *(chapters or ["None.\n"])])
+
+
+def scoring_key_csv() -> str:
+    """Which item enters which score, of every questionnaire in the library, as a table for scripts."""
+    head = ("instrument", "score", "item", "reversed", "answer_lowest", "answer_highest", "missing")
+    rows = [
+        (
+            each.name,
+            score.name,
+            item,
+            item in each.reversed_items,
+            each.answers.lowest,
+            each.answers.highest,
+            each.missing,
+        )
+        for each in library.every().values()
+        for score in each.scores
+        for item in score.items
+    ]
+    return "".join(csv_line(row) for row in (head, *rows))
 
 
 def is_own(settings: StudySettings, instrument: str, language: Language) -> bool:

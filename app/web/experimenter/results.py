@@ -13,6 +13,7 @@ from app.domain.evaluation import DonorRule
 from app.domain.people import Experimenter
 from app.domain.studies import Study
 from app.errors import AppError
+from app.paths import ANALYSIS
 from app.services import audit
 from app.services.answers import exclusions
 from app.services.archives import sealing, study_import
@@ -20,6 +21,7 @@ from app.services.evaluation import donors, evaluation_plan, unblinding
 from app.services.exports import export_formats, export_requests, export_tables
 from app.services.exports.export_requests import ExportKind
 from app.services.monitoring import form_summaries
+from app.services.paper import text
 from app.services.participants import enrolment
 from app.services.runs import reports
 from app.services.studies import locking, preregistration, studies
@@ -143,6 +145,25 @@ def show_figure(
     return Response(content, media_type=reports.FORMATS[kind], headers=headers)
 
 
+@router.get("/results/methods_and_results.md", name="download_methods_text")
+def download_methods_text(
+    slug: Slug, experimenter: CurrentExperimenter, session: ReadingSession, studio: StudioDep
+) -> Response:
+    """Methods and results for a paper; while the study is blinded the methods alone."""
+    study = studies.find_study(session, slug)
+    audit.note_reading(studio.database, session, experimenter.name, "results viewed", slug, study=study)
+    return _attached(text.methods_and_results(session, study), f"{slug}-{text.FILE_NAME}", "text/markdown")
+
+
+@router.get("/results/scripts/{script}", name="download_analysis")
+def download_analysis(
+    slug: Slug, script: Literal["analysis.py", "analysis.R"], _: CurrentExperimenter, session: ReadingSession
+) -> Response:
+    """The script that computes the report from the exported tables; the same for every study."""
+    studies.find_study(session, slug)
+    return _attached((ANALYSIS / script).read_text(), script, "text/plain")
+
+
 @router.get("/export", name="show_exports")
 def show_exports(
     request: Request, slug: Slug, experimenter: CurrentExperimenter, session: ReadingSession, studio: StudioDep
@@ -247,6 +268,11 @@ def _handfuls(lines: Iterator[str]) -> Iterator[str]:
             yield "".join(waiting)
             waiting = []
     yield "".join(waiting)
+
+
+def _attached(content: str, filename: str, media_type: str) -> Response:
+    headers = {"content-disposition": f'attachment; filename="{filename}"'}
+    return Response(content, media_type=f"{media_type}; charset=utf-8", headers=headers)
 
 
 def _lent(session: Session, study: Study) -> dict[str, str]:

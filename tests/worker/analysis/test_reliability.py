@@ -86,3 +86,12 @@ def test_scores_about_robots_are_compared_within_people_and_not_while_letters_hi
     assert [each["people"] for each in found["reliability"]] == [6, 5]
     blinded = scale_reports([instrument], ["a", "b"], compare=False)[0]["parts"][0]["scores"][0]
     assert blinded["comparisons"] == []
+
+
+def test_omega_is_the_same_every_time_also_where_a_unique_variance_would_vanish() -> None:
+    answers = np.array([[1.0, 1, 1], [2, 2, 1], [3, 3, 4], [4, 4, 2], [5, 5, 3], [4, 5, 1]])
+    covariance = np.cov(answers, rowvar=False)
+    first = omega(covariance, people=6)
+    assert first is not None
+    assert 0 < first < 1
+    assert omega(covariance, people=6) == first

@@ -10,17 +10,17 @@ fitted by maximum likelihood (McDonald 1999), allows for that. Two items do not 
 te Grotenhuis and Pelzer (2013) advise, it is Spearman-Brown's 2 r / (1 + r).
 """
 
-import warnings
 from typing import Any
 
 import numpy as np
-from scipy import stats
+from scipy import optimize, stats
 
 from worker.analysis.study.hypothesis_tests import not_computable, plain
 from worker.domain.type_aliases import FloatArray
 
 FEWEST = 3
 """Filled-in questionnaires."""
+LEAST_UNIQUE = 0.005
 CONFIDENCE = 0.95
 
 
@@ -65,26 +65,39 @@ def alpha_interval(value: float, people: int, items: int) -> tuple[float, float]
 def omega(covariance: FloatArray, people: int) -> float | None:
     """McDonald's omega of items with this covariance, one factor; None where it cannot be fitted. (K, K)
 
-    Fewer people than items, or items that determine each other, leave no likelihood to maximise.
+    Fewer people than items, or items that determine each other, leave no likelihood to maximise. It is maximised over
+    the unique variances (Lawley and Maxwell 1971, ch. 4), from the start and within the bounds of R's factanal: at
+    least LEAST_UNIQUE of an item is its own, or the likelihood may have no maximum (Heywood).
     """
-    from statsmodels.multivariate.factor import Factor  # a second to load, and few reports need it
-
     scale = np.sqrt(np.diag(covariance))
     correlation = covariance / np.outer(scale, scale)
     if people <= len(covariance) or np.linalg.eigvalsh(correlation)[0] < 1e-8:
         return None
-    with warnings.catch_warnings():  # a fit at the edge of what is possible is judged by its result
-        warnings.simplefilter("ignore")
-        try:
-            fit = Factor(corr=correlation, n_factor=1, method="ml", nobs=people).fit()
-        except (np.linalg.LinAlgError, ValueError):
-            return None
-    loadings = np.asarray(fit.loadings)[:, 0] * scale
-    unique = np.asarray(fit.uniqueness) * scale**2
-    if not (np.isfinite(loadings).all() and np.isfinite(unique).all() and (unique >= 0).all()):
-        return None
-    common = float(loadings.sum() ** 2)
+    start = (1 - 0.5 / len(covariance)) / np.diag(np.linalg.inv(correlation))
+    bounds = [(LEAST_UNIQUE, 1.0)] * len(covariance)
+    exact = {"ftol": 1e-15, "gtol": 1e-10, "maxiter": 10_000, "maxfun": 100_000}
+    found = optimize.minimize(
+        _misfit, start, args=(correlation,), method="L-BFGS-B", jac=True, bounds=bounds, options=exact
+    )
+    unique = found.x * scale**2
+    common = float((_loadings(found.x, correlation) * scale).sum() ** 2)
     return common / (common + float(unique.sum()))
+
+
+def _loadings(unique: FloatArray, correlation: FloatArray) -> FloatArray:
+    """The best ones given the unique variances. (K,) -> (K,)"""
+    root = np.sqrt(unique)
+    values, vectors = np.linalg.eigh(correlation / np.outer(root, root))
+    return np.asarray(root * vectors[:, -1] * max(values[-1] - 1, 0.0) ** 0.5, np.float64)
+
+
+def _misfit(unique: FloatArray, correlation: FloatArray) -> tuple[float, FloatArray]:
+    """What maximum likelihood minimises, and its gradient."""
+    root = np.sqrt(unique)
+    rest = np.linalg.eigvalsh(correlation / np.outer(root, root))[:-1]
+    loadings = _loadings(unique, correlation)
+    left = np.outer(loadings, loadings) + np.diag(unique) - correlation
+    return float((rest - np.log(rest) - 1).sum()), np.asarray(np.diag(left) / unique**2, np.float64)
 
 
 def spearman_brown(covariance: FloatArray) -> float:

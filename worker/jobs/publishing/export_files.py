@@ -14,9 +14,9 @@ from sqlalchemy.orm import Session
 from app.db import now
 from app.domain.models import Export
 from app.domain.studies import Deviation, Study
-from app.paths import DOCS
+from app.paths import ANALYSIS, DOCS
 from app.services.archives import archive, archive_reading, sealing
-from app.services.evaluation import unblinding
+from app.services.evaluation import evaluation_plan, unblinding
 from app.services.exports import (
     codebook,
     export_formats,
@@ -27,6 +27,7 @@ from app.services.exports import (
 )
 from app.services.exports.export_formats import RowProvenance, Table
 from app.services.exports.export_requests import ExportKind
+from app.services.paper import osf, text
 from app.services.runs import reports
 from app.services.studies import preregistration
 from app.storage import ArtefactMissing
@@ -103,7 +104,7 @@ def _workspace(context: WorkerContext) -> Iterator[Path]:
 
 
 def write_data(session: Session, context: WorkerContext, study: Study, path: Path) -> Missing:
-    """Tables in three formats, their dictionary, the report with its figures, and preference pairs as arrays.
+    """Tables in three formats, their dictionary, the report, text and scripts for a paper, and pairs as arrays.
 
     A stored file that is missing or damaged is left out, and said to be.
     """
@@ -115,6 +116,7 @@ def write_data(session: Session, context: WorkerContext, study: Study, path: Pat
         target.writestr("dictionary.md", export_formats.dictionary_markdown(export_tables.TABLES))
         target.writestr("questionnaires.json", _json(codebook.entries(study.settings)))
         target.writestr("questionnaires.md", codebook.markdown(study.settings))
+        _write_analysis(target, session, study)
         pictures = _write_report(target, session, context, study, missing)
         people = _write_pairs(target, session, context, study, missing)
         about = _provenance(session, study, provenance) | {"missing": missing}
@@ -131,6 +133,18 @@ def _write_table(
             for line in write(table, session, study, provenance):
                 stream.write(line.encode())
     target.writestr(f"parquet/{table.name}.parquet", parquet_file.content(table, session, study, provenance))
+
+
+def _write_analysis(target: zipfile.ZipFile, session: Session, study: Study) -> None:
+    """The paper's text, and the scripts that compute the report, with what they need beside the tables."""
+    target.writestr(text.FILE_NAME, text.methods_and_results(session, study))
+    target.writestr(osf.FILE_NAME, osf.registration(session, study))
+    for script in ("analysis.py", "analysis.R"):
+        target.writestr(script, (ANALYSIS / script).read_text())
+    evaluation = evaluation_plan.settings_of(study)
+    methods = [each.value for each in evaluation.methods] if evaluation else []
+    target.writestr("csv/methods.csv", "\n".join(["method", *methods, ""]))
+    target.writestr("csv/scoring_key.csv", codebook.scoring_key_csv())
 
 
 def _write_report(
@@ -230,6 +244,8 @@ Exported {moment} by PbARL Studio {version}. Lock hash of settings and plan: {lo
 | what every column means | `dictionary.csv`, `dictionary.md` |
 | standard questionnaires: words, scoring keys, sources | `questionnaires.md`, `questionnaires.json` |
 | settings, seed, lock, deviations | `provenance.json` |
+| text for a paper, and what a preregistration at OSF asks for | `methods_and_results.md`, `preregistration.md` |
+| scripts that compute all tables and figures of the report from `csv/` | `analysis.py`, `analysis.R` |
 | statistics and figures ({figures}) | `report/` |
 | preference pairs as arrays ({people}) | `pairs/`, explained in `pairs/README.md` |
 

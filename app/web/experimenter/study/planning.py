@@ -14,6 +14,7 @@ from app.domain.protocol import Language
 from app.domain.studies import NAME_LENGTH, Study
 from app.installed_tasks import catalogue
 from app.services.accounts import browser_sessions
+from app.services.paper import osf
 from app.services.participants import enrolment
 from app.services.studies import locking, membership, preregistration, studies
 from app.services.studies.studies import ClipsTooLong
@@ -174,6 +175,14 @@ def download_lock(slug: Slug, _experimenter: CurrentExperimenter, session: Readi
     headers = {"content-disposition": f'attachment; filename="{slug}-lock.json"'}
     contents = study.lock_document or locking.document(study)
     return Response(locking.canonical(contents), media_type="application/json", headers=headers)
+
+
+@router.get("/{slug}/preregistration.md", name="download_preregistration")
+def download_preregistration(slug: Slug, _experimenter: CurrentExperimenter, session: ReadingSession) -> Response:
+    """What a preregistration at OSF asks for, as far as the settings answer it."""
+    headers = {"content-disposition": f'attachment; filename="{slug}-{osf.FILE_NAME}"'}
+    contents = osf.registration(session, studies.find_study(session, slug))
+    return Response(contents, media_type="text/markdown; charset=utf-8", headers=headers)
 
 
 def _lock_page(

@@ -1,0 +1,1 @@
+"""Text for a paper and its preregistration."""

@@ -1,0 +1,220 @@
+"""What an experimenter pastes into a paper and a preregistration: every number there is, and what is missing."""
+
+import re
+from collections.abc import Callable
+from datetime import timedelta
+
+import pytest
+from fastapi.testclient import TestClient
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from app.db import Database, now
+from app.domain.designs import Arm, Ending
+from app.domain.models import Report
+from app.domain.power_plan import PowerInputs
+from app.domain.preferences import LabelEvent, Query
+from app.domain.protocol import EvaluatedMethod, EvaluationSettings
+from app.domain.studies import Participant, Study
+from app.domain.study_settings import PAPER_PROTOCOL
+from app.services.answers import exclusions
+from app.services.participants import withdrawal
+from app.services.studies import locking, power, studies
+from app.storage import ArtefactStore
+from tests import factories
+from tests.finished_study import make_finished_study
+from worker.analysis.study.report import make_report
+from worker.jobs.publishing import report_files
+
+Finished = Callable[..., Study]
+OSF_QUESTIONS = (
+    "Title",
+    "Authors",
+    "Description",
+    "Hypotheses",
+    "Study type",
+    "Blinding",
+    "Is there any additional blinding in this study?",
+    "Study design",
+    "Randomization",
+    "Existing data",
+    "Explanation of existing data",
+    "Data collection procedures",
+    "Sample size",
+    "Sample size rationale",
+    "Stopping rule",
+    "Manipulated variables",
+    "Measured variables",
+    "Indices",
+    "Statistical models",
+    "Transformations",
+    "Inference criteria",
+    "Data exclusion",
+    "Missing data",
+    "Exploratory analysis",
+    "Other",
+)
+"""Of the form “OSF Preregistration”, doi.org/10.31222/osf.io/epgjd."""
+
+
+@pytest.fixture
+def finished(database: Database, store: ArtefactStore, monkeypatch: pytest.MonkeyPatch) -> Finished:
+    """Makes a finished study with the report that the worker would make, without pictures."""
+    monkeypatch.setattr("worker.analysis.study.figures.all_figures", lambda _contents: {})
+
+    def make(*, unblinded: bool = True, lock: bool = True) -> Study:
+        with database.writing() as session:
+            study = make_finished_study(session, store, 6, labels=12, unblinded=unblinded)
+            for person in _people(session)[:4]:
+                person.completed_at = now()
+            _people(session)[4].ended_as = Ending.INATTENTIVE
+            factories.make_participant(session, study, ready=False)
+            if lock:
+                locking.lock(session, study, study.slug, "Ada")
+                study.locked_at = now() - timedelta(days=1)
+        report(study)
+        return study
+
+    def report(study: Study) -> None:
+        with database.writing() as session:
+            contents, _ = make_report(report_files.tables_of(session, session.get_one(Study, study.id)))
+            run = factories.make_run(session, study, kind="report")
+            session.add(Report(study_id=study.id, run_id=run.id, basis="", contents=contents, figures={}))
+
+    return make
+
+
+def _people(session: Session) -> list[Participant]:
+    return list(session.scalars(select(Participant).order_by(Participant.number)))
+
+
+def text_of(browser: TestClient, study: Study, path: str = "results/methods_and_results.md") -> str:
+    answer = browser.get(f"/studies/{study.slug}/{path}")
+    assert answer.status_code == 200
+    assert "attachment" in answer.headers["content-disposition"]
+    return answer.text
+
+
+def test_who_came_and_who_stayed_is_counted(
+    experimenter: TestClient, finished: Finished, database: Database, store: ArtefactStore
+) -> None:
+    study = finished()
+    with database.writing() as session:
+        withdrawal.withdraw(session, store, _people(session)[0], "P01")
+        _people(session)[1].scripted_as = "cautious"
+    said = text_of(experimenter, study)
+    assert "7 people were invited or joined; 5 gave informed consent" in said
+    assert "1 was sent back because of too many missed catch pairs, 1 had not finished" in said
+    assert "and 3 completed the study. 1 of those invited had not consented." in said
+    assert "1 person withdrew and had all their data erased" in said
+    assert "1 of the participants was played by a program" in said
+
+
+def test_every_number_of_the_report_is_in_the_text(
+    experimenter: TestClient, finished: Finished, database: Database
+) -> None:
+    said = text_of(experimenter, finished())
+    with database.reading() as session:
+        contents = session.scalars(select(Report)).one().contents
+    for scale in contents["ratings"]["scales"].values():
+        for comparison in scale["comparisons"]:
+            paired = comparison["paired_t"]
+            statistic, d_z = (f"{paired[name]:.2f}".replace("-", "\N{MINUS SIGN}") for name in ("statistic", "d_z"))
+            assert f"t({paired['degrees_of_freedom']}) = {statistic}" in said
+            assert f"d_z = {d_z} [" in said
+    for each in contents["head_to_heads"].get("strengths", []):
+        assert f"{each['strength']:.2f}".replace("-", "\N{MINUS SIGN}") in said
+    for score in contents["instruments"][0]["parts"][1]["scores"]:
+        assert all(f"{each['alpha']:.2f}".replace("-", "\N{MINUS SIGN}") in said for each in score["reliability"])
+    assert f"right in {100 * contents['answers']['pooled']['mean_accuracy']:.1f} %" in said
+    assert "Planned tests: Paired t. Every other test is exploratory." in said
+    assert "age, as typed" in said or "age: mean" in said
+    for broken in ("None", "nan", "{", "}"):
+        assert broken not in said, broken
+
+
+def test_what_the_studio_cannot_know_is_marked_and_never_invented(experimenter: TestClient, finished: Finished) -> None:
+    said = text_of(experimenter, finished())
+    assert "Ethics approval: **not recorded in the studio; add it**." in said
+    assert "Attention was not measured: no catch pair was answered." in said
+
+
+def test_exclusions_and_deviations_are_listed_with_their_reasons(
+    experimenter: TestClient, finished: Finished, database: Database, store: ArtefactStore
+) -> None:
+    study = finished()
+    with database.writing() as session:
+        there = session.get_one(Study, study.id)
+        query = session.scalars(select(Query).join(LabelEvent).order_by(Query.id)).first()
+        assert query is not None
+        exclusions.exclude(session, there, query.id, "phone *rang*", "Ada")
+        settings = there.settings.model_copy(update={"break_every": 10})
+        changed = {"name": there.name, "task": there.task, "seed": None, "settings": settings}
+        locking.change(session, store, there, **changed, actor="Ada", reason="People were tired.")  # type: ignore[arg-type]  # names are right
+    said = text_of(experimenter, study)
+    assert "excluded 1 answer to pairs" in said
+    assert "phone \\*rang\\*: 1" in said
+    assert "changed break every. Reason: People were tired." in said
+    assert f"`{study.lock_hash}`" in said
+
+
+def test_a_blinded_study_gives_its_methods_alone(experimenter: TestClient, finished: Finished) -> None:
+    said = text_of(experimenter, finished(unblinded=False))
+    assert "# Methods" in said
+    assert "# Results" not in said
+    assert "unblinded, which has not happened yet" in said
+
+
+def test_a_study_of_the_papers_protocol_has_a_text_before_anybody_came(
+    experimenter: TestClient, database: Database
+) -> None:
+    with database.writing() as session:
+        study = studies.create_study(session, "The paper's", PAPER_PROTOCOL, seed=1)
+    said = text_of(experimenter, study)
+    assert "0 people were invited" in said
+    assert "the first 10 of them on whole trajectories" in said
+    assert "pre-trained policy" in said
+    assert "Results" not in said.replace("The results", "")
+
+
+def test_a_preregistration_answers_every_question_of_osf(
+    experimenter: TestClient, database: Database, store: ArtefactStore
+) -> None:
+    with database.writing() as session:
+        study = factories.make_study(
+            session,
+            arms=(Arm(name="own", methods=(EvaluatedMethod.PBARL,)), Arm(name="usual", methods=("reference",))),
+            arm_quota=12,
+            catch_pairs=4,
+            end_after_misses=3,
+            instruments=("tia",),
+            evaluation=EvaluationSettings(methods=("reference", "pbarl"), head_to_heads=0),
+            planned_tests=("welch_t",),
+        )
+        plan = power.ask(session, study, PowerInputs(), "Ada")
+        plan.contents = {"studies": 400, "enough": {"ratings": 30, "head_to_heads": None}}
+        locking.lock(session, study, study.slug, "Ada")
+    said = text_of(experimenter, study, "preregistration.md")
+    asked = re.findall(r"^### (.*)\n\n(.+)", said, re.MULTILINE)
+    assert tuple(question for question, _ in asked) == OSF_QUESTIONS
+    answers = dict(asked)
+    assert answers["Existing data"] == "Registration prior to creation of data."
+    assert answers["Sample size"] == "12 completions in each of 2 arms."
+    assert "80 % for ratings is reached from 30 people on" in answers["Sample size rationale"]
+    assert "misses 3 catch pairs is sent back" in answers["Stopping rule"]
+    assert "Hypotheses" in answers
+    assert "To be written by you" in answers["Hypotheses"]
+    assert "* own: PbARL\n* usual: pre-trained policy" in said
+    assert "* Welch t, between people" in said
+    assert f"`{study.lock_hash}`" in said
+
+
+def test_what_was_locked_is_preregistered_and_not_what_was_changed_since(
+    experimenter: TestClient, database: Database, store: ArtefactStore
+) -> None:
+    with database.writing() as session:
+        study = factories.make_study(session, repeated_pairs=2)
+        locking.lock(session, study, study.slug, "Ada")
+        settings = study.settings.model_copy(update={"repeated_pairs": 7})
+        study.stored_settings = settings.model_dump(mode="json")
+    assert "2 asked again" in text_of(experimenter, study, "preregistration.md")

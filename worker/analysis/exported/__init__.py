@@ -1,0 +1,1 @@
+"""Scripts for analysts; they know only files."""
