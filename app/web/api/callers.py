@@ -1,7 +1,9 @@
 """Who asks the API: told by a bearer token, never by a cookie, so no other site can ask in somebody's name."""
 
+from collections.abc import Callable, Mapping
+from functools import partial
 from http import HTTPStatus
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from fastapi import Depends, Request
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
@@ -14,12 +16,14 @@ from app.services import audit
 from app.services.accounts import api_tokens, failed_logins
 from app.services.accounts.api_tokens import ScopeTooNarrow, TokenInvalid
 from app.services.studies import membership, studies
+from app.web.http.authorized_route import AuthorizedRoute, Check
 from app.web.http.deps import (
     ReadingSession,
     SecondFactorNeeded,
     Studio,
     StudioDep,
     lacks_second_factor,
+    studio_of,
 )
 from app.web.http.security import SAFE_METHODS
 
@@ -76,18 +80,27 @@ def _whoever(
     return experimenter
 
 
-_Whoever = Annotated[Experimenter, Depends(_whoever, scope="function")]
+Whoever = Annotated[Experimenter, Depends(_whoever, scope="function")]
+"""Whose token it is, whatever it may do."""
 
 
-def _caller(request: Request, session: ReadingSession, experimenter: _Whoever) -> Experimenter:
+async def _needs(request: Request, needed: StudyRole) -> None:
+    """Whether whoever sends something may, in a look of its own (app.web.http.authorized_route)."""
+    studio, credentials = await studio_of(request), await bearer(request)
+    await studio.session_queue.look(
+        lambda session: _entering(request, session, _whoever(request, studio, session, credentials), needed)
+    )
+
+
+def _caller(request: Request, session: ReadingSession, experimenter: Whoever) -> Experimenter:
     return _entering(request, session, experimenter, StudyRole.VIEWER)
 
 
-def _acting_caller(request: Request, session: ReadingSession, experimenter: _Whoever) -> Experimenter:
+def _acting_caller(request: Request, session: ReadingSession, experimenter: Whoever) -> Experimenter:
     return _entering(request, session, experimenter, StudyRole.EDITOR)
 
 
-def _owning_caller(request: Request, session: ReadingSession, experimenter: _Whoever) -> Experimenter:
+def _owning_caller(request: Request, session: ReadingSession, experimenter: Whoever) -> Experimenter:
     return _entering(request, session, experimenter, StudyRole.OWNER)
 
 
@@ -99,6 +112,16 @@ def _entering(request: Request, session: Session, experimenter: Experimenter, ne
         if request.state.token.study_id not in (None, studies.find_study(session, slug).id):
             raise studies.StudyNotFound
     return experimenter
+
+
+class AuthorizedCall(AuthorizedRoute):
+    """A route of the API: a token says who is asking."""
+
+    checks: ClassVar[Mapping[Callable[..., object], Check]] = {
+        _caller: partial(_needs, needed=StudyRole.VIEWER),
+        _acting_caller: partial(_needs, needed=StudyRole.EDITOR),
+        _owning_caller: partial(_needs, needed=StudyRole.OWNER),
+    }
 
 
 Caller = Annotated[Experimenter, Depends(_caller, scope="function")]

@@ -12,6 +12,7 @@ from starlette.exceptions import HTTPException
 
 from app.db import complaints
 from app.errors import AppError, in_words
+from app.web.api.callers import Whoever
 from app.web.http.security import HEADERS
 
 MEDIA_TYPE = "application/problem+json"
@@ -24,8 +25,10 @@ class ParameterUnknown(AppError):
     status = HTTPStatus.UNPROCESSABLE_ENTITY
 
 
-async def only_known_parameters(request: Request) -> None:
+async def only_known_parameters(request: Request, _asking: Whoever) -> None:
     """A parameter that is ignored is an answer to another question than the one that was asked.
+
+    Told to nobody without a token.
 
     Raises ParameterUnknown, which names those that are known.
     """

@@ -1,14 +1,17 @@
 """What a route may ask for: settings, sessions on the database, and the person who is asking."""
 
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Callable, Coroutine, Mapping
 from dataclasses import dataclass, field
 from datetime import timedelta
+from functools import partial
 from http import HTTPStatus
 from threading import Event
-from typing import Annotated, TypeVar
+from typing import Annotated, Any, TypeVar
+from urllib.parse import parse_qsl
 
 from fastapi import Depends, Path, Request, Response
-from fastapi.concurrency import run_in_threadpool
+from fastapi.exceptions import RequestValidationError
+from pydantic import BaseModel, ValidationError
 from sqlalchemy.orm import Session
 
 from app.db import Database
@@ -31,6 +34,9 @@ from app.web.http.session_queue import SessionQueue
 from app.web.http.shared_pages import SharedPages
 
 T = TypeVar("T")
+F = TypeVar("F", bound=BaseModel)
+MOST_FIELDS = 100
+"""Of an answer; it has fewer than twenty."""
 PARTICIPANT_COOKIE = "studio_participant"
 EXPERIMENTER_COOKIE = "studio_experimenter"
 KNOWN_BROWSER_COOKIE = "studio_known_browser"
@@ -150,6 +156,27 @@ class Answering:
             lambda session: step(session, participant_asking(self.request, session, lock=True))
         )
 
+    async def act_on(self, form: type[F], step: Callable[[Session, Participant, F], T]) -> T:
+        """Like act(), with what was sent, where empty means left out.
+
+        Nothing is parsed before it is known who sent it, and no second look is needed to know it. Raises LinkNeeded
+        and RequestValidationError.
+        """
+        sent = await self.request.body()
+        is_form = self.request.headers.get("content-type", "").startswith("application/x-www-form-urlencoded")
+        return await self.act(lambda session, participant: step(session, participant, _form(form, sent * is_form)))
+
+
+def _form(form: type[F], sent: bytes) -> F:
+    try:
+        fields = parse_qsl(sent.decode(errors="replace"), max_num_fields=MOST_FIELDS)
+    except ValueError:
+        fields = []
+    try:
+        return form.model_validate(dict(fields))
+    except ValidationError as error:
+        raise RequestValidationError([{**each, "loc": ("body", *each["loc"])} for each in error.errors()]) from None
+
 
 def experimenter_asking(
     request: Request, session: Session, needed: StudyRole = StudyRole.VIEWER, account_needed: Role = Role.READER
@@ -214,19 +241,29 @@ def _administrator(request: Request, session: ReadingSession) -> Experimenter:
     return experimenter_asking(request, session, account_needed=Role.ADMINISTRATOR)
 
 
-async def _administrator_briefly(request: Request, studio: StudioDep) -> Experimenter:
-    async with studio.session_queue.reading() as session:
-        return await run_in_threadpool(_administrator, request, session)
+def experimenter_awaited(request: Request, session: Session) -> Experimenter:
+    """The experimenter whose password was right and whose code is still to come. Raises LoginNeeded."""
+    cookie = request.cookies.get(EXPERIMENTER_COOKIE)
+    account = browser_sessions.experimenter_of(session, cookie, second_factor_due=True) if cookie else None
+    if account is None:
+        raise LoginNeeded
+    return account
 
 
-async def _account_briefly(request: Request, studio: StudioDep) -> Experimenter:
-    async with studio.session_queue.reading() as session:
-        return await run_in_threadpool(experimenter_with_own_password, request, session)
+def _briefly(ask: Callable[[Request, Session], T]) -> Callable[[Request], Coroutine[Any, Any, T]]:
+    """Asks in a look of its own, so that no turn is held afterwards."""
+
+    async def look(request: Request) -> T:
+        studio = await studio_of(request)
+        return await studio.session_queue.look(partial(ask, request))
+
+    return look
 
 
-async def _logged_in_briefly(request: Request, studio: StudioDep) -> Experimenter:
-    async with studio.session_queue.reading() as session:
-        return await run_in_threadpool(experimenter_logged_in, request, session)
+_administrator_briefly = _briefly(_administrator)
+_account_briefly = _briefly(experimenter_with_own_password)
+_logged_in_briefly = _briefly(experimenter_logged_in)
+_awaited_briefly = _briefly(experimenter_awaited)
 
 
 def _acting_experimenter(request: Request, session: WritingSession) -> Experimenter:
@@ -260,16 +297,26 @@ AccountBriefly = Annotated[Experimenter, Depends(_account_briefly)]
 """Whoever is logged in with a password of their own, a second factor may be missing; no turn is held either."""
 LoggedInBriefly = Annotated[Experimenter, Depends(_logged_in_briefly)]
 """Whoever is logged in, a one-time password is enough; no turn is held either."""
+AwaitedBriefly = Annotated[Experimenter, Depends(_awaited_briefly)]
+"""Whoever has shown the password and must show a code; no turn is held either."""
 OwnAccount = Annotated[Experimenter, Depends(_own_account, scope="function")]
 """In the request's writing session, whatever their role: for what concerns nobody but themselves."""
 
+CHECKS: Mapping[Callable[..., object], Callable[[Request], Coroutine[Any, Any, object]]] = {
+    _participant: _briefly(participant_asking),
+    **{ask: _briefly(ask) for ask in (_experimenter, _administrator, _acting_experimenter, _study_owner, _own_account)},
+    **{ask: ask for ask in (_administrator_briefly, _account_briefly, _logged_in_briefly, _awaited_briefly)},
+}
+"""What is asked of whoever sends something, by dependency, before it is read (app.web.http.authorized_route)."""
 
-async def _typed(request: Request) -> Mapping[str, str]:
+
+async def read_typed(request: Request) -> Mapping[str, str]:
+    """A form's fields, files left out."""
     async with request.form() as form:  # files that somebody sends along are closed again
         return {name: value for name, value in form.items() if isinstance(value, str)}
 
 
-Typed = Annotated[Mapping[str, str], Depends(_typed)]
+Typed = Annotated[Mapping[str, str], Depends(read_typed)]
 """A form's fields as they were typed, where which there are depends on the study."""
 RowId = Annotated[int, Path(ge=1, le=2**31 - 1)]
 Slug = Annotated[str, Path(pattern=r"^[a-z0-9-]{1,80}$")]

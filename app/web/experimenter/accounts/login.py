@@ -15,6 +15,7 @@ from app.domain.people import Experimenter
 from app.errors import AppError
 from app.services import audit
 from app.services.accounts import accounts, browser_sessions, failed_logins, known_browsers, second_factor
+from app.web.http.authorized_route import AuthorizedRoute
 from app.web.http.deps import (
     EXPERIMENTER_COOKIE,
     KNOWN_BROWSER_COOKIE,
@@ -26,7 +27,7 @@ from app.web.http.deps import (
 )
 from app.web.texts.templating import page
 
-router = APIRouter()
+router = APIRouter(route_class=AuthorizedRoute)
 
 TIME_FOR_CODE = timedelta(minutes=10)
 Password = Annotated[str, Form(max_length=accounts.MAX_PASSWORD_LENGTH)]

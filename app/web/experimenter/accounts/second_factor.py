@@ -9,42 +9,43 @@ from fastapi import APIRouter, Form, Query, Request
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import RedirectResponse, Response
 from markupsafe import Markup
-from sqlalchemy.orm import Session
 from starlette.background import BackgroundTask
 
 from app.domain.people import Experimenter
 from app.errors import AppError
 from app.services.accounts import accounts, browser_sessions, second_factor
 from app.web.experimenter.accounts.login import Password, TooManyAttempts, count_attempt, enter, inside, note_failure
+from app.web.http.authorized_route import AuthorizedRoute
 from app.web.http.deps import (
     EXPERIMENTER_COOKIE,
     AccountBriefly,
-    LoginNeeded,
+    AwaitedBriefly,
     ReadingSession,
     Studio,
     StudioDep,
 )
 from app.web.texts.templating import page
 
-router = APIRouter()
+router = APIRouter(route_class=AuthorizedRoute)
 
 Code = Annotated[str, Form(max_length=60)]
 
 
 @router.get("/login/code", name="show_code")
-def show_code(request: Request, session: ReadingSession, next: Annotated[str, Query(max_length=300)] = "") -> Response:
-    """The form for the code, for whoever has shown the password. Raises LoginNeeded."""
-    _awaited(request, session)
+def show_code(request: Request, _account: AwaitedBriefly, next: Annotated[str, Query(max_length=300)] = "") -> Response:
+    """The form for the code, for whoever has shown the password."""
     return page(request, "experimenter/login_code.html", {"next": inside(next), "error": None})
 
 
 @router.post("/login/code", name="enter_code")
 async def enter_code(
-    request: Request, studio: StudioDep, code: Code, next: Annotated[str, Form(max_length=300)] = ""
+    request: Request,
+    studio: StudioDep,
+    account: AwaitedBriefly,
+    code: Code,
+    next: Annotated[str, Form(max_length=300)] = "",
 ) -> Response:
-    """Exchange the session that waits for the code for a whole one. Raises LoginNeeded."""
-    async with studio.session_queue.reading() as session:
-        account = await run_in_threadpool(_awaited, request, session)
+    """Exchange the session that waits for the code for a whole one."""
     try:
         shown = await _shown(request, studio, account, code)
     except AppError as error:
@@ -121,15 +122,6 @@ class _WrongPassword(AppError):
     """The password is not right."""
 
     status = HTTPStatus.UNPROCESSABLE_ENTITY
-
-
-def _awaited(request: Request, session: Session) -> Experimenter:
-    """Whose password was right in this browser, and whose code is still to come. Raises LoginNeeded."""
-    cookie = request.cookies.get(EXPERIMENTER_COOKIE, "")
-    account = browser_sessions.experimenter_of(session, cookie, second_factor_due=True)
-    if account is None:
-        raise LoginNeeded
-    return account
 
 
 async def _shown(request: Request, studio: Studio, account: Experimenter, code: str) -> str:
