@@ -11,8 +11,8 @@ from sqlalchemy.exc import DatabaseError, OperationalError
 from starlette.exceptions import HTTPException
 
 from app.db import complaints
-from app.errors import AppError, in_words
-from app.web.http import request_log
+from app.errors import AppError, Refused, in_words
+from app.web.http import refusals, request_log
 from app.web.http.deps import (
     EXPERIMENTER_COOKIE,
     PARTICIPANT_COOKIE,
@@ -61,6 +61,11 @@ def add_error_pages(app: FastAPI) -> None:
 
     @app.exception_handler(AppError)
     def ours(request: Request, error: AppError) -> Response:
+        return error_page(request, error)
+
+    @app.exception_handler(Refused)
+    def refused(request: Request, error: Refused) -> Response:
+        refusals.note(request)
         return error_page(request, error)
 
     @app.exception_handler(LoginNeeded)

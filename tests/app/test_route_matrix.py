@@ -7,7 +7,7 @@ whoever is let in is mostly told that something is missing; that is enough to kn
 import asyncio
 import re
 from collections.abc import Callable, Coroutine, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import timedelta
 
 import pytest
@@ -19,7 +19,9 @@ from sqlalchemy import func, select
 
 from app.db import Base, Database
 from app.domain.people import AuditEvent, Experimenter, Role, StudyRole, TokenScope
+from app.main import serve
 from app.services.accounts import api_tokens, browser_sessions
+from app.services.accounts.hourly_counts import HourlyCounts
 from app.services.studies import membership
 from app.storage import ArtefactStore
 from tests import factories
@@ -349,6 +351,48 @@ async def _received(
     scope |= {"headers": [(name.lower(), value) for name, value in headers], "http_version": "1.1", "scheme": "http"}
     await application({**scope, "client": ("testclient", 1)}, receive, send)
     return received
+
+
+ACCOUNT_OF = {READS: OWNER, WRITES: OWNER, ELSEWHERE: OWNER, VIEWERS: VIEWER, OTHERS: OTHER_OWNER, ADMINS: ADMIN}
+
+
+def test_whatever_is_refused_to_somebody_known_is_in_the_audit_log(gate: Gate, studio_app: FastAPI) -> None:
+    refused = [
+        (route, visitor)
+        for route in ROUTES
+        for visitor in sorted({*MATRIX[route.name].forbidden, *MATRIX[route.name].hidden})
+        if MATRIX[route.name] not in (CLIP, OPERATOR, OWN_PAIR)
+    ]
+    for route, visitor in refused:
+        serve(studio_app, replace(studio_app.state.studio, refusals=HourlyCounts()))  # nothing was refused yet
+        gate.ask(route, visitor)
+        with gate.database.reading() as session:
+            newest = session.scalars(select(AuditEvent).order_by(AuditEvent.id.desc()).limit(1)).one()
+        told = newest.actor, newest.action, newest.subject
+        what = f"{route.method} {route.path.replace('{slug}', gate.values['slug'])}"
+        assert told == (ACCOUNT_OF.get(visitor, visitor), "access refused", what)
+        assert (newest.study_id is not None) is ("{slug}" in route.path)
+
+
+def test_who_is_refused_again_and_again_fills_no_disk(gate: Gate) -> None:
+    route = next(each for each in ROUTES if each.name == "delete_study")
+    for _ in range(100):
+        gate.ask(route, VIEWER)
+    gate.ask(route, EDITOR)
+    with gate.database.reading() as session:
+        rows = session.scalars(select(AuditEvent).where(AuditEvent.action == "access refused")).all()
+    assert [(row.actor, (row.subject or "").rpartition(" (")[2]) for row in rows] == [
+        (VIEWER, rows[0].subject),
+        (VIEWER, "10 times within an hour)"),
+        (VIEWER, "100 times within an hour)"),
+        (EDITOR, rows[3].subject),
+    ]
+
+
+def test_a_study_that_there_is_not_is_no_refusal(gate: Gate) -> None:
+    assert gate.visitors[OTHER_OWNER].get("/studies/nothing-of-this-name").status_code == 404
+    with gate.database.reading() as session:
+        assert "access refused" not in session.scalars(select(AuditEvent.action)).all()
 
 
 def test_a_wrong_parameter_is_told_to_nobody_without_a_token(gate: Gate) -> None:

@@ -13,7 +13,7 @@ from app.domain.people import Experimenter, StudyRole, TokenScope
 from app.domain.studies import Participant, Study
 from app.errors import AppError
 from app.services import audit
-from app.services.accounts import api_tokens, failed_logins
+from app.services.accounts import api_tokens, hourly_counts
 from app.services.accounts.api_tokens import ScopeTooNarrow, TokenInvalid
 from app.services.studies import membership, studies
 from app.web.http.authorized_route import AuthorizedRoute, Check
@@ -60,15 +60,16 @@ def _whoever(
     try:
         token, experimenter = api_tokens.find(session, credentials.credentials)
     except TokenInvalid:
-        count = studio.failed_logins.count(failed_logins.WRONG_TOKEN)
+        count = studio.failed_logins.count(hourly_counts.WRONG_TOKEN)
         if count is not None:
             with studio.database.writing() as writing:
-                subject = failed_logins.in_words(failed_logins.WRONG_TOKEN, count)
+                subject = hourly_counts.in_words(hourly_counts.WRONG_TOKEN, count)
                 audit.record(writing, audit.STRANGER, "login failed", subject)
         address = request.client.host if request.client else "unknown"
         if not studio.token_attempts.allow(address):
             raise TooManyWrongTokens from None
         raise
+    request.state.asking = experimenter.name
     if lacks_second_factor(studio.settings, experimenter):
         raise SecondFactorNeeded
     if token.scope == TokenScope.READ and request.method not in SAFE_METHODS:
@@ -110,7 +111,7 @@ def _entering(request: Request, session: Session, experimenter: Experimenter, ne
     if slug is not None:
         membership.enter(session, experimenter, slug, needed)
         if request.state.token.study_id not in (None, studies.find_study(session, slug).id):
-            raise studies.StudyNotFound
+            raise membership.OthersStudy
     return experimenter
 
 

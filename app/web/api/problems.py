@@ -11,8 +11,9 @@ from sqlalchemy.exc import DatabaseError, OperationalError
 from starlette.exceptions import HTTPException
 
 from app.db import complaints
-from app.errors import AppError, in_words
+from app.errors import AppError, Refused, in_words
 from app.web.api.callers import Whoever
+from app.web.http import refusals
 from app.web.http.security import HEADERS
 
 MEDIA_TYPE = "application/problem+json"
@@ -47,6 +48,11 @@ def add_problems(api: FastAPI) -> None:
 
     @api.exception_handler(AppError)
     def ours(_request: Request, error: AppError) -> Response:
+        return problem(error.status, error.message)
+
+    @api.exception_handler(Refused)
+    def refused(request: Request, error: Refused) -> Response:
+        refusals.note(request)
         return problem(error.status, error.message)
 
     @api.exception_handler(HTTPException)

@@ -19,7 +19,7 @@ from app.domain.people import Experimenter, Role, StudyRole
 from app.domain.studies import Participant
 from app.errors import AppError
 from app.services.accounts import browser_sessions, roles, second_factor
-from app.services.accounts.failed_logins import FailedLogins
+from app.services.accounts.hourly_counts import HourlyCounts
 from app.services.accounts.openid import Provider
 from app.services.monitoring.tallies import Tallies
 from app.services.participants.time_left import UsualTimes
@@ -93,7 +93,8 @@ class Studio:
     hashing_for_known: Hashing = field(default_factory=Hashing)
     """For people whose browser is known or who are logged in: they do not queue behind strangers who guess."""
     imports: ImportLimit = field(default_factory=ImportLimit)
-    failed_logins: FailedLogins = field(default_factory=FailedLogins)
+    failed_logins: HourlyCounts = field(default_factory=HourlyCounts)
+    refusals: HourlyCounts = field(default_factory=HourlyCounts)
     tallies: Tallies = field(default_factory=Tallies)
     usual_times: UsualTimes = field(default_factory=UsualTimes)
     closing: Event = field(default_factory=Event)
@@ -220,6 +221,7 @@ def experimenter_logged_in(request: Request, session: Session) -> Experimenter:
     experimenter = browser_sessions.experimenter_of(session, cookie) if cookie else None
     if experimenter is None:
         raise LoginNeeded
+    request.state.asking = experimenter.name
     return experimenter
 
 

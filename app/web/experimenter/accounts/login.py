@@ -14,7 +14,7 @@ from starlette.background import BackgroundTask
 from app.domain.people import Experimenter
 from app.errors import AppError
 from app.services import audit
-from app.services.accounts import accounts, browser_sessions, failed_logins, known_browsers, second_factor
+from app.services.accounts import accounts, browser_sessions, hourly_counts, known_browsers, second_factor
 from app.web.http.authorized_route import AuthorizedRoute
 from app.web.http.deps import (
     EXPERIMENTER_COOKIE,
@@ -134,11 +134,11 @@ async def note_failure(studio: Studio, name: str) -> None:
     """For the audit log; never what was typed, unless an account has that name."""
     async with studio.session_queue.reading() as session:
         account = await run_in_threadpool(accounts.by_name, session, name)
-    known = failed_logins.UNKNOWN_NAME if account is None else account.name
+    known = hourly_counts.UNKNOWN_NAME if account is None else account.name
     count = studio.failed_logins.count(known)
     if count is not None:
         async with studio.session_queue.writing() as session:
-            subject = failed_logins.in_words(known, count)
+            subject = hourly_counts.in_words(known, count)
             await run_in_threadpool(audit.record, session, audit.STRANGER, "login failed", subject)
 
 
