@@ -17,6 +17,7 @@ from app.web.http.deps import (
     EXPERIMENTER_COOKIE,
     PARTICIPANT_COOKIE,
     LoginNeeded,
+    NotSaved,
     NotYet,
     PasswordChangeDue,
     SecondFactorNeeded,
@@ -70,6 +71,8 @@ def add_error_pages(app: FastAPI) -> None:
 
     @app.exception_handler(LoginNeeded)
     def login_needed(request: Request, error: LoginNeeded) -> Response:
+        if request.method != "GET":
+            error = NotSaved() if EXPERIMENTER_COOKIE in request.cookies else error
         if wants_json(request) or request.method != "GET":
             return error_page(request, error)
         target = request.app.url_path_for("show_login")

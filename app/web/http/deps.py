@@ -40,6 +40,8 @@ MOST_FIELDS = 100
 PARTICIPANT_COOKIE = "studio_participant"
 EXPERIMENTER_COOKIE = "studio_experimenter"
 KNOWN_BROWSER_COOKIE = "studio_known_browser"
+UNATTENDED = "x-unattended"
+"""Header of requests that a page makes by itself, without anybody doing anything."""
 LANGUAGE_COOKIE = "studio_language"
 """The language of the pages in this browser, for those that cannot tell who is asking."""
 
@@ -60,6 +62,10 @@ class LoginNeeded(AppError):
     """Please log in."""
 
     status = HTTPStatus.UNAUTHORIZED
+
+
+class NotSaved(LoginNeeded):
+    """You are logged out, so this was not saved. Go back, log in in another tab, and send what you typed again."""
 
 
 class PasswordChangeDue(AppError):
@@ -218,10 +224,13 @@ def experimenter_with_own_password(request: Request, session: Session) -> Experi
 def experimenter_logged_in(request: Request, session: Session) -> Experimenter:
     """The experimenter who is logged in, perhaps with a one-time password. Raises LoginNeeded."""
     cookie = request.cookies.get(EXPERIMENTER_COOKIE)
-    experimenter = browser_sessions.experimenter_of(session, cookie) if cookie else None
-    if experimenter is None:
+    found = browser_sessions.login_of(session, cookie) if cookie else None
+    if found is None:
         raise LoginNeeded
+    experimenter, login = found
+    settings: Settings = request.app.state.studio.settings
     request.state.asking = experimenter.name
+    request.state.login_lasts_until = browser_sessions.lasts_until(login, settings.login_idle, settings.login_whole)
     return experimenter
 
 
@@ -304,6 +313,11 @@ AwaitedBriefly = Annotated[Experimenter, Depends(_awaited_briefly)]
 OwnAccount = Annotated[Experimenter, Depends(_own_account, scope="function")]
 """In the request's writing session, whatever their role: for what concerns nobody but themselves."""
 
+EXPERIMENTERS = {
+    *(_experimenter, _administrator, _acting_experimenter, _study_owner, _own_account),
+    *(_administrator_briefly, _account_briefly, _logged_in_briefly),
+}
+"""Dependencies of pages and forms that an experimenter opens or sends; streams and films come by themselves."""
 CHECKS: Mapping[Callable[..., object], Callable[[Request], Coroutine[Any, Any, object]]] = {
     _participant: _briefly(participant_asking),
     **{ask: _briefly(ask) for ask in (_experimenter, _administrator, _acting_experimenter, _study_owner, _own_account)},

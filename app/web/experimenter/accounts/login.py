@@ -167,12 +167,12 @@ async def enter(request: Request, studio: Studio, experimenter: Experimenter, ta
 
     Raises WrongNameOrPassword when the password was replaced while it was being checked.
     """
-    lifetime = timedelta(hours=studio.settings.login_hours)
+    lifetime = min(studio.settings.login_idle, studio.settings.login_whole)
     user_agent = request.headers.get("user-agent", "")
     async with studio.session_queue.writing() as session:
         cookie = await run_in_threadpool(_open_session, session, experimenter, lifetime, act, user_agent)
     response = RedirectResponse(target or request.app.url_path_for("show_studies"), HTTPStatus.SEE_OTHER)
-    set_cookie(response, studio.settings, EXPERIMENTER_COOKIE, cookie, lifetime)
+    set_cookie(response, studio.settings, EXPERIMENTER_COOKIE, cookie, studio.settings.login_whole)
     mark = known_browsers.new_mark(experimenter)
     set_cookie(response, studio.settings, KNOWN_BROWSER_COOKIE, mark, known_browsers.LIFETIME)
     return response
