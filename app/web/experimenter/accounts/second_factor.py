@@ -78,7 +78,7 @@ async def begin_second_factor(
         response.background = BackgroundTask(note_failure, studio, account.name)
         return response
     async with studio.session_queue.writing() as session:
-        secret = await run_in_threadpool(second_factor.begin, session, account)
+        secret = await run_in_threadpool(second_factor.begin, session, account, _key(studio))
     return _page(request, account, secret=secret)
 
 
@@ -88,9 +88,9 @@ async def confirm_second_factor(request: Request, studio: StudioDep, account: Ac
     try:
         await count_attempt(request, studio, account.name, browser=f"logged in/{account.id}")
         async with studio.session_queue.writing() as session:
-            codes = await run_in_threadpool(second_factor.confirm, session, account, code)
+            codes = await run_in_threadpool(second_factor.confirm, session, account, code, _key(studio))
     except (second_factor.CodeWrong, TooManyAttempts) as error:
-        return _page(request, account, secret=account.totp_secret, error=error)
+        return _page(request, account, secret=second_factor.secret_of(account, _key(studio)), error=error)
     return _page(request, account, codes=codes)
 
 
@@ -118,6 +118,10 @@ async def turn_off_second_factor(request: Request, studio: StudioDep, account: A
     return RedirectResponse(request.app.url_path_for("show_second_factor"), HTTPStatus.SEE_OTHER)
 
 
+def _key(studio: Studio) -> bytes:
+    return second_factor.key_of(studio.settings)
+
+
 class _WrongPassword(AppError):
     """The password is not right."""
 
@@ -128,7 +132,7 @@ async def _shown(request: Request, studio: Studio, account: Experimenter, code: 
     """What was shown, in words. Raises CodeWrong, TooManyWrongCodes and TooManyAttempts."""
     await count_attempt(request, studio, account.name, browser=f"code/{account.id}")
     async with studio.session_queue.writing() as session:
-        shown = await run_in_threadpool(second_factor.passes, session, account, code)
+        shown = await run_in_threadpool(second_factor.passes, session, account, code, _key(studio))
     if shown is None:  # after the commit: a mistake counts
         raise second_factor.CodeWrong
     return shown
