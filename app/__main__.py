@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
-from app import audit_commands, data_directory, deploy_check, logs, signing, upgrading
+from app import data_directory, logs, signing, upgrading
+from app.commands import audit_commands, deploy_check
 from app.db import Database, now
 from app.domain.studies import Study
 from app.errors import EXPLAINED, AppError, in_words

@@ -14,9 +14,8 @@ from alembic.script import ScriptDirectory
 from sqlalchemy import create_engine, inspect, text
 from sqlalchemy.exc import DatabaseError, OperationalError
 
-from app import sqlite
 from app.data_directory import require_whole
-from app.db import now
+from app.db import now, sqlite
 from app.errors import AppError, in_words
 from app.files.lost import ARTEFACTS
 from app.paths import MIGRATIONS

@@ -10,6 +10,7 @@ from uuid import uuid4
 
 import pytest
 import uvicorn
+from anyio.from_thread import BlockingPortal, start_blocking_portal
 from argon2 import PasswordHasher
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
@@ -30,6 +31,8 @@ from app.settings import Settings
 from app.storage import ArtefactStore
 from tests import buckets, databases
 from tests.databases import make_tables
+
+databases.share_compiled_statements()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -111,10 +114,23 @@ def store(studio_app: FastAPI) -> ArtefactStore:
     return store
 
 
+@pytest.fixture(scope="session")
+def event_loop_thread() -> Iterator[BlockingPortal]:
+    """Where requests are answered: one thread for all tests, for each request would start its own otherwise."""
+    with start_blocking_portal() as portal:
+        yield portal
+
+
 @pytest.fixture
-def new_browser(studio_app: FastAPI, database: Database) -> Callable[[], TestClient]:
+def new_browser(studio_app: FastAPI, database: Database, event_loop_thread: BlockingPortal) -> Callable[[], TestClient]:
     """Makes browsers without cookies; none follows redirects by itself."""
-    return lambda: TestClient(studio_app, follow_redirects=False)
+
+    def browser() -> TestClient:
+        made = TestClient(studio_app, follow_redirects=False)
+        made.portal = event_loop_thread
+        return made
+
+    return browser
 
 
 @pytest.fixture

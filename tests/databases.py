@@ -13,10 +13,11 @@ from typing import Any
 from uuid import uuid4
 
 import psycopg
-from sqlalchemy import Connection, Pool, create_engine, event, make_url, text
+from sqlalchemy import Connection, Dialect, Engine, Pool, create_engine, event, make_url, text
+from sqlalchemy.util import LRUCache
 
-from app import sqlite, upgrading
-from app.db import Base, Database
+from app import upgrading
+from app.db import Base, Database, sqlite
 from app.settings import Settings
 
 SERVER = os.environ.get("TEST_DATABASE_URL")
@@ -30,6 +31,24 @@ def _empty() -> bytes:
         Base.metadata.create_all(database.writer)
         database.dispose()
         return path.read_bytes()
+
+
+def share_compiled_statements() -> None:
+    """One dialect and one cache for all SQLite engines of this process, as if they were the one that a server has.
+
+    Each test has engines of its own, and would spend a quarter of its time on compiling the same statements anew.
+    """
+    make, cache = sqlite.engine, LRUCache[Any, Any](2000)
+    dialect: Dialect | None = None
+
+    def sharing(url: str, patience_s: float, *, writes: bool, log_pages: int) -> Engine:
+        nonlocal dialect
+        engine = make(url, patience_s, writes=writes, log_pages=log_pages)
+        engine.dialect = dialect = dialect or engine.dialect
+        engine.update_execution_options(compiled_cache=cache)
+        return engine
+
+    sqlite.engine = sharing
 
 
 def make_tables(database: Database) -> None:

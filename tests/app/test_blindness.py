@@ -29,8 +29,8 @@ from app.services.exports import export_tables
 from app.storage import ArtefactStore
 from tests import factories
 from tests.finished_study import make_finished_study
-from worker.analysis import figures
-from worker.analysis.report import make_report
+from worker.analysis.study import figures
+from worker.analysis.study.report import make_report
 from worker.compute.pools import Compute
 from worker.jobs.publishing import export_files, preference_arrays, report_files
 from worker.jobs.runtime.context import WorkerContext

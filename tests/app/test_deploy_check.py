@@ -11,7 +11,8 @@ from alembic.config import Config
 from sqlalchemy import text
 
 from app import __main__ as program
-from app import deploy_check, signing
+from app import signing
+from app.commands import deploy_check
 from app.db import Database, now
 from app.domain.people import ApiToken, Experimenter
 from app.paths import MIGRATIONS

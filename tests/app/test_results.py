@@ -23,8 +23,8 @@ from app.services.studies import locking
 from app.storage import ArtefactStore
 from tests import factories
 from tests.finished_study import make_finished_study
-from worker.analysis.report import make_report
-from worker.analysis.statistics import MEASURED_ERROR_PERCENT
+from worker.analysis.study.report import make_report
+from worker.analysis.study.statistics import MEASURED_ERROR_PERCENT
 from worker.jobs.publishing import report_files
 
 Finished = Callable[..., Study]
@@ -33,7 +33,7 @@ Finished = Callable[..., Study]
 @pytest.fixture
 def finished(database: Database, store: ArtefactStore, monkeypatch: pytest.MonkeyPatch) -> Finished:
     """Makes a finished study with the report that the worker would make, without pictures but one."""
-    monkeypatch.setattr("worker.analysis.figures.all_figures", lambda _contents: {})
+    monkeypatch.setattr("worker.analysis.study.figures.all_figures", lambda _contents: {})
 
     def make(people: int = 3, *, unblinded: bool = True, locked: bool = False) -> Study:
         with database.writing() as session:

@@ -21,7 +21,7 @@ from app.storage import ArtefactStore
 from tests import factories
 from tests.app.conftest import JSON
 from tests.finished_study import make_finished_study
-from worker.analysis.scales import scale_reports
+from worker.analysis.study.scales import scale_reports
 from worker.jobs.publishing import report_files
 
 ENGLISH = (Language.ENGLISH,)

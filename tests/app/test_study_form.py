@@ -126,8 +126,13 @@ def test_a_complaint_stands_beside_its_field_and_opens_its_group(
 def test_several_questionnaires_are_ticked_and_kept(experimenter: TestClient, database: Database) -> None:
     page = experimenter.get("/studies/new").text
     assert re.findall(r'type="(\w+)" name="(?:evaluation_)?instruments" value="sus"', page) == ["checkbox"] * 2
-    chosen = {"languages": ["en"], "instruments": ["sus", "nasa_tlx"], "evaluation_instruments": ["rosas_sf"]}
-    form = typed(experimenter, evaluation="yes", **chosen)
+    form = typed(
+        experimenter,
+        languages=["en"],
+        instruments=["sus", "nasa_tlx"],
+        evaluation="yes",
+        evaluation_instruments=["rosas_sf"],
+    )
     assert experimenter.post("/studies/new", data=form).status_code == 303
     settings = only_study(database).settings
     assert settings.instruments == ("sus", "nasa_tlx")

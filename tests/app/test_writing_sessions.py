@@ -6,8 +6,7 @@ import pytest
 from sqlalchemy import select, text
 from sqlalchemy.exc import OperationalError
 
-from app import sqlite
-from app.db import Database
+from app.db import Database, sqlite
 from app.settings import Settings
 from tests import databases
 

@@ -18,8 +18,8 @@ from app.services.evaluation import unblinding
 from app.services.participants import time_left
 from app.services.studies import preregistration
 from app.web.experimenter import results
-from worker.analysis import between, figures, hypothesis_tests, statistics
-from worker.analysis.promise import Promise
+from worker.analysis.filters.promise import Promise
+from worker.analysis.study import between, figures, hypothesis_tests, statistics
 from worker.domain import responses
 from worker.domain.spaces import CONTROL_STEP_S
 from worker.experiments import benchmark_cell, rollout_cache

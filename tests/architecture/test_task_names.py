@@ -18,7 +18,7 @@ ELSEWHERE = {
     "app/paths.py": "its file",
     "app/installed_tasks/entry_points.txt": "declares them",
     "worker/rehearsal/demo_study.py": "makes it",
-    "worker/analysis/published.py": "the numbers that the paper prints, by its names of tasks",
+    "worker/analysis/comparison/published.py": "the numbers that the paper prints, by its names of tasks",
 }
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from app.domain.protocol import EvaluatedMethod, EvaluationSettings
 from app.domain.study_settings import StudySettings
 from app.services.participants.arms import Load, choose, is_open
-from worker.analysis import result_pages
+from worker.analysis.comparison import result_pages
 
 RESULTS = Path("docs/results")
 DROPOUTS, AT_ONCE, ARMS, QUOTA = (0.1, 0.3, 0.5), (0.0, 2.0, 10.0, 50.0), (2, 4), 100

@@ -16,10 +16,10 @@ import numpy as np
 import pandas as pd
 
 from app.services.evaluation.evaluation_plan import williams_rows
-from worker.analysis import result_pages
-from worker.analysis.between import permutation, welch_t
-from worker.analysis.hypothesis_tests import two_sample_t
-from worker.analysis.order_effects import order_report
+from worker.analysis.comparison import result_pages
+from worker.analysis.study.between import permutation, welch_t
+from worker.analysis.study.hypothesis_tests import two_sample_t
+from worker.analysis.study.order_effects import order_report
 from worker.domain.type_aliases import FloatArray
 
 RESULTS = Path("docs/results")

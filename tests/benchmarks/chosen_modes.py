@@ -27,7 +27,7 @@ import torch
 from tqdm import tqdm
 
 from app.installed_tasks import catalogue
-from worker.analysis import result_pages
+from worker.analysis.comparison import result_pages
 from worker.compute import simulation
 from worker.compute.pools import Compute, Lane
 from worker.compute.simulation import surface_file

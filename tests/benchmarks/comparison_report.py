@@ -8,7 +8,7 @@
 import argparse
 from pathlib import Path
 
-from worker.analysis import comparison_page
+from worker.analysis.comparison import comparison_page
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)

@@ -20,9 +20,9 @@ import numpy.typing as npt
 from tqdm import tqdm
 
 from tests.benchmarks import error_rates_of_intervals
-from worker.analysis import result_pages
-from worker.analysis.effect_sizes import holm
-from worker.analysis.hypothesis_tests import TESTS, mixed_model, paired_t, two_sample_t, wilcoxon
+from worker.analysis.comparison import result_pages
+from worker.analysis.study.effect_sizes import holm
+from worker.analysis.study.hypothesis_tests import TESTS, mixed_model, paired_t, two_sample_t, wilcoxon
 from worker.domain.type_aliases import FloatArray
 
 Cells = list[list[FloatArray]]

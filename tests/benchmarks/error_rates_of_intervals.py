@@ -9,10 +9,10 @@ import numpy as np
 from app.domain.preferences import Purpose, Response
 from app.services.answers import accuracy, consistency
 from app.services.answers.consistency import JudgedAnswer
-from worker.analysis.agreement import wilson_interval
-from worker.analysis.effect_sizes import d_z_interval, rank_biserial, rank_biserial_interval
-from worker.analysis.evaluation import mean_change, success_change
-from worker.analysis.statistics import mean_interval
+from worker.analysis.filters.evaluation import mean_change, success_change
+from worker.analysis.study.effect_sizes import d_z_interval, rank_biserial, rank_biserial_interval
+from worker.analysis.study.statistics import mean_interval
+from worker.analysis.wilson import wilson_interval
 
 Bounds = tuple[float | None, float | None]
 Row = dict[str, Any]

@@ -17,8 +17,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from app.installed_tasks import catalogue
-from worker.analysis import result_pages
-from worker.analysis.figures import LINE_COLOURS, MARKERS, STYLE, rendered
+from worker.analysis.comparison import result_pages
+from worker.analysis.study.figures import LINE_COLOURS, MARKERS, STYLE, rendered
 
 Row = dict[str, Any]
 

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from worker.analysis import result_pages
-from worker.analysis.bradley_terry import covariance, strengths, why_not
-from worker.analysis.effect_sizes import holm
+from worker.analysis.comparison import result_pages
+from worker.analysis.study.bradley_terry import covariance, strengths, why_not
+from worker.analysis.study.effect_sizes import holm
 from worker.domain.type_aliases import FloatArray
 
 RESULTS = Path("docs/results")

@@ -20,10 +20,10 @@ import torch
 from tqdm import tqdm
 
 from app.installed_tasks import catalogue
-from worker.analysis import result_pages
-from worker.analysis.comparison import Row
-from worker.analysis.evaluation import success_change
-from worker.analysis.table_files import to_csv
+from worker.analysis.comparison import result_pages
+from worker.analysis.comparison.comparison_rows import Row
+from worker.analysis.comparison.table_files import to_csv
+from worker.analysis.filters.evaluation import success_change
 from worker.compute import learning
 from worker.domain.scenarios import EVALUATION, RESIDUAL, first_of
 from worker.domain.trajectory import Trajectory

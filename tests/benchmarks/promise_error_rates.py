@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from worker.analysis import result_pages
-from worker.analysis.promise import Outcome, Promise
+from worker.analysis.comparison import result_pages
+from worker.analysis.filters.promise import Outcome, Promise
 from worker.compute import harm_tests
 from worker.ml.filters.filter_module import FilterWeights
 from worker.ml.filters.filter_problem import FilterConfig, FilterDraft

@@ -24,8 +24,8 @@ from tqdm import tqdm
 from app.domain.study_settings import StudySettings
 from app.installed_tasks import catalogue
 from tests.worker.at_hand import AtHand
-from worker.analysis import result_pages
-from worker.analysis.promise import HARMS, Promise, harms, outcome_of
+from worker.analysis.comparison import result_pages
+from worker.analysis.filters.promise import HARMS, Promise, harms, outcome_of
 from worker.compute import filter_fitting, learning, simulation
 from worker.compute.filter_fitting import FilterFit, moves_nothing
 from worker.domain.scenarios import PROMISE_TEST, first_of

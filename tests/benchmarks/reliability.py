@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from worker.analysis import result_pages
-from worker.analysis.reliability import alpha, reliability_report
+from worker.analysis.comparison import result_pages
+from worker.analysis.study.reliability import alpha, reliability_report
 from worker.domain.type_aliases import FloatArray
 
 RESULTS = Path("docs/results")

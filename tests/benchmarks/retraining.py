@@ -22,8 +22,8 @@ from tqdm import tqdm
 
 from app.domain.study_settings import StudySettings
 from app.installed_tasks import catalogue
-from worker.analysis import result_pages
-from worker.analysis.promise import Outcome
+from worker.analysis.comparison import result_pages
+from worker.analysis.filters.promise import Outcome
 from worker.compute import learning
 from worker.compute.filter_fitting import FilterFit
 from worker.compute.pools import Compute, Lane

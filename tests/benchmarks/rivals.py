@@ -21,7 +21,7 @@ from tqdm import tqdm
 
 from app.installed_tasks import catalogue
 from tests.benchmarks import rivals_report
-from worker.analysis import result_pages
+from worker.analysis.comparison import result_pages
 from worker.commands import options as spoken
 from worker.domain.type_aliases import FloatArray
 from worker.experiments import benchmark_cell

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from worker.analysis import aggregate, result_pages
-from worker.analysis.table_files import to_csv
+from worker.analysis.comparison import aggregate, result_pages
+from worker.analysis.comparison.table_files import to_csv
 from worker.domain.type_aliases import FloatArray
 
 TITLE = "# How often do the intervals of the table of rivals miss?"

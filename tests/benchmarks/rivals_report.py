@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from worker.analysis.aggregate import (
+from worker.analysis.comparison.aggregate import (
     Estimate,
     compare,
     difference,
@@ -17,7 +17,7 @@ from worker.analysis.aggregate import (
     probability_of_improvement,
     profile,
 )
-from worker.analysis.evaluation import mean_change, success_change
+from worker.analysis.filters.evaluation import mean_change, success_change
 from worker.domain.type_aliases import FloatArray
 
 TITLE = "# Is the default better than rivals of today?"

@@ -13,8 +13,8 @@ from app.storage import ArtefactStore
 from tests import factories
 from tests.browser.conftest import NewPage, serious_findings
 from tests.finished_study import make_finished_study
-from worker.analysis import figures
-from worker.analysis.report import make_report
+from worker.analysis.study import figures
+from worker.analysis.study.report import make_report
 from worker.jobs.publishing import report_files
 
 pytestmark = pytest.mark.browser

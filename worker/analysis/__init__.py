@@ -1,1 +1,1 @@
-"""Statistics and figures of a study's report."""
+"""Statistics of people, filters and methods."""

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from worker.analysis.evaluation import evaluate
-from worker.analysis.promise import Outcome, Promise, sentence
-from worker.analysis.proof import case_against
+from worker.analysis.filters.evaluation import evaluate
+from worker.analysis.filters.promise import Outcome, Promise, sentence
+from worker.analysis.filters.proof import case_against
 from worker.compute import harm_tests, learning, simulation
 from worker.compute.pools import Computing, Lane
 from worker.compute.simulation import surface_file
@@ -200,7 +200,7 @@ class FilterFit:
 
     def prove(self, draft: FilterDraft) -> Proven:
         """Drive through unseen scenarios; a studio's filter that does not meet the burden of proof
-        (worker.analysis.proof) is replaced by the reference.
+        (worker.analysis.filters.proof) is replaced by the reference.
         """
         self.progress("driving the filter through unseen scenarios", 0.88)
         act = filter_problem.act_of(self.problem.task.modes, self.problem.policy, draft.weights)

@@ -5,7 +5,7 @@ from dataclasses import asdict, replace
 from functools import partial
 from typing import Any
 
-from worker.analysis.promise import BATCH, HarmTest, Outcome, Promise, counted
+from worker.analysis.filters.promise import BATCH, HarmTest, Outcome, Promise, counted
 from worker.ml.filters.filter_module import FilterWeights
 from worker.ml.filters.filter_problem import FilterDraft
 

@@ -10,7 +10,7 @@ from typing import Any, cast, get_args
 import numpy as np
 import numpy.typing as npt
 
-from worker.analysis.promise import Outcome, outcome_of
+from worker.analysis.filters.promise import Outcome, outcome_of
 from worker.compute.simulation import reference_rollouts, run_episode, signal_predictor
 from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import Act, Float32Array

@@ -20,10 +20,10 @@ import torch
 from tqdm import tqdm
 
 from app.installed_tasks import catalogue
-from worker.analysis import comparison_page
-from worker.analysis.comparison import Cells, EvaluatedCell, Row, compared, pooled, table_rows
-from worker.analysis.pareto import pareto_svg
-from worker.analysis.table_files import tables, to_csv
+from worker.analysis.comparison import comparison_page
+from worker.analysis.comparison.comparison_rows import Cells, EvaluatedCell, Row, compared, pooled, table_rows
+from worker.analysis.comparison.pareto import pareto_svg
+from worker.analysis.comparison.table_files import tables, to_csv
 from worker.compute.pools import Compute, Lane
 from worker.domain.trajectory import COSTS
 from worker.experiments import benchmark_cell

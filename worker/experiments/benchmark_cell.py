@@ -108,7 +108,7 @@ def code_mark() -> str:
     """Which state of the learning and simulation a cell was made with: a hash over their sources."""
     here = Path(worker.__file__).parent
     sources = sorted(
-        [*(each for room in ("ml", "sim", "tasks") for each in here.glob(f"{room}/**/*.py")), Path(__file__)]
+        [*(each for room in ("domain", "ml", "sim", "tasks") for each in here.glob(f"{room}/**/*.py")), Path(__file__)]
     )
     digest = hashlib.sha256()
     for source in sources:

@@ -22,8 +22,7 @@ from typing import IO
 
 from sqlalchemy import URL, make_url
 
-from app import sqlite
-from app.db import now
+from app.db import now, sqlite
 from app.errors import AppError
 from app.services.backups import layout, snapshots, withdrawals
 from app.services.backups.layout import ARTEFACTS, BESIDE, DATABASE, DRAFT, MANIFEST, Backup, File, Manifest

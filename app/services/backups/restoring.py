@@ -12,8 +12,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from app import data_directory, sqlite, upgrading
-from app.db import now
+from app import data_directory, upgrading
+from app.db import now, sqlite
 from app.errors import AppError
 from app.services.backups import layout, making, snapshots, withdrawals
 from app.services.backups.layout import BESIDE, DATABASE, Backup, BackupRefused

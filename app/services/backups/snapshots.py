@@ -9,8 +9,8 @@ from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager
 from pathlib import Path
 
+from app.db.sqlite import BUSY_TIMEOUT_S
 from app.services.participants.withdrawal import ARTEFACT_COLUMNS
-from app.sqlite import BUSY_TIMEOUT_S
 
 Identity = str
 """A participant or study for good: row id, seed and time of creation, such as

@@ -12,8 +12,8 @@ from pathlib import Path
 
 from sqlalchemy.orm import Session
 
-from app import sqlite, upgrading
-from app.db import Database, now
+from app import upgrading
+from app.db import Database, now, sqlite
 from app.domain.studies import Participant, Study
 from app.services import audit
 from app.services.backups import snapshots

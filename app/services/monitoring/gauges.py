@@ -8,8 +8,7 @@ from pathlib import Path
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
-from app import sqlite
-from app.db import now
+from app.db import now, sqlite
 from app.domain.models import Run, RunStatus, WorkerPresence
 from app.domain.preferences import LabelEvent
 from app.domain.studies import Participant, Study

@@ -135,7 +135,7 @@ class BundleAnswer(BaseModel):
 
 
 class ReportAnswer(BaseModel):
-    """The newest report: its statistics (layout in worker/analysis/statistics.py and answers.py) and figures."""
+    """The newest report: its statistics (layout in worker/analysis/study/statistics.py and answers.py) and figures."""
 
     made_at: datetime
     lock_hash: str = Field(description="As in every export; “not locked” while the study is not.")

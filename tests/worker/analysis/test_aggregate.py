@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from worker.analysis import aggregate
+from worker.analysis.comparison import aggregate
 from worker.domain.type_aliases import FloatArray
 
 

@@ -3,8 +3,8 @@
 import pandas as pd
 import pytest
 
-from worker.analysis.answers import answer_report, change_report
-from worker.analysis.statistics import rating_report
+from worker.analysis.study.answers import answer_report, change_report
+from worker.analysis.study.statistics import rating_report
 
 
 def person(code: str, accuracy: float | None, asked: int = 0, same: int = 0) -> dict[str, object]:

@@ -10,9 +10,9 @@ from scipy import stats
 from statsmodels.stats.anova import anova_lm
 
 from tests.benchmarks import between as simulation
-from worker.analysis.between import hedges_g, only_one_of, permutation, welch_t
-from worker.analysis.order_effects import order_report
-from worker.analysis.statistics import rating_report
+from worker.analysis.study.between import hedges_g, only_one_of, permutation, welch_t
+from worker.analysis.study.order_effects import order_report
+from worker.analysis.study.statistics import rating_report
 
 FIRST, SECOND = np.array([2.0, 3.0, 3.5, 2.5, 4.0]), np.array([4.0, 4.5, 3.0, 5.0])
 

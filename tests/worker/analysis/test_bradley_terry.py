@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from worker.analysis.bradley_terry import covariance, head_to_head_report, strengths
+from worker.analysis.study.bradley_terry import covariance, head_to_head_report, strengths
 
 
 def answers(person: str, left: str, right: str, *said: str) -> list[dict[str, Any]]:

@@ -11,12 +11,12 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from worker.analysis import comparison, comparison_page, result_pages
-from worker.analysis.comparison import EvaluatedCell, pooled, table_rows
-from worker.analysis.evaluation import success_change
-from worker.analysis.pareto import pareto_svg
-from worker.analysis.published import TABLE_1, published
-from worker.analysis.table_files import tables, to_csv
+from worker.analysis.comparison import comparison_page, comparison_rows, result_pages
+from worker.analysis.comparison.comparison_rows import EvaluatedCell, pooled, table_rows
+from worker.analysis.comparison.pareto import pareto_svg
+from worker.analysis.comparison.published import TABLE_1, published
+from worker.analysis.comparison.table_files import tables, to_csv
+from worker.analysis.filters.evaluation import success_change
 from worker.ml.methods.registry import METHODS
 
 USERS = ("neutral", "cautious", "impatient")
@@ -105,10 +105,10 @@ def test_methods_and_users_are_compared_in_the_seeds_they_share() -> None:
     """An unfinished second seed of one user must not be set against the first of another."""
     lucky = [run("neutral", "reference", seed=1), run("neutral", "pbarl", (100, 0, 0), seed=1)]
     before, after = (pooled(runs) for runs in (RUNS, [*RUNS, *lucky]))
-    assert comparison.against(after, "pbarl", "prefft") == comparison.against(before, "pbarl", "prefft")
+    assert comparison_rows.against(after, "pbarl", "prefft") == comparison_rows.against(before, "pbarl", "prefft")
     advantages = [
         next(row["own_advantage"] for row in rows if row["trained_for"] == row["judged_by"] == "neutral")
-        for rows in (comparison.personalisation_rows(cells, "pbarl", [USERS]) for cells in (before, after))
+        for rows in (comparison_rows.personalisation_rows(cells, "pbarl", [USERS]) for cells in (before, after))
     ]
     assert advantages[1] == pytest.approx(advantages[0])
 
@@ -175,13 +175,13 @@ def test_a_run_whose_reference_is_missing_waits_for_it() -> None:
 def test_the_files_have_the_promised_columns() -> None:
     cells = pooled(RUNS)
     assert to_csv(table_rows(cells)).splitlines()[0] == TABLE_COLUMNS
-    matrix = to_csv(comparison.personalisation_rows(cells, "pbarl", [USERS]))
+    matrix = to_csv(comparison_rows.personalisation_rows(cells, "pbarl", [USERS]))
     assert matrix.splitlines()[0] == MATRIX_COLUMNS
     assert len(matrix.splitlines()) == 1 + 9
 
 
 def test_own_advantage_is_over_the_best_of_the_others_and_on_the_diagonal_only() -> None:
-    rows = comparison.personalisation_rows(pooled(RUNS), "pbarl", [USERS])
+    rows = comparison_rows.personalisation_rows(pooled(RUNS), "pbarl", [USERS])
     found = {(row["trained_for"], row["judged_by"]): row for row in rows}
     assert found["cautious", "cautious"]["gain"] == pytest.approx(6.0 / abs(HARDNESS.mean() - 20.0))
     assert found["neutral", "neutral"]["own_advantage"] < 0 < found["cautious", "cautious"]["own_advantage"]
@@ -196,13 +196,13 @@ def test_gains_of_somebody_who_also_likes_things_are_shares_of_all_that_matters_
         replace(each, true_returns={judge: returns + 20.0 for judge, returns in each.true_returns.items()})
         for each in RUNS
     ]
-    rows = comparison.personalisation_rows(pooled(runs), "pbarl", [USERS])
+    rows = comparison_rows.personalisation_rows(pooled(runs), "pbarl", [USERS])
     found = {(row["trained_for"], row["judged_by"]): row for row in rows}
     assert found["cautious", "cautious"]["gain"] == pytest.approx(6.0 / (20.0 - HARDNESS.mean()))
 
 
 def test_users_of_different_groups_are_not_compared() -> None:
-    rows = comparison.personalisation_rows(pooled(RUNS), "pbarl", [("neutral", "cautious"), ("impatient",)])
+    rows = comparison_rows.personalisation_rows(pooled(RUNS), "pbarl", [("neutral", "cautious"), ("impatient",)])
     found = {(row["trained_for"], row["judged_by"]): row for row in rows}
     assert found["impatient", "impatient"]["own_advantage"] == ""
     assert found["neutral", "neutral"]["own_advantage"] > 0
@@ -230,7 +230,7 @@ def test_a_baseline_that_is_better_is_named_with_its_numbers(tmp_path: Path) -> 
 
 def test_time_is_averaged_over_users_and_seeds() -> None:
     cells = pooled([*RUNS, run("neutral", "reference", seed=1), run("neutral", "pbarl", seed=1)])
-    row = next(row for row in comparison.spent_rows(cells) if row["method"] == "pbarl")
+    row = next(row for row in comparison_rows.spent_rows(cells) if row["method"] == "pbarl")
     assert (row["fits"], row["cpu_s"]) == (4, pytest.approx(4.25))
 
 
@@ -254,7 +254,7 @@ def test_success_averaged_over_repetitions_has_an_interval_too() -> None:
     assert change["low"] < change["delta"] == -0.5 < change["high"]
 
 
-def marks_of(rows: list[comparison.Row]) -> list[ElementTree.Element]:
+def marks_of(rows: list[comparison_rows.Row]) -> list[ElementTree.Element]:
     """The circles of the picture, each with the method as its title."""
     drawn = ElementTree.fromstring(pareto_svg("feeding", rows, list(METHODS)))  # noqa: S314  (drawn by ourselves)
     return drawn.findall(".//{*}circle[{*}title]")
@@ -270,7 +270,7 @@ def test_the_picture_is_valid_and_has_a_mark_per_method_and_user() -> None:
 def test_a_method_keeps_its_colour_in_a_picture_without_the_others() -> None:
     rows = table_rows(pooled(RUNS))
 
-    def colour(shown: list[comparison.Row]) -> str | None:
+    def colour(shown: list[comparison_rows.Row]) -> str | None:
         return next(mark.get("fill") for mark in marks_of(shown) if mark[0].text == "prefft")
 
     assert colour(rows) == colour([row for row in rows if row["method"] == "prefft"])

@@ -8,8 +8,8 @@ import pytest
 
 from tests.benchmarks import error_rates
 from tests.benchmarks.error_rates import SPREAD, UNEQUAL, Truth
-from worker.analysis.hypothesis_tests import TESTS
-from worker.analysis.statistics import MEASURED_ERROR_PERCENT, RECOMMENDED
+from worker.analysis.study.hypothesis_tests import TESTS
+from worker.analysis.study.statistics import MEASURED_ERROR_PERCENT, RECOMMENDED
 
 STUDIES = 250
 MISSING = replace(SPREAD, name="spread .5, trials missing", missing=0.3, dropouts=0.1)

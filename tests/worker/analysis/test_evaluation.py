@@ -8,8 +8,8 @@ from statsmodels.stats.proportion import proportion_confint
 
 from app.services.answers import accuracy
 from tests.worker import invented
-from worker.analysis.agreement import wilson_interval
-from worker.analysis.evaluation import evaluate, mean_change, success_change
+from worker.analysis.filters.evaluation import evaluate, mean_change, success_change
+from worker.analysis.wilson import wilson_interval
 from worker.domain.trajectory import COSTS, Trajectory
 
 

@@ -5,10 +5,10 @@ from typing import Any
 import pytest
 
 from tests.worker.analysis.test_statistics import METHODS, ratings
-from worker.analysis import figures
-from worker.analysis.answers import answer_report, change_report
-from worker.analysis.report import Tables, make_report
-from worker.analysis.statistics import rating_report
+from worker.analysis.study import figures
+from worker.analysis.study.answers import answer_report, change_report
+from worker.analysis.study.report import Tables, make_report
+from worker.analysis.study.statistics import rating_report
 
 
 @pytest.fixture(scope="module")

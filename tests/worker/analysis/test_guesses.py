@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from worker.analysis.guesses import guess_report
+from worker.analysis.study.guesses import guess_report
 
 
 def guesses(right: int, people: int) -> list[dict[str, object]]:

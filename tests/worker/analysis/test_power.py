@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 from statsmodels.stats.power import TTestIndPower, TTestPower
 
-from worker.analysis.power import Truth, enough, power_at
+from worker.analysis.study.power import Truth, enough, power_at
 
 PAIRED = Truth(
     methods=2,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.worker import invented
-from worker.analysis.promise import BATCH, Outcome, Promise, counted, harms, sentence
+from worker.analysis.filters.promise import BATCH, Outcome, Promise, counted, harms, sentence
 from worker.compute import harm_tests
 from worker.ml.filters.filter_module import FilterWeights
 from worker.ml.filters.filter_problem import FilterDraft

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from worker.analysis.proof import case_against
+from worker.analysis.filters.proof import case_against
 from worker.compute import learning
 from worker.compute.filter_fitting import FilterFit, Finished
 from worker.compute.pools import Compute

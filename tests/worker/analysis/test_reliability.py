@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from worker.analysis.reliability import alpha, alpha_interval, omega, reliability_report, spearman_brown
-from worker.analysis.scales import scale_reports
+from worker.analysis.study.reliability import alpha, alpha_interval, omega, reliability_report, spearman_brown
+from worker.analysis.study.scales import scale_reports
 
 
 def test_equally_good_items_have_one_reliability_whatever_it_is_called() -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from app.installed_tasks import catalogue
 from tests.benchmarks import error_rates, feedback_report, printed_readings
-from worker.analysis import comparison_page, result_pages
+from worker.analysis.comparison import comparison_page, result_pages
 
 RESULTS = Path(__file__).resolve().parents[3] / "docs/results"
 

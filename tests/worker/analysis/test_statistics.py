@@ -10,9 +10,9 @@ import statsmodels.formula.api as formulas
 from scipy import stats
 from statsmodels.stats.multitest import multipletests
 
-from worker.analysis.effect_sizes import d_z_interval, holm, rank_biserial, rank_biserial_interval
-from worker.analysis.hypothesis_tests import mixed_model, paired_t, signed_rank, two_sample_t, wilcoxon
-from worker.analysis.statistics import SCALES, paired_differences, rating_report
+from worker.analysis.study.effect_sizes import d_z_interval, holm, rank_biserial, rank_biserial_interval
+from worker.analysis.study.hypothesis_tests import mixed_model, paired_t, signed_rank, two_sample_t, wilcoxon
+from worker.analysis.study.statistics import SCALES, paired_differences, rating_report
 
 METHODS = ("reference", "prefft", "pbarl")
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from worker import cli
-from worker.analysis.comparison import compared
+from worker.analysis.comparison.comparison_rows import compared
 from worker.commands import options
 from worker.experiments import benchmark, benchmark_cell
 from worker.experiments.benchmark import PROFILES, Selection

@@ -16,6 +16,7 @@ import pytest
 from sqlalchemy import select
 
 from app.db import Database
+from app.domain.clips import Clip
 from app.domain.studies import Study
 from app.services.participants import enrolment
 from app.storage import ArtefactStore
@@ -93,6 +94,10 @@ def test_features_can_be_what_people_judge_by(context: WorkerContext, folder: Pa
     assert np.allclose(dataset.stretch(context.store, clip).cut("signals")[:, 0], 2 + np.arange(14) / 10)
 
 
+def episode_of(clip: Clip) -> int:
+    return int(clip.rollout.mode["imported"]["episode"])
+
+
 def test_only_episodes_of_one_task_are_compared(context: WorkerContext, folder: Path) -> None:
     study = imported(context, folder)
     with context.database.writing() as session:
@@ -100,7 +105,7 @@ def test_only_episodes_of_one_task_are_compared(context: WorkerContext, folder: 
     query_selection.refill_queries(context, person.id)
     with context.database.reading() as session:
         waiting = list(records.unanswered(session, person.id, *dataset.CLIPS_AND_ROLLOUTS))
-    sides = [[int(each.rollout.mode["imported"]["episode"]) for each in (query.left_clip, query.right_clip)] for query in waiting]  # fmt: skip  # noqa: E501
+    sides = [[episode_of(query.left_clip), episode_of(query.right_clip)] for query in waiting]
     assert len(sides) > 3
     assert all(left % 2 == right % 2 for left, right in sides), "odd ones are of the other task"
 
@@ -152,7 +157,9 @@ def _elsewhere(folder: Path) -> None:
     (folder / DATA).symlink_to(folder.parent / "secret.parquet")
 
 
-VIDEO = "videos/observation.images.front/chunk-000/file-000.mp4"
+VIDEOS = "videos/observation.images.front"
+VIDEO = f"{VIDEOS}/chunk-000/file-000.mp4"
+STARTS = f"{VIDEOS}/from_timestamp"
 WRONG: dict[str, tuple[Callable[[Path], None], str]] = {
     "version 2.1": (info(codebase_version="v2.1"), "Convert it with LeRobot"),
     "no JSON": (lambda folder: _write(folder / INFO, b"{" * 100_000), "is not JSON"),
@@ -172,8 +179,8 @@ WRONG: dict[str, tuple[Callable[[Path], None], str]] = {
     "fewer rows": (table(DATA, lambda t: t.slice(1)), "episode 0: has 11 rows"),
     "rows in disorder": (table(DATA, column("frame_index", first(7))), "episode 0: has 12 rows in its file, in order"),
     "a far file": (table(EPISODES, column("data/file_index", first(10**12))), "numbers that cannot be"),
-    "before the beginning": (table(EPISODES, column("videos/observation.images.front/from_timestamp", first(-1.0))), "numbers that cannot be"),  # noqa: E501
-    "after the end": (table(EPISODES, column("videos/observation.images.front/from_timestamp", first(1e6))), "ends before this episode"),  # noqa: E501
+    "before the beginning": (table(EPISODES, column(STARTS, first(-1.0))), "numbers that cannot be"),
+    "after the end": (table(EPISODES, column(STARTS, first(1e6))), "ends before this episode"),
     "an endless episode": (table(EPISODES, column("length", first(10**9))), "Leave it out with --episodes"),
     "an episode twice": (table(EPISODES, column("episode_index", first(1))), "names an episode twice"),
     "no video": (lambda folder: _write(folder / VIDEO, b"no video"), f"{VIDEO}, episode 0: not an MP4"),
@@ -212,7 +219,9 @@ def test_which_camera_must_be_said(camera: str | None, folder: Path) -> None:
         read(folder, Choices(camera=camera))
 
 
-def test_the_command_says_what_is_wrong(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:  # fmt: skip  # noqa: E501
+def test_the_command_says_what_is_wrong(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     from app.__main__ import main as app
     from worker.__main__ import main
 

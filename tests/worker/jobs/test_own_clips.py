@@ -184,6 +184,23 @@ def test_videos_that_browsers_cannot_play_are_converted(tmp_path: Path) -> None:
     assert (made.width, made.height, made.fps, made.duration_ms) == (64, 48, 10, 1000)
 
 
+PLAYLISTS = {
+    "concat": "ffconcat version 1.0\nfile secret.mp4\n",
+    "pictures": "ffconcat version 1.0\nfile %d.png\noption format image2\n",
+    "stream": "#EXTM3U\n#EXT-X-TARGETDURATION:9\n#EXTINF:9,\nsecret.mp4\n#EXT-X-ENDLIST\n",
+    "words": "a text, which FFmpeg would otherwise draw as a video of letters\n" * 99,
+}
+
+
+@pytest.mark.parametrize("name", PLAYLISTS)
+def test_a_video_that_names_other_files_is_refused(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "secret.mp4").write_bytes(encode_mp4(np.zeros((20, 48, 64, 3), np.uint8), 64, 48, 10))
+    (tmp_path / name).write_text(PLAYLISTS[name])
+    with pytest.raises(ValueError, match="not a video"):
+        playable((tmp_path / name).read_bytes())
+
+
 WRONG: list[tuple[str, Callable[[dict[str, Any]], None], str]] = [
     ("no such file", lambda m: m["clips"][0].update(video="videos/none.mp4"), "no file videos/none.mp4"),
     ("outside", lambda m: m["clips"][0].update(video="../../secret.mp4"), "no file"),

@@ -10,7 +10,7 @@ from app.db import Database
 from app.domain.choices import Method
 from app.domain.study_settings import StudySettings
 from app.storage import ArtefactStore
-from worker.analysis.promise import Outcome
+from worker.analysis.filters.promise import Outcome
 from worker.compute.filter_fitting import FilterFit
 from worker.compute.pools import Compute
 from worker.domain.scenarios import of_promise

@@ -22,7 +22,7 @@ from app.storage import ArtefactStore
 from tests import factories
 from tests.finished_study import make_finished_study
 from tests.worker.at_hand import AtHand
-from worker.analysis import figures
+from worker.analysis.study import figures
 from worker.jobs import reconcile
 from worker.jobs.publishing import report_files
 from worker.jobs.runtime import records

@@ -19,7 +19,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from app.signing import SigningKey
 from tests.waiting import PATIENCE_S
 from tests.worker import invented
-from worker.analysis.evaluation import evaluate
+from worker.analysis.filters.evaluation import evaluate
 from worker.domain.trajectory import SIGNALS
 from worker.ml.export import bundle
 from worker.ml.export.bundle import BundleContents, BundleDamaged, Provenance, RecordedSteps

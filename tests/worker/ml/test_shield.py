@@ -126,12 +126,8 @@ def test_limits_are_stored_with_the_filter_and_older_filters_have_none() -> None
     assert again.encoder == {}
     np.testing.assert_array_equal(again.shield["observation_high"], limits()["observation_high"])
     assert FilterWeights.from_bytes(BARE.to_bytes()).shield == {}
-    assert [
-        OnnxFilter(act_of(TASK.modes, POLICY, each).exported.stored).is_shielded for each in (BARE, shielded())
-    ] == [
-        False,
-        True,
-    ]
+    exported = [act_of(TASK.modes, POLICY, each).exported for each in (BARE, shielded())]
+    assert [OnnxFilter(each.stored).is_shielded for each in exported] == [False, True]
 
 
 def test_limits_are_told_by_the_names_of_the_fields() -> None:

@@ -18,7 +18,7 @@ from app.domain.studies import Participant, Study
 from app.services.archives import demo_archive
 from app.storage import ArtefactStore
 from tests.worker.at_hand import AtHand
-from worker.analysis import figures
+from worker.analysis.study import figures
 from worker.jobs import reconcile
 from worker.jobs.learning import query_selection
 from worker.jobs.publishing import export_files, report_files

@@ -18,7 +18,7 @@ from app.domain.studies import Participant, Study
 from app.errors import AppError
 from app.services.evaluation import evaluation_plan, self_setting
 from app.services.participants import withdrawal
-from worker.analysis.evaluation import evaluate
+from worker.analysis.filters.evaluation import evaluate
 from worker.compute import baseline_fitting, learning
 from worker.compute.baseline_fitting import Baseline
 from worker.compute.pools import Lane

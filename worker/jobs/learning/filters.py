@@ -12,7 +12,7 @@ from app.errors import AppError
 from app.services.answers import accuracy
 from app.services.exports.export_formats import provenance_of
 from app.services.monitoring import dashboard
-from worker.analysis.promise import Promise
+from worker.analysis.filters.promise import Promise
 from worker.compute import filter_fitting, learning
 from worker.compute.filter_fitting import FilterFit
 from worker.compute.pools import Lane

@@ -2,7 +2,7 @@
 
 from app.domain.choices import Method
 from app.domain.study_settings import StudySettings
-from worker.analysis.promise import Outcome
+from worker.analysis.filters.promise import Outcome
 from worker.compute import learning, simulation
 from worker.compute.filter_fitting import CHUNK
 from worker.compute.pools import Computing, Lane

@@ -13,7 +13,7 @@ from worker.jobs.runtime.context import Step, WorkerContext
 from worker.jobs.runtime.records import Job
 
 if TYPE_CHECKING:
-    from worker.analysis.power import Truth
+    from worker.analysis.study.power import Truth
 
 STUDIES = 500
 """Simulated for each number of people: the power is then known within .04."""
@@ -31,7 +31,7 @@ def due(session: Session, study: Study) -> list[Job]:
 
 def make(context: WorkerContext, job: Job, run_id: int, step: Step) -> None:
     """Simulate, one step for every number of people: whoever kills the worker loses one of them."""
-    from worker.analysis.power import Truth, enough  # takes seconds, and a worker that starts needs none of it
+    from worker.analysis.study.power import Truth, enough  # takes seconds, and a worker that starts needs none of it
 
     with context.database.reading() as session:
         plan = session.get_one(PowerPlan, job.number)
@@ -69,7 +69,7 @@ def numbers_of_people(most: int) -> list[int]:
 
 
 def _simulate(context: WorkerContext, run_id: int, truth: "Truth", people: int, seed: int) -> dict[str, object]:
-    from worker.analysis.power import power_at
+    from worker.analysis.study.power import power_at
 
     return context.compute.run(Lane.LEARNING, context.beat(run_id), power_at, truth, people, STUDIES, seed)
 

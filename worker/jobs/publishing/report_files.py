@@ -28,7 +28,7 @@ from app.services.exports import export_formats, export_rows, export_tables
 from app.services.participants import forms, withdrawal
 from app.services.runs.reports import VERSION
 from app.services.studies import preregistration
-from worker.analysis.report import Tables, make_report
+from worker.analysis.study.report import Tables, make_report
 from worker.compute.pools import Lane
 from worker.jobs.runtime import records
 from worker.jobs.runtime.context import Step, WorkerContext

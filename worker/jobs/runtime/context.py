@@ -13,7 +13,7 @@ from app.db import Database
 from app.files.interface import StorageUnavailable
 from app.signing import SigningKey
 from app.storage import ArtefactStore, hash_of_file
-from worker.analysis.promise import Outcome
+from worker.analysis.filters.promise import Outcome
 from worker.compute.pools import Computing
 from worker.domain.trajectory import Trajectory
 from worker.jobs.runtime import records

@@ -16,10 +16,10 @@ from dbos import DBOS, WorkflowStatus
 from sqlalchemy.exc import DatabaseError
 
 from app.db import Database, now
+from app.db.sqlite import BUSY_TIMEOUT_S
 from app.domain.models import RunKind, WorkerPresence
 from app.errors import AppError
 from app.settings import Settings
-from app.sqlite import BUSY_TIMEOUT_S
 
 log = logging.getLogger("worker")
 

@@ -14,8 +14,8 @@ from dbos import DBOS, WorkflowStatus
 from sqlalchemy import select, update
 from sqlalchemy.orm import Session
 
-from app import sqlite, upgrading
-from app.db import now
+from app import upgrading
+from app.db import now, sqlite
 from app.domain.models import RunKind
 from app.domain.studies import Participant, Study
 from app.services.auditing import receipts

@@ -141,7 +141,7 @@ class FilterDraft:
     tested: Mapping[str, Float32Array] = field(default_factory=dict)
     """what the filter stayed within when it was tried (shield.limits_of)"""
     promise: Mapping[str, Any] = field(default_factory=dict)
-    """worker.analysis.promise.Promise with the tests by which it was earned, as plain values; empty: none is made"""
+    """a Promise (worker.analysis.filters.promise) and the tests that earned it, as plain values; empty: none"""
 
     def timed(self, stage: str, started: float) -> "FilterDraft":
         """The same with the seconds since ``started`` added to a stage."""

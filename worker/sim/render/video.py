@@ -26,6 +26,9 @@ SLOWEST_FPS = 12
 """Below this pictures are held, for players are bad at videos of few pictures per second."""
 MOST_PIXELS, MOST_PICTURES = 4096 * 2304, 20_000
 """Of a video that somebody else has made."""
+CONTAINERS = "mov,mp4,matroska,webm,avi,mpegts,mpeg,ogg,flv,asf,mxf,gif"
+"""What such a video may come in: each holds its pictures itself. Playlists, which FFmpeg would follow to other files of
+this machine, are none of them."""
 
 
 def encode_mp4(
@@ -80,7 +83,7 @@ def playable(content: bytes) -> PlayableVideo:
     Raises ValueError when it cannot be read, or is larger or longer than any clip.
     """
     try:
-        with av.open(io.BytesIO(content), "r") as container:
+        with av.open(io.BytesIO(content), "r", options={"format_whitelist": CONTAINERS}) as container:
             stream = container.streams.video[0]
             codec = (stream.codec_context.name, stream.codec_context.pix_fmt)
             usual = codec == ("h264", "yuv420p") and "mp4" in container.format.name

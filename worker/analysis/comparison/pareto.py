@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from xml.sax.saxutils import escape
 
-from worker.analysis.comparison import Row
+from worker.analysis.comparison.comparison_rows import Row
 
 PANEL, GAP, LEFT, TOP, BOTTOM = 300.0, 46.0, 52.0, 56.0, 58.0
 LEGEND_WIDTH, LEGEND_LINE = 112.0, 18.0

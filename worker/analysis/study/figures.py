@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from worker.analysis.statistics import POINTS, SCALES
+from worker.analysis.study.statistics import POINTS, SCALES
 
 DPI = 300
 INK, GREY, PALE = "#262626", "#8a8a8a", "#dddddd"

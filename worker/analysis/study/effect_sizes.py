@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import optimize, stats
 
-from worker.analysis.agreement import Z_95
+from worker.analysis.wilson import Z_95
 from worker.domain.type_aliases import FloatArray
 
 _TAIL = 0.025

@@ -3,7 +3,7 @@
 The input is a tidy table as it is exported (``ratings.csv``): one row per rated trial with the columns ``participant``,
 the group to compare by (``method``, or ``letter`` while the study is blinded), and the two scales.
 
-Layout of what ``rating_report`` returns, which is ``contents["ratings"]`` of a Report (worker/analysis/report.py):
+Layout of what ``rating_report`` returns, which is ``contents["ratings"]`` of a Report (see report.py):
 
     groups, participants, ratings       the groups in their order; how many people and ratings there are
     explanation                         the sentence on why two kinds of tests stand side by side
@@ -27,9 +27,9 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from worker.analysis.between import BETWEEN_TESTS, hedges_g, only_one_of, permutation, welch_t
-from worker.analysis.effect_sizes import d_z_interval, holm, rank_biserial, rank_biserial_interval
-from worker.analysis.hypothesis_tests import (
+from worker.analysis.study.between import BETWEEN_TESTS, hedges_g, only_one_of, permutation, welch_t
+from worker.analysis.study.effect_sizes import d_z_interval, holm, rank_biserial, rank_biserial_interval
+from worker.analysis.study.hypothesis_tests import (
     FEWEST_PAIRED,
     STAR_BELOW,
     TESTS,
@@ -39,7 +39,7 @@ from worker.analysis.hypothesis_tests import (
     two_sample_t,
     wilcoxon,
 )
-from worker.analysis.order_effects import order_report
+from worker.analysis.study.order_effects import order_report
 from worker.domain.type_aliases import FloatArray
 
 Result = dict[str, Any]

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from worker.analysis.hypothesis_tests import plain
-from worker.analysis.statistics import mean_interval
+from worker.analysis.study.hypothesis_tests import plain
+from worker.analysis.study.statistics import mean_interval
 
 Result = dict[str, Any]
 

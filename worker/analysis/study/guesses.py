@@ -5,7 +5,7 @@ from typing import Any
 
 from scipy import stats
 
-from worker.analysis.hypothesis_tests import plain
+from worker.analysis.study.hypothesis_tests import plain
 
 CONFIDENCE = 0.95
 

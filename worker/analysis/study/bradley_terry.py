@@ -14,8 +14,8 @@ import numpy as np
 from scipy import stats
 from scipy.sparse.csgraph import connected_components
 
-from worker.analysis.effect_sizes import holm
-from worker.analysis.hypothesis_tests import not_computable, plain
+from worker.analysis.study.effect_sizes import holm
+from worker.analysis.study.hypothesis_tests import not_computable, plain
 from worker.domain.type_aliases import FloatArray
 
 FEWEST_PEOPLE = 4

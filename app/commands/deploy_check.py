@@ -16,8 +16,8 @@ from urllib.parse import urlsplit
 from sqlalchemy import func, make_url, select
 from sqlalchemy.orm import Session
 
-from app import sqlite, upgrading
-from app.db import Database, now
+from app import upgrading
+from app.db import Database, now, sqlite
 from app.domain.people import ApiToken, Experimenter
 from app.programs import say
 from app.services.backups import schedule

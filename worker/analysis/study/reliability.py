@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from worker.analysis.hypothesis_tests import not_computable, plain
+from worker.analysis.study.hypothesis_tests import not_computable, plain
 from worker.domain.type_aliases import FloatArray
 
 FEWEST = 3

@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from worker.analysis.hypothesis_tests import not_computable, plain
+from worker.analysis.study.hypothesis_tests import not_computable, plain
 from worker.domain.type_aliases import FloatArray
 
 FEWEST_PEOPLE = 4

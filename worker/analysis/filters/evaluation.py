@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from worker.analysis.agreement import Z_95, wilson_interval
+from worker.analysis.wilson import Z_95, wilson_interval
 from worker.domain.task import Task
 from worker.domain.trajectory import COSTS, SIGNALS, Trajectory
 from worker.domain.type_aliases import FloatArray

@@ -6,7 +6,7 @@ reversed ones mirrored, None where there is no score.
 
 What ``scale_reports`` returns, which is ``contents["instruments"]`` of a Report: per questionnaire its words, and
 ``parts``: one for those about no robot, one for those about robots; each with groups and, per score, the means, people
-and comparisons of worker.analysis.statistics and a ``reliability`` per group.
+and comparisons of worker.analysis.study.statistics and a ``reliability`` per group.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from worker.analysis.reliability import reliability_report
-from worker.analysis.statistics import scale_report
+from worker.analysis.study.reliability import reliability_report
+from worker.analysis.study.statistics import scale_report
 
 TESTS = ("paired_t", "wilcoxon")
 """Shown of the differences between robots; one score per person and robot leaves the others nothing to add."""

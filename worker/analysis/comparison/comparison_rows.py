@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from worker.analysis.agreement import wilson_interval
-from worker.analysis.evaluation import mean_change, success_change
+from worker.analysis.filters.evaluation import mean_change, success_change
+from worker.analysis.wilson import wilson_interval
 from worker.domain.trajectory import COSTS
 from worker.domain.type_aliases import FloatArray
 

@@ -7,10 +7,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from worker.analysis import result_pages
-from worker.analysis.comparison import REFERENCE, Row, compared
-from worker.analysis.published import published
-from worker.analysis.table_files import DESCRIPTIONS, METHOD, Tables, read
+from worker.analysis.comparison import result_pages
+from worker.analysis.comparison.comparison_rows import REFERENCE, Row, compared
+from worker.analysis.comparison.published import published
+from worker.analysis.comparison.table_files import DESCRIPTIONS, METHOD, Tables, read
 
 TOLERANCE = 0.05
 """Largest loss of success with which a method counts as keeping the task."""

@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from worker.analysis.agreement import wilson_interval
-from worker.analysis.between import welch_t
-from worker.analysis.bradley_terry import covariance, strengths, why_not
-from worker.analysis.effect_sizes import holm
-from worker.analysis.hypothesis_tests import FEWEST_PAIRED, paired_t
+from worker.analysis.study.between import welch_t
+from worker.analysis.study.bradley_terry import covariance, strengths, why_not
+from worker.analysis.study.effect_sizes import holm
+from worker.analysis.study.hypothesis_tests import FEWEST_PAIRED, paired_t
+from worker.analysis.wilson import wilson_interval
 from worker.domain.type_aliases import FloatArray
 
 ALPHA, WANTED = 0.05, 0.8

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from worker.analysis.effect_sizes import noncentrality_interval
-from worker.analysis.hypothesis_tests import not_computable, plain
+from worker.analysis.study.effect_sizes import noncentrality_interval
+from worker.analysis.study.hypothesis_tests import not_computable, plain
 from worker.domain.type_aliases import FloatArray
 
 BETWEEN_TESTS = ("welch_t", "permutation")

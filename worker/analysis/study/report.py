@@ -50,9 +50,9 @@ class Tables:
 def make_report(tables: Tables) -> tuple[dict[str, Any], dict[str, dict[str, bytes]]]:
     """The contents, and the figures as {name: {format: file}}."""
     # Takes seconds, and the worker, which only names this function, needs none of it.
-    from worker.analysis import answers, figures, statistics
-    from worker.analysis.guesses import guess_report
-    from worker.analysis.scales import scale_reports
+    from worker.analysis.study import answers, figures, statistics
+    from worker.analysis.study.guesses import guess_report
+    from worker.analysis.study.scales import scale_reports
 
     contents = {
         "version": tables.version,
@@ -75,7 +75,7 @@ def make_report(tables: Tables) -> tuple[dict[str, Any], dict[str, dict[str, byt
 
 
 def _head_to_heads(tables: Tables) -> dict[str, Any]:
-    from worker.analysis.bradley_terry import head_to_head_report
+    from worker.analysis.study.bradley_terry import head_to_head_report
 
     rows = [
         {**each, "left": each["left_method"], "right": each["right_method"]}

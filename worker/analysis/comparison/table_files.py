@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from worker.analysis.comparison import (
+from worker.analysis.comparison.comparison_rows import (
     Cells,
     Row,
     against,

@@ -1,0 +1,1 @@
+"""What a filter is shown to do."""
