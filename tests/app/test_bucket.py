@@ -212,7 +212,7 @@ class TestOnline:
         assert experimenter.get("/studies").status_code == 200
         assert taking_part.browser.get("/p/next").status_code == 200
 
-    def test_dashboards_say_that_files_cannot_be_used(
+    def test_dashboards_say_so(
         self,
         experimenter: TestClient,
         taking_part: TakingPart,
