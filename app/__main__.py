@@ -24,7 +24,7 @@ from app.logs import LogFormat
 from app.paths import DOCS
 from app.programs import Programs, say
 from app.services import audit
-from app.services.accounts import accounts
+from app.services.accounts import accounts, second_factor
 from app.services.alerting import messages
 from app.services.archives import demo_archive as demo
 from app.services.archives import study_import
@@ -53,6 +53,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     demo = commands.add_parser("demo", help=demo_study.__doc__)
     demo.add_argument("--task", choices=catalogue.names(), default=catalogue.usual())
     demo.set_defaults(act=demo_study)
+    resetting = commands.add_parser("reset-second-factor", help=reset_second_factor.__doc__)
+    resetting.add_argument("name", help="of the account")
+    resetting.set_defaults(act=reset_second_factor)
     importing = commands.add_parser("import-study", help=import_study.__doc__)
     importing.add_argument("file", type=Path, help="the archive")
     importing.add_argument("--seal-key", default="", help="of the archive of a study that is still blinded")
@@ -93,6 +96,23 @@ def _add_backups(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
 def migrate(settings: Settings) -> int:
     """Bring the database to the newest schema."""
     upgrading.upgrade(settings)
+    with _database(settings) as database:
+        with database.writing() as session:
+            sealed = second_factor.seal_secrets(session, settings)
+        if sealed:
+            database.forget_erased()
+    return 0
+
+
+def reset_second_factor(settings: Settings, name: str) -> int:
+    """Turn off the second factor of an account: its phone is lost, or the key that opened its secret."""
+    migrate(settings)
+    with _database(settings) as database, database.writing() as session:
+        account = accounts.by_name(session, name)
+        if account is None:
+            raise accounts.ExperimenterNotFound
+        second_factor.turn_off(session, account, audit.SYSTEM)
+    say(f"The password of {name} is enough again. Set up a new second factor on the page of the account.")
     return 0
 
 

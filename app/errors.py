@@ -48,6 +48,12 @@ class AppError(Exception):
         super().__init__(self.message)
 
 
+class Refused(AppError):
+    """Your account may not do this."""  # whoever it is, it is known, and kept in the audit log (app.web.http.refusals)
+
+    status: ClassVar[HTTPStatus] = HTTPStatus.FORBIDDEN
+
+
 EXPLAINED = (AppError, OSError, DBAPIError, sqlite3.Error, ValidationError)
 """What in_words may know."""
 

@@ -1,6 +1,7 @@
 """Everything an operator may set, from the environment or a .env file, with units in the names."""
 
 import re
+from datetime import timedelta
 from ipaddress import ip_network
 from pathlib import Path
 from typing import Literal, Self
@@ -26,6 +27,7 @@ class Settings(BaseSettings):
     secure_cookies: bool = Field(default=False, description="Set when the server is reached by HTTPS only.")
     session_days: int = Field(default=30, ge=1, description="How long a participant's browser is remembered.")
     login_hours: int = Field(default=12, ge=1, description="How long an experimenter stays logged in.")
+    login_idle_minutes: int = Field(default=60, ge=5, description="An experimenter who does nothing is logged out.")
     require_second_factor: bool = Field(default=False, description="Experimenters must set up a second factor.")
     login_attempts_per_minute: int = Field(default=10, ge=1, description="Password attempts per address.")
     trusted_proxies: str = Field(default="", description="Addresses or networks whose X-Forwarded-For is believed.")
@@ -131,6 +133,16 @@ class Settings(BaseSettings):
     def trusted_fingerprints(self) -> frozenset[str]:
         """Of the keys of other studios that this one knows."""
         return frozenset(self.trusted_keys.split(",")) - {""}
+
+    @property
+    def login_idle(self) -> timedelta:
+        """After which an experimenter who does nothing is logged out."""
+        return timedelta(minutes=self.login_idle_minutes)
+
+    @property
+    def login_whole(self) -> timedelta:
+        """After which an experimenter is logged out in any case."""
+        return timedelta(hours=self.login_hours)
 
     @property
     def signing_key_path(self) -> Path:

@@ -17,6 +17,8 @@ from typing import Any
 
 from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
+from cryptography.hazmat.primitives.hashes import SHA256
+from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 from cryptography.hazmat.primitives.serialization import (
     Encoding,
     NoEncryption,
@@ -60,6 +62,11 @@ class SigningKey:
     def fingerprint(self) -> str:
         """SHA-256 of the public key: what people compare."""
         return fingerprint_of(self.public_hex)
+
+    def derived(self, purpose: bytes) -> bytes:
+        """32 bytes for another purpose, HKDF with SHA-256: whoever has them learns nothing of the key itself."""
+        private = self.private.private_bytes_raw()
+        return HKDF(algorithm=SHA256(), length=32, salt=None, info=b"pbarl-studio " + purpose).derive(private)
 
     def signed(self, document: Mapping[str, Any]) -> dict[str, Any]:
         """The document with its signature."""

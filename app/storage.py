@@ -195,6 +195,10 @@ class ArtefactStore:
         """What was found to be damaged or missing and is not back yet, with when that was (milliseconds since 1970)."""
         return self._lost.now()
 
+    def trouble(self) -> str | None:
+        """Why files could be neither stored nor read when lost() last had somebody look, in words."""
+        return self._lost.trouble
+
     def older_than(self, seconds: float) -> set[str]:
         """The artefacts that nobody has put here for so long. Half-written files of that age are removed."""
         newest_s = time.time() - seconds

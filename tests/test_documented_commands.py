@@ -73,6 +73,9 @@ RUN: dict[str, str | Elsewhere | OnlyParsed] = {
     "app link": "",
     "app migrate": "",
     "app reset-password": "",
+    "app reset-second-factor": Elsewhere(
+        "tests/app/test_second_factor.py::test_without_the_key_codes_are_refused_in_words_and_a_command_helps"
+    ),
     "app restore": Elsewhere("tests/app/backups/test_backups.py::test_the_commands_say_what_was_done"),
     "app scrub": "",
     "app signing-key": "",

@@ -24,6 +24,7 @@ from app.services.backups import schedule
 from app.settings import Settings
 
 LONGEST_LOGIN_HOURS = 24
+LONGEST_IDLE_MINUTES = 240
 MOST_ATTEMPTS_PER_MINUTE = 60
 OLD_INVITATION = timedelta(days=7)
 LEAST_SECRET = 16
@@ -136,6 +137,9 @@ def _of_secrets(settings: Settings) -> Iterator[Finding]:
 def _of_logins(settings: Settings) -> Iterator[Finding]:
     if settings.login_hours > LONGEST_LOGIN_HOURS:
         yield Finding(f"LOGIN_HOURS is {settings.login_hours}: a browser left alone stays open that long. 12 is usual.")
+    if settings.login_idle_minutes > LONGEST_IDLE_MINUTES:
+        idle = settings.login_idle_minutes
+        yield Finding(f"LOGIN_IDLE_MINUTES is {idle}: a browser left alone stays open that long. 60 is usual.")
     if settings.login_attempts_per_minute > MOST_ATTEMPTS_PER_MINUTE:
         yield Finding("LOGIN_ATTEMPTS_PER_MINUTE lets passwords be guessed quickly. 10 is usual.")
     if settings.oidc_new_accounts == "experimenter":

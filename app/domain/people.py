@@ -48,7 +48,7 @@ class Experimenter(Base):
     oidc_subject: Mapped[str | None] = mapped_column(String(500), unique=True)
     """Issuer and subject of the identity that logs in to this account; None: its password does."""
     totp_secret: Mapped[str | None] = mapped_column(String(64))
-    """Shared with an authenticator app, base32. It cannot be a hash: the code is computed from it."""
+    """Shared with an authenticator app. It cannot be a hash, as codes are computed from it, so it is encrypted."""
     second_factor_since: Mapped[datetime | None]
     """When the first code was right: since then a login needs one. None with a secret: it is still being set up."""
     totp_used_step: Mapped[int | None]

@@ -75,16 +75,24 @@ class Bucket(Files):
 
     def require_usable(self) -> None:
         """See Files. A wrong name or key is refused; a server that is away is waited for."""
-        name = urlsplit(self.url).netloc
         try:
-            obstore.put(self._s3, "probe", b"written at every start")
+            self.probe()
+        except StorageUnavailable:
+            log.warning("trying again when a file is needed")
+
+    def probe(self) -> None:
+        """See Files. Raises BucketRefused."""
+        try:
+            obstore.put(self._s3, "probe", b"written at every start, and while somebody looks at a dashboard")
             obstore.get(self._s3, "probe")
         except FileNotFoundError as error:
+            name = urlsplit(self.url).netloc
             raise BucketRefused(f"There is no bucket {name}. Make it, or correct STORAGE_URL.") from error
         except BaseError as error:
             if type(error).__name__ in ("PermissionDeniedError", "UnauthenticatedError"):
                 raise BucketRefused from error
-            log.warning("stored files cannot be reached, trying again when one is needed: %s", _first_line(error))
+            log.warning("stored files cannot be reached: %s", _first_line(error))
+            raise StorageUnavailable from error
 
     def put(self, name: str, content: bytes) -> None:
         """See Files."""

@@ -44,6 +44,9 @@ class Files(ABC):
     def require_usable(self) -> None:  # noqa: B027  (a directory makes itself)
         """At the start of a program. Raises AppError for what no waiting mends."""
 
+    def probe(self) -> None:  # noqa: B027  (whether a directory can be written to, the database tells)
+        """Write and read something small. Raises StorageUnavailable, and AppError for what no waiting mends."""
+
     @abstractmethod
     def put(self, name: str, content: bytes) -> None:
         """Write a file, or write it anew."""

@@ -2,10 +2,10 @@
 
 import re
 import time
-from contextlib import suppress
 from threading import Lock, Thread
 
-from app.files.interface import Files, StorageUnavailable
+from app.errors import AppError
+from app.files.interface import Files
 
 LOOK_AGAIN_S = 10.0
 """What other machines have found to be lost is known here after so long."""
@@ -30,6 +30,8 @@ class Lost:
         self._files = files
         self._lock = Lock()
         self._known: dict[str, int] = {}
+        self.trouble: str | None = None
+        """What kept the last look from the files, in words."""
         self._look_at_s = 0.0
         self._noted = 0
 
@@ -59,11 +61,16 @@ class Lost:
 
     def _look(self) -> None:
         noted = self._noted
-        with suppress(StorageUnavailable):  # the last known is the best known
+        try:
+            self._files.probe()
             found = self._found()
-            with self._lock:
-                if self._noted == noted:  # else what was found may be older than what was noted
-                    self._known = found
+        except AppError as error:  # the last known is the best known
+            self.trouble = error.message
+            return
+        self.trouble = None
+        with self._lock:
+            if self._noted == noted:  # else what was found may be older than what was noted
+                self._known = found
 
     def _found(self) -> dict[str, int]:
         lost: dict[str, int] = {}

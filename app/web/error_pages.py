@@ -11,12 +11,13 @@ from sqlalchemy.exc import DatabaseError, OperationalError
 from starlette.exceptions import HTTPException
 
 from app.db import complaints
-from app.errors import AppError, in_words
-from app.web.http import request_log
+from app.errors import AppError, Refused, in_words
+from app.web.http import refusals, request_log
 from app.web.http.deps import (
     EXPERIMENTER_COOKIE,
     PARTICIPANT_COOKIE,
     LoginNeeded,
+    NotSaved,
     NotYet,
     PasswordChangeDue,
     SecondFactorNeeded,
@@ -63,8 +64,15 @@ def add_error_pages(app: FastAPI) -> None:
     def ours(request: Request, error: AppError) -> Response:
         return error_page(request, error)
 
+    @app.exception_handler(Refused)
+    def refused(request: Request, error: Refused) -> Response:
+        refusals.note(request)
+        return error_page(request, error)
+
     @app.exception_handler(LoginNeeded)
     def login_needed(request: Request, error: LoginNeeded) -> Response:
+        if request.method != "GET":
+            error = NotSaved() if EXPERIMENTER_COOKIE in request.cookies else error
         if wants_json(request) or request.method != "GET":
             return error_page(request, error)
         target = request.app.url_path_for("show_login")

@@ -20,9 +20,10 @@ from app.services.accounts import browser_sessions
 from app.services.studies import membership
 from app.storage import ArtefactStore
 from app.web.http import stored_file
+from app.web.http.authorized_route import AuthorizedRoute
 from app.web.http.deps import PARTICIPANT_COOKIE, Sha256, StudioDep, experimenter_asking
 
-router = APIRouter()
+router = APIRouter(route_class=AuthorizedRoute)
 
 AT_NO_TIME = formatdate(0, usegmt=True)
 """When a film or a controller was made would tell, in a blinded study, with which others it was made."""

@@ -16,9 +16,10 @@ from app.db import complaints
 from app.errors import AppError
 from app.services.monitoring import gauges
 from app.services.monitoring.gauges import Gauge
+from app.web.http.authorized_route import AuthorizedRoute
 from app.web.http.deps import Studio, StudioDep
 
-router = APIRouter()
+router = APIRouter(route_class=AuthorizedRoute)
 
 
 class NoMetrics(AppError):

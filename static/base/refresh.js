@@ -7,7 +7,7 @@ const wait = () => setTimeout(look, 1000 * Number(page.dataset.refreshS));
 
 async function look() {
   try {
-    const response = await fetch(location.href, { headers: { Accept: "text/html" }, signal: AbortSignal.timeout(10000) });
+    const response = await fetch(location.href, { headers: { Accept: "text/html", "X-Unattended": "1" }, signal: AbortSignal.timeout(10000) });
     if (response.ok) follow(new DOMParser().parseFromString(await response.text(), "text/html"), response.url);
   } catch {
     // the network is away; the next look may find it again

@@ -1,5 +1,6 @@
 // Small helps for forms: copying links, asking before something is cut off, and not sending twice.
 
+const TYPED = "textarea, select, input:not([type=hidden], [readonly])";
 const copied = document.querySelector("[data-copied]");
 
 for (const button of document.querySelectorAll("[data-copy], [data-copy-all]")) {
@@ -33,6 +34,11 @@ function copyTheOldWay(text) {
 
 document.addEventListener("submit", (event) => {
   const form = event.target;
+  if (form.dataset.known === undefined && form.method === "post" && form.querySelector(TYPED)) {
+    event.preventDefault();
+    sendIfKnown(form, event.submitter);
+    return;
+  }
   const question = event.submitter?.dataset.confirm ?? form.dataset.confirm;
   if (question && !confirm(question)) {
     event.preventDefault();
@@ -43,6 +49,31 @@ document.addEventListener("submit", (event) => {
     form.dataset.sent = "yes";
   }
 });
+
+// A form that is sent when nobody is logged in any more, or to nobody, would be gone with all that was typed.
+async function sendIfKnown(form, submitter) {
+  const { account, login } = document.querySelector("[data-account]").dataset;
+  const headers = { Accept: "application/json", "X-Unattended": "1" };
+  const answer = await fetch(account, { headers, signal: AbortSignal.timeout(10000) }).catch(() => null);
+  form.querySelector("[data-kept]")?.remove();
+  if (answer && answer.status !== 401) {
+    form.dataset.known = "yes"; // the next submit event is this one again
+    form.requestSubmit(submitter);
+    delete form.dataset.known;
+    return;
+  }
+  const notice = document.createElement("div");
+  Object.assign(notice, { className: "alert", role: "alert", tabIndex: -1 });
+  notice.dataset.kept = "";
+  if (answer) {
+    const way = document.createElement("a");
+    Object.assign(way, { href: login, target: "_blank", textContent: "Log in in another tab" });
+    notice.append("You are logged out. What you typed is still here, and not saved. ", way, ", then send it again.");
+  } else notice.append("The studio does not answer. What you typed is still here, and not saved. Try again in a moment.");
+  form.append(notice);
+  notice.focus();
+}
+
 addEventListener("pageshow", () => {
   for (const form of document.querySelectorAll("[data-sent]")) delete form.dataset.sent;
 });

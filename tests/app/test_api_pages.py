@@ -227,11 +227,16 @@ class TestHostileCursors:
         assert get(f"{address(study, 'labels')}&cursor={cursor}").status_code == 422
 
 
-def test_a_parameter_that_no_address_knows_is_refused_on_every_one(studio_app: FastAPI, client: TestClient) -> None:
+def test_a_parameter_that_no_address_knows_is_refused_on_every_one(
+    studio_app: FastAPI, client: TestClient, database: Database, study: Study, password: str
+) -> None:
+    with database.writing() as session:
+        token = api_tokens.create(session, session.scalars(select(Experimenter)).one(), "a notebook")[1]
+    client.headers["authorization"] = f"Bearer {token}"
     api = studio_app.state.api
     for path, methods in api.openapi()["paths"].items():
         for method, operation in methods.items():
-            answer = client.request(method, f"/api/v1{path}?surprise=1&limit=1", json={})
+            answer = client.request(method, f"/api/v1{path.replace('{slug}', study.slug)}?surprise=1&limit=1", json={})
             known = [each["name"] for each in operation.get("parameters", []) if each["in"] == "query"]
             detail = answer.json()["detail"]
             assert (answer.status_code, "surprise" in detail) == (422, True), path

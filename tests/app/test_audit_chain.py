@@ -19,8 +19,8 @@ from app.db import Database, now
 from app.domain.people import AuditEvent, ErasureReceipt
 from app.domain.studies import Participant, Study
 from app.services import audit
-from app.services.accounts import failed_logins
-from app.services.accounts.failed_logins import FailedLogins
+from app.services.accounts import hourly_counts
+from app.services.accounts.hourly_counts import HourlyCounts
 from app.services.auditing import chain_check, lookup, receipts
 from app.services.participants import withdrawal
 from app.services.studies import retirement
@@ -409,17 +409,17 @@ class TestFailedLogins:
     ) -> None:
         client.post("/login", data={"name": "experimenter", "password": "hunter2-hunter2"})
         client.post("/login", data={"name": "my password: hunter2", "password": "x"})
-        assert self.rows(database) == ["experimenter", failed_logins.UNKNOWN_NAME]
+        assert self.rows(database) == ["experimenter", hourly_counts.UNKNOWN_NAME]
         with database.reading() as session:
             assert "hunter2" not in json.dumps(list(lookup.json_lines(session)))
 
     def test_a_thousand_failures_are_four_rows_and_the_next_hour_begins_anew(self) -> None:
         moment = [now()]
-        counts = FailedLogins(lambda: moment[0])
+        counts = HourlyCounts(lambda: moment[0])
         written = [counts.count("pat") for _ in range(1500)]
         assert [each for each in written if each is not None] == [1, 10, 100, 1000]
         assert counts.count("kim") == 1
-        moment[0] += failed_logins.COUNTED_FOR
+        moment[0] += hourly_counts.COUNTED_FOR
         assert counts.count("pat") == 1
 
     def test_made_up_names_are_counted_together(self, client: TestClient, database: Database, password: str) -> None:
@@ -427,14 +427,14 @@ class TestFailedLogins:
         for number in range(studio.settings.login_attempts_per_minute + 5):  # the rest is refused unread, and counted
             client.post("/login", data={"name": f"name {number}", "password": "x"})
         assert self.rows(database) == [
-            failed_logins.UNKNOWN_NAME,
-            f"{failed_logins.UNKNOWN_NAME} (10 times within an hour)",
+            hourly_counts.UNKNOWN_NAME,
+            f"{hourly_counts.UNKNOWN_NAME} (10 times within an hour)",
         ]
 
     def test_wrong_tokens_are_counted_too(self, client: TestClient, database: Database, password: str) -> None:
         for _ in range(3):
             client.get("/api/v1/me", headers={"Authorization": "Bearer pbarl_secret-of-somebody"})
-        assert self.rows(database) == [failed_logins.WRONG_TOKEN]
+        assert self.rows(database) == [hourly_counts.WRONG_TOKEN]
 
     def test_logging_out_is_a_row(self, experimenter: TestClient, database: Database) -> None:
         experimenter.post("/logout")

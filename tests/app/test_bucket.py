@@ -212,6 +212,35 @@ class TestOnline:
         assert experimenter.get("/studies").status_code == 200
         assert taking_part.browser.get("/p/next").status_code == 200
 
+    def test_dashboards_say_so(
+        self,
+        experimenter: TestClient,
+        taking_part: TakingPart,
+        store: ArtefactStore,
+        away: Callable[[], None],
+        monkeypatch: pytest.MonkeyPatch,
+    ) -> None:
+        monkeypatch.setattr(lost, "LOOK_AGAIN_S", 0.2)
+        assert isinstance(store.files, Bucket)
+        there, nowhere = store.files._s3, Bucket("s3://no-such-bucket/part")._s3
+        pages = ["/studies", f"/studies/{taking_part.study.slug}"]
+
+        def all_say(words: str) -> bool:
+            return all(words in experimenter.get(page).text for page in pages)
+
+        def none_complains() -> bool:
+            return not any("Stored files cannot be used" in experimenter.get(page).text for page in pages)
+
+        assert none_complains()
+        away()
+        assert until(lambda: all_say("Stored files cannot be reached at the moment"))
+        store.files._s3 = there
+        assert until(none_complains)
+        store.files._s3 = nowhere
+        assert until(lambda: all_say("There is no bucket"))
+        store.files._s3 = there
+        assert until(none_complains)
+
 
 def test_a_wrong_name_or_key_is_refused_at_the_start_and_a_server_that_is_away_is_not(
     store: ArtefactStore, away: Callable[[], None], server: dict[str, str]

@@ -75,6 +75,7 @@ CHANGED: dict[str, tuple[dict[str, Any], str]] = {
     "a campus of proxies": ({"trusted_proxies": "10.0.0.0/8"}, "more than a few proxies"),
     "no backup": ({"backup_dir": None}, "BACKUP_DIR is not set"),
     "long logins": ({"login_hours": 24 * 30}, "LOGIN_HOURS"),
+    "idle logins": ({"login_idle_minutes": 24 * 60}, "LOGIN_IDLE_MINUTES"),
     "quick guesses": ({"login_attempts_per_minute": 1000}, "LOGIN_ATTEMPTS_PER_MINUTE"),
     "metrics": ({"metrics_token": "aaaaaaaaaaaaaaaaaaaa"}, "METRICS_TOKEN can be guessed"),
 }

@@ -4,9 +4,10 @@ A route without a row fails. A visitor who is not let in also leaves no row behi
 whoever is let in is mostly told that something is missing; that is enough to know that they were.
 """
 
+import asyncio
 import re
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Coroutine, Iterator
+from dataclasses import dataclass, replace
 from datetime import timedelta
 
 import pytest
@@ -18,7 +19,9 @@ from sqlalchemy import func, select
 
 from app.db import Base, Database
 from app.domain.people import AuditEvent, Experimenter, Role, StudyRole, TokenScope
+from app.main import serve
 from app.services.accounts import api_tokens, browser_sessions
+from app.services.accounts.hourly_counts import HourlyCounts
 from app.services.studies import membership
 from app.storage import ArtefactStore
 from tests import factories
@@ -31,6 +34,7 @@ FORM = {"code": "000000", "response": "left", "client_uuid": "0b7a6a0e-6f7e-4d4e
 HOUR = timedelta(hours=1)
 
 STRANGER, GUESSED = "stranger", "stranger with a wrong token"
+FORGOTTEN = "browser with cookies that are worth nothing"
 THIS_PARTICIPANT, OTHER_PARTICIPANT = "participant", "participant of another study"
 READER, VIEWER, EDITOR, OWNER = "viewer with a reader's account", "viewer", "editor", "owner"
 OTHER_OWNER, ADMIN = "owner of another study", "administrator"
@@ -40,7 +44,7 @@ ELSEWHERE, OTHERS, ADMINS = "owner's token for another study", "token of an owne
 ACCOUNTS = {READER, VIEWER, EDITOR, OWNER, OTHER_OWNER, ADMIN}
 PARTICIPANTS = {THIS_PARTICIPANT, OTHER_PARTICIPANT}
 TOKENS = {READS, WRITES, VIEWERS, ELSEWHERE, OTHERS, ADMINS}
-EVERYBODY = {STRANGER, GUESSED, *ACCOUNTS, *PARTICIPANTS, *TOKENS}
+EVERYBODY = {STRANGER, GUESSED, FORGOTTEN, *ACCOUNTS, *PARTICIPANTS, *TOKENS}
 
 
 @dataclass(frozen=True)
@@ -67,7 +71,7 @@ PARTICIPANT = Rule(PARTICIPANTS)
 OWN_PAIR = Rule({THIS_PARTICIPANT}, hidden={OTHER_PARTICIPANT})
 CLIP = Rule(
     {THIS_PARTICIPANT, READER, VIEWER, EDITOR, OWNER, ADMIN},
-    hidden={STRANGER, GUESSED, OTHER_PARTICIPANT, OTHER_OWNER, *TOKENS},
+    hidden={STRANGER, GUESSED, FORGOTTEN, OTHER_PARTICIPANT, OTHER_OWNER, *TOKENS},
 )
 OPERATOR = Rule(set(), hidden=EVERYBODY)
 """Without METRICS_TOKEN."""
@@ -170,8 +174,12 @@ class Gate:
     values: dict[str, str]
     database: Database
 
+    def address(self, route: Route) -> str:
+        """Of something that there is."""
+        return re.sub(r"{(\w+)(?::\w+)?}", lambda found: self.values.get(found[1], "1"), route.path)
+
     def ask(self, route: Route, visitor: str) -> Answer:
-        address = re.sub(r"{(\w+)(?::\w+)?}", lambda found: self.values.get(found[1], "1"), route.path)
+        address = self.address(route)
         browser = self.visitors[visitor]
         if route.method in ("GET", "HEAD", "DELETE"):
             return browser.request(route.method, address)
@@ -193,6 +201,7 @@ class Gate:
 def gate(studio_app: FastAPI, database: Database, store: ArtefactStore, new_browser: Callable[[], TestClient]) -> Gate:
     visitors = {name: new_browser() for name in EVERYBODY}
     visitors[GUESSED].headers["authorization"] = f"Bearer {api_tokens.PREFIX}guessed"
+    visitors[FORGOTTEN].cookies.update({"studio_participant": "x" * 43, "studio_experimenter": "x" * 43})
     with database.writing() as session:
         here, there = factories.make_study(session, "Here"), factories.make_study(session, "There")
         person, token = factories.make_participant(session, here)
@@ -263,6 +272,136 @@ def test_visitors(route: Route, gate: Gate) -> None:
     for visitor in sorted(rule.let_in):
         answer = gate.ask(route, visitor)
         assert outcome(route, answer) == "let in", (visitor, answer.status_code, answer.text[:300])
+
+
+BODIES = {
+    "JSON that breaks off": ("application/json", b'{"kind": '),
+    "JSON that is no text": ("application/json", b"\xff\xfe"),
+    "a form of nonsense": ("application/x-www-form-urlencoded", b"%ff=%00&&client_uuid=1&code"),
+    "parts that break off": ("multipart/form-data; boundary=x", b"--x\r\nbroken"),
+    "nothing": ("", b""),
+}
+SENDING = [each for each in ROUTES if each.method not in ("GET", "HEAD") and MATRIX[each.name] is not ANYBODY]
+IN_ONE_STEP = {"label_query", "undo_label", "note_event"}
+"""Whose sender is looked up in the transaction that keeps what they sent: received before, parsed after."""
+
+
+def test_whoever_is_unknown_is_told_so_whatever_they_send(gate: Gate) -> None:
+    found = {
+        (route.method, route.name, kind): outcome(
+            route,
+            gate.visitors[FORGOTTEN].request(
+                route.method, gate.address(route), content=body, headers={"content-type": content_type}
+            ),
+        )
+        for route in SENDING
+        for kind, (content_type, body) in BODIES.items()
+    }
+    assert {one: what for one, what in found.items() if what != "asked who they are"} == {}
+
+
+def test_nothing_is_received_from_whoever_is_refused(gate: Gate, studio_app: FastAPI) -> None:
+    received = set()
+    for route in SENDING:
+        rule = MATRIX[route.name]
+        known = set() if rule is OWN_PAIR else sorted({*rule.forbidden, *rule.hidden})[:2]
+        for visitor in (STRANGER, GUESSED, FORGOTTEN, *known):
+            if asyncio.run(_received(studio_app, gate.visitors[visitor], route.method, gate.address(route))):
+                received.add((route.name, visitor))
+    assert received == {(name, FORGOTTEN) for name in IN_ONE_STEP}
+
+
+@pytest.mark.parametrize(
+    ("name", "visitor"), [("save_demographics", THIS_PARTICIPANT), ("ask_power", EDITOR), ("add_participants", EDITOR)]
+)
+def test_whoever_sends_slowly_holds_up_nobody(name: str, visitor: str, gate: Gate, studio_app: FastAPI) -> None:
+    async def somebody_else_writes() -> None:
+        async with asyncio.timeout(5), studio_app.state.studio.session_queue.writing():
+            pass
+
+    route = next(each for each in SENDING if each.name == name)
+    asked = _received(studio_app, gate.visitors[visitor], "POST", gate.address(route), meanwhile=somebody_else_writes)
+    assert asyncio.run(asked)
+
+
+async def _nothing() -> None:
+    pass
+
+
+async def _received(
+    application: FastAPI,
+    browser: TestClient,
+    method: str,
+    path: str,
+    meanwhile: Callable[[], Coroutine[None, None, None]] = _nothing,
+) -> bool:
+    """Whether the application asked for anything of the body before it answered; it comes after ``meanwhile``."""
+    received = False
+
+    async def receive() -> dict[str, object]:
+        nonlocal received
+        received = True
+        await meanwhile()
+        return {"type": "http.request", "body": b"{", "more_body": False}
+
+    async def send(_message: object) -> None:
+        pass
+
+    form = {"content-type": "application/x-www-form-urlencoded"}
+    headers = browser.build_request(method, path, headers=form).headers.raw
+    scope = {"type": "http", "method": method, "path": path, "raw_path": path.encode(), "query_string": b""}
+    scope |= {"headers": [(name.lower(), value) for name, value in headers], "http_version": "1.1", "scheme": "http"}
+    await application({**scope, "client": ("testclient", 1)}, receive, send)
+    return received
+
+
+ACCOUNT_OF = {READS: OWNER, WRITES: OWNER, ELSEWHERE: OWNER, VIEWERS: VIEWER, OTHERS: OTHER_OWNER, ADMINS: ADMIN}
+
+
+def test_whatever_is_refused_to_somebody_known_is_in_the_audit_log(gate: Gate, studio_app: FastAPI) -> None:
+    refused = [
+        (route, visitor)
+        for route in ROUTES
+        for visitor in sorted({*MATRIX[route.name].forbidden, *MATRIX[route.name].hidden})
+        if MATRIX[route.name] not in (CLIP, OPERATOR, OWN_PAIR)
+    ]
+    for route, visitor in refused:
+        serve(studio_app, replace(studio_app.state.studio, refusals=HourlyCounts()))  # nothing was refused yet
+        gate.ask(route, visitor)
+        with gate.database.reading() as session:
+            newest = session.scalars(select(AuditEvent).order_by(AuditEvent.id.desc()).limit(1)).one()
+        told = newest.actor, newest.action, newest.subject
+        what = f"{route.method} {route.path.replace('{slug}', gate.values['slug'])}"
+        assert told == (ACCOUNT_OF.get(visitor, visitor), "access refused", what)
+        assert (newest.study_id is not None) is ("{slug}" in route.path)
+
+
+def test_who_is_refused_again_and_again_fills_no_disk(gate: Gate) -> None:
+    route = next(each for each in ROUTES if each.name == "delete_study")
+    for _ in range(100):
+        gate.ask(route, VIEWER)
+    gate.ask(route, EDITOR)
+    with gate.database.reading() as session:
+        rows = session.scalars(select(AuditEvent).where(AuditEvent.action == "access refused")).all()
+    assert [(row.actor, (row.subject or "").rpartition(" (")[2]) for row in rows] == [
+        (VIEWER, rows[0].subject),
+        (VIEWER, "10 times within an hour)"),
+        (VIEWER, "100 times within an hour)"),
+        (EDITOR, rows[3].subject),
+    ]
+
+
+def test_a_study_that_there_is_not_is_no_refusal(gate: Gate) -> None:
+    assert gate.visitors[OTHER_OWNER].get("/studies/nothing-of-this-name").status_code == 404
+    with gate.database.reading() as session:
+        assert "access refused" not in session.scalars(select(AuditEvent.action)).all()
+
+
+def test_a_wrong_parameter_is_told_to_nobody_without_a_token(gate: Gate) -> None:
+    for route in ROUTES:
+        if MATRIX[route.name] in (TOKEN, TOKEN_LOOKS, TOKEN_READS_DATA, TOKEN_WRITES):
+            answer = gate.visitors[STRANGER].request(route.method, gate.address(route) + "?nonsense=1&limit=none")
+            assert answer.status_code == 401, (route.method, route.name)
 
 
 def outcome(route: Route, answer: Answer) -> str:

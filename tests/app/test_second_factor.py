@@ -1,15 +1,19 @@
 """The second factor: set up by scanning, asked for at every login, each code good once, guessing slowed down."""
 
+import base64
 import re
 from collections.abc import Callable, Iterator
 from datetime import timedelta
 
 import pyotp
 import pytest
+from alembic import command
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
 from sqlalchemy import select
 
+from app import upgrading
+from app.__main__ import main, migrate
 from app.db import Database, now
 from app.domain.people import AuditEvent, Experimenter, RecoveryCode
 from app.main import create_app
@@ -196,3 +200,67 @@ def test_an_installation_can_require_it_of_everybody(strict: FastAPI, database: 
     assert page.status_code == 200
     assert browser.get("/studies").status_code == 200
     assert browser.get("/api/v1/studies", headers=headers).status_code == 200
+
+
+def of_the_account(database: Database) -> Experimenter:
+    with database.reading() as session:
+        return session.scalars(select(Experimenter)).one()
+
+
+def test_the_database_alone_knows_no_secret(secret: str, database: Database, settings: Settings) -> None:
+    account = of_the_account(database)
+    stored = (account.totp_secret or "").encode()
+    raw = base64.b32decode(secret)
+    assert secret.encode() not in stored
+    assert raw not in base64.urlsafe_b64decode(stored)
+    assert second_factor.secret_of(account, second_factor.key_of(settings)) == secret
+
+
+def test_a_secret_of_another_account_opens_nothing(secret: str, database: Database, settings: Settings) -> None:
+    account = of_the_account(database)
+    account.id += 1
+    with pytest.raises(second_factor.SecretSealed):
+        second_factor.secret_of(account, second_factor.key_of(settings))
+
+
+def test_secrets_of_earlier_versions_open_and_are_sealed_when_the_studio_starts(
+    secret: str, asked: TestClient, database: Database, settings: Settings
+) -> None:
+    with database.writing() as session:
+        session.scalars(select(Experimenter)).one().totp_secret = secret
+    assert asked.post("/login/code", data={"code": code(secret)}).status_code == 303
+    command.stamp(upgrading._config(settings), "head")
+    assert migrate(settings) == 0
+    account = of_the_account(database)
+    assert account.totp_secret != secret
+    assert second_factor.secret_of(account, second_factor.key_of(settings)) == secret
+    if database.is_sqlite:
+        files = settings.data_dir.glob("studio.sqlite3*")
+        assert not any(secret.encode() in each.read_bytes() for each in files)
+
+
+def test_without_the_key_codes_are_refused_in_words_and_a_command_helps(
+    secret: str, asked: TestClient, database: Database, settings: Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings.signing_key_path.unlink()  # as after restoring the database alone: a new key is made
+    refused = asked.post("/login/code", data={"code": code(secret)})
+    assert refused.status_code == 503
+    assert "put the key&#39;s file (signing.key) back, or to run: python -m app reset-second-factor" in refused.text
+    command.stamp(upgrading._config(settings), "head")
+    monkeypatch.setenv("DATA_DIR", str(settings.data_dir))
+    assert main(["reset-second-factor", "nobody"]) == 1
+    assert main(["reset-second-factor", "experimenter"]) == 0
+    assert not second_factor.is_on(of_the_account(database))
+    assert asked.post("/login", data=LOGIN).headers["location"] == "/studies"
+
+
+def test_a_recovery_code_needs_no_key(
+    experimenter: TestClient, new_browser: Callable[[], TestClient], settings: Settings
+) -> None:
+    secret = begin(experimenter)
+    shown = experimenter.post("/second-factor/confirm", data={"code": code(secret, -1)}).text
+    settings.signing_key_path.unlink()
+    browser = new_browser()
+    browser.post("/login", data=LOGIN)
+    recovery = re.findall(r"\b(?:[0-9a-f]{5}-){5}[0-9a-f]{5}\b", shown)[0]
+    assert browser.post("/login/code", data={"code": recovery}).headers["location"] == "/studies"

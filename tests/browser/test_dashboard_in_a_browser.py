@@ -6,9 +6,11 @@ from collections.abc import Iterator
 import pytest
 from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Browser, Dialog, Page, expect
+from sqlalchemy import delete
 
 from app.db import Database
 from app.domain.models import ModelKind, RunStatus
+from app.domain.people import BrowserSession
 from app.domain.preferences import Response
 from app.domain.studies import Study
 from app.services.participants import enrolment
@@ -53,6 +55,26 @@ def page(chromium: Browser, address: str, study: Study) -> Iterator[Page]:
     yield page
     context.close()
     assert errors == []
+
+
+def test_what_was_typed_is_kept_when_the_login_has_ended(page: Page, study: Study, database: Database) -> None:
+    page.goto(f"/studies/{study.slug}/members")
+    page.get_by_label("Name of the account").fill("somebody with a long name")
+    with database.writing() as session:
+        session.execute(delete(BrowserSession))
+    page.get_by_role("button", name="Make a member").click()
+    expect(page.get_by_role("alert")).to_contain_text("What you typed is still here")
+    with page.context.expect_page() as opened:
+        page.get_by_role("link", name="Log in in another tab").click()
+    other = opened.value
+    other.get_by_label("Name").fill("experimenter")
+    other.get_by_label("Password").fill(PASSWORD)
+    other.get_by_role("button", name="Log in").click()
+    expect(other.get_by_role("heading", name="Studies")).to_be_visible()
+    other.close()
+    page.get_by_role("button", name="Make a member").click()
+    expect(page.get_by_role("alert")).to_contain_text("There is no account of this name")
+    expect(page.get_by_label("Name of the account")).to_have_value("somebody with a long name")
 
 
 def test_an_open_page_updates_itself_and_keeps_what_the_person_does(

@@ -12,7 +12,7 @@ from sqlalchemy.orm import Session
 from app.db import now
 from app.domain.people import ApiToken, Experimenter, TokenScope
 from app.domain.studies import Study
-from app.errors import AppError
+from app.errors import AppError, Refused
 from app.services import audit
 
 PREFIX = "pbarl_"
@@ -42,10 +42,8 @@ class TooManyTokens(AppError):
     status = HTTPStatus.CONFLICT
 
 
-class ScopeTooNarrow(AppError):
+class ScopeTooNarrow(Refused):
     """This token may only read. Make one that may also write."""
-
-    status = HTTPStatus.FORBIDDEN
 
 
 def create(

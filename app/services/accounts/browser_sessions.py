@@ -3,10 +3,10 @@
 import hashlib
 import secrets
 from collections.abc import Sequence
-from datetime import timedelta
+from datetime import datetime, timedelta
 from http import HTTPStatus
 
-from sqlalchemy import bindparam, delete, select
+from sqlalchemy import bindparam, delete, select, update
 from sqlalchemy.orm import Session, joinedload
 
 from app.db import now
@@ -15,6 +15,8 @@ from app.domain.studies import Participant
 from app.errors import AppError
 from app.services import audit
 from app.services.accounts import browser_names
+
+USE_NOTED_EVERY = timedelta(minutes=1)
 
 
 class SessionNotFound(AppError):
@@ -77,12 +79,35 @@ def experimenter_of(session: Session, cookie: str, *, second_factor_due: bool = 
 
     ``second_factor_due``: the one whose password was right and whose code is still to come; otherwise nobody is.
     """
-    return session.scalar(
-        select(Experimenter)
+    found = login_of(session, cookie, second_factor_due=second_factor_due)
+    return None if found is None else found[0]
+
+
+def login_of(
+    session: Session, cookie: str, *, second_factor_due: bool = False
+) -> tuple[Experimenter, BrowserSession] | None:
+    """Like experimenter_of(), with the login."""
+    return session.execute(
+        select(Experimenter, BrowserSession)
         .join(BrowserSession, BrowserSession.experimenter_id == Experimenter.id)
         .where(BrowserSession.cookie_sha256 == _hash(cookie), BrowserSession.expires_at > now())
         .where(Experimenter.disabled_at.is_(None), BrowserSession.second_factor_due.is_(second_factor_due))
-    )
+    ).one_or_none()
+
+
+def lasts_until(login: BrowserSession, idle: timedelta, whole: timedelta) -> datetime | None:
+    """When a login ends that is used now; None while that is about when it ends anyway.
+
+    ``idle``: after which one ends that is not used. ``whole``: after which it ends in any case.
+    """
+    until = min(login.created_at + whole, now() + idle)
+    return until if abs(until - login.expires_at) > USE_NOTED_EVERY else None
+
+
+def prolong(session: Session, cookie: str, until: datetime) -> None:
+    """Let the login of this cookie last until then, if it has not ended meanwhile."""
+    mine = BrowserSession.cookie_sha256 == _hash(cookie), BrowserSession.expires_at > now()
+    session.execute(update(BrowserSession).where(*mine).values(expires_at=until))
 
 
 def of_experimenter(session: Session, experimenter: Experimenter, cookie: str) -> Sequence[tuple[BrowserSession, bool]]:

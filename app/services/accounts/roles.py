@@ -1,17 +1,13 @@
 """Who may do what: administrator over experimenter over reader."""
 
-from http import HTTPStatus
-
 from app.domain.people import Experimenter, Role
-from app.errors import AppError
+from app.errors import Refused
 
 _RANKS = {Role.READER: 0, Role.EXPERIMENTER: 1, Role.ADMINISTRATOR: 2}
 
 
-class RoleTooLow(AppError):
+class RoleTooLow(Refused):
     """Your account may look at this, but not do it. Ask an administrator of this studio for another role."""
-
-    status = HTTPStatus.FORBIDDEN
 
 
 def may(experimenter: Experimenter, role: Role) -> bool:

@@ -1,9 +1,13 @@
 """The second factor of a login: codes of an authenticator app (TOTP, RFC 6238), and recovery codes for when it is lost.
 
+The secret is encrypted in the database (ChaCha20-Poly1305, bound to its account) with a key that follows from the
+signing key, which is a file: a database or a copy of it alone tells no codes. Recovery codes need no key.
+
 A code is good once, for its 30 s and those before and after. Whoever knows a password and guesses codes is slowed down
 until a day holds some two dozen guesses at a million codes; recovery codes are too long to be guessed.
 """
 
+import base64
 import hashlib
 import hmac
 import secrets
@@ -12,18 +16,25 @@ from datetime import timedelta
 from http import HTTPStatus
 
 import pyotp
+from cryptography.exceptions import InvalidTag
+from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
 from sqlalchemy import delete, func, select
 from sqlalchemy.orm import Session
 
+from app import signing
 from app.db import now
 from app.domain.people import Experimenter, RecoveryCode
 from app.errors import AppError
 from app.services import audit
+from app.settings import Settings
 
 ISSUER = "PbARL Studio"
 STEP_S = 30
 RECOVERY_CODES = 10
 FREE_MISTAKES = 5
+_NONCE_BYTES = 12
+_SEALED_LENGTH = 64
+"""Characters: 12 bytes of nonce, 20 of secret and 16 that authenticate them, in base64. Plain ones have 32."""
 LONGEST_PAUSE = timedelta(hours=1)
 
 
@@ -37,6 +48,14 @@ class TooManyWrongCodes(AppError):
     """Too many wrong codes. Use a recovery code, or wait: a minute, and twice as long after every further mistake."""
 
     status = HTTPStatus.TOO_MANY_REQUESTS
+
+
+class SecretSealed(AppError):
+    """Codes of the app cannot be checked, because the studio's signing key is another than when they were set up. Use a
+    recovery code. Without one, ask whoever runs the studio to put the key's file (signing.key) back, or to run: python
+    -m app reset-second-factor with the name of your account."""
+
+    status = HTTPStatus.SERVICE_UNAVAILABLE
 
 
 class AlreadyOn(AppError):
@@ -56,13 +75,52 @@ def is_on(experimenter: Experimenter) -> bool:
     return experimenter.second_factor_since is not None
 
 
-def begin(session: Session, experimenter: Experimenter) -> str:
+def key_of(settings: Settings) -> bytes:
+    """What secrets are encrypted with."""
+    return signing.load(settings).derived(b"second factors")
+
+
+def begin(session: Session, experimenter: Experimenter, key: bytes) -> str:
     """A new secret for an app, in force once a code of it was right. Raises AlreadyOn."""
     account = session.get_one(Experimenter, experimenter.id)
     if is_on(account):
         raise AlreadyOn
-    account.totp_secret = pyotp.random_base32()
-    return account.totp_secret
+    secret = pyotp.random_base32()
+    account.totp_secret = _sealed(account, secret, key)
+    return secret
+
+
+def secret_of(account: Experimenter, key: bytes) -> str | None:
+    """What the app shares with the studio; None when nothing was set up. Raises SecretSealed."""
+    stored = account.totp_secret
+    if stored is None or len(stored) != _SEALED_LENGTH:
+        return stored  # of an earlier version, and not sealed yet
+    whole = base64.urlsafe_b64decode(stored)
+    try:
+        opened = ChaCha20Poly1305(key).decrypt(whole[:_NONCE_BYTES], whole[_NONCE_BYTES:], _bound_to(account))
+    except InvalidTag as error:
+        raise SecretSealed from error
+    return base64.b32encode(opened).decode()
+
+
+def seal_secrets(session: Session, settings: Settings) -> int:
+    """Encrypt the secrets that an earlier version has stored as they are; how many there were."""
+    plain = select(Experimenter).where(func.length(Experimenter.totp_secret) < _SEALED_LENGTH)
+    found = session.scalars(plain).all()
+    for account in found:
+        account.totp_secret = _sealed(account, account.totp_secret or "", key_of(settings))
+    return len(found)
+
+
+def _sealed(account: Experimenter, secret: str, key: bytes) -> str:
+    nonce = secrets.token_bytes(_NONCE_BYTES)
+    sealed = ChaCha20Poly1305(key).encrypt(nonce, base64.b32decode(secret), _bound_to(account))
+    return base64.urlsafe_b64encode(nonce + sealed).decode()
+
+
+def _bound_to(account: Experimenter) -> bytes:
+    """Moved to another account, a secret opens nothing."""
+    return str(account.id).encode()
 
 
 def address_for_apps(experimenter: Experimenter, secret: str) -> str:
@@ -70,17 +128,17 @@ def address_for_apps(experimenter: Experimenter, secret: str) -> str:
     return pyotp.TOTP(secret).provisioning_uri(name=experimenter.name, issuer_name=ISSUER)
 
 
-def confirm(session: Session, experimenter: Experimenter, code: str) -> Sequence[str]:
+def confirm(session: Session, experimenter: Experimenter, code: str, key: bytes) -> Sequence[str]:
     """Turn it on with the first code; returns the recovery codes, here and nowhere else.
 
-    Raises NotBegun, AlreadyOn and CodeWrong.
+    Raises NotBegun, AlreadyOn, CodeWrong and SecretSealed.
     """
     account = session.get_one(Experimenter, experimenter.id)
     if is_on(account):
         raise AlreadyOn
     if account.totp_secret is None:
         raise NotBegun
-    step = _step_of(account, code)
+    step = _step_of(account, code, key)
     if step is None:
         raise CodeWrong
     account.second_factor_since, account.totp_used_step = now(), step
@@ -88,8 +146,10 @@ def confirm(session: Session, experimenter: Experimenter, code: str) -> Sequence
     return _new_recovery_codes(session, account)
 
 
-def passes(session: Session, experimenter: Experimenter, typed: str) -> str | None:
-    """What was typed, in words, if it is good; it is good no more afterwards. Raises TooManyWrongCodes.
+def passes(session: Session, experimenter: Experimenter, typed: str, key: bytes) -> str | None:
+    """What was typed, in words, if it is good; it is good no more afterwards.
+
+    Raises TooManyWrongCodes and SecretSealed.
 
     A wrong one is counted, so the caller commits in either case.
     """
@@ -101,7 +161,7 @@ def passes(session: Session, experimenter: Experimenter, typed: str) -> str | No
         return "a recovery code"
     if account.code_wrong_at is not None and now() < account.code_wrong_at + _pause(account.wrong_codes):
         raise TooManyWrongCodes
-    step = _step_of(account, typed)
+    step = _step_of(account, typed, key)
     if step is None:
         account.wrong_codes, account.code_wrong_at = account.wrong_codes + 1, now()
         return None
@@ -139,13 +199,14 @@ def present_step() -> int:
     return int(now().timestamp()) // STEP_S
 
 
-def _step_of(account: Experimenter, typed: str) -> int | None:
+def _step_of(account: Experimenter, typed: str, key: bytes) -> int | None:
     """The newest step whose code this is, if that was not used yet."""
     code = "".join(typed.split())
-    if account.totp_secret is None or len(code) != 6 or not (code.isascii() and code.isdigit()):
+    secret = secret_of(account, key)
+    if secret is None or len(code) != 6 or not (code.isascii() and code.isdigit()):
         return None
     present = present_step()
-    app = pyotp.TOTP(account.totp_secret)
+    app = pyotp.TOTP(secret)
     fitting = [step for step in (present - 1, present, present + 1) if hmac.compare_digest(app.at(step * STEP_S), code)]
     return next((step for step in reversed(fitting) if step > (account.totp_used_step or 0)), None)
 

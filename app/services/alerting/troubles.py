@@ -66,5 +66,7 @@ def of_studies(session: Session, settings: Settings, store: ArtefactStore) -> It
             f"failed work of study {study_id}",
             f"Work has failed and waits for somebody. Its study says which: {settings.base_url}/studies",
         )
+    if words := store.trouble():
+        yield Trouble("storage", words)
     if lost := len(damage.standing(session, store, true()).others):
         yield Trouble("damage", f"Stored files are damaged: {lost}. To see which: python -m app scrub")

@@ -44,6 +44,8 @@ class Machine:
     worker_alive: bool
     disk_free_bytes: int
     disk_low: bool
+    storage_trouble: str | None
+    """Why stored files cannot be reached, in words."""
     damage: damage.Damage
     falls: Sequence[Falls]
     """Programs that have stopped by themselves of late."""
@@ -144,7 +146,7 @@ def machine(session: Session, data_dir: Path, store: ArtefactStore, theirs: Colu
     alive = seen_at is not None and now() - seen_at <= WORKER_SILENCE
     broken = damage.standing(session, store, theirs)
     falls, backups = noted(data_dir), schedule.standing(data_dir)
-    return Machine(seen_at, alive, free, free < DISK_LOW_BYTES, broken, falls, backups)
+    return Machine(seen_at, alive, free, free < DISK_LOW_BYTES, store.trouble(), broken, falls, backups)
 
 
 def fingerprint(session: Session) -> str:

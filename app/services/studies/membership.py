@@ -9,7 +9,7 @@ from sqlalchemy.orm import Session
 
 from app.domain.people import Experimenter, Role, StudyMember, StudyRole
 from app.domain.studies import Study
-from app.errors import AppError
+from app.errors import AppError, Refused
 from app.services import audit
 from app.services.accounts import accounts
 from app.services.accounts.roles import RoleTooLow
@@ -19,10 +19,12 @@ _RANKS = {StudyRole.VIEWER: 0, StudyRole.EDITOR: 1, StudyRole.OWNER: 2}
 _SLUG = re.compile(r"[a-z0-9-]{1,80}")
 
 
-class StudyRoleTooLow(AppError):
+class StudyRoleTooLow(Refused):
     """Your role in this study allows looking at this, but not doing it. Ask an owner of the study."""
 
-    status = HTTPStatus.FORBIDDEN
+
+class OthersStudy(StudyNotFound, Refused):
+    __doc__ = StudyNotFound.__doc__  # whoever has no part in a study is not told that there is one
 
 
 class AccountUnknown(AppError):
@@ -73,7 +75,7 @@ def enter(session: Session, experimenter: Experimenter, slug: str, needed: Study
         raise StudyNotFound
     role = role_in(session, experimenter, find_study(session, slug))
     if role is None:
-        raise StudyNotFound
+        raise OthersStudy
     if not is_at_least(role, needed):
         raise RoleTooLow if experimenter.role == Role.READER else StudyRoleTooLow
     return role

@@ -1,7 +1,9 @@
 """Who asks the API: told by a bearer token, never by a cookie, so no other site can ask in somebody's name."""
 
+from collections.abc import Callable, Mapping
+from functools import partial
 from http import HTTPStatus
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from fastapi import Depends, Request
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
@@ -11,15 +13,17 @@ from app.domain.people import Experimenter, StudyRole, TokenScope
 from app.domain.studies import Participant, Study
 from app.errors import AppError
 from app.services import audit
-from app.services.accounts import api_tokens, failed_logins
+from app.services.accounts import api_tokens, hourly_counts
 from app.services.accounts.api_tokens import ScopeTooNarrow, TokenInvalid
 from app.services.studies import membership, studies
+from app.web.http.authorized_route import AuthorizedRoute, Check
 from app.web.http.deps import (
     ReadingSession,
     SecondFactorNeeded,
     Studio,
     StudioDep,
     lacks_second_factor,
+    studio_of,
 )
 from app.web.http.security import SAFE_METHODS
 
@@ -56,15 +60,16 @@ def _whoever(
     try:
         token, experimenter = api_tokens.find(session, credentials.credentials)
     except TokenInvalid:
-        count = studio.failed_logins.count(failed_logins.WRONG_TOKEN)
+        count = studio.failed_logins.count(hourly_counts.WRONG_TOKEN)
         if count is not None:
             with studio.database.writing() as writing:
-                subject = failed_logins.in_words(failed_logins.WRONG_TOKEN, count)
+                subject = hourly_counts.in_words(hourly_counts.WRONG_TOKEN, count)
                 audit.record(writing, audit.STRANGER, "login failed", subject)
         address = request.client.host if request.client else "unknown"
         if not studio.token_attempts.allow(address):
             raise TooManyWrongTokens from None
         raise
+    request.state.asking = experimenter.name
     if lacks_second_factor(studio.settings, experimenter):
         raise SecondFactorNeeded
     if token.scope == TokenScope.READ and request.method not in SAFE_METHODS:
@@ -76,18 +81,27 @@ def _whoever(
     return experimenter
 
 
-_Whoever = Annotated[Experimenter, Depends(_whoever, scope="function")]
+Whoever = Annotated[Experimenter, Depends(_whoever, scope="function")]
+"""Whose token it is, whatever it may do."""
 
 
-def _caller(request: Request, session: ReadingSession, experimenter: _Whoever) -> Experimenter:
+async def _needs(request: Request, needed: StudyRole) -> None:
+    """Whether whoever sends something may, in a look of its own (app.web.http.authorized_route)."""
+    studio, credentials = await studio_of(request), await bearer(request)
+    await studio.session_queue.look(
+        lambda session: _entering(request, session, _whoever(request, studio, session, credentials), needed)
+    )
+
+
+def _caller(request: Request, session: ReadingSession, experimenter: Whoever) -> Experimenter:
     return _entering(request, session, experimenter, StudyRole.VIEWER)
 
 
-def _acting_caller(request: Request, session: ReadingSession, experimenter: _Whoever) -> Experimenter:
+def _acting_caller(request: Request, session: ReadingSession, experimenter: Whoever) -> Experimenter:
     return _entering(request, session, experimenter, StudyRole.EDITOR)
 
 
-def _owning_caller(request: Request, session: ReadingSession, experimenter: _Whoever) -> Experimenter:
+def _owning_caller(request: Request, session: ReadingSession, experimenter: Whoever) -> Experimenter:
     return _entering(request, session, experimenter, StudyRole.OWNER)
 
 
@@ -97,8 +111,18 @@ def _entering(request: Request, session: Session, experimenter: Experimenter, ne
     if slug is not None:
         membership.enter(session, experimenter, slug, needed)
         if request.state.token.study_id not in (None, studies.find_study(session, slug).id):
-            raise studies.StudyNotFound
+            raise membership.OthersStudy
     return experimenter
+
+
+class AuthorizedCall(AuthorizedRoute):
+    """A route of the API: a token says who is asking."""
+
+    checks: ClassVar[Mapping[Callable[..., object], Check]] = {
+        _caller: partial(_needs, needed=StudyRole.VIEWER),
+        _acting_caller: partial(_needs, needed=StudyRole.EDITOR),
+        _owning_caller: partial(_needs, needed=StudyRole.OWNER),
+    }
 
 
 Caller = Annotated[Experimenter, Depends(_caller, scope="function")]

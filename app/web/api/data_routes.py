@@ -19,7 +19,7 @@ from app.services.participants import enrolment
 from app.services.runs import publishing, reports
 from app.services.studies import studies
 from app.web.api import schemas as answers
-from app.web.api.callers import PREFIX, ActingCaller, Caller, note_reading
+from app.web.api.callers import PREFIX, ActingCaller, AuthorizedCall, Caller, note_reading
 from app.web.http import stored_file
 from app.web.http.deps import (
     Code,
@@ -32,7 +32,7 @@ from app.web.http.deps import (
 
 LARGEST_PAGE = 1000
 _ZIP: dict[int | str, dict[str, Any]] = {200: {"content": {"application/zip": {}}, "description": "The file"}}
-router = APIRouter()
+router = APIRouter(route_class=AuthorizedCall)
 
 
 class NoReportYet(AppError):

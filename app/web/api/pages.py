@@ -16,10 +16,11 @@ from app.services.accounts import api_tokens
 from app.services.studies import membership, studies
 from app.web.api import openapi
 from app.web.api.callers import PREFIX
+from app.web.http.authorized_route import AuthorizedRoute
 from app.web.http.deps import CurrentExperimenter, OwnAccount, ReadingSession, RowId, WritingSession
 from app.web.texts.templating import page
 
-router = APIRouter()
+router = APIRouter(route_class=AuthorizedRoute)
 
 
 @router.get("/api/docs", name="show_api")

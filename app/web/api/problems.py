@@ -11,7 +11,9 @@ from sqlalchemy.exc import DatabaseError, OperationalError
 from starlette.exceptions import HTTPException
 
 from app.db import complaints
-from app.errors import AppError, in_words
+from app.errors import AppError, Refused, in_words
+from app.web.api.callers import Whoever
+from app.web.http import refusals
 from app.web.http.security import HEADERS
 
 MEDIA_TYPE = "application/problem+json"
@@ -24,8 +26,10 @@ class ParameterUnknown(AppError):
     status = HTTPStatus.UNPROCESSABLE_ENTITY
 
 
-async def only_known_parameters(request: Request) -> None:
+async def only_known_parameters(request: Request, _asking: Whoever) -> None:
     """A parameter that is ignored is an answer to another question than the one that was asked.
+
+    Told to nobody without a token.
 
     Raises ParameterUnknown, which names those that are known.
     """
@@ -44,6 +48,11 @@ def add_problems(api: FastAPI) -> None:
 
     @api.exception_handler(AppError)
     def ours(_request: Request, error: AppError) -> Response:
+        return problem(error.status, error.message)
+
+    @api.exception_handler(Refused)
+    def refused(request: Request, error: Refused) -> Response:
+        refusals.note(request)
         return problem(error.status, error.message)
 
     @api.exception_handler(HTTPException)

@@ -13,7 +13,7 @@ from app.services.exports import export_formats, export_tables
 from app.services.participants import enrolment
 from app.services.studies import membership, studies
 from app.web.api import schemas as answers
-from app.web.api.callers import PREFIX, ActingCaller, Caller, OwningCaller, note_reading
+from app.web.api.callers import PREFIX, ActingCaller, AuthorizedCall, Caller, OwningCaller, note_reading
 from app.web.http.deps import (
     Code,
     ReadingSession,
@@ -24,7 +24,7 @@ from app.web.http.deps import (
     WritingSession,
 )
 
-router = APIRouter()
+router = APIRouter(route_class=AuthorizedCall)
 
 
 @router.get("/me", tags=["account"])

@@ -13,7 +13,7 @@ from app.domain.studies import Study
 from app.services.exports import export_formats, export_tables, parquet_file
 from app.services.exports.export_formats import Table
 from app.services.studies import studies
-from app.web.api.callers import ActingCaller, note_reading
+from app.web.api.callers import ActingCaller, AuthorizedCall, note_reading
 from app.web.api.data_routes import TableUnknown
 from app.web.http.deps import ReadingSession, Slug, StudioDep
 
@@ -31,7 +31,7 @@ _FILE: dict[int | str, dict[str, Any]] = {
     304: {"description": "Nothing has changed since the file whose ETag was sent", "headers": _ETAG},
 }
 _NO_MOMENT = datetime.fromtimestamp(0, UTC)
-router = APIRouter()
+router = APIRouter(route_class=AuthorizedCall)
 
 
 @router.get("/studies/{slug}/tables/{table}.{kind}", tags=["tables"], response_class=Response, responses=_FILE)

@@ -17,11 +17,12 @@ from app.services import audit
 from app.services.auditing import lookup, receipts
 from app.services.auditing.lookup import Wanted
 from app.services.exports.csv_cells import csv_line
+from app.web.http.authorized_route import AuthorizedRoute
 from app.web.http.deps import CurrentAdministrator, ReadingSession, RowId, Studio, StudioDep
 from app.web.http.spooling import spooled
 from app.web.texts.templating import page
 
-router = APIRouter(prefix="/audit")
+router = APIRouter(prefix="/audit", route_class=AuthorizedRoute)
 
 HEAD_FORMAT = "pbarl-studio-audit-head"
 MEDIA_TYPES = {"csv": "text/csv; charset=utf-8", "jsonl": "application/x-ndjson"}

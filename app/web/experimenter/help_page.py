@@ -3,10 +3,11 @@
 from fastapi import APIRouter, Request
 from fastapi.responses import Response
 
+from app.web.http.authorized_route import AuthorizedRoute
 from app.web.http.deps import CurrentExperimenter
 from app.web.texts.templating import page
 
-router = APIRouter()
+router = APIRouter(route_class=AuthorizedRoute)
 
 
 @router.get("/help", name="show_help")

@@ -27,6 +27,7 @@ from app.services.runs import reports
 from app.services.studies import locking, preregistration, studies
 from app.web.experimenter.dashboard import form_words
 from app.web.http import stored_file
+from app.web.http.authorized_route import AuthorizedRoute
 from app.web.http.deps import (
     ActingExperimenter,
     CurrentExperimenter,
@@ -41,7 +42,7 @@ from app.web.http.spooling import spooled
 from app.web.texts import task_words
 from app.web.texts.templating import page
 
-router = APIRouter(prefix="/studies/{slug}")
+router = APIRouter(prefix="/studies/{slug}", route_class=AuthorizedRoute)
 
 TableName = Annotated[str, Path(pattern=r"^[a-z]{1,40}$")]
 FileKind = Literal["csv", "jsonl"]

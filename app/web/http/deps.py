@@ -1,14 +1,17 @@
 """What a route may ask for: settings, sessions on the database, and the person who is asking."""
 
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Callable, Coroutine, Mapping
 from dataclasses import dataclass, field
 from datetime import timedelta
+from functools import partial
 from http import HTTPStatus
 from threading import Event
-from typing import Annotated, TypeVar
+from typing import Annotated, Any, TypeVar
+from urllib.parse import parse_qsl
 
 from fastapi import Depends, Path, Request, Response
-from fastapi.concurrency import run_in_threadpool
+from fastapi.exceptions import RequestValidationError
+from pydantic import BaseModel, ValidationError
 from sqlalchemy.orm import Session
 
 from app.db import Database
@@ -16,7 +19,7 @@ from app.domain.people import Experimenter, Role, StudyRole
 from app.domain.studies import Participant
 from app.errors import AppError
 from app.services.accounts import browser_sessions, roles, second_factor
-from app.services.accounts.failed_logins import FailedLogins
+from app.services.accounts.hourly_counts import HourlyCounts
 from app.services.accounts.openid import Provider
 from app.services.monitoring.tallies import Tallies
 from app.services.participants.time_left import UsualTimes
@@ -31,9 +34,14 @@ from app.web.http.session_queue import SessionQueue
 from app.web.http.shared_pages import SharedPages
 
 T = TypeVar("T")
+F = TypeVar("F", bound=BaseModel)
+MOST_FIELDS = 100
+"""Of an answer; it has fewer than twenty."""
 PARTICIPANT_COOKIE = "studio_participant"
 EXPERIMENTER_COOKIE = "studio_experimenter"
 KNOWN_BROWSER_COOKIE = "studio_known_browser"
+UNATTENDED = "x-unattended"
+"""Header of requests that a page makes by itself, without anybody doing anything."""
 LANGUAGE_COOKIE = "studio_language"
 """The language of the pages in this browser, for those that cannot tell who is asking."""
 
@@ -54,6 +62,10 @@ class LoginNeeded(AppError):
     """Please log in."""
 
     status = HTTPStatus.UNAUTHORIZED
+
+
+class NotSaved(LoginNeeded):
+    """You are logged out, so this was not saved. Go back, log in in another tab, and send what you typed again."""
 
 
 class PasswordChangeDue(AppError):
@@ -87,7 +99,8 @@ class Studio:
     hashing_for_known: Hashing = field(default_factory=Hashing)
     """For people whose browser is known or who are logged in: they do not queue behind strangers who guess."""
     imports: ImportLimit = field(default_factory=ImportLimit)
-    failed_logins: FailedLogins = field(default_factory=FailedLogins)
+    failed_logins: HourlyCounts = field(default_factory=HourlyCounts)
+    refusals: HourlyCounts = field(default_factory=HourlyCounts)
     tallies: Tallies = field(default_factory=Tallies)
     usual_times: UsualTimes = field(default_factory=UsualTimes)
     closing: Event = field(default_factory=Event)
@@ -150,6 +163,27 @@ class Answering:
             lambda session: step(session, participant_asking(self.request, session, lock=True))
         )
 
+    async def act_on(self, form: type[F], step: Callable[[Session, Participant, F], T]) -> T:
+        """Like act(), with what was sent, where empty means left out.
+
+        Nothing is parsed before it is known who sent it, and no second look is needed to know it. Raises LinkNeeded
+        and RequestValidationError.
+        """
+        sent = await self.request.body()
+        is_form = self.request.headers.get("content-type", "").startswith("application/x-www-form-urlencoded")
+        return await self.act(lambda session, participant: step(session, participant, _form(form, sent * is_form)))
+
+
+def _form(form: type[F], sent: bytes) -> F:
+    try:
+        fields = parse_qsl(sent.decode(errors="replace"), max_num_fields=MOST_FIELDS)
+    except ValueError:
+        fields = []
+    try:
+        return form.model_validate(dict(fields))
+    except ValidationError as error:
+        raise RequestValidationError([{**each, "loc": ("body", *each["loc"])} for each in error.errors()]) from None
+
 
 def experimenter_asking(
     request: Request, session: Session, needed: StudyRole = StudyRole.VIEWER, account_needed: Role = Role.READER
@@ -190,9 +224,13 @@ def experimenter_with_own_password(request: Request, session: Session) -> Experi
 def experimenter_logged_in(request: Request, session: Session) -> Experimenter:
     """The experimenter who is logged in, perhaps with a one-time password. Raises LoginNeeded."""
     cookie = request.cookies.get(EXPERIMENTER_COOKIE)
-    experimenter = browser_sessions.experimenter_of(session, cookie) if cookie else None
-    if experimenter is None:
+    found = browser_sessions.login_of(session, cookie) if cookie else None
+    if found is None:
         raise LoginNeeded
+    experimenter, login = found
+    settings: Settings = request.app.state.studio.settings
+    request.state.asking = experimenter.name
+    request.state.login_lasts_until = browser_sessions.lasts_until(login, settings.login_idle, settings.login_whole)
     return experimenter
 
 
@@ -214,19 +252,29 @@ def _administrator(request: Request, session: ReadingSession) -> Experimenter:
     return experimenter_asking(request, session, account_needed=Role.ADMINISTRATOR)
 
 
-async def _administrator_briefly(request: Request, studio: StudioDep) -> Experimenter:
-    async with studio.session_queue.reading() as session:
-        return await run_in_threadpool(_administrator, request, session)
+def experimenter_awaited(request: Request, session: Session) -> Experimenter:
+    """The experimenter whose password was right and whose code is still to come. Raises LoginNeeded."""
+    cookie = request.cookies.get(EXPERIMENTER_COOKIE)
+    account = browser_sessions.experimenter_of(session, cookie, second_factor_due=True) if cookie else None
+    if account is None:
+        raise LoginNeeded
+    return account
 
 
-async def _account_briefly(request: Request, studio: StudioDep) -> Experimenter:
-    async with studio.session_queue.reading() as session:
-        return await run_in_threadpool(experimenter_with_own_password, request, session)
+def _briefly(ask: Callable[[Request, Session], T]) -> Callable[[Request], Coroutine[Any, Any, T]]:
+    """Asks in a look of its own, so that no turn is held afterwards."""
+
+    async def look(request: Request) -> T:
+        studio = await studio_of(request)
+        return await studio.session_queue.look(partial(ask, request))
+
+    return look
 
 
-async def _logged_in_briefly(request: Request, studio: StudioDep) -> Experimenter:
-    async with studio.session_queue.reading() as session:
-        return await run_in_threadpool(experimenter_logged_in, request, session)
+_administrator_briefly = _briefly(_administrator)
+_account_briefly = _briefly(experimenter_with_own_password)
+_logged_in_briefly = _briefly(experimenter_logged_in)
+_awaited_briefly = _briefly(experimenter_awaited)
 
 
 def _acting_experimenter(request: Request, session: WritingSession) -> Experimenter:
@@ -260,16 +308,31 @@ AccountBriefly = Annotated[Experimenter, Depends(_account_briefly)]
 """Whoever is logged in with a password of their own, a second factor may be missing; no turn is held either."""
 LoggedInBriefly = Annotated[Experimenter, Depends(_logged_in_briefly)]
 """Whoever is logged in, a one-time password is enough; no turn is held either."""
+AwaitedBriefly = Annotated[Experimenter, Depends(_awaited_briefly)]
+"""Whoever has shown the password and must show a code; no turn is held either."""
 OwnAccount = Annotated[Experimenter, Depends(_own_account, scope="function")]
 """In the request's writing session, whatever their role: for what concerns nobody but themselves."""
 
+EXPERIMENTERS = {
+    *(_experimenter, _administrator, _acting_experimenter, _study_owner, _own_account),
+    *(_administrator_briefly, _account_briefly, _logged_in_briefly),
+}
+"""Dependencies of pages and forms that an experimenter opens or sends; streams and films come by themselves."""
+CHECKS: Mapping[Callable[..., object], Callable[[Request], Coroutine[Any, Any, object]]] = {
+    _participant: _briefly(participant_asking),
+    **{ask: _briefly(ask) for ask in (_experimenter, _administrator, _acting_experimenter, _study_owner, _own_account)},
+    **{ask: ask for ask in (_administrator_briefly, _account_briefly, _logged_in_briefly, _awaited_briefly)},
+}
+"""What is asked of whoever sends something, by dependency, before it is read (app.web.http.authorized_route)."""
 
-async def _typed(request: Request) -> Mapping[str, str]:
+
+async def read_typed(request: Request) -> Mapping[str, str]:
+    """A form's fields, files left out."""
     async with request.form() as form:  # files that somebody sends along are closed again
         return {name: value for name, value in form.items() if isinstance(value, str)}
 
 
-Typed = Annotated[Mapping[str, str], Depends(_typed)]
+Typed = Annotated[Mapping[str, str], Depends(read_typed)]
 """A form's fields as they were typed, where which there are depends on the study."""
 RowId = Annotated[int, Path(ge=1, le=2**31 - 1)]
 Slug = Annotated[str, Path(pattern=r"^[a-z0-9-]{1,80}$")]

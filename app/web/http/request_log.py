@@ -58,13 +58,13 @@ class RequestLog:
 
     def _note(self, scope: Scope, status: int, seconds: float) -> None:
         method = scope["method"] if scope["method"] in _METHODS else "other"
-        route = _route_of(scope)
+        route = route_of(scope)
         self._seconds.labels(method, route, str(status)).observe(seconds)
         fields = {"method": method, "route": route, "status": status, "ms": round(seconds * 1000, 1)}
         log.info("%s %s %d", method, route, status, extra={"fields": fields})
 
 
-def _route_of(scope: Scope) -> str:
+def route_of(scope: Scope) -> str:
     """The route with its parameters in braces, and what it is mounted below."""
     path = getattr(scope.get("route"), "path", None)
     if path is None:

@@ -9,6 +9,7 @@ from app.domain.participation import ConsentRecord
 from app.domain.protocol import Stage
 from app.domain.studies import Participant
 from app.services.participants import consent, stages
+from app.web.http.authorized_route import AuthorizedRoute
 from app.web.http.deps import CurrentParticipant, WritingSession
 from app.web.participant.pages import go, participant_page
 from app.web.texts.consent_text import consent_text
@@ -16,7 +17,7 @@ from app.web.texts.languages import wording_of
 from app.web.texts.templating import moment
 from app.web.texts.wording import Wording
 
-router = APIRouter(prefix="/p")
+router = APIRouter(prefix="/p", route_class=AuthorizedRoute)
 
 
 @router.get("/consent", name="show_consent")

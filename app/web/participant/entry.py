@@ -16,6 +16,7 @@ from app.services.answers import next_query
 from app.services.participants import admission, completion, enrolment, stages
 from app.services.studies.retirement import StudyDeleted, StudyPutAway
 from app.web.error_pages import wants_json
+from app.web.http.authorized_route import AuthorizedRoute
 from app.web.http.deps import (
     PARTICIPANT_COOKIE,
     AnsweringParticipant,
@@ -29,7 +30,7 @@ from app.web.participant import pairs
 from app.web.participant.pages import ADDRESSES, back_from, go, has_reached, participant_page
 from app.web.texts import languages
 
-router = APIRouter(prefix="/p")
+router = APIRouter(prefix="/p", route_class=AuthorizedRoute)
 
 AtInstructions = Annotated[Participant, has_reached(Stage.INSTRUCTIONS)]
 

@@ -15,10 +15,11 @@ from app.services.answers import next_query
 from app.services.evaluation import evaluation_plan, ratings, robot_preparation
 from app.services.evaluation.evaluation_plan import EvaluationState, NextTrial
 from app.web.error_pages import wants_json
+from app.web.http.authorized_route import AuthorizedRoute
 from app.web.http.deps import NotYet, RowId, StudioDep, WritingSession
 from app.web.participant.pages import go, has_reached, is_in, participant_page
 
-router = APIRouter(prefix="/p/evaluation")
+router = APIRouter(prefix="/p/evaluation", route_class=AuthorizedRoute)
 
 _DAY_MS = 24 * 3600 * 1000
 _Points = Annotated[int, Field(ge=1, le=LIKERT_POINTS)]

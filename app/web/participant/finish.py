@@ -12,10 +12,11 @@ from app.services.answers import next_query
 from app.services.evaluation import robot_preparation
 from app.services.monitoring import dashboard
 from app.services.participants import completion, debrief, stages
+from app.web.http.authorized_route import AuthorizedRoute
 from app.web.http.deps import CurrentParticipant, NotYet, StudioDep, WritingSession
 from app.web.participant.pages import back_from, go, has_reached, participant_page
 
-router = APIRouter(prefix="/p")
+router = APIRouter(prefix="/p", route_class=AuthorizedRoute)
 
 AtDebrief = Annotated[Participant, has_reached(Stage.DEBRIEF)]
 

@@ -12,6 +12,7 @@ from app.domain.protocol import LIKERT_POINTS, FormItem, Stage
 from app.domain.studies import Participant
 from app.services.participants import forms, stages
 from app.services.participants.forms import MOST_CHARACTERS, AnswerProblem
+from app.web.http.authorized_route import AuthorizedRoute
 from app.web.http.deps import Typed, WritingSession
 from app.web.participant import scales
 from app.web.participant.pages import back_from, go, has_reached, participant_page
@@ -19,7 +20,7 @@ from app.web.texts.form_questions import choice_of, label_of, question_of
 from app.web.texts.languages import wording_of
 from app.web.texts.wording import Wording
 
-router = APIRouter(prefix="/p")
+router = APIRouter(prefix="/p", route_class=AuthorizedRoute)
 
 
 AtDemographics = Annotated[Participant, has_reached(Stage.DEMOGRAPHICS)]

@@ -17,11 +17,12 @@ from app.services.evaluation import evaluation_plan, head_to_heads
 from app.services.evaluation.evaluation_plan import EvaluationState, NextTrial
 from app.services.evaluation.ratings import CorrectionTooLate
 from app.web.error_pages import wants_json
+from app.web.http.authorized_route import AuthorizedRoute
 from app.web.http.deps import RowId, StudioDep, WritingSession
 from app.web.participant.evaluation import Milliseconds, Reason, next_path
 from app.web.participant.pages import go, has_reached, is_in, participant_page
 
-router = APIRouter(prefix="/p/head-to-heads")
+router = APIRouter(prefix="/p/head-to-heads", route_class=AuthorizedRoute)
 
 AHEAD = 2
 """Head-to-heads that the page loads while another is shown."""

@@ -16,13 +16,14 @@ from app.services.accounts import browser_sessions
 from app.services.answers import next_query
 from app.services.participants import recruitment_panel
 from app.services.participants.recruitment_panel import Joined, PanelIdMissing
+from app.web.http.authorized_route import AuthorizedRoute
 from app.web.http.deps import PARTICIPANT_COOKIE, ReadingSession, StudioDep, Token, WritingSession, set_cookie
 from app.web.participant.pages import go, participant_page
 from app.web.texts import languages
 from app.web.texts.templating import page
 from app.web.texts.wording import wording_for
 
-router = APIRouter()
+router = APIRouter(route_class=AuthorizedRoute)
 
 
 @router.get("/join/{token}", name="join_study")

@@ -5,10 +5,9 @@ from http import HTTPStatus
 from typing import Annotated, Any
 from uuid import UUID, uuid4
 
-from fastapi import APIRouter, Depends, Form, Request
-from fastapi.exceptions import RequestValidationError
+from fastapi import APIRouter, Request
 from fastapi.responses import JSONResponse, Response
-from pydantic import BaseModel, BeforeValidator, Field, ValidationError
+from pydantic import BaseModel, BeforeValidator, Field
 from sqlalchemy.orm import Session
 
 from app.domain import preferences
@@ -22,12 +21,13 @@ from app.services.participants import admission, time_left
 from app.services.participants.time_left import TimeLeft
 from app.services.runs import estimates
 from app.web.error_pages import wants_json
+from app.web.http.authorized_route import AuthorizedRoute
 from app.web.http.deps import AnsweringParticipant, RowId, Studio
 from app.web.participant.pages import go, participant_page
 from app.web.texts.languages import wording_of
 from app.web.texts.wording import Wording
 
-router = APIRouter(prefix="/p")
+router = APIRouter(prefix="/p", route_class=AuthorizedRoute)
 
 _DAY_MS = 24 * 3600 * 1000
 _MINUTE_S, _HOUR_S = 60, 3600
@@ -53,6 +53,12 @@ class LabelForm(BaseModel):
     watched_whole: Annotated[bool | None, _Missing] = None
     left_watched_ms: _Milliseconds = None
     right_watched_ms: _Milliseconds = None
+
+
+class UndoForm(BaseModel):
+    """Which taking back this is, should it be sent twice."""
+
+    client_uuid: UUID
 
 
 class EventForm(BaseModel):
@@ -99,43 +105,29 @@ def show_turn(request: Request, session: Session, studio: Studio, participant: P
     return participant_page(request, f"participant/{_template(turn)}.html", participant, context)
 
 
-async def _label_form(request: Request) -> LabelForm:
-    """The answer as it was sent, where empty means left out. FastAPI would ask anew each time what the fields are."""
-    sent = await request.form()
-    try:
-        return LabelForm.model_validate({name: value for name, value in sent.items() if value != ""})
-    except ValidationError as error:
-        raise RequestValidationError([{**each, "loc": ("body", *each["loc"])} for each in error.errors()]) from None
-
-
-SentLabel = Annotated[LabelForm, Depends(_label_form)]
-
-
 @router.post("/queries/{query_id}/label", name="label_query")
-async def label_query(request: Request, query_id: RowId, answering: AnsweringParticipant, form: SentLabel) -> Response:
+async def label_query(request: Request, query_id: RowId, answering: AnsweringParticipant) -> Response:
     """Record the answer; the transaction is committed before this response leaves."""
-    measured = form.model_dump(exclude={"response", "client_uuid", "reason"})
-    watching = labelling.Watching(**measured, by_script=wants_json(request))
 
-    def label(session: Session, participant: Participant) -> Response:
+    def label(session: Session, participant: Participant, form: LabelForm) -> Response:
+        measured = form.model_dump(exclude={"response", "client_uuid", "reason"})
+        watching = labelling.Watching(**measured, by_script=wants_json(request))
         labelling.record_label(session, participant, query_id, form.response, form.client_uuid, watching, form.reason)
         admission.settle(session, participant, Stage.PAIRS)
         return _go_on(request, session, answering.studio, participant)
 
-    return await answering.act(label)
+    return await answering.act_on(LabelForm, label)
 
 
 @router.post("/queries/{query_id}/undo", name="undo_label")
-async def undo_label(
-    request: Request, query_id: RowId, client_uuid: Annotated[UUID, Form()], answering: AnsweringParticipant
-) -> Response:
+async def undo_label(request: Request, query_id: RowId, answering: AnsweringParticipant) -> Response:
     """Take the newest answer back; its pair is the next to be shown."""
 
-    def undo(session: Session, participant: Participant) -> Response:
-        labelling.undo_label(session, participant, query_id, client_uuid)
+    def undo(session: Session, participant: Participant, form: UndoForm) -> Response:
+        labelling.undo_label(session, participant, query_id, form.client_uuid)
         return _go_on(request, session, answering.studio, participant)
 
-    return await answering.act(undo)
+    return await answering.act_on(UndoForm, undo)
 
 
 @router.post("/break", name="end_break")
@@ -151,15 +143,15 @@ async def end_break(request: Request, answering: AnsweringParticipant) -> Respon
 
 
 @router.post("/events", name="note_event", status_code=HTTPStatus.NO_CONTENT)
-async def note_event(form: Annotated[EventForm, Form()], answering: AnsweringParticipant) -> Response:
+async def note_event(answering: AnsweringParticipant) -> Response:
     """Keep what the script noticed; sent as a beacon, so nobody waits for an answer."""
 
-    def note(session: Session, participant: Participant) -> None:
+    def note(session: Session, participant: Participant, form: EventForm) -> None:
         if form.kind not in (EventKind.BREAK_BEGUN, EventKind.BREAK_OVER):
             detail = {name: value for name, value in form.model_dump(exclude={"kind"}).items() if value is not None}
             participant_events.note(session, participant, form.kind, detail)
 
-    await answering.act(note)
+    await answering.act_on(EventForm, note)
     return Response(status_code=HTTPStatus.NO_CONTENT)
 
 

@@ -18,13 +18,14 @@ from app.services.answers import form_answers
 from app.services.evaluation import evaluation_plan, ratings
 from app.services.participants import forms, stages
 from app.services.participants.forms import AnswerProblem
+from app.web.http.authorized_route import AuthorizedRoute
 from app.web.http.deps import NotYet, StudioDep, Typed, WritingSession
 from app.web.participant.evaluation import AtEvaluation, next_path
 from app.web.participant.pages import back_from, go, has_reached, participant_page
 from app.web.texts.languages import wording_of
 from app.web.texts.wording import Wording
 
-router = APIRouter(prefix="/p")
+router = APIRouter(prefix="/p", route_class=AuthorizedRoute)
 
 AtQuestionnaire = Annotated[Participant, has_reached(Stage.QUESTIONNAIRE)]
 Name = Annotated[str, Path(pattern=r"^[a-z][a-z0-9_]{0,19}$")]

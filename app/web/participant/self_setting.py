@@ -19,13 +19,14 @@ from app.services.evaluation.self_setting import Preview
 from app.services.participants import sliders, stages
 from app.storage import ArtefactStore
 from app.web.error_pages import wants_json
+from app.web.http.authorized_route import AuthorizedRoute
 from app.web.http.deps import StudioDep, Typed, WritingSession
 from app.web.participant.evaluation import Milliseconds
 from app.web.participant.pages import go, has_reached, is_in, participant_page
 from app.web.texts import slider_words
 from app.web.texts.languages import wording_of
 
-router = APIRouter(prefix="/p/setting")
+router = APIRouter(prefix="/p/setting", route_class=AuthorizedRoute)
 
 InSetting = Annotated[Participant, is_in(Stage.SELF_SETTING)]
 AtSetting = Annotated[Participant, has_reached(Stage.SELF_SETTING)]

@@ -8,13 +8,14 @@ from starlette.background import BackgroundTask
 
 from app.services import audit
 from app.services.participants import withdrawal
+from app.web.http.authorized_route import AuthorizedRoute
 from app.web.http.deps import PARTICIPANT_COOKIE, CurrentParticipant, StudioDep, WritingSession
 from app.web.participant.pages import participant_page
 from app.web.texts import languages
 from app.web.texts.templating import page
 from app.web.texts.wording import Wording
 
-router = APIRouter(prefix="/p")
+router = APIRouter(prefix="/p", route_class=AuthorizedRoute)
 
 
 @router.get("/withdraw", name="show_withdraw")

@@ -16,10 +16,11 @@ from fastapi.responses import RedirectResponse, Response
 from app.domain.protocol import Language
 from app.domain.studies import Participant
 from app.settings import Settings
+from app.web.http.authorized_route import AuthorizedRoute
 from app.web.http.deps import LANGUAGE_COOKIE, StudioDep, WritingSession, participant_or_nobody, set_cookie
 from app.web.texts.wording import Wording, preferred, wording_for
 
-router = APIRouter(prefix="/p")
+router = APIRouter(prefix="/p", route_class=AuthorizedRoute)
 
 _OUR_PAGE = re.compile(r"/(?:p|join)/[\w./?=&%~+-]*", re.ASCII)
 

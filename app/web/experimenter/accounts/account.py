@@ -6,6 +6,7 @@ from fastapi import APIRouter, Request
 from fastapi.responses import RedirectResponse, Response
 
 from app.services.accounts import browser_sessions, second_factor
+from app.web.http.authorized_route import AuthorizedRoute
 from app.web.http.deps import (
     EXPERIMENTER_COOKIE,
     CurrentExperimenter,
@@ -16,7 +17,7 @@ from app.web.http.deps import (
 )
 from app.web.texts.templating import page
 
-router = APIRouter(prefix="/account")
+router = APIRouter(prefix="/account", route_class=AuthorizedRoute)
 
 
 @router.get("", name="show_own_account")

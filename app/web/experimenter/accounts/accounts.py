@@ -11,10 +11,11 @@ from sqlalchemy.orm import Session
 from app.domain.people import Experimenter, Role
 from app.errors import AppError
 from app.services.accounts import accounts, second_factor
+from app.web.http.authorized_route import AuthorizedRoute
 from app.web.http.deps import AdministratorBriefly, CurrentAdministrator, ReadingSession, RowId, StudioDep
 from app.web.texts.templating import page
 
-router = APIRouter(prefix="/accounts")
+router = APIRouter(prefix="/accounts", route_class=AuthorizedRoute)
 
 
 @router.get("", name="show_accounts")

@@ -14,7 +14,8 @@ from starlette.background import BackgroundTask
 from app.domain.people import Experimenter
 from app.errors import AppError
 from app.services import audit
-from app.services.accounts import accounts, browser_sessions, failed_logins, known_browsers, second_factor
+from app.services.accounts import accounts, browser_sessions, hourly_counts, known_browsers, second_factor
+from app.web.http.authorized_route import AuthorizedRoute
 from app.web.http.deps import (
     EXPERIMENTER_COOKIE,
     KNOWN_BROWSER_COOKIE,
@@ -26,7 +27,7 @@ from app.web.http.deps import (
 )
 from app.web.texts.templating import page
 
-router = APIRouter()
+router = APIRouter(route_class=AuthorizedRoute)
 
 TIME_FOR_CODE = timedelta(minutes=10)
 Password = Annotated[str, Form(max_length=accounts.MAX_PASSWORD_LENGTH)]
@@ -133,11 +134,11 @@ async def note_failure(studio: Studio, name: str) -> None:
     """For the audit log; never what was typed, unless an account has that name."""
     async with studio.session_queue.reading() as session:
         account = await run_in_threadpool(accounts.by_name, session, name)
-    known = failed_logins.UNKNOWN_NAME if account is None else account.name
+    known = hourly_counts.UNKNOWN_NAME if account is None else account.name
     count = studio.failed_logins.count(known)
     if count is not None:
         async with studio.session_queue.writing() as session:
-            subject = failed_logins.in_words(known, count)
+            subject = hourly_counts.in_words(known, count)
             await run_in_threadpool(audit.record, session, audit.STRANGER, "login failed", subject)
 
 
@@ -166,12 +167,12 @@ async def enter(request: Request, studio: Studio, experimenter: Experimenter, ta
 
     Raises WrongNameOrPassword when the password was replaced while it was being checked.
     """
-    lifetime = timedelta(hours=studio.settings.login_hours)
+    lifetime = min(studio.settings.login_idle, studio.settings.login_whole)
     user_agent = request.headers.get("user-agent", "")
     async with studio.session_queue.writing() as session:
         cookie = await run_in_threadpool(_open_session, session, experimenter, lifetime, act, user_agent)
     response = RedirectResponse(target or request.app.url_path_for("show_studies"), HTTPStatus.SEE_OTHER)
-    set_cookie(response, studio.settings, EXPERIMENTER_COOKIE, cookie, lifetime)
+    set_cookie(response, studio.settings, EXPERIMENTER_COOKIE, cookie, studio.settings.login_whole)
     mark = known_browsers.new_mark(experimenter)
     set_cookie(response, studio.settings, KNOWN_BROWSER_COOKIE, mark, known_browsers.LIFETIME)
     return response

@@ -13,10 +13,11 @@ from app.errors import AppError
 from app.services.accounts import accounts, openid, provider_accounts, second_factor
 from app.services.accounts.openid import Attempt, Provider
 from app.web.experimenter.accounts.login import TooManyAttempts, ask_for_code, count_attempt, enter, inside
+from app.web.http.authorized_route import AuthorizedRoute
 from app.web.http.deps import Studio, StudioDep, set_cookie
 from app.web.texts.templating import page
 
-router = APIRouter(prefix="/login/provider")
+router = APIRouter(prefix="/login/provider", route_class=AuthorizedRoute)
 
 ATTEMPT_COOKIE = "studio_login_attempt"
 TIME_TO_LOG_IN = timedelta(minutes=10)

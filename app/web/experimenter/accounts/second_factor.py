@@ -9,42 +9,43 @@ from fastapi import APIRouter, Form, Query, Request
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import RedirectResponse, Response
 from markupsafe import Markup
-from sqlalchemy.orm import Session
 from starlette.background import BackgroundTask
 
 from app.domain.people import Experimenter
 from app.errors import AppError
 from app.services.accounts import accounts, browser_sessions, second_factor
 from app.web.experimenter.accounts.login import Password, TooManyAttempts, count_attempt, enter, inside, note_failure
+from app.web.http.authorized_route import AuthorizedRoute
 from app.web.http.deps import (
     EXPERIMENTER_COOKIE,
     AccountBriefly,
-    LoginNeeded,
+    AwaitedBriefly,
     ReadingSession,
     Studio,
     StudioDep,
 )
 from app.web.texts.templating import page
 
-router = APIRouter()
+router = APIRouter(route_class=AuthorizedRoute)
 
 Code = Annotated[str, Form(max_length=60)]
 
 
 @router.get("/login/code", name="show_code")
-def show_code(request: Request, session: ReadingSession, next: Annotated[str, Query(max_length=300)] = "") -> Response:
-    """The form for the code, for whoever has shown the password. Raises LoginNeeded."""
-    _awaited(request, session)
+def show_code(request: Request, _account: AwaitedBriefly, next: Annotated[str, Query(max_length=300)] = "") -> Response:
+    """The form for the code, for whoever has shown the password."""
     return page(request, "experimenter/login_code.html", {"next": inside(next), "error": None})
 
 
 @router.post("/login/code", name="enter_code")
 async def enter_code(
-    request: Request, studio: StudioDep, code: Code, next: Annotated[str, Form(max_length=300)] = ""
+    request: Request,
+    studio: StudioDep,
+    account: AwaitedBriefly,
+    code: Code,
+    next: Annotated[str, Form(max_length=300)] = "",
 ) -> Response:
-    """Exchange the session that waits for the code for a whole one. Raises LoginNeeded."""
-    async with studio.session_queue.reading() as session:
-        account = await run_in_threadpool(_awaited, request, session)
+    """Exchange the session that waits for the code for a whole one."""
     try:
         shown = await _shown(request, studio, account, code)
     except AppError as error:
@@ -77,7 +78,7 @@ async def begin_second_factor(
         response.background = BackgroundTask(note_failure, studio, account.name)
         return response
     async with studio.session_queue.writing() as session:
-        secret = await run_in_threadpool(second_factor.begin, session, account)
+        secret = await run_in_threadpool(second_factor.begin, session, account, _key(studio))
     return _page(request, account, secret=secret)
 
 
@@ -87,9 +88,9 @@ async def confirm_second_factor(request: Request, studio: StudioDep, account: Ac
     try:
         await count_attempt(request, studio, account.name, browser=f"logged in/{account.id}")
         async with studio.session_queue.writing() as session:
-            codes = await run_in_threadpool(second_factor.confirm, session, account, code)
+            codes = await run_in_threadpool(second_factor.confirm, session, account, code, _key(studio))
     except (second_factor.CodeWrong, TooManyAttempts) as error:
-        return _page(request, account, secret=account.totp_secret, error=error)
+        return _page(request, account, secret=second_factor.secret_of(account, _key(studio)), error=error)
     return _page(request, account, codes=codes)
 
 
@@ -117,26 +118,21 @@ async def turn_off_second_factor(request: Request, studio: StudioDep, account: A
     return RedirectResponse(request.app.url_path_for("show_second_factor"), HTTPStatus.SEE_OTHER)
 
 
+def _key(studio: Studio) -> bytes:
+    return second_factor.key_of(studio.settings)
+
+
 class _WrongPassword(AppError):
     """The password is not right."""
 
     status = HTTPStatus.UNPROCESSABLE_ENTITY
 
 
-def _awaited(request: Request, session: Session) -> Experimenter:
-    """Whose password was right in this browser, and whose code is still to come. Raises LoginNeeded."""
-    cookie = request.cookies.get(EXPERIMENTER_COOKIE, "")
-    account = browser_sessions.experimenter_of(session, cookie, second_factor_due=True)
-    if account is None:
-        raise LoginNeeded
-    return account
-
-
 async def _shown(request: Request, studio: Studio, account: Experimenter, code: str) -> str:
     """What was shown, in words. Raises CodeWrong, TooManyWrongCodes and TooManyAttempts."""
     await count_attempt(request, studio, account.name, browser=f"code/{account.id}")
     async with studio.session_queue.writing() as session:
-        shown = await run_in_threadpool(second_factor.passes, session, account, code)
+        shown = await run_in_threadpool(second_factor.passes, session, account, code, _key(studio))
     if shown is None:  # after the commit: a mistake counts
         raise second_factor.CodeWrong
     return shown

@@ -18,6 +18,7 @@ from app.services.answers.answers import Mark, Wanted
 from app.services.exports import export_rows
 from app.services.participants import enrolment
 from app.services.studies import studies
+from app.web.http.authorized_route import AuthorizedRoute
 from app.web.http.deps import (
     ActingExperimenter,
     CurrentExperimenter,
@@ -30,7 +31,7 @@ from app.web.http.deps import (
 )
 from app.web.texts.templating import page
 
-router = APIRouter(prefix="/studies/{slug}/answers")
+router = APIRouter(prefix="/studies/{slug}/answers", route_class=AuthorizedRoute)
 
 NOTHING: Literal[""] = ""
 Reason = Annotated[str, Form(max_length=exclusions.LONGEST_REASON)]

@@ -24,6 +24,7 @@ from app.services.studies import membership, studies
 from app.web.experimenter.dashboard import charts, form_words, live
 from app.web.experimenter.dashboard.participants_table import View, WantedView, people_table
 from app.web.http import stored_file
+from app.web.http.authorized_route import AuthorizedRoute
 from app.web.http.deps import (
     ActingExperimenter,
     Code,
@@ -39,7 +40,7 @@ from app.web.http.deps import (
 from app.web.texts import task_words
 from app.web.texts.templating import page
 
-router = APIRouter(prefix="/studies")
+router = APIRouter(prefix="/studies", route_class=AuthorizedRoute)
 
 LIST_PARTS = {"machine": "pieces/machine", "study_list": "studies/list"}
 STUDY_PARTS = {

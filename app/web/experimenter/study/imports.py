@@ -21,11 +21,12 @@ from app.services.archives.archive import ArchiveInvalid
 from app.services.archives.study_import import Imported
 from app.services.studies import membership
 from app.web.http import new_links
+from app.web.http.authorized_route import AuthorizedRoute
 from app.web.http.deps import CurrentExperimenter, Studio, StudioDep, experimenter_asking
 from app.web.http.new_links import NewLink
 from app.web.texts.templating import page
 
-router = APIRouter()
+router = APIRouter(route_class=AuthorizedRoute)
 
 LONGEST_SEAL_KEY = 100
 LARGEST_ARCHIVE_BYTES = 16 * 1024**3

@@ -20,6 +20,7 @@ from app.services.exports.csv_cells import csv_line
 from app.services.participants import enrolment, recruitment_panel, withdrawal
 from app.services.studies import studies
 from app.web.http import new_links
+from app.web.http.authorized_route import AuthorizedRoute
 from app.web.http.deps import (
     ActingExperimenter,
     Code,
@@ -33,7 +34,7 @@ from app.web.http.deps import (
 from app.web.http.new_links import NewLink
 from app.web.texts.templating import page
 
-router = APIRouter(prefix="/studies")
+router = APIRouter(prefix="/studies", route_class=AuthorizedRoute)
 
 MAX_NEW_PARTICIPANTS = 50
 LinkKey = Annotated[str, Path(pattern=r"^[A-Za-z0-9_-]{10,40}$")]

@@ -11,10 +11,11 @@ from app.domain.people import Experimenter, StudyRole
 from app.domain.studies import Study
 from app.errors import AppError
 from app.services.studies import membership, studies
+from app.web.http.authorized_route import AuthorizedRoute
 from app.web.http.deps import CurrentExperimenter, ReadingSession, RowId, Slug, StudyOwner, WritingSession
 from app.web.texts.templating import page
 
-router = APIRouter(prefix="/studies/{slug}/members")
+router = APIRouter(prefix="/studies/{slug}/members", route_class=AuthorizedRoute)
 
 
 @router.get("", name="show_members")

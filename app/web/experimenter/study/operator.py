@@ -19,6 +19,7 @@ from app.services.evaluation.unblinding import NAMES, ConfirmationDiffers
 from app.services.participants import enrolment
 from app.services.studies import studies
 from app.web.http import stored_file
+from app.web.http.authorized_route import AuthorizedRoute
 from app.web.http.deps import (
     ActingExperimenter,
     Code,
@@ -33,7 +34,7 @@ from app.web.http.deps import (
 from app.web.media import AT_NO_TIME
 from app.web.texts.templating import page
 
-router = APIRouter(prefix="/studies/{slug}")
+router = APIRouter(prefix="/studies/{slug}", route_class=AuthorizedRoute)
 
 Letter = Annotated[str, Path(pattern=r"^[A-E]$")]
 

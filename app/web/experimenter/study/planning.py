@@ -21,6 +21,7 @@ from app.services.studies.studies import ClipsTooLong
 from app.web.experimenter.study.study_form import study_form
 from app.web.experimenter.study.study_form.form_fields import FIELDS, SECTIONS
 from app.web.experimenter.study.study_form.study_form import FormInvalid, Preset, StudyForm, TypedStudy
+from app.web.http.authorized_route import AuthorizedRoute
 from app.web.http.deps import (
     PARTICIPANT_COOKIE,
     ActingExperimenter,
@@ -35,7 +36,7 @@ from app.web.texts import task_words
 from app.web.texts.templating import page
 from app.web.texts.wording import built_in_texts, plain_text
 
-router = APIRouter(prefix="/studies")
+router = APIRouter(prefix="/studies", route_class=AuthorizedRoute)
 
 PREVIEW_LASTS = timedelta(hours=2)
 _Reason = Annotated[str, Form(max_length=2000)]

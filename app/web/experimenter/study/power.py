@@ -15,10 +15,11 @@ from app.domain.power_plan import PowerInputs, PowerPlan
 from app.domain.studies import Study
 from app.services.evaluation.unblinding import NAMES
 from app.services.studies import power, studies
+from app.web.http.authorized_route import AuthorizedRoute
 from app.web.http.deps import ActingExperimenter, CurrentExperimenter, ReadingSession, Slug, Typed, WritingSession
 from app.web.texts.templating import page
 
-router = APIRouter(prefix="/studies/{slug}")
+router = APIRouter(prefix="/studies/{slug}", route_class=AuthorizedRoute)
 
 WIDTH, HEIGHT, LEFT, BOTTOM, TOP = 560, 280, 48, 40, 12
 """Of the figure, in its own units."""

@@ -12,6 +12,7 @@ from app.domain.people import Experimenter
 from app.domain.studies import Study
 from app.services.exports import export_rows
 from app.services.studies import retirement, studies
+from app.web.http.authorized_route import AuthorizedRoute
 from app.web.http.deps import (
     ActingExperimenter,
     CurrentExperimenter,
@@ -23,7 +24,7 @@ from app.web.http.deps import (
 )
 from app.web.texts.templating import page
 
-router = APIRouter(prefix="/studies/{slug}")
+router = APIRouter(prefix="/studies/{slug}", route_class=AuthorizedRoute)
 
 
 @router.get("/away", name="show_put_away")

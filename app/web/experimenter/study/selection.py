@@ -20,10 +20,11 @@ from app.services.studies import studies
 from app.storage import Artefact
 from app.web.experimenter.study.invitations import link_of
 from app.web.http import new_links
+from app.web.http.authorized_route import AuthorizedRoute
 from app.web.http.deps import ActingExperimenter, Slug, StudioDep, WritingSession
 from app.web.http.new_links import NewLink
 
-router = APIRouter(prefix="/studies/{slug}/selection")
+router = APIRouter(prefix="/studies/{slug}/selection", route_class=AuthorizedRoute)
 
 MOST = 1000
 _Code = Annotated[str, StringConstraints(pattern=r"^P[0-9]{2,8}$")]

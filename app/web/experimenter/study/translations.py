@@ -9,6 +9,7 @@ from fastapi.responses import RedirectResponse, Response
 from app.domain.people import Experimenter
 from app.domain.studies import Study
 from app.services.studies import locking, studies
+from app.web.http.authorized_route import AuthorizedRoute
 from app.web.http.deps import (
     ActingExperimenter,
     CurrentExperimenter,
@@ -22,7 +23,7 @@ from app.web.texts.own_texts import own_texts, with_translations
 from app.web.texts.templating import page
 from app.web.texts.wording import broken_texts
 
-router = APIRouter(prefix="/studies")
+router = APIRouter(prefix="/studies", route_class=AuthorizedRoute)
 
 
 @router.get("/{slug}/translations", name="show_translations")

@@ -1,7 +1,7 @@
-"""Failed logins for the audit log: counted per account, and written down so seldom that nobody fills a disk with them.
+"""Failed logins and refusals for the audit log: written down so seldom that nobody fills a disk with them.
 
-Of an account the 1st, 10th, 100th, ... failure within an hour is a row. Names that no account has are counted together
-and never written down: people type passwords there.
+Of an account the 1st, 10th, 100th, ... within an hour is a row. Names that no account has are counted together and
+never written down: people type passwords there.
 """
 
 import math
@@ -16,25 +16,25 @@ UNKNOWN_NAME = "a name that no account has"
 WRONG_TOKEN = "a token that is not valid"  # noqa: S105  (no password)
 
 
-class FailedLogins:
+class HourlyCounts:
     """Counts of one web process. ``clock``: the time."""
 
     def __init__(self, clock: Callable[[], datetime] = now) -> None:
         self._clock = clock
         self._lock = Lock()
         self._counts: dict[str, tuple[datetime, int]] = {}
-        """by account: since when, how many; accounts of the studio and two more, so they are few"""
+        """by name: since when, how many; accounts and studies that there are, so they are few"""
 
-    def count(self, account: str) -> int | None:
+    def count(self, name: str) -> int | None:
         """How many there are now within the hour, when that is to be written down."""
         with self._lock:
-            since, before = self._counts.get(account, (self._clock(), 0))
+            since, before = self._counts.get(name, (self._clock(), 0))
             if self._clock() - since >= COUNTED_FOR:
                 since, before = self._clock(), 0
-            self._counts[account] = since, before + 1
+            self._counts[name] = since, before + 1
         return before + 1 if math.log10(before + 1).is_integer() else None
 
 
-def in_words(account: str, count: int) -> str:
+def in_words(subject: str, count: int) -> str:
     """The subject of the row."""
-    return account if count == 1 else f"{account} ({count} times within an hour)"
+    return subject if count == 1 else f"{subject} ({count} times within an hour)"
