@@ -42,6 +42,8 @@ from app.services.studies import power, studies
 from app.settings import Settings
 from app.storage import ArtefactStore
 from tests import factories
+from tests.benchmarks import planted_report
+from tests.benchmarks.planted_report import Cell, found_in
 from tests.conftest import serving
 from tests.databases import make_tables
 from tests.worker.at_hand import AtHand, at_once
@@ -301,17 +303,9 @@ def _contents(plan: PowerPlan) -> dict[str, Any]:
     return plan.contents
 
 
-def read(path: Path) -> list[dict[str, str]]:
-    """Rows that are there."""
-    if not path.exists():
-        return []
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
 def run_missing(path: Path, wanted: int, say: Callable[[str], object]) -> None:
     """Every study that has no row yet, the first ones of every truth before the second ones."""
-    known = {(row["truth"], int(row["people"]), int(row["study"])) for row in read(path)}
+    known = {(row["truth"], int(row["people"]), int(row["study"])) for row in planted_report.read(path)}
     if not path.exists():
         path.write_text(",".join(COLUMNS) + "\n")
     for number in range(wanted):
@@ -326,13 +320,43 @@ def run_missing(path: Path, wanted: int, say: Callable[[str], object]) -> None:
                     say(f"study {number + 1} of {wanted}: {truth.name}, {people} people, {row['seconds']} s\n")
 
 
+def cells(rows: Sequence[Mapping[str, str]], invented: int, say: Callable[[str], object]) -> list[Cell]:
+    """What is promised, what was found through the pages, and what ``invented`` studies find without them."""
+    found = []
+    with studio() as there:
+        for truth in TRUTHS.values():
+            promised = {effect: promise(there, truth, effect) for effect in {truth.effect, 0.0}}
+            for people in PEOPLE:
+                without = [p_without_pages(opinions_of(truth, people, number)) for number in range(invented)]
+                with_pages = [row for row in rows if (row["truth"], row["people"]) == (truth.name, str(people))]
+                say(f"{truth.name}, {people} people: {invented} studies without pages\n")
+                for measure in MEASURES:
+                    effect = 0.0 if measure == SCALES[1] else truth.effect
+                    row = promised[effect][people]["head_to_heads" if measure == "head_to_heads" else "ratings"]
+                    found.append(
+                        Cell(
+                            truth=truth.name,
+                            measure=measure,
+                            people=people,
+                            is_there=effect > 0,
+                            promised=(round(row["power"] * power_plans.STUDIES), power_plans.STUDIES),
+                            through_pages=found_in([float(each[measure] or "nan") for each in with_pages]),
+                            without_pages=found_in([each[measure] for each in without]),
+                        )
+                    )
+    return sorted(found, key=lambda cell: (list(TRUTHS).index(cell.truth), MEASURES.index(cell.measure), cell.people))
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run what is missing, then draw."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--studies", type=int, default=40, help="of each truth and number of people; 0: only draw")
+    parser.add_argument("--studies", type=int, default=25, help="of each truth and number of people; 0: only draw")
+    parser.add_argument("--invented", type=int, default=2000, help="studies without pages, of each")
     parser.add_argument("--to", type=Path, default=RESULTS)
     said = parser.parse_args(arguments)
     run_missing(said.to / "planted.csv", said.studies, sys.stdout.write)
+    rows = planted_report.read(said.to / "planted.csv")
+    planted_report.write(said.to, cells(rows, said.invented, sys.stdout.write))
 
 
 if __name__ == "__main__":
