@@ -309,15 +309,15 @@ def run_missing(path: Path, wanted: int, say: Callable[[str], object]) -> None:
     if not path.exists():
         path.write_text(",".join(COLUMNS) + "\n")
     for number in range(wanted):
-        keys = [(truth, people) for people in PEOPLE for truth in TRUTHS.values()]
+        keys = [(truth, count) for count in PEOPLE for truth in TRUTHS.values()]
         missing = [key for key in keys if (key[0].name, key[1], number) not in known]
         if missing:
             with studio() as there:
-                for truth, people in missing:
-                    row = run_study(there, truth, people, number)
+                for truth, count in missing:
+                    row = run_study(there, truth, count, number)
                     with path.open("a", newline="") as file:
                         csv.DictWriter(file, COLUMNS, lineterminator="\n").writerow(row)
-                    say(f"study {number + 1} of {wanted}: {truth.name}, {people} people, {row['seconds']} s\n")
+                    say(f"study {number + 1} of {wanted}: {truth.name}, {count} people, {row['seconds']} s\n")
 
 
 def cells(rows: Sequence[Mapping[str, str]], invented: int, say: Callable[[str], object]) -> list[Cell]:
