@@ -7,8 +7,9 @@ trials, ratings, head-to-heads. The answered pairs and the films, which make the
 planted in what people say, not in robots. Then the study is unblinded on its page, and the report computed from its
 tables as the worker does. Its p-values must be those of what its people meant to say, computed without any page; this
 alone is done with thousands of studies more. The promise is that of the page "How many people", asked of the same
-study. Adds a row per study to docs/results/planted.csv, where it goes on after an interruption, and draws planted.svg
-and the tables of planted.md from all rows; ``--studies 0`` only draws.
+study. Adds a row per study to docs/results/planted.csv, where it goes on after an interruption; writes promises and
+rates without pages once, to planted_rates.csv; and draws planted.svg and the tables of planted.md from both.
+``--studies 0`` only draws.
 """
 
 import argparse
@@ -43,7 +44,7 @@ from app.settings import Settings
 from app.storage import ArtefactStore
 from tests import factories
 from tests.benchmarks import planted_report
-from tests.benchmarks.planted_report import Cell, found_in
+from tests.benchmarks.planted_report import found_in
 from tests.conftest import serving
 from tests.databases import make_tables
 from tests.worker.at_hand import AtHand, at_once
@@ -320,43 +321,51 @@ def run_missing(path: Path, wanted: int, say: Callable[[str], object]) -> None:
                     say(f"study {number + 1} of {wanted}: {truth.name}, {count} people, {row['seconds']} s\n")
 
 
-def cells(rows: Sequence[Mapping[str, str]], invented: int, say: Callable[[str], object]) -> list[Cell]:
-    """What is promised, what was found through the pages, and what ``invented`` studies find without them."""
-    found = []
+def rates(path: Path, invented: int, say: Callable[[str], object]) -> list[dict[str, str]]:
+    """What is promised, and what ``invented`` studies find without pages; computed once, then read."""
+    if path.exists():
+        return planted_report.read(path)
+    rows = []
     with studio() as there:
         for truth in TRUTHS.values():
             promised = {effect: promise(there, truth, effect) for effect in {truth.effect, 0.0}}
             for people in PEOPLE:
                 without = [p_without_pages(opinions_of(truth, people, number)) for number in range(invented)]
-                with_pages = [row for row in rows if (row["truth"], row["people"]) == (truth.name, str(people))]
                 say(f"{truth.name}, {people} people: {invented} studies without pages\n")
                 for measure in MEASURES:
                     effect = 0.0 if measure == SCALES[1] else truth.effect
-                    row = promised[effect][people]["head_to_heads" if measure == "head_to_heads" else "ratings"]
-                    found.append(
-                        Cell(
-                            truth=truth.name,
-                            measure=measure,
-                            people=people,
-                            is_there=effect > 0,
-                            promised=(round(row["power"] * power_plans.STUDIES), power_plans.STUDIES),
-                            through_pages=found_in([float(each[measure] or "nan") for each in with_pages]),
-                            without_pages=found_in([each[measure] for each in without]),
-                        )
+                    plan = promised[effect][people]["head_to_heads" if measure == "head_to_heads" else "ratings"]
+                    found, studies = found_in([each[measure] for each in without])
+                    rows.append(
+                        {
+                            "truth": truth.name,
+                            "measure": measure,
+                            "people": people,
+                            "effect": effect,
+                            "promised": round(plan["power"] * power_plans.STUDIES),
+                            "of_promised": power_plans.STUDIES,
+                            "found_without_pages": found,
+                            "of_without_pages": studies,
+                        }
                     )
-    return sorted(found, key=lambda cell: (list(TRUTHS).index(cell.truth), MEASURES.index(cell.measure), cell.people))
+    rows.sort(key=lambda row: (list(TRUTHS).index(row["truth"]), MEASURES.index(row["measure"]), row["people"]))
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+    return planted_report.read(path)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run what is missing, then draw."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--studies", type=int, default=25, help="of each truth and number of people; 0: only draw")
-    parser.add_argument("--invented", type=int, default=2000, help="studies without pages, of each")
+    parser.add_argument("--invented", type=int, default=500, help="studies without pages, of each")
     parser.add_argument("--to", type=Path, default=RESULTS)
     said = parser.parse_args(arguments)
     run_missing(said.to / "planted.csv", said.studies, sys.stdout.write)
-    rows = planted_report.read(said.to / "planted.csv")
-    planted_report.write(said.to, cells(rows, said.invented, sys.stdout.write))
+    promised = rates(said.to / "planted_rates.csv", said.invented, sys.stdout.write)
+    planted_report.write(said.to, planted_report.cells(promised, planted_report.read(said.to / "planted.csv")))
 
 
 if __name__ == "__main__":

@@ -64,6 +64,28 @@ def found_in(p_values: Sequence[float | None]) -> tuple[int, int]:
     return sum(p is not None and p < ALPHA for p in p_values), len(p_values)
 
 
+def cells(rates: Sequence[Mapping[str, str]], studies: Sequence[Mapping[str, str]]) -> list[Cell]:
+    """Of planted_rates.csv and planted.csv."""
+    return [
+        Cell(
+            truth=rate["truth"],
+            measure=rate["measure"],
+            people=int(rate["people"]),
+            is_there=float(rate["effect"]) > 0,
+            promised=(int(rate["promised"]), int(rate["of_promised"])),
+            through_pages=found_in(
+                [
+                    float(row[rate["measure"]] or "nan")
+                    for row in studies
+                    if (row["truth"], row["people"]) == (rate["truth"], rate["people"])
+                ]
+            ),
+            without_pages=(int(rate["found_without_pages"]), int(rate["of_without_pages"])),
+        )
+        for rate in rates
+    ]
+
+
 def write(folder: Path, cells: Sequence[Cell]) -> None:
     """planted.svg and the tables of planted.md."""
     (folder / "planted.svg").write_bytes(rendered(_picture(cells))["svg"])
@@ -136,8 +158,8 @@ def _panel(axes: Axes, cells: Sequence[Cell], title: str) -> None:
         axes.plot(at, [_percent(cell.without_pages) for cell in mine], "x", color=colour, markersize=5)
         rates = [_percent(cell.through_pages) for cell in mine]
         ends = [wilson_interval(*cell.through_pages) for cell in mine]
-        below = [rate - 100 * low for rate, (low, _) in zip(rates, ends, strict=True)]
-        above = [100 * high - rate for rate, (_, high) in zip(rates, ends, strict=True)]
+        below = [max(rate - 100 * low, 0.0) for rate, (low, _) in zip(rates, ends, strict=True)]
+        above = [max(100 * high - rate, 0.0) for rate, (_, high) in zip(rates, ends, strict=True)]
         name = f"{NAMES[measure]}, {truth}" if not mine[0].is_there else NAMES[measure]
         marks: dict[str, Any] = {"fmt": MARKERS[place], "color": colour, "markersize": 4, "elinewidth": 0.8}
         axes.errorbar(at, rates, yerr=[below, above], label=name, **marks)
