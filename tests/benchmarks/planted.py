@@ -6,7 +6,7 @@ Every person goes from the personal link to the end through the pages of a web s
 trials, ratings, head-to-heads. The answered pairs and the films, which make the robots, are put in place: the effect is
 planted in what people say, not in robots. Then the study is unblinded on its page, and the report computed from its
 tables as the worker does. Its p-values must be those of what its people meant to say, computed without any page; this
-alone is done with thousands of studies more. The promise is that of the page "How many people", asked of the same
+alone is done with hundreds of studies more. The promise is that of the page "How many people", asked of the same
 study. Adds a row per study to docs/results/planted.csv, where it goes on after an interruption; writes promises and
 rates without pages once, to planted_rates.csv; and draws planted.svg and the tables of planted.md from both.
 ``--studies 0`` only draws.

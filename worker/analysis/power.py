@@ -100,7 +100,7 @@ def _worth(truth: Truth, people: int, rng: np.random.Generator) -> tuple[FloatAr
 def _means(truth: Truth, worth: FloatArray, rng: np.random.Generator) -> FloatArray:
     """Of what everybody says of each method, (people, methods)."""
     said = worth[:, :, None] + rng.normal(0.0, truth.noise, (*worth.shape, truth.trials))
-    return np.clip(np.rint(said), 1, 5).mean(axis=2).round(12)
+    return np.asarray(np.clip(np.rint(said), 1, 5).mean(axis=2).round(12), np.float64)
 
 
 def ratings_p(truth: Truth, means: FloatArray, meets: Any) -> list[float | None]:
