@@ -138,7 +138,7 @@ def _picture(cells: Sequence[Cell]) -> Figure:
         power.set_ylabel("Studies that find it, %")
         alarms.axhline(100 * ALPHA, color=GREY, linewidth=0.8, linestyle="--")
         power.set_ylim(0, 100)
-        alarms.set_ylim(0, 40)
+        alarms.set_ylim(0, 60)
         for axes in (power, alarms):
             axes.set_xlabel("People")
             axes.legend(loc="upper left" if axes is alarms else "lower right", fontsize=7)
