@@ -134,7 +134,7 @@ def test_whatever_is_asked_is_answered_and_stored_as_it_was_meant(scene: Scene) 
     best = max(person.rated, key=lambda each: each.true_share)
     assert said[Stage.QUESTIONNAIRE][MADE_FOR_YOU] == letters[best.method]
     assert [each.response in ("left", "right") for each in compared] == [True]
-    assert all(each.reason for each in (*ratings, *compared))
+    assert all(reason for reason in [*(each.reason for each in ratings), *(each.reason for each in compared)])
     described = [(each.instrument.name, each.letter) for each in filled_in]
     assert sorted(described, key=str) == sorted(
         [("tia", "A"), ("tia", "B"), ("tia", None), ("nasa_tlx", None)], key=str
@@ -154,7 +154,7 @@ def test_people_of_an_arm_meet_its_methods_and_set_their_robot_where_it_is_one_o
     for participant_id, person in people:
         met = {"own": {"pbarl"}, "themselves": {"self_set", "reference"}}[arms_of[participant_id] or ""]
         assert {each.method for each in person.rated} == met
-    assert [(arms_of[each.participant_id], each.mode.keys()) for each in settings] == [("themselves", {"speed_far"})]
+    assert [(arms_of[each.participant_id], list(each.mode)) for each in settings] == [("themselves", ["speed_far"])]
 
 
 @pytest.mark.parametrize(

@@ -231,11 +231,11 @@ def run_study(there: Studio, truth: Truth, people: int, number: int) -> dict[str
     study = make_study(there, seed=1000 * people + number)
     with there.database.writing() as session:
         here = session.get_one(Study, study.id)
-        clips = [factories.make_clip(session, there.store, here) for _ in range(2)]
+        left, right = (factories.make_clip(session, there.store, here) for _ in range(2))
         invited = [enrolment.add_participant(session, here, scripted_as=truth.name) for _ in range(people)]
         for participant, _ in invited:
             for _ in range(PAIRS):
-                factories.make_label(session, factories.make_query(session, participant, *clips))
+                factories.make_label(session, factories.make_query(session, participant, left, right))
     opinions = opinions_of(truth, people, number)
     for (participant, token), theirs in zip(invited, opinions, strict=True):
         _walk(there, f"/p/{token}", PlantedPerson(there.database, theirs), participant.id)

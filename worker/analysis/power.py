@@ -1,11 +1,11 @@
 """How likely a study of this very design is to find an effect, for several numbers of people: by simulation.
 
-What somebody says of a method is 3 (the middle of the scale) + their own level + what the method is to them + the noise
-of one rating, rounded and cut to 1 to 5. One method is better than all the others by the effect on average. A share of
-those who begin drops out, and counts in no test. Every invented study is tested as the page of results would: means of
-each person by the paired t-test, or between arms by Welch's; head-to-heads by Bradley-Terry strengths; corrected by
-Holm over all comparisons of the design, of which one that this test cannot make counts as not found. Intervals of the power are Wilson's, 95 %: they say how far the simulation may
-be off.
+What somebody says of a method is 3 (the middle of the scale) + their own level + what the method is to them + the
+noise of one rating, rounded and cut to 1 to 5. One method is better than all the others by the effect on average. A
+share of those who begin drops out, and counts in no test. Every invented study is tested as the page of results
+would: means of each person by the paired t-test, or between arms by Welch's; head-to-heads by Bradley-Terry
+strengths; corrected by Holm over all comparisons of the design, of which one that this test cannot make counts as not
+found. Intervals of the power are Wilson's, 95 %: they say how far the simulation may be off.
 """
 
 from collections.abc import Sequence
