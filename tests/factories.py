@@ -193,10 +193,14 @@ def make_film(
     method: str,
     model: Model | None = None,
     scenario: int | None = None,
+    picture: int | None = None,
 ) -> Film:
-    """A method in a scenario, filmed; usually the first of those in which people see before and after."""
+    """A method in a scenario, filmed; usually the first of those in which people see before and after.
+
+    ``picture``: what it looks like; otherwise each looks different.
+    """
     number = session.scalar(select(func.count(Film.id))) or 0
-    video, poster = moving_picture(1000 + number)
+    video, poster = moving_picture(1000 + (number if picture is None else picture))
     film = Film(
         participant_id=participant.id,
         method=method,
@@ -234,9 +238,14 @@ def answer_everything(session: Session, store: ArtefactStore, study: Study, part
         make_label(session, query)
 
 
-def make_robots(session: Session, store: ArtefactStore, study: Study, participant: Participant) -> Sequence[Trial]:
-    """The evaluation drawn, and everything there that it shows: films or controllers. Returns the trials."""
-    settings = study.settings.evaluation
+def make_robots(
+    session: Session, store: ArtefactStore, study: Study, participant: Participant, picture: int | None = None
+) -> Sequence[Trial]:
+    """The evaluation drawn, and everything there that it shows: films or controllers. Returns the trials.
+
+    ``picture``: what all films look like; otherwise each looks different.
+    """
+    settings = evaluation_plan.settings_for(study, participant.arm)
     if settings is None:
         raise ValueError("This study evaluates nothing.")
     evaluation_plan.draw(session, study, participant)
@@ -247,7 +256,8 @@ def make_robots(session: Session, store: ArtefactStore, study: Study, participan
             make_controller(session, store, participant, method)
         return trials
     for trial in trials:
-        trial.film = make_film(session, store, participant, methods[trial.letter], scenario=trial.scenario)
+        method = methods[trial.letter]
+        trial.film = make_film(session, store, participant, method, scenario=trial.scenario, picture=picture)
     session.flush()
     return trials
 

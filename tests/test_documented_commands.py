@@ -130,6 +130,9 @@ RUN: dict[str, str | Elsewhere | OnlyParsed] = {
     "page_times": "--people 1 --labels 20 --times 2",
     "pages": OnlyParsed("photographs a real studio, which takes minutes, and writes to docs/pictures"),
     "pool_rollouts": "--first 10800000 --scenarios 1 --directory pool",
+    "planted": OnlyParsed(
+        "asks for plans of thousands of invented studies; tests/app/test_scripted_people.py walks through the pages"
+    ),
     "printed_readings": ROLLOUTS,
     "render_speed": "--tasks feeding --films 1 --steps 1",
     "replayed_waiting": REAL_TIME,

@@ -25,9 +25,9 @@ from app.services.participants import enrolment
 from app.services.studies import studies
 from app.storage import ArtefactStore
 from worker.ml.teachers import TASTES, Manner
-from worker.rehearsal.browser import FormBrowser
+from worker.rehearsal.browser import UP_TO_PAIRS, WAITING, FormBrowser
 from worker.rehearsal.participant_steps import ScriptedPerson
-from worker.rehearsal.server import OwnStudio, wait_until
+from worker.rehearsal.server import POLL_S, OwnStudio, wait_until
 
 LABELS, TRIALS = 12, 1
 PACE_S = 2.0
@@ -63,11 +63,9 @@ def main() -> None:
             store = ArtefactStore(Path(directory) / "artefacts")
             person = ScriptedPerson(database, store, study, TASTES["cautious"], Manner(), participant.number)
             with FormBrowser(studio.settings.base_url, f"/p/{token}") as visitor:
-                visitor.come_in()
-                for _ in range(study.settings.practice_pairs + study.settings.question_count):
-                    query_id = wait_until(PATIENCE_S, "no pair to label", visitor.query_id)
-                    time.sleep(PACE_S)
-                    visitor.answer(person.answer(query_id))
+                while visitor.page in UP_TO_PAIRS:
+                    time.sleep(PACE_S if visitor.query_id() else POLL_S)
+                    visitor.act(person)
                 _wait(database, visitor, participant.id)
             _report_runs(database, participant.id)
         database.dispose()
@@ -78,12 +76,12 @@ def _wait(database: Database, visitor: FormBrowser, participant_id: int) -> None
     began = time.monotonic()
     told: list[tuple[float, float]] = []
 
-    def robot() -> int | None:
-        found = visitor.trial_id()
+    def robot() -> bool | None:
+        visitor.look()
         words = TOLD.search(visitor.text)
-        if found is None and words:
+        if visitor.page in WAITING and words:
             told.append((time.monotonic() - began, 60.0 * (1 if words[1] == "a" else int(words[1]))))
-        return found
+        return visitor.page not in WAITING or None
 
     wait_until(PATIENCE_S, "no robot to rate", robot)
     first_s = time.monotonic() - began

@@ -3,6 +3,7 @@
 import argparse
 from dataclasses import dataclass, field
 from enum import StrEnum
+from pathlib import Path
 from typing import Any, Literal
 
 import pytest
@@ -153,3 +154,15 @@ def test_settings_that_no_study_can_have_are_refused_in_words_before_anything_st
     told = capsys.readouterr().err
     assert "cannot have these settings" in told
     assert name in told
+
+
+def test_so_are_those_of_a_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(rehearsing, "OwnStudio", None)
+    monkeypatch.setattr(stop_signals, "any_signal_is_ctrl_c", lambda: None)
+    file = tmp_path / "study.json"
+    for written, told in (("{", "Invalid JSON"), ('{"labels_per_participant": 0}', "labels_per_participant")):
+        file.write_text(written)
+        assert main(["rehearse", "--settings", str(file)]) == 1
+        assert told in capsys.readouterr().err

@@ -61,6 +61,11 @@ def _add_rehearsal(commands: Commands) -> None:
         "--omega", nargs=6, type=float, action="append", default=[], help="somebody with these six weights; repeatable"
     )
     rehearse.add_argument("--paper", action="store_true", help="the paper's whole protocol, robots rated in the end")
+    rehearse.add_argument(
+        "--settings",
+        type=Path,
+        help="a study of these settings, in a file as the API has them; instead of most options",
+    )
     options.add(rehearse, OF_SETTINGS, StudySettings(strategy=Strategy.UNIFORM))
     options.add(rehearse, OF_EVALUATION, EvaluationSettings())
     rehearse.add_argument("--clip-scenarios", type=int, help="size of the pool; default: just enough pairs")
@@ -117,6 +122,8 @@ def _manner(said: argparse.Namespace) -> Manner:
 
 
 def _settings(said: argparse.Namespace) -> StudySettings:
+    if said.settings is not None:
+        return StudySettings.model_validate_json(said.settings.read_bytes())
     chosen = {name: getattr(said, name) for name in OF_SETTINGS}
     chosen["clip_quality"] = ClipQuality.QUICK  # nobody looks at them
     enough = -(-said.labels_per_participant // StudySettings().pairs_per_scenario)

@@ -45,12 +45,13 @@ class ScriptedRater:
         """Satisfaction and personalisation, 1 to 5 each."""
         share = self.share(preference_return)
         weight = self._manner.success_share
-        return self._points((1 - weight) * share + weight * success), self._points(share)
+        return 1 + self.place((1 - weight) * share + weight * success), 1 + self.place(share)
 
     def share(self, preference_return: float) -> float:
         """q: the share of what was seen that is worse."""
         return float(np.searchsorted(self._seen, preference_return)) / len(self._seen)
 
-    def _points(self, share: float) -> int:
+    def place(self, share: float, places: int = POINTS) -> int:
+        """Which of so many points is chosen for something this good, 0 to places - 1."""
         felt = share + self._bias + float(self._rng.normal(0.0, self._manner.noise))
-        return int(np.clip(round(1 + (POINTS - 1) * felt), 1, POINTS))
+        return int(np.clip(round((places - 1) * felt), 0, places - 1))

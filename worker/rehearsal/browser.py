@@ -1,28 +1,90 @@
-"""A browser without scripts, as far as a rehearsal needs one: follows redirects, fills in forms, presses buttons."""
+"""A browser without scripts, as far as a rehearsal needs one: follows redirects, fills in forms, presses buttons.
+
+Whoever sits in front of it answers whatever a page asks (``Visitor``), so that every study can be gone through.
+"""
 
 import re
 import secrets
-import time
-from collections.abc import Mapping
-from dataclasses import dataclass
+import ssl
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import Enum
+from functools import cache
 from html.parser import HTMLParser
-from typing import Self
+from typing import Protocol, Self
 from urllib.parse import urljoin
 
 import httpx2
 
 from app.errors import AppError
 
-_QUERY = re.compile(r"/p/queries/(\d+)/label")
-_BREAK = re.compile(r"/p/break$")
-_RATING = re.compile(r"/p/evaluation/trials/(\d+)/rating")
-_SETTING = re.compile(r"/p/setting$")
-_HEAD_TO_HEAD = re.compile(r"/p/head-to-heads/(\d+)/answer")
-_SCALE = re.compile(r"/p/(?:questionnaire|evaluation/robots/[A-E])/[a-z0-9_]+$")
 _LANGUAGE = re.compile(r"/p/language$")
-_END = "/p/finished"
-_MOST_PAGES = 60
-"""Forms between the pairs and the end."""
+_AGAIN = "/p/next"
+_TAGS = re.compile(r"<(?:main|form|input|button|textarea)\b[^>]*>|</textarea>")
+"""What is read of a page: our templates escape > in attributes, and the parser takes longer than the server."""
+
+
+class Asked(Enum):
+    """What a page asks for; the value: where its form is sent."""
+
+    PAIR = re.compile(r"/p/queries/(\d+)/label$")
+    BREAK = re.compile(r"/p/break$")
+    SLIDERS = re.compile(r"/p/setting$")
+    RATING = re.compile(r"/p/evaluation/trials/(\d+)/rating$")
+    HEAD_TO_HEAD = re.compile(r"/p/head-to-heads/(\d+)/answer$")
+    ROBOT_SCALE = re.compile(r"/p/evaluation/robots/([A-E])/([a-z0-9_]+)$")
+    SCALE = re.compile(r"/p/questionnaire/([a-z0-9_]+)$")
+    QUESTIONS = re.compile(r"/p/(demographics|questionnaire)$")
+    GOING_ON = re.compile(r"/p/(?:consent|instructions|debrief)$")
+    """One button."""
+
+
+OVER = ("finished", "ended")
+"""Pages, by the name they give themselves, after which there is nothing to do: the end, and being sent back before."""
+WAITING = ("waiting", "self-setting-waiting", "evaluation-waiting")
+"""Pages that wait for the studio."""
+UP_TO_PAIRS = ("consent", "demographics", "instructions", "practice", "pair", "break", "waiting")
+"""Pages up to the last pair."""
+
+
+@dataclass(frozen=True)
+class Offered:
+    """One question of a form as a browser sees it."""
+
+    kind: str
+    """choice, number or text"""
+    choices: Sequence[str] = ()
+
+
+@dataclass
+class Form:
+    """A form of a page: what is sent when somebody only presses its button, and what could be filled in."""
+
+    action: str
+    fields: dict[str, str] = field(default_factory=dict)
+    questions: dict[str, Offered] = field(default_factory=dict)
+
+
+class Visitor(Protocol):
+    """Who answers; every method gets what the page's address says, and gives what is filled in."""
+
+    def answer(self, query_id: int) -> str:
+        """Which of two clips: an answer's name."""
+
+    def set_robot(self) -> Mapping[str, int]:
+        """The place of every slider, by axis."""
+
+    def rate(self, trial_id: int) -> tuple[int, int]:
+        """Satisfaction and personalisation."""
+
+    def prefer(self, head_to_head_id: int) -> str:
+        """Which of two robots: left, right or equal."""
+
+    def describe(self, instrument: str, letter: str | None) -> Mapping[str, str]:
+        """The points of a standard questionnaire, about the robot of this letter or about none."""
+
+    def reply(self, questions: Mapping[str, Offered]) -> Mapping[str, str]:
+        """Answers to the study's own questions, and reasons in words."""
 
 
 class WentAstray(AppError):
@@ -34,7 +96,7 @@ class FormBrowser:
 
     def __init__(self, base_url: str, path: str) -> None:
         self._client = httpx2.Client(
-            base_url=base_url, follow_redirects=True, timeout=60.0, headers={"Origin": base_url}
+            base_url=base_url, follow_redirects=True, timeout=60.0, headers={"Origin": base_url}, verify=_trusted()
         )
         self._page = _Page("", "")
         self._first = path
@@ -46,14 +108,6 @@ class FormBrowser:
     def __exit__(self, *exception: object) -> None:
         self._client.close()
 
-    def come_in(self) -> None:
-        """Go through consent and instructions to the first pair."""
-        for _ in range(5):
-            if self._page.address.endswith("/p/next") or self._page.form_to(_QUERY):
-                return
-            self._send_first({})
-        raise WentAstray(f"The way from the personal link to the first pair ended at {self._page.address}.")
-
     def log_in(self, name: str, password: str) -> None:
         """As an experimenter, choosing a new password on the way when asked to."""
         self._send_first({"name": name, "password": password})
@@ -64,10 +118,10 @@ class FormBrowser:
     def fill_in(self, path: str, **filled_in: str) -> None:
         """Open the page at this address and send its form to the same address."""
         self._open(path)
-        form = self._page.form_to(re.compile(rf"{re.escape(path)}$"))
+        form = next((each for each in self._page.forms if each.action.endswith(path)), None)
         if form is None:
             raise WentAstray(f"There is no form to {path} on {self._page.address}.")
-        self._send(form.target.group(0), {**form.fields, **filled_in})
+        self._send(path, {**form.fields, **filled_in})
 
     def download(self, path: str) -> bytes:
         """The bytes behind an address."""
@@ -76,94 +130,48 @@ class FormBrowser:
             raise WentAstray(f"GET {path} answered {response.status_code}.")
         return response.content
 
-    def query_id(self) -> int | None:
-        """The query on the page, after loading the page anew; None while there is none. Breaks are not needed."""
-        self._open("/p/next")
-        if rest := self._page.form_to(_BREAK):
-            self._send(rest.target.group(0), rest.fields)
-        form = self._page.form_to(_QUERY)
-        return None if form is None else int(form.target.group(1))
+    @property
+    def page(self) -> str:
+        """The name that the page gives itself, such as pair, waiting or finished."""
+        return self._page.name
 
     @property
     def text(self) -> str:
         """The page as it was sent."""
         return self._page.text
 
-    def answer(self, response: str) -> float:
-        """Press a button; returns the seconds until the next page was there."""
-        form = self._page.form_to(_QUERY)
-        if form is None:
-            raise WentAstray(f"There is no pair on {self._page.address}.")
-        started = time.perf_counter()
-        self._send(form.target.group(0), {**form.fields, "response": response})
-        return time.perf_counter() - started
+    def look(self) -> None:
+        """Open the page on which one should be now."""
+        self._open(_AGAIN)
 
-    def trial_id(self) -> int | None:
-        """The trial to be rated on the page, after loading it anew; None while the robots are prepared."""
-        self._open_after_scales()
-        form = self._page.form_to(_RATING)
-        return None if form is None else int(form.target.group(1))
+    def query_id(self) -> int | None:
+        """The pair on the page; None where there is none."""
+        found = self._asked()
+        return int(found[1].group(1)) if found is not None and found[0] is Asked.PAIR else None
 
-    def rate(self, satisfaction: int, personalisation: int) -> None:
-        """Give a rating and go on."""
-        form = self._page.form_to(_RATING)
-        if form is None:
-            raise WentAstray(f"There is no robot to rate on {self._page.address}.")
-        points = {"satisfaction": str(satisfaction), "personalisation": str(personalisation)}
-        self._send(form.target.group(0), {**form.fields, **points})
+    def act(self, visitor: Visitor) -> Asked | None:
+        """Do what the page asks; None, and the page anew, where there is nothing to do but to wait or to go on."""
+        found = self._asked()
+        if found is None:
+            self.look()
+            return None
+        asked, match, form = found
+        self._send(match.group(0), {**form.fields, **_filled_in(visitor, asked, match.groups(), form)})
+        return asked
 
-    def head_to_head_id(self) -> int | None:
-        """The head-to-head on the page, after loading it anew; None while there is none."""
-        self._open_after_scales()
-        form = self._page.form_to(_HEAD_TO_HEAD)
-        return None if form is None else int(form.target.group(1))
-
-    def prefer(self, response: str) -> None:
-        """Answer the head-to-head and go on."""
-        form = self._page.form_to(_HEAD_TO_HEAD)
-        if form is None:
-            raise WentAstray(f"There are no two robots to compare on {self._page.address}.")
-        self._send(form.target.group(0), {**form.fields, "response": response})
-
-    def is_at_sliders(self) -> bool | None:
-        """Whether the sliders are on the page, after loading it anew; None while there are none."""
-        self._open("/p/next")
-        return self._page.form_to(_SETTING) is not None or None
-
-    def set_robot(self, stops: Mapping[str, int]) -> None:
-        """Move the sliders to these places, by axis, and go on."""
-        form = self._page.form_to(_SETTING)
-        if form is None:
-            raise WentAstray(f"There are no sliders on {self._page.address}.")
-        moved = {f"axis-{axis}": str(stop) for axis, stop in stops.items()}
-        self._send(form.target.group(0), {**form.fields, **moved, "goes_on": "true"})
-
-    def go_to_the_end(self) -> None:
-        """Through whatever forms are left, as they are."""
-        self._open("/p/next")
-        for _ in range(_MOST_PAGES):
-            if self._page.address.endswith(_END):
-                return
-            self._send_first({})
-        raise WentAstray(f"The way to the end ended at {self._page.address}.")
-
-    def _open_after_scales(self) -> None:
-        """Standard questionnaires about robots are sent as they are, without answers: nobody scripted has a view."""
-        self._open("/p/next")
-        for _ in range(_MOST_PAGES):
-            form = self._page.form_to(_SCALE)
-            if form is None:
-                return
-            self._send(form.target.group(0), form.fields)
-        raise WentAstray(f"The way through the questionnaires ended at {self._page.address}.")
+    def _asked(self) -> tuple[Asked, re.Match[str], Form] | None:
+        for form in self._page.forms:
+            for asked in Asked:
+                if self._page.name not in OVER and (match := asked.value.search(form.action)):
+                    return asked, match, form
+        return None
 
     def _send_first(self, filled_in: dict[str, str]) -> None:
         """Send the page's first form, that for the language left out, with these fields filled in."""
-        forms = [form for form in self._page.forms if not _LANGUAGE.search(form[0])]
+        forms = [form for form in self._page.forms if not _LANGUAGE.search(form.action)]
         if not forms:
             raise WentAstray(f"There is nothing to press on {self._page.address}.")
-        action, fields = forms[0]
-        self._send(action, {**fields, **filled_in})
+        self._send(forms[0].action, {**forms[0].fields, **filled_in})
 
     def _open(self, path: str) -> None:
         self._arrive(self._client.get(path))
@@ -177,12 +185,34 @@ class FormBrowser:
         self._page = _Page(str(response.url), response.text)
 
 
-@dataclass(frozen=True)
-class _Form:
-    """A form whose address has been recognised."""
+@cache
+def _trusted() -> ssl.SSLContext:
+    """Whom to trust, read once for all visitors: it takes a tenth of a second."""
+    return httpx2.create_ssl_context()
 
-    target: re.Match[str]
-    fields: dict[str, str]
+
+def _filled_in(visitor: Visitor, asked: Asked, says: tuple[str, ...], form: Form) -> dict[str, str]:
+    """What the visitor fills in; in words as well where there is room for it."""
+    words = {name: each for name, each in form.questions.items() if name == "reason"}
+    match asked:
+        case Asked.PAIR:
+            return {"response": visitor.answer(int(says[0]))}
+        case Asked.SLIDERS:
+            return {"goes_on": "true", **{f"axis-{axis}": str(stop) for axis, stop in visitor.set_robot().items()}}
+        case Asked.RATING:
+            satisfaction, personalisation = visitor.rate(int(says[0]))
+            points = {"satisfaction": str(satisfaction), "personalisation": str(personalisation)}
+            return {**points, **visitor.reply(words)}
+        case Asked.HEAD_TO_HEAD:
+            return {"response": visitor.prefer(int(says[0])), **visitor.reply(words)}
+        case Asked.ROBOT_SCALE:
+            return dict(visitor.describe(says[1], says[0]))
+        case Asked.SCALE:
+            return dict(visitor.describe(says[0], None))
+        case Asked.QUESTIONS:
+            return dict(visitor.reply(form.questions))
+        case Asked.BREAK | Asked.GOING_ON:
+            return {}
 
 
 class _Page(HTMLParser):
@@ -190,23 +220,25 @@ class _Page(HTMLParser):
 
     def __init__(self, address: str, text: str) -> None:
         super().__init__()
-        self.address, self.text = address, text
-        self.forms: list[tuple[str, dict[str, str]]] = []
-        self.feed(text)
-
-    def form_to(self, address: re.Pattern[str]) -> _Form | None:
-        """The first form that is sent to such an address."""
-        for action, fields in self.forms:
-            if found := address.search(action):
-                return _Form(found, fields)
-        return None
+        self.address, self.text, self.name = address, text, ""
+        self.forms: list[Form] = []
+        self.feed("".join(_TAGS.findall(text)))
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        """Collect forms and their input fields."""
+        """Collect forms and their fields."""
         named = {name: value or "" for name, value in attrs}
+        self.name = named.get("data-page", self.name)
         if tag == "form" and named.get("method", "").lower() == "post":
-            self.forms.append((named.get("action", ""), {}))
-        elif tag == "input" and named.get("type") == "radio" and "checked" not in named:
-            return
-        elif tag in {"input", "button"} and self.forms and named.get("name"):
-            self.forms[-1][1].setdefault(named["name"], named.get("value", "on"))
+            self.forms.append(Form(named.get("action", "")))
+        elif tag in ("input", "button", "textarea") and self.forms and named.get("name"):
+            self._field(tag, named["name"], named)
+
+    def _field(self, tag: str, name: str, named: dict[str, str]) -> None:
+        form, kind, value = self.forms[-1], named.get("type", "text"), named.get("value", "on")
+        if tag == "input" and kind == "radio":
+            choices = form.questions.get(name, Offered("choice")).choices
+            form.questions[name] = Offered("choice", [*choices, value] if value else choices)
+        elif tag == "textarea" or (tag == "input" and kind == "text"):
+            form.questions[name] = Offered("number" if named.get("inputmode") == "decimal" else "text")
+        if tag != "textarea" and (kind != "radio" or "checked" in named):
+            form.fields.setdefault(name, named.get("value", "on"))

@@ -1,9 +1,12 @@
 """A scripted participant of a rehearsal: knows what really happened in each clip, and answers and rates by taste.
 
-What a robot "really" did they look up in the database, which a person does by watching.
+What a robot "really" did they look up in the database, which a person does by watching. Of a standard questionnaire
+about a robot every item is answered like a rating of it, and so is the question which robot was made for them; what
+has nothing to do with robots is answered at random.
 """
 
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,8 +18,10 @@ from app.db import Database
 from app.domain.clips import Clip
 from app.domain.evaluation import HeadToHead, Trial
 from app.domain.models import ModelKind
-from app.domain.preferences import Query
+from app.domain.preferences import Purpose, Query, Response
+from app.domain.protocol import MADE_FOR_YOU
 from app.domain.studies import Study
+from app.questionnaires import library
 from app.services.evaluation import self_setting
 from app.storage import ArtefactStore
 from worker.compute import simulation
@@ -30,10 +35,14 @@ from worker.ml.rewards.loading import load_reward_model
 from worker.ml.rewards.reward_models import RewardModel
 from worker.ml.scripted_ratings import RatingManner, ScriptedRater
 from worker.ml.teachers import Manner, ScriptedTeacher, Taste, segment_returns
+from worker.rehearsal.browser import Offered
 from worker.sim.costs import preference_rewards
 from worker.tasks import registry
 
 CALIBRATION_PAIRS = 200
+AGES = (18, 80)
+INDIFFERENT = 0.5
+"""What a questionnaire is answered by that is about no robot, as a share of its range."""
 Rows = npt.NDArray[np.intp]
 
 
@@ -71,32 +80,66 @@ class ScriptedPerson:
         self._rng = np.random.default_rng(seed)
         self._teacher: ScriptedTeacher | None = None
         self._rater: ScriptedRater | None = None
+        self.rated: list[Rated] = []
+        """every trial, in the order in which it was rated"""
+        self._robots: dict[str, list[float]] = defaultdict(list)
+        """by letter, how well each of its trials suits this user"""
 
     def answer(self, query_id: int) -> str:
-        """What this user says about the query."""
+        """What this user says about the query; a catch pair has an obvious answer, which is missed now and then."""
         with self._database.reading() as session:
             query = session.scalars(
                 select(Query).where(Query.id == query_id).options(*dataset.CLIPS_AND_ROLLOUTS)
             ).one()
+            if query.purpose == Purpose.CATCH and query.expected is not None:
+                missed = self._rng.random() < self._manner.mistakes
+                other = {Response.LEFT: Response.RIGHT, Response.RIGHT: Response.LEFT}
+                return str((other[Response(query.expected)] if missed else Response(query.expected)).value)
             left, right = (self._rewards(clip) for clip in (query.left_clip, query.right_clip))
             if self._teacher is None:
                 self._teacher = self._calibrated(session)
         return self._teacher.answer(left, right, self._rng)
 
-    def rate(self, trial_id: int) -> Rated:
-        """What this user says about the robot of a trial, and which method it really was."""
+    def rate(self, trial_id: int) -> tuple[int, int]:
+        """Satisfaction and personalisation; ``rated`` keeps which method it really was."""
         with self._database.reading() as session:
             trial = session.scalars(select(Trial).where(Trial.id == trial_id).options(joinedload(Trial.film))).one()
             if trial.film is None:
                 raise ValueError(f"Trial {trial_id} has no film.")
             watched = dataset.stored_trajectory(self._store, trial.film.trajectory_sha256)
-            if self._rater is None:
+        value, rater = float(self._true_rewards(watched).sum()), self._calibrated_rater()
+        given = rater.rate(value, watched.success)
+        self.rated.append(Rated(trial.film.method, *given, rater.share(value), bool(watched.success)))
+        self._robots[trial.letter].append(rater.share(value))
+        return given
+
+    def describe(self, instrument: str, letter: str | None) -> Mapping[str, str]:
+        """A point for every item, higher for a robot that suits this user better; reversed items the other way."""
+        known, rater = library.every()[instrument], self._calibrated_rater()
+        points = known.answers.points
+        good = INDIFFERENT if letter is None else float(np.mean(self._robots[letter]))
+        places = {item.name: rater.place(good, len(points)) for item in known.items}
+        return {name: points[-1 - at if name in known.reversed_items else at] for name, at in places.items()}
+
+    def reply(self, questions: Mapping[str, Offered]) -> Mapping[str, str]:
+        """Some answer to everything; which robot was made for them: the one that suits them best."""
+        said = {name: self._some(offered) for name, offered in questions.items()}
+        if MADE_FOR_YOU in questions:
+            said[MADE_FOR_YOU] = max(self._robots, key=lambda letter: float(np.mean(self._robots[letter])))
+        return said
+
+    def _some(self, offered: Offered) -> str:
+        if offered.choices:
+            return offered.choices[int(self._rng.integers(len(offered.choices)))]
+        return str(self._rng.integers(*AGES)) if offered.kind == "number" else "Said by a program."
+
+    def _calibrated_rater(self) -> ScriptedRater:
+        if self._rater is None:
+            with self._database.reading() as session:
                 episodes = [dataset.shown(self._store, clip) for clip in dataset.pool_clips(session, self._study_id)]
-                seen = np.array([self._true_rewards(each).sum() for each in episodes])
-                self._rater = ScriptedRater(seen, RatingManner(), self._rng)
-        value = float(self._true_rewards(watched).sum())
-        given = self._rater.rate(value, watched.success)
-        return Rated(trial.film.method, *given, self._rater.share(value), bool(watched.success))
+            seen = np.array([self._true_rewards(each).sum() for each in episodes])
+            self._rater = ScriptedRater(seen, RatingManner(), self._rng)
+        return self._rater
 
     def prefer(self, head_to_head_id: int) -> str:
         """Which of two robots this user would rather have: the one whose whole episode suits them better."""

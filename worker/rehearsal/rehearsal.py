@@ -33,7 +33,7 @@ from app.storage import ArtefactStore
 from worker.jobs.runtime import records
 from worker.ml.teachers import Manner, Taste
 from worker.rehearsal import experimenter_steps as conclusion
-from worker.rehearsal.browser import FormBrowser
+from worker.rehearsal.browser import OVER, UP_TO_PAIRS, WAITING, Asked, FormBrowser
 from worker.rehearsal.experimenter_steps import Conclusion
 from worker.rehearsal.participant_steps import Insight, Rated, ScriptedPerson
 from worker.rehearsal.server import PATIENCE_S, wait_until
@@ -61,6 +61,8 @@ class RehearsedPerson:
     insight: Insight | None = None
     rated: list[Rated] = field(default_factory=list)
     """every trial, in the order in which it was rated"""
+    sent_back: bool = False
+    """before the end: screened out, no arm open, or too many catch pairs missed"""
     waited_for_robots_seconds: float = 0.0
     """from the finished bundle to the first robot to rate"""
 
@@ -81,7 +83,8 @@ def write(rehearsed: Rehearsed, directory: Path) -> None:
     for name, file in rehearsed.conclusion.files.items():
         (directory / name).write_bytes(file)
     for each in rehearsed.outcomes:
-        (directory / f"{each.code}-{each.taste.name}.zip").write_bytes(each.bundle)
+        if not each.sent_back:
+            (directory / f"{each.code}-{each.taste.name}.zip").write_bytes(each.bundle)
     people = [{name: value for name, value in asdict(each).items() if name != "bundle"} for each in rehearsed.outcomes]
     numbers = {"seconds": rehearsed.seconds, "people": people, "report": rehearsed.conclusion.contents}
     (directory / "numbers.json").write_text(json.dumps(numbers, indent=2) + "\n")
@@ -93,6 +96,9 @@ def summary(rehearsed: Rehearsed) -> str:
     head = f"{'who':<4} {'user':<10} {'labels':>6} {'accuracy':>8} {'success':>14} {'preference':>10} {'gate':>5}"
     lines = [f"{head} {'truth':>12} {'save ms (p50/p95)':>18} {'bundle':>16}"]
     for each in outcomes:
+        if each.sent_back:
+            lines.append(f"{each.code:<4} {each.taste.name:<10} {each.labels:>6} sent back before the end")
+            continue
         success, preference = each.evaluation["success"], each.evaluation["preference"]
         accuracy = "-" if each.prequential_accuracy is None else f"{each.prequential_accuracy:.2f}"
         middle, late = (1000 * float(np.quantile(each.save_seconds, share)) for share in (0.5, 0.95))
@@ -103,7 +109,7 @@ def summary(rehearsed: Rehearsed) -> str:
             f"{middle:>9.0f} / {late:<6.0f} {len(each.bundle) / 1024:>4.0f} kB in {each.bundle_seconds:.0f} s"
         )
     answers = sum(len(each.save_seconds) for each in outcomes)
-    pace = answers / sum(each.answering_seconds for each in outcomes)
+    pace = answers / max(sum(each.answering_seconds for each in outcomes), 1e-9)
     lines += ["", f"{answers} answers at {pace:.1f} a second; the final figure after {rehearsed.seconds / 60:.1f} min"]
     return "\n".join([*lines, *_rating_lines(outcomes)])
 
@@ -114,12 +120,12 @@ def _truth(insight: Insight | None) -> str:
 
 def _rating_lines(outcomes: Sequence[RehearsedPerson]) -> list[str]:
     """Mean satisfaction / personalisation per method, and in brackets how well its robot truly suits the person."""
-    methods = sorted({each.method for outcome in outcomes for each in outcome.rated})
-    if not methods:
+    rated = [each for each in outcomes if each.rated]
+    if not rated:
         return []
     lines = ["", "ratings: satisfaction / personalisation (true share of worse episodes)"]
-    for each in outcomes:
-        shown = "  ".join(_ratings_of(method, each.rated) for method in methods)
+    for each in rated:
+        shown = "  ".join(_ratings_of(method, each.rated) for method in sorted({one.method for one in each.rated}))
         lines.append(f"{each.code:<4} {each.taste.name:<10} {shown}  waited {each.waited_for_robots_seconds:.0f} s")
     return lines
 
@@ -162,60 +168,56 @@ class Rehearsal:
             for (participant, token), taste in zip(enrolled, tastes, strict=True):
                 person = ScriptedPerson(self.database, self.store, study, taste, manner, seed + participant.number)
                 persons.append(person)
-                outcome = RehearsedPerson(participant.id, participant.code, taste)
+                outcome = RehearsedPerson(participant.id, participant.code, taste, rated=person.rated)
                 with FormBrowser(self.base_url, f"/p/{token}") as visitor:
                     self._answer_everything(visitor, person, outcome, settings)
+                    outcome.sent_back = visitor.page == "ended"
                 outcome.finished_at = time.monotonic()
                 outcomes.append(outcome)
             for outcome, person in zip(outcomes, persons, strict=True):
-                self._await_bundle(outcome, study, experimenter)
-                outcome.insight = person.insight(outcome.participant_id)
+                if not outcome.sent_back:
+                    self._await_bundle(outcome, study, experimenter)
+                    outcome.insight = person.insight(outcome.participant_id)
             for (_, token), person, outcome in zip(enrolled, persons, outcomes, strict=True):
-                with FormBrowser(self.base_url, f"/p/{token}") as visitor:
-                    self._rate_robots(visitor, person, outcome, settings)
-                    visitor.go_to_the_end()
+                if not outcome.sent_back:
+                    with FormBrowser(self.base_url, f"/p/{token}") as visitor:
+                        self._go_to_the_end(visitor, person, outcome, settings)
             ending = conclusion.conclude(experimenter, self.database, study)
         return Rehearsed(outcomes, ending, time.monotonic() - began)
 
-    def _rate_robots(
+    def _go_to_the_end(
         self, visitor: FormBrowser, person: ScriptedPerson, outcome: RehearsedPerson, settings: StudySettings
     ) -> None:
-        """Everything between the last pair and the last rating; a physical robot needs an operator, who is not here."""
-        evaluation = settings.evaluation
-        if evaluation is None or evaluation.mode is not EvaluationMode.VIDEO:
+        """Everything after the last pair; a physical robot needs an operator, who is not here."""
+        if settings.evaluation is not None and settings.evaluation.mode is not EvaluationMode.VIDEO:
             return
-        if evaluation.has_sliders:
-            wait_until(PATIENCE_S, "no sliders", visitor.is_at_sliders)
-            visitor.set_robot(person.set_robot())
         came = time.monotonic()
-        for number in range(evaluation.trial_count):
-            trial_id = wait_until(PATIENCE_S, "no robot to rate", visitor.trial_id)
-            if number == 0:
-                outcome.waited_for_robots_seconds = time.monotonic() - came
-            rated = person.rate(trial_id)
-            visitor.rate(rated.satisfaction, rated.personalisation)
-            outcome.rated.append(rated)
-        for _ in range(evaluation.head_to_head_count):
-            head_to_head_id = wait_until(PATIENCE_S, "no head-to-head", visitor.head_to_head_id)
-            visitor.prefer(person.prefer(head_to_head_id))
+        while visitor.page not in OVER:
+            if wait_until(PATIENCE_S, "no page to go on with", partial(_act, visitor, person)) is Asked.RATING:
+                outcome.waited_for_robots_seconds = outcome.waited_for_robots_seconds or time.monotonic() - came
 
     def _answer_everything(
         self, visitor: FormBrowser, person: ScriptedPerson, outcome: RehearsedPerson, settings: StudySettings
     ) -> None:
-        visitor.come_in()
+        """From the personal link to the last pair, or to where somebody is sent back."""
         came = time.monotonic()
         pairs = settings.practice_pairs + settings.question_count
         with tqdm(total=pairs, desc=f"{outcome.code} {outcome.taste.name}", unit="pair") as bar:
-            for _ in range(pairs):
-                query_id = wait_until(PATIENCE_S, "no pair to label", visitor.query_id)
+            while visitor.page in UP_TO_PAIRS:
+                query_id = visitor.query_id()
+                if query_id is None:
+                    wait_until(PATIENCE_S, "no pair to label", partial(_act, visitor, person))
+                    continue
                 wait_until(PATIENCE_S, "no prediction", partial(self._was_predicted, outcome, query_id))
                 time.sleep(self.pace_s)
-                outcome.save_seconds.append(visitor.answer(person.answer(query_id)))
+                sent = time.perf_counter()
+                visitor.act(person)
+                outcome.save_seconds.append(time.perf_counter() - sent)
                 bar.update()
                 if not self._is_label(query_id):
                     continue
                 outcome.labels += 1
-                if outcome.labels % settings.retrain_every_labels == 0:
+                if outcome.labels % settings.retrain_every_labels == 0 and visitor.page not in OVER:
                     wait_until(PATIENCE_S, "no reward model", lambda: self._has_learned(outcome) or None)
         outcome.answering_seconds = time.monotonic() - came
 
@@ -271,6 +273,11 @@ class Rehearsal:
         outcome.bundle = experimenter.download(address)
         with self.database.reading() as session:
             outcome.prequential_accuracy = _prequential_accuracy(session, outcome.participant_id)
+
+
+def _act(visitor: FormBrowser, person: ScriptedPerson) -> Asked | str | None:
+    """Do what the page asks for; None while it asks for nothing, unless there is nothing more to come."""
+    return visitor.act(person) or (visitor.page if visitor.page not in WAITING else None)
 
 
 def _prequential_accuracy(session: Session, participant_id: int) -> float | None:

@@ -20,7 +20,7 @@ from app.domain.studies import Study
 from app.errors import AppError
 from app.services import audit
 
-VERSION = 1
+VERSION = 2
 """Of the simulation: a plan of an earlier one is made anew."""
 
 

@@ -2,10 +2,14 @@
 
 from dataclasses import replace
 
+import numpy as np
+import pandas as pd
 import pytest
 from statsmodels.stats.power import TTestIndPower, TTestPower
 
-from worker.analysis.study.power import Truth, enough, power_at
+from worker.analysis.study.effect_sizes import holm
+from worker.analysis.study.power import Truth, enough, power_at, ratings_p
+from worker.analysis.study.statistics import scale_report
 
 PAIRED = Truth(
     methods=2,
@@ -38,6 +42,26 @@ def test_the_power_between_arms_is_that_of_theory_and_smaller() -> None:
     found = power_at(BETWEEN, 24, STUDIES, 1)["ratings"]["power"]
     assert found == pytest.approx(expected, abs=ERROR + 0.03)
     assert found < power_at(PAIRED, 24, STUDIES, 1)["ratings"]["power"]
+
+
+MIXED = replace(PAIRED, methods=3, better=1, compared=2, arms=((0, 1), (0, 2)))
+
+
+@pytest.mark.parametrize("truth", [replace(PAIRED, methods=3, arms=((0, 1, 2),)), BETWEEN, MIXED])
+def test_an_invented_study_is_tested_and_corrected_as_the_page_of_results_does(truth: Truth) -> None:
+    """Also where everybody meets the reference, so that only one of three comparisons is between people."""
+    rng, groups = np.random.default_rng(4), [f"method {place}" for place in range(truth.methods)]
+    means = rng.integers(3, 16, (24, truth.methods)) / 3
+    meets = np.array(
+        [[method in truth.arms[person % len(truth.arms)] for method in range(truth.methods)] for person in range(24)]
+    )
+    rows = [(person, groups[method], means[person, method]) for person, method in np.argwhere(meets)]
+    table = pd.DataFrame(rows, columns=["participant", "method", "satisfaction"])
+    report = scale_report(table, "satisfaction", "method", groups, compare=True, between=True)
+    test = "paired_t" if any({truth.better, truth.compared} <= set(arm) for arm in truth.arms) else "welch_t"
+    expected = [comparison[test].get("p_holm") for comparison in report["comparisons"]]
+    assert any(expected)
+    assert holm(ratings_p(truth, means, meets)) == pytest.approx(expected)
 
 
 @pytest.mark.parametrize("truth", [PAIRED, BETWEEN, replace(PAIRED, methods=3, arms=((0, 1, 2),), head_to_heads=2)])

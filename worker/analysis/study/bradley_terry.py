@@ -20,6 +20,8 @@ from worker.domain.type_aliases import FloatArray
 
 FEWEST_PEOPLE = 4
 """Below, a covariance over people says nothing."""
+NO_SPREAD = 1e-9
+"""Standard error up to which all people answered alike, so that nothing says how they scatter."""
 _STEPS = 100
 
 
@@ -122,11 +124,11 @@ def _estimated(wins: FloatArray, groups: Sequence[str]) -> dict[str, Any]:
 
 
 def _compared(first: str, second: str, difference: float, error: float, degrees_of_freedom: int) -> dict[str, Any]:
-    """No p and no interval where all people answered alike, so that nothing says how they scatter."""
+    """No p and no interval where there is no spread."""
     compared: dict[str, Any] = {"first": first, "second": second, "difference": difference}
     compared["chance"] = float(1 / (1 + np.exp(-difference)))
     compared |= dict.fromkeys(("low", "high", "chance_low", "chance_high", "p"))
-    if error > 1e-9:
+    if error > NO_SPREAD:
         margin = float(stats.t.ppf(0.975, degrees_of_freedom)) * error
         compared["low"], compared["high"] = difference - margin, difference + margin
         compared["chance_low"], compared["chance_high"] = (

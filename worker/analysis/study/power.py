@@ -1,11 +1,11 @@
 """How likely a study of this very design is to find an effect, for several numbers of people: by simulation.
 
-What somebody says of a method is 3 (the middle of the scale) + their own level + what the method is to them + the noise
-of one rating, rounded and cut to 1 to 5. One method is better than all the others by the effect on average. A share of
-those who begin drops out, and counts in no test. Every invented study is tested as the page of results would: means of
-each person by the paired t-test, or between arms by Welch's; head-to-heads by Bradley-Terry strengths; corrected by
-Holm over all comparisons of the design. Intervals of the power are Wilson's, 95 %: they say how far the simulation may
-be off.
+What somebody says of a method is 3 (the middle of the scale) + their own level + what the method is to them + the
+noise of one rating, rounded and cut to 1 to 5. One method is better than all the others by the effect on average. A
+share of those who begin drops out, and counts in no test. Every invented study is tested as the page of results
+would: means of each person by the paired t-test, or between arms by Welch's; head-to-heads by Bradley-Terry
+strengths; corrected by Holm over all comparisons of the design, of which one that this test cannot make counts as not
+found. Intervals of the power are Wilson's, 95 %: they say how far the simulation may be off.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ import numpy as np
 from scipy import stats
 
 from worker.analysis.study.between import welch_t
-from worker.analysis.study.bradley_terry import covariance, strengths, why_not
+from worker.analysis.study.bradley_terry import NO_SPREAD, covariance, strengths, why_not
 from worker.analysis.study.effect_sizes import holm
 from worker.analysis.study.hypothesis_tests import FEWEST_PAIRED, paired_t
 from worker.analysis.wilson import wilson_interval
@@ -59,7 +59,7 @@ def power_at(truth: Truth, people: int, studies: int, seed: int) -> dict[str, An
         stayed = int(rng.binomial(people, 1 - truth.dropout))
         completed += stayed
         worth, arms = _worth(truth, stayed, rng)
-        found += _is_found(truth, _ratings_p(truth, worth, arms, rng))
+        found += _is_found(truth, ratings_p(truth, _means(truth, worth, rng), arms))
         if truth.head_to_heads:
             found_side_by_side += _is_found(truth, _head_to_heads_p(truth, worth, arms, rng))
     return {
@@ -97,13 +97,22 @@ def _worth(truth: Truth, people: int, rng: np.random.Generator) -> tuple[FloatAr
     return worth, meets[np.arange(people) % len(truth.arms)]
 
 
-def _ratings_p(truth: Truth, worth: FloatArray, meets: Any, rng: np.random.Generator) -> list[float | None]:
+def _means(truth: Truth, worth: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Of what everybody says of each method, (people, methods)."""
     said = worth[:, :, None] + rng.normal(0.0, truth.noise, (*worth.shape, truth.trials))
-    means = np.clip(np.rint(said), 1, 5).mean(axis=2).round(12)
+    return np.asarray(np.clip(np.rint(said), 1, 5).mean(axis=2).round(12), np.float64)
+
+
+def ratings_p(truth: Truth, means: FloatArray, meets: Any) -> list[float | None]:
+    """Of every two methods, all by the one test that can compare the two in question; None: it cannot.
+
+    ``means`` and ``meets`` (whether somebody meets a method): (people, methods).
+    """
+    paired = (meets[:, truth.better] & meets[:, truth.compared]).sum() >= FEWEST_PAIRED
     found: list[float | None] = []
     for first, second in combinations(range(truth.methods), 2):
-        both = meets[:, first] & meets[:, second]
-        if both.sum() >= FEWEST_PAIRED:
+        if paired:
+            both = meets[:, first] & meets[:, second]
             result = paired_t((means[both, second] - means[both, first]).round(12))
         else:
             alone = [means[meets[:, one] & ~meets[:, other], one] for one, other in ((first, second), (second, first))]
@@ -127,8 +136,9 @@ def _head_to_heads_p(truth: Truth, worth: FloatArray, meets: Any, rng: np.random
     spread, people = covariance(wins, found), len(wins)
     p_values: list[float | None] = []
     for first, second in pairs:
-        error = max(spread[first, first] + spread[second, second] - 2 * spread[first, second], 1e-12) ** 0.5
-        p_values.append(float(2 * stats.t.sf(abs(found[second] - found[first]) / error, people - 1)))
+        error = max(spread[first, first] + spread[second, second] - 2 * spread[first, second], 0.0) ** 0.5
+        p = float(2 * stats.t.sf(abs(found[second] - found[first]) / max(error, NO_SPREAD), people - 1))
+        p_values.append(p if error > NO_SPREAD else None)
     return p_values
 
 

@@ -1,4 +1,4 @@
-"""One report: tables in, contents and figures out. The one function that the worker's processes run.
+"""One report: tables in, contents and figures out. make_report is what the worker's processes run.
 
 Contents (stored as Report.contents): ``version``, ``blinded``, ``plan`` (standing, planned tests, in_words: see
 app.services.studies.preregistration), ``ratings`` (see statistics), ``guesses`` (see guesses; None where it is not
@@ -50,11 +50,19 @@ class Tables:
 def make_report(tables: Tables) -> tuple[dict[str, Any], dict[str, dict[str, bytes]]]:
     """The contents, and the figures as {name: {format: file}}."""
     # Takes seconds, and the worker, which only names this function, needs none of it.
-    from worker.analysis.study import answers, figures, statistics
+    from worker.analysis.study import figures
+
+    contents = contents_of(tables)
+    return contents, figures.all_figures(contents)
+
+
+def contents_of(tables: Tables) -> dict[str, Any]:
+    """All numbers of a report, without its figures."""
+    from worker.analysis.study import answers, statistics
     from worker.analysis.study.guesses import guess_report
     from worker.analysis.study.scales import scale_reports
 
-    contents = {
+    return {
         "version": tables.version,
         "blinded": tables.blinded,
         "plan": dict(tables.plan),
@@ -71,7 +79,6 @@ def make_report(tables: Tables) -> tuple[dict[str, Any], dict[str, dict[str, byt
         "answers": answers.answer_report(tables.answers, tables.window),
         "change": answers.change_report(_frame(tables, "evaluations"), tables.participants),
     }
-    return contents, figures.all_figures(contents)
 
 
 def _head_to_heads(tables: Tables) -> dict[str, Any]:
