@@ -171,7 +171,7 @@ PARAMETER = re.compile(r"{(\w+)(?::\w+)?}")
 def addresses(application: FastAPI, laboratory: Laboratory) -> Iterator[str]:
     """Every address below /studies that can be looked at or downloaded, endless streams and letters' files excepted."""
     single = {"slug": laboratory.study.slug, "code": laboratory.participant.code, "version": "1", "letter": "A"}
-    single["query_id"] = "1"
+    single |= {"query_id": "1", "script": "analysis.py"}
     tables = [{"table": table.name, "kind": kind} for table in export_tables.TABLES for kind in ("csv", "jsonl")]
     for route in iter_route_contexts(application.routes):
         path = route.path or ""

@@ -35,6 +35,7 @@ from worker.jobs.runtime.context import WorkerContext
 
 METHODS = ("reference", "pbarl")
 MOMENT = re.compile(rb"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(\.\d+)?(\+00:00)?")
+COMMITMENT = re.compile(rb"Locked document \(JSON\): SHA-256 `[0-9a-f]{64}`")
 
 
 @dataclass(frozen=True)
@@ -128,10 +129,13 @@ def _from_outside(path: Path) -> list[tuple[str, int]]:
 
 
 def _inside(path: Path) -> dict[str, bytes]:
-    """The texts of an export, without moments."""
+    """The texts of an export, without moments, and without the hash that commits a plan to its secret."""
     with zipfile.ZipFile(path) as file:
-        texts = [name for name in file.namelist() if name.endswith((".csv", ".jsonl", ".md", ".json"))]
-        return {name: MOMENT.sub(b"", file.read(name)) for name in texts}
+        names = [name for name in file.namelist() if name.endswith((".csv", ".jsonl", ".md", ".json"))]
+        texts = {name: MOMENT.sub(b"", file.read(name)) for name in names}
+    texts["preregistration.md"], commitments = COMMITMENT.subn(b"", texts["preregistration.md"])
+    assert commitments == 1
+    return texts
 
 
 @pytest.mark.usefixtures("all_said")
