@@ -7,6 +7,7 @@ from datetime import timedelta
 from functools import cache
 from pathlib import Path
 from uuid import uuid4
+from zlib import crc32
 
 import pytest
 import uvicorn
@@ -38,10 +39,11 @@ databases.share_compiled_statements()
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Tell the tests that work on a studio's database, and skip what makes no sense on the one they are given.
 
-    Files with slow tests come first, so that none of them begins when everything else has ended.
+    Files with slow tests come first, so that none of them begins when everything else has ended. The others are mixed,
+    so that what waits for films in a browser runs beside what computes.
     """
     slow = {item.path for item in items if item.get_closest_marker("slow")}
-    items.sort(key=lambda item: item.path not in slow)
+    items.sort(key=lambda item: (item.path not in slow, crc32(item.nodeid.partition("::")[0].encode())))
     seen = set()
     for item in items:
         name = item.nodeid.partition("[")[0]

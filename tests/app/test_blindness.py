@@ -151,6 +151,7 @@ def test_no_method_is_named_beside_a_letter(everything: Callable[[], Answers], s
         assert LETTER_AND_METHOD.search(text) is None, path
 
 
+@pytest.mark.long
 def test_the_same_look_finds_the_key_once_the_study_is_unblinded(
     everything: Callable[[], Answers], database: Database, study: Study
 ) -> None:

@@ -74,7 +74,7 @@ def _keys() -> tuple[str, str]:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("all_said")
-@pytest.mark.parametrize("mode", EvaluationMode)
+@pytest.mark.parametrize("mode", [pytest.param(EvaluationMode.VIDEO, marks=pytest.mark.long), EvaluationMode.PHYSICAL])
 def test_rows_times_progress_and_archives_say_the_same_whichever_method_a_letter_hides(
     context: Told, database: Database, study: Study, participant: Participant, mode: EvaluationMode, tmp_path: Path
 ) -> None:
