@@ -9,6 +9,7 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, RedirectResponse, Response
 from sqlalchemy.exc import DatabaseError, OperationalError
 from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
 
 from app.db import complaints
 from app.errors import AppError, Refused, in_words
@@ -111,6 +112,10 @@ def add_error_pages(app: FastAPI) -> None:
         fields = sorted({str(each["loc"][-1]) for each in error.errors() if each["loc"]})
         message = f"Something in this form is missing or not valid: {', '.join(fields)}. Please go back and check it."
         return _answer(request, HTTPStatus.UNPROCESSABLE_ENTITY, message, key="NotUnderstood")
+
+    @app.exception_handler(ClientDisconnect)
+    def broken_off(_request: Request, _error: ClientDisconnect) -> Response:
+        return Response(status_code=HTTPStatus.BAD_REQUEST)  # nobody is there to read it, and nothing is wrong here
 
     @app.exception_handler(OperationalError)
     def database_busy(request: Request, error: OperationalError) -> Response:

@@ -20,6 +20,7 @@ from app.services.archives import study_import
 from app.settings import Settings
 from app.storage import ArtefactStore
 from tests import databases, factories
+from tests.app.gate import Gate, make_gate
 from tests.databases import make_tables
 
 JSON = {"Accept": "application/json"}
@@ -98,3 +99,9 @@ def bring(application: FastAPI, path: Path, seal_key: str = "") -> study_import.
     studio = application.state.studio
     with studio.database.writing() as session:
         return study_import.read(session, studio.store, path, "experimenter", seal_key)
+
+
+@pytest.fixture
+def gate(studio_app: FastAPI, database: Database, store: ArtefactStore, new_browser: Callable[[], TestClient]) -> Gate:
+    """Two studies, and a browser of every kind of visitor."""
+    return make_gate(studio_app, database, store, new_browser)

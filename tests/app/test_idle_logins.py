@@ -3,6 +3,7 @@
 from datetime import timedelta
 
 import pytest
+from fastapi import FastAPI
 from fastapi.testclient import TestClient
 from sqlalchemy import select, text
 
@@ -66,12 +67,12 @@ def test_nobody_stays_for_longer_than_a_login_may_last(
 
 
 def test_what_a_page_asks_for_by_itself_keeps_nobody_logged_in(
-    browser: TestClient, database: Database, store: ArtefactStore
+    browser: TestClient, studio_app: FastAPI, database: Database, store: ArtefactStore
 ) -> None:
     with database.writing() as session:
         study = factories.make_study(session, "Here")
         clip = factories.make_clip(session, store, study).video_sha256
-    browser.app.state.studio.closing.set()  # type: ignore[attr-defined]  # streams begin, and end at once
+    studio_app.state.studio.closing.set()  # streams begin, and end at once
     pass_by(database, HALF_AN_HOUR)
     before = left(database)
     for path in ("/studies/live", f"/studies/{study.slug}/live", f"/media/{clip}.mp4"):

@@ -149,8 +149,17 @@ def test_exclusions_and_deviations_are_listed_with_their_reasons(
         assert query is not None
         exclusions.exclude(session, there, query.id, "phone *rang*", "Ada")
         settings = there.settings.model_copy(update={"break_every": 10})
-        changed = {"name": there.name, "task": there.task, "seed": None, "settings": settings}
-        locking.change(session, store, there, **changed, actor="Ada", reason="People were tired.")  # type: ignore[arg-type]  # names are right
+        locking.change(
+            session,
+            store,
+            there,
+            name=there.name,
+            task=there.task,
+            seed=None,
+            settings=settings,
+            actor="Ada",
+            reason="People were tired.",
+        )
     said = text_of(experimenter, study)
     assert "excluded 1 answer to pairs" in said
     assert "phone \\*rang\\*: 1" in said

@@ -149,7 +149,7 @@ class PlantedPerson:
 
     def answer(self, query_id: int) -> str:
         """Nobody is asked to: the pairs have been answered."""
-        raise NotImplementedError(query_id)
+        raise AssertionError(f"Pair {query_id} is asked although all pairs had been answered.")
 
     def rate(self, trial_id: int) -> tuple[int, int]:
         """Satisfaction and personalisation of this method's next trial."""

@@ -9,6 +9,7 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, Response
 from sqlalchemy.exc import DatabaseError, OperationalError
 from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
 
 from app.db import complaints
 from app.errors import AppError, Refused, in_words
@@ -74,6 +75,10 @@ def add_problems(api: FastAPI) -> None:
         if any(each["loc"][0] == "path" for each in error.errors()):
             status = HTTPStatus.NOT_FOUND
         return problem(status, f"Not valid: {'; '.join(wrong)}.")
+
+    @api.exception_handler(ClientDisconnect)
+    def broken_off(_request: Request, _error: ClientDisconnect) -> Response:
+        return Response(status_code=HTTPStatus.BAD_REQUEST)  # nobody is there to read it, and nothing is wrong here
 
     @api.exception_handler(OperationalError)
     def database_busy(_request: Request, error: OperationalError) -> Response:

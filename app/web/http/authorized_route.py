@@ -7,17 +7,15 @@ asked again inside the request's transaction, where it counts.
 
 from collections.abc import Awaitable, Callable, Coroutine, Iterator, Mapping, Sequence
 from datetime import datetime
-from http import HTTPStatus
 from typing import Any, ClassVar, TypeAlias
 
-from fastapi import HTTPException, Request
+from fastapi import Request
 from fastapi.concurrency import run_in_threadpool
 from fastapi.dependencies.models import Dependant
 from fastapi.responses import Response
 from fastapi.routing import APIRoute
 from sqlalchemy.exc import SQLAlchemyError
 from starlette.background import BackgroundTask, BackgroundTasks
-from starlette.requests import ClientDisconnect
 
 from app.db import complaints
 from app.services.accounts import browser_sessions
@@ -46,10 +44,7 @@ class AuthorizedRoute(APIRoute):
         async def handle_known(request: Request) -> Response:
             for check in checks:
                 await check(request)
-            try:
-                await request.body()  # whole, before anything is held that others wait for
-            except ClientDisconnect as error:
-                raise HTTPException(HTTPStatus.BAD_REQUEST) from error
+            await request.body()  # whole, before anything is held that others wait for
             return await handle(request)
 
         return handle_known
