@@ -348,6 +348,15 @@ class StudySettings(BaseModel):
     )
     clip_quality: ClipQuality = setting(ClipQuality.SHARP, Section.CLIPS, "Quality", fixed_by=Use.CLIPS)
     planned_tests: tuple[PlannedTest, ...] = setting((PlannedTest.PAIRED_T,), Section.TESTS, "Tests on the ratings")
+    equivalence_bound: float = setting(
+        0.5,
+        Section.TESTS,
+        "Smallest difference that matters",
+        "Of mean ratings from 1 to 5. The equivalence test asks whether two robots differ by less.",
+        unit="points",
+        ge=0.1,
+        le=2.0,
+    )
 
     @model_validator(mode="after")
     def _enough_pairs(self) -> "StudySettings":

@@ -224,6 +224,11 @@ def _analysis(study: Study, plan: Plan) -> Iterator[str]:
         "d_z with its exact interval), Wilcoxon's signed-rank test (exact given ties; matched-pairs rank-biserial "
         "correlation with an approximate interval), and a linear mixed model with random intercepts and slopes for "
         "people, estimated in two stages (Paule-Mandel, Hartung-Knapp).",
+        "Beside it, ratings as ordered categories: a cumulative link mixed model (proportional odds, random intercept "
+        "for people, adaptive Gauss-Hermite quadrature) with a sandwich covariance over people and t with people less "
+        "one degrees of freedom.",
+        f"Equivalence: two one-sided paired t-tests with bounds of ±{study.settings.equivalence_bound:g} points, at 5 % "
+        "each.",
         "Between arms: Welch's t-test (Hedges' g) and a permutation test of its statistic, without people who met both "
         "methods."
         if study.settings.arms

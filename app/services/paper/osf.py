@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 
 from sqlalchemy.orm import Session
 
-from app.domain.protocol import EvaluationMode, EvaluationSettings
+from app.domain.protocol import EvaluationMode, EvaluationSettings, PlannedTest
 from app.domain.studies import Study
 from app.domain.study_settings import StudySettings
 from app.questionnaires import library
@@ -238,6 +238,11 @@ def _analysis(study: Study, settings: StudySettings) -> Mapping[str, str]:
     models = (
         "Planned tests of the ratings, of every two methods on each scale, two-sided:\n\n"
         + ("\n".join(tests) or "* none")
+        + (
+            f"\n\nBounds of equivalence: ±{settings.equivalence_bound:g} points of the scale from 1 to 5."
+            if PlannedTest.EQUIVALENCE in settings.planned_tests
+            else ""
+        )
         + (
             "\n\nHead-to-heads: Bradley-Terry strengths, an equal answer as half a win for each, with a sandwich "
             "covariance over people and t with people less one degrees of freedom."

@@ -174,6 +174,12 @@ def _sentences(comparison: Result, plan: Plan) -> Iterator[str]:
 def _difference(test: str, result: Result) -> str:
     if test == "wilcoxon":
         return f"median difference {number(result['median'])}"
+    if test == "cumulative_link":
+        ends = interval(result["odds_ratio_low"], result["odds_ratio_high"])
+        return f"odds ratio of a higher rating {number(result['odds_ratio'])}{ends}"
+    if test == "equivalence":
+        ends = interval(result["low_90"], result["high_90"])
+        return f"difference {number(result['difference'])}, 90 % interval{ends}, bounds ±{result['bound']:g}"
     return f"difference {number(result['difference'])}{interval(result.get('low'), result.get('high'))}"
 
 

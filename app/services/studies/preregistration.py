@@ -19,10 +19,12 @@ from app.services.answers import exclusions
 from app.services.studies import locking
 
 TEST_NAMES: Mapping[str, str] = {
-    PlannedTest.TWO_SAMPLE_T: "Two-sample t, as in the paper",
     PlannedTest.PAIRED_T: "Paired t",
-    PlannedTest.WILCOXON: "Wilcoxon signed-rank",
     PlannedTest.MIXED_MODEL: "Linear mixed model",
+    PlannedTest.CUMULATIVE_LINK: "Cumulative link mixed model",
+    PlannedTest.WILCOXON: "Wilcoxon signed-rank",
+    PlannedTest.EQUIVALENCE: "Equivalence, two one-sided paired t",
+    PlannedTest.TWO_SAMPLE_T: "Two-sample t, as in the paper",
     PlannedTest.WELCH_T: "Welch t, between people",
     PlannedTest.PERMUTATION: "Permutation, between people",
 }

@@ -283,7 +283,7 @@ def script() -> dict[str, Any]:
 def invented(script: dict[str, Any], folder: Path, **tables: pd.DataFrame) -> Any:
     """A study of these tables; the others are there and empty."""
     empty = {table.name: [column.name for column in table.columns] for table in export_tables.TABLES}
-    empty |= {"methods": ["method"], "scoring_key": ["instrument", "score"]}
+    empty |= {"methods": ["method", "equivalence_bound"], "scoring_key": ["instrument", "score"]}
     for name, columns in empty.items():
         pd.DataFrame(tables.get(name, pd.DataFrame()), columns=columns).to_csv(folder / f"{name}.csv", index=False)
     return script["Study"](folder)
@@ -323,8 +323,14 @@ def test_arms_and_missing_ratings_are_computed_alike(
     ratings, between = ratings_of(people, arms, seed=people), len(arms) > 1
     who = pd.DataFrame({"participant": ratings["participant"].unique()})
     who["arm"] = [str(number % len(arms)) if between else None for number in range(len(who))]
-    study = invented(script, tmp_path, ratings=ratings, participants=who, methods=pd.DataFrame({"method": methods}))
-    for name, reported in ratings_tables(rating_report(ratings, methods, between=between)).items():
+    study = invented(
+        script,
+        tmp_path,
+        ratings=ratings,
+        participants=who,
+        methods=pd.DataFrame({"method": methods, "equivalence_bound": 0.4}),
+    )
+    for name, reported in ratings_tables(rating_report(ratings, methods, between=between, bound=0.4)).items():
         assert_same(reported, script[name](study), name)
 
 
@@ -339,7 +345,12 @@ def test_head_to_heads_with_equal_answers_are_computed_alike(
         for number in range(people)
         for left, right in (random.permutation(methods)[:2] for _ in range(int(random.integers(2, 5))))
     ]
-    study = invented(script, tmp_path, headtoheads=pd.DataFrame(rows), methods=pd.DataFrame({"method": methods}))
+    study = invented(
+        script,
+        tmp_path,
+        headtoheads=pd.DataFrame(rows),
+        methods=pd.DataFrame({"method": methods, "equivalence_bound": 0.4}),
+    )
     report = head_to_head_report(
         [{**each, "left": each["left_method"], "right": each["right_method"]} for each in rows], methods
     )
@@ -358,6 +369,12 @@ def test_guesses_are_computed_alike(script: dict[str, Any], tmp_path: Path) -> N
     )
     forms = pd.DataFrame({"participant": [f"P{number}" for number in range(len(said))], "value": list(said)})
     forms = forms.assign(form="questionnaire", item="made_for_you", superseded=False)
-    study = invented(script, tmp_path, ratings=ratings, forms=forms, methods=pd.DataFrame({"method": methods}))
+    study = invented(
+        script,
+        tmp_path,
+        ratings=ratings,
+        forms=forms,
+        methods=pd.DataFrame({"method": methods, "equivalence_bound": 0.4}),
+    )
     report = guess_report([{"right": letter == "C"} for letter in said], len(methods))
     assert_same([report], script["guesses"](study), "guesses")

@@ -36,6 +36,7 @@ read_study <- function(folder) {
   counts <- yes(study$ratings$counts) & study$ratings$group %in% study$groups
   study$ratings <- study$ratings[counts & complete.cases(study$ratings[SCALES]), ]
   study$between <- any(!is.na(study$participants$arm))
+  study$bound <- study$methods$equivalence_bound[1] # points; the study's smallest difference that matters
   study
 }
 
@@ -168,6 +169,112 @@ mixed_model <- function(first, second) {
   )
 }
 
+# Ratings as an order: proportional odds, rating ~ group + (1 | person), errors that count people (sandwich).
+# ordinal::clmm(rating ~ group + (1 | person), nAGQ = 10) has the same estimates; its own errors suppose one effect for
+# everybody.
+cumulative_link <- function(first, second) {
+  n <- length(first)
+  cells <- c(first, second)
+  ratings <- unlist(cells)
+  if (n < 4 || spread_of(ratings) == 0) return(NULL)
+  x <- rep(0:1, c(length(unlist(first)), length(unlist(second))))
+  person <- rep(c(seq_len(n), seq_len(n)), lengths(cells))
+  model <- ordered_ratings(ratings, x, person)
+  cuts <- model$cuts
+  found <- model$fit()
+  scores <- model$scores(found)$scores
+  bread <- solve_symmetric(model$information(found))
+  sandwich <- n / (n - 1) * bread %*% crossprod(scores) %*% bread
+  difference <- found[cuts + 1]
+  error <- sqrt(max(sandwich[cuts + 1, cuts + 1], 0))
+  unfit <- abs(difference) > 12 || abs(found[cuts + 2]) > 8 || max(abs(colSums(scores))) > 1e-6
+  if (unfit || error < 1e-6) return(NULL)
+  ends <- difference + c(-1, 1) * qt(0.975, n - 1) * error
+  row_of(
+    n = n, n_ratings = length(ratings), difference = difference, standard_error = error, low = ends[1], high = ends[2],
+    odds_ratio = exp(difference), odds_ratio_low = exp(ends[1]), odds_ratio_high = exp(ends[2]),
+    statistic = difference / error, degrees_of_freedom = n - 1, p = 2 * pt(-abs(difference / error), n - 1),
+    sd_between_people = abs(found[cuts + 2])
+  )
+}
+
+solve_symmetric <- function(matrix) {
+  parts <- eigen(matrix, symmetric = TRUE)
+  kept <- abs(parts$values) > 1e-15 * max(abs(parts$values))
+  parts$vectors[, kept, drop = FALSE] %*% (t(parts$vectors[, kept, drop = FALSE]) / parts$values[kept])
+}
+
+# The marginal likelihood of thresholds, effect and the people's standard deviation, on a fine grid of levels.
+ordered_ratings <- function(ratings, x, person) {
+  levels <- match(ratings, sort(unique(ratings)))
+  cuts <- max(levels) - 1
+  grid <- seq(-8, 8, length.out = 161)
+  log_weights <- dnorm(grid, log = TRUE) + log(grid[2] - grid[1])
+  scores <- function(values) {
+    ends <- c(-Inf, values[seq_len(cuts)], Inf)
+    shift <- outer(values[cuts + 1] * x, values[cuts + 2] * grid, "+")
+    lower <- ends[levels] - shift
+    upper <- ends[levels + 1] - shift
+    above <- plogis(upper)
+    below <- plogis(lower)
+    chance <- pmax(ifelse(lower > 0, plogis(-lower) - plogis(-upper), above - below), 1e-300)
+    logs <- sweep(rowsum(log(chance), person), 2, log_weights, "+")
+    most <- apply(logs, 1, max)
+    likelihoods <- most + log(rowSums(exp(logs - most)))
+    weights <- exp(logs - likelihoods)[person, , drop = FALSE]
+    slopes <- weights * (above + below - 1)
+    at_upper <- rowSums(weights * above * (1 - above) / chance)
+    at_lower <- rowSums(weights * below * (1 - below) / chance)
+    of_cuts <- sapply(seq_len(cuts), function(cut) at_upper * (levels == cut) - at_lower * (levels == cut + 1))
+    list(
+      likelihood = sum(likelihoods),
+      scores = rowsum(cbind(of_cuts, rowSums(slopes) * x, slopes %*% grid), person)
+    )
+  }
+  information <- function(values, step = 1e-5) {
+    found <- sapply(seq_along(values), function(i) {
+      moved <- replace(numeric(length(values)), i, step)
+      (colSums(scores(values - moved)$scores) - colSums(scores(values + moved)$scores)) / (2 * step)
+    })
+    (found + t(found)) / 2
+  }
+  # The first threshold and the logarithms of the gaps between them, effect, SD.
+  ordered <- function(free) c(cumsum(c(free[1], exp(free[seq_len(cuts)[-1]]))), free[cuts + 1:2])
+  gradient <- function(free) {
+    found <- colSums(scores(ordered(free))$scores)
+    found[seq_len(cuts)] <- rev(cumsum(rev(found[seq_len(cuts)])))
+    gaps <- seq_len(cuts)[-1]
+    found[gaps] <- found[gaps] * exp(free[gaps])
+    -found
+  }
+  fit <- function() {
+    start <- qlogis(cumsum(tabulate(levels))[seq_len(cuts)] / length(levels))
+    best <- optim(
+      c(start[1], log(diff(start)), 0, 1), function(free) -scores(ordered(free))$likelihood, gradient,
+      method = "L-BFGS-B", lower = c(-30, rep(-12, cuts - 1), -13, -13), upper = c(30, rep(3.5, cuts - 1), 13, 13),
+      control = list(factr = 1e3, maxit = 1000)
+    )
+    values <- ordered(best$par)
+    step <- solve_symmetric(information(values))
+    for (each in 1:3) values <- values + as.numeric(step %*% colSums(scores(values)$scores)) # Newton: the last digits
+    values
+  }
+  list(cuts = cuts, scores = scores, information = information, fit = fit)
+}
+
+# Two one-sided paired t-tests (Schuirmann 1987): p below .05 shows that the means are less than bound apart.
+equivalence <- function(differences, bound) {
+  n <- length(differences)
+  if (n < 3 || spread_of(differences) == 0) return(NULL)
+  above <- t.test(differences, mu = -bound, alternative = "greater")
+  below <- t.test(differences, mu = bound, alternative = "less")
+  ends <- t.test(differences, conf.level = 0.90)$conf.int
+  row_of(
+    n = n, difference = mean(differences), low_90 = ends[1], high_90 = ends[2], bound = bound,
+    statistic = min(above$statistic, -below$statistic), degrees_of_freedom = n - 1, p = max(above$p.value, below$p.value)
+  )
+}
+
 can_be_compared <- function(first, second) {
   min(length(first), length(second)) >= 3 && (spread_of(first) > 0 || spread_of(second) > 0)
 }
@@ -276,7 +383,7 @@ means_of <- function(rows, value, groups, lowest = 1, highest = 5) {
 }
 
 # Every test of every two methods, with Holm's correction over the comparisons of one test.
-comparisons_of <- function(rows, value, groups, tests) {
+comparisons_of <- function(rows, value, groups, tests, bound = NULL) {
   if (length(groups) < 2 || nrow(rows) == 0) return(NULL)
   people <- sort(unique(rows$participant))
   cells <- sapply(groups, function(group) {
@@ -297,6 +404,7 @@ comparisons_of <- function(rows, value, groups, tests) {
       result <- switch(test,
         two_sample_t = two_sample_t(every[[1]], every[[2]]), paired_t = paired_t(differences),
         wilcoxon = wilcoxon(differences), mixed_model = mixed_model(mine, theirs),
+        cumulative_link = cumulative_link(mine, theirs), equivalence = equivalence(differences, bound),
         welch_t = welch_t(alone[[1]], alone[[2]]), permutation = permutation(alone[[1]], alone[[2]])
       )
       named <- row_of(first = pair[1], second = pair[2], test = test)
@@ -328,8 +436,9 @@ people <- function(study) {
 
 comparisons <- function(study) {
   if (study$blinded) return(NULL)
-  tests <- c("two_sample_t", "paired_t", "wilcoxon", "mixed_model", if (study$between) c("welch_t", "permutation"))
-  of_scales(function(scale) comparisons_of(study$ratings, scale, study$groups, tests))
+  within <- c("paired_t", "mixed_model", "cumulative_link", "wilcoxon", "equivalence", "two_sample_t")
+  tests <- c(within, if (study$between) c("welch_t", "permutation"))
+  of_scales(function(scale) comparisons_of(study$ratings, scale, study$groups, tests, study$bound))
 }
 
 # Period and carryover (Jones and Kenward 2014): person + method + period, then + the method before.

@@ -27,7 +27,7 @@ from statsmodels.stats.meta_analysis import combine_effects
 
 SCALES = ("satisfaction", "personalisation")
 """Of the ratings; both from 1 to 5."""
-WITHIN = ("two_sample_t", "paired_t", "wilcoxon", "mixed_model")
+WITHIN = ("paired_t", "mixed_model", "cumulative_link", "wilcoxon", "equivalence", "two_sample_t")
 BETWEEN = ("welch_t", "permutation")
 WINDOW, FIRST_POINT = 30, 5
 """Answers in the running accuracy, and from which answer on it is drawn."""
@@ -60,7 +60,10 @@ class Study:
         self.scoring_key = self.read("scoring_key")
         self.head_to_heads = self.read("headtoheads")
         ratings = self.read("ratings")
-        self.methods = list(self.read("methods")["method"])
+        methods = self.read("methods")
+        self.methods = list(methods["method"])
+        # Points; the study's smallest difference that matters.
+        self.bound = float(methods["equivalence_bound"].iloc[0]) if len(methods) else None
         # Until a study is unblinded there are letters alone, and a letter is another method for everybody.
         self.blinded = bool(len(ratings)) and ratings["method"].isna().all()
         self.by = "letter" if self.blinded else "method"
@@ -220,6 +223,122 @@ def mixed_model(first, second):
     }
 
 
+def cumulative_link(first, second):
+    """Ratings as an order: proportional odds, rating ~ group + (1 | person), errors that count people (sandwich).
+
+    In R: ordinal::clmm(rating ~ group + (1 | person), nAGQ = 10); its own errors suppose one effect for everybody.
+    """
+    n, cells = len(first), [*first, *second]
+    if n < 4 or np.ptp(np.concatenate(cells)) == 0:
+        return {}
+    ratings = np.concatenate(cells)
+    x = np.repeat([0.0, 1.0], [sum(map(len, first)), sum(map(len, second))])
+    person = np.repeat([*range(n), *range(n)], [len(cell) for cell in cells])
+    model = OrderedRatings(ratings, x, person)
+    found, scores, information = model.fit()
+    sandwich = np.linalg.pinv(information) @ (scores.T @ scores) @ np.linalg.pinv(information)
+    difference, error = found[-2], math.sqrt(max(n / (n - 1) * sandwich[-2, -2], 0.0))
+    if abs(difference) > 12 or abs(found[-1]) > 8 or error < 1e-6 or np.abs(scores.sum(axis=0)).max() > 1e-6:
+        return {}
+    margin = stats.t.ppf(0.975, n - 1) * error
+    low, high = difference - margin, difference + margin
+    return {
+        "n": n,
+        "n_ratings": len(ratings),
+        "difference": difference,
+        "standard_error": error,
+        "low": low,
+        "high": high,
+        "odds_ratio": math.exp(difference),
+        "odds_ratio_low": math.exp(low),
+        "odds_ratio_high": math.exp(high),
+        "statistic": difference / error,
+        "degrees_of_freedom": n - 1,
+        "p": 2 * stats.t.sf(abs(difference / error), n - 1),
+        "sd_between_people": abs(found[-1]),
+    }
+
+
+class OrderedRatings:
+    """The marginal likelihood of thresholds, effect and the people's standard deviation, on a fine grid of levels."""
+
+    def __init__(self, ratings, x, person):
+        found, self.levels = np.unique(ratings, return_inverse=True)
+        self.x, self.cuts = x, len(found) - 1
+        self.belongs = (person == np.arange(person.max() + 1)[:, None]).astype(float)
+        self.person, self.grid = person, np.linspace(-8, 8, 161)
+        self.log_weights = stats.norm.logpdf(self.grid) + math.log(self.grid[1] - self.grid[0])
+
+    def scores(self, values):
+        """Log-likelihood of everybody, and its derivatives by thresholds, effect and SD: (people, parameters)."""
+        ends = np.concatenate([[-np.inf], values[: self.cuts], [np.inf]])
+        shift = (values[-2] * self.x)[:, None] + values[-1] * self.grid
+        lower, upper = ends[self.levels][:, None] - shift, ends[self.levels + 1][:, None] - shift
+        above, below = special.expit(upper), special.expit(lower)
+        chance = np.where(lower > 0, special.expit(-lower) - special.expit(-upper), above - below).clip(1e-300)
+        logs = self.belongs @ np.log(chance) + self.log_weights
+        likelihoods = special.logsumexp(logs, axis=1)
+        weights = np.exp(logs - likelihoods[:, None])[self.person]
+        slopes = weights * (above + below - 1)
+        at_upper, at_lower = ((weights * end * (1 - end) / chance).sum(axis=1) for end in (above, below))
+        columns = [at_upper * (self.levels == cut) - at_lower * (self.levels == cut + 1) for cut in range(self.cuts)]
+        columns += [slopes.sum(axis=1) * self.x, slopes @ self.grid]
+        return likelihoods, self.belongs @ np.column_stack(columns)
+
+    def information(self, values, step=1e-5):
+        def slope(at):
+            return self.scores(at)[1].sum(axis=0)
+
+        found = np.array([slope(values - each) - slope(values + each) for each in step * np.eye(len(values))]) / (
+            2 * step
+        )
+        return (found + found.T) / 2
+
+    def fit(self):
+        """Parameters where the likelihood is largest, everybody's scores there, and the observed information."""
+        below, cuts = np.cumsum(np.bincount(self.levels))[:-1] / len(self.levels), self.cuts
+        start = special.logit(below)
+
+        def ordered(free):  # the first threshold and the logarithms of the gaps between them, effect, SD
+            return np.concatenate([np.cumsum([free[0], *np.exp(free[1:cuts])]), free[cuts:]])
+
+        def misfit(free):
+            likelihoods, scores = self.scores(ordered(free))
+            gradient = scores.sum(axis=0)
+            gradient[:cuts] = np.cumsum(gradient[:cuts][::-1])[::-1]
+            gradient[1:cuts] *= np.exp(free[1:cuts])
+            return -likelihoods.sum(), -gradient
+
+        ends = [(-30, 30)] + [(-12, 3.5)] * (cuts - 1) + [(-13, 13)] * 2
+        free = [start[0], *np.log(np.diff(start)), 0.0, 1.0]
+        best = optimize.minimize(misfit, free, jac=True, method="L-BFGS-B", bounds=ends, options={"ftol": 1e-13})
+        values = ordered(best.x)
+        step = np.linalg.pinv(self.information(values))
+        for _ in range(3):  # Newton's steps, for the last digits
+            values = values + step @ self.scores(values)[1].sum(axis=0)
+        return values, self.scores(values)[1], self.information(values)
+
+
+def equivalence(differences, bound):
+    """Two one-sided paired t-tests (Schuirmann 1987): p below .05 shows that the means are less than bound apart."""
+    n = len(differences)
+    if n < 3 or np.ptp(differences) == 0:
+        return {}
+    low, high = stats.ttest_1samp(differences, 0.0).confidence_interval(0.90)
+    above = stats.ttest_1samp(differences, -bound, alternative="greater")
+    below = stats.ttest_1samp(differences, bound, alternative="less")
+    return {
+        "n": n,
+        "difference": differences.mean(),
+        "low_90": low,
+        "high_90": high,
+        "bound": bound,
+        "statistic": min(above.statistic, -below.statistic),
+        "degrees_of_freedom": n - 1,
+        "p": max(above.pvalue, below.pvalue),
+    }
+
+
 def can_be_compared(first, second):
     return min(len(first), len(second)) >= 3 and (np.ptp(first) > 0 or np.ptp(second) > 0)
 
@@ -370,7 +489,7 @@ def means_of(rows, value, by, groups, lowest=1, highest=5):
     return found
 
 
-def comparisons_of(rows, value, groups, tests=WITHIN):
+def comparisons_of(rows, value, groups, tests=WITHIN, bound=None):
     """Every test of every two methods, with Holm's correction over the comparisons of one test."""
     cells = {key: found.to_numpy(float) for key, found in rows.groupby(["participant", "method"])[value]}
     people = list(dict.fromkeys(rows["participant"]))
@@ -391,6 +510,8 @@ def comparisons_of(rows, value, groups, tests=WITHIN):
             "paired_t": lambda differences=differences: paired_t(differences),
             "wilcoxon": lambda differences=differences: wilcoxon(differences),
             "mixed_model": lambda mine=mine, theirs=theirs: mixed_model(mine, theirs),
+            "cumulative_link": lambda mine=mine, theirs=theirs: cumulative_link(mine, theirs),
+            "equivalence": lambda differences=differences: equivalence(differences, bound),
             "welch_t": lambda alone=alone: welch_t(*(each.round(12) for each in alone)),
             "permutation": lambda alone=alone: permutation(*(each.round(12) for each in alone)),
         }
@@ -426,7 +547,7 @@ def comparisons(study):
     return [
         {"scale": scale, **each}
         for scale in SCALES
-        for each in comparisons_of(study.ratings, scale, study.groups, tests)
+        for each in comparisons_of(study.ratings, scale, study.groups, tests, study.bound)
     ]
 
 

@@ -1,7 +1,7 @@
 """Tests of the difference between two groups of ratings: the paper's exactly, and three that count people.
 
 Each takes arrays and returns its numbers, or ``not_computable``: the reason in words. A difference is always second
-minus first. Their measured error rates are in docs/results/error_rates.md.
+minus first. Their measured error rates are in docs/results/error_rates.md and likert.md.
 """
 
 import warnings
@@ -15,8 +15,10 @@ from worker.domain.type_aliases import FloatArray
 
 Result = dict[str, Any]
 
-TESTS = ("two_sample_t", "paired_t", "wilcoxon", "mixed_model")
-"""Names as in app.domain.protocol.PlannedTest."""
+TESTS = ("paired_t", "mixed_model", "cumulative_link", "wilcoxon", "equivalence", "two_sample_t")
+"""Names as in app.domain.protocol.PlannedTest; what is to be relied on comes first, the paper's own last."""
+UNCORRECTED = "two_sample_t"
+"""The paper's, to which Holm's correction is not applied, as it was not there."""
 STAR_BELOW = 0.01
 """The paper's star: p < .01."""
 FEWEST_RATINGS = 2
@@ -61,6 +63,31 @@ def paired_t(differences: FloatArray) -> Result:
         "statistic": plain(outcome.statistic),
         "degrees_of_freedom": n - 1,
         "p": plain(outcome.pvalue),
+    }
+
+
+def equivalence(differences: FloatArray, bound: float) -> Result:
+    """Two one-sided paired t-tests: is the mean difference between -bound and bound? (P,), bound in points.
+
+    Schuirmann (1987), Journal of Pharmacokinetics and Biopharmaceutics 15, 657. ``p`` is the larger of the two, and
+    below .05 just when the 90 % interval ``low_90`` to ``high_90`` lies between the bounds.
+    """
+    n = len(differences)
+    reason = _why_not(differences)
+    if reason is not None:
+        return not_computable(reason)
+    mean, error = float(differences.mean()), float(stats.sem(differences))
+    margin = float(stats.t.ppf(0.95, n - 1)) * error
+    statistic = (bound - abs(mean)) / error
+    return {
+        "n": n,
+        "difference": plain(mean),
+        "low_90": plain(mean - margin),
+        "high_90": plain(mean + margin),
+        "bound": bound,
+        "statistic": plain(statistic),
+        "degrees_of_freedom": n - 1,
+        "p": plain(stats.t.sf(statistic, n - 1)),
     }
 
 
@@ -165,6 +192,6 @@ def not_computable(reason: str) -> Result:
     return {"not_computable": reason}
 
 
-def too_few(people: int) -> str:
+def too_few(people: int, needed: int = FEWEST_PAIRED) -> str:
     """Why a paired test needs more people."""
-    return f"{people} {'person has' if people == 1 else 'people have'} rated both; {FEWEST_PAIRED} are needed"
+    return f"{people} {'person has' if people == 1 else 'people have'} rated both; {needed} are needed"

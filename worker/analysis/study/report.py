@@ -39,6 +39,8 @@ class Tables:
     """standard questionnaires with what people filled in, see scales"""
     between: bool = False
     """whether people in different arms met different methods"""
+    bound: float = 0.5
+    """of equivalence, in points of the ratings' scale"""
     head_to_heads: Sequence[Row] | None = None
     """rows of the table headtoheads; None: there are none, or the study is blinded"""
     version: int = 0
@@ -72,6 +74,7 @@ def contents_of(tables: Tables) -> dict[str, Any]:
             by="letter" if tables.blinded else "method",
             compare=not tables.blinded,
             between=tables.between,
+            bound=tables.bound,
         ),
         "guesses": None if tables.guesses is None else guess_report(tables.guesses, len(tables.groups)),
         "head_to_heads": None if tables.head_to_heads is None else _head_to_heads(tables),

@@ -52,11 +52,7 @@ def _part(
         values = [(each["participant"], each["group"], each["scores"][score["name"]]) for each in scored]
         frame = pd.DataFrame(values, columns=["participant", "group", "score"])
         possible = float(score["lowest"]), float(score["highest"])
-        found = scale_report(frame, "score", "group", groups, compare, possible)
-        keep = {"first", "second", *TESTS}
-        found["comparisons"] = [
-            {name: part for name, part in each.items() if name in keep} for each in found["comparisons"]
-        ]
+        found = scale_report(frame, "score", "group", groups, compare, possible, tests=TESTS)
         answered = {
             group: [[each["items"][name] for name in score["items"]] for each in scored if each["group"] == group]
             for group in groups

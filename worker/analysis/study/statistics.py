@@ -19,7 +19,7 @@ Every result of a test has either its numbers or ``not_computable``: the reason 
 minus first. Nothing here is NaN or infinite; what is unknown is None.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import combinations
 from typing import Any
 
@@ -28,11 +28,14 @@ import pandas as pd
 from scipy import stats
 
 from worker.analysis.study.between import BETWEEN_TESTS, hedges_g, only_one_of, permutation, welch_t
+from worker.analysis.study.cumulative_link import cumulative_link
 from worker.analysis.study.effect_sizes import d_z_interval, holm, rank_biserial, rank_biserial_interval
 from worker.analysis.study.hypothesis_tests import (
     FEWEST_PAIRED,
     STAR_BELOW,
     TESTS,
+    UNCORRECTED,
+    equivalence,
     mixed_model,
     paired_t,
     plain,
@@ -48,6 +51,12 @@ SCALES = ("satisfaction", "personalisation")
 POINTS = (1, 5)
 """The lowest and the highest rating."""
 
+BOUND = 0.5
+"""Points; differences below it count as none that matters, unless the study says otherwise.
+
+Half a standard deviation of ratings that scatter by about one point: what people notice as a difference of how they
+fare (Norman, Sloan and Wyrwich 2003, Medical Care 41, 582).
+"""
 RECOMMENDED = "paired_t"
 MEASURED_ERROR_PERCENT: Sequence[Result] = (
     {"people": 4, "two_sample_t": 8.1, "paired_t": 4.6, "wilcoxon": 0.0, "mixed_model": 4.6},
@@ -68,13 +77,19 @@ ERROR_BARS = (
 
 
 def rating_report(
-    ratings: pd.DataFrame, groups: Sequence[str], *, by: str = "method", compare: bool = True, between: bool = False
+    ratings: pd.DataFrame,
+    groups: Sequence[str],
+    *,
+    by: str = "method",
+    compare: bool = True,
+    between: bool = False,
+    bound: float = BOUND,
 ) -> Result:
     """Means and tests of both scales. See the layout above.
 
     ``by``: the column that names the groups; ``compare``: False while letters hide methods, for then a letter is
     another method for every participant and a test between letters would say nothing about methods. ``between``: with
-    the tests of people who met different methods.
+    the tests of people who met different methods. ``bound``: of equivalence, in points of the scale.
     """
     rows = ratings.dropna(subset=list(SCALES))
     rows = rows[rows[by].isin(list(groups))]
@@ -87,7 +102,9 @@ def rating_report(
         "measured_error_percent": list(MEASURED_ERROR_PERCENT),
         "error_bars": ERROR_BARS,
         "star_below": STAR_BELOW,
-        "scales": {scale: scale_report(rows, scale, by, groups, compare, between=between) for scale in SCALES},
+        "scales": {
+            scale: scale_report(rows, scale, by, groups, compare, between=between, bound=bound) for scale in SCALES
+        },
     }
 
 
@@ -99,16 +116,21 @@ def scale_report(
     compare: bool,
     possible: tuple[float, float] = POINTS,
     between: bool = False,
+    tests: Sequence[str] = TESTS,
+    bound: float = BOUND,
 ) -> Result:
-    """Means, people and comparisons of one scale, a column of ``rows``; ``possible``: its lowest and highest value."""
+    """Means, people and comparisons of one scale, a column of ``rows``; ``possible``: its lowest and highest value.
+
+    ``bound``: of equivalence, in points of the scale.
+    """
     comparisons: list[Result] = [
-        {"first": first, "second": second, **_tests(rows, scale, by, first, second)}
+        {"first": first, "second": second, **_tests(rows, scale, by, first, second, tests, bound)}
         for first, second in (combinations(groups, 2) if compare else ())
     ]
     people = _people(rows, scale, by)
     for comparison in comparisons if between else ():
         comparison |= _between(people, comparison["first"], comparison["second"])
-    for test in (*TESTS[1:], *(BETWEEN_TESTS if between else ())):
+    for test in (*(each for each in tests if each != UNCORRECTED), *(BETWEEN_TESTS if between else ())):
         _correct([comparison[test] for comparison in comparisons])
     return {
         "means": [_mean_of(rows[rows[by] == group], scale, group, possible) for group in groups],
@@ -163,32 +185,38 @@ def mean_interval(
     return plain(max(values.mean() - margin, possible[0])), plain(min(values.mean() + margin, possible[1]))
 
 
-def _tests(rows: pd.DataFrame, scale: str, by: str, first: str, second: str) -> dict[str, Result]:
-    every = {group: _floats(rows[rows[by] == group][scale]) for group in (first, second)}
+def _tests(
+    rows: pd.DataFrame, scale: str, by: str, first: str, second: str, tests: Sequence[str], bound: float
+) -> dict[str, Result]:
+    every = [_floats(rows[rows[by] == group][scale]) for group in (first, second)]
     differences = paired_differences(rows, scale, by, first, second)
-    results = {
-        "two_sample_t": two_sample_t(every[first], every[second]),
-        "paired_t": paired_t(differences),
-        "wilcoxon": wilcoxon(differences),
-        "mixed_model": mixed_model(*ratings_of_each(rows, scale, by, first, second)),
+    of_each = ratings_of_each(rows, scale, by, first, second)
+    computed: dict[str, Callable[[], Result]] = {
+        "paired_t": lambda: _cohens_d_z(paired_t(differences), differences),
+        "mixed_model": lambda: mixed_model(*of_each),
+        "cumulative_link": lambda: cumulative_link(*of_each),
+        "wilcoxon": lambda: _rank_biserial(wilcoxon(differences), differences),
+        "equivalence": lambda: equivalence(differences, bound),
+        "two_sample_t": lambda: two_sample_t(*every),
     }
-    if "p" in results["paired_t"]:
-        results["paired_t"] |= _cohens_d_z(results["paired_t"], differences)
-    if "p" in results["wilcoxon"]:
-        results["wilcoxon"] |= _rank_biserial(differences)
-    return results
+    return {test: computed[test]() for test in tests}
 
 
 def _cohens_d_z(test: Result, differences: FloatArray) -> Result:
+    if "p" not in test:
+        return test
     low, high = d_z_interval(test["statistic"], len(differences))
     d_z = differences.mean() / differences.std(ddof=1)
-    return {"d_z": plain(d_z), "d_z_low": plain(low), "d_z_high": plain(high)}
+    return test | {"d_z": plain(d_z), "d_z_low": plain(low), "d_z_high": plain(high)}
 
 
-def _rank_biserial(differences: FloatArray) -> Result:
+def _rank_biserial(test: Result, differences: FloatArray) -> Result:
+    if "p" not in test:
+        return test
     correlation = rank_biserial(differences)
     low, high = rank_biserial_interval(correlation, int(np.count_nonzero(differences)))
-    return {"rank_biserial": plain(correlation), "rank_biserial_low": plain(low), "rank_biserial_high": plain(high)}
+    ends = {"rank_biserial_low": plain(low), "rank_biserial_high": plain(high)}
+    return test | {"rank_biserial": plain(correlation), **ends}
 
 
 def ratings_of_each(

@@ -143,7 +143,9 @@ def _write_analysis(target: zipfile.ZipFile, session: Session, study: Study) -> 
         target.writestr(script, (ANALYSIS / script).read_text())
     evaluation = evaluation_plan.settings_of(study)
     methods = [each.value for each in evaluation.methods] if evaluation else []
-    target.writestr("csv/methods.csv", "\n".join(["method", *methods, ""]))
+    bound = study.settings.equivalence_bound
+    lines = ["method,equivalence_bound", *(f"{method},{bound}" for method in methods), ""]
+    target.writestr("csv/methods.csv", "\n".join(lines))
     target.writestr("csv/scoring_key.csv", codebook.scoring_key_csv())
 
 

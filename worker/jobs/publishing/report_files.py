@@ -139,6 +139,7 @@ def tables_of(session: Session, study: Study) -> Tables:
         ratings=rows["ratings"],
         evaluations=rows["evaluations"],
         between=bool(study.settings.arms),
+        bound=study.settings.equivalence_bound,
         head_to_heads=rows["headtoheads"] if settings and settings.head_to_heads and not blinded else None,
         guesses=_guesses(session, study) if _asks_whose(study) else None,
         instruments=_instruments(session, study),
