@@ -249,7 +249,17 @@ class Advisor(Choice):
 class PlannedTest(Choice):
     """Tests that a study announces before its data are seen."""
 
+    TWO_SAMPLE_T = (
+        "two_sample_t",
+        "Two-sample t",
+        "As in the paper; ignores that the same people rated all methods, and finds too much.",
+    )
     PAIRED_T = "paired_t", "Paired t", "Each person with themselves: right for this design."
+    WILCOXON = (
+        "wilcoxon",
+        "Wilcoxon signed-rank",
+        "The same without assuming a normal distribution; finds nothing with fewer than six people.",
+    )
     MIXED_MODEL = (
         "mixed_model",
         "Linear mixed model",
@@ -260,20 +270,10 @@ class PlannedTest(Choice):
         "Cumulative link mixed model",
         "Takes ratings as an order and not as distances; counts people.",
     )
-    WILCOXON = (
-        "wilcoxon",
-        "Wilcoxon signed-rank",
-        "The paired t without assuming a normal distribution; finds nothing with fewer than six people.",
-    )
     EQUIVALENCE = (
         "equivalence",
         "Equivalence (two one-sided tests)",
         "Shows that two robots differ by less than what matters, which no other test can.",
-    )
-    TWO_SAMPLE_T = (
-        "two_sample_t",
-        "Two-sample t",
-        "As in the paper; ignores that the same people rated all methods, and finds too much.",
     )
     WELCH_T = "welch_t", "Welch t", "Between arms: one number per person, spreads may differ."
     PERMUTATION = "permutation", "Permutation", "Between arms, without assuming a normal distribution."

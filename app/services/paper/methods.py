@@ -227,8 +227,8 @@ def _analysis(study: Study, plan: Plan) -> Iterator[str]:
         "Beside it, ratings as ordered categories: a cumulative link mixed model (proportional odds, random intercept "
         "for people, adaptive Gauss-Hermite quadrature) with a sandwich covariance over people and t with people less "
         "one degrees of freedom.",
-        f"Equivalence: two one-sided paired t-tests with bounds of ±{study.settings.equivalence_bound:g} points, at 5 % "
-        "each.",
+        f"Equivalence: two one-sided paired t-tests with bounds of ±{study.settings.equivalence_bound:g} points, at "
+        "5 % each.",
         "Between arms: Welch's t-test (Hedges' g) and a permutation test of its statistic, without people who met both "
         "methods."
         if study.settings.arms

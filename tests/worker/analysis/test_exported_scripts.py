@@ -289,6 +289,10 @@ def invented(script: dict[str, Any], folder: Path, **tables: pd.DataFrame) -> An
     return script["Study"](folder)
 
 
+def bounded(methods: Sequence[str]) -> pd.DataFrame:
+    return pd.DataFrame({"method": methods, "equivalence_bound": 0.4})
+
+
 def ratings_of(people: int, arms: Sequence[Sequence[str]], seed: int) -> pd.DataFrame:
     """Ratings in blocks of one to three, by people of arms in turn; some leave a method out."""
     random, rows = np.random.default_rng(seed), []
@@ -328,7 +332,7 @@ def test_arms_and_missing_ratings_are_computed_alike(
         tmp_path,
         ratings=ratings,
         participants=who,
-        methods=pd.DataFrame({"method": methods, "equivalence_bound": 0.4}),
+        methods=bounded(methods),
     )
     for name, reported in ratings_tables(rating_report(ratings, methods, between=between, bound=0.4)).items():
         assert_same(reported, script[name](study), name)
@@ -349,7 +353,7 @@ def test_head_to_heads_with_equal_answers_are_computed_alike(
         script,
         tmp_path,
         headtoheads=pd.DataFrame(rows),
-        methods=pd.DataFrame({"method": methods, "equivalence_bound": 0.4}),
+        methods=pd.DataFrame({"method": methods}),
     )
     report = head_to_head_report(
         [{**each, "left": each["left_method"], "right": each["right_method"]} for each in rows], methods
@@ -374,7 +378,7 @@ def test_guesses_are_computed_alike(script: dict[str, Any], tmp_path: Path) -> N
         tmp_path,
         ratings=ratings,
         forms=forms,
-        methods=pd.DataFrame({"method": methods, "equivalence_bound": 0.4}),
+        methods=pd.DataFrame({"method": methods}),
     )
     report = guess_report([{"right": letter == "C"} for letter in said], len(methods))
     assert_same([report], script["guesses"](study), "guesses")

@@ -6,8 +6,8 @@ person), nAGQ = 10)`` fits. For one smooth integral over a line an even grid los
 Weideman 2014); ten to fifteen adaptive Gauss-Hermite nodes lose all beyond the third where people differ much.
 
 Its usual standard errors suppose that a difference is the same to everybody, and promise too much where it is not
-(docs/results/likert.md). Tests and intervals here count people: the sandwich over people (Liang and Zeger 1986) with a t
-of people - 1 degrees of freedom, as in worker.analysis.study.bradley_terry.
+(docs/results/likert.md). Tests and intervals here count people: the sandwich over people (Liang and Zeger 1986) with
+a t of people - 1 degrees of freedom, as in worker.analysis.study.bradley_terry.
 """
 
 from collections.abc import Sequence
@@ -17,13 +17,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from scipy import optimize, stats
-from scipy.special import expit, logsumexp
+from scipy.special import expit
 
 from worker.analysis.study.hypothesis_tests import not_computable, plain, too_few
 from worker.domain.type_aliases import FloatArray
 
 GRID = np.linspace(-8.0, 8.0, 161)
 """Values of u, in standard deviations over people."""
+_LOG_WEIGHTS = -(GRID**2) / 2 - np.log(2 * np.pi) / 2 + np.log(GRID[1] - GRID[0])
 FEWEST_PEOPLE = 4
 """Below, a covariance over people says nothing."""
 MOST = 12.0
@@ -74,9 +75,12 @@ def cumulative_link(first: Sequence[FloatArray], second: Sequence[FloatArray]) -
     reason = _why_not(ratings, n)
     if reason is not None:
         return not_computable(reason)
-    sizes = [[len(each) for each in group] for group in (first, second)]
-    person = np.concatenate([np.repeat(np.arange(n), each) for each in sizes])
-    found = fit(ratings, np.repeat([0.0, 1.0], [sum(each) for each in sizes])[:, None], person)
+    return tested(fit_two(first, second), len(ratings))
+
+
+def tested(found: Fit, ratings: int) -> dict[str, Any]:
+    """What ``cumulative_link`` says of a model of two groups that is fitted to so many ratings."""
+    n = len(found.scores)
     difference, place = float(found.effects[0]), len(found.thresholds)
     if not found.converged or abs(difference) > MOST or found.sd > WIDEST:
         return not_computable("the ratings of the two, or of the people, overlap so little that no finite model fits")
@@ -87,7 +91,7 @@ def cumulative_link(first: Sequence[FloatArray], second: Sequence[FloatArray]) -
     ends = {"low": difference - margin, "high": difference + margin}
     return {
         "n": n,
-        "n_ratings": len(ratings),
+        "n_ratings": ratings,
         "difference": plain(difference),
         "standard_error": plain(error),
         **ends,
@@ -98,6 +102,14 @@ def cumulative_link(first: Sequence[FloatArray], second: Sequence[FloatArray]) -
         "p": plain(2 * stats.t.sf(abs(difference / error), n - 1)),
         "sd_between_people": plain(found.sd),
     }
+
+
+def fit_two(first: Sequence[FloatArray], second: Sequence[FloatArray]) -> Fit:
+    """rating ~ group + (1 | person); by person: their ratings of each group."""
+    sizes = [[len(each) for each in group] for group in (first, second)]
+    person = np.concatenate([np.repeat(np.arange(len(first)), each) for each in sizes])
+    x = np.repeat([0.0, 1.0], [sum(each) for each in sizes])[:, None]
+    return fit(np.concatenate([*first, *second]), x, person)
 
 
 def _why_not(ratings: FloatArray, people: int) -> str | None:
@@ -114,24 +126,27 @@ def _odds(log_odds: float) -> float | None:
 
 @dataclass(frozen=True)
 class _Data:
-    levels: npt.NDArray[np.int64]
-    """of every rating, 0 up to the number of levels that occur, less one: (R,)"""
-    x: FloatArray
-    """(R, E)"""
-    person: npt.NDArray[np.int64]
-    """whose rating it is, 0 up to people less one: (R,)"""
-    people: int
+    """Ratings counted: what is the same of one person adds to the likelihood alike."""
 
-    def sums(self, values: FloatArray) -> FloatArray:
-        """Over each person's ratings: (R, ...) -> (P, ...)."""
-        belongs = (self.person == np.arange(self.people)[:, None]).astype(np.float64)
-        return np.asarray(belongs @ values, np.float64)
+    levels: npt.NDArray[np.int64]
+    """of every kind of rating, 0 up to the number of levels that occur, less one: (C,)"""
+    x: FloatArray
+    """(C, E)"""
+    counts: FloatArray
+    """how many each person gave of each kind, (P, C)"""
+
+
+def _counted(levels: npt.NDArray[np.int64], x: FloatArray, person: npt.NDArray[np.int64]) -> _Data:
+    kinds, which = np.unique(np.column_stack([levels, x]), axis=0, return_inverse=True)
+    counts = np.zeros((int(person.max()) + 1, len(kinds)))
+    np.add.at(counts, (person, which.ravel()), 1.0)
+    return _Data(kinds[:, 0].astype(np.int64), kinds[:, 1:], counts)
 
 
 def fit(ratings: FloatArray, x: FloatArray, person: npt.NDArray[np.int64]) -> Fit:
     """``ratings`` (R,), of which two values at least occur; ``x`` (R, E) without intercept; ``person`` (R,) from 0."""
     found, levels = np.unique(ratings, return_inverse=True)
-    data = _Data(levels, np.asarray(x, np.float64), person, int(person.max()) + 1)
+    data = _counted(levels, np.asarray(x, np.float64), person)
     below = np.cumsum(np.bincount(levels))[:-1] / len(levels)
     cuts = np.log(below / (1 - below))
     start = np.concatenate([cuts[:1], np.log(np.diff(cuts)), np.zeros(data.x.shape[1]), [1.0]])
@@ -182,23 +197,21 @@ def _likelihoods(parameters: FloatArray, data: _Data, count: int) -> tuple[Float
     """Each person's log-likelihood (P,) and its derivatives (P, parameters), by Fisher's identity."""
     ends = np.concatenate([[-np.inf], parameters[:count], [np.inf]])
     shift = (data.x @ parameters[count:-1])[:, None] + parameters[-1] * GRID
-    above, below, chance = _chances(ends[data.levels][:, None], ends[data.levels + 1][:, None], shift)
-    logs = data.sums(np.log(chance)) + stats.norm.logpdf(GRID) + np.log(GRID[1] - GRID[0])
-    values = logsumexp(logs, axis=1)
-    mine = np.exp(logs - values[:, None])[data.person]
-    slopes = mine * (above + below - 1)
-    at_upper = (mine * above * (1 - above) / chance).sum(axis=1)
-    at_lower = (mine * below * (1 - below) / chance).sum(axis=1)
-    each = np.zeros((len(data.levels), len(parameters)))
-    for cut in range(count):
-        each[:, cut] = at_upper * (data.levels == cut) - at_lower * (data.levels == cut + 1)
-    each[:, count:-1] = slopes.sum(axis=1)[:, None] * data.x
-    each[:, -1] = slopes @ GRID
-    return values, data.sums(each)
+    lower, upper = ends[data.levels][:, None], ends[data.levels + 1][:, None]
+    at_most, at_least = expit(upper - shift), expit(shift - lower)
+    chance = np.maximum(at_most * at_least * -np.expm1(lower - upper), _LEAST)  # no difference of near equals
+    logs = data.counts @ np.log(chance) + _LOG_WEIGHTS
+    most = logs.max(axis=1, keepdims=True)
+    likely = np.exp(logs - most)
+    total = likely.sum(axis=1, keepdims=True)
+    values, posterior = (most + np.log(total))[:, 0], likely / total
 
+    def expected(slopes: FloatArray) -> FloatArray:
+        return np.asarray(data.counts * (posterior @ slopes.T), np.float64)
 
-def _chances(lower: FloatArray, upper: FloatArray, shift: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """P(rating at or below), P(rating below) and P(rating); the last from the tail that loses no digits."""
-    above, below = expit(upper - shift), expit(lower - shift)
-    chance = np.where(lower > shift, expit(shift - lower) - expit(shift - upper), above - below)
-    return above, below, np.maximum(chance, _LEAST)
+    by_effect = expected(at_most - at_least)
+    by_upper = expected(at_most * (1 - at_most) / chance)
+    by_lower = expected(at_least * (1 - at_least) / chance)
+    is_upper, is_lower = (data.levels[:, None] == np.arange(count) + lies for lies in (0, 1))
+    by_sd = expected((at_most - at_least) * GRID).sum(axis=1)
+    return values, np.column_stack([by_upper @ is_upper - by_lower @ is_lower, by_effect @ data.x, by_sd])
