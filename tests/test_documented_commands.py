@@ -117,6 +117,7 @@ RUN: dict[str, str | Elsewhere | OnlyParsed] = {
     "feedback_report": "results",
     "first_robot": REAL_TIME,
     "fuzz_api": "--requests 20",
+    "likert": Elsewhere("tests/worker/analysis/test_likert.py::test_the_command_writes_page_and_table"),
     "head_to_head": OnlyParsed("computes each truth from 200 000 people; what it measures has tests of its own"),
     "reliability": OnlyParsed("computes each truth from 400 000 people; what it measures has tests of its own"),
     "in_lerobot": OnlyParsed("needs the library lerobot, in an environment of its own"),

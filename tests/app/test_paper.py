@@ -122,6 +122,12 @@ def test_every_number_of_the_report_is_in_the_text(
             statistic, d_z = (f"{paired[name]:.2f}".replace("-", "\N{MINUS SIGN}") for name in ("statistic", "d_z"))
             assert f"t({paired['degrees_of_freedom']}) = {statistic}" in said
             assert f"d_z = {d_z} [" in said
+            link = comparison["cumulative_link"]
+            assert f"{link.get('odds_ratio', 0):.2f} [" in said or link["not_computable"] in said
+            ends = (
+                f"{comparison['equivalence'][end]:.2f}".replace("-", "\N{MINUS SIGN}") for end in ("low_90", "high_90")
+            )
+            assert f"90 % interval [{', '.join(ends)}], bounds ±0.5" in said
     for each in contents["head_to_heads"].get("strengths", []):
         assert f"{each['strength']:.2f}".replace("-", "\N{MINUS SIGN}") in said
     for score in contents["instruments"][0]["parts"][1]["scores"]:

@@ -79,7 +79,7 @@ def test_without_answers_the_page_says_what_it_waits_for(database: Database, exp
 
 def test_planned_tests_are_marked_and_all_others_are_exploratory(experimenter: TestClient, finished: Finished) -> None:
     text = results(experimenter, finished(locked=True))
-    comparisons, scales, kinds = 3, 2, 4
+    comparisons, scales, kinds = 3, 2, 6
     questionnaire = comparisons * 6 * 2
     """Six scores of the standard questionnaire, two tests: never planned, for plans are about ratings."""
     assert text.count('tag-planned">planned') == comparisons * scales
@@ -137,7 +137,7 @@ def test_the_page_says_which_test_to_rely_on_and_how_often_the_papers_errs(
     assert "Rely on the paired t test" in text
     for row in MEASURED_ERROR_PERCENT:
         assert f'<th scope="row">{row["people"]}</th><td data-label="Two-sample t, as in the paper">' in text
-        assert f"{row['two_sample_t']:.1f} %" in text
+        assert f"{row['two_sample_t']['percent']:.1f} %" in text
 
 
 def test_a_report_of_an_earlier_version_is_not_shown_but_made_again(

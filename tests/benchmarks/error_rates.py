@@ -22,7 +22,7 @@ from tqdm import tqdm
 from tests.benchmarks import error_rates_of_intervals
 from worker.analysis.comparison import result_pages
 from worker.analysis.study.effect_sizes import holm
-from worker.analysis.study.hypothesis_tests import TESTS, mixed_model, paired_t, two_sample_t, wilcoxon
+from worker.analysis.study.hypothesis_tests import mixed_model, paired_t, two_sample_t, wilcoxon
 from worker.domain.type_aliases import FloatArray
 
 Cells = list[list[FloatArray]]
@@ -98,7 +98,7 @@ def _met(truth: Truth, rng: np.random.Generator) -> npt.NDArray[np.bool_]:
 
 def p_values(cells: Cells) -> dict[str, list[float | None]]:
     """By test: p of every comparison, as a report would have them; None where it cannot be computed."""
-    found: dict[str, list[float | None]] = {test: [] for test in TESTS}
+    found: dict[str, list[float | None]] = {test: [] for test in NAMES}
     for first, second in combinations(range(len(cells[0])), 2):
         every = [np.concatenate([person[group] for person in cells]) for group in (first, second)]
         both = [person for person in cells if len(person[first]) and len(person[second])]
@@ -119,7 +119,7 @@ def rates(truth: Truth, studies: int, seed: int = 0) -> list[dict[str, Any]]:
     """A row per test: how often it found something that is there, something that is not, and could say nothing."""
     rng = np.random.default_rng([seed, truth.people, zlib.crc32(truth.name.encode())])
     differ = [truth.means[first] != truth.means[second] for first, second in combinations(range(len(truth.means)), 2)]
-    tallies = {test: np.zeros(5) for test in TESTS}
+    tallies = {test: np.zeros(5) for test in NAMES}
     for _ in range(studies):
         for test, found in p_values(invented(truth, rng)).items():
             corrected = holm(found)

@@ -225,7 +225,7 @@ def _analysis(study: Study, plan: Plan) -> Iterator[str]:
         "correlation with an approximate interval), and a linear mixed model with random intercepts and slopes for "
         "people, estimated in two stages (Paule-Mandel, Hartung-Knapp).",
         "Beside it, ratings as ordered categories: a cumulative link mixed model (proportional odds, random intercept "
-        "for people, adaptive Gauss-Hermite quadrature) with a sandwich covariance over people and t with people less "
+        "for people, maximum likelihood) with a sandwich covariance over people and t with people less "
         "one degrees of freedom.",
         f"Equivalence: two one-sided paired t-tests with bounds of ±{study.settings.equivalence_bound:g} points, at "
         "5 % each.",

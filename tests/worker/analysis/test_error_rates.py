@@ -1,4 +1,4 @@
-"""The simulation of error rates, small; and that the page shows what the large one measured."""
+"""The simulation of error rates, small; and that what is relied on kept its promise in the large one."""
 
 import csv
 from dataclasses import replace
@@ -8,8 +8,7 @@ import pytest
 
 from tests.benchmarks import error_rates
 from tests.benchmarks.error_rates import SPREAD, UNEQUAL, Truth
-from worker.analysis.study.hypothesis_tests import TESTS
-from worker.analysis.study.statistics import MEASURED_ERROR_PERCENT, RECOMMENDED
+from worker.analysis.study.statistics import RECOMMENDED
 
 STUDIES = 250
 MISSING = replace(SPREAD, name="spread .5, trials missing", missing=0.3, dropouts=0.1)
@@ -21,7 +20,7 @@ def test_tests_that_count_people_err_as_often_as_they_promise(truth: Truth) -> N
     """Within three standard errors; three comparisons of one study are not independent, so counted as one."""
     most = 5.0 + 3 * (5.0 * 95.0 / STUDIES) ** 0.5
     found = {row["test"]: row for row in error_rates.rates(truth, STUDIES)}
-    for test in TESTS[1:]:
+    for test in ("paired_t", "wilcoxon", "mixed_model"):
         assert found[test]["false_alarms_percent"] <= most
         assert found[test]["false_alarms_of_family_percent"] <= most
 
@@ -36,14 +35,6 @@ def test_the_command_writes_every_table(tmp_path: Path) -> None:
         "error_rates.md",
         "error_rates_of_intervals.csv",
     }
-
-
-def test_the_page_shows_what_was_measured() -> None:
-    with (error_rates.RESULTS / "error_rates.csv").open() as file:
-        rows = [row for row in csv.DictReader(file) if row["truth"] == error_rates.WHOLE.name]
-    measured = {(int(row["people"]), row["test"]): float(row["false_alarms_percent"]) for row in rows}
-    shown = {(each["people"], test): each[test] for each in MEASURED_ERROR_PERCENT for test in TESTS}
-    assert shown == measured
 
 
 def test_what_is_recommended_never_erred_clearly_more_often_than_promised() -> None:

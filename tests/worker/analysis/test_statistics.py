@@ -11,7 +11,14 @@ from scipy import stats
 from statsmodels.stats.multitest import multipletests
 
 from worker.analysis.study.effect_sizes import d_z_interval, holm, rank_biserial, rank_biserial_interval
-from worker.analysis.study.hypothesis_tests import mixed_model, paired_t, signed_rank, two_sample_t, wilcoxon
+from worker.analysis.study.hypothesis_tests import (
+    equivalence,
+    mixed_model,
+    paired_t,
+    signed_rank,
+    two_sample_t,
+    wilcoxon,
+)
 from worker.analysis.study.statistics import SCALES, paired_differences, rating_report
 
 METHODS = ("reference", "prefft", "pbarl")
@@ -226,3 +233,24 @@ def test_every_pair_of_methods_is_compared_once_second_minus_first() -> None:
     means = {each["group"]: each["mean"] for each in report["means"]}
     for each in report["comparisons"]:
         assert each["two_sample_t"]["difference"] == pytest.approx(means[each["second"]] - means[each["first"]])
+
+
+@pytest.mark.parametrize("bound", [0.2, 0.4, 0.6])
+def test_equivalence_is_shown_by_the_larger_of_two_one_sided_tests(bound: float) -> None:
+    """Which is below 5 % just when the 90 % interval lies between the bounds (Schuirmann 1987)."""
+    differences = np.array([0.3, -0.1, 0.4, 0.0, 0.2, 0.1, 0.3, -0.2])
+    sides = [
+        stats.ttest_1samp(differences, -bound, alternative="greater").pvalue,
+        stats.ttest_1samp(differences, bound, alternative="less").pvalue,
+    ]
+    got = equivalence(differences, bound)
+    assert got["p"] == pytest.approx(max(sides))
+    assert (got["p"] < 0.05) == (-bound < got["low_90"] and got["high_90"] < bound)
+    assert equivalence(-differences, bound)["p"] == pytest.approx(got["p"])
+
+
+def test_few_people_cannot_show_equivalence_by_not_finding_a_difference() -> None:
+    differences = np.array([-1.0, 1.0, 0.5, -0.5])
+    assert paired_t(differences)["p"] > 0.9
+    assert equivalence(differences, 0.5)["p"] > 0.05
+    assert "3 are needed" in equivalence(differences[:2], 0.5)["not_computable"]

@@ -213,18 +213,16 @@ ordered_ratings <- function(ratings, x, person) {
   scores <- function(values) {
     ends <- c(-Inf, values[seq_len(cuts)], Inf)
     shift <- outer(values[cuts + 1] * x, values[cuts + 2] * grid, "+")
-    lower <- ends[levels] - shift
-    upper <- ends[levels + 1] - shift
-    above <- plogis(upper)
-    below <- plogis(lower)
-    chance <- pmax(ifelse(lower > 0, plogis(-lower) - plogis(-upper), above - below), 1e-300)
+    at_most <- plogis(ends[levels + 1] - shift)
+    at_least <- plogis(shift - ends[levels])
+    chance <- pmax(at_most * at_least * -expm1(ends[levels] - ends[levels + 1]), 1e-300)
     logs <- sweep(rowsum(log(chance), person), 2, log_weights, "+")
     most <- apply(logs, 1, max)
     likelihoods <- most + log(rowSums(exp(logs - most)))
     weights <- exp(logs - likelihoods)[person, , drop = FALSE]
-    slopes <- weights * (above + below - 1)
-    at_upper <- rowSums(weights * above * (1 - above) / chance)
-    at_lower <- rowSums(weights * below * (1 - below) / chance)
+    slopes <- weights * (at_most - at_least)
+    at_upper <- rowSums(weights * at_most * (1 - at_most) / chance)
+    at_lower <- rowSums(weights * at_least * (1 - at_least) / chance)
     of_cuts <- sapply(seq_len(cuts), function(cut) at_upper * (levels == cut) - at_lower * (levels == cut + 1))
     list(
       likelihood = sum(likelihoods),

@@ -264,26 +264,37 @@ class OrderedRatings:
 
     def __init__(self, ratings, x, person):
         found, self.levels = np.unique(ratings, return_inverse=True)
-        self.x, self.cuts = x, len(found) - 1
-        self.belongs = (person == np.arange(person.max() + 1)[:, None]).astype(float)
-        self.person, self.grid = person, np.linspace(-8, 8, 161)
+        # What is the same of one person is counted: it adds to the likelihood alike.
+        kinds, which = np.unique(np.column_stack([self.levels, x]), axis=0, return_inverse=True)
+        self.levels, self.x, self.cuts = kinds[:, 0].astype(int), kinds[:, 1], len(found) - 1
+        self.counts = np.zeros((person.max() + 1, len(kinds)))
+        np.add.at(self.counts, (person, which.ravel()), 1.0)
+        below = np.cumsum(np.bincount(self.levels, self.counts.sum(axis=0)))[:-1] / len(ratings)
+        self.start, self.grid = special.logit(below), np.linspace(-8, 8, 161)
         self.log_weights = stats.norm.logpdf(self.grid) + math.log(self.grid[1] - self.grid[0])
 
     def scores(self, values):
         """Log-likelihood of everybody, and its derivatives by thresholds, effect and SD: (people, parameters)."""
         ends = np.concatenate([[-np.inf], values[: self.cuts], [np.inf]])
         shift = (values[-2] * self.x)[:, None] + values[-1] * self.grid
-        lower, upper = ends[self.levels][:, None] - shift, ends[self.levels + 1][:, None] - shift
-        above, below = special.expit(upper), special.expit(lower)
-        chance = np.where(lower > 0, special.expit(-lower) - special.expit(-upper), above - below).clip(1e-300)
-        logs = self.belongs @ np.log(chance) + self.log_weights
+        lower, upper = ends[self.levels][:, None], ends[self.levels + 1][:, None]
+        at_most, at_least = special.expit(upper - shift), special.expit(shift - lower)
+        chance = (at_most * at_least * -np.expm1(lower - upper)).clip(1e-300)
+        logs = self.counts @ np.log(chance) + self.log_weights
         likelihoods = special.logsumexp(logs, axis=1)
-        weights = np.exp(logs - likelihoods[:, None])[self.person]
-        slopes = weights * (above + below - 1)
-        at_upper, at_lower = ((weights * end * (1 - end) / chance).sum(axis=1) for end in (above, below))
-        columns = [at_upper * (self.levels == cut) - at_lower * (self.levels == cut + 1) for cut in range(self.cuts)]
-        columns += [slopes.sum(axis=1) * self.x, slopes @ self.grid]
-        return likelihoods, self.belongs @ np.column_stack(columns)
+        weights = np.exp(logs - likelihoods[:, None])
+        effect, upper, lower, sd = (
+            self.counts * (weights @ slopes.T)
+            for slopes in (
+                at_most - at_least,
+                at_most * (1 - at_most) / chance,
+                at_least * (1 - at_least) / chance,
+                (at_most - at_least) * self.grid,
+            )
+        )
+        cuts = np.arange(self.cuts)
+        by_cut = upper @ (self.levels[:, None] == cuts) - lower @ (self.levels[:, None] == cuts + 1)
+        return likelihoods, np.column_stack([by_cut, effect @ self.x, sd.sum(axis=1)])
 
     def information(self, values, step=1e-5):
         def slope(at):
@@ -296,8 +307,7 @@ class OrderedRatings:
 
     def fit(self):
         """Parameters where the likelihood is largest, everybody's scores there, and the observed information."""
-        below, cuts = np.cumsum(np.bincount(self.levels))[:-1] / len(self.levels), self.cuts
-        start = special.logit(below)
+        cuts, start = self.cuts, self.start
 
         def ordered(free):  # the first threshold and the logarithms of the gaps between them, effect, SD
             return np.concatenate([np.cumsum([free[0], *np.exp(free[1:cuts])]), free[cuts:]])
