@@ -136,7 +136,7 @@ def test_the_page_says_which_test_to_rely_on_and_how_often_the_papers_errs(
     text = " ".join(results(experimenter, finished()).split())
     assert "Rely on the paired t test" in text
     for row in MEASURED_ERROR_PERCENT:
-        assert f'<th scope="row">{row["people"]}</th><td data-label="Two-sample t, as in the paper">' in text
+        assert f'<th scope="row">{row["people"]}</th><td data-label="Paired t">' in text
         assert f"{row['two_sample_t']['percent']:.1f} %" in text
 
 
@@ -174,7 +174,7 @@ def test_dashboard_and_results_have_the_same_figures_of_a_person(
 def test_tests_that_need_more_people_say_how_many(experimenter: TestClient, finished: Finished) -> None:
     text = results(experimenter, finished(people=2))
     assert "Not computable because 2 people have rated both; 3 are needed." in text
-    assert "paired tests and the mixed model compare each person with themselves" in text
+    assert "paired tests and the mixed models compare each person with themselves" in text
 
 
 def test_a_blinded_study_shows_letters_and_no_tests(experimenter: TestClient, finished: Finished) -> None:
