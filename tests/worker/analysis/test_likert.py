@@ -15,7 +15,7 @@ from worker.analysis.study.statistics import MEASURED_ERROR_PERCENT, RECOMMENDED
 
 def most(studies: int) -> float:
     """What a test of 5 % hardly exceeds: three standard errors."""
-    return 5.0 + 3 * float(5.0 * 95.0 / studies) ** 0.5
+    return float(5.0 + 3 * (5.0 * 95.0 / studies) ** 0.5)
 
 
 def large() -> list[dict[str, str]]:
