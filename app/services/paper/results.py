@@ -193,7 +193,7 @@ def _statistic(test: str, result: Result) -> str:
 
 def _effect(test: str, result: Result) -> str:
     if test == "equivalence":
-        return "equivalent within the bounds" if result["p"] < 0.05 else "equivalence not shown"
+        return "equivalent within the bounds" if result["p_holm"] < 0.05 else "equivalence not shown"
     name, key = {
         "paired_t": ("d_z", "d_z"),
         "wilcoxon": ("rank-biserial r", "rank_biserial"),
