@@ -84,7 +84,8 @@ def earlier_models(session: Session, participant: Participant, study: Study) -> 
 def _look_ahead(context: WorkerContext, participant_id: int) -> None:
     with context.database.writing() as session:
         participant = session.get_one(Participant, participant_id)
-        if session.get_one(Study, participant.study_id).settings.strategy is not Strategy.UNIFORM:
+        settings = session.get_one(Study, participant.study_id).settings
+        if settings.strategy is not Strategy.UNIFORM or settings.following_share:
             records.drop_unseen_queries(session, participant_id, keep=KEPT_QUERIES)
     query_selection.refill_queries(context, participant_id)
     query_selection.predict_waiting(context, participant_id)
