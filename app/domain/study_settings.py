@@ -375,7 +375,9 @@ class StudySettings(BaseModel):
     @model_validator(mode="after")
     def _can_follow(self) -> "StudySettings":
         if self.following_share + self.random_share > 1.0 + 1e-9:
-            raise ValueError("Pairs that follow the person and pairs drawn at random are more than all. Lower one share.")
+            raise ValueError(
+                "Pairs that follow the person and pairs drawn at random are more than all. Lower one share."
+            )
         if self.following_share and self.reward_kind not in (RewardKind.STRUCTURED, RewardKind.PREDICTED):
             raise ValueError("Pairs follow the person with structured reward models only. Choose one, or enter 0 %.")
         return self

@@ -13,7 +13,7 @@ from app.db import Database
 from app.domain.choices import Strategy
 from app.domain.clips import Clip
 from app.domain.models import ModelKind, Run
-from app.domain.preferences import Query, Response
+from app.domain.preferences import FOLLOWING, Query, Response
 from app.domain.studies import Participant, Study
 from app.storage import ArtefactDamaged, ArtefactStore
 from tests import stored_files
@@ -231,7 +231,7 @@ def test_from_the_tenth_answer_on_a_share_of_the_pairs_shows_robots_like_the_one
         records.drop_unseen_queries(session, participant.id, keep=0)
     query_selection.refill_queries(context, participant.id)
     chosen = queries_of(context.database, participant)
-    assert {query.strategy for query in chosen} == {query_selection.FOLLOWING, "uniform"}
+    assert {query.strategy for query in chosen} == {FOLLOWING, "uniform"}
     surface = ResponseSurface.load(surface_file("feeding"), registry.task("feeding").modes)
     stored = StructuredReward(np.tile(FIRST_SIGNAL, (8, 1)))
     wanted = best_mode(surface, stored.signal_weights(), participant.seed)
@@ -241,7 +241,7 @@ def test_from_the_tenth_answer_on_a_share_of_the_pairs_shows_robots_like_the_one
         sides = [(modes[side] - wanted) / width for side in (query.left_clip_id, query.right_clip_id)]
         return float(sum(np.sqrt((side**2).mean()) for side in sides))
 
-    following = [distance(query) for query in chosen if query.strategy == query_selection.FOLLOWING]
+    following = [distance(query) for query in chosen if query.strategy == FOLLOWING]
     others = [distance(query) for query in chosen if query.strategy == "uniform"]
     assert np.mean(following) < np.mean(others)
     assert all(np.isfinite(following)), "a disturbed behaviour is no mode of anybody's robot"

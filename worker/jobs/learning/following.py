@@ -1,7 +1,8 @@
-"""Pairs that follow a person: their robot as it would be now, against a variation of it, as far as the pool has them."""
+"""Pairs that follow a person: their robot as it would be now beside a variation of it, as near as the pool has them."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
@@ -41,7 +42,7 @@ def scores(
     for clip in (clip for pair in pairs for clip in pair):
         if clip.id not in rows:
             rows[clip.id] = len(modes)
-            modes.append(_mode_of(family, clip))
+            modes.append(mode_of(family, clip.rollout.mode))
     width = np.array([axis.high - axis.low for axis in family.axes])
     sides = np.array([(rows[left.id], rows[right.id]) for left, right in pairs])
     return acquisition.nearness(np.array(modes), sides, wanted, width)
@@ -58,8 +59,8 @@ def _mode(task: str, stored_model: bytes, seed: int) -> FloatArray | None:
     return best_mode(surface, model.signal_weights(), seed)
 
 
-def _mode_of(family: ModeFamily, clip: Clip) -> FloatArray:
-    """(A,) nan where something else than the mode was different, too: sampled, disturbed or clumsy behaviours."""
-    if clip.rollout.mode.keys() - {"mode"}:
+def mode_of(family: ModeFamily, described: Mapping[str, Any]) -> FloatArray:
+    """(A,) of a behaviour as it is stored with a rollout; nan where something else than the mode was different, too."""
+    if described.keys() - {"mode"}:
         return np.full(len(family.axes), np.nan)
-    return np.array(family.vector(clip.rollout.mode.get("mode", {})))
+    return np.array(family.vector(described.get("mode", {})))

@@ -12,7 +12,16 @@ from sqlalchemy.orm import Session
 from app.domain.choices import Strategy
 from app.domain.clips import Clip
 from app.domain.models import Model, ModelKind
-from app.domain.preferences import LEARNED_FROM, Purpose, Query
+from app.domain.preferences import (
+    FOLLOWING,
+    LEARNED_FROM,
+    NO_OBVIOUS_PAIR,
+    OBVIOUS,
+    PRACTICE,
+    REPEAT,
+    Purpose,
+    Query,
+)
 from app.domain.studies import Participant, Study
 from app.storage import ArtefactStore
 from worker.compute import learning
@@ -30,13 +39,7 @@ from worker.tasks import registry
 
 log = logging.getLogger("worker.jobs.learning.query_selection")
 
-PRACTICE, REPEAT, OBVIOUS, NO_OBVIOUS_PAIR = "practice", "repeat", "obvious", "no_obvious_pair"
-"""How pairs that are no labels were chosen; the last: a repeat in the place of a catch pair that could not be had."""
-
 _CHOSEN_LATER = (Purpose.PREFERENCE, Purpose.REPEAT)
-FOLLOWING = "following"
-"""How a label's pair was chosen that follows the person, whatever the study's rule."""
-
 OTHERS_LABELS = 20
 """So many answers a participant has given before their model speaks for them to others."""
 MOST_OTHERS = 12
