@@ -194,7 +194,7 @@ def chains(seeds: int) -> list[Chain]:
 def main() -> None:
     """See the module."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--seeds", type=int, default=2)
     parser.add_argument("--pools", type=Path, default=Path("data/following_pairs"), help="where rollouts are kept")
     parser.add_argument("--output", type=Path, default=Path("docs/results/following_pairs"), help="stem of both files")
     options = parser.parse_args()

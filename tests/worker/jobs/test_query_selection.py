@@ -248,7 +248,7 @@ def test_from_the_tenth_answer_on_a_share_of_the_pairs_shows_robots_like_the_one
 
 
 def spread_over_modes(context: WorkerContext, participant: Participant) -> dict[int, npt.NDArray[np.float64]]:
-    """Give every clip of the pool a mode, and one of them a disturbance; the modes by the clips, nan for that one."""
+    """Give every clip of the pool a mode, one a disturbance, one an axis of an earlier version: these two are of none."""
     family, found = registry.task("feeding").modes, {}
     with context.database.writing() as session:
         clips = dataset.pool_clips(session, participant.study_id)
@@ -256,7 +256,9 @@ def spread_over_modes(context: WorkerContext, participant: Participant) -> dict[
             clip.rollout.mode = {"mode": family.named(mode)}
             found[clip.id] = mode
         clips[0].rollout.mode = {**clips[0].rollout.mode, "disturbance": 0.1}
-        found[clips[0].id] = np.full(len(family.axes), np.nan)
+        clips[1].rollout.mode = {"mode": {"speed_of_before": 1.0}}
+        for clip in clips[:2]:
+            found[clip.id] = np.full(len(family.axes), np.nan)
     return found
 
 

@@ -164,8 +164,16 @@ NEAR = np.array([-np.inf, *np.linspace(-1.0, 0.0, 19)])
 def test_with_a_share_that_follows_the_propensity_is_still_how_often_a_pair_is_drawn(rule: Strategy) -> None:
     def draw(seed: int) -> Choice:
         rng = np.random.default_rng(seed)
-        shares = {"random_share": 0.3, "following_share": 0.4}
-        return choose(1, 20, rng, rule=rule, scores=SCORES[::-1], following_scores=NEAR, **shares)
+        return choose(
+            1,
+            20,
+            rng,
+            rule=rule,
+            scores=SCORES[::-1],
+            random_share=0.3,
+            following_scores=NEAR,
+            following_share=0.4,
+        )
 
     draws = [draw(seed) for seed in range(3000)]
     first = np.array([each.indices[0] for each in draws])
@@ -183,8 +191,7 @@ def test_with_a_share_that_follows_the_propensity_is_still_how_often_a_pair_is_d
 
 def test_where_nothing_can_follow_the_rule_chooses_all_the_same() -> None:
     nothing = np.full(4, -np.inf)
-    shares = {"random_share": 0.5, "following_share": 0.5}
-    choice = choose(4, 4, np.random.default_rng(0), following_scores=nothing, **shares)
+    choice = choose(4, 4, np.random.default_rng(0), random_share=0.5, following_scores=nothing, following_share=0.5)
     assert choice.at_random.all()
     np.testing.assert_allclose(choice.propensities, [1 / 4, 1 / 3, 1 / 2, 1])
 

@@ -38,7 +38,7 @@ def scores(
         return None
     family = registry.task(study.task).modes
     rows: dict[int, int] = {}
-    modes = []
+    modes: list[FloatArray] = []
     for clip in (clip for pair in pairs for clip in pair):
         if clip.id not in rows:
             rows[clip.id] = len(modes)
@@ -60,7 +60,11 @@ def _mode(task: str, stored_model: bytes, seed: int) -> FloatArray | None:
 
 
 def mode_of(family: ModeFamily, described: Mapping[str, Any]) -> FloatArray:
-    """(A,) of a behaviour as it is stored with a rollout; nan where something else than the mode was different, too."""
-    if described.keys() - {"mode"}:
+    """(A,) of a behaviour as it is stored with a rollout.
+
+    nan where something else than the mode was different, too, and for axes that an earlier version had.
+    """
+    mode = described.get("mode", {})
+    if described.keys() - {"mode"} or mode.keys() - set(family.names):
         return np.full(len(family.axes), np.nan)
-    return np.array(family.vector(described.get("mode", {})))
+    return np.array(family.vector(mode))
