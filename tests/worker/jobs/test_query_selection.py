@@ -248,7 +248,7 @@ def test_from_the_tenth_answer_on_a_share_of_the_pairs_shows_robots_like_the_one
 
 
 def spread_over_modes(context: WorkerContext, participant: Participant) -> dict[int, npt.NDArray[np.float64]]:
-    """Give every clip of the pool a mode, one a disturbance, one an axis of an earlier version: these two are of none."""
+    """Modes of all clips of the pool; of none (nan) are one with a disturbance and one with an axis that is no more."""
     family, found = registry.task("feeding").modes, {}
     with context.database.writing() as session:
         clips = dataset.pool_clips(session, participant.study_id)

@@ -14,7 +14,6 @@ from worker.compute.simulation import surface_file
 from worker.domain.modes import ModeFamily
 from worker.domain.type_aliases import FloatArray
 from worker.ml import acquisition
-from worker.ml.filters.response_surface import ResponseSurface, best_mode
 from worker.ml.rewards.loading import load_reward_model
 from worker.ml.rewards.reward_models import StructuredReward
 from worker.tasks import registry
@@ -51,6 +50,8 @@ def scores(
 @lru_cache(maxsize=64)
 def _mode(task: str, stored_model: bytes, seed: int) -> FloatArray | None:
     """(A,) what the search of modes would try first; None where it cannot be foreseen."""
+    from worker.ml.filters.response_surface import ResponseSurface, best_mode  # scipy, which the worker starts without
+
     model = load_reward_model(stored_model)
     if not isinstance(model, StructuredReward) or not surface_file(task).exists():
         return None
