@@ -4,6 +4,7 @@ A scripted participant takes the paper's protocol with small settings while anot
 short of clips. From the last answer on they look at the waiting page like a browser without script.
 
     python -m tests.benchmarks.first_robot --steps 1000 --people 2
+    python -m tests.benchmarks.first_robot --whole --labels 60 --methods reference pbarl somebody_else average
 """
 
 import argparse
@@ -18,7 +19,7 @@ from sqlalchemy import select
 from app.db import Database
 from app.domain.evaluation import Film, Trial
 from app.domain.models import Run, RunKind, RunStatus
-from app.domain.protocol import EvaluationSettings
+from app.domain.protocol import EvaluatedMethod, EvaluationSettings
 from app.domain.study_settings import PAPER_PROTOCOL, StudySettings
 from app.services.evaluation import evaluation_plan
 from app.services.participants import enrolment
@@ -29,7 +30,6 @@ from worker.rehearsal.browser import UP_TO_PAIRS, WAITING, FormBrowser
 from worker.rehearsal.participant_steps import ScriptedPerson
 from worker.rehearsal.server import POLL_S, OwnStudio, wait_until
 
-LABELS, TRIALS = 12, 1
 PACE_S = 2.0
 """Between two answers: slow enough for a filter to be in the making when the last one comes."""
 PATIENCE_S = 3600.0
@@ -40,17 +40,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--steps", type=int, default=1_000, help="of fine-tuning")
     parser.add_argument("--people", type=int, default=2, help="one after the other")
+    parser.add_argument("--labels", type=int, default=12)
+    parser.add_argument("--methods", type=EvaluatedMethod, nargs="+", default=list(EvaluationSettings().methods))
+    parser.add_argument("--whole", action="store_true", help="filters, promise and trials as studies usually have them")
     options = parser.parse_args()
-    small = {
-        "labels_per_participant": LABELS,
-        "introduction_pairs": 2,
-        "filter_milestones": (6,),
-        "pool_scenarios": 2,
-        "evaluation_scenarios": 10,
-        "harm_share": 0.5,
-        "retrain_every_labels": 6,
-        "evaluation": EvaluationSettings(fine_tuning_steps=options.steps, trials=TRIALS),
-    }
+    evaluation = EvaluationSettings(fine_tuning_steps=options.steps, methods=tuple(options.methods))
+    small = {"labels_per_participant": options.labels, "introduction_pairs": 2, "evaluation": evaluation}
+    small["pool_scenarios"] = max(2, options.labels // 10)
+    if not options.whole:
+        small["evaluation"] = evaluation.model_copy(update={"trials": 1})
+        small |= {"filter_milestones": (6,), "retrain_every_labels": 6, "evaluation_scenarios": 10, "harm_share": 0.5}
     with tempfile.TemporaryDirectory() as directory, OwnStudio(Path(directory)) as studio:
         database = Database(studio.settings.sqlalchemy_url)
         with database.writing() as session:

@@ -8,12 +8,13 @@ browser shows it, and how far the filmed setting was from the one that was set.
 """
 
 import argparse
-import shutil
 import sys
 from typing import Any
 
 import numpy as np
-from playwright.sync_api import Page, sync_playwright
+from playwright.sync_api import Page
+
+from tests.chromium import launched
 
 MOVE = """async ([index, stop]) => {
     const page = document.querySelector("[data-setting]");
@@ -60,14 +61,11 @@ def main() -> None:
     parser.add_argument("--moves", type=int, default=40)
     parser.add_argument("--seed", type=int, default=0)
     said = parser.parse_args()
-    with sync_playwright() as playwright:
-        path = shutil.which("chromium-headless-shell") or shutil.which("chromium")
-        browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox", "--disable-gpu"])
+    with launched() as browser:
         page = browser.new_context(bypass_csp=True).new_page()
         page.goto(said.link)
         page.wait_for_selector("[data-setting]")
         moves = measured(page, said.moves, np.random.default_rng(said.seed))
-        browser.close()
     changed = [each for each in moves if each["changed"]]
     sys.stdout.write(f"{len(moves)} moves, in {len(changed)} of them another film was nearest\n")
     for name, values in (

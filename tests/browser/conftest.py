@@ -1,12 +1,11 @@
 """Chromium for the browser tests, one for each file, and a participant with a link to open in it."""
 
-import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import pytest
 from axe_playwright_python.sync_playwright import Axe
-from playwright.sync_api import Browser, BrowserContext, Locator, Page, expect, sync_playwright
+from playwright.sync_api import Browser, BrowserContext, Locator, Page, expect
 from sqlalchemy import select
 
 from app.db import Database
@@ -14,9 +13,7 @@ from app.domain.preferences import LabelEvent, current_answers
 from app.domain.studies import Participant, Study
 from app.storage import ArtefactStore
 from tests import factories
-
-BROWSERS = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome")
-"""The first has no window to draw and needs half the processor time."""
+from tests.chromium import launched
 
 
 @pytest.fixture(scope="module")
@@ -26,13 +23,8 @@ def chromium() -> Iterator[Browser]:
     Not for the whole session: while Playwright is there, an event loop counts as running, in which other tests of the
     same process cannot start the worker's engine.
     """
-    path = next(filter(None, map(shutil.which, BROWSERS)), None)
-    if path is None:
-        pytest.fail("The browser tests need Chromium: install your system's package 'chromium-headless-shell'.")
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox", "--disable-gpu"])
+    with launched() as browser:
         yield browser
-        browser.close()
 
 
 NewPage = Callable[..., Page]

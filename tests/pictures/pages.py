@@ -7,7 +7,6 @@ play at a tenth of their speed, so that no machine is too slow.
 
 import argparse
 import io
-import shutil
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -17,12 +16,13 @@ from datetime import timedelta
 from pathlib import Path
 
 from PIL import Image
-from playwright.sync_api import Browser, Page, Route, expect, sync_playwright
+from playwright.sync_api import Browser, Page, Route, expect
 
 from app.db import Database
 from app.services.accounts import accounts, browser_sessions
 from app.services.archives import demo_archive
 from app.storage import ArtefactStore
+from tests.chromium import launched
 from worker.rehearsal.server import OwnStudio
 
 PICTURES = Path(__file__).resolve().parents[2] / "docs/pictures"
@@ -167,10 +167,8 @@ def photograph_dashboard(chromium: Browser, address: str, cookie: str) -> None:
 if __name__ == "__main__":
     argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter).parse_args()
     expect.set_options(timeout=PATIENCE_MS)
-    with demo_studio() as (address, token, cookie), sync_playwright() as playwright:
-        chromium = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
+    with demo_studio() as (address, token, cookie), launched() as chromium:
         film_pairs(chromium, f"{address}/p/{token}").save(PICTURES / "pair.webp")
         photograph_dashboard(chromium, address, cookie)
-        chromium.close()
     for name in ("pair.webp", "dashboard.png"):
         sys.stdout.write(f"Wrote docs/pictures/{name}, {(PICTURES / name).stat().st_size / 1e6:.2f} MB\n")

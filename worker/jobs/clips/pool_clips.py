@@ -30,7 +30,8 @@ def build_clips(context: WorkerContext, job: Job, run_id: int, step: Step) -> No
         count = session.get_one(Study, job.study_id).settings.behaviours_per_scenario
     for first in range(0, count, AT_A_TIME):
         which = list(range(first, min(first + AT_A_TIME, count)))
-        context.report(run_id, f"filming behaviours {which[0] + 1} to {which[-1] + 1} of {count}", first / count)
+        shown = f"scenario {job.number + 1}, behaviours {which[0] + 1} to {which[-1] + 1} of {count}"
+        context.report(run_id, f"filming {shown}", first / count)
         step(f"film-{first}", film, context, run_id, job.study_id, job.number, which)
 
 
