@@ -62,6 +62,13 @@ LEARNED_FROM = (Purpose.INTRODUCTION, Purpose.PREFERENCE)
 """What counts as a label: everything else measures the person, not their taste."""
 
 
+FOLLOWING = "following"
+"""How a label's pair was chosen that follows the person, whatever the study's rule."""
+PRACTICE, REPEAT, OBVIOUS, NO_OBVIOUS_PAIR = "practice", "repeat", "obvious", "no_obvious_pair"
+"""How pairs that are no labels were chosen; the last: a repeat in the place of a catch pair that could not be had."""
+NO_LABELS = (PRACTICE, REPEAT, OBVIOUS, NO_OBVIOUS_PAIR)
+
+
 class Query(Base):
     """Two clips put to one participant; sides are fixed here and never drawn again."""
 

@@ -316,6 +316,16 @@ class StudySettings(BaseModel):
         ge=0.1,
         le=1.0,
     )
+    following_share: float = setting(
+        0.0,
+        Section.LEARNING,
+        "Pairs that follow the person",
+        "From the tenth answer on: their robot as it would be now, beside a variation of it, as near as the pool has "
+        "them. With scripted people it did not save answers. 0: none.",
+        unit="%",
+        ge=0.0,
+        le=0.9,
+    )
     pooled_prior: bool = setting(
         False,
         Section.LEARNING,
@@ -369,6 +379,16 @@ class StudySettings(BaseModel):
                 f"{pairs} different pairs, fewer than the "
                 f"{max(self.labels_per_participant, short)} labels asked for{also}. Add scenarios or behaviours."
             )
+        return self
+
+    @model_validator(mode="after")
+    def _can_follow(self) -> "StudySettings":
+        if self.following_share + self.random_share > 1.0 + 1e-9:
+            raise ValueError(
+                "Pairs that follow the person and pairs drawn at random are more than all. Lower one share."
+            )
+        if self.following_share and self.reward_kind not in (RewardKind.STRUCTURED, RewardKind.PREDICTED):
+            raise ValueError("Pairs follow the person with structured reward models only. Choose one, or enter 0 %.")
         return self
 
     @model_validator(mode="after")

@@ -16,8 +16,9 @@ from sqlalchemy import select
 
 from app.db import Database
 from app.domain.evaluation import LONGEST_REASON, HeadToHead, HeadToHeadAnswer, Rating
+from app.domain.people import AuditEvent
 from app.domain.protocol import LETTERS, EvaluatedMethod, EvaluationMode, EvaluationSettings
-from app.domain.studies import Participant
+from app.domain.studies import Participant, Study
 from app.services.evaluation import evaluation_plan, head_to_heads
 from app.storage import ArtefactStore
 from tests import factories
@@ -292,3 +293,20 @@ def test_a_study_without_head_to_heads_draws_none(begin: Begin) -> None:
     with there.database.reading() as session:
         assert session.scalars(select(HeadToHead)).all() == []
     assert there.browser.get("/p/evaluation/done").status_code == 200
+
+
+def test_whoever_unblinds_is_told_which_of_their_answers_are_still_missing(
+    begin: Begin, experimenter: TestClient
+) -> None:
+    there = begin(trials=2)
+    there.answer_next()
+    with there.database.reading() as session:
+        slug = session.get_one(Study, there.participant.study_id).slug
+    page = experimenter.get(f"/studies/{slug}/unblind").text
+    assert "<strong>6 of 6</strong> trials rated" in page
+    assert "<strong>1 of 3</strong> head-to-heads answered" in page
+    assert "can influence the answers that are missing" in page
+    experimenter.post(f"/studies/{slug}/unblind", data={"typed": slug})
+    with there.database.reading() as session:
+        told = session.scalars(select(AuditEvent.subject).where(AuditEvent.action == "study unblinded")).one()
+    assert told == f"{slug} (6 of 6 trials rated, 1 of 3 head-to-heads answered)"

@@ -16,6 +16,29 @@ CHOICES = [
 ]
 
 
+@pytest.mark.parametrize(
+    ("share", "changed", "complaint"),
+    [
+        ("20", {}, None),
+        ("80", {}, "more than all"),
+        ("20", {"reward_kind": "mlp"}, "structured reward models only"),
+    ],
+)
+def test_a_share_of_the_pairs_can_follow_the_person_beside_the_random_ones(
+    experimenter: TestClient, database: Database, share: str, changed: dict[str, str], complaint: str | None
+) -> None:
+    form = {**form_with_defaults().model_dump(), "name": "Pilot", "following_share": share, **changed}
+    answer = experimenter.post("/studies/new", data=form)
+    with database.reading() as session:
+        studies = session.scalars(select(Study)).all()
+    if complaint is not None:
+        assert complaint in answer.text
+        assert not studies
+        return
+    assert studies[0].settings.following_share == 0.2
+    assert "20 % follow the person" in experimenter.get("/studies/pilot").text
+
+
 @pytest.mark.parametrize(("field", "value"), CHOICES)
 def test_a_choice_is_offered_and_stored(experimenter: TestClient, database: Database, field: str, value: str) -> None:
     assert f'name="{field}" value="{value}"' in experimenter.get("/studies/new").text

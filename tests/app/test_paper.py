@@ -192,6 +192,18 @@ def test_a_study_of_the_papers_protocol_has_a_text_before_anybody_came(
     assert "Results" not in said.replace("The results", "")
 
 
+@pytest.mark.parametrize(("share", "times"), [(0.0, 0), (0.25, 1)])
+@pytest.mark.parametrize("path", ["results/methods_and_results.md", "preregistration.md"])
+def test_pairs_that_follow_the_person_are_told_where_there_are_any(
+    experimenter: TestClient, database: Database, share: float, times: int, path: str
+) -> None:
+    with database.writing() as session:
+        settings = PAPER_PROTOCOL.model_copy(update={"following_share": share})
+        study = studies.create_study(session, "Following", settings, seed=1)
+    said = text_of(experimenter, study, path)
+    assert said.count("From the tenth answer on 25 %") == times
+
+
 def test_a_preregistration_answers_every_question_of_osf(
     experimenter: TestClient, database: Database, store: ArtefactStore
 ) -> None:

@@ -9,6 +9,7 @@ Every rule but the uniform one is a score of each candidate, made here from pred
 score into chances.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -26,6 +27,9 @@ SHARPNESS = 4.0
 STAND_IN_RATIONALITY = 2.0
 """Log odds of a stand-in's answer per root mean square difference of the returns of a pair."""
 
+AT_RANDOM, FOLLOWING = 0, 2
+"""How one pair was drawn; between them: by the rule."""
+
 
 @dataclass(frozen=True)
 class Choice:
@@ -39,6 +43,8 @@ class Choice:
     """(K,) True: the candidate's second clip goes to the left"""
     at_random: npt.NDArray[np.bool_]
     """(K,) True: drawn uniformly, whatever the rule: answers to these measure a model without bias"""
+    following: npt.NDArray[np.bool_]
+    """(K,) True: drawn by ``following_scores``"""
 
 
 def matched_pairs(scenarios: npt.ArrayLike, behaviours: npt.ArrayLike | None = None) -> Indices:
@@ -94,6 +100,18 @@ def contested(others_probabilities: FloatArray, member_probabilities: FloatArray
     return apart if member_probabilities is None else apart * entropy(member_probabilities) / np.log(2.0)
 
 
+def nearness(modes: FloatArray, pairs: Indices, wanted: FloatArray, width: FloatArray) -> FloatArray:
+    """(C, A) modes of clips, (M, 2) rows of the pairs' clips, (A,) the mode that is wanted -> (M,) at most 0.
+
+    Minus the sum of both clips' distances (root mean square over the axes, each in units of its ``width`` (A,)): the
+    pair is of the wanted mode and a variation of it, as far as there are such clips. A clip whose mode is nan is of no
+    mode alone; its pairs are worth -inf.
+    """
+    distance = np.sqrt((((modes - wanted) / width) ** 2).mean(axis=-1))
+    near: FloatArray = -distance[pairs].sum(axis=-1)
+    return np.where(np.isnan(near), -np.inf, near)
+
+
 def expected_answers(return_differences: FloatArray) -> FloatArray:
     """(U, M) right minus left return of U stand-ins with known tastes -> (U, M) P(right), each in their own unit."""
     unit = np.maximum(np.sqrt((return_differences**2).mean(axis=1, keepdims=True)), 1e-9)
@@ -115,27 +133,38 @@ def choose(
     rule: Strategy = "uniform",
     scores: FloatArray | None = None,
     random_share: float = RANDOM_SHARE,
+    following_scores: FloatArray | None = None,
+    following_share: float = 0.0,
 ) -> Choice:
     """Draw up to ``count`` of ``candidates`` pairs without replacement and put them on sides.
 
-    ``scores`` (candidates,): needed by rules other than uniform; higher is more worth asking.
-    Raises ValueError when scores are missing or random_share is not in (0, 1].
+    ``scores`` (candidates,): needed by rules other than uniform; higher is more worth asking. ``following_scores``
+    (candidates,): of the share that follows the person, whatever the rule; -inf is never drawn by it.
+    Raises ValueError when scores are missing, random_share is not in (0, 1], or the two shares exceed 1.
     """
     if not 0.0 < random_share <= 1.0:
         raise ValueError("random_share must lie in (0, 1]: a share of the choices always stays random.")
+    if not 0.0 <= following_share <= 1.0 - random_share + 1e-9:
+        raise ValueError("following_share must lie in [0, 1 - random_share].")
     if rule != "uniform" and (scores is None or np.shape(scores) != (candidates,)):
         raise ValueError(f"The rule {rule!r} needs one score per candidate.")
-    preference = np.zeros(candidates) if scores is None or rule == "uniform" else _standardised(scores)
+    by_rule = np.zeros(candidates) if scores is None or rule == "uniform" else _standardised(scores)
+    near = np.full(candidates, -np.inf) if following_scores is None else _standardised(following_scores)
     count = min(count, candidates)
     remaining = np.ones(candidates, bool)
     indices, propensities = np.zeros(count, np.int64), np.zeros(count)
-    at_random = np.ones(count, bool) if rule == "uniform" else rng.random(count) < random_share
+    kinds = np.zeros(count, np.int64)
+    lots = rng.random(count) if rule != "uniform" or following_share > 0.0 else np.zeros(count)
     for turn in range(count):
-        uniform, sharp = _chances(preference, remaining)
-        indices[turn] = rng.choice(candidates, p=uniform if at_random[turn] else sharp)
-        propensities[turn] = (random_share * uniform + (1.0 - random_share) * sharp)[indices[turn]]
+        share = following_share if np.isfinite(near[remaining]).any() else 0.0
+        drawn_at_random = 1.0 - share if rule == "uniform" else random_share
+        shares = np.array([drawn_at_random, max(0.0, 1.0 - drawn_at_random - share), share])
+        chances = _chances((by_rule, near), remaining)
+        kinds[turn] = int(lots[turn] >= drawn_at_random) + int(lots[turn] >= 1.0 - share)
+        indices[turn] = rng.choice(candidates, p=chances[kinds[turn]])
+        propensities[turn] = shares @ chances[:, indices[turn]]
         remaining[indices[turn]] = False
-    return Choice(indices, propensities, balanced_sides(count, rng), at_random)
+    return Choice(indices, propensities, balanced_sides(count, rng), kinds == AT_RANDOM, kinds == FOLLOWING)
 
 
 def balanced_sides(count: int, rng: np.random.Generator) -> npt.NDArray[np.bool_]:
@@ -146,13 +175,19 @@ def balanced_sides(count: int, rng: np.random.Generator) -> npt.NDArray[np.bool_
 
 
 def _standardised(scores: FloatArray) -> FloatArray:
-    spread = float(np.std(scores))
-    standardised: FloatArray = (scores - np.mean(scores)) / (spread if spread > 0.0 else 1.0)
+    """Mean 0 and deviation 1 of what is finite."""
+    finite = scores[np.isfinite(scores)]
+    spread = float(np.std(finite)) if len(finite) else 0.0
+    standardised: FloatArray = (scores - (np.mean(finite) if len(finite) else 0.0)) / (spread if spread > 0.0 else 1.0)
     return standardised
 
 
-def _chances(preference: FloatArray, remaining: npt.NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
-    """(M,) of a uniform draw and (M,) of one by the rule."""
-    pull = np.where(remaining, SHARPNESS * preference, -np.inf)
-    sharp = np.exp(pull - pull.max())
-    return remaining / remaining.sum(), sharp / sharp.sum()
+def _chances(preferences: Sequence[FloatArray], remaining: npt.NDArray[np.bool_]) -> FloatArray:
+    """(1 + P, M) of a uniform draw and of one by each preference; uniform where it prefers nothing that is left."""
+    uniform = remaining / remaining.sum()
+    chances = [uniform]
+    for preference in preferences:
+        pull = np.where(remaining, SHARPNESS * preference, -np.inf)
+        sharp = np.exp(pull - pull.max()) if np.isfinite(pull.max()) else uniform
+        chances.append(sharp / sharp.sum())
+    return np.stack(chances)

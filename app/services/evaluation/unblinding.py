@@ -1,13 +1,14 @@
 """Who may know which letter hides which method: nobody, until somebody unblinds the study on purpose."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from http import HTTPStatus
 
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from app.db import now
-from app.domain.evaluation import Assignment, Rating, Trial
+from app.domain.evaluation import Assignment, HeadToHead, HeadToHeadAnswer, Rating, Trial
 from app.domain.protocol import EvaluatedMethod
 from app.domain.studies import Participant, Study
 from app.errors import AppError
@@ -60,26 +61,42 @@ def unblind(session: Session, study: Study, typed: str, actor: str) -> None:
         raise ConfirmationDiffers
     if study.unblinded_at is None:
         study.unblinded_at = now()
-        rated, wanted = rated_and_wanted(session, study)
-        audit.record(session, actor, "study unblinded", f"{study.slug} ({rated} of {wanted} trials rated)", study=study)
+        there_are = ", ".join(map(str, answers(session, study)))
+        audit.record(session, actor, "study unblinded", f"{study.slug} ({there_are or 'nobody there'})", study=study)
 
 
-def rated_and_wanted(session: Session, study: Study) -> tuple[int, int]:
-    """Trials rated, and trials that all participants are to rate: what unblinding too early would spoil."""
+@dataclass(frozen=True)
+class Answers:
+    """How many answers about blinded robots there are, of how many: what unblinding too early would spoil."""
+
+    given: int
+    wanted: int
+    what: str
+
+    def __str__(self) -> str:
+        return f"{self.given} of {self.wanted} {self.what}"
+
+
+def answers(session: Session, study: Study) -> Sequence[Answers]:
+    """Of trials and, where there are any, of head-to-heads."""
     settings = study.settings
-    people = select(Participant.arm, func.count(Participant.id)).where(
-        Participant.study_id == study.id, Participant.withdrawn_at.is_(None), Participant.is_preview.is_(False)
+    those = (
+        Participant.study_id == study.id,
+        Participant.is_preview.is_(False),
+        Participant.withdrawn_at.is_(None),
+        Participant.ended_as.is_(None),
     )
-    people = people.where(Participant.ended_as.is_(None)).group_by(Participant.arm)
-    theirs = {arm: settings.in_arm(arm).evaluation for arm, _ in session.execute(people)}
-    rated = (
-        select(func.count(func.distinct(Rating.trial_id)))
-        .join(Trial)
-        .join(Participant, Participant.id == Trial.participant_id)
-        .where(Participant.study_id == study.id, Participant.is_preview.is_(False))
+    arms = session.execute(select(Participant.arm, func.count(Participant.id)).where(*those).group_by(Participant.arm))
+    meant = [(people, each) for arm, people in arms if (each := settings.in_arm(arm).evaluation)]
+    rated = select(func.count(func.distinct(Rating.trial_id))).join(Trial)
+    rated = rated.join(Participant, Participant.id == Trial.participant_id).where(*those)
+    compared = select(func.count(func.distinct(HeadToHeadAnswer.head_to_head_id))).join(HeadToHead)
+    compared = compared.join(Participant, Participant.id == HeadToHead.participant_id).where(*those)
+    found = (
+        (rated, sum(people * each.trial_count for people, each in meant), "trials rated"),
+        (compared, sum(people * each.head_to_head_count for people, each in meant), "head-to-heads answered"),
     )
-    wanted = sum(count * (each.trial_count if (each := theirs[arm]) else 0) for arm, count in session.execute(people))
-    return session.scalar(rated) or 0, wanted
+    return [Answers(session.scalar(given) or 0, wanted, what) for given, wanted, what in found if wanted]
 
 
 def methods_by_letter(session: Session, study: Study) -> dict[tuple[int, str], str]:

@@ -3,12 +3,13 @@
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+from app.domain.choices import Strategy
 from app.domain.clips import Clip
 from app.domain.designs import Ending
 from app.domain.evaluation import DonorDraw, DonorRule, HeadToHead, HeadToHeadAnswer, HeadToHeadResponse, Rating, Trial
 from app.domain.models import Model, ModelKind
 from app.domain.participation import Allocation, ConsentRecord, FormAnswer, ParticipantEvent, StageRecord
-from app.domain.preferences import LabelEvent, Purpose, Query, Response, SkipReason
+from app.domain.preferences import FOLLOWING, NO_LABELS, LabelEvent, Purpose, Query, Response, SkipReason
 from app.domain.protocol import FROM_OTHERS, EvaluatedMethod, Stage
 from app.domain.self_setting import SelfSetting
 from app.domain.studies import Deviation, Participant
@@ -117,8 +118,20 @@ TABLES: Sequence[Table] = (
             Column("right_steps", I, "Length of the right clip.", "control steps"),
             Column("left_video_sha256", T, "The video that was shown on the left.", allowed=SHA256),
             Column("right_video_sha256", T, "The video that was shown on the right.", allowed=SHA256),
-            Column("strategy", T, "How the pair was chosen."),
-            Column("propensity", N, "Probability with which it was chosen from the candidates.", allowed="0 to 1"),
+            Column(
+                "strategy",
+                T,
+                "How the pair was chosen: at random (uniform), by a rule, or following the person: their robot as it "
+                "would have been then, beside a variation of it. The last four are no pairs for labels.",
+                allowed=", ".join((*Strategy, FOLLOWING, *NO_LABELS)),
+            ),
+            Column(
+                "propensity",
+                N,
+                "Probability with which it was chosen from the candidates: over all ways in which a label's pair could "
+                "be chosen at that moment, not only the one that it was.",
+                allowed="0 to 1",
+            ),
             Column(
                 "predicted_right",
                 N,

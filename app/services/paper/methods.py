@@ -139,6 +139,11 @@ def _procedure(study: Study) -> Iterator[str]:
             if settings.strategy is not Strategy.UNIFORM
             else "."
         ),
+        f"From the tenth answer on {percent(settings.following_share, 0)} of the pairs followed the participant "
+        "instead, whatever the rule: of the clips that there were they showed those nearest to the execution that "
+        "their filter would have had by then, side by side. Each pair's probability was stored."
+        if settings.following_share and study.material is None
+        else "",
         f"The reward model was “{settings.reward_kind.label}”, trained anew every "
         f"{count(settings.retrain_every_labels, 'answer')}"
         + (", starting from earlier participants." if settings.pooled_prior else ", starting from nothing."),

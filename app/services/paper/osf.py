@@ -119,7 +119,13 @@ def _randomisation(settings: StudySettings, evaluation: EvaluationSettings | Non
         "Everything that is drawn follows from seeds in the locked document and from the study's secret, whose hash is "
         "in it.",
         f"Pairs: {settings.strategy.label.lower()}; at least {percent(settings.random_share, 0)} are drawn at random. "
-        "Sides are drawn.",
+        + (
+            f"From the tenth answer on {percent(settings.following_share, 0)} follow the person: clips nearest to what "
+            "their filter would do by then. "
+            if settings.following_share
+            else ""
+        )
+        + "Sides are drawn.",
         "Orders of methods come from Williams squares; letters are given in the order of appearance."
         if evaluation
         else "",

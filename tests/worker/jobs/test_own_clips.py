@@ -209,6 +209,7 @@ WRONG: list[tuple[str, Callable[[dict[str, Any]], None], str]] = [
     ("alone", lambda m: m["clips"][0].update(scenario=9), "Scenario 9 has one clip only"),
     ("too many labels", lambda m: m["settings"].update(labels_per_participant=50), "12 pairs"),
     ("evaluation", lambda m: m["settings"].update(evaluation={}), "evaluation need the simulator"),
+    ("following", lambda m: m["settings"].update(following_share=0.2), "following_share need the simulator"),
     ("unknown key", lambda m: m.update(secret=1), "secret"),
     ("no video", lambda m: m["clips"][0].update(video="manifest.json"), "not a video"),
 ]

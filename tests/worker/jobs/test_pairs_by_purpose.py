@@ -11,7 +11,7 @@ from sqlalchemy import select
 from app.db import Database
 from app.domain.clips import Clip, Rollout
 from app.domain.models import RunKind
-from app.domain.preferences import LabelEvent, Purpose, Query, Response
+from app.domain.preferences import NO_OBVIOUS_PAIR, LabelEvent, Purpose, Query, Response
 from app.domain.studies import Participant, Study, longest_clip_steps
 from app.storage import ArtefactStore
 from tests.worker.conftest import STEPS, make_trajectory
@@ -173,7 +173,7 @@ def test_a_pool_without_an_obvious_pair_gives_repeats_instead_and_a_note(
         add_runs(context, study, scenario, (True, True, True, True))
     with caplog.at_level(logging.WARNING, logger="worker.jobs.learning.query_selection"):
         answer_all(context, participant)
-    instead = [query for query in queries_of(context, participant) if query.strategy == query_selection.NO_OBVIOUS_PAIR]
+    instead = [query for query in queries_of(context, participant) if query.strategy == NO_OBVIOUS_PAIR]
     assert {(query.purpose, query.expected) for query in instead} == {(Purpose.REPEAT, None)}
     assert len(instead) == 3
     assert "no pair with an obvious answer" in caplog.text

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from worker.ml.acquisition import (
+    Choice,
     Strategy,
     balanced_sides,
     choose,
@@ -13,6 +14,7 @@ from worker.ml.acquisition import (
     expected_answers,
     information_gain,
     matched_pairs,
+    nearness,
     score,
 )
 
@@ -152,3 +154,58 @@ def test_sides_are_balanced(count: int) -> None:
 def test_sides_are_in_no_fixed_order_and_repeatable() -> None:
     first, again, other = (balanced_sides(40, np.random.default_rng(seed)).tolist() for seed in (1, 1, 2))
     assert first == again != other
+
+
+NEAR = np.array([-np.inf, *np.linspace(-1.0, 0.0, 19)])
+"""The first pair is of no mode; the last is the one that is wanted."""
+
+
+@pytest.mark.parametrize("rule", ["uniform", "entropy"])
+def test_with_a_share_that_follows_the_propensity_is_still_how_often_a_pair_is_drawn(rule: Strategy) -> None:
+    def draw(seed: int) -> Choice:
+        rng = np.random.default_rng(seed)
+        return choose(
+            1,
+            20,
+            rng,
+            rule=rule,
+            scores=SCORES[::-1],
+            random_share=0.3,
+            following_scores=NEAR,
+            following_share=0.4,
+        )
+
+    draws = [draw(seed) for seed in range(3000)]
+    first = np.array([each.indices[0] for each in draws])
+    following, at_random = (np.array([getattr(each, name)[0] for each in draws]) for name in ("following", "at_random"))
+    assert following.mean() == pytest.approx(0.4, abs=0.03)
+    assert at_random.mean() == pytest.approx(0.6 if rule == "uniform" else 0.3, abs=0.03)
+    assert not (following & at_random).any()
+    assert not following[first == 0].any(), "what is of no mode is drawn by the others alone"
+    assert first[following].mean() > 15 > first[at_random].mean()
+    propensity = {int(each.indices[0]): float(each.propensities[0]) for each in draws}
+    assert sum(propensity.values()) == pytest.approx(1.0)
+    for pair in (0, 10, 19):
+        assert np.mean(first == pair) == pytest.approx(propensity[pair], abs=0.03)
+
+
+def test_where_nothing_can_follow_the_rule_chooses_all_the_same() -> None:
+    nothing = np.full(4, -np.inf)
+    choice = choose(4, 4, np.random.default_rng(0), random_share=0.5, following_scores=nothing, following_share=0.5)
+    assert choice.at_random.all()
+    np.testing.assert_allclose(choice.propensities, [1 / 4, 1 / 3, 1 / 2, 1])
+
+
+def test_a_share_that_follows_leaves_the_random_one_alone() -> None:
+    with pytest.raises(ValueError, match="following_share"):
+        choose(1, 20, np.random.default_rng(0), random_share=0.3, following_share=0.8, following_scores=NEAR)
+
+
+def test_the_nearest_pair_is_of_the_wanted_mode_and_its_neighbour() -> None:
+    modes = np.array([[0.0, 0.0], [0.1, 0.0], [0.0, 1.0], [np.nan, np.nan]])
+    pairs = np.array([[0, 1], [0, 2], [1, 2], [0, 3]])
+    near = nearness(modes, pairs, np.zeros(2), np.array([1.0, 1.0]))
+    assert near.argmax() == 0
+    assert near[3] == -np.inf
+    wide = nearness(modes, pairs, np.zeros(2), np.array([1.0, 100.0]))
+    assert wide[0] < wide[1], "an axis counts in units of its range"

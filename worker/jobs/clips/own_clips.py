@@ -176,6 +176,7 @@ def settings_of(material: Material, ready: Sequence[Ready]) -> StudySettings:
         "reward_kind": settings.reward_kind is not RewardKind.STRUCTURED,
         "pooled_prior": settings.pooled_prior,
         "strategy": settings.strategy is Strategy.CONTESTED,
+        "following_share": settings.following_share > 0.0,
     }
     wrong = [name for name, needed in needs_a_simulator.items() if needed]
     if wrong:

@@ -12,13 +12,22 @@ from sqlalchemy.orm import Session
 from app.domain.choices import Strategy
 from app.domain.clips import Clip
 from app.domain.models import Model, ModelKind
-from app.domain.preferences import LEARNED_FROM, Purpose, Query
+from app.domain.preferences import (
+    FOLLOWING,
+    LEARNED_FROM,
+    NO_OBVIOUS_PAIR,
+    OBVIOUS,
+    PRACTICE,
+    REPEAT,
+    Purpose,
+    Query,
+)
 from app.domain.studies import Participant, Study
 from app.storage import ArtefactStore
 from worker.compute import learning
 from worker.domain.task import Task
 from worker.domain.type_aliases import FloatArray
-from worker.jobs.learning import dataset, query_plan
+from worker.jobs.learning import dataset, following, query_plan
 from worker.jobs.learning.query_plan import Slot
 from worker.jobs.runtime import records
 from worker.jobs.runtime.context import WorkerContext
@@ -30,11 +39,7 @@ from worker.tasks import registry
 
 log = logging.getLogger("worker.jobs.learning.query_selection")
 
-PRACTICE, REPEAT, OBVIOUS, NO_OBVIOUS_PAIR = "practice", "repeat", "obvious", "no_obvious_pair"
-"""How pairs that are no labels were chosen; the last: a repeat in the place of a catch pair that could not be had."""
-
 _CHOSEN_LATER = (Purpose.PREFERENCE, Purpose.REPEAT)
-
 OTHERS_LABELS = 20
 """So many answers a participant has given before their model speaks for them to others."""
 MOST_OTHERS = 12
@@ -117,6 +122,7 @@ def _load(session: Session, participant_id: int, lost: Collection[str]) -> _Know
     free = [slots[ordinal - 1] for ordinal in records.free_ordinals(session, participant_id, settings)]
     wanted = {slot.purpose for slot in free}
     scored = Purpose.PREFERENCE in wanted and settings.strategy is not Strategy.UNIFORM
+    follows = Purpose.PREFERENCE in wanted and settings.following_share > 0.0
     contested = scored and settings.strategy is Strategy.CONTESTED
     asked = select(Query).where(Query.participant_id == participant_id)
     return _Known(
@@ -126,7 +132,7 @@ def _load(session: Session, participant_id: int, lost: Collection[str]) -> _Know
         {query.ordinal: (query.left_clip_id, query.right_clip_id) for query in session.scalars(asked)},
         shown(dataset.pool_clips(session, study.id)) if free else [],
         shown(dataset.whole_clips(session, study.id)) if Purpose.INTRODUCTION in wanted else [],
-        _newest_whole(session, participant_id, lost) if scored else None,
+        _newest_whole(session, participant_id, lost) if scored or follows else None,
         [
             model
             for model in records.models_of_others(session, participant_id, ModelKind.REWARD, OTHERS_LABELS, MOST_OTHERS)
@@ -242,14 +248,21 @@ class _Choosing:
             rule="uniform" if scores is None else cast(acquisition.Strategy, settings.strategy.value),
             scores=scores,
             random_share=settings.random_share,
+            following_scores=self._following(pairs),
+            following_share=settings.following_share,
         )
-        drawn = zip(choice.indices, choice.swapped, choice.propensities, choice.at_random, strict=True)
+        how = np.select([choice.following, choice.at_random], [FOLLOWING, Strategy.UNIFORM.value], settings.strategy)
+        drawn = zip(choice.indices, choice.swapped, choice.propensities, how, strict=True)
         return [
-            _columns(
-                pairs[index], bool(swapped), Strategy.UNIFORM if at_random else settings.strategy, float(propensity)
-            )
-            for index, swapped, propensity, at_random in drawn
+            _columns(pairs[index], bool(swapped), str(strategy), float(propensity))
+            for index, swapped, propensity, strategy in drawn
         ]
+
+    def _following(self, pairs: Sequence[tuple[Clip, Clip]]) -> FloatArray | None:
+        if not self._settings.following_share:
+            return None
+        known = self._known
+        return following.scores(self._context.store, known.study, known.model, self._participant.seed, pairs)
 
     def _introduction(self, rng: np.random.Generator) -> dict[str, Any] | None:
         """A pair of whole trajectories."""

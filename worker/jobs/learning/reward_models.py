@@ -5,7 +5,7 @@ from sqlalchemy.orm import Session
 
 from app.domain.choices import Strategy
 from app.domain.models import Model, ModelKind
-from app.domain.preferences import Query
+from app.domain.preferences import NO_OBVIOUS_PAIR, Query
 from app.domain.studies import Participant, Study
 from app.services.answers import stopping_advice
 from worker.compute import learning
@@ -64,7 +64,7 @@ def _fit(context: WorkerContext, run_id: int, participant_id: int) -> None:
 def notes_on_pairs(session: Session, participant_id: int) -> list[str]:
     """What should be known about the pairs this participant was given."""
     substitutes = select(func.count(Query.id)).where(
-        Query.participant_id == participant_id, Query.strategy == query_selection.NO_OBVIOUS_PAIR
+        Query.participant_id == participant_id, Query.strategy == NO_OBVIOUS_PAIR
     )
     count = session.scalar(substitutes) or 0
     if not count:
@@ -84,7 +84,8 @@ def earlier_models(session: Session, participant: Participant, study: Study) -> 
 def _look_ahead(context: WorkerContext, participant_id: int) -> None:
     with context.database.writing() as session:
         participant = session.get_one(Participant, participant_id)
-        if session.get_one(Study, participant.study_id).settings.strategy is not Strategy.UNIFORM:
+        settings = session.get_one(Study, participant.study_id).settings
+        if settings.strategy is not Strategy.UNIFORM or settings.following_share:
             records.drop_unseen_queries(session, participant_id, keep=KEPT_QUERIES)
     query_selection.refill_queries(context, participant_id)
     query_selection.predict_waiting(context, participant_id)

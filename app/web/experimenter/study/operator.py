@@ -186,13 +186,13 @@ def _unblinding_page(
 ) -> Response:
     if study.settings.evaluation is None:
         raise unblinding.NothingToUnblind
-    rated, wanted = unblinding.rated_and_wanted(session, study)
+    answers = unblinding.answers(session, study)
     context = {
         "study": study,
         "experimenter": experimenter,
         "blinded": unblinding.is_blinded(study),
-        "rated": rated,
-        "wanted": wanted,
+        "answers": answers,
+        "all_given": all(each.given >= each.wanted for each in answers),
         "key": [] if unblinding.is_blinded(study) else unblinding.key_of(session, study),
         "names": NAMES,
         "error": error,
