@@ -66,6 +66,7 @@ def _of_lab(described: LabDescription) -> TaskWords:
         "smooth": "smoother (+)",
         "hesitate": f"slows down before the {target} (+)",
         **{f"push_{name}": f"on the way pushed along {name}" for name in described.environment.action_names},
+        **{f"shift_{name}": f"ends beside the {target} along {name}" for name in described.environment.action_names},
     }
     return TaskWords(
         described.title,
