@@ -2,8 +2,8 @@
 
     python -m tests.benchmarks.disagreement feeding drinking scratching reach reacher
 
-``LAB_TASKS`` names the folders of the two examples, and reacher's policy server has to be there. Every cell (a task, and modes
-shortened to a share of their way) is written when it is done: an interrupted run goes on where it was.
+``LAB_TASKS`` names the folders of the two examples, and reacher's policy server has to be there. A cell is a task with
+its modes shortened to a share of their way. It is written when it is done: an interrupted run goes on where it was.
 """
 
 import argparse
