@@ -34,6 +34,7 @@ from tests import buckets, databases
 from tests.databases import make_tables
 
 databases.share_compiled_statements()
+databases.leave_files_to_the_system()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

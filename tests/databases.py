@@ -4,20 +4,22 @@ They are files of SQLite, or databases on the PostgreSQL server that TEST_DATABA
 """
 
 import os
+import sqlite3
 import tempfile
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
 import psycopg
+import pytest
 from sqlalchemy import Connection, Dialect, Engine, Pool, create_engine, event, make_url, text
 from sqlalchemy.util import LRUCache
 
 from app import upgrading
-from app.db import Base, Database, sqlite
+from app.db import Database, sqlite
 from app.settings import Settings
 
 SERVER = os.environ.get("TEST_DATABASE_URL")
@@ -26,11 +28,29 @@ SERVER = os.environ.get("TEST_DATABASE_URL")
 @cache
 def _empty() -> bytes:
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "empty.sqlite3"
-        database = Database(f"sqlite:///{path}")
-        Base.metadata.create_all(database.writer)
-        database.dispose()
+        settings = Settings(_env_file=None, data_dir=Path(folder), database_url=None)
+        upgrading.upgrade(settings)
+        path = sqlite.file_of(settings.sqlalchemy_url)
+        assert path is not None
+        with closing(sqlite3.connect(path)) as connection:
+            connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
         return path.read_bytes()
+
+
+def leave_files_to_the_system() -> None:
+    """Nothing that this process writes is forced to the disk: no test cuts the power, and waiting for the disk is slow.
+
+    Programs that tests start write as they always do.
+    """
+    make = sqlite.engine
+
+    def unsynced(url: str, patience_s: float, *, writes: bool, log_pages: int) -> Engine:
+        engine = make(url, patience_s, writes=writes, log_pages=log_pages)
+        event.listen(engine, "connect", lambda connection, _: connection.execute("PRAGMA synchronous=OFF"))
+        return engine
+
+    sqlite.engine = unsynced
+    pytest.MonkeyPatch().setattr(os, "fsync", lambda _descriptor: None)
 
 
 def share_compiled_statements() -> None:
@@ -55,6 +75,7 @@ def make_tables(database: Database) -> None:
     """Give a database its tables, unless it has them, as those on PostgreSQL do."""
     path = sqlite.file_of(database.url)
     if path is not None and not path.exists():
+        path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(_empty())
 
 

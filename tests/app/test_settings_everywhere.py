@@ -1,6 +1,6 @@
 """A setting is written once: the form, locking and the API have every one, with the same default and bounds."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from html import unescape
 from typing import Any
 
@@ -38,8 +38,10 @@ def settings() -> Iterator[tuple[type[BaseModel], str, str]]:
 
 def bounds() -> Iterator[tuple[str, str, float]]:
     """Field, "minimum" or "maximum", and the bound of every number."""
+    models: Sequence[type[BaseModel]] = (StudySettings, EvaluationSettings)
+    schemas = {model: model.model_json_schema()["properties"] for model in models}
     for model, name, field in settings():
-        schema = model.model_json_schema()["properties"][name]
+        schema = schemas[model][name]
         for end in ("minimum", "maximum"):
             if end in schema:
                 yield field, end, schema[end]

@@ -12,7 +12,6 @@ import pytest
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from app.__main__ import migrate
 from app.db import Database
 from app.domain.choices import ClipQuality
 from app.domain.clips import Clip, Rollout
@@ -21,6 +20,7 @@ from app.domain.studies import Participant, Study
 from app.domain.study_settings import StudySettings
 from app.settings import Settings
 from app.storage import ArtefactStore
+from tests.databases import make_tables
 from worker.compute.pools import Compute
 from worker.domain.trajectory import COSTS, SIGNALS, Trajectory
 from worker.jobs.runtime.context import WorkerContext
@@ -72,8 +72,8 @@ def settings(tmp_path: Path) -> Settings:
 
 @pytest.fixture
 def database(settings: Settings) -> Iterator[Database]:
-    migrate(settings)
     database = Database(settings.sqlalchemy_url)
+    make_tables(database)
     yield database
     database.dispose()
 

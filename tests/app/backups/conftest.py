@@ -5,12 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from app.__main__ import migrate
 from app.db import Database
 from app.domain.studies import Participant
 from app.settings import Settings
 from app.storage import ArtefactStore
 from tests import backed_up
+from tests.databases import make_tables
 
 
 @pytest.fixture
@@ -20,8 +20,8 @@ def settings(tmp_path: Path) -> Settings:
 
 @pytest.fixture
 def database(settings: Settings) -> Iterator[Database]:
-    migrate(settings)
     database = Database(settings.sqlalchemy_url)
+    make_tables(database)
     yield database
     database.dispose()
 

@@ -79,9 +79,12 @@ def rendered(figure: Figure) -> dict[str, bytes]:
     """The figure in both formats, without dates or versions inside."""
     files = {}
     with mpl.rc_context(STYLE):
+        figure.draw_without_rendering()
+        cut = figure.get_tightbbox().padded(0.08)
+        figure.set_layout_engine(None)  # it is laid out: savefig would do so twice for each format
         for kind, metadata in (("svg", {"Date": None, "Creator": None}), ("png", {"Software": None})):
             target = io.BytesIO()
-            figure.savefig(target, format=kind, dpi=DPI, metadata=metadata, bbox_inches="tight", pad_inches=0.08)
+            figure.savefig(target, format=kind, dpi=DPI, metadata=metadata, bbox_inches=cut)
             files[kind] = target.getvalue()
     return files
 
