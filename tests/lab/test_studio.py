@@ -55,7 +55,7 @@ def test_the_form_warns_of_a_policy_that_answers_from_a_server(
     (plane / "lab.toml").write_text(text.replace('file = "policy.onnx"', 'url = "ws://127.0.0.1:8000"'))
     use(plane)
     page = experimenter.get("/studies/new").text
-    assert "answers from a server, which must be running" in page
+    assert "The server must be running whenever clips are made" in page
     assert "Blinded evaluation" in page
 
 
