@@ -22,7 +22,7 @@ from worker.experiments.disagreement import Differences
 from worker.tasks import registry
 
 SHARES = (1.0, 0.25, 0.1, 0.05, 0.02, 0.005)
-SCENARIOS, HELD_OUT = 24, 8
+SCENARIOS, HELD_OUT_SHARE = 24, 1 / 3
 PEOPLE, LABELS, RIDGE = 60, 30, 1.0
 FILE = Path("docs/results/disagreement.csv")
 COLUMNS = ("task", "share", "excess", "own", "other", "own_better")
@@ -31,6 +31,8 @@ COLUMNS = ("task", "share", "excess", "own", "other", "own_better")
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("tasks", nargs="+")
+    parser.add_argument("--shares", nargs="+", type=float, default=SHARES)
+    parser.add_argument("--scenarios", type=int, default=SCENARIOS)
     parser.add_argument("--file", type=Path, default=FILE)
     said = parser.parse_args()
     done = set()
@@ -38,9 +40,9 @@ def main() -> None:
         with said.file.open() as stored:
             done = {(row["task"], float(row["share"])) for row in csv.DictReader(stored)}
     for name in said.tasks:
-        for share in SHARES:
+        for share in said.shares:
             if (name, share) not in done:
-                row = cell(name, share)
+                row = cell(name, share, said.scenarios)
                 with said.file.open("a", newline="") as target:
                     writer = csv.writer(target, lineterminator="\n")
                     if target.tell() == 0:
@@ -50,7 +52,7 @@ def main() -> None:
                 sys.stdout.flush()
 
 
-def cell(name: str, share: float) -> tuple[object, ...]:
+def cell(name: str, share: float, scenarios: int) -> tuple[object, ...]:
     """One task with its modes shortened to a share: how much people disagree, and what that is worth."""
     task, policy = registry.task(name), simulation.reference_policy(name)
     found = disagreement.measured(
@@ -58,7 +60,7 @@ def cell(name: str, share: float) -> tuple[object, ...]:
         policy.mean,
         lambda act, scenario: simulation.run_episode(name, act, scenario),
         registry.installed_task(name).description.usual_clip_steps,
-        SCENARIOS,
+        scenarios,
         share,
     )
     own, other, better = worth(found, task)
@@ -74,7 +76,7 @@ def worth(found: Differences, task: Task) -> tuple[float, float, float]:
     said = disagreement.answers(found, wants)
     pairs, _ = disagreement.scaled(found)
     scenarios = np.unique(found.scenarios)
-    test = np.isin(found.scenarios, scenarios[-HELD_OUT:])
+    test = np.isin(found.scenarios, scenarios[-round(HELD_OUT_SHARE * len(scenarios)) :])
     truth = np.sign(pairs[test] @ wants.T)
     models = np.array([_learned(pairs[~test], each[~test], rng) for each in said])
     right = np.array([(np.sign(pairs[test] @ model)[:, None] == truth).mean(axis=0) for model in models])

@@ -52,11 +52,13 @@ COLUMNS = ("task", "labels", "filter", "success", "quick", "gentle", "third", "b
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("tasks", nargs="+", choices=sorted(USERS))
+    parser.add_argument("tasks", nargs="+", help=" or ".join(USERS))
     parser.add_argument("--labels", nargs="+", type=int, default=LABELS)
     parser.add_argument("--work", type=Path, default=Path("data/foreign"))
     parser.add_argument("--file", type=Path, default=FILE)
     said = parser.parse_args()
+    if unknown := set(said.tasks) - set(USERS):
+        parser.error(f"nobody's wishes are known for {min(unknown)}; there are {', '.join(USERS)}.")
     said.work.mkdir(parents=True, exist_ok=True)
     rows = [row for task in said.tasks for labels in said.labels for row in table(task, labels, said.work)]
     with said.file.open("w", newline="") as target:
