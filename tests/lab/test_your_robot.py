@@ -1,10 +1,6 @@
 """docs/your_robot.md holds: its example can be used as it is committed, and a filter of it acts like its mode."""
 
-import os
 import re
-import shutil
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
@@ -33,28 +29,6 @@ def test_the_example_can_be_used(tmp_path: Path) -> None:
     assert found.wrong == ()
     assert found.remarks[0].startswith("3 of 3 episodes succeeded")
     assert (tmp_path / "sheet.png").exists()
-
-
-@pytest.mark.long
-def test_the_commands_of_the_page_lead_to_a_participants_link(tmp_path: Path) -> None:
-    folder = Path(shutil.copytree(EXAMPLE, tmp_path / "reach", ignore=shutil.ignore_patterns("checkpoint")))
-    commands = [line.strip() for line in PAGE.split("then:\n")[1].split("`check` says")[0].splitlines() if line.strip()]
-    assert len(commands) == 5
-    script = "\n".join(commands).replace("examples/reach", str(folder)).replace(".venv/bin/python", sys.executable)
-    assert "--scenarios 50" in script
-    environment = {**os.environ, "DATA_DIR": str(tmp_path / "data")}
-    done = subprocess.run(
-        ["bash", "-e", "-c", script.replace("--scenarios 50", "--scenarios 10")],
-        cwd=ROOT,
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr[-2000:]
-    assert "Of 100 pairs of clips" in done.stdout
-    assert "too alike" not in done.stdout
-    assert "/p/" in done.stdout.splitlines()[-1]
 
 
 def test_the_page_names_every_key_and_everything_a_function_is_given() -> None:
