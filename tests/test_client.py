@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from typing import Any
 
+import pandas as pd
 import pytest
 from fastapi.testclient import TestClient
 from pbarl_client import Client, Refused
@@ -80,6 +81,25 @@ def test_what_was_added_since_is_read_alone(
     assert list(added["response"]) == ["equal"]
     assert reader.table("labels", since=added).empty
     assert len(reader.table("labels")) == len(before) + 1
+
+
+def test_a_whole_table_is_the_same_from_one_file_and_is_fetched_again_only_when_it_has_changed(
+    reader: Client, database: Database, study: Study
+) -> None:
+    for name in reader.tables():
+        whole, paged = reader.whole(name), reader.table(name)
+        told_of = [column for column in paged if column != "exported_at"]
+        pd.testing.assert_frame_equal(whole[told_of], paged[told_of])
+        assert reader.whole(name, earlier=whole) is whole
+    before = reader.whole("participants")
+    with database.writing() as session:
+        factories.make_participant(session, session.get_one(Study, study.id))
+    after = reader.whole("participants", earlier=before)
+    assert len(after) == len(before) + 1
+    with pytest.raises(ValueError, match="not what whole"):
+        reader.whole("labels", earlier=before)
+    with pytest.raises(Refused):
+        reader.whole("nothing")
 
 
 def test_tables_whose_rows_change_cannot_be_read_since(reader: Client) -> None:

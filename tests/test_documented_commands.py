@@ -111,6 +111,8 @@ RUN: dict[str, str | Elsewhere | OnlyParsed] = {
     "following_pairs": ROLLOUTS,
     "comparison_report": "results/paper_form",
     "contact_sheet": "sheets feeding --films 1 --steps 5 --no-people",
+    "disagreement": "feeding --file cells.csv --shares 1 --scenarios 12",
+    "foreign": OnlyParsed("fits six filters, which takes minutes; tests/lab/test_whole_loop.py fits two small ones"),
     "arms": "--arrivals 20 --studies 1 --to .",
     "between": "--studies 2 --to .",
     "error_rates": Elsewhere("tests/worker/analysis/test_error_rates.py::test_the_command_writes_every_table"),

@@ -467,6 +467,7 @@ setting-press = Pressure
 setting-press-low = more gently
 setting-press-high = more firmly
 setting-push = Pushed along { $name } on the way
+setting-shift = Beside the goal along { $name } at the end
 
 ## Preview by an experimenter
 

@@ -46,6 +46,19 @@ def test_it_stands_on_the_form_and_its_study_is_in_its_words(
     assert "Ein Punkt bewegt sich an eine Stelle." in browser.get("/p/instructions").text
 
 
+def test_the_form_warns_of_a_policy_that_answers_from_a_server(
+    plane: Path, use: Callable[[Path], None], experimenter: TestClient
+) -> None:
+    use(plane)
+    assert "answers from a server" not in experimenter.get("/studies/new").text
+    text = (plane / "lab.toml").read_text()
+    (plane / "lab.toml").write_text(text.replace('file = "policy.onnx"', 'url = "ws://127.0.0.1:8000"'))
+    use(plane)
+    page = experimenter.get("/studies/new").text
+    assert "The server must be running whenever clips are made" in page
+    assert "Blinded evaluation" in page
+
+
 def test_the_web_server_imports_nothing_of_it(plane: Path, tmp_path: Path) -> None:
     (plane / "plane.py").write_text("raise RuntimeError('imported')\n")
     program = (

@@ -18,9 +18,9 @@ HALFWAY, WIDTH = 0.5, 0.5
 """Share of the way (or of the episode) around which early becomes late, and over how much of it."""
 HESITATES_AT, HESITATES_WITHIN = 0.35, 0.15
 """Share of the way that is left where hesitate slows the robot, and how far around it."""
-SPEED, SMOOTH, HESITATE, PUSH = (-1.4, 0.9), (0.0, 0.9), (0.0, 2.0), (-0.6, 0.6)
+SPEED, SMOOTH, HESITATE, PUSH, SHIFT = (-1.4, 0.9), (0.0, 0.9), (0.0, 2.0), (-0.6, 0.6), (-0.6, 0.6)
 """Widest ranges; the program narrows them (worker.experiments.lab_ranges)."""
-MOST_PUSHES = 6
+MOST_PUSHES, MOST_SHIFTS = 6, 3
 PUSHES_UNTIL = 0.5
 """Share of the episode after which nothing is pushed, so that every way arrives."""
 
@@ -29,18 +29,24 @@ def widest_axes(by_distance: bool, moving: tuple[str, ...]) -> tuple[Axis, ...]:
     """Every way there is, in its widest range. ``moving``: the names of the actions that move the robot."""
     early, late = BY_DISTANCE if by_distance else BY_TIME
     where = {"far": "far from the goal", "near": "near the goal", "early": "early", "late": "late in the episode"}
+    shifted = moving[:MOST_SHIFTS] if by_distance else ()
     return (
         Axis(f"speed_{early}", *SPEED, f"log of the speed factor {where[early]}"),
         Axis(f"speed_{late}", *SPEED, f"log of the speed factor {where[late]}"),
         Axis("smooth", *SMOOTH, "share of the action before that is kept: a low-pass filter"),
         Axis("hesitate", *HESITATE, "slows down before the end of the way"),
         *(Axis(f"push_{name}", *PUSH, f"added to the action {name} on the way") for name in moving[:MOST_PUSHES]),
+        *(Axis(f"shift_{name}", *SHIFT, f"added to the action {name} near the goal") for name in shifted),
     )
 
 
 @dataclass(frozen=True)
 class LabModes(ModeFamily):
-    """Speed early and late, smoothing, hesitation and a constant push per action that fades on the way."""
+    """Speed early and late, smoothing, hesitation, a push per action that fades on the way, and a shifted goal.
+
+    The goal is shifted without asking the policy again: where it settles at the goal, a constant added to an action
+    there lets it settle beside the goal, as far as the constant over the policy's own gain.
+    """
 
     actions: tuple[str, ...]
     """their names"""
@@ -70,7 +76,8 @@ class LabModes(ModeFamily):
         scaled = action * factor
         pushed = early * xp.clip(1.0 - self._field(observation, EPISODE_SHARE) / PUSHES_UNTIL, 0.0, 1.0)
         for index in self.moving:
-            scaled = scaled + pushed * self._of(mode, f"push_{self.actions[index]}") * self._unit(index, action, xp)
+            push, shift = (self._of(mode, f"{way}_{self.actions[index]}") for way in ("push", "shift"))
+            scaled = scaled + (pushed * push + (1.0 - early) * shift) * self._unit(index, action, xp)
         kept = self._of(mode, "smooth")
         smoothed = (1.0 - kept) * scaled + kept * self._field(observation, PREVIOUS_ACTION)
         if len(self.moving) == len(self.actions):

@@ -7,18 +7,21 @@ from typing import NamedTuple
 
 import numpy as np
 from PIL import Image
+from tqdm import tqdm
 
 from app.installed_tasks import lab
-from app.installed_tasks.description import TaskRefused
+from app.installed_tasks.description import InstalledTask, TaskRefused
 from app.installed_tasks.lab import LabDescription
 from worker.compute.lab_policies import policy_of
 from worker.domain.scenarios import POLICY_TEST
 from worker.domain.trajectory import Trajectory
-from worker.experiments import lab_ranges
+from worker.domain.type_aliases import Act
+from worker.experiments import disagreement, lab_ranges
 from worker.ml.policies.onnx_policy import NotAPolicy, OnnxPolicy
 from worker.ml.policies.remote_policy import RemotePolicy
 from worker.sim.lab.environment import LabEnvironment, Picture
 from worker.sim.lab.errors import LabTaskBroken
+from worker.sim.lab.found import FOUND_FILE, Found, mark_of
 
 EPISODES, PICTURES = 3, 6
 SLOW_EPISODE_S = 5.0
@@ -66,7 +69,8 @@ def checked(file: Path, sheet: Path) -> Checked:
         found = lab_ranges.first_found(described, environment, installed.folder)
         policy = policy_of(described, installed.folder, found)
         lab_ranges.asked_first(policy, environment, POLICY_TEST[0])
-        return _run(described, environment, policy, sheet)
+        ran = _run(described, environment, policy, sheet)
+        return ran if ran.wrong else ran._replace(remarks=(*ran.remarks, *_disagree(installed, described, environment)))
     except LabTaskBroken as error:
         return Checked((f"{file}: {error}",), (), None)
     except NotAPolicy as error:
@@ -103,6 +107,23 @@ def _run(
             "policy.gain and the policy itself."
         )
     return Checked(tuple(wrong), _remarks(described, trajectories, seconds, sheet), sheet)
+
+
+def _disagree(installed: InstalledTask, described: LabDescription, environment: LabEnvironment) -> tuple[str, ...]:
+    """Whether people will have anything to disagree about, once it is known in which ways the task can be done."""
+    file = installed.checkpoint / FOUND_FILE
+    found = Found.load(file) if file.exists() else None
+    if found is None or found.mark != mark_of(described, installed.folder):
+        return ("Whether behaviours differ enough for people to disagree is said here after `explore`.",)
+    task, policy = found.task(described), policy_of(described, installed.folder, found)
+    with tqdm(total=disagreement.SCENARIOS * (1 + disagreement.PER_SCENARIO) + 1, desc="do people disagree") as bar:
+
+        def episode(act: Act, scenario: int) -> Trajectory:
+            bar.update()
+            return environment.episode(act, scenario)
+
+        differences = disagreement.measured(task, policy.mean, episode, described.usual_clip_steps)
+    return disagreement.in_words(differences, task)
 
 
 def _not_repeated(again: Trajectory, before: Trajectory, described: LabDescription) -> str:

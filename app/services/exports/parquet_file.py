@@ -1,6 +1,6 @@
 """A table of an export as Parquet, with typed columns and what they mean."""
 
-from datetime import datetime
+from datetime import UTC, datetime, timedelta
 from io import BytesIO
 from typing import Any
 
@@ -22,6 +22,7 @@ _TYPES = {
     ColumnKind.TIME: DataType.int64(),
     ColumnKind.JSON: DataType.utf8(),
 }
+_EPOCH, _MILLISECOND = datetime.fromtimestamp(0, UTC), timedelta(milliseconds=1)
 _TIME = DataType.timestamp("ms", tz="UTC")
 
 
@@ -48,4 +49,4 @@ def _value(kind: ColumnKind, value: Any) -> Any:
         return None
     if kind is ColumnKind.JSON:
         return json_text(value)
-    return round(value.timestamp() * 1000) if isinstance(value, datetime) else value
+    return (value - _EPOCH) // _MILLISECOND if isinstance(value, datetime) else value  # cut off, as in other files

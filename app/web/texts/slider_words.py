@@ -5,7 +5,8 @@ from app.installed_tasks.description import SliderWords
 from app.web.texts import task_words
 from app.web.texts.wording import Wording
 
-_PUSH = "push_"
+_OF_ACTIONS = ("push", "shift")
+"""Ways that there are for each action; its name follows."""
 
 
 def words_of(wording: Wording, task: str, axis: str) -> SliderWords:
@@ -17,8 +18,9 @@ def words_of(wording: Wording, task: str, axis: str) -> SliderWords:
     key = f"setting-{axis}"
     if key in wording:
         return SliderWords(label=wording(key), low=wording(f"{key}-low"), high=wording(f"{key}-high"))
-    if axis.startswith(_PUSH):
-        label = wording("setting-push", name=axis.removeprefix(_PUSH).replace("_", " "))
+    way, _, action = axis.partition("_")
+    if way in _OF_ACTIONS:
+        label = wording(f"setting-{way}", name=action.replace("_", " "))
     else:
         label = task_words.words_of(task).axes.get(axis) or axis.replace("_", " ").capitalize()
     return SliderWords(label=label, low=wording("setting-less"), high=wording("setting-more"))

@@ -10,6 +10,10 @@ from app.installed_tasks import catalogue
 from app.installed_tasks.description import Words
 from app.installed_tasks.lab import LabDescription
 
+OF_A_SERVER = (
+    "Its policy answers from a server. The server must be running whenever clips are made and filters are trained, and "
+    "training waits for its answers. Blinded evaluation is not available: leave it out."
+)
 _NEUTRAL = Words(tool="tool", target="target", carried="food or water")
 
 
@@ -30,6 +34,8 @@ class TaskWords:
     """What the structured reward model weighs."""
     silent_signals: frozenset[str] = frozenset()
     """Always 0 in this task; a weight of them says nothing."""
+    warning: str = ""
+    """What whoever chooses the task has to know first."""
 
 
 def words_of(task: str) -> TaskWords:
@@ -66,6 +72,7 @@ def _of_lab(described: LabDescription) -> TaskWords:
         "smooth": "smoother (+)",
         "hesitate": f"slows down before the {target} (+)",
         **{f"push_{name}": f"on the way pushed along {name}" for name in described.environment.action_names},
+        **{f"shift_{name}": f"ends beside the {target} along {name}" for name in described.environment.action_names},
     }
     return TaskWords(
         described.title,
@@ -75,6 +82,7 @@ def _of_lab(described: LabDescription) -> TaskWords:
         {**axes, **words.axes},
         {name: own.get(name) or shared[name] for name in described.signal_names},
         words.silent_signals,
+        OF_A_SERVER if described.policy.url else "",
     )
 
 

@@ -21,6 +21,7 @@ from app.db import Database
 from app.domain.clips import Clip
 from app.domain.preferences import Query, Response
 from app.domain.studies import Study
+from app.paths import DOCS
 from app.services.exports import export_requests
 from app.services.exports.export_requests import ExportKind
 from app.storage import ArtefactStore
@@ -99,6 +100,29 @@ def test_hugging_face_opens_every_part(
     head = (exported / "README.md").read_text().split("---\n")[1]
     for config in yaml.safe_load(head)["configs"]:
         assert len(part(config["config_name"])) > 0
+
+
+@pytest.mark.filterwarnings("default")
+def test_minari_has_the_same_episodes_by_the_example_of_the_manual(
+    exported: Path, clips: list[Clip], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, context: WorkerContext
+) -> None:
+    monkeypatch.setenv("HF_HOME", str(tmp_path / "home"))
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    import minari
+    from datasets import disable_progress_bars
+
+    disable_progress_bars()
+    first, example = (DOCS / "recordings.md").read_text().split("```python\n")[1:3]
+    code = first.splitlines()[0] + "\n" + example.split("```")[0]
+    exec(code.replace('"unpacked"', repr(str(exported))), {})  # noqa: S102  (the manual's example)
+    opened = minari.load_dataset("studio/study-v0")
+    assert opened.total_episodes == len(clips)
+    for episode, clip in zip(opened.iterate_episodes(), clips, strict=True):
+        stretch = dataset.stretch(context.store, clip)
+        np.testing.assert_array_equal(episode.observations, stretch.cut("observations"))
+        np.testing.assert_array_equal(episode.actions, stretch.cut("actions")[:-1])
+        np.testing.assert_array_equal(episode.infos["signals"], stretch.cut("signals"))
 
 
 def test_a_film_has_one_picture_for_every_row(exported: Path, clips: list[Clip]) -> None:
