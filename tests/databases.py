@@ -33,6 +33,7 @@ def _empty() -> bytes:
         path = sqlite.file_of(settings.sqlalchemy_url)
         assert path is not None
         with closing(sqlite3.connect(path)) as connection:
+            connection.execute("PRAGMA journal_mode=WAL")  # as every program's first connection leaves it
             connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
         return path.read_bytes()
 
