@@ -8,6 +8,7 @@ import pytest
 
 from app.installed_tasks import catalogue
 from app.web.texts import wording
+from tests.worker.traced import traced_once  # noqa: F401
 from worker.compute import simulation
 from worker.ml.policies.onnx_policy import mlp_to_onnx
 from worker.tasks import registry

@@ -55,6 +55,7 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("LAB_TASKS", str(write_plane(folder)))
         patch.setattr(fit_response_surface, "Compute", lambda _: AtHand())
+        patch.setattr(fit_response_surface, "ROUNDS", 1)
         forget()
         fit_response_surface.explore("plane", folder.parent / "blocks", 1, scenarios=20)
         yield folder

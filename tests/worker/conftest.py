@@ -21,6 +21,7 @@ from app.domain.study_settings import StudySettings
 from app.settings import Settings
 from app.storage import ArtefactStore
 from tests.databases import make_tables
+from tests.worker.traced import traced_once  # noqa: F401
 from worker.compute.pools import Compute
 from worker.domain.trajectory import COSTS, SIGNALS, Trajectory
 from worker.jobs.runtime.context import WorkerContext

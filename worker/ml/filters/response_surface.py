@@ -6,7 +6,6 @@ same scenario. Given a person's weights on the signals, their best mode is then 
 
 import json
 from dataclasses import dataclass, replace
-from itertools import combinations_with_replacement
 from pathlib import Path
 from typing import Self
 
@@ -112,9 +111,10 @@ class ResponseSurface:
 
 def monomials(modes: FloatArray) -> FloatArray:
     """(..., A) -> (..., M): first order, second order with cross terms, pure third order. No constant: 0 maps to 0."""
-    columns = [modes[..., axis] for axis in range(modes.shape[-1])]
-    products = [first * second for first, second in combinations_with_replacement(columns, 2)]
-    return np.stack([*columns, *products, *(column**3 for column in columns)], axis=-1)
+    axes = np.ascontiguousarray(np.moveaxis(modes, -1, 0))  # whole columns at a time: half the time of going by modes
+    first, second = np.triu_indices(len(axes))
+    found = np.concatenate([axes, axes[first] * axes[second], axes**3])
+    return np.ascontiguousarray(np.moveaxis(found, 0, -1))
 
 
 def fit(
@@ -188,17 +188,18 @@ def best_mode(
     members = np.atleast_2d(weights)
     reference = np.zeros((1, len(width)))
     candidates = np.concatenate([reference, rng.uniform(surface.low, surface.high, (DRAWS, len(width)))])
-    unit = max(float((surface.predict(candidates)[0] @ members.mean(axis=0)).std()), 1e-9)
+    signals, success = surface.predict(candidates, success_caution)
+    unit = max(float((signals @ members.mean(axis=0)).std()), 1e-9)
 
-    def value(modes: FloatArray) -> FloatArray:
-        signals, success = surface.predict(modes, success_caution)
+    def value(signals: FloatArray, success: FloatArray) -> FloatArray:
         returns = signals @ members.T / unit
         worth: FloatArray = returns.mean(axis=-1) - caution * returns.std(axis=-1)
         return worth - penalty * np.maximum(-success - tolerance, 0.0)
 
     for spread in (0.2, 0.05):
-        best = candidates[np.argsort(value(candidates))[-40:]]
+        best = candidates[np.argsort(value(signals, success))[-40:]]
         around = np.repeat(best, 100, axis=0) + spread * width * rng.standard_normal((4000, len(width)))
         candidates = np.concatenate([reference, best, np.clip(around, surface.low, surface.high)])
-    winner: FloatArray = candidates[np.argmax(value(candidates))]
+        signals, success = surface.predict(candidates, success_caution)
+    winner: FloatArray = candidates[np.argmax(value(signals, success))]
     return winner
