@@ -61,9 +61,15 @@ def contents() -> dict[str, Any]:
     return make_report(tables)[0]
 
 
-def test_every_figure_is_drawn_and_is_the_same_bytes_every_time(contents: dict[str, Any]) -> None:
-    first, second = figures.all_figures(contents), figures.all_figures(contents)
-    assert set(first) == {
+@pytest.fixture(scope="module")
+def drawn(contents: dict[str, Any]) -> dict[str, dict[str, bytes]]:
+    return figures.all_figures(contents)
+
+
+def test_every_figure_is_drawn_and_is_the_same_bytes_every_time(
+    contents: dict[str, Any], drawn: dict[str, dict[str, bytes]]
+) -> None:
+    assert set(drawn) == {
         "ratings",
         "ratings_of_each_person",
         "head_to_heads",
@@ -71,26 +77,28 @@ def test_every_figure_is_drawn_and_is_the_same_bytes_every_time(contents: dict[s
         "success_against_preference",
         "cost_changes",
     }
-    assert first == second
+    assert figures.all_figures(contents) == drawn
 
 
-def test_text_in_svg_is_text_and_png_has_300_dpi(contents: dict[str, Any]) -> None:
-    files = figures.all_figures(contents)["ratings"]
+def test_text_in_svg_is_text_and_png_has_300_dpi(drawn: dict[str, dict[str, bytes]]) -> None:
+    files = drawn["ratings"]
     assert b"Satisfaction</text>" in files["svg"]
     assert b">PbARL</text>" in files["svg"]
     width = int.from_bytes(files["png"][16:20])
     assert width > 6 * figures.DPI
 
 
-def test_the_strongest_robot_is_on_top(contents: dict[str, Any]) -> None:
-    svg = figures.all_figures(contents)["head_to_heads"]["svg"].decode()
+def test_the_strongest_robot_is_on_top(contents: dict[str, Any], drawn: dict[str, dict[str, bytes]]) -> None:
+    svg = drawn["head_to_heads"]["svg"].decode()
     found = sorted(contents["head_to_heads"]["strengths"], key=lambda each: -each["strength"])
     names = [figures.name_of(each["group"]) for each in found]
     assert sorted(names, key=lambda name: svg.index(f">{name}</text>")) == names
 
 
-def test_significant_comparisons_have_a_star_and_others_say_so(contents: dict[str, Any]) -> None:
-    svg = figures.all_figures(contents)["ratings"]["svg"].decode()
+def test_significant_comparisons_have_a_star_and_others_say_so(
+    contents: dict[str, Any], drawn: dict[str, dict[str, bytes]]
+) -> None:
+    svg = drawn["ratings"]["svg"].decode()
     stars = [
         comparison["two_sample_t"]["star"]
         for scale in contents["ratings"]["scales"].values()

@@ -10,7 +10,9 @@ from app.db import Database
 from app.domain.choices import Method
 from app.domain.study_settings import StudySettings
 from app.storage import ArtefactStore
+from tests.worker import invented
 from worker.analysis.filters.promise import Outcome
+from worker.compute import simulation
 from worker.compute.filter_fitting import FilterFit
 from worker.compute.pools import Compute
 from worker.domain.scenarios import of_promise
@@ -59,7 +61,8 @@ def test_they_are_those_a_filter_would_make_for_itself(context: WorkerContext) -
         np.testing.assert_array_equal(ahead.actions, mine.actions)
 
 
-def test_what_is_there_is_not_made_again(context: WorkerContext) -> None:
+def test_what_is_there_is_not_made_again(context: WorkerContext, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(simulation, "reference_policy", lambda _: invented.small_policy())  # others trace its filters
     for scenarios in reference_blocks("feeding", SETTINGS):
         context.references["feeding", scenarios] = []
     met = [Outcome(0.0, 0.0, True)] * len(promise_block(SETTINGS, 5))

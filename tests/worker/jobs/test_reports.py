@@ -41,6 +41,12 @@ def _small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
+def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Drawing them takes longest, and most tests look at numbers or at when a report is due."""
+    monkeypatch.setattr(figures, "all_figures", lambda _contents: {})
+
+
+@pytest.fixture
 def finished(database: Database, store: ArtefactStore) -> Study:
     with database.writing() as session:
         return make_finished_study(session, store, people=5, labels=6)
@@ -70,6 +76,7 @@ def age(context: WorkerContext, by: timedelta, took: timedelta = timedelta(0)) -
             run.started_at, run.finished_at = now() - took, now()
 
 
+@pytest.mark.usefixtures("no_pictures")
 def test_who_named_their_own_robot_is_counted_after_unblinding(context: WorkerContext, finished: Study) -> None:
     with context.database.writing() as session:
         study = session.get_one(Study, finished.id)
@@ -98,6 +105,7 @@ def test_an_empty_study_has_no_report(context: WorkerContext) -> None:
     assert due(context, study) == []
 
 
+@pytest.mark.usefixtures("no_pictures")
 def test_reports_are_found_by_the_reconciler_and_only_while_something_is_newer(
     context: WorkerContext, finished: Study
 ) -> None:
@@ -108,6 +116,7 @@ def test_reports_are_found_by_the_reconciler_and_only_while_something_is_newer(
     assert due(context, finished) == []
 
 
+@pytest.mark.usefixtures("no_pictures")
 def test_a_new_rating_makes_a_new_report_but_not_at_once(context: WorkerContext, finished: Study) -> None:
     first = make_report(context, finished)
     with context.database.writing() as session:
@@ -121,6 +130,7 @@ def test_a_new_rating_makes_a_new_report_but_not_at_once(context: WorkerContext,
         assert [run.id for run in runs] == [second.run_id], "older reports go with their runs"
 
 
+@pytest.mark.usefixtures("no_pictures")
 def test_an_excluded_answer_makes_a_new_report_without_it(context: WorkerContext, finished: Study) -> None:
     before = make_report(context, finished).contents["answers"]["participants"][0]
     age(context, timedelta(hours=1))
@@ -132,6 +142,7 @@ def test_an_excluded_answer_makes_a_new_report_without_it(context: WorkerContext
     assert (before["labels"], after["labels"]) == (6, 5)
 
 
+@pytest.mark.usefixtures("no_pictures")
 def test_on_a_busy_machine_reports_do_not_keep_people_s_models_waiting(context: WorkerContext, finished: Study) -> None:
     make_report(context, finished)
     with context.database.writing() as session:
@@ -146,6 +157,7 @@ def test_on_a_busy_machine_reports_do_not_keep_people_s_models_waiting(context: 
     assert len(due(context, finished)) == 1, "somebody wants to see the end of it"
 
 
+@pytest.mark.usefixtures("no_pictures")
 def test_whoever_unblinds_a_study_does_not_wait_for_the_next_round(context: WorkerContext) -> None:
     with context.database.writing() as session:
         study = make_finished_study(session, context.store, people=3, labels=6, unblinded=False)
@@ -204,6 +216,7 @@ def test_somebody_who_withdraws_while_a_report_is_made_is_in_no_report(context: 
     assert not any(context.store.has(sha256) for sha256 in stored)
 
 
+@pytest.mark.usefixtures("no_pictures")
 def test_numbers_of_the_report_are_those_of_the_exported_csv(context: WorkerContext, finished: Study) -> None:
     report = make_report(context, finished)
     with context.database.reading() as session:

@@ -13,15 +13,15 @@ from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_for_sb3
 
 from app.installed_tasks import catalogue
+from tests.worker.sim.episodes import episode, policy_for
 from worker.domain.trajectory import BODIES, SIGNALS
-from worker.ml.policies.gaussian import GaussianPolicy
 from worker.sim import human
 from worker.sim.arm import start_postures
 from worker.sim.assistive import ARM, AssistiveEnv
 from worker.sim.bullet import Bullet
 from worker.sim.geometry import rotation_of
 from worker.sim.seated_person import PERSON, add_person
-from worker.tasks.registry import checkpoint, environment_class
+from worker.tasks.registry import environment_class
 
 STILL = np.zeros(7, np.float32)
 
@@ -38,24 +38,8 @@ def env(kind: type[AssistiveEnv]) -> Iterator[AssistiveEnv]:
     environment.close()
 
 
-def policy_for(kind: type[AssistiveEnv]) -> GaussianPolicy:
-    return GaussianPolicy.load(checkpoint(kind.task.name) / "policy.safetensors")
-
-
 def field(env: AssistiveEnv, observation: np.ndarray, name: str) -> np.ndarray:
     return observation[..., env.task.observation.slice_of(name)]
-
-
-def episode(env: AssistiveEnv, scenario: int, noise: float = 0.3, steps: int = 100) -> np.ndarray:
-    """Observations and rewards of an episode with a policy disturbed in a way that depends on the scenario only."""
-    rng, policy = np.random.default_rng(scenario), policy_for(type(env))
-    observation, _ = env.reset(seed=scenario)
-    seen = [np.append(observation, 0.0)]
-    for _ in range(steps):
-        action = policy.mean(observation) + noise * rng.standard_normal(7)
-        observation, reward, *_ = env.step(action.astype(np.float32))
-        seen.append(np.append(observation, reward))
-    return np.array(seen)
 
 
 def registered(kind: type[AssistiveEnv]) -> str:
@@ -108,7 +92,8 @@ def test_the_same_seed_replays_bit_identically_after_other_episodes(env: Assisti
 
 def test_the_same_seed_replays_bit_identically_in_a_fresh_process(env: AssistiveEnv) -> None:
     program = (
-        "import sys; from tests.worker.sim.test_environments import *;"
+        "import sys; from tests.worker.sim.episodes import episode;"
+        "from worker.tasks.registry import environment_class;"
         f"o = episode(environment_class({env.task.name!r})(), 5);"
         "sys.stdout.buffer.write(b'BEGIN' + o.tobytes())"
     )

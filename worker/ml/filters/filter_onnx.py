@@ -4,6 +4,7 @@ import logging
 import threading
 import warnings
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -110,7 +111,9 @@ def _float32(array: npt.ArrayLike) -> Float32Array:
     return np.ascontiguousarray(array, np.float32)
 
 
+@lru_cache(maxsize=4)
 def _session(stored: bytes) -> Any:
+    """The last few are kept: an export is compared first and used then, and processes get one filter many times."""
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 3
