@@ -69,8 +69,12 @@ def filter_of(context: WorkerContext, model: Model) -> FilterAct:
     return act_of(registry.task(TASK).modes, simulation.reference_policy(TASK), weights)
 
 
-@pytest.mark.parametrize("user", PEOPLE)
-def test_the_same_answers_give_the_same_reward_model(context: WorkerContext, user: str) -> None:
+def test_the_same_answers_give_the_same_reward_models(context: WorkerContext) -> None:
+    for user in PEOPLE:
+        _is_learned_again(context, user)
+
+
+def _is_learned_again(context: WorkerContext, user: str) -> None:
     with context.database.writing() as session:
         recorded = newest(session, user, ModelKind.REWARD)
         person_id, count = recorded.participant_id, recorded.label_count
@@ -81,30 +85,25 @@ def test_the_same_answers_give_the_same_reward_model(context: WorkerContext, use
     with context.database.reading() as session:
         again = newest(session, user, ModelKind.REWARD)
     assert again.id != recorded.id
-    assert again.label_hash == recorded.label_hash
-    np.testing.assert_allclose(weights_of(context, again), weights_of(context, recorded), rtol=1e-5, atol=1e-7)
+    assert again.label_hash == recorded.label_hash, user
+    weights, before = weights_of(context, again), weights_of(context, recorded)
+    np.testing.assert_allclose(weights, before, rtol=1e-5, atol=1e-7, err_msg=user)
 
 
-@pytest.mark.parametrize("user", PEOPLE)
-def test_a_recorded_filter_is_exported_to_the_same_function(context: WorkerContext, user: str) -> None:
-    with context.database.reading() as session:
-        model = newest(session, user, ModelKind.FILTER)
-        with bundle_of(context, session, model) as bundle:
-            observations, means, actions = (
-                np.load(io.BytesIO(bundle.read(f"recorded/{name}.npy")))
-                for name in ("observations", "policy_means", "actions")
-            )
-    exported = filter_of(context, model).exported
-    np.testing.assert_allclose(exported.batch(observations, means), actions, atol=1e-6)
+def test_recorded_filters_are_exported_to_the_same_functions_and_drive_the_robot_as_they_did(
+    context: WorkerContext,
+) -> None:
     policy = simulation.reference_policy(TASK)
-    np.testing.assert_allclose([policy.mean(each) for each in observations], means, atol=1e-5)
-
-
-@pytest.mark.parametrize("user", PEOPLE)
-def test_a_recorded_filter_drives_the_robot_as_it_did(context: WorkerContext, user: str) -> None:
-    with context.database.reading() as session:
-        model = newest(session, user, ModelKind.FILTER)
-        with bundle_of(context, session, model) as bundle:
-            recorded = np.load(io.BytesIO(bundle.read("recorded/observations.npy")))
-    driven = rollout(simulation.environment(TASK), filter_of(context, model), EVALUATION.start)
-    np.testing.assert_allclose(driven.observations[:BEFORE_CONTACT], recorded[:BEFORE_CONTACT], atol=1e-4)
+    for user in PEOPLE:
+        with context.database.reading() as session:
+            model = newest(session, user, ModelKind.FILTER)
+            with bundle_of(context, session, model) as bundle:
+                observations, means, actions = (
+                    np.load(io.BytesIO(bundle.read(f"recorded/{name}.npy")))
+                    for name in ("observations", "policy_means", "actions")
+                )
+        again = filter_of(context, model)
+        np.testing.assert_allclose(again.exported.batch(observations, means), actions, atol=1e-6, err_msg=user)
+        np.testing.assert_allclose([policy.mean(each) for each in observations], means, atol=1e-5, err_msg=user)
+        driven = rollout(simulation.environment(TASK), again, EVALUATION.start).observations[:BEFORE_CONTACT]
+        np.testing.assert_allclose(driven, observations[:BEFORE_CONTACT], atol=1e-4, err_msg=user)

@@ -73,19 +73,19 @@ class Killed(Exception):
 
 
 def test_a_killed_training_resumes_where_it_last_saved(tmp_path: Path) -> None:
-    config = replace(CONFIG, total_steps=1200, save_every_s=0.0, evaluate_every_steps=400)
+    config = replace(CONFIG, total_steps=600, save_every_s=0.0, evaluate_every_steps=200, test_episodes=5)
 
-    def kill_at_1000(steps: int, figures: dict[str, float]) -> None:
-        if steps >= 1000:
+    def kill_at_500(steps: int, figures: dict[str, float]) -> None:
+        if steps >= 500:
             raise Killed
 
     with pytest.raises(Killed):
-        pretraining.pretrain(Reach, config, tmp_path, kill_at_1000)
+        pretraining.pretrain(Reach, config, tmp_path, kill_at_500)
     seen: list[int] = []
     record = pretraining.pretrain(Reach, config, tmp_path, lambda steps, figures: seen.append(steps))
-    assert seen[0] > 800
-    assert record["steps"] == 1200
-    assert [point["steps"] for point in record["curve"]][-2:] == [800, 1200]
+    assert seen[0] > 400
+    assert record["steps"] == 600
+    assert [point["steps"] for point in record["curve"]][-2:] == [400, 600]
 
 
 def test_saved_state_holds_every_number_of_the_learner() -> None:
