@@ -57,7 +57,7 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         patch.setattr(fit_response_surface, "Compute", lambda _: AtHand())
         patch.setattr(fit_response_surface, "ROUNDS", 1)
         forget()
-        fit_response_surface.explore("plane", folder.parent / "blocks", 1, scenarios=20)
+        fit_response_surface.explore("plane", folder.parent / "blocks", 1, scenarios=10)
         yield folder
     forget()
 

@@ -80,5 +80,5 @@ def test_an_early_policy_acts_differently_from_the_finished_one() -> None:
 def test_what_is_stored_with_a_rollout_says_how_it_was_made() -> None:
     behaviour = Behaviour({"speed_far": -0.4, "press": 0.0}, disturbance=0.2, seed=(7, 1))
     assert behaviour.described() == {"mode": {"speed_far": -0.4, "press": 0.0}, "disturbance": 0.2, "seed": (7, 1)}
-    recorded = simulation.record_clip("feeding", "quick", 7, behaviour, 0, 15)
+    recorded = simulation.record_clip("feeding", "quick", 7, behaviour, 0, 1)
     assert Trajectory.load(io.BytesIO(recorded.trajectory)).task == "feeding"

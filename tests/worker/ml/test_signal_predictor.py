@@ -1,6 +1,7 @@
 """Signals that are foreseen instead of measured: how well, and what a reward model makes of them."""
 
 import json
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -39,8 +40,9 @@ def predicted() -> PredictedReward:
     return PredictedReward.with_predictor(random_weights(), invented.predictor())
 
 
+@cache
 def episodes(task: str, count: int) -> list[Trajectory]:
-    """Behaviours as in a pool of clips, in scenarios that the predictor has never seen."""
+    """Behaviours as in a pool of clips, in scenarios that the predictor has never seen; nobody changes them."""
     found = []
     for scenario in range(260_000, 260_000 + count):
         for behaviour in simulation.behaviours(task, scenario, 3):
