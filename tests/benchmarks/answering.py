@@ -216,15 +216,17 @@ def _rolled(name: str) -> Pool:
     )
 
 
-def main(
-    description: str | None, title: str, stem: str, column: str, variants: Mapping[str, Variant], seeds: int = 2
-) -> None:
+def parser(description: str | None, stem: str, seeds: int = 2) -> argparse.ArgumentParser:
+    """What such a benchmark can be told. ``stem``: of the files of its results."""
+    told = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    told.add_argument("--seeds", type=int, default=seeds)
+    told.add_argument("--pools", type=Path, default=Path("data/answering"), help="where rollouts are kept")
+    told.add_argument("--output", type=Path, default=Path("docs/results") / stem, help="stem of both files")
+    return told
+
+
+def run(options: argparse.Namespace, title: str, column: str, variants: Mapping[str, Variant]) -> None:
     """Answer in every variant, the first of which the others are compared with. ``column``: what varies is called."""
-    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=seeds)
-    parser.add_argument("--pools", type=Path, default=Path("data/answering"), help="where rollouts are kept")
-    parser.add_argument("--output", type=Path, default=Path("docs/results") / stem, help="stem of both files")
-    options = parser.parse_args()
     torch.set_num_threads(1)
     file, page = options.output.with_suffix(".csv"), options.output.with_suffix(".md")
     # Seed by seed, so that whoever stops early has everybody.

@@ -15,5 +15,12 @@ from tests.benchmarks.answering import Variant
 TITLE = "# Whether pairs that follow the person pay"
 SHARES = {"0.0": Variant(), "0.3": Variant(following_share=0.3)}
 
+
+def main() -> None:
+    """See the module."""
+    options = answering.parser(__doc__, "following_pairs").parse_args()
+    answering.run(options, TITLE, "share", SHARES)
+
+
 if __name__ == "__main__":
-    answering.main(__doc__, TITLE, "following_pairs", "share", SHARES)
+    main()

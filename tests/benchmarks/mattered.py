@@ -16,5 +16,12 @@ from tests.benchmarks.answering import Variant
 TITLE = "# Whether it pays to ask what made the difference"
 NAMING = {"nothing": Variant(), "seldom wrong": Variant(names=0.7), "at random": Variant(names=0.0)}
 
+
+def main() -> None:
+    """See the module."""
+    options = answering.parser(__doc__, "mattered").parse_args()
+    answering.run(options, TITLE, "named", NAMING)
+
+
 if __name__ == "__main__":
-    answering.main(__doc__, TITLE, "mattered", "named", NAMING)
+    main()
