@@ -115,6 +115,8 @@ def _disagree(installed: InstalledTask, described: LabDescription, environment: 
     found = Found.load(file) if file.exists() else None
     if found is None or found.mark != mark_of(described, installed.folder):
         return ("Whether behaviours differ enough for people to disagree is said here after `explore`.",)
+    if why := lab_ranges.changed_since(found, described, installed.folder, environment):
+        return (why,)
     task, policy = found.task(described), policy_of(described, installed.folder, found)
     with tqdm(total=disagreement.SCENARIOS * (1 + disagreement.PER_SCENARIO) + 1, desc="do people disagree") as bar:
 

@@ -34,7 +34,7 @@ from worker.jobs.runtime import records
 from worker.ml.rewards.loading import load_reward_model
 from worker.ml.rewards.reward_models import RewardModel
 from worker.ml.scripted_ratings import RatingManner, ScriptedRater
-from worker.ml.teachers import Manner, ScriptedTeacher, Taste, segment_returns
+from worker.ml.teachers import LabTaste, Manner, ScriptedTeacher, Taste, segment_returns
 from worker.rehearsal.browser import Offered
 from worker.sim.costs import preference_rewards
 from worker.tasks import registry
@@ -208,6 +208,8 @@ class ScriptedPerson:
     def _true_rewards(self, shown: Trajectory) -> FloatArray:
         """r^H of every step."""
         taste = self._taste
+        if isinstance(taste, LabTaste):
+            return taste.step_rewards(shown.signals, self._task.signals)
         rewards = preference_rewards(
             self._task, shown.costs, shown.signals, taste.omega, "calibrated", taste.per_signal
         )
