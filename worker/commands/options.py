@@ -99,7 +99,7 @@ def taste(text: str) -> Taste:
     omega = [part for part in weights.split(",") if ":" not in part]
     signals = [part.split(":", 1) for part in weights.split(",") if ":" in part]
     try:
-        if not name.replace("-", "").isalnum() or name in TASTES:
+        if not name.replace("-", "").isalnum() or (name in TASTES and omega):
             raise ValueError(f"A user of one's own needs a new name of letters, digits and hyphens; got {name!r}.")
         per_signal = {signal: float(weight) for signal, weight in signals}
         if signals and not omega:

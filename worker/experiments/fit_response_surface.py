@@ -123,12 +123,10 @@ def find_ranges(task: str, scenarios: int = lab_ranges.SCENARIOS) -> None:
     try:
         if _is_known(task, described, environment):
             return
-        with tqdm(
-            total=100, desc="ranges of the ways to do it", bar_format="{desc}: {percentage:.0f} % {elapsed}"
-        ) as bar:
+        with tqdm(total=100, bar_format="{desc}: {percentage:.0f} %, {elapsed}") as bar:
 
             def progress(what: str, share: float) -> None:
-                bar.set_description(f"ranges of the ways to do it, {what}", refresh=False)
+                bar.set_description(f"ranges of the ways to do it, {what}")
                 bar.update(100 * share - bar.n)
 
             found = lab_ranges.find(described, installed.folder, environment, progress, scenarios)

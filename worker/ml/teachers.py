@@ -64,7 +64,7 @@ class LabTaste(Taste):
         if not self.per_signal or any(not isfinite(weight) for weight in self.per_signal.values()):
             raise ValueError(f"Somebody must mind a signal, with a finite weight; got {dict(self.per_signal)}.")
 
-    def step_rewards(self, signals: FloatArray, names: Sequence[str]) -> FloatArray:
+    def step_rewards(self, signals: npt.ArrayLike, names: Sequence[str]) -> FloatArray:
         """(..., S) -> (...,) of every step. Raises ValueError for signals that the task does not have."""
         unknown = sorted(self.per_signal.keys() - set(names))
         if unknown:

@@ -131,8 +131,8 @@ def _state(file: Path) -> Mapping[str, Any]:
 def _told_activation(file: Path) -> str | None:
     """The activation function that the file's readable part names; None: it says none, so its algorithm's usual one.
 
-    What is stored of a class is its name beside its pickle; the name alone is read. Raises NotAPolicy for functions that
-    are not known here.
+    What is stored of a class is its name beside its pickle; the name alone is read. Raises NotAPolicy for a function
+    that is not known here.
     """
     with zipfile.ZipFile(file) as archive:
         if _DATA not in archive.namelist() or archive.getinfo(_DATA).file_size > LARGEST_BYTES:
