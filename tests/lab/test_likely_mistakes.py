@@ -12,11 +12,15 @@ import numpy as np
 import pytest
 import torch
 from stable_baselines3 import PPO, SAC
+from starlette.testclient import TestClient
 from websockets.sync.server import ServerConnection, serve
 
 from app import __main__ as studio
+from app.db import Database
 from app.domain.protocol import Language
+from app.domain.study_settings import StudySettings
 from app.installed_tasks import catalogue
+from app.services.studies import studies
 from app.settings import Settings
 from app.web.texts.wording import Wording
 from tests.lab.test_check import change, found, said
@@ -67,6 +71,19 @@ def test_participants_of_a_lab_without_instructions_read_nothing_untrue(
     for language in Language:
         told = Wording(language)("task-plane")
         assert told == Wording(language)("task-lab") != Wording(language)("task-other"), "nobody is fed here"
+
+
+def test_seconds_are_those_of_the_labs_own_rate(
+    plane: Path, use: Callable[[Path], None], database: Database, experimenter: TestClient
+) -> None:
+    change(plane, "rate_hz = 10", "rate_hz = 80")
+    use(plane)
+    with database.writing() as session:
+        study = studies.create_study(session, "Points", StudySettings(clip_steps=40), task="plane")
+        assert study.clip_s == 0.5
+        slug = study.slug
+    page = experimenter.get(f"/studies/{slug}").text
+    assert "<dt>Length of a clip</dt><dd>0.5 s</dd>" in page
 
 
 def test_what_draws_is_told_that_there_is_no_screen(plane: Path, monkeypatch: pytest.MonkeyPatch) -> None:
