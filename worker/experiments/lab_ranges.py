@@ -89,8 +89,8 @@ def changed_since(found: Found, described: LabDescription, folder: Path, environ
     ]
     return (
         "The environment, a function of yours or an installed package has changed since the task was explored: in one "
-        f"and the same episode it now measures {', '.join(other)}. Run python -m worker explore --task "
-        f"{described.name} again; it begins anew."
+        f"and the same episode it now measures {', '.join(other)}. It begins anew with "
+        f"python -m worker explore --task {described.name}."
         if other
         else ""
     )
