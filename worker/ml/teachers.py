@@ -66,12 +66,15 @@ class LabTaste(Taste):
 
     def step_rewards(self, signals: npt.ArrayLike, names: Sequence[str]) -> FloatArray:
         """(..., S) -> (...,) of every step. Raises ValueError for signals that the task does not have."""
+        rewards: FloatArray = np.asarray(signals, np.float64) @ self.signal_weights(names)
+        return rewards
+
+    def signal_weights(self, names: Sequence[str]) -> FloatArray:
+        """(S,) of a task's signals, above 0: wanted. Raises ValueError."""
         unknown = sorted(self.per_signal.keys() - set(names))
         if unknown:
             raise ValueError(f"No signal is called {', '.join(unknown)}; there are {', '.join(names)}.")
-        costs = np.array([self.per_signal.get(name, 0.0) for name in names])
-        rewards: FloatArray = -np.asarray(signals, np.float64) @ costs
-        return rewards
+        return -np.array([self.per_signal.get(name, 0.0) for name in names])
 
 
 OF_LABS: tuple[LabTaste, ...] = (
@@ -174,6 +177,11 @@ class ScriptedTeacher:
         if errs < self.manner.mistakes:
             names_right = not names_right
         return "right" if names_right else "left"
+
+
+def speaks_most(gains: FloatArray, qualities: Mapping[str, Sequence[int]]) -> str:
+    """The quality that speaks most for a segment: gains (S,) of it over the other by signal, columns by quality."""
+    return max(qualities, key=lambda name: float(gains[list(qualities[name])].sum()))
 
 
 def segment_returns(rewards: FloatArray, myopia: float = 1.0) -> FloatArray:
