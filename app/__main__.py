@@ -20,6 +20,7 @@ from app.db import Database, now
 from app.domain.studies import Study
 from app.errors import EXPLAINED, AppError, in_words
 from app.installed_tasks import catalogue
+from app.installed_tasks.lab import LabDescription
 from app.logs import LogFormat
 from app.paths import DOCS
 from app.programs import Programs, say
@@ -51,7 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     audit_commands.add_to(commands)
     deploy_check.add_to(commands)
     demo = commands.add_parser("demo", help=demo_study.__doc__)
-    demo.add_argument("--task", choices=catalogue.names(), default=catalogue.usual())
+    demo.add_argument("--task", type=catalogue.as_argument, metavar="NAME", default=catalogue.usual())
     demo.set_defaults(act=demo_study)
     resetting = commands.add_parser("reset-second-factor", help=reset_second_factor.__doc__)
     resetting.add_argument("name", help="of the account")
@@ -233,6 +234,9 @@ def demo_study(settings: Settings, task: str) -> int:
     with _database(settings) as database, database.writing() as session:
         token = demo.make_empty(session, task)
     say(f"{settings.base_url}/p/{token}")
+    installed = catalogue.find(task)
+    if installed and isinstance(installed.description, LabDescription) and not installed.checkpoint.exists():
+        say(f"Nothing is known yet of the ways to do {task}, so its clips wait: python -m worker explore --task {task}")
     return 0
 
 

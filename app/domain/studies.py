@@ -11,10 +11,13 @@ from sqlalchemy.orm import Mapped, mapped_column, relationship
 from app.db import Base, now
 from app.domain.study_settings import USUAL_CLIP_STEPS, StudySettings
 from app.installed_tasks import catalogue
+from app.installed_tasks.lab import LabDescription
 
 NAME_LENGTH = 120
 SEED_LIMIT = 2**31
 """Seeds of studies are smaller."""
+CONTROL_RATE_HZ = 10.0
+"""Of the studio's own tasks."""
 
 
 def longest_clip_steps(task: str) -> int | None:
@@ -27,6 +30,13 @@ def usual_clip_steps(task: str) -> int:
     """Control steps from the start in which what matters in a task has happened."""
     installed = catalogue.find(task)
     return installed.description.usual_clip_steps if installed else USUAL_CLIP_STEPS
+
+
+def control_rate_hz(task: str) -> float:
+    """Control steps per second; a laboratory's task has its own."""
+    installed = catalogue.find(task)
+    described = installed.description if installed else None
+    return described.environment.rate_hz if isinstance(described, LabDescription) else CONTROL_RATE_HZ
 
 
 def new_key_secret() -> str:
@@ -75,6 +85,11 @@ class Study(Base):
     def whole_clip_steps(self) -> int | None:
         """Steps of a clip of a whole episode; None for a task that is not installed here."""
         return longest_clip_steps(self.task)
+
+    @property
+    def clip_s(self) -> float:
+        """How long a clip plays, in seconds."""
+        return self.settings.clip_steps / control_rate_hz(self.task)
 
 
 class Deviation(Base):

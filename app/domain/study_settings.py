@@ -364,7 +364,7 @@ class StudySettings(BaseModel):
         USUAL_CLIP_STEPS,
         Section.CLIPS,
         "Length of a clip",
-        "10 steps are one second; empty: what suits the task.",
+        "10 steps are one second, in a task of your own as its lab.toml says; empty: what suits the task.",
         unit="steps",
         fixed_by=Use.CLIPS,
         ge=SHORTEST_CLIP_STEPS,

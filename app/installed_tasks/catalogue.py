@@ -8,6 +8,7 @@ what is installed. Those of laboratories come from the files that ``LAB_TASKS`` 
 import os
 import re
 import sys
+from argparse import ArgumentTypeError
 from collections.abc import Iterator, Mapping, Sequence
 from configparser import ConfigParser
 from dataclasses import dataclass
@@ -93,6 +94,17 @@ def lab_files() -> list[Path]:
 def names() -> tuple[str, ...]:
     """Of every task that can be used."""
     return tuple(installed().tasks)
+
+
+def as_argument(name: str) -> str:
+    """The name of a task where somebody types it. Raises ArgumentTypeError, which says what to do."""
+    if name in names():
+        return name
+    left_out = "".join(f" {each.why}" for each in installed().broken)
+    raise ArgumentTypeError(
+        f"there is no task {name!r}; there are {', '.join(names())}.{left_out} A task of your own is known where "
+        "LAB_TASKS names its lab.toml: export LAB_TASKS=path/to/lab.toml, in this shell or in .env."
+    )
 
 
 def usual() -> str:

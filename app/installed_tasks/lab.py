@@ -15,6 +15,7 @@ from app.installed_tasks.description import (
     LanguageCode,
     Reference,
     TaskRefused,
+    Text,
     Word,
     Words,
     parsed,
@@ -156,6 +157,8 @@ class LabDescription(DescribedTask):
     name: Annotated[str, AfterValidator(_name)]
     """as stored in studies, trajectories and bundles"""
     words: Words = Words(tool="robot", target="goal")
+    instructions: dict[LanguageCode, Text] = Field(default_factory=dict)
+    """as in DescribedTask; a language without them reads neutral words"""
     environment: LabEnvironment
     policy: LabPolicy
     success: Measured

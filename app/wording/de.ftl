@@ -87,6 +87,7 @@ form-comments = Möchten Sie uns sonst noch etwas mitteilen?
 
 instructions-title = So funktioniert es
 task-other = Ein Roboterarm hilft einer sitzenden Person. Jedes Paar zeigt dieselbe Situation in zwei Ausführungen. Stellen Sie sich vor, dass Ihnen selbst geholfen wird.
+task-lab = Ein Roboter bei seiner Aufgabe. Jedes Paar zeigt dieselbe Situation in zwei Ausführungen. Stellen Sie sich vor, dass Sie daneben stehen.
 instructions-keys = Antworten und ihre Tasten
 instructions-key = Taste
 instructions-answer = Antwort

@@ -92,6 +92,7 @@ form-comments = Is there anything else you would like to tell us?
 
 instructions-title = How it works
 task-other = A robot arm helps a seated person. Each pair shows the same situation handled in two different ways. Imagine that you are the one being helped.
+task-lab = A robot at its task. Each pair shows the same situation handled in two different ways. Imagine that you stand beside it.
 instructions-keys = Answers and their keys
 instructions-key = Key
 instructions-answer = Answer

@@ -99,7 +99,7 @@ def test_a_mistake_in_the_file_is_said_with_its_key_and_what_to_do(
         (
             "picture = np.full",
             "self.gl.context\n        picture = np.full",
-            "Without a screen MuJoCo needs MUJOCO_GL=egl",
+            "Without a screen MuJoCo draws by EGL: install libegl1",
         ),
         ("spaces.Box(-0.1, 0.1, (2,))", "spaces.Discrete(4)", "one vector of continuous numbers"),
         ("spaces.Box(-0.1, 0.1, (2,))", "spaces.Box(-np.inf, np.inf, (2,))", "its actions have no bounds"),

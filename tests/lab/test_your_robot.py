@@ -1,4 +1,4 @@
-"""docs/your_robot.md holds: its example can be used as it is committed, and a filter of it acts like its mode."""
+"""docs/lab_toml.md holds: the example can be used as it is committed, and a filter of it acts like its mode."""
 
 import re
 from collections.abc import Callable
@@ -19,7 +19,7 @@ from worker.sim.lab.environment import LabStep
 from worker.tasks import registry
 
 ROOT = Path(__file__).parents[2]
-EXAMPLE, PAGE = ROOT / "examples" / "reach", (ROOT / "docs" / "your_robot.md").read_text()
+EXAMPLE, PAGE = ROOT / "examples" / "reach", (ROOT / "docs" / "lab_toml.md").read_text()
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::UserWarning")
@@ -34,8 +34,7 @@ def test_the_example_can_be_used(tmp_path: Path) -> None:
 def test_the_page_names_every_key_and_everything_a_function_is_given() -> None:
     named = set(re.findall(r"`[.]?([\w.]+)`", PAGE))
     for key in (*LabEnvironment.model_fields, *LabPolicy.model_fields):
-        if key != "activation":
-            assert {key, f"environment.{key}", f"policy.{key}"} & named, key
+        assert {key, f"environment.{key}", f"policy.{key}"} & named, key
     for key in LabDescription.model_fields:
         assert any(each.split(".")[0] == key for each in named) or key in {"environment", "policy"}, key
     assert {each.name for each in fields(LabStep)} <= named

@@ -15,4 +15,4 @@ def add_processes(command: argparse.ArgumentParser) -> None:
 
 def add_task(command: argparse.ArgumentParser) -> None:
     """Add ``--task``: one of those installed."""
-    command.add_argument("--task", choices=catalogue.names(), default=catalogue.usual())
+    command.add_argument("--task", type=catalogue.as_argument, metavar="NAME", default=catalogue.usual())

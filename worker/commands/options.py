@@ -11,7 +11,7 @@ from math import isfinite
 from types import NoneType
 from typing import Any, Literal, TypeAlias, TypeVar, get_args, get_origin, get_type_hints
 
-from worker.ml.teachers import TASTES, Taste
+from worker.ml.teachers import TASTES, LabTaste, Taste
 
 Table: TypeAlias = Mapping[str, tuple[str, str]]
 """The path of a field -> the option and its help."""
@@ -89,16 +89,21 @@ def positive(text: str) -> float:
 
 
 def taste(text: str) -> Taste:
-    """A known user, or somebody with weights of their own: six for omega, then signal:weight as often as wanted."""
+    """A known user, or somebody with weights of their own: six for omega, then signal:weight as often as wanted.
+
+    Of a laboratory's task there is no omega, so signals alone: quick=distance_m:1,height_m:-2.
+    """
     name, _, weights = text.partition("=")
     if not weights and name in TASTES:
         return TASTES[name]
     omega = [part for part in weights.split(",") if ":" not in part]
     signals = [part.split(":", 1) for part in weights.split(",") if ":" in part]
     try:
-        if not name.replace("-", "").isalnum() or name in TASTES:
+        if not name.replace("-", "").isalnum() or (name in TASTES and omega):
             raise ValueError(f"A user of one's own needs a new name of letters, digits and hyphens; got {name!r}.")
         per_signal = {signal: float(weight) for signal, weight in signals}
+        if signals and not omega:
+            return LabTaste(name, per_signal=per_signal)
         return Taste(name, tuple(float(weight) for weight in omega), per_signal)
     except ValueError as error:
         known = ", ".join(TASTES)

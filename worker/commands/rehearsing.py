@@ -3,7 +3,10 @@
 import argparse
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
+
+import numpy as np
 
 from app.db import Database
 from app.domain.choices import ClipQuality, Strategy
@@ -14,9 +17,10 @@ from app.storage import ArtefactStore
 from worker.commands import options
 from worker.commands.arguments import Commands, add_task
 from worker.experiments.benchmark_cell import PAPER_USERS
-from worker.ml.teachers import Manner, Taste
+from worker.ml.teachers import OF_LABS, LabTaste, Manner, Taste
 from worker.rehearsal import demo_study, rehearsal
 from worker.rehearsal.server import OwnStudio
+from worker.tasks import registry
 
 OF_SETTINGS: options.Table = {
     "labels_per_participant": ("--labels", "labels per participant"),
@@ -55,7 +59,7 @@ def _add_rehearsal(commands: Commands) -> None:
         nargs="+",
         type=options.taste,
         default=[],
-        help="names, or NAME=six weights; default: the paper's three",
+        help="names, or NAME=six weights; of a task of your own NAME=SIGNAL:WEIGHT,...; default: the paper's three",
     )
     rehearse.add_argument(
         "--omega", nargs=6, type=float, action="append", default=[], help="somebody with these six weights; repeatable"
@@ -87,14 +91,19 @@ def _add_demo_study(commands: Commands) -> None:
 
 def _rehearse(said: argparse.Namespace) -> int:
     """Send scripted participants through the real pages and print what came out."""
-    settings = _settings(said)
+    settings, tastes = _settings(said), _tastes(said)
+    try:
+        _require_fitting(tastes, said.task)
+    except (ValueError, registry.NotExplored) as error:
+        sys.stderr.write(f"Error: {error}\n")
+        return 1
     with tempfile.TemporaryDirectory(prefix="rehearsal-") as temporary:
         directory = said.directory or Path(temporary)
         with OwnStudio(directory) as studio:
             database = Database(studio.settings.sqlalchemy_url)
             store = ArtefactStore(directory / "artefacts")
             rehearsed = rehearsal.Rehearsal(database, store, studio.settings.base_url, said.pace)
-            done = rehearsed.run(said.task, _tastes(said), settings, _manner(said), said.seed)
+            done = rehearsed.run(said.task, tastes, settings, _manner(said), said.seed)
             database.dispose()
         rehearsal.write(done, directory / "rehearsed")
         sys.stdout.write(rehearsal.summary(done) + "\n")
@@ -114,7 +123,23 @@ def _make_demo_study(said: argparse.Namespace) -> int:
 def _tastes(said: argparse.Namespace) -> list[Taste]:
     """Whoever was asked for; the paper's three when nobody was."""
     own = [Taste.of_omega(omega) for omega in said.omega]
-    return [*said.users, *own] or list(PAPER_USERS.values())
+    of_nobody = PAPER_USERS.values() if registry.lab(said.task) is None else OF_LABS
+    return [*said.users, *own] or list(of_nobody)
+
+
+def _require_fitting(tastes: Sequence[Taste], name: str) -> None:
+    """Raises ValueError for people who mind what the task does not have, NotExplored."""
+    task = registry.task(name)
+    for taste in tastes:
+        if isinstance(taste, LabTaste) is not task.is_a_labs:
+            raise ValueError(
+                f"{taste.name} is nobody who knows {name}. Say what they mind of its signals, below 0 what they like: "
+                f"--users quick=undelivered:1 (there are {', '.join(task.signals)})."
+                if task.is_a_labs
+                else f"{taste.name} minds signals alone, and {name} wants six weights before them: NAME=six,weights,..."
+            )
+        if isinstance(taste, LabTaste):
+            taste.step_rewards(np.zeros(len(task.signals)), task.signals)
 
 
 def _manner(said: argparse.Namespace) -> Manner:
@@ -128,6 +153,8 @@ def _settings(said: argparse.Namespace) -> StudySettings:
     chosen["clip_quality"] = ClipQuality.QUICK  # nobody looks at them
     enough = -(-said.labels_per_participant // StudySettings().pairs_per_scenario)
     chosen["pool_scenarios"] = said.clip_scenarios or enough
+    if registry.lab(said.task) is not None:
+        chosen["clip_steps"] = registry.installed_task(said.task).description.usual_clip_steps
     if not said.paper:
         return StudySettings(**chosen)
     chosen["introduction_pairs"] = min(PAPER_PROTOCOL.introduction_pairs, said.labels_per_participant)

@@ -46,11 +46,14 @@ def check(file: Path, sheet: Path | None = None) -> int:
         sys.stdout.write(f"{each}\n")
     for each in found.wrong:
         sys.stderr.write(f"Wrong: {each}\n")
+    if found.wrong:
+        sys.stderr.write("What each key means: docs/lab_toml.md\n")
     if not found.wrong:
         name = lab.read(file).name
+        explore = "" if _explored(lab.read(file)) else f"  python -m worker explore --task {name}\n"
         sys.stdout.write(
-            f"{file} can be used. Next:\n  export LAB_TASKS={file}\n  python -m worker explore --task {name}\n"
-            f"  python -m app demo --task {name}\n"
+            f"{file} can be used. Next:\n  export LAB_TASKS={file}\n{explore}"
+            f"  python -m worker rehearse --task {name} --labels 30\n  python -m app demo --task {name}\n"
         )
     return 1 if found.wrong else 0
 
@@ -105,16 +108,23 @@ def _run(
         wrong.append(
             f"success: none of {EPISODES} episodes succeeded. Check what success says at the last step, episode_steps, "
             "policy.gain and the policy itself."
+            + (
+                " A zip of Stable-Baselines3 lacks VecNormalize's statistics; export such a policy as ONNX, with them "
+                "inside."
+                if (described.policy.file or "").endswith(".zip")
+                else ""
+            )
         )
     return Checked(tuple(wrong), _remarks(described, trajectories, seconds, sheet), sheet)
 
 
 def _disagree(installed: InstalledTask, described: LabDescription, environment: LabEnvironment) -> tuple[str, ...]:
     """Whether people will have anything to disagree about, once it is known in which ways the task can be done."""
-    file = installed.checkpoint / FOUND_FILE
-    found = Found.load(file) if file.exists() else None
-    if found is None or found.mark != mark_of(described, installed.folder):
+    found = _explored(installed)
+    if found is None:
         return ("Whether behaviours differ enough for people to disagree is said here after `explore`.",)
+    if why := lab_ranges.changed_since(found, described, installed.folder, environment):
+        return (why,)
     task, policy = found.task(described), policy_of(described, installed.folder, found)
     with tqdm(total=disagreement.SCENARIOS * (1 + disagreement.PER_SCENARIO) + 1, desc="do people disagree") as bar:
 
@@ -124,6 +134,14 @@ def _disagree(installed: InstalledTask, described: LabDescription, environment: 
 
         differences = disagreement.measured(task, policy.mean, episode, described.usual_clip_steps)
     return disagreement.in_words(differences, task)
+
+
+def _explored(installed: InstalledTask) -> Found | None:
+    """What was found out about a lab.toml as it is now."""
+    assert isinstance(installed.description, LabDescription)  # noqa: S101 -- which lab.read() reads
+    file = installed.checkpoint / FOUND_FILE
+    found = Found.load(file) if file.exists() else None
+    return found if found and found.mark == mark_of(installed.description, installed.folder) else None
 
 
 def _not_repeated(again: Trajectory, before: Trajectory, described: LabDescription) -> str:
@@ -143,7 +161,9 @@ def _remarks(
     usual = float(np.median(seconds))
     successes = sum(each.success for each in trajectories)
     remarks = [
-        f"{successes} of {len(trajectories)} episodes succeeded; an episode takes {usual:.2f} s.",
+        f"{successes} of {len(trajectories)} episodes succeeded; an episode takes {usual:.2f} s, so exploring "
+        f"takes about {EXPLORED_EPISODES * usual / 120:.0f} minutes on two processes, a quarter of it with "
+        "--scenarios 50.",
         f"Contact sheet: {sheet}",
     ]
     sums = np.array([each.signals.sum(axis=0) for each in trajectories])

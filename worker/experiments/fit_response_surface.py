@@ -8,6 +8,7 @@ space of modes, where random modes are rare and a regression promises most.
 Finished blocks are kept, so an interrupted exploration goes on where it was.
 """
 
+import hashlib
 import json
 import platform
 from collections.abc import Sequence
@@ -18,6 +19,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from app.installed_tasks.lab import LabDescription
 from worker.compute import simulation
 from worker.compute.pools import Compute, Lane
 from worker.domain.scenarios import RESPONSE_SURFACE, RESPONSE_SURFACE_SOUGHT, first_of
@@ -29,6 +31,7 @@ from worker.ml.filters.response_surface import ResponseSurface, best_mode
 from worker.ml.rewards.reward_models import NEVER_WANTED
 from worker.ml.teachers import random_taste
 from worker.sim.costs import signal_weights
+from worker.sim.lab.environment import LabEnvironment
 from worker.sim.lab.found import FOUND_FILE
 from worker.tasks import registry
 from worker.whole_files import written_whole
@@ -90,6 +93,9 @@ def explore(task: str, work_directory: Path, processes: int, scenarios: int = SC
     work_directory.mkdir(parents=True, exist_ok=True)
     if registry.lab(task) is not None:
         find_ranges(task)
+        found = registry.checkpoint(task) / FOUND_FILE
+        work_directory /= hashlib.sha256(found.read_bytes()).hexdigest()[:16]  # blocks of another policy are no part
+        work_directory.mkdir(exist_ok=True)
     described = registry.task(task)
     blocks = [
         Block(task, first, _random_modes(described, first), work_directory / f"differences-{first}.npz")
@@ -110,25 +116,38 @@ def explore(task: str, work_directory: Path, processes: int, scenarios: int = SC
 
 
 def find_ranges(task: str, scenarios: int = lab_ranges.SCENARIOS) -> None:
-    """The ways to do a laboratory's task, unless they are known already."""
+    """The ways to do a laboratory's task, unless they are known already and still true."""
     installed, described = registry.installed_task(task), registry.lab(task)
     assert described is not None  # noqa: S101 -- callers do this for laboratories' tasks only
+    environment = registry.lab_environment(task)
     try:
-        registry.found_out(task)
-        return
-    except registry.NotExplored:
-        pass
-    with tqdm(total=1.0, desc="ranges of the ways to do it") as bar:
-        environment = registry.lab_environment(task)
-        try:
-            found = lab_ranges.find(
-                described, installed.folder, environment, lambda _, share: bar.update(share - bar.n), scenarios
-            )
-        finally:
-            environment.close()
+        if _is_known(task, described, environment):
+            return
+        with tqdm(total=100, bar_format="{desc}: {percentage:.0f} %, {elapsed}") as bar:
+
+            def progress(what: str, share: float) -> None:
+                bar.set_description(f"ranges of the ways to do it, {what}")
+                bar.update(100 * share - bar.n)
+
+            found = lab_ranges.find(described, installed.folder, environment, progress, scenarios)
+    finally:
+        environment.close()
     found.save(installed.checkpoint / FOUND_FILE)
+    registry.found_out.cache_clear()
     for each in (*found.notes, *(f"{way}: {why}" for way, why in found.dropped.items())):
         tqdm.write(each)
+
+
+def _is_known(task: str, described: LabDescription, environment: LabEnvironment) -> bool:
+    """Whether ranges were found for this lab.toml and policy, and the environment still does what it did then."""
+    try:
+        found = registry.found_out(task)
+    except registry.NotExplored:
+        return False
+    why = lab_ranges.changed_since(found, described, registry.installed_task(task).folder, environment)
+    if why:
+        tqdm.write("What was found before is no longer true and is found anew.")
+    return not why
 
 
 def compare_block(block: Block) -> None:

@@ -35,6 +35,8 @@ SEEN = 0.05
 AT_LIMIT = 0.98
 USUALLY_AT_LIMIT = 0.2
 """Share of the actions that move the robot; above it nobody can be quicker."""
+WITNESS = RESPONSE_SURFACE[-1]
+"""The scenario by which an environment is known again."""
 _MAY_GROW = ("undelivered", "distance_m")
 """Being slower is no disaster: success says whether it is too slow."""
 
@@ -70,6 +72,32 @@ def first_found(described: LabDescription, environment: LabEnvironment, folder: 
 def asked_first(policy: OnnxPolicy | RemotePolicy, environment: LabEnvironment, scenario: int) -> Answered | None:
     """What a policy server says at the beginning of a scenario; None of a policy in a file. Raises NotAPolicy."""
     return policy.first_answer(environment.first_observation(scenario)) if isinstance(policy, RemotePolicy) else None
+
+
+def changed_since(found: Found, described: LabDescription, folder: Path, environment: LabEnvironment) -> str:
+    """Whether the frozen policy's episode is another than when the task was explored, in words; empty: it is the same.
+
+    What was found before there was a witness is taken as it is. Raises NotAPolicy, LabTaskBroken.
+    """
+    if not found.witness:
+        return ""
+    now = _witness(environment.episode(policy_of(described, folder, found).mean, WITNESS))
+    other = [
+        f"{name} {after:.4g} instead of {before:.4g}"
+        for name, before, after in zip(described.signal_names, found.witness, now, strict=True)
+        if not np.isclose(after, before, rtol=SEEN, atol=1e-6)
+    ]
+    return (
+        "The environment, a function of yours or an installed package has changed since the task was explored: in one "
+        f"and the same episode it now measures {', '.join(other)}. It begins anew with "
+        f"python -m worker explore --task {described.name}."
+        if other
+        else ""
+    )
+
+
+def _witness(episode: Trajectory) -> tuple[float, ...]:
+    return tuple(episode.signals.sum(axis=0, dtype=np.float64).tolist())
 
 
 def find(
@@ -114,6 +142,7 @@ def find(
         axes=tuple(kept),
         dropped=dropped,
         notes=_notes(success, at_limit, described),
+        witness=_witness(reference[-1]),
         reference={"episodes": float(scenarios), "success": success, "actions_at_limit": round(at_limit, 3)},
     )
 

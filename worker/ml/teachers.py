@@ -57,6 +57,32 @@ class Taste:
         return cls("omega-" + "-".join(f"{weight:g}" for weight in omega), tuple(omega))
 
 
+class LabTaste(Taste):
+    """Somebody with a laboratory's task, who minds its signals alone; which there are, the task knows."""
+
+    def __post_init__(self) -> None:
+        if not self.per_signal or any(not isfinite(weight) for weight in self.per_signal.values()):
+            raise ValueError(f"Somebody must mind a signal, with a finite weight; got {dict(self.per_signal)}.")
+
+    def step_rewards(self, signals: npt.ArrayLike, names: Sequence[str]) -> FloatArray:
+        """(..., S) -> (...,) of every step. Raises ValueError for signals that the task does not have."""
+        rewards: FloatArray = np.asarray(signals, np.float64) @ self.signal_weights(names)
+        return rewards
+
+    def signal_weights(self, names: Sequence[str]) -> FloatArray:
+        """(S,) of a task's signals, above 0: wanted. Raises ValueError."""
+        unknown = sorted(self.per_signal.keys() - set(names))
+        if unknown:
+            raise ValueError(f"No signal is called {', '.join(unknown)}; there are {', '.join(names)}.")
+        return -np.array([self.per_signal.get(name, 0.0) for name in names])
+
+
+OF_LABS: tuple[LabTaste, ...] = (
+    LabTaste("quick", per_signal={"undelivered": 1.0}),
+    LabTaste("smooth", per_signal={"action_change_squared": 1.0}),
+)
+"""Who rehearses a laboratory's task when nobody else is named: what they mind is measured in every lab."""
+
 OPPOSED: tuple[tuple[Taste, Taste], ...] = (
     (
         Taste("slow", (1.0, 6.0, 1.0, 1.0, 1.0, 1.0), {"acceleration_squared_m2_s4": 0.3}),

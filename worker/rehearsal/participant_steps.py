@@ -35,7 +35,7 @@ from worker.jobs.runtime import records
 from worker.ml.rewards.loading import load_reward_model
 from worker.ml.rewards.reward_models import RewardModel
 from worker.ml.scripted_ratings import RatingManner, ScriptedRater
-from worker.ml.teachers import Manner, ScriptedTeacher, Taste, segment_returns, speaks_most
+from worker.ml.teachers import LabTaste, Manner, ScriptedTeacher, Taste, segment_returns, speaks_most
 from worker.rehearsal.browser import Offered
 from worker.sim.costs import preference_rewards, signal_weights
 from worker.tasks import registry
@@ -108,7 +108,12 @@ class ScriptedPerson:
         with self._database.reading() as session:
             query = session.get_one(Query, query_id, options=dataset.CLIPS_AND_ROLLOUTS)
             pair = dataset.segment_pairs(self._store, [(query.left_clip, query.right_clip)])
-        weights = signal_weights(self._task, self._taste.omega, self._taste.per_signal)
+        taste, task = self._taste, self._task
+        weights = (
+            taste.signal_weights(task.signals)
+            if isinstance(taste, LabTaste)
+            else signal_weights(task, taste.omega, taste.per_signal)
+        )
         gains = weights * pair.signal_differences()[0] * (1.0 if answer == Response.RIGHT else -1.0)
         named = qualities.of_task(self._task.name)
         columns = {name: [self._task.signals.index(each) for each in named[name]] for name in named}
@@ -222,6 +227,8 @@ class ScriptedPerson:
     def _true_rewards(self, shown: Trajectory) -> FloatArray:
         """r^H of every step."""
         taste = self._taste
+        if isinstance(taste, LabTaste):
+            return taste.step_rewards(shown.signals, self._task.signals)
         rewards = preference_rewards(
             self._task, shown.costs, shown.signals, taste.omega, "calibrated", taste.per_signal
         )

@@ -103,7 +103,7 @@ def _procedure(study: Study) -> Iterator[str]:
     installed = catalogue.find(study.task)
     title = installed.description.title if installed else study.task
     made = (
-        f"simulated clips of {settings.clip_steps / 10:g} s "
+        f"simulated clips of {study.clip_s:.3g} s "
         f"({settings.clip_quality.hint.split(';')[0].rstrip('.')}), from {settings.pool_scenarios} scenarios with "
         f"{settings.behaviours_per_scenario} ways of doing each"
         if study.material is None

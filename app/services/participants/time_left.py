@@ -14,7 +14,7 @@ from sqlalchemy.orm import Session
 
 from app.domain.participation import ParticipantEvent, StageRecord
 from app.domain.protocol import Stage
-from app.domain.studies import Participant
+from app.domain.studies import Participant, Study, control_rate_hz
 from app.domain.study_settings import StudySettings
 from app.services.answers.next_query import LONGEST_PAUSE, PairProgress
 from app.services.participant_events import EventKind
@@ -26,7 +26,6 @@ RECENT = 90
 """Rows looked at, the newest."""
 KNOWN_FOR_S = 30.0
 _AFTER_PAIRS = (Stage.SELF_SETTING, Stage.EVALUATION, Stage.QUESTIONNAIRE, Stage.DEBRIEF)
-CONTROL_RATE_HZ = 10
 
 
 _BREAKS = (
@@ -97,18 +96,20 @@ def time_left(
         return None
     study, usual = participant.study, usual_times.of(session, participant.study_id)
     settings = study.settings
-    seconds = _pairs_s(progress, settings, study.whole_clip_steps)
+    seconds = _pairs_s(progress, study)
     seconds += _breaks_coming(progress, settings) * (usual.break_s or 0.0)
     later = [stage for stage in stages.stages_of(settings) if stage in _AFTER_PAIRS]
     known = all(stage in usual.stages_s for stage in later)
     return TimeLeft(round(seconds + (sum(usual.stages_s[stage] for stage in later) if known else 0.0)), known)
 
 
-def _pairs_s(progress: PairProgress, settings: StudySettings, whole_clip_steps: int | None) -> float:
+def _pairs_s(progress: PairProgress, study: Study) -> float:
     """Whole episodes come first and play longer than what follows; the pace is that of what was answered last."""
+    settings = study.settings
     pace_s, left = progress.pace_s or 0.0, progress.wanted - progress.answered
     whole = max(0, settings.introduction_count - progress.answered)
-    shorter_s = ((whole_clip_steps or settings.clip_steps) - settings.clip_steps) / CONTROL_RATE_HZ
+    steps = (study.whole_clip_steps or settings.clip_steps) - settings.clip_steps
+    shorter_s = steps / control_rate_hz(study.task)
     after_s = pace_s - shorter_s if whole and pace_s > shorter_s else pace_s
     return whole * pace_s + (left - whole) * after_s
 

@@ -18,6 +18,7 @@ from jinja2.runtime import Context
 from app.domain.protocol import CONSENT_FACTS, Language
 from app.domain.study_settings import StudySettings
 from app.installed_tasks import catalogue
+from app.installed_tasks.lab import LabDescription
 from app.paths import WORDING
 
 log = logging.getLogger("app.wording")
@@ -176,17 +177,19 @@ def _resource(language: Language) -> ast.Resource:
     """The language's file, and in it what is said of each task, before what is said of any other."""
     texts: list[ast.EntryType] = []
     for entry in FluentResource((WORDING / f"{language}.ftl").read_text(encoding="utf-8")).body:
-        if isinstance(entry, ast.Message) and entry.id.name == "task-other":
-            texts += _of_tasks(language)
+        if isinstance(entry, ast.Message) and entry.id.name == "task-lab":
+            texts += _of_tasks(language, entry.value)
         texts.append(entry)
     return ast.Resource(texts)
 
 
-def _of_tasks(language: Language) -> Iterator[ast.Message]:
+def _of_tasks(language: Language, of_labs: ast.Pattern | None) -> Iterator[ast.Message]:
+    """What each task says of itself; a laboratory's that says nothing in this language, what is true of all of them."""
     for task in catalogue.installed().tasks.values():
         text = task.description.instructions.get(language)
-        if text is not None:
-            yield ast.Message(ast.Identifier(f"task-{task.name}"), ast.Pattern([ast.TextElement(text)]))
+        said = ast.Pattern([ast.TextElement(text)]) if text is not None else of_labs
+        if text is not None or isinstance(task.description, LabDescription):
+            yield ast.Message(ast.Identifier(f"task-{task.name}"), said)
 
 
 @cache

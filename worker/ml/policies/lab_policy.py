@@ -1,6 +1,7 @@
 """Policies that laboratories bring: ONNX, Stable-Baselines3's zip files by their weights alone, and our own files."""
 
 import io
+import json
 import re
 import zipfile
 from collections.abc import Mapping
@@ -17,7 +18,7 @@ from worker.ml.policies.onnx_policy import NotAPolicy, OnnxPolicy, adapted, mlp_
 from worker.ml.policies.policy_onnx import policy_to_onnx
 
 LARGEST_BYTES = 256 << 20
-_WEIGHTS = "policy.pth"
+_WEIGHTS, _DATA = "policy.pth", "data"
 _OPERATIONS = {"relu": "Relu", "tanh": "Tanh", "elu": "Elu"}
 
 
@@ -62,6 +63,9 @@ def _of_ours(file: Path, bounds: tuple[FloatArray, FloatArray]) -> bytes:
 def _of_stable_baselines(file: Path, activation: str | None, bounds: tuple[FloatArray, FloatArray]) -> bytes:
     """The actor of SAC, TD3, DDPG, PPO or A2C, told by the names of its weights."""
     state = _state(file)
+    activation = activation or _told_activation(file)
+    if any(name.startswith("actor.latent_pi") for name in state) and "actor.mu.weight" not in state:
+        raise NotAPolicy("its noise depends on the state (use_sde=True), whose mean is bounded; export it as ONNX.")
     found: list[tuple[Float32Array, Float32Array]]
     if "actor.mu.weight" in state:  # SAC: hidden layers, then a mean and a tanh
         found, squash, usual = [*_layers(state, "actor.latent_pi"), _layer(state, "actor.mu")], "Tanh", "relu"
@@ -122,6 +126,30 @@ def _state(file: Path) -> Mapping[str, Any]:
     if not isinstance(state, Mapping):
         raise NotAPolicy(f"its {_WEIGHTS} holds no weights by name.")
     return state
+
+
+def _told_activation(file: Path) -> str | None:
+    """The activation function that the file's readable part names; None: it says none, so its algorithm's usual one.
+
+    What is stored of a class is its name beside its pickle; the name alone is read. Raises NotAPolicy for a function
+    that is not known here.
+    """
+    with zipfile.ZipFile(file) as archive:
+        if _DATA not in archive.namelist() or archive.getinfo(_DATA).file_size > LARGEST_BYTES:
+            return None
+        try:
+            data = json.loads(archive.read(_DATA))
+        except ValueError:
+            return None
+    arguments = data.get("policy_kwargs") if isinstance(data, dict) else None
+    said = str(arguments.get("activation_fn", "")) if isinstance(arguments, dict) else ""
+    if not (named := re.search(r"activation\.(\w+)'", said)):
+        return None
+    if named[1].lower() not in _OPERATIONS:
+        raise NotAPolicy(
+            f"its activation function is {named[1]}; only ReLU, Tanh and ELU are known. Export it as ONNX."
+        )
+    return named[1].lower()
 
 
 def _layers(state: Mapping[str, Any], prefix: str) -> list[tuple[Float32Array, Float32Array]]:

@@ -5,6 +5,7 @@ two ways of doing one scenario could not be compared. The server is asked twice 
 answers as when the task was explored.
 """
 
+import atexit
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -123,8 +124,10 @@ class RemotePolicy:
 
 @cache
 def _connection(url: str, answer_s: float) -> PolicyServer:
-    """This process' connection to a server."""
-    return PolicyServer(url, answer_s)
+    """This process' connection to a server, which is told when the process ends."""
+    server = PolicyServer(url, answer_s)
+    atexit.register(server.close)
+    return server
 
 
 @cache

@@ -5,6 +5,7 @@ is over, which modes need (worker.domain.lab_modes). Actions are in [-1, 1], str
 """
 
 import math
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -27,6 +28,10 @@ Picture = npt.NDArray[np.uint8]
 UNBOUNDED = 1e6
 """Stands for the bound of an observation whose space has none."""
 SMALLEST_PICTURE_PX = 64
+NO_SCREEN = (
+    "Without a screen MuJoCo draws by EGL: install libegl1 and libegl-mesa0 (Debian's names), or libosmesa6 and set "
+    "MUJOCO_GL=osmesa in the worker's environment."
+)
 
 
 @dataclass(frozen=True)
@@ -54,6 +59,8 @@ class LabEnvironment:
     _made: Any = field(default=None, init=False)
 
     def __post_init__(self) -> None:
+        if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+            os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo reads it when it is imported, by what follows
         self._signals = {
             name: self._measure(f"signals.{name}", each) for name, each in self.description.signals.items()
         }
@@ -187,8 +194,7 @@ class LabEnvironment:
         except Exception as error:  # whatever code from elsewhere may do
             raise LabTaskBroken(
                 "environment",
-                f"render() failed ({type(error).__name__}: {error}). Without a screen MuJoCo needs MUJOCO_GL=egl "
-                "(Debian's libegl1 and libegl-mesa0) or osmesa (libosmesa6) in the worker's environment.",
+                f"render() failed ({type(error).__name__}: {error}). {NO_SCREEN}",
             ) from error
         if drawn.ndim != 3 or drawn.shape[2] != 3 or drawn.dtype != np.uint8:
             raise LabTaskBroken(
@@ -337,4 +343,6 @@ def _not_made(error: Exception, what: str) -> str:
         return f"{said} Install its package into the studio's environment."
     if isinstance(error, gymnasium.error.NameNotFound | gymnasium.error.NamespaceNotFound):
         return f"{said} Name the module that registers it before a colon, as in panda_gym:PandaReach-v3."
+    if "egl" in str(error).lower():
+        return f"{said} {NO_SCREEN}"
     return f"{said} Check environment.kwargs; it must take render_mode='rgb_array'."

@@ -64,6 +64,9 @@ class Found:
     """of the frozen policy's episodes: success, share of actions at their limit"""
     answered: Answered | None = None
     """what a policy server said when the task was explored"""
+    witness: tuple[float, ...] = ()
+    """(S,) of the signals, summed over the frozen policy's episode of one scenario: by it the environment, the lab's
+    own functions and installed packages are known again, of which the mark knows nothing"""
 
     def modes(self, axes: tuple[Axis, ...] | None = None) -> LabModes:
         """The ways to do the task."""
@@ -123,8 +126,8 @@ class Found:
         kinds = {"observation": Field, "action": Field, "axes": Axis}
         for name, kind in kinds.items():
             stored[name] = tuple(kind(**each) for each in stored[name])
-        for name in ("moving", "tip", "goal", "notes"):
-            stored[name] = tuple(stored[name])
+        for name in ("moving", "tip", "goal", "notes", "witness"):
+            stored[name] = tuple(stored.get(name, ()))
         stored["bounds"] = tuple(map(tuple, stored["bounds"]))
         if stored.get("answered"):
             said = stored["answered"]
