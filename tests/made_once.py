@@ -62,7 +62,7 @@ def made_once(
 
     A copy fits where all tables that it has rows of are empty, for it has their ids.
     """
-    kind = make, about, *more.items()
+    kind = make, repr((about, more))
     copy = _COPIES.get(kind)
     if copy is not None and not any(counts(session, copy.rows).values()):
         copy.paste(session, store)

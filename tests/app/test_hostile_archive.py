@@ -344,7 +344,7 @@ def test_a_list_of_contents_that_is_far_too_long_is_not_read(
         archive_of_names.writestr("files/first", b"")
         for number in range(120_000):
             again = zipfile.ZipInfo(f"files/{number:064}")
-            again.header_offset = 0
+            again.header_offset = again.CRC = 0
             archive_of_names.filelist.append(again)
     _refused_within_memory(database, store, tmp_path / "long.zip")
 
