@@ -3,6 +3,7 @@
 import re
 from collections.abc import Callable
 from datetime import timedelta
+from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
@@ -192,14 +193,22 @@ def test_a_study_of_the_papers_protocol_has_a_text_before_anybody_came(
     assert "Results" not in said.replace("The results", "")
 
 
-@pytest.mark.parametrize(("share", "times"), [(0.0, 0), (0.25, 1)])
+@pytest.mark.parametrize(
+    ("share", "material", "times"),
+    [
+        (0.0, None, 0),
+        (0.25, None, 1),
+        pytest.param(0.25, {"signals": []}, 0, id="imported clips, which are all there is"),
+    ],
+)
 @pytest.mark.parametrize("path", ["results/methods_and_results.md", "preregistration.md"])
 def test_pairs_that_follow_the_person_are_told_where_there_are_any(
-    experimenter: TestClient, database: Database, share: float, times: int, path: str
+    experimenter: TestClient, database: Database, share: float, material: dict[str, Any] | None, times: int, path: str
 ) -> None:
     with database.writing() as session:
         settings = PAPER_PROTOCOL.model_copy(update={"following_share": share})
         study = studies.create_study(session, "Following", settings, seed=1)
+        study.material = material
     said = text_of(experimenter, study, path)
     assert said.count("From the tenth answer on 25 %") == times
 

@@ -81,7 +81,7 @@ def _design(study: Study, settings: StudySettings) -> Mapping[str, str]:
             "Blinding": "No blinding is involved in this study.",
             "Is there any additional blinding in this study?": NOTHING,
             "Study design": nothing,
-            "Randomization": _randomisation(settings, None),
+            "Randomization": _randomisation(study, settings, None),
         }
     arms = [
         f"* {arm.name}: {listed(unblinding.NAMES[method] for method in arm.methods)}"
@@ -110,11 +110,11 @@ def _design(study: Study, settings: StudySettings) -> Mapping[str, str]:
             if evaluation.head_to_heads
             else "There are no head-to-heads.",
         ),
-        "Randomization": _randomisation(settings, evaluation),
+        "Randomization": _randomisation(study, settings, evaluation),
     }
 
 
-def _randomisation(settings: StudySettings, evaluation: EvaluationSettings | None) -> str:
+def _randomisation(study: Study, settings: StudySettings, evaluation: EvaluationSettings | None) -> str:
     return paragraph(
         "Everything that is drawn follows from seeds in the locked document and from the study's secret, whose hash is "
         "in it.",
@@ -122,7 +122,7 @@ def _randomisation(settings: StudySettings, evaluation: EvaluationSettings | Non
         + (
             f"From the tenth answer on {percent(settings.following_share, 0)} follow the person: clips nearest to what "
             "their filter would do by then. "
-            if settings.following_share
+            if settings.following_share and study.material is None
             else ""
         )
         + "Sides are drawn.",
