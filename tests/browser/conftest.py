@@ -88,7 +88,7 @@ def invited(database: Database, store: ArtefactStore, address: str, request: pyt
     return Invited(address, token, participant, study, database)
 
 
-def _invite(session: Session, store: ArtefactStore, ready: bool, **settings: Any) -> tuple[int, str]:
+def _invite(session: Session, store: ArtefactStore, /, ready: bool, **settings: Any) -> tuple[int, str]:
     study = factories.make_study(session, **settings)
     participant, token = factories.make_participant(session, study, ready=ready)
     factories.make_queries(session, store, participant, 12)
