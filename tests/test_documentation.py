@@ -13,6 +13,8 @@ from app.settings import Settings
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 PAGES = [*sorted(ROOT.glob("*.md")), *sorted(DOCS.rglob("*.md"))]
+WRITTEN = ("data", "build")
+"""Folders that programs write, which are there or not."""
 LONGEST_LINE = 400
 LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
 CODE = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
@@ -64,7 +66,8 @@ def named() -> Iterator[tuple[Path, str, str]]:
     """Page, path and name of everything in the repository that a page speaks of as it is now."""
     for page in PAGES:
         for path, name in NAMED.findall(prose(page)) if page.name != "CHANGELOG.md" else ():
-            if name or ("/" in path and (ROOT / path.partition("/")[0]).is_dir()):
+            folder = path.partition("/")[0]
+            if name or (folder != path and folder not in WRITTEN and (ROOT / folder).is_dir()):
                 yield page, path, name
 
 

@@ -41,6 +41,11 @@ class RewardKind(Choice):
         "As in the paper; also sees what happened before, needs the most answers and seconds.",
     )
 
+    @property
+    def is_linear_in_signals(self) -> bool:
+        """Whether it weighs quantities that people can name."""
+        return self in {RewardKind.STRUCTURED, RewardKind.PREDICTED}
+
 
 class ClipQuality(Choice):
     """How finely clips are drawn."""

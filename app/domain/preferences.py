@@ -121,6 +121,8 @@ class LabelEvent(Base):
     play_error_count: Mapped[int | None]
     reason: Mapped[str | None] = mapped_column(String(40))
     """Why the person could not tell, one of SkipReason."""
+    mattered: Mapped[str | None] = mapped_column(String(40))
+    """What the person said made the difference, one of app.installed_tasks.qualities."""
     stall_count: Mapped[int | None]
     stalled_ms: Mapped[int | None]
     """How long a clip had to wait for the network while playing."""

@@ -168,6 +168,20 @@ class StudySettings(BaseModel):
     answer_after_first_play: bool = setting(
         True, Section.PAIRS, "Answers open after the first play", "Nobody can answer before both clips were seen once."
     )
+    asks_what_mattered: bool = setting(
+        False,
+        Section.PAIRS,
+        "Ask what made the difference",
+        options=(
+            ("no", "No", "One tap answers a pair."),
+            (
+                "yes",
+                "Yes",
+                "A second tap, which people may pass over, names a quality such as speed or force. The model hears the "
+                "answer once more, about that quality alone. Structured models of simulated clips only.",
+            ),
+        ),
+    )
     evaluation: EvaluationSettings | None = setting(
         None,
         Section.EVALUATION,
@@ -387,8 +401,14 @@ class StudySettings(BaseModel):
             raise ValueError(
                 "Pairs that follow the person and pairs drawn at random are more than all. Lower one share."
             )
-        if self.following_share and self.reward_kind not in (RewardKind.STRUCTURED, RewardKind.PREDICTED):
+        if self.following_share and not self.reward_kind.is_linear_in_signals:
             raise ValueError("Pairs follow the person with structured reward models only. Choose one, or enter 0 %.")
+        return self
+
+    @model_validator(mode="after")
+    def _can_hear_what_mattered(self) -> "StudySettings":
+        if self.asks_what_mattered and not self.reward_kind.is_linear_in_signals:
+            raise ValueError("What made the difference is learned from by structured reward models only. Choose one.")
         return self
 
     @model_validator(mode="after")

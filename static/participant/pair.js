@@ -22,6 +22,7 @@ const words = Object.fromEntries(
 const answers = find("answers");
 const undo = find("undo");
 const why = find("why"); // only where "can't tell" is an answer
+const mattered = find("mattered"); // only where the study asks what made the difference
 const written = answers.querySelector("[data-written]"); // a reason in words, where the study asks for it
 const buttons = [...answers.querySelectorAll("button")];
 const still = matchMedia("(prefers-reduced-motion: reduce)");
@@ -34,7 +35,7 @@ let prepared = null; // { queryId, videos: promise of both } of the pair after t
 let player = null;
 let watching = null; // what is measured about this pair
 let phase = "loading"; // loading, watching, ready, unplayable, saving
-let skippedAfterMs = ""; // when "can't tell" was pressed, while the reason is asked for
+let pressed = null; // { response, elapsed, button } of the button that was pressed, while a dialog asks for more
 
 const practice = find("practice") && new Practice(find("practice"), say, (count) => events.note("keys_used", { count }));
 const enlarging = new Enlarging(page);
@@ -62,9 +63,15 @@ async function start() {
     const button = event.target.closest("button");
     if (!button) return;
     why.close();
-    if (button.dataset.reason !== undefined) give("skip", skippedAfterMs, button.dataset.reason);
+    if (button.dataset.reason !== undefined) give(pressed, { reason: button.dataset.reason });
   });
-  listen(() => (why?.open ? why : page));
+  mattered?.addEventListener("click", (event) => {
+    const button = event.target.closest("button");
+    if (!button) return;
+    mattered.close();
+    if (button.dataset.quality !== undefined) give(pressed, { quality: button.dataset.quality });
+  });
+  listen(() => [why, mattered].find((dialog) => dialog?.open) ?? page);
   addEventListener("pageshow", (event) => event.persisted && location.reload());
   events.watchVisibility(() => ({ query_id: watching?.queryId ?? "" }));
 
@@ -195,22 +202,25 @@ async function answer(button) {
   practice?.used("answer");
   if (!usable(button.value)) return;
   const elapsed = watching.firstFrameAt === null ? "" : Math.round(performance.now() - watching.firstFrameAt);
-  if (button.value !== "skip") {
-    await give(button.value, elapsed, "", button);
+  pressed = { response: button.value, elapsed, button };
+  if (button.value !== "skip" && (!mattered || button.value === "equal")) {
+    await give(pressed);
+  } else if (button.value !== "skip") {
+    mattered.showModal();
   } else if (watching.firstFrameAt === null) {
-    await give("skip", elapsed, "not_seen", button);
+    await give(pressed, { reason: "not_seen" });
   } else {
-    skippedAfterMs = elapsed;
     why.showModal();
   }
 }
 
-async function give(response, elapsed, reason, button = null) {
+async function give({ response, elapsed, button }, { reason = "", quality = "" } = {}) {
   if (!usable(response)) return;
   const [leftWatchedMs, rightWatchedMs] = player.watchedMs;
   const entry = outbox.add(turn.pair.label_path, {
     response,
     reason: written ? written.value : reason,
+    mattered: quality,
     response_time_ms: elapsed,
     replay_count: watching.replays,
     play_error_count: watching.playErrors,

@@ -57,6 +57,30 @@ def test_from_the_link_to_the_tenth_answer_and_on_the_dashboard(
     assert serious_findings(dashboard) == []
 
 
+@pytest.mark.parametrize("invited", [{"asks_what_mattered": True}], indirect=True)
+def test_what_mattered_is_said_by_a_key_after_the_answer_or_passed_over(invited: Invited, new_page: NewPage) -> None:
+    page = new_page()
+    page.goto(invited.link)
+    wait_ready(page, 0)
+    page.keyboard.press(KEYS["left"])
+    dialog = page.get_by_role("dialog", name="What made the difference?")
+    expect(dialog).to_be_visible()
+    assert serious_findings(page) == []
+    page.keyboard.press("Escape")
+    expect(dialog).to_be_hidden()
+    assert invited.events() == []
+    page.keyboard.press(KEYS["right"])
+    page.keyboard.press("3")
+    wait_ready(page, 1)
+    page.keyboard.press(KEYS["left"])
+    page.keyboard.press("Enter")
+    wait_ready(page, 2)
+    page.keyboard.press(KEYS["equal"])
+    wait_ready(page, 3)
+    said = [(event.response, event.mattered) for event in invited.events()]
+    assert said == [("right", "force"), ("left", None), ("equal", None)]
+
+
 def test_both_clips_start_together_and_loop_together(invited: Invited, new_page: NewPage) -> None:
     page = new_page()
     page.goto(invited.link)

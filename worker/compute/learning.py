@@ -60,12 +60,14 @@ def fit_reward(
     seed: int,
     earlier: Sequence[bytes] = (),
     recorded_signals: Sequence[str] | None = None,
+    mattered: npt.NDArray[np.bool_] | None = None,
 ) -> tuple[bytes, dict[str, Any]]:
     """The stored reward model and its metrics.
 
     ``scale``: what the signals are like in the study's pool; ``earlier``: models of others for
     a pooled prior; ``recorded_signals``: what the signals are called when the clips were recorded elsewhere. Then there
     is no reference policy to normalise over, and what the person was shown takes its place.
+    ``mattered``: (N, S) the signals that made the difference, as far as the person said so.
     Raises ValueError for a kind there is not, and simulation.NoPredictor where the task's signals cannot be foreseen.
     """
     from worker.ml.rewards import reward_training
@@ -85,6 +87,7 @@ def fit_reward(
         signal_names=recorded_signals or () if simulated is None else simulated.signals,
         costs=NEVER_WANTED if simulated is None else (*NEVER_WANTED, *simulated.costs),
         predictor=signal_predictor(task) if kind == "predicted" else None,
+        mattered=mattered,
     )
     return fitted.model.to_bytes(), {**fitted.metrics, "pooled_from": len(earlier)}
 

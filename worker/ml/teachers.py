@@ -153,6 +153,11 @@ class ScriptedTeacher:
         return "right" if names_right else "left"
 
 
+def speaks_most(gains: FloatArray, qualities: Mapping[str, Sequence[int]]) -> str:
+    """The quality that speaks most for a segment: gains (S,) of it over the other by signal, columns by quality."""
+    return max(qualities, key=lambda name: float(gains[list(qualities[name])].sum()))
+
+
 def segment_returns(rewards: FloatArray, myopia: float = 1.0) -> FloatArray:
     """(..., T) -> (...): summed rewards, later steps counting more when myopia < 1."""
     returns: FloatArray = rewards @ myopia ** np.arange(rewards.shape[-1] - 1, -1, -1)

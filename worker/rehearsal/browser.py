@@ -20,7 +20,7 @@ from app.errors import AppError
 
 _LANGUAGE = re.compile(r"/p/language$")
 _AGAIN = "/p/next"
-_TAGS = re.compile(r"<(?:main|form|input|button|textarea)\b[^>]*>|</textarea>")
+_TAGS = re.compile(r"<(?:main|form|input|button|textarea|select)\b[^>]*>|</textarea>")
 """What is read of a page: our templates escape > in attributes, and the parser takes longer than the server."""
 
 
@@ -39,6 +39,8 @@ class Asked(Enum):
     """One button."""
 
 
+MATTERED = "mattered"
+"""The field of what made the difference between two clips."""
 OVER = ("finished", "ended")
 """Pages, by the name they give themselves, after which there is nothing to do: the end, and being sent back before."""
 WAITING = ("waiting", "self-setting-waiting", "evaluation-waiting")
@@ -70,6 +72,9 @@ class Visitor(Protocol):
 
     def answer(self, query_id: int) -> str:
         """Which of two clips: an answer's name."""
+
+    def name_quality(self, query_id: int, answer: str) -> str:
+        """What made the difference between them; empty: nothing in particular."""
 
     def set_robot(self) -> Mapping[str, int]:
         """The place of every slider, by axis."""
@@ -196,7 +201,9 @@ def _filled_in(visitor: Visitor, asked: Asked, says: tuple[str, ...], form: Form
     words = {name: each for name, each in form.questions.items() if name == "reason"}
     match asked:
         case Asked.PAIR:
-            return {"response": visitor.answer(int(says[0]))}
+            said = visitor.answer(int(says[0]))
+            mattered = visitor.name_quality(int(says[0]), said) if MATTERED in form.questions else ""
+            return {"response": said, MATTERED: mattered}
         case Asked.SLIDERS:
             return {"goes_on": "true", **{f"axis-{axis}": str(stop) for axis, stop in visitor.set_robot().items()}}
         case Asked.RATING:
@@ -230,7 +237,7 @@ class _Page(HTMLParser):
         self.name = named.get("data-page", self.name)
         if tag == "form" and named.get("method", "").lower() == "post":
             self.forms.append(Form(named.get("action", "")))
-        elif tag in ("input", "button", "textarea") and self.forms and named.get("name"):
+        elif tag in ("input", "button", "textarea", "select") and self.forms and named.get("name"):
             self._field(tag, named["name"], named)
 
     def _field(self, tag: str, name: str, named: dict[str, str]) -> None:
@@ -238,7 +245,9 @@ class _Page(HTMLParser):
         if tag == "input" and kind == "radio":
             choices = form.questions.get(name, Offered("choice")).choices
             form.questions[name] = Offered("choice", [*choices, value] if value else choices)
+        elif tag == "select":
+            form.questions[name] = Offered("choice")
         elif tag == "textarea" or (tag == "input" and kind == "text"):
             form.questions[name] = Offered("number" if named.get("inputmode") == "decimal" else "text")
-        if tag != "textarea" and (kind != "radio" or "checked" in named):
+        if tag in ("input", "button") and (kind != "radio" or "checked" in named):
             form.fields.setdefault(name, named.get("value", "on"))

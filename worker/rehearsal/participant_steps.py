@@ -21,6 +21,7 @@ from app.domain.models import ModelKind
 from app.domain.preferences import Purpose, Query, Response
 from app.domain.protocol import MADE_FOR_YOU
 from app.domain.studies import Study
+from app.installed_tasks import qualities
 from app.questionnaires import library
 from app.services.evaluation import self_setting
 from app.storage import ArtefactStore
@@ -34,9 +35,9 @@ from worker.jobs.runtime import records
 from worker.ml.rewards.loading import load_reward_model
 from worker.ml.rewards.reward_models import RewardModel
 from worker.ml.scripted_ratings import RatingManner, ScriptedRater
-from worker.ml.teachers import Manner, ScriptedTeacher, Taste, segment_returns
+from worker.ml.teachers import Manner, ScriptedTeacher, Taste, segment_returns, speaks_most
 from worker.rehearsal.browser import Offered
-from worker.sim.costs import preference_rewards
+from worker.sim.costs import preference_rewards, signal_weights
 from worker.tasks import registry
 
 CALIBRATION_PAIRS = 200
@@ -99,6 +100,19 @@ class ScriptedPerson:
             if self._teacher is None:
                 self._teacher = self._calibrated(session)
         return self._teacher.answer(left, right, self._rng)
+
+    def name_quality(self, query_id: int, answer: str) -> str:
+        """What speaks most for the clip this user has chosen, by their true weights; nothing where they chose none."""
+        if answer not in (Response.LEFT, Response.RIGHT):
+            return ""
+        with self._database.reading() as session:
+            query = session.get_one(Query, query_id, options=dataset.CLIPS_AND_ROLLOUTS)
+            pair = dataset.segment_pairs(self._store, [(query.left_clip, query.right_clip)])
+        weights = signal_weights(self._task, self._taste.omega, self._taste.per_signal)
+        gains = weights * pair.signal_differences()[0] * (1.0 if answer == Response.RIGHT else -1.0)
+        named = qualities.of_task(self._task.name)
+        columns = {name: [self._task.signals.index(each) for each in named[name]] for name in named}
+        return speaks_most(gains, columns)
 
     def rate(self, trial_id: int) -> tuple[int, int]:
         """Satisfaction and personalisation; ``rated`` keeps which method it really was."""

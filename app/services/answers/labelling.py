@@ -14,6 +14,7 @@ from sqlalchemy.orm import Session
 from app.domain.preferences import LabelEvent, Query, Response, SkipReason
 from app.domain.studies import Participant
 from app.errors import AppError
+from app.installed_tasks import qualities
 from app.services.answers import next_query
 
 
@@ -33,6 +34,12 @@ class AnswerMisdirected(AppError):
     """This answer was already given to another pair. Please reload the page and answer again."""
 
     status = HTTPStatus.CONFLICT
+
+
+class QualityUnknown(AppError):
+    """This study does not ask about that. Please reload the page and answer again."""
+
+    status = HTTPStatus.UNPROCESSABLE_ENTITY
 
 
 class UndoTooLate(AppError):
@@ -68,13 +75,18 @@ def record_label(
     client_uuid: UUID,
     watching: Watching,
     reason: SkipReason | None = None,
+    mattered: str | None = None,
 ) -> None:
     """Store one answer, unless this repeats or contradicts an earlier one, which then goes on counting.
 
-    ``reason``: why somebody could not tell; kept with that answer only.
+    ``reason``: why somebody could not tell; ``mattered``: what made the difference between the clips, where the study
+    asks. Each is kept with the answers it belongs to only.
 
-    Raises QueryNotFound (missing, or put to someone else), QueryNotShown and AnswerMisdirected.
+    Raises QueryNotFound (missing, or put to someone else), QueryNotShown, AnswerMisdirected and QualityUnknown.
     """
+    study = participant.study
+    if mattered is not None and mattered not in qualities.of_task(study.task):
+        raise QualityUnknown
     asked = _asked(session, participant, query_id, client_uuid)
     if asked.sent_to is not None:
         return
@@ -82,7 +94,10 @@ def record_label(
         raise QueryNotShown
     if asked.response is None:
         reason = reason if response is Response.SKIP else None
-        _append(session, asked, client_uuid, {"response": response, "reason": reason, **vars(watching)})
+        chosen = response in {Response.LEFT, Response.RIGHT}
+        mattered = mattered if chosen and study.settings.asks_what_mattered else None
+        said = {"response": response, "reason": reason, "mattered": mattered}
+        _append(session, asked, client_uuid, {**said, **vars(watching)})
 
 
 def undo_label(session: Session, participant: Participant, query_id: int, client_uuid: UUID) -> None:

@@ -51,6 +51,7 @@ _PATTERNS: Mapping[tuple[str, str], str] = {
     ("study", "task"): r"[a-z][a-z0-9_]{0,39}",  # names a folder of the worker
     ("study", "key_secret"): r"[0-9a-f]{64}",
     ("run", "workflow_id"): r"[ -~]+",
+    ("label_event", "mattered"): r"[a-z][a-z0-9_]{0,39}",
     ("participant", "arm"): r"[a-z][a-z0-9_]{0,39}",
     ("assignment", "letter"): r"[A-E]",
     ("trial", "letter"): r"[A-E]",

@@ -186,6 +186,7 @@ def labels(session: Session, study: Study, window: Window = EVERYTHING) -> Keyed
                     event.response,
                     event.id not in newest,
                     event.reason,
+                    event.mattered,
                     event.response_time_ms,
                     event.replay_count,
                     event.scrub_count,

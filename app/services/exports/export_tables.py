@@ -167,6 +167,7 @@ TABLES: Sequence[Table] = (
             ),
             Column("superseded", B, "Whether a later answer or undo of this pair counts instead."),
             Column("reason", T, "Why they could not tell (skip).", allowed=_words(SkipReason)),
+            Column("mattered", T, "What they said made the difference; empty: nothing, or nobody asked."),
             Column("response_time_ms", I, "From the first frame of both videos to the answer.", "ms"),
             Column("replay_count", I, "How often the clips were started again."),
             Column("scrub_count", I, "How often somebody moved through the clips by hand."),

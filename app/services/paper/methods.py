@@ -130,6 +130,10 @@ def _procedure(study: Study) -> Iterator[str]:
         f"On top of these came {listed(on_top)}." if on_top else "",
         f"Breaks were offered every {settings.break_every} answers." if settings.break_every else "",
         "Answers opened after both clips had been played once." if settings.answer_after_first_play else "",
+        "After each answer for one side participants could name what had made the difference, or pass this over; the "
+        "reward model heard the answer once more, about the quality that was named alone."
+        if settings.asks_what_mattered and study.material is None
+        else "",
     )
     chosen = settings.strategy.label.lower()
     yield paragraph(

@@ -164,6 +164,9 @@ def _sampling(session: Session, study: Study, settings: StudySettings) -> Mappin
             f"Each participant is asked {settings.question_count} pairs: {settings.labels_per_participant} that the "
             f"model learns from ({settings.introduction_count} of whole trajectories), {settings.repeated_pairs} asked "
             f"again and {settings.catch_pairs} catch pairs; {settings.practice_pairs} practice pairs come before.",
+            "After each answer for one side they can name what made the difference, or pass this over."
+            if settings.asks_what_mattered and study.material is None
+            else "",
             f"So far: {flow.consented} consented, {flow.completed} completed." if flow.consented else "",
         ),
         "Sample size": quota,

@@ -24,6 +24,7 @@ from app.web.error_pages import wants_json
 from app.web.http.authorized_route import AuthorizedRoute
 from app.web.http.deps import AnsweringParticipant, RowId, Studio
 from app.web.participant.pages import go, participant_page
+from app.web.texts import quality_words
 from app.web.texts.languages import wording_of
 from app.web.texts.wording import Wording
 
@@ -42,6 +43,7 @@ class LabelForm(BaseModel):
     response: preferences.Response
     client_uuid: UUID
     reason: Annotated[SkipReason | None, _Missing] = None
+    mattered: Annotated[str | None, _Missing, Field(max_length=40)] = None
     response_time_ms: _Milliseconds = None
     replay_count: _Count = None
     play_error_count: _Count = None
@@ -102,6 +104,9 @@ def show_turn(request: Request, session: Session, studio: Studio, participant: P
     if turn.query is not None:
         context |= {"pair": _pair(request, turn.query), "client_uuid": uuid4(), "reasons": list(SkipReason)}
         context |= {"responses": set(preferences.Response), "next_path": None, "given": None}
+        if participant.study.settings.asks_what_mattered and not state["practising"]:
+            wording = wording_of(request, participant)
+            context["qualities"] = quality_words.words_of(wording, participant.study.task)
     return participant_page(request, f"participant/{_template(turn)}.html", participant, context)
 
 
@@ -110,9 +115,10 @@ async def label_query(request: Request, query_id: RowId, answering: AnsweringPar
     """Record the answer; the transaction is committed before this response leaves."""
 
     def label(session: Session, participant: Participant, form: LabelForm) -> Response:
-        measured = form.model_dump(exclude={"response", "client_uuid", "reason"})
+        measured = form.model_dump(exclude={"response", "client_uuid", "reason", "mattered"})
         watching = labelling.Watching(**measured, by_script=wants_json(request))
-        labelling.record_label(session, participant, query_id, form.response, form.client_uuid, watching, form.reason)
+        said = form.response, form.client_uuid, watching, form.reason, form.mattered
+        labelling.record_label(session, participant, query_id, *said)
         admission.settle(session, participant, Stage.PAIRS)
         return _go_on(request, session, answering.studio, participant)
 

@@ -13,6 +13,7 @@ from app.domain.studies import Participant
 from app.storage import ArtefactStore
 from tests.worker.conftest import STEPS, make_trajectory
 from worker.domain.responses import TARGETS
+from worker.domain.trajectory import SIGNALS
 from worker.jobs.learning import dataset
 
 AddClips = Callable[..., list[Clip]]
@@ -46,6 +47,24 @@ def test_left_and_right_keep_their_places_and_cant_tell_is_left_out(
     np.testing.assert_array_equal(preferences.pairs.signals[0, 0], make_trajectory(7, 1).signals)
     np.testing.assert_array_equal(preferences.pairs.signals[0, 1], make_trajectory(7, 0).signals)
     assert preferences.pairs.actions.shape == (2, 2, STEPS, 7)
+
+
+def test_what_mattered_names_its_signals_and_is_part_of_the_fingerprint(
+    database: Database, store: ArtefactStore, participant: Participant, add_clips: AddClips, answer: Answer
+) -> None:
+    first, second, third, _ = add_clips(7)
+    answer(first, second, Response.EQUAL)
+    query = answer(first, third, Response.LEFT)
+    with database.reading() as session:
+        before = dataset.load_preferences(session, store, participant.id)
+    with database.writing() as session:
+        session.scalars(select(LabelEvent).where(LabelEvent.query_id == query.id)).one().mattered = "speed"
+    with database.reading() as session:
+        after = dataset.load_preferences(session, store, participant.id)
+    named = [[SIGNALS[column] for column in np.flatnonzero(row)] for row in after.mattered]
+    assert named == [[], ["speed_m_s", "speed_squared_m2_s2"]]
+    assert not before.mattered.any()
+    assert before.label_hash != after.label_hash
 
 
 def test_only_cant_tell_means_nothing_to_learn_from(

@@ -101,6 +101,28 @@ def test_slips_on_easy_pairs_do_not_outweigh_careful_answers(labelled: tuple[Seg
     assert careless > careful - 0.02
 
 
+def test_what_somebody_says_mattered_is_believed_of_that_alone() -> None:
+    """Slow clips are also gentle ones: only what is named tells which of the two is minded."""
+    rng = np.random.default_rng(6)
+    speed, force = SIGNALS.index("speed_m_s"), SIGNALS.index("force_away_n")
+    shown = invented.pairs(60, rng)
+    shown.signals[..., force] = shown.signals[..., speed]
+    named = np.zeros((60, len(SIGNALS)), bool)
+    named[:, speed] = True
+    answers = invented.answers_of(shown, DISLIKES_SPEED)
+    weights = [fit(shown, answers, "structured", 0, mattered=mattered).metrics["weights"] for mattered in (None, named)]
+    unnamed, heard = ((each["speed_m_s"]["mean"], each["force_away_n"]["mean"]) for each in weights)
+    assert unnamed[0] == pytest.approx(unnamed[1])
+    assert heard[0] < unnamed[0]
+    assert heard[1] > unnamed[1]
+
+
+def test_naming_nothing_changes_nothing(labelled: tuple[SegmentPairs, np.ndarray]) -> None:
+    nothing = np.zeros((100, len(SIGNALS)), bool)
+    said, unsaid = (fit(*labelled, "structured", 3, mattered=mattered) for mattered in (nothing, None))
+    assert said.model.to_bytes() == unsaid.model.to_bytes()
+
+
 def test_weights_stay_finite_when_a_few_answers_can_be_explained_perfectly() -> None:
     shown = invented.pairs(12, np.random.default_rng(4))
     model = fit(shown, invented.answers_of(shown, 1e3 * DISLIKES_SPEED), "structured", 0).model

@@ -8,6 +8,7 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 from sqlalchemy import select
 from sqlalchemy.orm import Session, contains_eager, joinedload
 
@@ -16,6 +17,7 @@ from app.domain.preferences import Label, Query, count_labels, current_labels
 from app.domain.studies import Participant, Study
 from app.errors import AppError
 from app.files.interface import Files
+from app.installed_tasks import qualities
 from app.storage import ArtefactStore
 from worker.domain.responses import TARGETS
 from worker.domain.trajectory import OutdatedTrajectory, Recorded, Recording, Trajectory
@@ -47,6 +49,8 @@ class Preferences:
     """None while nothing with a target has been said."""
     targets: Float32Array
     """(N,) in {0, 1/2, 1}"""
+    mattered: npt.NDArray[np.bool_]
+    """(N, S) which signals made the difference, as far as somebody said so"""
     label_count: int
     """How many labels were given, those without a target and those that were excluded included."""
     label_hash: str
@@ -56,6 +60,7 @@ def label_hash(labels: Sequence[Label]) -> str:
     """A fingerprint of who was shown what and said what: the same labels give the same hash on any machine."""
     lines = [
         f"{each.query.ordinal} {each.query.left_clip.video_sha256} {each.query.right_clip.video_sha256} {each.response}"
+        + (f" {each.event.mattered}" if each.event.mattered else "")
         for each in labels
     ]
     return hashlib.sha256("\n".join(lines).encode()).hexdigest()
@@ -71,14 +76,22 @@ def load_preferences(session: Session, store: ArtefactStore, participant_id: int
     given = count_labels(session, select(Participant.id).where(Participant.id == participant_id))
     labels = labels_with_clips(session, participant_id)
     said = [(label, target) for label in labels if (target := TARGETS[label.response]) is not None]
+    study = session.get_one(Study, session.get_one(Participant, participant_id).study_id)
     return Preferences(
         pairs=segment_pairs(store, [(each.query.left_clip, each.query.right_clip) for each, _ in said])
         if said
         else None,
         targets=np.array([target for _, target in said], np.float32),
+        mattered=named_signals(study, [label.event.mattered for label, _ in said]),
         label_count=given.get(participant_id, 0),
         label_hash=label_hash(labels),
     )
+
+
+def named_signals(study: Study, said: Sequence[str | None]) -> npt.NDArray[np.bool_]:
+    """(N, S) the signals that each named quality is about; none where nothing was said."""
+    known, groups = list(signal_names(study)), qualities.of_task(study.task)
+    return np.array([np.isin(known, groups.get(name or "", ())) for name in said], bool).reshape(len(said), len(known))
 
 
 def segment_pairs(store: ArtefactStore, pairs: Sequence[tuple[Clip, Clip]]) -> SegmentPairs:

@@ -54,6 +54,7 @@ def fit(
     signal_names: Sequence[str] = SIGNALS,
     costs: Sequence[str] = NEVER_WANTED,
     predictor: SignalPredictor | None = None,
+    mattered: npt.ArrayLike | None = None,
 ) -> FitResult:
     """Fit an ensemble to N pairs and their targets P(right preferred) in {0, 1/2, 1}.
 
@@ -64,6 +65,8 @@ def fit(
     ``signal_names``: what the columns of the pairs' signals are called.
     ``costs``: the signals of which nobody wants more.
     ``predictor``: of the signals, which the kind "predicted" needs.
+    ``mattered``: (N, S) bool, the signals that somebody named as what made the difference, for the kinds that are
+    linear in signals. The answer is then heard once more, about these signals alone.
     Raises ValueError for targets outside {0, 1/2, 1}, a count that differs from the pairs', or a missing predictor.
     """
     started = time.perf_counter()
@@ -72,14 +75,15 @@ def fit(
     known = prior or Prior.standard(len(signal_names))
     model: RewardModel
     if kind == "structured":
-        model, found = _fit_structured(pairs, answers, seed, scale or SignalScale.of(pairs), known, signal_names, costs)
+        spread = scale or SignalScale.of(pairs)
+        model, found = _fit_structured(pairs, answers, seed, spread, known, signal_names, costs, mattered)
     elif kind == "predicted":
         if predictor is None:
             raise ValueError("The kind 'predicted' needs a predictor of the signals.")
         foreseen = predictor.completed(pairs.signals, pairs.observations, pairs.actions).astype(np.float32)
         completed = replace(pairs, signals=foreseen)
         wider = _wider(scale or SignalScale.of(completed), completed)
-        linear, found = _fit_structured(completed, answers, seed, wider, known, signal_names, costs)
+        linear, found = _fit_structured(completed, answers, seed, wider, known, signal_names, costs, mattered)
         model = PredictedReward.with_predictor(linear, predictor)
     elif kind == "mlp":
         model, found = fit_mlp(pairs, answers, seed, mlp or MlpTraining())
@@ -136,10 +140,12 @@ def _fit_structured(
     prior: Prior,
     signal_names: Sequence[str],
     never_wanted: Sequence[str],
+    mattered: npt.ArrayLike | None,
 ) -> tuple[StructuredReward, dict[str, Any]]:
     features = pairs.signal_differences() / scale.spread
+    named = np.zeros(features.shape, bool) if mattered is None else np.asarray(mattered, bool)
     costs = [column for column, name in enumerate(signal_names) if name in never_wanted]
-    mean, covariance = posterior(features, answers, prior, costs)
+    mean, covariance = posterior(*_heard(features, answers, named), prior, costs)
     members = _antithetic(mean, covariance, np.random.default_rng(seed)) / scale.spread
     deviation = 1.96 * np.sqrt(np.diag(covariance))
     weights = {
@@ -149,18 +155,32 @@ def _fit_structured(
     return StructuredReward(members, least_per_step=scale.least_per_step, most_per_step=scale.most_per_step), {
         "weights": weights,
         "weights_unit": "log odds per standard deviation of a pair",
-        "held_out": _held_out(features, answers, seed, prior, costs),
+        "held_out": _held_out(features, answers, named, seed, prior, costs),
     }
 
 
-def _held_out(features: FloatArray, answers: FloatArray, seed: int, prior: Prior, costs: Sequence[int]) -> HeldOut:
+def _heard(features: FloatArray, answers: FloatArray, named: npt.NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
+    """The answers, and once more those of which somebody said what mattered: as if only that had differed."""
+    said = named.any(axis=1)
+    return np.concatenate([features, (features * named)[said]]), np.concatenate([answers, answers[said]])
+
+
+def _held_out(
+    features: FloatArray,
+    answers: FloatArray,
+    named: npt.NDArray[np.bool_],
+    seed: int,
+    prior: Prior,
+    costs: Sequence[int],
+) -> HeldOut:
     """Log odds of every pair under members fitted without its fold."""
     rng = np.random.default_rng(seed)
     fold = rng.permutation(len(answers)) % CALIBRATION_FOLDS
     logits = np.zeros((MEMBERS, len(answers)))
     for each in range(min(CALIBRATION_FOLDS, len(answers))):
         inside = fold == each
-        mean, covariance = posterior(features[~inside], answers[~inside], prior, costs)
+        heard = _heard(features[~inside], answers[~inside], named[~inside])
+        mean, covariance = posterior(*heard, prior, costs)
         logits[:, inside] = _antithetic(mean, covariance, rng) @ features[inside].T
     return HeldOut(logits, answers, allows_for_lapses=True)
 

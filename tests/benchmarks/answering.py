@@ -1,0 +1,296 @@
+"""Scripted users who answer pairs of a pool as large as a study's, done in several variants, and what each gains."""
+
+import argparse
+import csv
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from scipy import stats
+from tqdm import tqdm
+
+from app.domain.study_settings import StudySettings
+from app.installed_tasks import catalogue, qualities
+from tests.benchmarks.chosen_modes import stake
+from worker.analysis.comparison import result_pages
+from worker.compute import simulation
+from worker.domain.responses import TARGETS
+from worker.domain.type_aliases import Float32Array, FloatArray
+from worker.experiments.benchmark_cell import CHOOSE_EVERY
+from worker.jobs.learning import following
+from worker.ml import acquisition
+from worker.ml.filters.response_surface import ResponseSurface, best_mode
+from worker.ml.rewards import reward_training
+from worker.ml.rewards.segments import SegmentPairs
+from worker.ml.rewards.signal_scale import SignalScale
+from worker.ml.teachers import TASTES, Manner, ScriptedTeacher, Taste, random_taste, speaks_most
+from worker.sim.costs import preference_rewards, signal_weights
+from worker.sim.rollout import rollout
+from worker.tasks import registry
+
+USUAL = StudySettings()
+POOL_FIRST = 10_700_000
+COUNTS = (25, 50, 100)
+PEOPLE = ("neutral", "cautious", "impatient", "slow", "wide", *(f"person-{number}" for number in range(4)))
+MEASURED = ("gain_percent", "best_percent", "success_points")
+"""best_percent: what the mode of the user's true weights would gain"""
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Variant:
+    """What is done otherwise while somebody answers."""
+
+    following_share: float = 0.0
+    """of the pairs, from the tenth answer on"""
+    names: float | None = None
+    """How often the quality that speaks most for the chosen clip is what is named; else any is. None: nobody asks."""
+
+
+@dataclass(frozen=True)
+class Chain:
+    """One user answering one pair after the other."""
+
+    task: str
+    user: str
+    seed: int
+    variant: str
+    """what is done otherwise"""
+
+
+@dataclass(frozen=True)
+class Pool:
+    """C clips of T steps."""
+
+    signals: Float32Array
+    """(C, T, S)"""
+    observations: Float32Array
+    actions: Float32Array
+    costs: Float32Array
+    means: FloatArray
+    """(C, S) signals of the whole episodes"""
+    modes: FloatArray
+    """(C, A); nan: something else than the mode was different, too"""
+    scenarios: acquisition.Indices
+
+
+class Bench:
+    """The pool of one task, and what its users answer."""
+
+    def __init__(self, name: str, directory: Path, variants: Mapping[str, Variant]) -> None:
+        self.task, self.variants, self.qualities = registry.task(name), variants, qualities.of_task(name)
+        self.surface = ResponseSurface.load(simulation.surface_file(name), self.task.modes)
+        self.pool = _pool(name, directory)
+        self.pairs = acquisition.matched_pairs(self.pool.scenarios)
+        self.scale = SignalScale.of(self.segments(self.pairs), self.pool.means)
+
+    def segments(self, rows: acquisition.Indices) -> SegmentPairs:
+        """The pairs of clips in (N, 2) rows."""
+        return SegmentPairs(self.pool.signals[rows], self.pool.observations[rows], self.pool.actions[rows])
+
+    def measure(self, chain: Chain) -> Iterator[Row]:
+        """Answer, fit, choose, and so on."""
+        variant, taste, rng = self.variants[chain.variant], _taste(chain.user), np.random.default_rng([chain.seed, 7])
+        saying = np.random.default_rng([chain.seed, 11])
+        rewards = preference_rewards(
+            self.task, self.pool.costs, self.pool.signals, taste.omega, "calibrated", taste.per_signal
+        )[self.pairs]
+        teacher = ScriptedTeacher.calibrated(Manner(), rewards)
+        rows, answers, model = np.zeros(0, np.int64), np.zeros(0), None
+        named = np.zeros((0, len(self.task.signals)), bool)
+        for count in sorted({*COUNTS, *range(CHOOSE_EVERY, COUNTS[-1], CHOOSE_EVERY)}):
+            added = self._choose(chain, variant.following_share, count - len(rows), rows, model, rng)
+            said = [TARGETS[teacher.answer(left, right, rng)] for left, right in rewards[added]]
+            rows, answers = np.concatenate([rows, added]), np.concatenate([answers, said])
+            named = np.concatenate([named, self._named(variant, taste, added, said, saying)])
+            asked = self.segments(self.pairs[rows])
+            model = reward_training.fit(
+                asked, answers, "structured", chain.seed, scale=self.scale, mattered=named
+            ).model
+            if count in COUNTS:
+                mode = best_mode(self.surface, model.signal_weights(()), chain.seed)
+                yield {**vars(chain), "labels": count, **self._gained(chain.user, mode)}
+
+    def _named(
+        self,
+        variant: Variant,
+        taste: Taste,
+        rows: acquisition.Indices,
+        said: Sequence[float | None],
+        rng: np.random.Generator,
+    ) -> npt.NDArray[np.bool_]:
+        """(N, S) the signals that are said to have mattered."""
+        named = np.zeros((len(rows), len(self.task.signals)), bool)
+        if variant.names is None:
+            return named
+        weights = signal_weights(self.task, taste.omega, taste.per_signal)
+        offered = {name: [self.task.signals.index(each) for each in group] for name, group in self.qualities.items()}
+        differences = self.segments(self.pairs[rows]).signal_differences() * weights
+        for row, (difference, target) in enumerate(zip(differences, said, strict=True)):
+            says, which = rng.random(), int(rng.integers(len(offered)))  # always two draws
+            if target in (0.0, 1.0):
+                most = speaks_most(difference if target == 1.0 else -difference, offered)
+                named[row, offered[most if says < variant.names else [*offered][which]]] = True
+        return named
+
+    def _choose(
+        self,
+        chain: Chain,
+        following_share: float,
+        count: int,
+        used: acquisition.Indices,
+        model: Any,
+        rng: np.random.Generator,
+    ) -> acquisition.Indices:
+        free = np.setdiff1d(np.arange(len(self.pairs)), used)
+        if model is None:
+            return free[acquisition.choose(count, len(free), rng).indices]
+        near = None
+        if following_share and len(used) >= following.FROM_ANSWER:
+            wanted = best_mode(self.surface, model.signal_weights(()), chain.seed)
+            near = acquisition.nearness(self.pool.modes, self.pairs[free], wanted, self.surface.high - self.surface.low)
+        choice = acquisition.choose(
+            count,
+            len(free),
+            rng,
+            rule="entropy",
+            scores=acquisition.entropy(model.member_probabilities(self.segments(self.pairs[free]))),
+            following_scores=near,
+            following_share=following_share,
+        )
+        return free[choice.indices]
+
+    def _gained(self, user: str, mode: FloatArray) -> Row:
+        taste = _taste(user)
+        weights = signal_weights(self.task, taste.omega, taste.per_signal)
+        unit = stake(self.task, taste) / 100
+        change, success = self.surface.predict(mode)
+        best, _ = self.surface.predict(best_mode(self.surface, weights, 0))
+        gains = {"gain_percent": change @ weights / unit, "best_percent": best @ weights / unit}
+        return {name: float(each) for name, each in {**gains, "success_points": 100 * success}.items()}
+
+
+def _taste(user: str) -> Taste:
+    if user in TASTES:
+        return TASTES[user]
+    return random_taste(user, np.random.default_rng([int(user.removeprefix("person-")), 10]))
+
+
+def _pool(name: str, directory: Path) -> Pool:
+    path = directory / f"{name}.npz"
+    if not path.exists():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        unfinished = path.with_suffix(".partial.npz")
+        np.savez(unfinished, allow_pickle=False, **vars(_rolled(name)))
+        unfinished.rename(path)
+    with np.load(path, allow_pickle=False) as stored:
+        return Pool(**{part: stored[part] for part in stored.files})
+
+
+def _rolled(name: str) -> Pool:
+    scenarios = range(POOL_FIRST, POOL_FIRST + USUAL.pool_scenarios)
+    shown = [
+        (scenario, each)
+        for scenario in scenarios
+        for each in simulation.behaviours(name, scenario, USUAL.behaviours_per_scenario)
+    ]
+    made = [
+        rollout(simulation.environment(name), simulation.act_as(name, each), scenario)
+        for scenario, each in tqdm(shown, desc=f"{name} pool", unit="rollout", mininterval=5)
+    ]
+    steps, family = slice(registry.installed_task(name).description.usual_clip_steps), registry.task(name).modes
+    return Pool(
+        np.stack([each.signals[steps] for each in made]),
+        np.stack([each.observations[steps] for each in made]),
+        np.stack([each.actions[steps] for each in made]),
+        np.stack([each.costs[steps] for each in made]),
+        np.array([each.signals.mean(axis=0, dtype=np.float64) for each in made]),
+        np.array([following.mode_of(family, each.described()) for _, each in shown]),
+        np.array([scenario for scenario, _ in shown]),
+    )
+
+
+def parser(description: str | None, stem: str, seeds: int = 2) -> argparse.ArgumentParser:
+    """What such a benchmark can be told. ``stem``: of the files of its results."""
+    told = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    told.add_argument("--seeds", type=int, default=seeds)
+    told.add_argument("--pools", type=Path, default=Path("data/answering"), help="where rollouts are kept")
+    told.add_argument("--output", type=Path, default=Path("docs/results") / stem, help="stem of both files")
+    return told
+
+
+def run(options: argparse.Namespace, title: str, column: str, variants: Mapping[str, Variant]) -> None:
+    """Answer in every variant, the first of which the others are compared with. ``column``: what varies is called."""
+    torch.set_num_threads(1)
+    file, page = options.output.with_suffix(".csv"), options.output.with_suffix(".md")
+    # Seed by seed, so that whoever stops early has everybody.
+    planned = [
+        Chain(task, user, seed, variant)
+        for seed, task, user, variant in product(range(options.seeds), catalogue.names(), PEOPLE, variants)
+    ]
+    done, benches = _finished(file, column), dict[str, Bench]()
+    for chain in tqdm(planned, unit="chain", mininterval=5):
+        if chain not in done:
+            if chain.task not in benches:
+                benches[chain.task] = Bench(chain.task, options.pools, variants)
+            done[chain] = list(benches[chain.task].measure(chain))
+            _write(file, column, [row for each in planned for row in done.get(each, [])])
+    usual, *others = variants
+    found = [tables([row for each in planned for row in done[each]], usual, other, column) for other in others]
+    page.write_text(result_pages.page(page, title, "\n\n".join(found)))
+
+
+def _finished(file: Path, column: str) -> dict[Chain, list[Row]]:
+    found: defaultdict[Chain, list[Row]] = defaultdict(list)
+    for row in csv.DictReader(file.read_text().splitlines()) if file.exists() else []:
+        row["variant"] = row.pop(column)
+        found[Chain(row["task"], row["user"], int(row["seed"]), row["variant"])].append(row)
+    return {chain: rows for chain, rows in found.items() if len(rows) == len(COUNTS)}
+
+
+def _write(file: Path, column: str, rows: Sequence[Row]) -> None:
+    """Replace the file at once, so that an interruption leaves it whole."""
+    unfinished = file.with_suffix(".unfinished")
+    with unfinished.open("w", newline="") as stream:
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow(["task", "user", "seed", column, "labels", *MEASURED])
+        for row in rows:
+            measured = [f"{float(row[name]):.3f}" for name in MEASURED]
+            writer.writerow([row["task"], row["user"], row["seed"], row["variant"], row["labels"], *measured])
+    unfinished.replace(file)
+
+
+def tables(rows: Sequence[Row], usual: str, other: str, column: str) -> str:
+    """What was gained as usual and in another variant, and by how much more; intervals by Student's t over users."""
+    gains = {
+        (row["task"], row["user"], int(row["seed"]), row["variant"], int(row["labels"])): float(row["gain_percent"])
+        for row in rows
+    }
+    seeds = sorted({int(row["seed"]) for row in rows})
+    lines = [
+        f"| task | answers | gained with {column} {usual}, % | {other}, % | difference, points | seeds with more |",
+        "|---|---|---|---|---|---|",
+    ]
+    for tasks, count in product([*((each,) for each in catalogue.names()), catalogue.names()], COUNTS):
+        both = np.array(
+            [
+                [[gains[task, user, seed, variant, count] for variant in (usual, other)] for seed in seeds]
+                for task, user in product(tasks, PEOPLE)
+            ]
+        )
+        by_user = (both[..., 1] - both[..., 0]).mean(axis=1)
+        half = float(stats.t.ppf(0.975, len(by_user) - 1) * by_user.std(ddof=1) / np.sqrt(len(by_user)))
+        more, middle = both[..., 1] > both[..., 0], float(by_user.mean())
+        title = tasks[0].capitalize() if len(tasks) == 1 else "all"
+        before, after = both.mean(axis=(0, 1))
+        lines.append(
+            f"| {title} | {count} | {before:.1f} | {after:.1f} "
+            f"| {middle:+.1f} [{middle - half:+.1f}, {middle + half:+.1f}] | {more.sum()} of {more.size} |"
+        )
+    return "\n".join(lines)
