@@ -13,6 +13,7 @@ from sqlalchemy.orm import Session
 
 from app.db import Base, UtcDateTime, now
 from app.domain.people import AuditEvent
+from app.services import audit
 from app.storage import ArtefactStore
 from tests import stored_files
 
@@ -73,6 +74,8 @@ def made_once(
     before, files = counts(session, Base.metadata.sorted_tables), stored_files.names(store)
     made = make(session, store, *about, **more)
     session.flush()
+    if session.info.get(audit._PENDING):
+        audit._append(session)  # else it would be recorded at the end of the transaction, and not be copied
     after = counts(session, Base.metadata.sorted_tables)
     changed = [table for table, count in after.items() if count != before[table]]
     if not files and not any(before[table] for table in changed):
