@@ -7,10 +7,8 @@ import sqlite3
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from alembic import command
-from alembic.config import Config
-from alembic.script import ScriptDirectory
 from sqlalchemy import create_engine, inspect, text
 from sqlalchemy.exc import DatabaseError, OperationalError
 
@@ -21,6 +19,10 @@ from app.files.lost import ARTEFACTS
 from app.paths import MIGRATIONS
 from app.settings import Settings
 from app.storage import ArtefactStore
+
+if TYPE_CHECKING:
+    from alembic.config import Config
+    from alembic.script import ScriptDirectory
 
 log = logging.getLogger(__name__)
 
@@ -62,7 +64,7 @@ def upgrade(settings: Settings) -> None:
     settings.data_dir.mkdir(parents=True, exist_ok=True)
     require_whole(settings.data_dir)
     config = _config(settings)
-    newest = ScriptDirectory.from_config(config).get_current_head() or ""
+    newest = _scripts(config).get_current_head() or ""
     with _one_at_a_time(settings):
         present = _revision(settings, config)
         path = sqlite.file_of(settings.sqlalchemy_url)
@@ -74,6 +76,8 @@ def upgrade(settings: Settings) -> None:
             _copy(path, newest)
         elif present is not None:
             log.warning("the database is upgraded to revision %s; pg_dump makes copies of what it is", newest)
+        from alembic import command
+
         try:
             command.upgrade(config, "head")
         except DatabaseError as error:
@@ -88,7 +92,7 @@ def revisions(settings: Settings) -> tuple[str | None, str | None]:
     Raises NewerDatabase, DamagedDatabase and UnfinishedDatabase.
     """
     config = _config(settings)
-    return _revision(settings, config), ScriptDirectory.from_config(config).get_current_head()
+    return _revision(settings, config), _scripts(config).get_current_head()
 
 
 def require_known(settings: Settings, revision: str) -> None:
@@ -115,7 +119,9 @@ def _draft(path: Path) -> Path:
     return path.with_name(f"{path.name}.copying")
 
 
-def _config(settings: Settings) -> Config:
+def _config(settings: Settings) -> "Config":
+    from alembic.config import Config  # takes a quarter of a second to load, and most programs upgrade nothing
+
     config = Config()
     config.set_main_option("script_location", str(MIGRATIONS))
     config.set_main_option("sqlalchemy.url", settings.sqlalchemy_url.replace("%", "%%"))
@@ -139,7 +145,7 @@ def _one_at_a_time(settings: Settings) -> Iterator[None]:
         yield
 
 
-def _revision(settings: Settings, config: Config) -> str | None:
+def _revision(settings: Settings, config: "Config") -> str | None:
     """The schema's revision, None while there is none. Raises what an upgrade could not mend."""
     path = sqlite.file_of(settings.sqlalchemy_url)
     if path is not None and not path.exists():
@@ -165,8 +171,14 @@ def _revision(settings: Settings, config: Config) -> str | None:
     return found
 
 
-def _known(config: Config) -> set[str]:
-    return {script.revision for script in ScriptDirectory.from_config(config).walk_revisions()}
+def _known(config: "Config") -> set[str]:
+    return {script.revision for script in _scripts(config).walk_revisions()}
+
+
+def _scripts(config: "Config") -> "ScriptDirectory":
+    from alembic.script import ScriptDirectory
+
+    return ScriptDirectory.from_config(config)
 
 
 def _copy(path: Path, newest: str) -> None:

@@ -69,7 +69,7 @@ class Labeller(threading.Thread):
             try:
                 response = client.request(method, path, data=fields or None)
             except httpx2.TransportError:
-                threading.Event().wait(0.05)
+                threading.Event().wait(0.2)
                 continue
             if response.status_code < 400:
                 return response

@@ -16,6 +16,7 @@ from app.domain.studies import Participant
 from app.settings import Settings
 from app.storage import ArtefactStore
 from tests import factories
+from tests.made_once import made_once
 
 PEOPLE, ANSWERS = 3, 4
 
@@ -27,6 +28,11 @@ def mark_of(participant: Participant) -> str:
 
 def fill(session: Session, store: ArtefactStore, name: str = "Feeding at home") -> list[Participant]:
     """A study of people who have answered, filled in a form and got a model."""
+    ids = made_once(_fill, session, store, name)
+    return list(session.scalars(select(Participant).where(Participant.id.in_(ids)).order_by(Participant.id)))
+
+
+def _fill(session: Session, store: ArtefactStore, name: str) -> list[int]:
     study = factories.make_study(session, name)
     people = []
     for _ in range(PEOPLE):
@@ -37,7 +43,7 @@ def fill(session: Session, store: ArtefactStore, name: str = "Feeding at home") 
         session.add(FormAnswer(participant_id=participant.id, form="questionnaire", item="comments", value=text))
         model = factories.make_model(session, study, participant, ModelKind.REWARD, {})
         model.artefact_sha256 = store.put(f"model: {text}".encode())
-        people.append(participant)
+        people.append(participant.id)
     for rollout in session.scalars(select(Rollout)):
         rollout.trajectory_sha256 = store.put(f"trajectory {rollout.id}".encode())
     session.flush()

@@ -15,10 +15,9 @@ from urllib.request import urlopen
 
 from sqlalchemy import select
 
-from app.__main__ import migrate
 from app.db import Database
 from app.domain.clips import Clip, Rollout
-from app.domain.preferences import LabelEvent
+from app.domain.preferences import LabelEvent, Query
 from app.domain.studies import Study
 from app.main import create_app
 from app.services.backups import layout, making, restoring
@@ -27,6 +26,7 @@ from app.storage import ArtefactStore
 from tests import factories
 from tests.answering import Labeller, Server
 from tests.conftest import serving
+from tests.databases import make_tables
 from tests.waiting import PATIENCE_S, free_port
 
 PEOPLE = 4
@@ -58,8 +58,8 @@ class Drill:
         self._given = threading.Semaphore(0)
 
     def _fill(self, answers: int) -> list[str]:
-        migrate(self.settings)
         database, store = Database(self.settings.sqlalchemy_url), ArtefactStore.of(self.settings)
+        make_tables(database)
         tokens = []
         with database.writing() as session:
             study = factories.make_study(session, labels_per_participant=answers, pool_scenarios=500, break_every=0)
@@ -69,8 +69,17 @@ class Drill:
             for _ in range(PEOPLE):
                 participant, token = factories.make_participant(session, study)
                 tokens.append(token)
-                for number in range(answers):
-                    factories.make_query(session, participant, clips[number % POOL], clips[(number + 1) % POOL])
+                session.add_all(
+                    Query(
+                        participant_id=participant.id,
+                        ordinal=number + 1,
+                        left_clip_id=clips[number % POOL].id,
+                        right_clip_id=clips[(number + 1) % POOL].id,
+                        strategy="uniform",
+                        propensity=1.0,
+                    )
+                    for number in range(answers)
+                )
         database.dispose()
         return tokens
 

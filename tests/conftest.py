@@ -1,5 +1,6 @@
 """What the tests of the web half share: a studio in a temporary directory, with and without a real server."""
 
+import gc
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -35,6 +36,27 @@ from tests.databases import make_tables
 
 databases.share_compiled_statements()
 databases.leave_files_to_the_system()
+REAL_HASHER = accounts._hasher()
+
+
+def hash_passwords_quickly() -> None:
+    """In this process a password costs no quarter of a second, as it does in programs that tests start."""
+    quick = PasswordHasher(time_cost=1, memory_cost=8, parallelism=1)
+    patch = pytest.MonkeyPatch()
+    patch.setattr(accounts, "_hasher", lambda: quick)
+    patch.setattr(accounts, "_HASH_OF_NOTHING", quick.hash(uuid4().hex))
+
+
+hash_passwords_quickly()
+
+
+gc.disable()
+
+
+def pytest_collection_finish() -> None:
+    """What was collected stays to the end: looking for garbage in it took a tenth of the suite's time."""
+    gc.freeze()
+    gc.enable()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -144,8 +166,8 @@ def client(new_browser: Callable[[], TestClient]) -> TestClient:
 
 @pytest.fixture(scope="session")
 def password_hash() -> str:
-    """Hashing is slow on purpose, so the tests do it once."""
-    return PasswordHasher().hash(PASSWORD)
+    """Of everybody's password."""
+    return accounts._hasher().hash(PASSWORD)
 
 
 @pytest.fixture

@@ -31,7 +31,7 @@ from app.storage import ArtefactStore
 
 FPS = 10
 FRAMES = 20
-WIDTH, HEIGHT = 320, 240
+WIDTH, HEIGHT = 160, 120
 AXES = {"speed_far": [-0.5, 0.4], "press": [-0.4, 0.4], "hesitate": [0.0, 0.6]}
 """Of make_previews: the last one has one direction."""
 
@@ -353,7 +353,7 @@ def reward_metrics() -> dict[str, Any]:
     return {"prequential": {"correct": 15, "scored": 20}, "weights": weights, "trained_on": 20, "fit_seconds": 1.2}
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=1000)
 def moving_picture(number: int) -> tuple[bytes, bytes]:
     """A small H.264 video of a moving square and its poster; every number looks different."""
     frames = [_frame(number, step) for step in range(FRAMES)]
@@ -370,11 +370,12 @@ def moving_picture(number: int) -> tuple[bytes, bytes]:
 
 
 def _frame(number: int, step: int) -> "np.typing.NDArray[np.uint8]":
-    frame = np.full((HEIGHT, WIDTH, 3), (214, 206, 196), np.uint8)
-    frame[HEIGHT * 3 // 4 :] = (176, 160, 144)
-    at = 20 + (WIDTH - 80) * step // FRAMES
-    up = 60 + (number * 17) % 100
-    frame[up : up + 40, at : at + 40] = ((number * 67) % 200, (number * 31) % 160, 90)
+    frame = np.empty((HEIGHT, WIDTH, 3), np.uint8)
+    frame[:] = np.array((214, 206, 196), np.uint8)
+    frame[HEIGHT * 3 // 4 :] = np.array((176, 160, 144), np.uint8)
+    at = 10 + (WIDTH - 40) * step // FRAMES
+    up = 30 + (number * 17) % 50
+    frame[up : up + 20, at : at + 20] = np.array(((number * 67) % 200, (number * 31) % 160, 90), np.uint8)
     return frame
 
 

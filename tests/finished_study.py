@@ -21,6 +21,7 @@ from app.services.answers import form_answers
 from app.services.evaluation import donors, evaluation_plan, head_to_heads
 from app.storage import ArtefactStore
 from tests import factories
+from tests.made_once import made_once
 
 MEANS = {"reference": 2.6, "prefft": 3.0, "pbarl": 4.1}
 
@@ -29,6 +30,10 @@ def make_finished_study(
     session: Session, store: ArtefactStore, people: int = 8, labels: int = 12, *, unblinded: bool = True
 ) -> Study:
     """The study, with participants P01, P02, ..."""
+    return session.get_one(Study, made_once(_make, session, store, people, labels, unblinded))
+
+
+def _make(session: Session, store: ArtefactStore, people: int, labels: int, unblinded: bool) -> int:
     study = factories.make_study(
         session,
         "Feeding, finished",
@@ -47,7 +52,7 @@ def make_finished_study(
         _evaluate(session, study, person, random)
         _rate(session, study, person, random)
         donors.draw(session, study, person, EvaluatedMethod.SOMEBODY_ELSE, ("cautious",))
-    return study
+    return study.id
 
 
 def _answer(session: Session, person: Participant, clips: list[Clip], labels: int, random: Random) -> None:

@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any, ClassVar
 
 from authlib.integrations.flask_oauth2 import AuthorizationServer
@@ -173,10 +174,15 @@ def _application(provider: IdentityProvider) -> Flask:
     return application
 
 
+@cache
+def _first_key() -> RSAKey:
+    return RSAKey.generate_key(2048, {"kid": "first"})
+
+
 @contextmanager
 def running(redirect_uri: str) -> Iterator[IdentityProvider]:
     """Serves one on a free port."""
-    key = RSAKey.generate_key(2048, {"kid": "first"})
+    key = _first_key()
     user = {"sub": "4711", "email": "ada@example.org", "email_verified": True}
     provider = IdentityProvider("", Client(redirect_uri), user, key, key)
     server = make_server("127.0.0.1", 0, _application(provider))

@@ -158,7 +158,7 @@ TOOLS = {
     "alembic": "check",
     "pip": "show pbarl-studio",
     "pre-commit": "validate-config",
-    "pytest": "--collect-only -q tests/architecture/test_scenarios.py",
+    "pytest": "--collect-only -q --noconftest tests/architecture/test_scenarios.py",
 }
 """What shows that a tool does its work here."""
 

@@ -145,6 +145,7 @@ def test_where_nothing_helps_ways_are_named_docker_last(
     assert ways == sorted(ways)
 
 
+@pytest.mark.long
 def test_this_python_makes_an_environment(tmp_path: Path) -> None:
     done = environment(dict(os.environ), tmp_path, PYTHON=sys.executable)
     assert done.returncode == 0, done.stdout

@@ -11,6 +11,7 @@ from fastapi import FastAPI
 from fastapi.testclient import TestClient
 from httpx2 import Response as Answer
 from sqlalchemy import select
+from sqlalchemy.orm import Session
 
 from app.db import Database
 from app.domain.preferences import LabelEvent, Query
@@ -22,6 +23,7 @@ from app.storage import ArtefactStore
 from tests import databases, factories
 from tests.app.gate import Gate, make_gate
 from tests.databases import make_tables
+from tests.made_once import made_once
 
 JSON = {"Accept": "application/json"}
 
@@ -69,12 +71,21 @@ class TakingPart:
 def taking_part(database: Database, store: ArtefactStore, new_browser: Callable[[], TestClient]) -> TakingPart:
     """A participant who has read the instructions, opened the link, and has twelve queries waiting."""
     with database.writing() as session:
-        study = factories.make_study(session)
-        participant, token = factories.make_participant(session, study)
-        queries = factories.make_queries(session, store, participant, 12)
+        participant_id, token = made_once(_somebody_with_queries, session, store)
+        participant = session.get_one(Participant, participant_id)
+        study = session.get_one(Study, participant.study_id)
+        theirs = select(Query).where(Query.participant_id == participant_id).order_by(Query.ordinal)
+        queries = session.scalars(theirs).all()
     browser = new_browser()
     browser.get(f"/p/{token}")
     return TakingPart(browser, participant, token, study, queries, database)
+
+
+def _somebody_with_queries(session: Session, store: ArtefactStore) -> tuple[int, str]:
+    study = factories.make_study(session)
+    participant, token = factories.make_participant(session, study)
+    factories.make_queries(session, store, participant, 12)
+    return participant.id, token
 
 
 @pytest.fixture

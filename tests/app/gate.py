@@ -9,7 +9,7 @@ from fastapi import FastAPI
 from fastapi.routing import iter_route_contexts
 from fastapi.testclient import TestClient
 from httpx2 import Response as Answer
-from sqlalchemy import func, select
+from sqlalchemy.orm import Session
 
 from app.db import Base, Database
 from app.domain.people import AuditEvent, Experimenter, Role, StudyRole, TokenScope
@@ -18,6 +18,7 @@ from app.services.studies import membership
 from app.storage import ArtefactStore
 from tests import factories
 from tests.conftest import the_routes
+from tests.made_once import counts, made_once
 
 API = "/api/v1"
 NO_STUDY = "There is no such study"
@@ -180,13 +181,19 @@ class Gate:
         return browser.request(route.method, address, data=FORM)
 
     def rows(self) -> dict[str, int]:
-        """How many there are of each kind."""
+        """How many there are of each kind; the audit log is left out, which tells of wrong tokens."""
         with self.database.reading() as session:
-            return {
-                table.name: session.scalar(select(func.count()).select_from(table)) or 0
-                for table in Base.metadata.sorted_tables
-                if table.name != AuditEvent.__tablename__  # which tells of wrong tokens
-            }
+            counted = counts(session, Base.metadata.sorted_tables)
+        return {table.name: count for table, count in counted.items() if table.name != AuditEvent.__tablename__}
+
+
+@dataclass
+class Keys:
+    """What makes visitors those who they are, and the words that fill in addresses."""
+
+    cookies: dict[str, dict[str, str]]
+    tokens: dict[str, str]
+    values: dict[str, str]
 
 
 def make_gate(
@@ -194,53 +201,59 @@ def make_gate(
 ) -> Gate:
     """Two studies, one account of every kind, and a browser of each visitor that has what makes them one."""
     visitors = {name: new_browser() for name in EVERYBODY}
-    visitors[GUESSED].headers["authorization"] = f"Bearer {api_tokens.PREFIX}guessed"
-    visitors[FORGOTTEN].cookies.update({"studio_participant": "x" * 43, "studio_experimenter": "x" * 43})
     with database.writing() as session:
-        here, there = factories.make_study(session, "Here"), factories.make_study(session, "There")
-        person, token = factories.make_participant(session, here)
-        (query,) = factories.make_queries(session, store, person, 1)
-        clip = factories.make_clip(session, store, here)
-        stranger_here, _ = factories.make_participant(session, there)
-        for visitor, participant in ((THIS_PARTICIPANT, person), (OTHER_PARTICIPANT, stranger_here)):
-            cookie = browser_sessions.open_for_participant(session, participant, HOUR)
-            visitors[visitor].cookies["studio_participant"] = cookie
-        for visitor, role, study_role in (
-            (READER, Role.READER, StudyRole.VIEWER),
-            (VIEWER, Role.EXPERIMENTER, StudyRole.VIEWER),
-            (EDITOR, Role.EXPERIMENTER, StudyRole.EDITOR),
-            (OWNER, Role.EXPERIMENTER, StudyRole.OWNER),
-            (OTHER_OWNER, Role.EXPERIMENTER, None),
-            (ADMIN, Role.ADMINISTRATOR, None),
-        ):
-            account = Experimenter(name=visitor, role=role, password_hash="-", must_change_password=False)
-            session.add(account)
-            session.flush()
-            if study_role is not None:
-                membership.admit(session, here, visitor, study_role, "the test")
-            if visitor in (OWNER, OTHER_OWNER):
-                membership.admit(session, there, visitor, StudyRole.OWNER, "the test")
-            cookie = browser_sessions.open_for_experimenter(session, account, HOUR)
-            visitors[visitor].cookies["studio_experimenter"] = cookie
-            for name, scope, only in TOKENS_OF.get(visitor, ()):
-                _, text = api_tokens.create(session, account, name, scope=scope, study=there if only else None)
-                visitors[name].headers["authorization"] = f"Bearer {text}"
-        values = {
-            "slug": here.slug,
-            "code": person.code,
-            "query_id": str(query.id),
-            "sha256": clip.video_sha256,
-            "token": token,
-            "key": "k" * 20,
-            "letter": "A",
-            "kind": "csv",
-            "table": "labels",
-            "script": "analysis.py",
-            "name": "ratings",
-            "account_id": "2000",  # nobody: what is asked here is whether one may ask
-        }
+        keys = made_once(_make_keys, session, store)
+    for visitor, cookies in keys.cookies.items():
+        visitors[visitor].cookies.update(cookies)
+    for visitor, token in keys.tokens.items():
+        visitors[visitor].headers["authorization"] = f"Bearer {token}"
     studio_app.state.studio.closing.set()  # streams begin, and end at once
-    return Gate(visitors, values, database)
+    return Gate(visitors, keys.values, database)
+
+
+def _make_keys(session: Session, store: ArtefactStore) -> Keys:
+    cookies = {FORGOTTEN: {"studio_participant": "x" * 43, "studio_experimenter": "x" * 43}}
+    tokens = {GUESSED: f"{api_tokens.PREFIX}guessed"}
+    here, there = factories.make_study(session, "Here"), factories.make_study(session, "There")
+    person, token = factories.make_participant(session, here)
+    (query,) = factories.make_queries(session, store, person, 1)
+    clip = factories.make_clip(session, store, here)
+    stranger_here, _ = factories.make_participant(session, there)
+    for visitor, participant in ((THIS_PARTICIPANT, person), (OTHER_PARTICIPANT, stranger_here)):
+        cookies[visitor] = {"studio_participant": browser_sessions.open_for_participant(session, participant, HOUR)}
+    for visitor, role, study_role in (
+        (READER, Role.READER, StudyRole.VIEWER),
+        (VIEWER, Role.EXPERIMENTER, StudyRole.VIEWER),
+        (EDITOR, Role.EXPERIMENTER, StudyRole.EDITOR),
+        (OWNER, Role.EXPERIMENTER, StudyRole.OWNER),
+        (OTHER_OWNER, Role.EXPERIMENTER, None),
+        (ADMIN, Role.ADMINISTRATOR, None),
+    ):
+        account = Experimenter(name=visitor, role=role, password_hash="-", must_change_password=False)
+        session.add(account)
+        session.flush()
+        if study_role is not None:
+            membership.admit(session, here, visitor, study_role, "the test")
+        if visitor in (OWNER, OTHER_OWNER):
+            membership.admit(session, there, visitor, StudyRole.OWNER, "the test")
+        cookies[visitor] = {"studio_experimenter": browser_sessions.open_for_experimenter(session, account, HOUR)}
+        for name, scope, only in TOKENS_OF.get(visitor, ()):
+            _, tokens[name] = api_tokens.create(session, account, name, scope=scope, study=there if only else None)
+    values = {
+        "slug": here.slug,
+        "code": person.code,
+        "query_id": str(query.id),
+        "sha256": clip.video_sha256,
+        "token": token,
+        "key": "k" * 20,
+        "letter": "A",
+        "kind": "csv",
+        "table": "labels",
+        "script": "analysis.py",
+        "name": "ratings",
+        "account_id": "2000",  # nobody: what is asked here is whether one may ask
+    }
+    return Keys(cookies, tokens, values)
 
 
 TOKENS_OF = {

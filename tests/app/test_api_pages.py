@@ -47,7 +47,7 @@ def study(database: Database, store: ArtefactStore) -> Study:
 
 
 @pytest.fixture
-def get(client: TestClient, database: Database, password: str) -> Get:
+def get(client: TestClient, database: Database, password: str, study: Study) -> Get:
     """Asks the API with a token of the only account."""
     with database.writing() as session:
         token = api_tokens.create(session, session.scalars(select(Experimenter)).one(), "a notebook")[1]

@@ -9,7 +9,7 @@ import pytest
 from fastapi.testclient import TestClient
 from sqlalchemy import select
 
-from app.__main__ import _first_start, main, migrate
+from app.__main__ import _first_start, main
 from app.db import Database
 from app.domain.clips import Clip
 from app.domain.studies import Participant, Study, usual_clip_steps
@@ -17,6 +17,7 @@ from app.installed_tasks import catalogue
 from app.services.archives import demo_archive
 from app.settings import Settings
 from app.storage import ArtefactStore
+from tests.databases import make_tables
 
 MOST_BYTES = 6_000_000
 """Everybody who clones the repository loads every version of it."""
@@ -114,8 +115,8 @@ def test_the_table_of_participants_says_who_plays_them(
 def first_start(tmp_path: Path) -> Iterator[Callable[[], str]]:
     """Greets as at a start of the studio in one directory."""
     settings = Settings(_env_file=None, data_dir=tmp_path / "data", public_url=None)
-    migrate(settings)
     database = Database(settings.sqlalchemy_url)
+    make_tables(database)
 
     def greet() -> str:
         with database.writing() as session:

@@ -1,7 +1,6 @@
 """Whether the studio says truly that it can do its work."""
 
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -10,35 +9,24 @@ from fastapi.testclient import TestClient
 from sqlalchemy import event, text
 from sqlalchemy.exc import OperationalError
 
-from app import __main__ as commands
 from app.db import Database, complaints
-from app.main import create_app
 from app.services.monitoring import health
 from app.settings import Settings
 from tests import databases
 from tests.app.conftest import TakingPart
 
 
-@pytest.fixture
-def browser(settings: Settings) -> Iterator[TestClient]:
-    """At a studio whose database was made as ``python -m app up`` does."""
-    commands.migrate(settings)
-    application = create_app(settings)
-    yield TestClient(application)
-    application.state.studio.database.dispose()
-
-
-def database_of(browser: TestClient) -> Database:
-    database: Database = browser.app.state.studio.database  # type: ignore[attr-defined]
+def database_of(client: TestClient) -> Database:
+    database: Database = client.app.state.studio.database  # type: ignore[attr-defined]
     return database
 
 
-def test_all_is_well_on_a_fresh_database(browser: TestClient) -> None:
-    answer = browser.get("/health")
+def test_all_is_well_on_a_fresh_database(client: TestClient) -> None:
+    answer = client.get("/health")
     assert (answer.status_code, answer.text) == (200, "ok")
 
 
-def test_a_database_that_cannot_be_written_is_not_well(browser: TestClient, settings: Settings) -> None:
+def test_a_database_that_cannot_be_written_is_not_well(client: TestClient, settings: Settings) -> None:
     address = f"sqlite:///file:{settings.data_dir}/studio.sqlite3?mode=ro&uri=true"
     if databases.SERVER is not None:
         address = f"{settings.sqlalchemy_url}&options=-cdefault_transaction_read_only%3Don"
@@ -48,11 +36,11 @@ def test_a_database_that_cannot_be_written_is_not_well(browser: TestClient, sett
 
 
 def test_a_database_that_somebody_keeps_locked_is_not_well(
-    browser: TestClient, settings: Settings, monkeypatch: pytest.MonkeyPatch
+    client: TestClient, settings: Settings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("app.db.BUSY_TIMEOUT_S", 0.1)
     impatient = Database(settings.sqlalchemy_url)
-    with database_of(browser).writing() as session:
+    with database_of(client).writing() as session:
         session.execute(text("UPDATE alembic_version SET version_num = version_num"))
         assert health.complaint(impatient, settings.data_dir) == health.NOT_WRITABLE
     assert health.complaint(impatient, settings.data_dir) is None
@@ -60,40 +48,40 @@ def test_a_database_that_somebody_keeps_locked_is_not_well(
 
 
 @pytest.mark.parametrize("change", ["DELETE FROM alembic_version", "DROP TABLE alembic_version"])
-def test_another_schema_is_not_well(browser: TestClient, change: str) -> None:
-    with database_of(browser).writing() as session:
+def test_another_schema_is_not_well(client: TestClient, change: str) -> None:
+    with database_of(client).writing() as session:
         session.execute(text(change))
-    answer = browser.get("/health")
+    answer = client.get("/health")
     assert answer.status_code == 503
     assert "python -m app migrate" in answer.text
 
 
 def test_a_nearly_full_disk_is_not_well_but_the_server_lives(
-    browser: TestClient, monkeypatch: pytest.MonkeyPatch
+    client: TestClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(shutil, "disk_usage", lambda _path: SimpleNamespace(free=health.LEAST_FREE_BYTES - 1))
-    answer = browser.get("/health")
+    answer = client.get("/health")
     assert (answer.status_code, answer.text) == (503, health.DISK_FULL)
-    assert browser.get("/health/live").status_code == 200
+    assert client.get("/health/live").status_code == 200
 
 
-def test_a_missing_data_directory_is_not_well(browser: TestClient, tmp_path: Path) -> None:
-    assert health.complaint(database_of(browser), tmp_path / "gone") == health.NOT_WRITABLE
+def test_a_missing_data_directory_is_not_well(client: TestClient, tmp_path: Path) -> None:
+    assert health.complaint(database_of(client), tmp_path / "gone") == health.NOT_WRITABLE
 
 
-def test_strangers_learn_no_path_and_no_version(browser: TestClient, settings: Settings) -> None:
-    with database_of(browser).writing() as session:
+def test_strangers_learn_no_path_and_no_version(client: TestClient, settings: Settings) -> None:
+    with database_of(client).writing() as session:
         session.execute(text("UPDATE alembic_version SET version_num = '9999'"))
-    said = browser.get("/health").text
+    said = client.get("/health").text
     assert str(settings.data_dir) not in said
     assert "9999" not in said
 
 
-def test_however_many_ask_the_database_is_written_once(browser: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_however_many_ask_the_database_is_written_once(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("app.web.http.readiness.KNOWN_FOR_S", 3600.0)
     commits: list[object] = []
-    event.listen(database_of(browser).writer, "commit", commits.append)
-    assert [browser.get("/health").status_code for _ in range(50)] == [200] * 50
+    event.listen(database_of(client).writer, "commit", commits.append)
+    assert [client.get("/health").status_code for _ in range(50)] == [200] * 50
     assert len(commits) == 1
 
 

@@ -297,7 +297,7 @@ def test_a_manifest_with_something_else_in_it_is_refused(
 def _with(packed: Path, name: str, size: int, compression: int = zipfile.ZIP_DEFLATED) -> Path:
     """The archive with one member that unpacks to so many noughts."""
     target = packed.with_name("swollen.zip")
-    with zipfile.ZipFile(packed) as source, zipfile.ZipFile(target, "w", compression) as copy:
+    with zipfile.ZipFile(packed) as source, zipfile.ZipFile(target, "w", compression, compresslevel=1) as copy:
         for each in source.namelist():
             if each != name:
                 copy.writestr(each, source.read(each))
@@ -331,7 +331,7 @@ def _peak(act: Callable[[], Any]) -> int:
 def test_noughts_by_the_hundred_megabytes_fill_no_memory(
     database: Database, store: ArtefactStore, packed: Path, name: str, compression: int
 ) -> None:
-    size = 300 * MEGABYTE if compression == zipfile.ZIP_DEFLATED else 80 * MEGABYTE
+    size = 200 * MEGABYTE if compression == zipfile.ZIP_DEFLATED else 50 * MEGABYTE
     path = _with(packed, name, size, compression)
     assert compression == zipfile.ZIP_STORED or path.stat().st_size < 5 * MEGABYTE
     _refused_within_memory(database, store, path)
@@ -341,8 +341,11 @@ def test_a_list_of_contents_that_is_far_too_long_is_not_read(
     database: Database, store: ArtefactStore, tmp_path: Path
 ) -> None:
     with zipfile.ZipFile(tmp_path / "long.zip", "w") as archive_of_names:
+        archive_of_names.writestr("files/first", b"")
         for number in range(120_000):
-            archive_of_names.writestr(f"files/{number:064}", b"")
+            again = zipfile.ZipInfo(f"files/{number:064}")
+            again.header_offset = again.CRC = 0
+            archive_of_names.filelist.append(again)
     _refused_within_memory(database, store, tmp_path / "long.zip")
 
 

@@ -8,18 +8,18 @@ from pathlib import Path
 import pytest
 from sqlalchemy import select
 
-from app.__main__ import migrate
 from app.db import Database
 from app.domain.preferences import LabelEvent
 from app.settings import Settings
 from app.storage import ArtefactStore
 from tests import factories
 from tests.answering import Labeller, Server
+from tests.databases import make_tables
 from tests.waiting import PATIENCE_S, free_port
 
 PEOPLE = 4
-LABELS = 40
-KILL_AFTER = 50
+LABELS = 25
+KILL_AFTER = 30
 
 
 @pytest.fixture
@@ -29,8 +29,8 @@ def settings(tmp_path: Path) -> Settings:
 
 @pytest.fixture
 def database(settings: Settings) -> Iterator[Database]:
-    migrate(settings)
     database = Database(settings.sqlalchemy_url)
+    make_tables(database)
     yield database
     database.dispose()
 

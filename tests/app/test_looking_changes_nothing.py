@@ -10,6 +10,7 @@ from fastapi import FastAPI
 from fastapi.routing import iter_route_contexts
 from fastapi.testclient import TestClient
 from sqlalchemy import select
+from sqlalchemy.orm import Session
 
 from app.db import Base, Database, now
 from app.domain.models import Export, ModelKind
@@ -24,6 +25,7 @@ from app.services.evaluation import head_to_heads
 from app.services.participants import recruitment_panel
 from app.storage import ArtefactStore
 from tests import factories
+from tests.made_once import made_once
 
 WHO_LOOKED = {"audit_event", "browser_session"}
 """Tables that remember who looked, and in which browser they may look on."""
@@ -89,58 +91,64 @@ class Place:
 @pytest.fixture
 def place(studio_app: FastAPI, database: Database, store: ArtefactStore, password: str) -> Place:
     with database.writing() as session:
-        settings = EvaluationSettings(methods=("reference", "pbarl"), head_to_heads=1, instruments=("tia",))
-        study = factories.make_study(session, evaluation=settings, instruments=("tia",), panel_parameter="")
-        person, person_token = factories.make_participant(session, study)
-        factories.make_queries(session, store, person, 4)
-        model = factories.make_model(session, study, person, ModelKind.FILTER, factories.filter_metrics())
-        factories.make_bundle(session, store, model)
-        rater, rater_token = factories.make_participant(session, study)
-        factories.answer_everything(session, store, study, rater)
-        trial = factories.make_robots(session, store, study, rater)[0]
-        factories.make_controller(session, store, rater, "pbarl")
-        chooser, chooser_token = factories.make_participant(session, study)
-        factories.answer_everything(session, store, study, chooser)
-        factories.rate_everything(session, factories.make_robots(session, store, study, chooser))
-        given = {item.name: "3" for item in library.every()["tia"].items}
-        for letter in "AB":
-            form_answers.append(session, chooser, "tia", given, letter)
-        head_to_head = head_to_heads.of_participant(session, chooser.id)[0]
-        file = store.put(b"PK an export")
-        export = Export(
-            study_id=study.id,
-            kind="data",
-            requested_by="pat",
-            finished_at=now(),
-            artefact_sha256=file,
-            byte_count=12,
-        )
-        session.add(export)
-        session.flush()
-        query = session.scalars(select(Query).where(Query.participant_id == person.id)).first()
-        assert query is not None
-        session.refresh(query, ["left_clip"])
-        words = {
-            "slug": study.slug,
-            "code": person.code,
-            "version": "1",
-            "letter": "A",
-            "instrument": "tia",
-            "export_id": str(export.id),
-            "trial_id": str(trial.id),
-            "head_to_head_id": str(head_to_head.id),
-            "query_id": str(query.id),
-            "sha256": query.left_clip.video_sha256,
-            "table": "labels",
-            "script": "analysis.py",
-            "name": "ratings",
-            "key": "x" * 20,
-            "number": "1",
-        }
-        join_token = recruitment_panel.open_joining(session, study, "pat")
-        token = api_tokens.create(session, session.scalars(select(Experimenter)).one(), "a notebook")[1]
-    addresses = list(_addresses(studio_app, words, join_token, person_token))
-    return Place(addresses, database, f"/p/{person_token}", f"/p/{rater_token}", f"/p/{chooser_token}", token)
+        words, join_token, person, rater, chooser, api_token = made_once(_make_place, session, store)
+    addresses = list(_addresses(studio_app, words, join_token, person))
+    return Place(addresses, database, f"/p/{person}", f"/p/{rater}", f"/p/{chooser}", api_token)
+
+
+def _make_place(session: Session, store: ArtefactStore) -> tuple[dict[str, str], str, str, str, str, str]:
+    """Words that fill in addresses, then tokens: to join, of the person, the rater and the chooser, and of the API."""
+    settings = EvaluationSettings(methods=("reference", "pbarl"), head_to_heads=1, instruments=("tia",))
+    study = factories.make_study(session, evaluation=settings, instruments=("tia",), panel_parameter="")
+    person, person_token = factories.make_participant(session, study)
+    factories.make_queries(session, store, person, 4)
+    model = factories.make_model(session, study, person, ModelKind.FILTER, factories.filter_metrics())
+    factories.make_bundle(session, store, model)
+    rater, rater_token = factories.make_participant(session, study)
+    factories.answer_everything(session, store, study, rater)
+    trial = factories.make_robots(session, store, study, rater)[0]
+    factories.make_controller(session, store, rater, "pbarl")
+    chooser, chooser_token = factories.make_participant(session, study)
+    factories.answer_everything(session, store, study, chooser)
+    factories.rate_everything(session, factories.make_robots(session, store, study, chooser))
+    given = {item.name: "3" for item in library.every()["tia"].items}
+    for letter in "AB":
+        form_answers.append(session, chooser, "tia", given, letter)
+    head_to_head = head_to_heads.of_participant(session, chooser.id)[0]
+    file = store.put(b"PK an export")
+    export = Export(
+        study_id=study.id,
+        kind="data",
+        requested_by="pat",
+        finished_at=now(),
+        artefact_sha256=file,
+        byte_count=12,
+    )
+    session.add(export)
+    session.flush()
+    query = session.scalars(select(Query).where(Query.participant_id == person.id)).first()
+    assert query is not None
+    session.refresh(query, ["left_clip"])
+    words = {
+        "slug": study.slug,
+        "code": person.code,
+        "version": "1",
+        "letter": "A",
+        "instrument": "tia",
+        "export_id": str(export.id),
+        "trial_id": str(trial.id),
+        "head_to_head_id": str(head_to_head.id),
+        "query_id": str(query.id),
+        "sha256": query.left_clip.video_sha256,
+        "table": "labels",
+        "script": "analysis.py",
+        "name": "ratings",
+        "key": "x" * 20,
+        "number": "1",
+    }
+    join_token = recruitment_panel.open_joining(session, study, "pat")
+    token = api_tokens.create(session, session.scalars(select(Experimenter)).one(), "a notebook")[1]
+    return words, join_token, person_token, rater_token, chooser_token, token
 
 
 def _addresses(application: FastAPI, words: dict[str, str], join_token: str, person_token: str) -> Iterator[str]:

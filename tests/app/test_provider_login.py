@@ -2,7 +2,7 @@
 
 import re
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import httpx2
@@ -14,12 +14,11 @@ from sqlalchemy import select
 
 from app.db import Database, now
 from app.domain.people import AuditEvent, Experimenter, Role
-from app.main import create_app
+from app.main import make_studio, serve
 from app.services.accounts import accounts
 from app.settings import Settings
 from tests import identity_provider
 from tests.conftest import PASSWORD
-from tests.databases import make_tables
 from tests.identity_provider import CLIENT, SECRET, IdentityProvider
 
 BACK = "http://studio.example/login/provider/back"
@@ -43,15 +42,23 @@ def settings(settings: Settings, provider: IdentityProvider) -> Settings:
     )
 
 
-def studio(settings: Settings, **changed: Any) -> FastAPI:
-    application = create_app(settings.model_copy(update=changed))
-    make_tables(application.state.studio.database)
-    return application
+@pytest.fixture
+def browser(client: TestClient) -> TestClient:
+    return client
 
 
 @pytest.fixture
-def browser(settings: Settings, database: Database) -> TestClient:
-    return TestClient(studio(settings), follow_redirects=False)
+def change(studio_app: FastAPI, database: Database, settings: Settings) -> Iterator[Callable[..., None]]:
+    """From now on, the server is one with other settings."""
+    studios = []
+
+    def serve_another(**changed: Any) -> None:
+        studios.append(make_studio(settings.model_copy(update=changed)))
+        serve(studio_app, studios[-1])
+
+    yield serve_another
+    for studio in studios:
+        studio.database.dispose()
 
 
 def make_account(database: Database, name: str, password_hash: str | None = None, **columns: Any) -> None:
@@ -125,15 +132,15 @@ def test_an_address_that_is_not_verified_leads_to_no_account(
 
 
 def test_nobody_unknown_is_let_in_unless_the_installation_says_so(
-    settings: Settings, browser: TestClient, database: Database
+    browser: TestClient, database: Database, change: Callable[..., None]
 ) -> None:
     assert there_and_back(browser).status_code == 403
-    generous = TestClient(studio(settings, oidc_new_accounts="reader"), follow_redirects=False)
-    assert there_and_back(generous).status_code == 303
+    change(oidc_new_accounts="reader")
+    assert there_and_back(browser).status_code == 303
     with database.reading() as session:
         account = session.scalars(select(Experimenter)).one()
         assert (account.name, account.role) == ("ada@example.org", "reader")
-    assert generous.get("/accounts").status_code == 403
+    assert browser.get("/accounts").status_code == 403
 
 
 def test_a_disabled_account_stays_shut_out(browser: TestClient, database: Database) -> None:
@@ -162,11 +169,13 @@ def test_a_code_of_ones_own_is_still_asked_for(browser: TestClient, database: Da
     assert browser.get("/studies").status_code == 303
 
 
-def test_where_a_second_factor_is_required_the_providers_is_enough(settings: Settings, database: Database) -> None:
-    strict = TestClient(studio(settings, require_second_factor=True), follow_redirects=False)
+def test_where_a_second_factor_is_required_the_providers_is_enough(
+    browser: TestClient, database: Database, change: Callable[..., None]
+) -> None:
+    change(require_second_factor=True)
     make_account(database, "ada@example.org")
-    there_and_back(strict)
-    assert strict.get("/studies").status_code == 200
+    there_and_back(browser)
+    assert browser.get("/studies").status_code == 200
 
 
 BENT: dict[str, dict[str, Any]] = {
@@ -212,12 +221,12 @@ def test_a_new_key_of_the_provider_is_fetched(
 
 
 def test_a_login_ends_in_the_browser_in_which_it_began_and_once(
-    settings: Settings, browser: TestClient, database: Database
+    browser: TestClient, database: Database, new_browser: Callable[[], TestClient]
 ) -> None:
     make_account(database, "ada@example.org")
     back = httpx2.get(browser.get("/login/provider").headers["location"]).headers["location"]
     address = back.removeprefix("http://studio.example")
-    victim = TestClient(browser.app, follow_redirects=False)
+    victim = new_browser()
     assert victim.get(address).status_code == 401
     victim.get("/login/provider")
     assert victim.get(address).status_code == 401, "with a login of its own that has begun"
@@ -242,30 +251,31 @@ def test_a_refusal_of_the_provider_leads_back_to_the_form(browser: TestClient) -
 
 
 def test_a_provider_that_does_not_answer_is_told_and_passwords_still_work(
-    settings: Settings, database: Database, password: str
+    browser: TestClient, password: str, change: Callable[..., None]
 ) -> None:
-    away = TestClient(studio(settings, oidc_issuer="http://127.0.0.1:9"), follow_redirects=False)
-    answer = away.get("/login/provider")
+    change(oidc_issuer="http://127.0.0.1:9")
+    answer = browser.get("/login/provider")
     assert (answer.status_code, "does not answer as it should" in answer.text) == (502, True)
     login = {"name": "experimenter", "password": password}
-    assert away.post("/login", data=login).status_code == 303
+    assert browser.post("/login", data=login).status_code == 303
 
 
-def test_a_provider_that_calls_itself_otherwise_is_not_used(settings: Settings, provider: IdentityProvider) -> None:
-    other = TestClient(studio(settings, oidc_issuer=f"{provider.issuer}/"), follow_redirects=False)
-    assert other.get("/login/provider").status_code == 502
+def test_a_provider_that_calls_itself_otherwise_is_not_used(
+    browser: TestClient, provider: IdentityProvider, change: Callable[..., None]
+) -> None:
+    change(oidc_issuer=f"{provider.issuer}/")
+    assert browser.get("/login/provider").status_code == 502
 
 
-def test_the_form_offers_it_where_there_is_one(browser: TestClient, client: TestClient) -> None:
+def test_the_form_offers_it_where_there_is_one(browser: TestClient) -> None:
     assert re.search(r'href="/login/provider"', browser.get("/login").text)
-    assert "/login/provider" in browser.get("/login").text
 
 
-def test_without_a_provider_nothing_of_it_is_there(settings: Settings, database: Database) -> None:
-    plain = TestClient(studio(settings, oidc_issuer=None), follow_redirects=False)
-    assert "/login/provider" not in plain.get("/login").text
-    assert plain.get("/login/provider").status_code == 404
-    assert plain.get("/login/provider/back").status_code == 404
+def test_without_a_provider_nothing_of_it_is_there(browser: TestClient, change: Callable[..., None]) -> None:
+    change(oidc_issuer=None)
+    assert "/login/provider" not in browser.get("/login").text
+    assert browser.get("/login/provider").status_code == 404
+    assert browser.get("/login/provider/back").status_code == 404
 
 
 @pytest.mark.parametrize(

@@ -13,15 +13,18 @@ import pytest
 from fastapi.testclient import TestClient
 from httpx2 import Response as Answer
 from sqlalchemy import select
+from sqlalchemy.orm import Session
 
 from app.db import Database, now
 from app.domain.evaluation import Rating, Trial
 from app.domain.models import ModelKind, RunKind, RunStatus
 from app.domain.protocol import EvaluatedMethod, EvaluationMode, EvaluationSettings
 from app.domain.studies import Participant, Study
+from app.services.evaluation import evaluation_plan
 from app.storage import ArtefactStore
 from tests import factories
 from tests.app.conftest import JSON
+from tests.made_once import made_once
 from tests.waiting import PATIENCE_S
 
 METHODS = (EvaluatedMethod.REFERENCE, EvaluatedMethod.PREFFT, EvaluatedMethod.PBARL)
@@ -63,15 +66,24 @@ def begin(
 
     def start(*, robots: bool = True, **settings: Any) -> AtTheRobots:
         with database.writing() as session:
-            study = factories.make_study(session, evaluation=EvaluationSettings(methods=METHODS, **settings))
-            participant, token = factories.make_participant(session, study)
-            factories.answer_everything(session, store, study, participant)
-            trials = factories.make_robots(session, store, study, participant) if robots else []
+            made, token = made_once(_before_the_robots, session, store, robots, **settings)
+            participant = session.get_one(Participant, made)
+            study = session.get_one(Study, participant.study_id)
+            trials = evaluation_plan.trials_of(session, participant.id)
         browser = new_browser()
         browser.get(f"/p/{token}")
         return AtTheRobots(browser, participant, token, study, trials, database)
 
     return start
+
+
+def _before_the_robots(session: Session, store: ArtefactStore, /, robots: bool, **settings: Any) -> tuple[int, str]:
+    study = factories.make_study(session, evaluation=EvaluationSettings(methods=METHODS, **settings))
+    participant, token = factories.make_participant(session, study)
+    factories.answer_everything(session, store, study, participant)
+    if robots:
+        factories.make_robots(session, store, study, participant)
+    return participant.id, token
 
 
 @pytest.fixture

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 from sqlalchemy import select
+from sqlalchemy.orm import Session
 
 from app.db import Database, now
 from app.domain.evaluation import DonorDraw
@@ -23,6 +24,7 @@ from app.services.studies import locking
 from app.storage import ArtefactStore
 from tests import factories
 from tests.finished_study import make_finished_study
+from tests.made_once import made_once
 from worker.analysis.study.report import make_report
 from worker.analysis.study.statistics import MEASURED_ERROR_PERCENT
 from worker.jobs.publishing import report_files
@@ -37,17 +39,21 @@ def finished(database: Database, store: ArtefactStore, monkeypatch: pytest.Monke
 
     def make(people: int = 3, *, unblinded: bool = True, locked: bool = False) -> Study:
         with database.writing() as session:
-            study = make_finished_study(session, store, people, labels=4, unblinded=unblinded)
-            if locked:
-                locking.lock(session, study, study.slug, "Ada")
-                study.locked_at = now() - timedelta(days=1)
-            contents, _ = make_report(report_files.tables_of(session, study))
-            run = factories.make_run(session, study, kind="report")
-            figures: dict[str, Any] = {"ratings": {"svg": store.put(b"<svg/>"), "png": store.put(b"png")}}
-            session.add(Report(study_id=study.id, run_id=run.id, basis="", contents=contents, figures=figures))
-        return study
+            return session.get_one(Study, made_once(_with_report, session, store, people, unblinded, locked))
 
     return make
+
+
+def _with_report(session: Session, store: ArtefactStore, people: int, unblinded: bool, locked: bool) -> int:
+    study = make_finished_study(session, store, people, labels=4, unblinded=unblinded)
+    if locked:
+        locking.lock(session, study, study.slug, "Ada")
+        study.locked_at = now() - timedelta(days=1)
+    contents, _ = make_report(report_files.tables_of(session, study))
+    run = factories.make_run(session, study, kind="report")
+    figures: dict[str, Any] = {"ratings": {"svg": store.put(b"<svg/>"), "png": store.put(b"png")}}
+    session.add(Report(study_id=study.id, run_id=run.id, basis="", contents=contents, figures=figures))
+    return study.id
 
 
 def results(browser: TestClient, study: Study) -> str:

@@ -16,8 +16,8 @@ from app.web.http.session_queue import READERS
 from tests import factories
 from tests.waiting import PATIENCE_S
 
-LONG_REASON = "Because. " * 4000
-PEOPLE = 300
+LONG_REASON = "Because. " * 20_000
+PEOPLE = 60
 """With the reason in every row that makes ten megabytes, far more than what connections hold."""
 
 

@@ -1,5 +1,7 @@
 """Results, exports and the API's documentation in a browser: for everybody, at every size, from this origin only."""
 
+from typing import Any
+
 import pytest
 from playwright.sync_api import Page, expect
 from sqlalchemy import select
@@ -29,9 +31,15 @@ def study(database: Database, store: ArtefactStore) -> Study:
         return make_finished_study(session, store, people=5, labels=8)
 
 
+MADE: list[tuple[dict[str, Any], dict[str, dict[str, bytes]]]] = []
+"""The report of such a study, which is the same in every test."""
+
+
 def report(database: Database, store: ArtefactStore, study: Study) -> None:
     with database.writing() as session:
-        contents, files = make_report(report_files.tables_of(session, study))
+        if not MADE:
+            MADE.append(make_report(report_files.tables_of(session, study)))
+        (contents, files), *_ = MADE
         stored = {name: {kind: store.put(file) for kind, file in each.items()} for name, each in files.items()}
         run = factories.make_run(session, study, kind="report")
         session.add(Report(study_id=study.id, run_id=run.id, basis="", contents=contents, figures=stored))

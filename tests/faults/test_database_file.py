@@ -20,6 +20,7 @@ from app.storage import ArtefactStore
 from app.upgrading import DatabaseLost
 from tests import factories
 from tests.app.conftest import TakingPart
+from tests.databases import make_tables
 
 pytestmark = pytest.mark.sqlite("about its files")
 
@@ -91,8 +92,8 @@ def test_pages_on_a_damaged_database_say_so_and_acknowledge_nothing(
 @pytest.fixture
 def crashed(settings: Settings, tmp_path: Path) -> Iterator[Settings]:
     """A copy of a studio as a power cut left it: answers 1 to 5 in the file, 6 to 10 only in its log."""
-    migrate(settings)
     database, store = Database(settings.sqlalchemy_url), ArtefactStore.of(settings)
+    make_tables(database)
     with database.writing() as session:
         study = factories.make_study(session)
         participant, _ = factories.make_participant(session, study)

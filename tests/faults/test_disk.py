@@ -11,7 +11,6 @@ import httpx2
 import pytest
 from sqlalchemy import select, text
 
-from app.__main__ import migrate
 from app.db import Database
 from app.domain.preferences import LabelEvent
 from app.settings import Settings
@@ -19,6 +18,7 @@ from app.storage import ArtefactStore
 from tests import databases, factories
 from tests.answering import Server
 from tests.app.conftest import TakingPart
+from tests.databases import make_tables
 from tests.waiting import PATIENCE_S, free_port, until
 
 pytestmark = pytest.mark.sqlite("about a disk on which SQLite's file lies")
@@ -46,8 +46,8 @@ def settings_there(disk: Path) -> Settings:
 @pytest.fixture
 def token(settings_there: Settings) -> str:
     """The link of somebody in a study on that disk."""
-    migrate(settings_there)
     database, store = Database(settings_there.sqlalchemy_url), ArtefactStore.of(settings_there)
+    make_tables(database)
     with database.writing() as session:
         study = factories.make_study(session, labels_per_participant=LABELS, pool_scenarios=20)
         participant, token = factories.make_participant(session, study)

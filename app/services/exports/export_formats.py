@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from enum import StrEnum
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
@@ -114,6 +115,7 @@ def provenance_of(session: Session, study: Study, exported_at: datetime | None =
     )
 
 
+@cache
 def software_version() -> str:
     """The installed version of this project."""
     try:

@@ -4,8 +4,6 @@ import shutil
 from functools import cache
 from pathlib import Path
 
-from alembic.config import Config
-from alembic.script import ScriptDirectory
 from sqlalchemy import text
 from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 
@@ -40,6 +38,9 @@ def complaint(database: Database, data_dir: Path) -> str | None:
 @cache
 def newest_revision() -> str | None:
     """Of the schema this version was written for."""
+    from alembic.config import Config  # takes a quarter of a second to load
+    from alembic.script import ScriptDirectory
+
     config = Config()
     config.set_main_option("script_location", str(MIGRATIONS))
     return ScriptDirectory.from_config(config).get_current_head()

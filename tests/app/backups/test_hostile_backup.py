@@ -12,7 +12,6 @@ from typing import Any
 
 import pytest
 
-from app.__main__ import migrate
 from app.db import Database
 from app.errors import AppError
 from app.services.backups import layout, making, restoring
@@ -20,6 +19,7 @@ from app.services.backups.layout import BackupRefused
 from app.settings import Settings
 from app.storage import ArtefactStore
 from tests import backed_up
+from tests.databases import make_tables
 
 Spoil = Callable[[Path], None]
 SPOILED: list[Spoil] = []
@@ -29,8 +29,8 @@ SPOILED: list[Spoil] = []
 def pristine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """A sound backup."""
     settings = Settings(_env_file=None, data_dir=tmp_path_factory.mktemp("data"), database_url=None)
-    migrate(settings)
     database = Database(settings.sqlalchemy_url)
+    make_tables(database)
     with database.writing() as session:
         backed_up.fill(session, ArtefactStore.of(settings))
     (settings.data_dir / "some.key").write_bytes(b"key")
