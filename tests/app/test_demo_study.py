@@ -193,4 +193,4 @@ def test_a_demo_study_has_one_participant_whose_link_is_printed(
 def test_a_task_that_does_not_exist_is_refused_with_the_ones_that_do(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         main(["demo", "--task", "dressing"])
-    assert "'feeding', 'drinking', 'scratching'" in capsys.readouterr().err
+    assert "feeding, drinking, scratching" in capsys.readouterr().err
