@@ -83,6 +83,7 @@ def test_what_was_added_since_is_read_alone(
     assert len(reader.table("labels")) == len(before) + 1
 
 
+@pytest.mark.slow  # beside other tests: what makes whole tables gives way to all else
 def test_a_whole_table_is_the_same_from_one_file_and_is_fetched_again_only_when_it_has_changed(
     reader: Client, database: Database, study: Study
 ) -> None:

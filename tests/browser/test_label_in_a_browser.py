@@ -10,7 +10,7 @@ from app.storage import ArtefactStore
 from tests import factories, stored_files
 from tests.browser.conftest import Invited, NewPage, serious_findings, the_only, wait_ready
 
-pytestmark = pytest.mark.browser
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
 KEYS = {"left": "ArrowLeft", "right": "ArrowRight", "equal": "ArrowDown", "skip": "s"}
 

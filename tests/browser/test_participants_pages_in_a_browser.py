@@ -12,7 +12,7 @@ from app.storage import ArtefactStore
 from tests import factories
 from tests.browser.conftest import Invited, NewPage, serious_findings, wait_ready
 
-pytestmark = pytest.mark.browser
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
 SMALL = {"width": 320, "height": 568}
 ON_ITS_SIDE = {"width": 568, "height": 320}

@@ -31,10 +31,9 @@ from worker.jobs.runtime.context import Step, WorkerContext
 from worker.jobs.runtime.records import Job, as_arguments, from_arguments
 from worker.jobs.workflows import JobRunner
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.sqlite("about the engine's own file")]
 
 Damage = Callable[[Path], None]
-pytestmark = pytest.mark.sqlite("about the engine's own file")
 
 
 class Work:
