@@ -277,6 +277,27 @@ class PlannedTest(Choice):
     )
     WELCH_T = "welch_t", "Welch t", "Between arms: one number per person, spreads may differ."
     PERMUTATION = "permutation", "Permutation", "Between arms, without assuming a normal distribution."
+    CUMULATIVE_LINK_BETWEEN = (
+        "cumulative_link_between",
+        "Cumulative link model between arms",
+        "Takes ratings as an order and not as distances; counts people, and spreads may differ.",
+    )
+    EQUIVALENCE_BETWEEN = (
+        "equivalence_between",
+        "Equivalence between arms",
+        "Two one-sided Welch tests: shows that two arms differ by less than what matters.",
+    )
+
+
+BETWEEN_ARMS = frozenset(
+    {
+        PlannedTest.WELCH_T,
+        PlannedTest.PERMUTATION,
+        PlannedTest.CUMULATIVE_LINK_BETWEEN,
+        PlannedTest.EQUIVALENCE_BETWEEN,
+    }
+)
+"""Tests of people who met one method with people who met the other."""
 
 
 CONSENT_FACTS = ("duration", "payment", "ethics", "contact")

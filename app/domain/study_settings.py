@@ -9,6 +9,7 @@ from app.domain.choices import ClipQuality, Method, RewardKind, Strategy
 from app.domain.described import Section, Use, setting
 from app.domain.designs import MOST_ARMS, Arm, Screen, why_no_arms, why_no_screening
 from app.domain.protocol import (
+    BETWEEN_ARMS,
     MOST_INSTRUMENTS,
     PAPER_DEMOGRAPHICS,
     STANDARD_QUESTIONNAIRES,
@@ -459,8 +460,9 @@ class StudySettings(BaseModel):
         )
         if wrong is None and self.end_after_misses > self.catch_pairs:
             wrong = f"Nobody can miss {self.end_after_misses} of {self.catch_pairs} catch pairs."
-        if wrong is None and not self.arms and set(self.planned_tests) & {PlannedTest.WELCH_T, PlannedTest.PERMUTATION}:
-            wrong = "Welch\N{RIGHT SINGLE QUOTATION MARK}s and the permutation test compare arms, and there are none."
+        if wrong is None and not self.arms:
+            names = [test.label for test in self.planned_tests if test in BETWEEN_ARMS]
+            wrong = f"There are no arms to compare by {names[0]}: choose tests within people." if names else None
         if wrong is not None:
             raise ValueError(wrong)
         return self

@@ -238,8 +238,9 @@ def _analysis(study: Study, plan: Plan) -> Iterator[str]:
         "one degrees of freedom.",
         f"Equivalence: two one-sided paired t-tests with bounds of ±{study.settings.equivalence_bound:g} points, at "
         "5 % each.",
-        "Between arms: Welch's t-test (Hedges' g) and a permutation test of its statistic, without people who met both "
-        "methods."
+        "Between arms: Welch's t-test (Hedges' g), a permutation test of its statistic, the cumulative link model with "
+        "a variance for each arm and Welch's degrees of freedom, and equivalence by two one-sided Welch tests with the "
+        "same bounds; all without people who met both methods."
         if study.settings.arms
         else "",
         "Order and carryover: F tests of the analysis of variance of a crossover (person, method, period; then the "

@@ -249,7 +249,7 @@ def _analysis(study: Study, settings: StudySettings) -> Mapping[str, str]:
         + ("\n".join(tests) or "* none")
         + (
             f"\n\nBounds of equivalence: ±{settings.equivalence_bound:g} points of the scale from 1 to 5."
-            if PlannedTest.EQUIVALENCE in settings.planned_tests
+            if {PlannedTest.EQUIVALENCE, PlannedTest.EQUIVALENCE_BETWEEN} & set(settings.planned_tests)
             else ""
         )
         + (

@@ -174,10 +174,10 @@ def _sentences(comparison: Result, plan: Plan) -> Iterator[str]:
 def _difference(test: str, result: Result) -> str:
     if test == "wilcoxon":
         return f"median difference {number(result['median'])}"
-    if test == "cumulative_link":
+    if test in ("cumulative_link", "cumulative_link_between"):
         ends = interval(result["odds_ratio_low"], result["odds_ratio_high"])
         return f"odds ratio of a higher rating {number(result['odds_ratio'])}{ends}"
-    if test == "equivalence":
+    if test in ("equivalence", "equivalence_between"):
         ends = interval(result["low_90"], result["high_90"])
         return f"difference {number(result['difference'])}, 90 % interval{ends}, bounds ±{result['bound']:g}"
     return f"difference {number(result['difference'])}{interval(result.get('low'), result.get('high'))}"
@@ -192,7 +192,7 @@ def _statistic(test: str, result: Result) -> str:
 
 
 def _effect(test: str, result: Result) -> str:
-    if test == "equivalence":
+    if test in ("equivalence", "equivalence_between"):
         return "equivalent within the bounds" if result["p_holm"] < 0.05 else "equivalence not shown"
     name, key = {
         "paired_t": ("d_z", "d_z"),
@@ -205,9 +205,10 @@ def _effect(test: str, result: Result) -> str:
 
 
 def _n(test: str, result: Result) -> str:
-    if "n_first" in result:
-        return f"n = {result['n_first']} and {result['n_second']} {'ratings' if test == 'two_sample_t' else 'people'}"
     more = f", {result['n_ratings']} ratings" if "n_ratings" in result else ""
+    if "n_first" in result:
+        of_each = f"n = {result['n_first']} and {result['n_second']}"
+        return f"{of_each} {'ratings' if test == 'two_sample_t' else 'people'}{more}"
     moved = result.get("n_without_ties", result["n"])
     more += f", {moved} of them not equal" if moved != result["n"] else ""
     return f"n = {result['n']} people{more}"

@@ -27,6 +27,8 @@ TEST_NAMES: Mapping[str, str] = {
     PlannedTest.TWO_SAMPLE_T: "Two-sample t, as in the paper",
     PlannedTest.WELCH_T: "Welch t, between people",
     PlannedTest.PERMUTATION: "Permutation, between people",
+    PlannedTest.CUMULATIVE_LINK_BETWEEN: "Cumulative link model, between people",
+    PlannedTest.EQUIVALENCE_BETWEEN: "Equivalence, two one-sided Welch t, between people",
 }
 
 

@@ -10,7 +10,15 @@ from scipy import stats
 from statsmodels.stats.anova import anova_lm
 
 from tests.benchmarks import between as simulation
-from worker.analysis.study.between import hedges_g, only_one_of, permutation, welch_t
+from worker.analysis.study.between import (
+    equivalence_between,
+    hedges_g,
+    means_of,
+    only_one_of,
+    permutation,
+    welch_t,
+)
+from worker.analysis.study.cumulative_link import cumulative_link_between
 from worker.analysis.study.order_effects import order_report
 from worker.analysis.study.statistics import rating_report
 
@@ -52,12 +60,18 @@ def test_drawn_divisions_come_near_the_exact_ones_and_are_the_same_every_time() 
 
 
 def test_who_rated_both_is_in_neither_group_and_few_people_give_reasons() -> None:
-    means = {"P1": {"a": 1.0}, "P2": {"b": 2.0}, "P3": {"a": 3.0, "b": 4.0}}
-    first, second = only_one_of(means, "a", "b")
-    assert (list(first), list(second)) == ([1.0], [2.0])
-    assert "1 and 1 people" in welch_t(first, second)["not_computable"]
+    cells = {("P1", "a"): [1.0, 2.0], ("P2", "b"): [2.0], ("P3", "a"): [3.0], ("P3", "b"): [4.0]}
+    first, second = only_one_of({whose: np.array(said) for whose, said in cells.items()}, "a", "b")
+    assert (list(means_of(first)), list(means_of(second))) == ([1.5], [2.0])
+    few = means_of(first), means_of(second)
+    for result in (welch_t(*few), equivalence_between(*few, 0.5), cumulative_link_between(first, second)):
+        assert result == {"not_computable": "1 and 1 people rated one of the two alone; 3 of each are needed"}
     same = np.full(4, 3.0)
-    assert "no spread" in permutation(same, same + 1)["not_computable"]
+    for result in (permutation(same, same + 1), equivalence_between(same, same + 1, 0.5)):
+        assert "no spread" in result["not_computable"]
+    alike, above = [np.full(2, 3.0)] * 4, [np.full(2, 5.0)] * 4
+    assert "all ratings of the two are the same" in cumulative_link_between(alike, alike)["not_computable"]
+    assert "no finite model" in cumulative_link_between(alike, above)["not_computable"]
 
 
 def crossover(people: int = 12, drift: float = 0.0, seed: int = 3) -> pd.DataFrame:

@@ -174,28 +174,47 @@ mixed_model <- function(first, second) {
 # everybody.
 cumulative_link <- function(first, second) {
   n <- length(first)
+  if (n < 4) return(NULL)
+  fit <- fit_two(first, second, c(seq_len(n), seq_len(n)))
+  if (is.null(fit)) return(NULL)
+  odds_of(fit, n / (n - 1) * sum(fit$influences^2), n - 1, row_of(n = n, n_ratings = length(unlist(c(first, second)))))
+}
+
+# The same of different people: a variance for each group, and Welch's degrees of freedom.
+cumulative_link_between <- function(first, second) {
+  n <- c(length(first), length(second))
+  if (min(n) < 3) return(NULL)
+  fit <- fit_two(first, second, seq_len(sum(n)))
+  if (is.null(fit)) return(NULL)
+  variances <- n / (n - 1) * c(sum(fit$influences[seq_len(n[1])]^2), sum(fit$influences[-seq_len(n[1])]^2))
+  counts <- row_of(n_first = n[1], n_second = n[2], n_ratings = length(unlist(c(first, second))))
+  odds_of(fit, sum(variances), sum(variances)^2 / sum(variances^2 / (n - 1)), counts)
+}
+
+# Effect, SD, and what each person moves the effect by; people: whose each cell is. NULL: no finite ones fit.
+fit_two <- function(first, second, people) {
   cells <- c(first, second)
   ratings <- unlist(cells)
-  if (n < 4 || spread_of(ratings) == 0) return(NULL)
+  if (spread_of(ratings) == 0) return(NULL)
   x <- rep(0:1, c(length(unlist(first)), length(unlist(second))))
-  person <- rep(c(seq_len(n), seq_len(n)), lengths(cells))
-  model <- ordered_ratings(ratings, x, person)
-  cuts <- model$cuts
+  model <- ordered_ratings(ratings, x, rep(people, lengths(cells)))
   found <- model$fit()
   scores <- model$scores(found)$scores
-  bread <- solve_symmetric(model$information(found))
-  sandwich <- n / (n - 1) * bread %*% crossprod(scores) %*% bread
-  difference <- found[cuts + 1]
-  error <- sqrt(max(sandwich[cuts + 1, cuts + 1], 0))
-  unfit <- abs(difference) > 12 || abs(found[cuts + 2]) > 8 || max(abs(colSums(scores))) > 1e-6
-  if (unfit || error < 1e-6) return(NULL)
-  ends <- difference + c(-1, 1) * qt(0.975, n - 1) * error
-  row_of(
-    n = n, n_ratings = length(ratings), difference = difference, standard_error = error, low = ends[1], high = ends[2],
-    odds_ratio = exp(difference), odds_ratio_low = exp(ends[1]), odds_ratio_high = exp(ends[2]),
-    statistic = difference / error, degrees_of_freedom = n - 1, p = 2 * pt(-abs(difference / error), n - 1),
-    sd_between_people = abs(found[cuts + 2])
-  )
+  effect <- found[model$cuts + 1]
+  sd <- abs(found[model$cuts + 2])
+  if (abs(effect) > 12 || sd > 8 || max(abs(colSums(scores))) > 1e-6) return(NULL)
+  list(effect = effect, sd = sd, influences = as.numeric(scores %*% solve_symmetric(model$information(found))[, model$cuts + 1]))
+}
+
+odds_of <- function(fit, variance, freedom, counts) {
+  error <- sqrt(variance)
+  if (error < 1e-6) return(NULL)
+  ends <- fit$effect + c(-1, 1) * qt(0.975, freedom) * error
+  cbind(counts, row_of(
+    difference = fit$effect, standard_error = error, low = ends[1], high = ends[2], odds_ratio = exp(fit$effect),
+    odds_ratio_low = exp(ends[1]), odds_ratio_high = exp(ends[2]), statistic = fit$effect / error,
+    degrees_of_freedom = freedom, p = 2 * pt(-abs(fit$effect / error), freedom), sd_between_people = fit$sd
+  ))
 }
 
 solve_symmetric <- function(matrix) {
@@ -292,6 +311,19 @@ welch_t <- function(first, second) {
     degrees_of_freedom = unname(found$parameter), p = found$p.value, g = small * g,
     g_low = small * noncentrality(g / scale, freedom, 0.975) * scale,
     g_high = small * noncentrality(g / scale, freedom, 0.025) * scale
+  )
+}
+
+# Two one-sided Welch tests, of people who met one of the two methods.
+equivalence_between <- function(first, second, bound) {
+  if (!can_be_compared(first, second)) return(NULL)
+  above <- t.test(second, first, mu = -bound, alternative = "greater")
+  below <- t.test(second, first, mu = bound, alternative = "less")
+  ends <- t.test(second, first, conf.level = 0.90)$conf.int
+  row_of(
+    n_first = length(first), n_second = length(second), difference = mean(second) - mean(first), low_90 = ends[1],
+    high_90 = ends[2], bound = bound, statistic = min(above$statistic, -below$statistic),
+    degrees_of_freedom = unname(above$parameter), p = max(above$p.value, below$p.value)
   )
 }
 
@@ -394,16 +426,17 @@ comparisons_of <- function(rows, value, groups, tests, bound = NULL) {
     mine <- cells[[pair[1]]][both]
     theirs <- cells[[pair[2]]][both]
     differences <- round(as.numeric(mapply(function(a, b) mean(b) - mean(a), mine, theirs)), 12)
-    alone <- lapply(1:2, function(i) {
-      round(as.numeric(sapply(cells[[pair[i]]][people[met[, i] & !met[, 3 - i]]], mean)), 12)
-    })
+    alone <- lapply(1:2, function(i) cells[[pair[i]]][people[met[, i] & !met[, 3 - i]]])
+    apart <- lapply(alone, function(group) round(as.numeric(sapply(group, mean)), 12))
     every <- lapply(pair, function(group) rows[[value]][rows$group == group])
     stack_rows(lapply(tests, function(test) {
       result <- switch(test,
         two_sample_t = two_sample_t(every[[1]], every[[2]]), paired_t = paired_t(differences),
         wilcoxon = wilcoxon(differences), mixed_model = mixed_model(mine, theirs),
         cumulative_link = cumulative_link(mine, theirs), equivalence = equivalence(differences, bound),
-        welch_t = welch_t(alone[[1]], alone[[2]]), permutation = permutation(alone[[1]], alone[[2]])
+        welch_t = welch_t(apart[[1]], apart[[2]]), permutation = permutation(apart[[1]], apart[[2]]),
+        cumulative_link_between = cumulative_link_between(alone[[1]], alone[[2]]),
+        equivalence_between = equivalence_between(apart[[1]], apart[[2]], bound)
       )
       named <- row_of(first = pair[1], second = pair[2], test = test)
       if (is.null(result)) named else cbind(named, result)
@@ -435,7 +468,7 @@ people <- function(study) {
 comparisons <- function(study) {
   if (study$blinded) return(NULL)
   within <- c("paired_t", "mixed_model", "cumulative_link", "wilcoxon", "equivalence", "two_sample_t")
-  tests <- c(within, if (study$between) c("welch_t", "permutation"))
+  tests <- c(within, if (study$between) c("welch_t", "permutation", "cumulative_link_between", "equivalence_between"))
   of_scales(function(scale) comparisons_of(study$ratings, scale, study$groups, tests, study$bound))
 }
 

@@ -28,7 +28,7 @@ from statsmodels.stats.meta_analysis import combine_effects
 SCALES = ("satisfaction", "personalisation")
 """Of the ratings; both from 1 to 5."""
 WITHIN = ("paired_t", "mixed_model", "cumulative_link", "wilcoxon", "equivalence", "two_sample_t")
-BETWEEN = ("welch_t", "permutation")
+BETWEEN = ("welch_t", "permutation", "cumulative_link_between", "equivalence_between")
 WINDOW, FIRST_POINT = 30, 5
 """Answers in the running accuracy, and from which answer on it is drawn."""
 NAMES = {
@@ -228,23 +228,52 @@ def cumulative_link(first, second):
 
     In R: ordinal::clmm(rating ~ group + (1 | person), nAGQ = 10); its own errors suppose one effect for everybody.
     """
-    n, cells = len(first), [*first, *second]
-    if n < 4 or np.ptp(np.concatenate(cells)) == 0:
+    n = len(first)
+    if n < 4:
         return {}
-    ratings = np.concatenate(cells)
-    x = np.repeat([0.0, 1.0], [sum(map(len, first)), sum(map(len, second))])
-    person = np.repeat([*range(n), *range(n)], [len(cell) for cell in cells])
-    model = OrderedRatings(ratings, x, person)
-    found, scores, information = model.fit()
-    sandwich = np.linalg.pinv(information) @ (scores.T @ scores) @ np.linalg.pinv(information)
-    difference, error = found[-2], math.sqrt(max(n / (n - 1) * sandwich[-2, -2], 0.0))
-    if abs(difference) > 12 or abs(found[-1]) > 8 or error < 1e-6 or np.abs(scores.sum(axis=0)).max() > 1e-6:
+    found, influences = fit_two(first, second, [*range(n), *range(n)])
+    variance = n / (n - 1) * (influences**2).sum() if found is not None else 0.0
+    return odds_of(found, variance, n - 1, {"n": n, "n_ratings": sum(map(len, [*first, *second]))})
+
+
+def cumulative_link_between(first, second):
+    """The same of different people: a variance for each group, and Welch's degrees of freedom."""
+    sizes = len(first), len(second)
+    if min(sizes) < 3:
         return {}
-    margin = stats.t.ppf(0.975, n - 1) * error
+    found, influences = fit_two(first, second, range(sum(sizes)))
+    groups = np.split(influences, [sizes[0]])
+    variances = [n / (n - 1) * (each**2).sum() for n, each in zip(sizes, groups, strict=True)]
+    counts = {"n_first": sizes[0], "n_second": sizes[1], "n_ratings": sum(map(len, [*first, *second]))}
+    return odds_of(found, sum(variances), welch_freedom(variances, sizes), counts)
+
+
+def welch_freedom(variances, sizes):
+    scatter = sum(variance**2 / (n - 1) for variance, n in zip(variances, sizes, strict=True))
+    return sum(variances) ** 2 / scatter if scatter else math.inf
+
+
+def fit_two(first, second, people):
+    """Parameters (None: no finite ones), and what each person moves the effect by; ``people``: whose each cell is."""
+    cells = [*first, *second]
+    ratings, x = np.concatenate(cells), np.repeat([0.0, 1.0], [sum(map(len, first)), sum(map(len, second))])
+    if np.ptp(ratings) == 0:
+        return None, np.zeros(max(people) + 1)
+    person = np.repeat(list(people), [len(cell) for cell in cells])
+    found, scores, information = OrderedRatings(ratings, x, person).fit()
+    unfit = abs(found[-2]) > 12 or abs(found[-1]) > 8 or np.abs(scores.sum(axis=0)).max() > 1e-6
+    return None if unfit else found, scores @ np.linalg.pinv(information)[:, -2]
+
+
+def odds_of(found, variance, freedom, counts):
+    error = math.sqrt(variance)
+    if found is None or error < 1e-6:
+        return {}
+    difference = found[-2]
+    margin = stats.t.ppf(0.975, freedom) * error
     low, high = difference - margin, difference + margin
     return {
-        "n": n,
-        "n_ratings": len(ratings),
+        **counts,
         "difference": difference,
         "standard_error": error,
         "low": low,
@@ -253,8 +282,8 @@ def cumulative_link(first, second):
         "odds_ratio_low": math.exp(low),
         "odds_ratio_high": math.exp(high),
         "statistic": difference / error,
-        "degrees_of_freedom": n - 1,
-        "p": 2 * stats.t.sf(abs(difference / error), n - 1),
+        "degrees_of_freedom": freedom,
+        "p": 2 * stats.t.sf(abs(difference / error), freedom),
         "sd_between_people": abs(found[-1]),
     }
 
@@ -377,6 +406,29 @@ def welch_t(first, second):
         "g": small * g,
         "g_low": small * noncentrality(g / scale, freedom, 0.975) * scale,
         "g_high": small * noncentrality(g / scale, freedom, 0.025) * scale,
+    }
+
+
+def equivalence_between(first, second, bound):
+    """Two one-sided Welch tests, of people who met one of the two methods."""
+    if not can_be_compared(first, second):
+        return {}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        whole = stats.ttest_ind(second, first, equal_var=False)
+        above = stats.ttest_ind(second + bound, first, equal_var=False, alternative="greater")
+        below = stats.ttest_ind(second - bound, first, equal_var=False, alternative="less")
+    low, high = whole.confidence_interval(0.90)
+    return {
+        "n_first": len(first),
+        "n_second": len(second),
+        "difference": second.mean() - first.mean(),
+        "low_90": low,
+        "high_90": high,
+        "bound": bound,
+        "statistic": min(above.statistic, -below.statistic),
+        "degrees_of_freedom": whole.df,
+        "p": max(above.pvalue, below.pvalue),
     }
 
 
@@ -509,11 +561,10 @@ def comparisons_of(rows, value, groups, tests=WITHIN, bound=None):
         mine, theirs = [cells[each, first] for each in both], [cells[each, second] for each in both]
         differences = np.array([b.mean() - a.mean() for a, b in zip(mine, theirs, strict=True)]).round(12)
         alone = [
-            np.array(
-                [cells[each, one].mean() for each in people if (each, one) in cells and (each, other) not in cells]
-            )
+            [cells[each, one] for each in people if (each, one) in cells and (each, other) not in cells]
             for one, other in ((first, second), (second, first))
         ]
+        apart = [np.array([each.mean() for each in group]).round(12) for group in alone]
         every = [rows[rows["method"] == group][value].to_numpy(float) for group in (first, second)]
         computed = {
             "two_sample_t": lambda every=every: two_sample_t(*every),
@@ -522,8 +573,10 @@ def comparisons_of(rows, value, groups, tests=WITHIN, bound=None):
             "mixed_model": lambda mine=mine, theirs=theirs: mixed_model(mine, theirs),
             "cumulative_link": lambda mine=mine, theirs=theirs: cumulative_link(mine, theirs),
             "equivalence": lambda differences=differences: equivalence(differences, bound),
-            "welch_t": lambda alone=alone: welch_t(*(each.round(12) for each in alone)),
-            "permutation": lambda alone=alone: permutation(*(each.round(12) for each in alone)),
+            "welch_t": lambda apart=apart: welch_t(*apart),
+            "permutation": lambda apart=apart: permutation(*apart),
+            "cumulative_link_between": lambda alone=alone: cumulative_link_between(*alone),
+            "equivalence_between": lambda apart=apart: equivalence_between(*apart, bound),
         }
         found += [{"first": first, "second": second, "test": test, **computed[test]()} for test in tests]
     for test in tests:

@@ -1,13 +1,13 @@
-"""Tests between people who met one method and people who met the other: Welch's, a permutation test, Hedges' g.
+"""Tests between people who met one method and people who met the other: Welch's, a permutation test, equivalence.
 
 One number per person, the mean of their ratings of the method; who rated both methods is in neither group, for the two
-numbers of one person are not independent. A difference is second minus first. Measured error rates:
-docs/results/between.md.
+numbers of one person are not independent. The cumulative link model, which takes every rating as an order, is in
+cumulative_link.py. A difference is second minus first. Measured error rates: docs/results/between.md.
 """
 
 import math
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from itertools import combinations
 from typing import Any
@@ -16,12 +16,18 @@ import numpy as np
 from scipy import stats
 
 from worker.analysis.study.effect_sizes import noncentrality_interval
-from worker.analysis.study.hypothesis_tests import not_computable, plain
+from worker.analysis.study.hypothesis_tests import (
+    FEWEST_OF_EACH,
+    few_of_each,
+    not_computable,
+    plain,
+    two_one_sided,
+    welch_freedom,
+)
 from worker.domain.type_aliases import FloatArray
 
-BETWEEN_TESTS = ("welch_t", "permutation")
+BETWEEN_TESTS = ("welch_t", "permutation", "cumulative_link_between", "equivalence_between")
 """Names as in app.domain.protocol.PlannedTest."""
-FEWEST_OF_EACH = 3
 MOST_EXACT = 20_000
 """Ways to divide the people; where there are more, as many are drawn."""
 _SEED = 112
@@ -45,6 +51,24 @@ def welch_t(first: FloatArray, second: FloatArray) -> dict[str, Any]:
         "statistic": plain(outcome.statistic),
         "degrees_of_freedom": plain(outcome.df),
         "p": plain(outcome.pvalue),
+    }
+
+
+def equivalence_between(first: FloatArray, second: FloatArray, bound: float) -> dict[str, Any]:
+    """Two one-sided Welch tests: is the difference of the means between -bound and bound? (P,), (Q,), bound in points.
+
+    Dannenberg, Dette and Munk (1994) have Welch's degrees of freedom in Schuirmann's tests. ``p`` and ``low_90`` to
+    ``high_90`` as in hypothesis_tests.equivalence.
+    """
+    reason = why_not(first, second)
+    if reason is not None:
+        return not_computable(reason)
+    variances, sizes = [float(group.var(ddof=1)) / len(group) for group in (first, second)], [len(first), len(second)]
+    difference, freedom = float(second.mean() - first.mean()), welch_freedom(variances, sizes)
+    return {
+        "n_first": sizes[0],
+        "n_second": sizes[1],
+        **two_one_sided(difference, sum(variances) ** 0.5, freedom, bound),
     }
 
 
@@ -117,16 +141,23 @@ def _statistics(values: FloatArray, first_group: FloatArray) -> FloatArray:
 def why_not(first: FloatArray, second: FloatArray) -> str | None:
     """Why there is no test between these groups, in words; None where there is one."""
     if min(len(first), len(second)) < FEWEST_OF_EACH:
-        return f"{len(first)} and {len(second)} people rated one of the two alone; {FEWEST_OF_EACH} of each are needed"
+        return few_of_each(len(first), len(second))
     if np.ptp(first.round(12)) == 0 and np.ptp(second.round(12)) == 0:
         return "all people of each of the two gave the same ratings, so there is no spread to compare with"
     return None
 
 
-def only_one_of(means: Mapping[str, Mapping[str, float]], first: str, second: str) -> tuple[FloatArray, FloatArray]:
-    """Means of the people who rated ``first`` and not ``second``, and the other way round. ``means``: by person."""
-    groups = [
-        [theirs[mine] for theirs in means.values() if mine in theirs and other not in theirs]
+def only_one_of(
+    ratings: Mapping[tuple[str, str], FloatArray], first: str, second: str
+) -> tuple[list[FloatArray], list[FloatArray]]:
+    """Of people who rated ``first`` and not ``second``, and the other way round. ``ratings``: by person and method."""
+    of_first, of_second = (
+        [given for (person, method), given in ratings.items() if method == mine and (person, other) not in ratings]
         for mine, other in ((first, second), (second, first))
-    ]
-    return np.array(groups[0], np.float64).round(12), np.array(groups[1], np.float64).round(12)
+    )
+    return of_first, of_second
+
+
+def means_of(people: Sequence[FloatArray]) -> FloatArray:
+    """A number per person, the mean of their ratings, (P,)."""
+    return np.array([each.mean() for each in people], np.float64).round(12)

@@ -7,7 +7,8 @@ Weideman 2014); ten to fifteen adaptive Gauss-Hermite nodes lose all beyond the 
 
 Its usual standard errors suppose that a difference is the same to everybody, and promise too much where it is not
 (docs/results/likert.md). Tests and intervals here count people: the sandwich over people (Liang and Zeger 1986) with
-a t of people - 1 degrees of freedom, as in worker.analysis.study.bradley_terry.
+a t of people - 1 degrees of freedom, as in worker.analysis.study.bradley_terry. Where the two groups are different
+people, each group has a variance of its own, and t Welch's degrees of freedom (docs/results/between.md).
 """
 
 from collections.abc import Sequence
@@ -19,7 +20,14 @@ import numpy.typing as npt
 from scipy import optimize, stats
 from scipy.special import expit
 
-from worker.analysis.study.hypothesis_tests import not_computable, plain, too_few
+from worker.analysis.study.hypothesis_tests import (
+    FEWEST_OF_EACH,
+    few_of_each,
+    not_computable,
+    plain,
+    too_few,
+    welch_freedom,
+)
 from worker.domain.type_aliases import FloatArray
 
 GRID = np.linspace(-8.0, 8.0, 161)
@@ -33,6 +41,7 @@ WIDEST = 8.0
 """Standard deviation of people, likewise; up to it the grid is fine enough."""
 NO_SPREAD = 1e-6
 """Standard error up to which all people answered alike, so that nothing says how they scatter."""
+ALL_THE_SAME = "all ratings of the two are the same, so there is nothing to compare"
 _LEAST = 1e-300
 _POLISHING = 3
 _STEP = 1e-5
@@ -59,10 +68,9 @@ class Fit:
         """From the observed information, as R has it: right if the effects are the same to everybody."""
         return np.asarray(np.linalg.pinv(self.information), np.float64)
 
-    def robust_covariance(self) -> FloatArray:
-        """The sandwich over people, times people / (people - 1)."""
-        people, bread = len(self.scores), self.covariance()
-        return np.asarray(people / (people - 1) * bread @ (self.scores.T @ self.scores) @ bread, np.float64)
+    def influences(self) -> FloatArray:
+        """What each person moves the first effect by, (people,): their squares make the sandwich over people."""
+        return np.asarray(self.scores @ self.covariance()[:, len(self.thresholds)], np.float64)
 
 
 def cumulative_link(first: Sequence[FloatArray], second: Sequence[FloatArray]) -> dict[str, Any]:
@@ -78,28 +86,63 @@ def cumulative_link(first: Sequence[FloatArray], second: Sequence[FloatArray]) -
     return tested(fit_two(first, second), len(ratings))
 
 
+def cumulative_link_between(first: Sequence[FloatArray], second: Sequence[FloatArray]) -> dict[str, Any]:
+    """The model of two groups of different people; by person: their ratings. Numbers as in ``cumulative_link``."""
+    reason = why_not_between(first, second)
+    if reason is not None:
+        return not_computable(reason)
+    people = [*first, *second]
+    x = np.repeat([0.0, 1.0], [sum(map(len, group)) for group in (first, second)])[:, None]
+    found = fit(np.concatenate(people), x, np.repeat(np.arange(len(people)), [len(each) for each in people]))
+    return tested_between(found, len(first), len(x))
+
+
+def why_not_between(first: Sequence[FloatArray], second: Sequence[FloatArray]) -> str | None:
+    """Why there is no model of these groups of people, in words; None where there may be one."""
+    if min(len(first), len(second)) < FEWEST_OF_EACH:
+        return few_of_each(len(first), len(second))
+    return ALL_THE_SAME if np.ptp(np.concatenate([*first, *second])) == 0 else None
+
+
 def tested(found: Fit, ratings: int) -> dict[str, Any]:
     """What ``cumulative_link`` says of a model of two groups that is fitted to so many ratings."""
     n = len(found.scores)
-    difference, place = float(found.effects[0]), len(found.thresholds)
+    variance = n / (n - 1) * float((found.influences() ** 2).sum())
+    numbers = _numbers(found, variance, n - 1)
+    return numbers if "not_computable" in numbers else {"n": n, "n_ratings": ratings, **numbers}
+
+
+def tested_between(found: Fit, people: int, ratings: int) -> dict[str, Any]:
+    """The same of different people, of whom the first ``people`` are the first group.
+
+    As Welch (1947) has it: a variance for each group, and the degrees of freedom of their sum.
+    """
+    groups = np.split(found.influences(), [people])
+    sizes = [len(each) for each in groups]
+    variances = [n / (n - 1) * float((each**2).sum()) for n, each in zip(sizes, groups, strict=True)]
+    numbers = _numbers(found, sum(variances), welch_freedom(variances, sizes))
+    if "not_computable" in numbers:
+        return numbers
+    return {"n_first": sizes[0], "n_second": sizes[1], "n_ratings": ratings, **numbers}
+
+
+def _numbers(found: Fit, variance: float, freedom: float) -> dict[str, Any]:
+    difference, error = float(found.effects[0]), variance**0.5
     if not found.converged or abs(difference) > MOST or found.sd > WIDEST:
         return not_computable("the ratings of the two, or of the people, overlap so little that no finite model fits")
-    error = float(max(found.robust_covariance()[place, place], 0.0)) ** 0.5
     if error < NO_SPREAD:
-        return not_computable(f"all {n} people answered alike, so there is no spread to compare with")
-    margin = float(stats.t.ppf(0.975, n - 1)) * error
+        return not_computable(f"all {len(found.scores)} people answered alike, so there is no spread to compare with")
+    margin = float(stats.t.ppf(0.975, freedom)) * error
     ends = {"low": difference - margin, "high": difference + margin}
     return {
-        "n": n,
-        "n_ratings": ratings,
         "difference": plain(difference),
         "standard_error": plain(error),
         **ends,
         "odds_ratio": _odds(difference),
         **{f"odds_ratio_{name}": _odds(end) for name, end in ends.items()},
         "statistic": plain(difference / error),
-        "degrees_of_freedom": n - 1,
-        "p": plain(2 * stats.t.sf(abs(difference / error), n - 1)),
+        "degrees_of_freedom": freedom,
+        "p": plain(2 * stats.t.sf(abs(difference / error), freedom)),
         "sd_between_people": plain(found.sd),
     }
 
@@ -116,7 +159,7 @@ def _why_not(ratings: FloatArray, people: int) -> str | None:
     if people < FEWEST_PEOPLE:
         return too_few(people, FEWEST_PEOPLE)
     if np.ptp(ratings) == 0:
-        return "all ratings of the two are the same, so there is nothing to compare"
+        return ALL_THE_SAME
     return None
 
 

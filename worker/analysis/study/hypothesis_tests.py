@@ -25,6 +25,8 @@ FEWEST_RATINGS = 2
 """Of each group, for the paper's test."""
 FEWEST_PAIRED = 3
 """People who rated both groups; with two, one difference decides everything."""
+FEWEST_OF_EACH = 3
+"""People who rated one of the two alone."""
 
 
 def two_sample_t(first: FloatArray, second: FloatArray) -> Result:
@@ -76,18 +78,21 @@ def equivalence(differences: FloatArray, bound: float) -> Result:
     reason = _why_not(differences)
     if reason is not None:
         return not_computable(reason)
-    mean, error = float(differences.mean()), float(stats.sem(differences))
-    margin = float(stats.t.ppf(0.95, n - 1)) * error
-    statistic = (bound - abs(mean)) / error
+    return {"n": n, **two_one_sided(float(differences.mean()), float(stats.sem(differences)), n - 1, bound)}
+
+
+def two_one_sided(difference: float, error: float, degrees_of_freedom: float, bound: float) -> Result:
+    """Schuirmann's tests of a difference with this standard error."""
+    margin = float(stats.t.ppf(0.95, degrees_of_freedom)) * error
+    statistic = (bound - abs(difference)) / error
     return {
-        "n": n,
-        "difference": plain(mean),
-        "low_90": plain(mean - margin),
-        "high_90": plain(mean + margin),
+        "difference": plain(difference),
+        "low_90": plain(difference - margin),
+        "high_90": plain(difference + margin),
         "bound": bound,
         "statistic": plain(statistic),
-        "degrees_of_freedom": n - 1,
-        "p": plain(stats.t.sf(statistic, n - 1)),
+        "degrees_of_freedom": degrees_of_freedom,
+        "p": plain(stats.t.sf(statistic, degrees_of_freedom)),
     }
 
 
@@ -195,3 +200,14 @@ def not_computable(reason: str) -> Result:
 def too_few(people: int, needed: int = FEWEST_PAIRED) -> str:
     """Why a paired test needs more people."""
     return f"{people} {'person has' if people == 1 else 'people have'} rated both; {needed} are needed"
+
+
+def few_of_each(first: int, second: int) -> str:
+    """Why a test between people needs more of them."""
+    return f"{first} and {second} people rated one of the two alone; {FEWEST_OF_EACH} of each are needed"
+
+
+def welch_freedom(variances: Sequence[float], sizes: Sequence[int]) -> float:
+    """Degrees of freedom of a difference (Welch 1947) whose parts have these variances, from so many people each."""
+    scatter = sum(variance**2 / (size - 1) for variance, size in zip(variances, sizes, strict=True))
+    return sum(variances) ** 2 / scatter if scatter else float(np.inf)

@@ -19,7 +19,7 @@ Every result of a test has either its numbers or ``not_computable``: the reason 
 minus first. Nothing here is NaN or infinite; what is unknown is None.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import combinations
 from typing import Any
 
@@ -27,8 +27,16 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from worker.analysis.study.between import BETWEEN_TESTS, hedges_g, only_one_of, permutation, welch_t
-from worker.analysis.study.cumulative_link import cumulative_link
+from worker.analysis.study.between import (
+    BETWEEN_TESTS,
+    equivalence_between,
+    hedges_g,
+    means_of,
+    only_one_of,
+    permutation,
+    welch_t,
+)
+from worker.analysis.study.cumulative_link import cumulative_link, cumulative_link_between
 from worker.analysis.study.effect_sizes import d_z_interval, holm, rank_biserial, rank_biserial_interval
 from worker.analysis.study.hypothesis_tests import (
     FEWEST_PAIRED,
@@ -148,25 +156,35 @@ def scale_report(
         {"first": first, "second": second, **_tests(rows, scale, by, first, second, tests, bound)}
         for first, second in (combinations(groups, 2) if compare else ())
     ]
-    people = _people(rows, scale, by)
     for comparison in comparisons if between else ():
-        comparison |= _between(people, comparison["first"], comparison["second"])
+        comparison |= _between(_cells(rows, scale, by), comparison["first"], comparison["second"], bound)
     for test in (*(each for each in tests if each != UNCORRECTED), *(BETWEEN_TESTS if between else ())):
         _correct([comparison[test] for comparison in comparisons])
     return {
         "means": [_mean_of(rows[rows[by] == group], scale, group, possible) for group in groups],
-        "people": people,
+        "people": _people(rows, scale, by),
         "comparisons": comparisons,
         "order": order_report(rows, scale) if compare and "order" in rows else None,
     }
 
 
-def _between(people: Sequence[Result], first: str, second: str) -> dict[str, Result]:
-    groups = only_one_of({each["participant"]: each["means"] for each in people}, first, second)
-    results = {"welch_t": welch_t(*groups), "permutation": permutation(*groups)}
+def _between(cells: Mapping[tuple[str, str], FloatArray], first: str, second: str, bound: float) -> dict[str, Result]:
+    ratings = only_one_of(cells, first, second)
+    means = means_of(ratings[0]), means_of(ratings[1])
+    results = {
+        "welch_t": welch_t(*means),
+        "permutation": permutation(*means),
+        "cumulative_link_between": cumulative_link_between(*ratings),
+        "equivalence_between": equivalence_between(*means, bound),
+    }
     if "p" in results["welch_t"]:
-        results["welch_t"] |= hedges_g(*groups)
+        results["welch_t"] |= hedges_g(*means)
     return results
+
+
+def _cells(rows: pd.DataFrame, scale: str, by: str) -> dict[tuple[str, str], FloatArray]:
+    """Ratings by person and group."""
+    return {name: _floats(values) for name, values in rows.groupby(["participant", by])[scale]}
 
 
 def _people(rows: pd.DataFrame, scale: str, by: str) -> list[Result]:
@@ -244,7 +262,7 @@ def ratings_of_each(
     rows: pd.DataFrame, scale: str, by: str, first: str, second: str
 ) -> tuple[list[FloatArray], list[FloatArray]]:
     """Everybody's ratings of ``first`` and of ``second``, by participant; only who rated both."""
-    cells = {name: _floats(values) for name, values in rows.groupby(["participant", by])[scale]}
+    cells = _cells(rows, scale, by)
     people = [
         person for person in dict.fromkeys(rows["participant"]) if {(person, first), (person, second)} <= set(cells)
     ]
