@@ -91,10 +91,7 @@ def cumulative_link_between(first: Sequence[FloatArray], second: Sequence[FloatA
     reason = why_not_between(first, second)
     if reason is not None:
         return not_computable(reason)
-    people = [*first, *second]
-    x = np.repeat([0.0, 1.0], [sum(map(len, group)) for group in (first, second)])[:, None]
-    found = fit(np.concatenate(people), x, np.repeat(np.arange(len(people)), [len(each) for each in people]))
-    return tested_between(found, len(first), len(x))
+    return tested_between(fit_two(first, second, paired=False), len(first), sum(map(len, (*first, *second))))
 
 
 def why_not_between(first: Sequence[FloatArray], second: Sequence[FloatArray]) -> str | None:
@@ -147,10 +144,11 @@ def _numbers(found: Fit, variance: float, freedom: float) -> dict[str, Any]:
     }
 
 
-def fit_two(first: Sequence[FloatArray], second: Sequence[FloatArray]) -> Fit:
-    """rating ~ group + (1 | person); by person: their ratings of each group."""
+def fit_two(first: Sequence[FloatArray], second: Sequence[FloatArray], *, paired: bool = True) -> Fit:
+    """rating ~ group + (1 | person); by person: their ratings of each group, or other people's of the second."""
     sizes = [[len(each) for each in group] for group in (first, second)]
-    person = np.concatenate([np.repeat(np.arange(len(first)), each) for each in sizes])
+    people = [np.arange(len(first)), np.arange(len(second)) + (0 if paired else len(first))]
+    person = np.concatenate([np.repeat(who, each) for who, each in zip(people, sizes, strict=True)])
     x = np.repeat([0.0, 1.0], [sum(each) for each in sizes])[:, None]
     return fit(np.concatenate([*first, *second]), x, person)
 
