@@ -8,7 +8,25 @@ from sqlalchemy import ForeignKey, String
 from sqlalchemy.orm import Mapped, mapped_column
 
 from app.db import Base, now
-from app.domain.protocol import EvaluatedMethod
+from app.domain.choices import Choice
+from app.domain.protocol import EvaluatedMethod, PlannedTest
+
+
+class PowerTest(Choice):
+    """What the simulated studies are to show, by one test within people or its like between arms."""
+
+    DIFFERENCE = "difference", "A difference of means"
+    CUMULATIVE_LINK = "cumulative_link", "A difference of ratings as an order"
+    EQUIVALENCE = "equivalence", "That they differ by less than what matters"
+
+    def planned(self, *, paired: bool) -> PlannedTest:
+        """As the page of results calls it."""
+        within, between = {
+            PowerTest.DIFFERENCE: (PlannedTest.PAIRED_T, PlannedTest.WELCH_T),
+            PowerTest.CUMULATIVE_LINK: (PlannedTest.CUMULATIVE_LINK, PlannedTest.CUMULATIVE_LINK_BETWEEN),
+            PowerTest.EQUIVALENCE: (PlannedTest.EQUIVALENCE, PlannedTest.EQUIVALENCE_BETWEEN),
+        }[self]
+        return within if paired else between
 
 
 class PowerInputs(BaseModel):
@@ -24,6 +42,7 @@ class PowerInputs(BaseModel):
     noise: float = Field(default=0.8, ge=0.0, le=3.0, title="Noise of one rating (SD)")
     dropout_percent: float = Field(default=10.0, ge=0.0, le=90.0, title="Who drops out, %")
     most_people: int = Field(default=48, ge=8, le=400, title="Up to how many people")
+    test: PowerTest = PowerTest.DIFFERENCE
 
 
 class PowerPlan(Base):

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from sqlalchemy.orm import Session, joinedload
 
 from app.domain.designs import Ending, Screen
+from app.domain.power_plan import PowerTest
 from app.domain.preferences import Label, Query, current_answers
 from app.domain.studies import Participant, Study
 from app.services.answers import consistency, exclusions
@@ -18,6 +19,7 @@ from app.services.paper import recruitment
 from app.services.paper.prose import NOT_RECORDED, count, day, listed, number, paragraph, percent, quoted, table
 from app.services.paper.recruitment import Flow
 from app.services.studies import power
+from app.services.studies.preregistration import TEST_NAMES
 
 LONGEST_LISTED = 30
 """Characters of a free answer that is counted in the text; longer ones may say who somebody is."""
@@ -66,8 +68,12 @@ def sample_size(session: Session, study: Study) -> str:
     inputs, contents = plan.inputs, plan.contents
     enough = contents["enough"]["ratings"]
     found = f"reached from {enough} people on" if enough else f"not reached with {inputs.most_people} people"
+    tested = ""
+    if inputs.test is not PowerTest.DIFFERENCE:
+        tested = f", tested by {TEST_NAMES[inputs.test.planned(paired=contents['paired'])]}"
+        tested += f" (bounds ±{contents['bound']:g} points)" if inputs.test is PowerTest.EQUIVALENCE else ""
     return (
-        f"by simulation of this design ({contents['studies']} studies for each number of people): "
+        f"by simulation of this design ({contents['studies']} studies for each number of people){tested}: "
         f"{unblinding.NAMES[inputs.better]} better than {unblinding.NAMES[inputs.compared]} by {inputs.effect:g} "
         f"points of 5, differing between people by {inputs.spread:g} (SD), levels of people {inputs.levels:g} (SD), "
         f"noise of a rating {inputs.noise:g} (SD), {inputs.dropout_percent:g} % dropouts. A power of 80 % for ratings "

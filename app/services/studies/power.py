@@ -1,8 +1,9 @@
 """Planning how many people a study needs: asked for here, simulated by the worker, kept.
 
-Contents of a finished plan: ``paired`` (whether the two methods are met by the same people), ``comparisons``,
-``studies`` (simulated per number of people), ``rows`` (people, completed, ratings and head_to_heads: power, low, high)
-and ``enough`` (for ratings and head_to_heads the number of people from which on the power is 80 %; None: more).
+Contents of a finished plan: ``paired`` (whether the two methods are met by the same people), ``bound`` (of equivalence;
+not in plans of before there was that test), ``comparisons``, ``studies`` (simulated per number of people), ``rows``
+(people, completed, ratings and head_to_heads: power, low, high) and ``enough`` (for ratings and head_to_heads from how
+many people on the power is 80 %; None: more).
 """
 
 import hashlib
@@ -14,7 +15,7 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from app.domain.models import Run, RunKind, RunStatus
-from app.domain.power_plan import PowerInputs, PowerPlan
+from app.domain.power_plan import PowerInputs, PowerPlan, PowerTest
 from app.domain.run_keys import PLAN, RunKey
 from app.domain.studies import Study
 from app.errors import AppError
@@ -36,11 +37,22 @@ class NotCompared(AppError):
     status = HTTPStatus.UNPROCESSABLE_ENTITY
 
 
+class TooDifferent(AppError):
+    """Enter less than the study's smallest difference that matters, 0 if the two do not differ."""
+
+    status = HTTPStatus.UNPROCESSABLE_ENTITY
+
+
 def ask(session: Session, study: Study, inputs: PowerInputs, actor: str) -> PowerPlan:
-    """Ask for a plan; what was asked before of the same design is there already. Raises NothingToPlan, NotCompared."""
+    """Ask for a plan; what was asked before of the same design is there already.
+
+    Raises NothingToPlan, NotCompared, TooDifferent.
+    """
     methods = design_of(study)["methods"]
     if inputs.better == inputs.compared or not {inputs.better.value, inputs.compared.value} <= set(methods):
         raise NotCompared
+    if inputs.test is PowerTest.EQUIVALENCE and inputs.effect >= study.settings.equivalence_bound:
+        raise TooDifferent
     basis = basis_of(study, inputs)
     same = select(PowerPlan).where(PowerPlan.study_id == study.id, PowerPlan.basis == basis)
     known = session.scalar(same)
@@ -57,7 +69,12 @@ def ask(session: Session, study: Study, inputs: PowerInputs, actor: str) -> Powe
 
 def basis_of(study: Study, inputs: PowerInputs) -> str:
     """Fingerprint of what is supposed and of what of the design matters."""
-    return hashlib.sha256(repr((VERSION, inputs.model_dump(mode="json"), design_of(study))).encode()).hexdigest()
+    supposed, design = inputs.model_dump(mode="json"), design_of(study)
+    if inputs.test is PowerTest.DIFFERENCE:
+        del supposed["test"]  # plans of before it could be chosen hold on, and with them what was preregistered
+    if inputs.test is PowerTest.EQUIVALENCE:
+        design["equivalence_bound"] = study.settings.equivalence_bound
+    return hashlib.sha256(repr((VERSION, supposed, design)).encode()).hexdigest()
 
 
 def design_of(study: Study) -> dict[str, Any]:

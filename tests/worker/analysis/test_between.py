@@ -1,5 +1,6 @@
 """Tests between people, and of order and period: as scipy, statsmodels, and paper and pencil have them."""
 
+import csv
 from itertools import combinations
 
 import numpy as np
@@ -8,9 +9,11 @@ import pytest
 import statsmodels.formula.api as formulas
 from scipy import stats
 from statsmodels.stats.anova import anova_lm
+from statsmodels.stats.weightstats import ttost_ind
 
 from tests.benchmarks import between as simulation
 from worker.analysis.study.between import (
+    BETWEEN_TESTS,
     equivalence_between,
     hedges_g,
     means_of,
@@ -38,6 +41,30 @@ def test_welch_is_scipys_and_hedges_g_is_by_hand() -> None:
         7, effect["g_low"] / (effect["g"] / (SECOND.mean() - FIRST.mean()) * pooled) / (1 / 5 + 1 / 4) ** 0.5
     )
     assert noncentral.sf(stats.ttest_ind(SECOND, FIRST).statistic) == pytest.approx(0.025, abs=1e-6)
+
+
+def test_equivalence_between_people_is_statsmodels_two_one_sided_welch_tests() -> None:
+    p, above, below = ttost_ind(SECOND, FIRST, -1.5, 1.5, usevar="unequal")
+    got = equivalence_between(FIRST, SECOND, 1.5)
+    assert [got["p"], got["statistic"], got["degrees_of_freedom"]] == pytest.approx([p, -below[0], above[2]])
+    ends = stats.ttest_ind(SECOND, FIRST, equal_var=False).confidence_interval(0.90)
+    assert [got["low_90"], got["high_90"]] == pytest.approx(list(ends))
+    exchanged = equivalence_between(SECOND, FIRST, 1.5)
+    assert [exchanged["p"], exchanged["difference"]] == pytest.approx([got["p"], -got["difference"]])
+
+
+def test_the_cumulative_link_model_between_people_as_r_has_it() -> None:
+    """By hand in R 4.2: clmm(rating ~ group + (1 | person), nAGQ = 30) of ordinal 2022.11-16; its estimates, with every
+    person's likelihood integrated by integrate(), its scores by numDeriv, and from them a sandwich with n / (n - 1) of
+    each group and Welch's degrees of freedom."""
+    first = [np.array(each, float) for each in ([2, 3, 3], [3, 3, 4], [1, 2, 2], [4, 3, 4], [2, 2, 3])]
+    second = [np.array(each, float) for each in ([3, 4, 4], [5, 4, 5], [2, 3, 3], [4, 4, 3])]
+    got = cumulative_link_between(first, second)
+    assert (got["n_first"], got["n_second"], got["n_ratings"]) == (5, 4, 27)
+    assert [got["difference"], got["sd_between_people"]] == pytest.approx([3.2699453, 2.1624500], rel=1e-6)
+    expected = [1.76063916, 6.40387052, 0.109560134, -0.973172224, 7.51306273]
+    names = ("standard_error", "degrees_of_freedom", "p", "low", "high")
+    assert [got[name] for name in names] == pytest.approx(expected, rel=1e-5)
 
 
 def test_the_permutation_test_counts_the_divisions_that_are_as_far_apart() -> None:
@@ -120,19 +147,34 @@ def test_where_everybody_met_one_method_there_is_no_order() -> None:
 def test_a_report_between_subjects_has_its_tests_and_corrects_them() -> None:
     rows = crossover()
     mine = rows.apply(lambda row: row["method"] == f"m{int(row['participant'][1:]) % 3}", axis=1)
-    report = rating_report(rows[mine], ["m0", "m1", "m2"], between=True)
+    report = rating_report(rows[mine], ["m0", "m1", "m2"], between=True, bound=0.4)
     for comparison in report["scales"]["satisfaction"]["comparisons"]:
         assert comparison["welch_t"]["n_first"] == 4
         assert comparison["welch_t"]["corrected_over"] == 3
-        assert comparison["permutation"]["p_holm"] >= comparison["permutation"]["p"]
+        for test in BETWEEN_TESTS:
+            assert comparison[test]["p_holm"] >= comparison[test]["p"]
+        assert comparison["equivalence_between"]["bound"] == 0.4
+        assert comparison["cumulative_link_between"]["n_ratings"] == 16
         assert "not_computable" in comparison["paired_t"]
 
 
 def test_error_rates_small() -> None:
     """Within three standard errors."""
-    most = 5.0 + 3 * (5.0 * 95.0 / 150) ** 0.5
-    found = simulation.between_row(simulation.Truth("unequal", (8, 8), (0.3, 1.0)), 150)
-    assert found["welch_t_percent"] <= most
-    assert found["misses_percent"] <= most
+    most = 5.0 + 3 * (5.0 * 95.0 / 80) ** 0.5
+    found = simulation.between_row(simulation.Truth("unequal", (8, 8), (0.3, 1.0), better=0.5), 80)
+    for name in ("welch_t_misses", "cumulative_link_misses", "equivalence"):
+        assert found[f"{name}_percent"] <= most
+
+
+def test_what_is_offered_between_arms_never_erred_clearly_more_often_than_promised() -> None:
+    """By the committed table; beside it the model's usual errors, which do."""
+    with (simulation.RESULTS / "between.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    alike, bound = ([row for row in rows if float(row["better"]) == better] for better in (0.0, 0.5))
+    most = 5.0 + 3 * (5.0 * 95.0 / int(rows[0]["studies"])) ** 0.5
+    assert len(alike) == len(bound) == 16
+    for name, those in (("welch_t", alike), ("permutation", alike), ("cumulative_link", alike), ("equivalence", bound)):
+        assert max(float(row[f"{name}_percent"]) for row in those) <= most, name
+    assert max(float(row["usual_errors_percent"]) for row in alike) > most
     order = simulation.order_row(8, 0.0, 30)
     assert order["period_percent"] <= 5.0 + 3 * (5.0 * 95.0 / 30) ** 0.5

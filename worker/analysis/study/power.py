@@ -3,9 +3,10 @@
 What somebody says of a method is 3 (the middle of the scale) + their own level + what the method is to them + the
 noise of one rating, rounded and cut to 1 to 5. One method is better than all the others by the effect on average. A
 share of those who begin drops out, and counts in no test. Every invented study is tested as the page of results
-would: means of each person by the paired t-test, or between arms by Welch's; head-to-heads by Bradley-Terry
-strengths; corrected by Holm over all comparisons of the design, of which one that this test cannot make counts as not
-found. Intervals of the power are Wilson's, 95 %: they say how far the simulation may be off.
+would: ratings for a difference of means (paired t, between arms Welch's), for their order (cumulative link model) or
+for equivalence; head-to-heads by Bradley-Terry strengths; corrected by Holm over all comparisons of the design, of
+which one that this test cannot make counts as not found. Intervals of the power are Wilson's, 95 %: they say how far
+the simulation may be off.
 """
 
 from collections.abc import Sequence
@@ -16,10 +17,11 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from worker.analysis.study.between import welch_t
+from worker.analysis.study.between import equivalence_between, means_of, welch_t
 from worker.analysis.study.bradley_terry import NO_SPREAD, covariance, strengths, why_not
+from worker.analysis.study.cumulative_link import cumulative_link, cumulative_link_between
 from worker.analysis.study.effect_sizes import holm
-from worker.analysis.study.hypothesis_tests import FEWEST_PAIRED, paired_t
+from worker.analysis.study.hypothesis_tests import FEWEST_PAIRED, equivalence, paired_t
 from worker.analysis.wilson import wilson_interval
 from worker.domain.type_aliases import FloatArray
 
@@ -49,24 +51,42 @@ class Truth:
     """Standard deviation over people of how they rate altogether."""
     noise: float
     dropout: float
+    test: str = "difference"
+    """Of the ratings; as app.domain.power_plan.PowerTest."""
+    bound: float = 0.5
+    """Of equivalence, in points."""
+
+    @property
+    def comparisons(self) -> int:
+        """Of every two methods."""
+        return self.methods * (self.methods - 1) // 2
+
+    @property
+    def wanted(self) -> tuple[int, int]:
+        """The comparison that is to be found."""
+        return min(self.better, self.compared), max(self.better, self.compared)
 
 
 def power_at(truth: Truth, people: int, studies: int, seed: int) -> dict[str, Any]:
-    """people, completed (mean), and for ``ratings`` and ``head_to_heads`` (None without): power, low, high."""
+    """people, completed (mean), and for ``ratings`` and ``head_to_heads``: power, low, high.
+
+    ``head_to_heads`` is None without any, and for equivalence, which they have no test of.
+    """
     rng = np.random.default_rng([seed, people])
     found, found_side_by_side, completed = 0, 0, 0
+    side_by_side = truth.head_to_heads > 0 and truth.test != "equivalence"
     for _ in range(studies):
         stayed = int(rng.binomial(people, 1 - truth.dropout))
         completed += stayed
         worth, arms = _worth(truth, stayed, rng)
-        found += _is_found(truth, ratings_p(truth, _means(truth, worth, rng), arms))
-        if truth.head_to_heads:
+        found += _ratings_find(truth, _ratings(truth, worth, rng), arms)
+        if side_by_side:
             found_side_by_side += _is_found(truth, _head_to_heads_p(truth, worth, arms, rng))
     return {
         "people": people,
         "completed": completed / studies,
         "ratings": _power(found, studies),
-        "head_to_heads": _power(found_side_by_side, studies) if truth.head_to_heads else None,
+        "head_to_heads": _power(found_side_by_side, studies) if side_by_side else None,
     }
 
 
@@ -97,28 +117,48 @@ def _worth(truth: Truth, people: int, rng: np.random.Generator) -> tuple[FloatAr
     return worth, meets[np.arange(people) % len(truth.arms)]
 
 
-def _means(truth: Truth, worth: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Of what everybody says of each method, (people, methods)."""
+def _ratings(truth: Truth, worth: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """What everybody says of each method, 1 to 5: (people, methods, trials)."""
     said = worth[:, :, None] + rng.normal(0.0, truth.noise, (*worth.shape, truth.trials))
-    return np.asarray(np.clip(np.rint(said), 1, 5).mean(axis=2).round(12), np.float64)
+    return np.clip(np.rint(said), 1, 5)
 
 
-def ratings_p(truth: Truth, means: FloatArray, meets: Any) -> list[float | None]:
+def _ratings_find(truth: Truth, ratings: FloatArray, meets: Any) -> bool:
+    """As _is_found of all p values, of which the others are needed only where Holm's correction decides."""
+    p = _rating_p(truth, ratings, meets, *truth.wanted)
+    if p is None or p >= ALPHA:
+        return False
+    return p * truth.comparisons < ALPHA or _is_found(truth, ratings_p(truth, ratings, meets))
+
+
+def ratings_p(truth: Truth, ratings: FloatArray, meets: Any) -> list[float | None]:
     """Of every two methods, all by the one test that can compare the two in question; None: it cannot.
 
-    ``means`` and ``meets`` (whether somebody meets a method): (people, methods).
+    ``ratings``: (people, methods, trials); ``meets`` (whether somebody meets a method): (people, methods).
     """
-    paired = (meets[:, truth.better] & meets[:, truth.compared]).sum() >= FEWEST_PAIRED
-    found: list[float | None] = []
-    for first, second in combinations(range(truth.methods), 2):
-        if paired:
-            both = meets[:, first] & meets[:, second]
-            result = paired_t((means[both, second] - means[both, first]).round(12))
-        else:
-            alone = [means[meets[:, one] & ~meets[:, other], one] for one, other in ((first, second), (second, first))]
-            result = welch_t(*alone)
-        found.append(result.get("p"))
-    return found
+    return [_rating_p(truth, ratings, meets, *pair) for pair in combinations(range(truth.methods), 2)]
+
+
+def _rating_p(truth: Truth, ratings: FloatArray, meets: Any, first: int, second: int) -> float | None:
+    if (meets[:, truth.better] & meets[:, truth.compared]).sum() >= FEWEST_PAIRED:
+        both = meets[:, first] & meets[:, second]
+        return _paired(truth, list(ratings[both, first]), list(ratings[both, second])).get("p")
+    alone = [list(ratings[meets[:, one] & ~meets[:, other], one]) for one, other in ((first, second), (second, first))]
+    return _between(truth, *alone).get("p")
+
+
+def _paired(truth: Truth, first: Sequence[FloatArray], second: Sequence[FloatArray]) -> dict[str, Any]:
+    if truth.test == "cumulative_link":
+        return cumulative_link(first, second)
+    differences = (means_of(second) - means_of(first)).round(12)
+    return equivalence(differences, truth.bound) if truth.test == "equivalence" else paired_t(differences)
+
+
+def _between(truth: Truth, first: Sequence[FloatArray], second: Sequence[FloatArray]) -> dict[str, Any]:
+    if truth.test == "cumulative_link":
+        return cumulative_link_between(first, second)
+    means = means_of(first), means_of(second)
+    return equivalence_between(*means, truth.bound) if truth.test == "equivalence" else welch_t(*means)
 
 
 def _head_to_heads_p(truth: Truth, worth: FloatArray, meets: Any, rng: np.random.Generator) -> list[float | None]:
@@ -144,7 +184,5 @@ def _head_to_heads_p(truth: Truth, worth: FloatArray, meets: Any, rng: np.random
 
 def _is_found(truth: Truth, p_values: Sequence[float | None]) -> bool:
     """Whether the comparison is significant after Holm's correction; in whichever direction."""
-    pairs = list(combinations(range(truth.methods), 2))
-    wanted = (min(truth.better, truth.compared), max(truth.better, truth.compared))
-    p = holm(p_values)[pairs.index(wanted)]
+    p = holm(p_values)[list(combinations(range(truth.methods), 2)).index(truth.wanted)]
     return p is not None and p < ALPHA

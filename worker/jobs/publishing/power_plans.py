@@ -37,6 +37,7 @@ def make(context: WorkerContext, job: Job, run_id: int, step: Step) -> None:
         plan = session.get_one(PowerPlan, job.number)
         study = session.get_one(Study, plan.study_id)
         design, inputs, seed = power.design_of(study), plan.inputs, study.seed
+        bound = study.settings.equivalence_bound
     truth = Truth(
         methods=len(design["methods"]),
         better=design["methods"].index(inputs.better),
@@ -50,6 +51,8 @@ def make(context: WorkerContext, job: Job, run_id: int, step: Step) -> None:
         levels=inputs.levels,
         noise=inputs.noise,
         dropout=inputs.dropout_percent / 100,
+        test=inputs.test.value,
+        bound=bound,
     )
     counts = numbers_of_people(inputs.most_people)
     rows = []
@@ -57,8 +60,7 @@ def make(context: WorkerContext, job: Job, run_id: int, step: Step) -> None:
         context.report(run_id, f"simulating {STUDIES} studies with {people} people", place / len(counts))
         rows.append(step(f"{people} people", _simulate, context, run_id, truth, people, seed))
     paired = any({truth.better, truth.compared} <= set(arm) for arm in truth.arms)
-    pairs = truth.methods * (truth.methods - 1) // 2
-    found = {"paired": paired, "comparisons": pairs, "studies": STUDIES, "rows": rows}
+    found = {"paired": paired, "bound": bound, "comparisons": truth.comparisons, "studies": STUDIES, "rows": rows}
     found["enough"] = {what: enough(rows, what) for what in ("ratings", "head_to_heads")}
     step("save", _save, context, job.number, found)
 

@@ -11,10 +11,11 @@ from pydantic import ValidationError
 from sqlalchemy.orm import Session
 
 from app.domain.people import Experimenter
-from app.domain.power_plan import PowerInputs, PowerPlan
+from app.domain.power_plan import PowerInputs, PowerPlan, PowerTest
 from app.domain.studies import Study
 from app.services.evaluation.unblinding import NAMES
 from app.services.studies import power, studies
+from app.services.studies.preregistration import TEST_NAMES
 from app.web.http.authorized_route import AuthorizedRoute
 from app.web.http.deps import ActingExperimenter, CurrentExperimenter, ReadingSession, Slug, Typed, WritingSession
 from app.web.texts.templating import page
@@ -57,8 +58,9 @@ def ask_power(
     except ValidationError as found:
         errors = {str(error["loc"][0]): _in_words(error) for error in found.errors()}
         return _power_page(request, session, study, experimenter, given, errors)
-    except power.NotCompared as refused:
-        return _power_page(request, session, study, experimenter, given, {"compared": refused.message})
+    except (power.NotCompared, power.TooDifferent) as refused:
+        field = "compared" if isinstance(refused, power.NotCompared) else "effect"
+        return _power_page(request, session, study, experimenter, given, {field: refused.message})
     return RedirectResponse(request.app.url_path_for("show_power", slug=slug), HTTPStatus.SEE_OTHER)
 
 
@@ -67,6 +69,8 @@ def _in_words(error: Mapping[str, Any]) -> str:
         key, word = _BOUNDS[error["type"]]
         return f"Enter {word} {error['ctx'][key]:g}."
     whole = error["type"].startswith("int")
+    if error["loc"] == ("test",):
+        return "Choose what is to be shown."
     return "Enter a whole number." if whole else "Enter a number." if "float" in error["type"] else "Choose a method."
 
 
@@ -87,6 +91,8 @@ def _power_page(
         "methods": [(method.value, NAMES[method]) for method in evaluation.methods] if evaluation else [],
         "names": {method.value: name for method, name in NAMES.items()},
         "values": given or _usual(study, plans[0][0] if plans else None),
+        "tests": [(each.value, each.label) for each in PowerTest],
+        "test_names": TEST_NAMES,
         "errors": errors or {},
         "numbers": [(name, PowerInputs.model_fields[name].title) for name in NUMBERS],
         "plans": plans,
@@ -100,13 +106,21 @@ def _power_page(
 
 def _usual(study: Study, last: PowerPlan | None) -> Mapping[str, str]:
     """What the form says at first: what was supposed last, or what is usual."""
-    found = last.inputs if last is not None else PowerInputs()
+    found = last.inputs if last is not None else _unasked(study)
     methods = list(study.settings.evaluation.methods) if study.settings.evaluation else []
     values = {name: f"{getattr(found, name):g}" for name in NUMBERS}
     better = found.better if found.better in methods or not methods else methods[-1]
     others = [method for method in methods if method != better]
     compared = found.compared if found.compared in others or not others else others[0]
-    return values | {"better": better.value, "compared": compared.value}
+    return values | {"better": better.value, "compared": compared.value, "test": found.test.value}
+
+
+def _unasked(study: Study) -> PowerInputs:
+    """What is usual for the first test that the study plans; where it is to show that methods are alike, they are."""
+    planned = study.settings.planned_tests
+    kinds = {kind.planned(paired=paired): kind for kind in PowerTest for paired in (True, False)}
+    test = next((kinds[each] for each in planned if each in kinds), PowerTest.DIFFERENCE)
+    return PowerInputs(test=test, effect=0.0) if test is PowerTest.EQUIVALENCE else PowerInputs(test=test)
 
 
 def _figure(plan: PowerPlan) -> dict[str, Any] | None:
