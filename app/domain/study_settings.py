@@ -53,10 +53,10 @@ class StudySettings(BaseModel):
         max_length=200,
     )
     labels_per_participant: int = setting(
-        200,
+        100,
         Section.START,
         "Answers per participant",
-        "The paper used 200.",
+        "The paper used 200. Scripted people gain a point more by the second hundred.",
         unit="pairs",
         fixed_by=Use.PAIRS,
         ge=10,
@@ -274,7 +274,7 @@ class StudySettings(BaseModel):
         le=100,
     )
     filter_milestones: tuple[int, ...] = setting(
-        (50, 100),
+        (50,),
         Section.LEARNING,
         "Also train a filter after",
         "Numbers of answers, with commas. One is always trained at the end.",
@@ -511,6 +511,8 @@ class StudySettings(BaseModel):
 
 
 PAPER_PROTOCOL = StudySettings(
+    labels_per_participant=200,
+    filter_milestones=(50, 100),
     strategy=Strategy.UNIFORM,
     demographics=PAPER_DEMOGRAPHICS,
     practice_pairs=1,

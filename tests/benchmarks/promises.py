@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from app.domain.study_settings import StudySettings
+from app.domain.study_settings import PAPER_PROTOCOL
 from app.installed_tasks import catalogue
 from tests.worker.at_hand import AtHand
 from worker.analysis.comparison import result_pages
@@ -98,7 +98,7 @@ def _draft(task: str, number: int, bench: BenchmarkUser, kept: Path) -> FilterDr
         progress=lambda stage, share: None,
         references={},
         study_seed=number,
-        version=len(StudySettings().milestones),
+        version=len(PAPER_PROTOCOL.milestones),
     )
     fit._gate_reference()  # of which a worker has made sure beforehand
     started = time.process_time()
