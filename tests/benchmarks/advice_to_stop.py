@@ -77,7 +77,7 @@ def main() -> None:
     with options.output.with_suffix(".csv").open("w", newline="") as stream:
         writer = csv.writer(stream, lineterminator="\n")
         writer.writerow(Row._fields)
-        writer.writerows([*row[:4], *(f"{value:.3f}" for value in row[4:])] for row in rows)
+        writer.writerows(rows)
     page = options.output.with_suffix(".md")
     page.write_text(result_pages.page(page, TITLE, f"{table_of_rules(rows)}\n\n{table_of_lengths(rows)}"))
 
@@ -96,7 +96,7 @@ def _measured(bench: Bench, chain: Chain, file: Path) -> Iterator[Row]:
         gained = bench.gained(chain.user, mode)
         regrets = relative_regret(bench.surface, members), regret_in_deviations(bench.surface, members)
         who = chain.task, chain.user, chain.seed
-        yield Row(*who, count, gained["gain_percent"], gained["best_percent"], *regrets)
+        yield Row(*who, count, *(round(each, 4) for each in (gained["gain_percent"], gained["best_percent"], *regrets)))
 
 
 def regret_in_deviations(surface: ResponseSurface, members: FloatArray) -> float:
@@ -135,13 +135,13 @@ def _chains(rows: Sequence[Row], task: str, people: Sequence[tuple[str, int]]) -
 def _wrong(lost: Sequence[float]) -> str:
     wrong = sum(each > MATTERS for each in lost)
     low, high = wilson_interval(wrong, len(lost))
-    return f"{wrong} of {len(lost)} [{100 * low:.0f}, {100 * high:.0f}]"
+    return f"{wrong} of {len(lost)} [{100 * max(low, 0.0):.0f}, {100 * high:.0f}]"
 
 
 def table_of_rules(rows: Sequence[Row]) -> str:
     """Who is told, and how often that is wrong."""
     lines = [
-        "| task | chains | rule | told | after | wrong, % | lost, mean | at most | answers saved of 100 |",
+        "| task | chains | rule | told | after | wrong [%] | lost, mean | at most | answers saved of 100 |",
         "|---|---|---|---|---|---|---|---|---|",
     ]
     parts = {"chose the rule": CHOSEN_BY, "tried it": TRIED_ON}
@@ -160,7 +160,7 @@ def table_of_rules(rows: Sequence[Row]) -> str:
 def table_of_lengths(rows: Sequence[Row]) -> str:
     """What everybody would still gain who stops after the same number of answers."""
     lines = [
-        "| task | answers | gained so far, points | still to gain, mean | of nine in ten at most | wrong, % |",
+        "| task | answers | gained so far, points | still to gain, mean | of nine in ten at most | wrong [%] |",
         "|---|---|---|---|---|---|",
     ]
     for task, count in product(catalogue.names(), LENGTHS):

@@ -188,8 +188,8 @@ class Bench:
         """What the response surface says the mode is worth to them."""
         weights, unit, best = self._wishes(user)
         change, success = self.surface.predict(mode)
-        gains = {"gain_percent": change @ weights / unit, "best_percent": best / unit}
-        return {name: float(each) for name, each in {**gains, "success_points": 100 * success}.items()}
+        gain = float(change @ weights / unit)
+        return {"gain_percent": gain, "best_percent": best / unit, "success_points": float(100 * success)}
 
     def _wishes(self, user: str) -> tuple[FloatArray, float, float]:
         """A user's true weights, a hundredth of their stake, and the best that a mode gains."""

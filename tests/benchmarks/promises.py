@@ -2,10 +2,10 @@
 
     python -m tests.benchmarks.promises --output docs/results/promises
 
-Per task and person: 200 answers, a filter as a study's worker makes its third one (strengths tested until the promise
-is earned), then drives of it and of the same filter without shield and promise, beside the reference policy, through
-scenarios that nothing else uses. On one core; every hundred scenarios a row is added to the table and the page is
-written anew. Interrupted, it goes on where it was; other --people and --scenarios add to what is there.
+Per task and person: 200 answers, a filter as a worker makes the third of a study of as many (strengths tested until
+the promise is earned), then drives of it and of the same filter without shield and promise, beside the reference
+policy, through scenarios that nothing else uses. On one core; every hundred scenarios a row is added to the table and
+the page is written anew. Interrupted, it goes on where it was; other --people and --scenarios add to what is there.
 """
 
 import argparse
