@@ -98,6 +98,16 @@ class DescribedTask(BaseModel):
     """What participants who set a robot themselves read beside the slider of an axis, by axis and language; where it is
     missing, the words that all tasks share."""
 
+    @property
+    def policy_is_looked_into(self) -> bool:
+        """Whether methods may use the policy's own weights, and not only ask it what it does."""
+        return True
+
+    @property
+    def policy_is_a_server(self) -> bool:
+        """Whether the policy answers from elsewhere."""
+        return False
+
     @model_validator(mode="after")
     def _shown_within_the_episode(self) -> Self:
         if self.usual_clip_steps > self.episode_steps:
