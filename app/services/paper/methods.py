@@ -136,7 +136,7 @@ def _procedure(study: Study) -> Iterator[str]:
         if settings.asks_what_mattered and study.material is None
         else "",
         f"After the introduction participants could give up to {hints.MOST} hints about how the robot was to move, "
-        "from a list in an order of their own, and change them later; the reward model heard each hint as one more answer, "
+        "from a list in an order of their own, and change them later; the reward model heard each as one more answer "
         "about the signals concerned."
         if hint_offers.asks(study)
         else "",

@@ -28,7 +28,7 @@ MEMBERS = 8
 LARGEST_GRADIENT = 1e-6
 """At what counts as the posterior's mode."""
 CALIBRATION_FOLDS = 5
-HINT_STRENGTH = 2.0
+HINT_STRENGTH = 1.0
 """Standard deviations of a pair by which the clips of a hint differ (docs/results/hints.md)."""
 _PINNED = 1e6
 """Prior precision of a weight that is held at 0."""
