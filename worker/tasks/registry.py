@@ -67,8 +67,8 @@ def _check_hints(installed: InstalledTask, description: TaskDescription, task: T
         unknown = sorted({*hint.less, *hint.more} - set(task.signals))
         if unknown:
             raise TaskBroken(
-                f"{installed.folder / 'task.toml'}: hints.{name} is about {unknown[0]}, which is no signal of this task; "
-                f"it has {', '.join(task.signals)}."
+                f"{installed.folder / 'task.toml'}: hints.{name} is about {unknown[0]}, which is no signal of it; "
+                f"there are {', '.join(task.signals)}."
             )
 
 
