@@ -17,7 +17,7 @@ from app.domain.power_plan import PowerInputs
 from app.domain.preferences import LabelEvent, Query
 from app.domain.protocol import EvaluatedMethod, EvaluationSettings
 from app.domain.studies import Participant, Study
-from app.domain.study_settings import PAPER_PROTOCOL
+from app.domain.study_settings import PAPER_PROTOCOL, StudySettings
 from app.services.answers import exclusions
 from app.services.participants import withdrawal
 from app.services.studies import locking, power, studies

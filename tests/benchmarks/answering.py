@@ -54,6 +54,8 @@ class Variant:
     """How often the quality that speaks most for the chosen clip is what is named; else any is. None: nobody asks."""
     hints: float | None = None
     """How often each of the hints that are given before the first pair is one of the truest; else any. None: none."""
+    hint_weight: int = 1
+    """As how many answers each hint is heard"""
 
 
 @dataclass(frozen=True)
@@ -156,7 +158,7 @@ class Bench:
         for row in range(len(given)):
             true, which = rng.random() < variant.hints, int(rng.integers(len(offered)))
             given[row] = given[row] if true else [*offered][which]
-        return np.array([directions[name] for name in dict.fromkeys(given)])
+        return np.repeat([directions[name] for name in dict.fromkeys(given)], variant.hint_weight, axis=0)
 
     def _choose(
         self,

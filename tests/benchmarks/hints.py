@@ -2,7 +2,7 @@
 
     python -m tests.benchmarks.hints
 
-Three quarters of an hour on one core. Finished chains are kept in the table of results; repeat the command to go on.
+About an hour of one core. Finished chains are kept in the table of results; repeat the command to go on.
 """
 
 from tests.benchmarks import answering
@@ -14,6 +14,8 @@ HINTS = {
     "true": Variant(hints=1.0),
     "a quarter wrong": Variant(hints=0.75),
     "at random": Variant(hints=0.0),
+    "true, fourfold": Variant(hints=1.0, hint_weight=4),
+    "at random, fourfold": Variant(hints=0.0, hint_weight=4),
 }
 
 
