@@ -71,6 +71,8 @@ class EvaluatedMethod(Choice):
     )
 
 
+NEEDS_WEIGHTS = (EvaluatedMethod.PREFFT, EvaluatedMethod.PREFFT_ANCHORED, EvaluatedMethod.PBARL_PRINTED)
+"""Methods that look into the policy, and do not only ask it what it does."""
 STANDARD_QUESTIONNAIRES = tuple((each.name, each.title, each.about) for each in library.every().values())
 """(name, title, what to know before choosing it), as the form offers them."""
 MOST_INSTRUMENTS = 10

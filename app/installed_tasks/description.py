@@ -125,6 +125,16 @@ class DescribedTask(BaseModel):
     hints: dict[Annotated[str, Field(pattern=NAME)], HintedAt] = {}
     """What participants may wish for in general, where a study asks; their order is that of the file."""
 
+    @property
+    def policy_is_looked_into(self) -> bool:
+        """Whether methods may use the policy's own weights, and not only ask it what it does."""
+        return True
+
+    @property
+    def policy_is_a_server(self) -> bool:
+        """Whether the policy answers from elsewhere."""
+        return False
+
     @model_validator(mode="after")
     def _shown_within_the_episode(self) -> Self:
         if self.usual_clip_steps > self.episode_steps:

@@ -185,6 +185,16 @@ class LabDescription(DescribedTask):
         return self
 
     @property
+    def policy_is_looked_into(self) -> bool:
+        """Never: whatever it is, a lab's policy is only asked what it does."""
+        return False
+
+    @property
+    def policy_is_a_server(self) -> bool:
+        """Whether it answers over a websocket."""
+        return self.policy.url is not None
+
+    @property
     def signal_names(self) -> tuple[str, ...]:
         """Columns of the signals: what is measured in every lab, what fields allow for, what the lab declares."""
         tip = ("speed_m_s", "speed_squared_m2_s2", "acceleration_squared_m2_s4") if self.fields.tip else ()
