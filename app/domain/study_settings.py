@@ -182,6 +182,20 @@ class StudySettings(BaseModel):
             ),
         ),
     )
+    asks_for_hints: bool = setting(
+        False,
+        Section.PAIRS,
+        "Ask for hints",
+        options=(
+            ("no", "No", "Answers to pairs say it all."),
+            (
+                "yes",
+                "Yes",
+                "After the introduction people may tick up to two hints, such as \u201cslower near me\u201d, and "
+                "change them later. Each is heard as one more answer. Structured models of simulated clips only.",
+            ),
+        ),
+    )
     evaluation: EvaluationSettings | None = setting(
         None,
         Section.EVALUATION,
@@ -409,6 +423,12 @@ class StudySettings(BaseModel):
     def _can_hear_what_mattered(self) -> "StudySettings":
         if self.asks_what_mattered and not self.reward_kind.is_linear_in_signals:
             raise ValueError("What made the difference is learned from by structured reward models only. Choose one.")
+        return self
+
+    @model_validator(mode="after")
+    def _can_hear_hints(self) -> "StudySettings":
+        if self.asks_for_hints and not self.reward_kind.is_linear_in_signals:
+            raise ValueError("Hints are learned from by structured reward models only. Choose one.")
         return self
 
     @model_validator(mode="after")

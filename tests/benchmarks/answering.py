@@ -16,7 +16,7 @@ from scipy import stats
 from tqdm import tqdm
 
 from app.domain.study_settings import StudySettings
-from app.installed_tasks import catalogue, qualities
+from app.installed_tasks import catalogue, hints, qualities
 from tests.benchmarks.chosen_modes import stake
 from worker.analysis.comparison import result_pages
 from worker.compute import simulation
@@ -27,10 +27,11 @@ from worker.jobs.learning import following
 from worker.ml import acquisition
 from worker.ml.filters.response_surface import ResponseSurface, best_mode
 from worker.ml.rewards import reward_training
+from worker.ml.rewards.hint_directions import direction
 from worker.ml.rewards.reward_models import RewardModel
 from worker.ml.rewards.segments import SegmentPairs
 from worker.ml.rewards.signal_scale import SignalScale
-from worker.ml.teachers import TASTES, Manner, ScriptedTeacher, Taste, random_taste, speaks_most
+from worker.ml.teachers import TASTES, Manner, ScriptedTeacher, Taste, random_taste, speaks_most, truest
 from worker.sim.costs import preference_rewards, signal_weights
 from worker.sim.rollout import rollout
 from worker.tasks import registry
@@ -52,6 +53,10 @@ class Variant:
     """of the pairs, from the tenth answer on"""
     names: float | None = None
     """How often the quality that speaks most for the chosen clip is what is named; else any is. None: nobody asks."""
+    hints: float | None = None
+    """How often each of the hints that are given before the first pair is one of the truest; else any. None: none."""
+    hint_weight: int = 1
+    """As how many answers each hint is heard"""
 
 
 @dataclass(frozen=True)
@@ -117,6 +122,7 @@ class Bench:
     def answered(self, chain: Chain, counts: Sequence[int]) -> Iterator[Fitted]:
         """What is known after so many answers each; by that the next pairs are chosen."""
         variant, taste, rng = self.variants[chain.variant], taste_of(chain.user), np.random.default_rng([chain.seed, 7])
+        hinted = self._hinted(variant, taste, chain)
         saying = np.random.default_rng([chain.seed, 11])
         rewards = preference_rewards(
             self.task, self.pool.costs, self.pool.signals, taste.omega, "calibrated", taste.per_signal
@@ -131,7 +137,7 @@ class Bench:
             named = np.concatenate([named, self._named(variant, taste, added, said, saying)])
             asked = self.segments(self.pairs[rows])
             model = reward_training.fit(
-                asked, answers, "structured", chain.seed, scale=self.scale, mattered=named
+                asked, answers, "structured", chain.seed, scale=self.scale, mattered=named, hints=hinted
             ).model
             yield Fitted(rows, answers, model)
 
@@ -156,6 +162,21 @@ class Bench:
                 most = speaks_most(difference if target == 1.0 else -difference, offered)
                 named[row, offered[most if says < variant.names else [*offered][which]]] = True
         return named
+
+    def _hinted(self, variant: Variant, taste: Taste, chain: Chain) -> FloatArray:
+        """(H, S) the hints that are given before the first pair."""
+        if variant.hints is None:
+            return np.zeros((0, len(self.task.signals)))
+        place = (catalogue.names().index(chain.task), PEOPLE.index(chain.user))
+        rng = np.random.default_rng([chain.seed, 13, *place])
+        offered = hints.of_task(chain.task)
+        directions = {name: direction(self.task.signals, each) for name, each in offered.items()}
+        weights = signal_weights(self.task, taste.omega, taste.per_signal) * self.scale.spread
+        given = truest(directions, weights, hints.MOST)
+        for row in range(len(given)):
+            true, which = rng.random() < variant.hints, int(rng.integers(len(offered)))
+            given[row] = given[row] if true else [*offered][which]
+        return np.repeat([directions[name] for name in dict.fromkeys(given)], variant.hint_weight, axis=0)
 
     def _choose(
         self,
