@@ -229,7 +229,8 @@ class _Seat:
                 raise EOFError
             ours, theirs = _FORKS.Pipe()
             with theirs:
-                process = _FORKS.Process(target=_serve, args=(theirs, self._niceness))
+                # A daemon: a program that ends without closing is not kept from it by a process that waits.
+                process = _FORKS.Process(target=_serve, args=(theirs, self._niceness), daemon=True)
                 process.start()  # waits for seconds while the server that forks is new
             with self._changing:
                 self._process, self._pipe = process, ours
