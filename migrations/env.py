@@ -7,6 +7,7 @@ from sqlalchemy import Connection, Engine, create_engine, event, text
 
 import app.domain.clips
 import app.domain.evaluation
+import app.domain.hints
 import app.domain.models
 import app.domain.participation
 import app.domain.people

@@ -10,6 +10,7 @@ from sqlalchemy.orm import Session
 from app.db import now
 from app.domain.clips import Clip
 from app.domain.evaluation import HeadToHeadAnswer, Rating, Trial
+from app.domain.hints import HintEvent
 from app.domain.models import ModelKind
 from app.domain.participation import Allocation, ConsentRecord, FormAnswer, ParticipantEvent, StageRecord
 from app.domain.preferences import Purpose, Query, Response
@@ -139,6 +140,16 @@ def _rate(session: Session, study: Study, person: Participant, random: Random) -
             filmed=True,
             client_uuid=str(uuid5(NAMESPACE_URL, f"setting/{person.id}")),
             by_script=True,
+        )
+    )
+    session.add(
+        HintEvent(
+            participant_id=person.id,
+            revision=1,
+            hints="gentler",
+            offered="gentler slower_near",
+            answered=3,
+            client_uuid=str(uuid5(NAMESPACE_URL, f"hints/{person.id}")),
         )
     )
     for each in head_to_heads.of_participant(session, person.id):

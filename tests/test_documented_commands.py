@@ -109,6 +109,7 @@ RUN: dict[str, str | Elsewhere | OnlyParsed] = {
     "api_pages": "--people 1 --answers 20",
     "chosen_modes": ROLLOUTS,
     "following_pairs": ROLLOUTS,
+    "hints": ROLLOUTS,
     "mattered": ROLLOUTS,
     "comparison_report": "results/paper_form",
     "contact_sheet": "sheets feeding --films 1 --steps 5 --no-people",

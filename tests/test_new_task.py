@@ -25,6 +25,7 @@ from app.services.studies import studies
 from app.web.texts import wording
 from tests import factories
 from tests.app.conftest import agree
+from tests.app.study_pages import typed
 from worker.compute import simulation
 from worker.sim.assistive import AssistiveEnv
 from worker.sim.rollout import rollout
@@ -124,7 +125,7 @@ def test_it_stands_behind_our_tasks_on_the_form_and_its_study_is_in_its_words(
     assert re.findall(r'name="task" value="(\w+)"', page) == ["feeding", "drinking", "scratching", "dabbing"]
     assert "A folded napkin dabs the corner of the mouth." in page
     assert 'd="M150 66L122 64"' in page
-    form = {"task": "dabbing", "name": "Napkins", "clip_steps": "101"}
+    form = typed(experimenter, task="dabbing", name="Napkins", clip_steps="101")
     assert "An episode of this task has 100 steps." in experimenter.post("/studies/new", data=form).text
     with database.writing() as session:
         study = studies.create_study(session, "Napkins", StudySettings(language=Language.GERMAN), task="dabbing")

@@ -13,6 +13,7 @@ from pydantic_core import ErrorDetails
 DESCRIPTION, PICTURE, CHECKPOINT = "task.toml", "picture.svg", "checkpoint"
 SHORTEST_CLIP_STEPS, LONGEST_CLIP_STEPS = 20, 600
 """Control steps of 0.1 s."""
+NAME = r"^[a-z][a-z0-9_]{0,39}$"
 PICTURE_FRAME = "0 0 240 150"
 _SHAPES = {"g", "path", "circle", "ellipse", "rect", "line", "polyline", "polygon"}
 _PLACES = {"cx", "cy", "x", "y", "x1", "y1", "x2", "y2"}
@@ -80,6 +81,30 @@ class SliderWords(BaseModel):
     high: Word
 
 
+class HintedAt(BaseModel):
+    """What somebody may wish for in general: a direction of some signals, and what participants read of it."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    less: tuple[str, ...] = ()
+    """signals that are to be less"""
+    more: tuple[str, ...] = ()
+    words: dict[LanguageCode, Word]
+    """as in "slower near me"; en is needed"""
+
+    @model_validator(mode="after")
+    def _says_something(self) -> Self:
+        if not (self.less or self.more) or set(self.less) & set(self.more):
+            raise ValueError("needs signals in less or in more, none in both")
+        if "en" not in self.words:
+            raise ValueError("needs words.en")
+        return self
+
+    def contradicts(self, other: "HintedAt") -> bool:
+        """Whether both cannot be wished for at once."""
+        return bool(set(self.less) & set(other.more) or set(self.more) & set(other.less))
+
+
 class DescribedTask(BaseModel):
     """What both ways to describe a task say: a folder of code with ``task.toml``, and a ``lab.toml``."""
 
@@ -97,6 +122,18 @@ class DescribedTask(BaseModel):
     sliders: dict[str, dict[LanguageCode, SliderWords]] = {}
     """What participants who set a robot themselves read beside the slider of an axis, by axis and language; where it is
     missing, the words that all tasks share."""
+    hints: dict[Annotated[str, Field(pattern=NAME)], HintedAt] = {}
+    """What participants may wish for in general, where a study asks; their order is that of the file."""
+
+    @property
+    def policy_is_looked_into(self) -> bool:
+        """Whether methods may use the policy's own weights, and not only ask it what it does."""
+        return True
+
+    @property
+    def policy_is_a_server(self) -> bool:
+        """Whether the policy answers from elsewhere."""
+        return False
 
     @model_validator(mode="after")
     def _shown_within_the_episode(self) -> Self:

@@ -176,6 +176,24 @@ class LabDescription(DescribedTask):
             raise ValueError("signals is empty and fields.tip is not given: there is nothing people could judge by")
         return self
 
+    @model_validator(mode="after")
+    def _hints_at_what_is_measured(self) -> Self:
+        for name, hint in self.hints.items():
+            unknown = sorted({*hint.less, *hint.more} - set(self.signal_names))
+            if unknown:
+                raise ValueError(f"hints.{name} is about {unknown[0]}, which is not among its signals")
+        return self
+
+    @property
+    def policy_is_looked_into(self) -> bool:
+        """Never: whatever it is, a lab's policy is only asked what it does."""
+        return False
+
+    @property
+    def policy_is_a_server(self) -> bool:
+        """Whether it answers over a websocket."""
+        return self.policy.url is not None
+
     @property
     def signal_names(self) -> tuple[str, ...]:
         """Columns of the signals: what is measured in every lab, what fields allow for, what the lab declares."""

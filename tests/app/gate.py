@@ -121,7 +121,7 @@ MATRIX: dict[str, Rule] = {
     **dict.fromkeys(("finish_instructions", "show_last_rating", "rate_trial"), PARTICIPANT),
     **dict.fromkeys(("show_head_to_head", "show_last_head_to_head", "answer_head_to_head"), PARTICIPANT),
     **dict.fromkeys(("show_scale", "save_scale", "show_robot_scale", "save_robot_scale"), PARTICIPANT),
-    **dict.fromkeys(("show_self_setting", "save_self_setting"), PARTICIPANT),
+    **dict.fromkeys(("show_self_setting", "save_self_setting", "show_hints", "save_hints"), PARTICIPANT),
     "api openapi": ANYBODY,
     **dict.fromkeys(("api show_account", "api list_studies"), TOKEN),
     **dict.fromkeys(("api show_study", "api list_participants", "api list_members", "api list_bundles"), TOKEN_LOOKS),

@@ -14,7 +14,7 @@ from tests import factories
 
 def models(regrets: Sequence[float | None]) -> list[Model]:
     return [
-        Model(label_count=10 * (place + 1), metrics={} if regret is None else {"advice": {"expected_regret": regret}})
+        Model(label_count=10 * (place + 1), metrics={} if regret is None else {"advice": {"relative_regret": regret}})
         for place, regret in enumerate(regrets)
     ]
 
@@ -22,12 +22,12 @@ def models(regrets: Sequence[float | None]) -> list[Model]:
 @pytest.mark.parametrize(
     ("regrets", "since"),
     [
-        ([1.0, 0.1, 0.1], None),
-        ([1.0, 0.1, 0.1, 0.1], 40),
-        ([0.1, 0.1, 0.1, 0.1, 0.1], 30),
-        ([0.1, 0.1, 0.1, 0.9], None),
-        ([0.1, 0.3, 0.1, 0.1, 0.1], 50),
-        ([None, 0.1, None, 0.1, 0.1], 50),
+        ([1.0, 0.05, 0.05], None),
+        ([1.0, 0.05, 0.05, 0.05], 40),
+        ([0.05, 0.05, 0.05, 0.05, 0.05], 30),
+        ([0.05, 0.05, 0.05, 0.9], None),
+        ([0.05, 0.3, 0.05, 0.05, 0.05], 50),
+        ([None, 0.05, None, 0.05, 0.05], 50),
     ],
 )
 def test_three_small_regrets_in_a_row_are_enough(regrets: list[float | None], since: int | None) -> None:
@@ -46,7 +46,7 @@ def test_it_is_noted_once(database: Database) -> None:
         study = factories.make_study(session, "Pilot")
         participant, _ = factories.make_participant(session, study)
     for labels in (10, 20, 30, 40):
-        metrics = {"advice": {"expected_regret": 0.05}}
+        metrics = {"advice": {"relative_regret": 0.05}}
         with database.writing() as session:
             factories.make_model(session, study, participant, ModelKind.REWARD, metrics, labels=labels)
             stopping_advice.note(session, study, participant)

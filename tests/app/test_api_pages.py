@@ -15,6 +15,7 @@ from sqlalchemy.orm import Session
 from app.db import Database, now
 from app.domain.clips import Clip
 from app.domain.evaluation import HeadToHead, HeadToHeadAnswer, Rating, Trial
+from app.domain.hints import HintEvent, newest_hints
 from app.domain.models import ModelKind
 from app.domain.participation import Allocation, ConsentRecord, FormAnswer, ParticipantEvent, StageRecord
 from app.domain.people import AuditEvent, Experimenter
@@ -115,6 +116,10 @@ def somebody_does_everything(session: Session, store: ArtefactStore, study: Stud
                 participant_id=person.id, revision=revision, mode=mode, filmed=True, client_uuid=uuid, by_script=True
             )
         )
+        hinted = newest_hints(session, person.id)
+        revision = hinted.revision + 1 if hinted else 1
+        event = {"revision": revision, "hints": "", "offered": "gentler", "client_uuid": f"{person.id}-t{revision}"}
+        session.add(HintEvent(participant_id=person.id, answered=5, **event))
         donors.draw(session, study, person, EvaluatedMethod.AVERAGE, ("cautious",))
     newcomer, _ = factories.make_participant(session, study)
     _fill_in(session, newcomer, "5")

@@ -172,6 +172,7 @@ FORGERIES: dict[str, Change] = {
     "a secret that can be guessed": _set("study", "key_secret", "0"),
     "a study that was deleted": _set("study", "deleted_at", "2026-01-01T00:00:00+00:00"),
     "material without signals": _set("study", "material", {"rate_hz": 10}),
+    "hints that are no names": _set("hint_event", "hints", "<b>"),
     "an answer that cannot be given": _set("label_event", "response", "both"),
     "a letter that is none": _set("trial", "letter", "<"),
     "a number as text": _set("query", "ordinal", "1"),

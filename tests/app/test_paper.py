@@ -17,7 +17,7 @@ from app.domain.power_plan import PowerInputs
 from app.domain.preferences import LabelEvent, Query
 from app.domain.protocol import EvaluatedMethod, EvaluationSettings
 from app.domain.studies import Participant, Study
-from app.domain.study_settings import PAPER_PROTOCOL
+from app.domain.study_settings import PAPER_PROTOCOL, StudySettings
 from app.services.answers import exclusions
 from app.services.participants import withdrawal
 from app.services.studies import locking, power, studies
@@ -211,6 +211,17 @@ def test_pairs_that_follow_the_person_are_told_where_there_are_any(
         study.material = material
     said = text_of(experimenter, study, path)
     assert said.count("From the tenth answer on 25 %") == times
+
+
+@pytest.mark.parametrize("asks", [True, False])
+@pytest.mark.parametrize("path", ["results/methods_and_results.md", "preregistration.md"])
+def test_hints_are_told_where_they_are_asked_for(
+    experimenter: TestClient, database: Database, asks: bool, path: str
+) -> None:
+    with database.writing() as session:
+        settings = StudySettings(asks_for_hints=asks)
+        study = studies.create_study(session, "Hints", settings, seed=1)
+    assert text_of(experimenter, study, path).count("up to 2 hints") == asks
 
 
 def test_a_preregistration_answers_every_question_of_osf(

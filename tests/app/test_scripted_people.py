@@ -12,10 +12,12 @@ from app.db import Database
 from app.domain.clips import Clip, Rollout
 from app.domain.designs import Ending
 from app.domain.evaluation import HeadToHeadAnswer, Rating, Trial
+from app.domain.hints import HintEvent
 from app.domain.preferences import Purpose
 from app.domain.protocol import MADE_FOR_YOU, EvaluatedMethod, EvaluationSettings, FormItem, Stage
 from app.domain.self_setting import SelfSetting
 from app.domain.studies import Participant, Study
+from app.installed_tasks import hints
 from app.services.answers import form_answers
 from app.services.evaluation import evaluation_plan
 from app.storage import ArtefactStore
@@ -94,6 +96,21 @@ class Scene:
 @pytest.fixture
 def scene(address: str, database: Database, store: ArtefactStore) -> Scene:
     return Scene(address, database, store)
+
+
+def test_hints_are_given_that_are_true(scene: Scene) -> None:
+    study = scene.open(asks_for_hints=True, introduction_pairs=0)
+    participant_id, _ = scene.send(study)
+    with scene.database.reading() as session:
+        [said] = session.scalars(select(HintEvent).where(HintEvent.participant_id == participant_id)).all()
+    given = [hints.of_task(study.task)[name] for name in said.hints.split()]
+    minded = {
+        "distance_m",
+        "speed_squared_m2_s2",
+        *["force_away_n", "high_force_n", "spilled_on_person", "intake_speed_m_s"],
+    }
+    assert len(given) == hints.MOST
+    assert all(minded & set(each.less) for each in given)
 
 
 def test_whatever_is_asked_is_answered_and_stored_as_it_was_meant(scene: Scene) -> None:

@@ -31,7 +31,7 @@ CHANGES: dict[str, Act] = {
     ),
     "an answer taken back": undo,
     "a reward model": lambda session, _store, person, _queries: factories.make_model(
-        session, person.study, person, ModelKind.REWARD, {"advice": {"expected_regret": 0.1}}
+        session, person.study, person, ModelKind.REWARD, {"advice": {"relative_regret": 0.05}}
     ),
     "a filter": lambda session, _store, person, _queries: factories.make_model(
         session, person.study, person, ModelKind.FILTER, factories.filter_metrics()

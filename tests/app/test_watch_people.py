@@ -175,7 +175,7 @@ def test_the_advice_is_shown_only_where_the_study_wants_it(
         study = factories.make_study(session, "Advised", advisor=advisor)
         person, _ = factories.make_participant(session, study)
         for labels in (10, 20, 30):
-            metrics = {"advice": {"expected_regret": 0.1}}
+            metrics = {"advice": {"relative_regret": 0.05}}
             factories.make_model(session, study, person, ModelKind.REWARD, metrics, labels=labels)
     assert ("enough answers" in experimenter.get("/studies/advised").text) is shown
     assert ("more answers could gain" in experimenter.get("/studies/advised/participants/P01").text) is shown

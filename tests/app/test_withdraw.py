@@ -20,6 +20,7 @@ from app.domain.evaluation import (
     Rating,
     Trial,
 )
+from app.domain.hints import HintEvent
 from app.domain.models import Export, Model, ModelKind, Report, RunKind
 from app.domain.participation import Allocation, ConsentRecord, FormAnswer, ParticipantEvent, StageRecord
 from app.domain.people import AuditEvent
@@ -102,6 +103,8 @@ def leave_traces(database: Database, store: ArtefactStore, participant_id: int) 
                 by_script=True,
             )
         )
+        hinted = {"hints": marked("hint"), "offered": marked("offered"), "client_uuid": marked("hinting")[:36]}
+        session.add(HintEvent(participant_id=person.id, revision=1, answered=3, **hinted))
         factories.make_previews(session, store, study, [{}])
         chosen = SelfSetting(
             participant_id=person.id,

@@ -13,7 +13,7 @@ from app.domain import studies
 from app.domain.choices import ClipQuality, Method, RewardKind, Strategy
 from app.domain.preferences import Response
 from app.domain.protocol import FROM_OTHERS, LIKERT_POINTS, EvaluatedMethod, EvaluationSettings, Language, PlannedTest
-from app.domain.study_settings import StudySettings
+from app.domain.study_settings import PAPER_PROTOCOL, StudySettings
 from app.paths import WORDING
 from app.services.evaluation import unblinding
 from app.services.studies import preregistration
@@ -51,7 +51,7 @@ def default(config: type, name: str) -> Any:
         (default(Promise, "force_n"), USUAL.harm_force_n),
         (default(Promise, "spilled"), USUAL.harm_spilled),
         (default(FineTuning, "steps"), EVALUATION.fine_tuning_steps),
-        (default(BenchmarkConfig, "labels"), USUAL.labels_per_participant),
+        (default(BenchmarkConfig, "labels"), PAPER_PROTOCOL.labels_per_participant),
         (default(BenchmarkConfig, "rule"), USUAL.strategy),
         (default(BenchmarkConfig, "reward"), USUAL.reward_kind),
         (default(BenchmarkConfig, "smallest_pool"), USUAL.pool_scenarios),

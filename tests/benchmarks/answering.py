@@ -16,7 +16,7 @@ from scipy import stats
 from tqdm import tqdm
 
 from app.domain.study_settings import StudySettings
-from app.installed_tasks import catalogue, qualities
+from app.installed_tasks import catalogue, hints, qualities
 from tests.benchmarks.chosen_modes import stake
 from worker.analysis.comparison import result_pages
 from worker.compute import simulation
@@ -27,9 +27,11 @@ from worker.jobs.learning import following
 from worker.ml import acquisition
 from worker.ml.filters.response_surface import ResponseSurface, best_mode
 from worker.ml.rewards import reward_training
+from worker.ml.rewards.hint_directions import direction
+from worker.ml.rewards.reward_models import RewardModel
 from worker.ml.rewards.segments import SegmentPairs
 from worker.ml.rewards.signal_scale import SignalScale
-from worker.ml.teachers import TASTES, Manner, ScriptedTeacher, Taste, random_taste, speaks_most
+from worker.ml.teachers import TASTES, Manner, ScriptedTeacher, Taste, random_taste, speaks_most, truest
 from worker.sim.costs import preference_rewards, signal_weights
 from worker.sim.rollout import rollout
 from worker.tasks import registry
@@ -51,6 +53,10 @@ class Variant:
     """of the pairs, from the tenth answer on"""
     names: float | None = None
     """How often the quality that speaks most for the chosen clip is what is named; else any is. None: nobody asks."""
+    hints: float | None = None
+    """How often each of the hints that are given before the first pair is one of the truest; else any. None: none."""
+    hint_weight: int = 1
+    """As how many answers each hint is heard"""
 
 
 @dataclass(frozen=True)
@@ -80,6 +86,17 @@ class Pool:
     scenarios: acquisition.Indices
 
 
+@dataclass(frozen=True)
+class Fitted:
+    """What N answers led to."""
+
+    rows: acquisition.Indices
+    """(N,) of the pool's pairs"""
+    answers: FloatArray
+    """(N,)"""
+    model: RewardModel
+
+
 class Bench:
     """The pool of one task, and what its users answer."""
 
@@ -89,6 +106,7 @@ class Bench:
         self.pool = _pool(name, directory)
         self.pairs = acquisition.matched_pairs(self.pool.scenarios)
         self.scale = SignalScale.of(self.segments(self.pairs), self.pool.means)
+        self._of_users = dict[str, tuple[FloatArray, float, float]]()
 
     def segments(self, rows: acquisition.Indices) -> SegmentPairs:
         """The pairs of clips in (N, 2) rows."""
@@ -96,7 +114,15 @@ class Bench:
 
     def measure(self, chain: Chain) -> Iterator[Row]:
         """Answer, fit, choose, and so on."""
-        variant, taste, rng = self.variants[chain.variant], _taste(chain.user), np.random.default_rng([chain.seed, 7])
+        for fitted in self.answered(chain, sorted({*COUNTS, *range(CHOOSE_EVERY, COUNTS[-1], CHOOSE_EVERY)})):
+            if (count := len(fitted.rows)) in COUNTS:
+                mode = best_mode(self.surface, fitted.model.signal_weights(()), chain.seed)
+                yield {**vars(chain), "labels": count, **self.gained(chain.user, mode)}
+
+    def answered(self, chain: Chain, counts: Sequence[int]) -> Iterator[Fitted]:
+        """What is known after so many answers each; by that the next pairs are chosen."""
+        variant, taste, rng = self.variants[chain.variant], taste_of(chain.user), np.random.default_rng([chain.seed, 7])
+        hinted = self._hinted(variant, taste, chain)
         saying = np.random.default_rng([chain.seed, 11])
         rewards = preference_rewards(
             self.task, self.pool.costs, self.pool.signals, taste.omega, "calibrated", taste.per_signal
@@ -104,18 +130,16 @@ class Bench:
         teacher = ScriptedTeacher.calibrated(Manner(), rewards)
         rows, answers, model = np.zeros(0, np.int64), np.zeros(0), None
         named = np.zeros((0, len(self.task.signals)), bool)
-        for count in sorted({*COUNTS, *range(CHOOSE_EVERY, COUNTS[-1], CHOOSE_EVERY)}):
+        for count in counts:
             added = self._choose(chain, variant.following_share, count - len(rows), rows, model, rng)
             said = [TARGETS[teacher.answer(left, right, rng)] for left, right in rewards[added]]
             rows, answers = np.concatenate([rows, added]), np.concatenate([answers, said])
             named = np.concatenate([named, self._named(variant, taste, added, said, saying)])
             asked = self.segments(self.pairs[rows])
             model = reward_training.fit(
-                asked, answers, "structured", chain.seed, scale=self.scale, mattered=named
+                asked, answers, "structured", chain.seed, scale=self.scale, mattered=named, hints=hinted
             ).model
-            if count in COUNTS:
-                mode = best_mode(self.surface, model.signal_weights(()), chain.seed)
-                yield {**vars(chain), "labels": count, **self._gained(chain.user, mode)}
+            yield Fitted(rows, answers, model)
 
     def _named(
         self,
@@ -138,6 +162,21 @@ class Bench:
                 most = speaks_most(difference if target == 1.0 else -difference, offered)
                 named[row, offered[most if says < variant.names else [*offered][which]]] = True
         return named
+
+    def _hinted(self, variant: Variant, taste: Taste, chain: Chain) -> FloatArray:
+        """(H, S) the hints that are given before the first pair."""
+        if variant.hints is None:
+            return np.zeros((0, len(self.task.signals)))
+        place = (catalogue.names().index(chain.task), PEOPLE.index(chain.user))
+        rng = np.random.default_rng([chain.seed, 13, *place])
+        offered = hints.of_task(chain.task)
+        directions = {name: direction(self.task.signals, each) for name, each in offered.items()}
+        weights = signal_weights(self.task, taste.omega, taste.per_signal) * self.scale.spread
+        given = truest(directions, weights, hints.MOST)
+        for row in range(len(given)):
+            true, which = rng.random() < variant.hints, int(rng.integers(len(offered)))
+            given[row] = given[row] if true else [*offered][which]
+        return np.repeat([directions[name] for name in dict.fromkeys(given)], variant.hint_weight, axis=0)
 
     def _choose(
         self,
@@ -166,17 +205,25 @@ class Bench:
         )
         return free[choice.indices]
 
-    def _gained(self, user: str, mode: FloatArray) -> Row:
-        taste = _taste(user)
-        weights = signal_weights(self.task, taste.omega, taste.per_signal)
-        unit = stake(self.task, taste) / 100
+    def gained(self, user: str, mode: FloatArray) -> Row:
+        """What the response surface says the mode is worth to them."""
+        weights, unit, best = self._wishes(user)
         change, success = self.surface.predict(mode)
-        best, _ = self.surface.predict(best_mode(self.surface, weights, 0))
-        gains = {"gain_percent": change @ weights / unit, "best_percent": best @ weights / unit}
-        return {name: float(each) for name, each in {**gains, "success_points": 100 * success}.items()}
+        gain = float(change @ weights / unit)
+        return {"gain_percent": gain, "best_percent": best / unit, "success_points": float(100 * success)}
+
+    def _wishes(self, user: str) -> tuple[FloatArray, float, float]:
+        """A user's true weights, a hundredth of their stake, and the best that a mode gains."""
+        if user not in self._of_users:
+            taste = taste_of(user)
+            weights = signal_weights(self.task, taste.omega, taste.per_signal)
+            best, _ = self.surface.predict(best_mode(self.surface, weights, 0))
+            self._of_users[user] = weights, stake(self.task, taste) / 100, float(best @ weights)
+        return self._of_users[user]
 
 
-def _taste(user: str) -> Taste:
+def taste_of(user: str) -> Taste:
+    """person-7 is drawn from a population, always the same."""
     if user in TASTES:
         return TASTES[user]
     return random_taste(user, np.random.default_rng([int(user.removeprefix("person-")), 10]))
@@ -217,9 +264,10 @@ def _rolled(name: str) -> Pool:
 
 
 def parser(description: str | None, stem: str, seeds: int = 2) -> argparse.ArgumentParser:
-    """What such a benchmark can be told. ``stem``: of the files of its results."""
+    """What such a benchmark can be told. ``stem``: of the files of its results; ``seeds`` 0: it has its own."""
     told = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
-    told.add_argument("--seeds", type=int, default=seeds)
+    if seeds:
+        told.add_argument("--seeds", type=int, default=seeds)
     told.add_argument("--pools", type=Path, default=Path("data/answering"), help="where rollouts are kept")
     told.add_argument("--output", type=Path, default=Path("docs/results") / stem, help="stem of both files")
     return told

@@ -3,8 +3,7 @@
     python -m tests.benchmarks.foreign reach reacher
 
 ``LAB_TASKS`` names the folders of the two examples, and reacher's policy server has to be there. Each user's filter is
-kept when it is done (--work), with what it did in unseen scenarios: an interrupted run goes on where it was. The
-promise about harm, which can only weaken a filter, is left out.
+kept when it is done (--work), with what it did in unseen scenarios: an interrupted run goes on where it was.
 """
 
 import argparse
@@ -17,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from tests.worker.at_hand import AtHand
+from worker.analysis.filters.promise import Outcome
 from worker.compute import learning, simulation
 from worker.compute.filter_fitting import FilterFit
 from worker.domain.responses import TARGETS
@@ -63,6 +63,8 @@ COLUMNS = (
     "fit_s",
 )
 CRITICAL = 1.96
+OUTCOMES: dict[tuple[str, int], list[Outcome]] = {}
+"""Of the frozen policies, for the promise."""
 
 
 def main() -> None:
@@ -161,8 +163,9 @@ def _driven(
                 FilterConfig(),
                 lambda what, share: None,
                 {},
+                outcomes=OUTCOMES,
             )
-            act = act_of(task.modes, policy, fit.find_mode(pool).shielded().weights)
+            act = act_of(task.modes, policy, fit.keep_promise(fit.find_mode(pool)).weights)
         seconds = time.perf_counter() - started
         driven = learning.run_scenarios(name, act, UNSEEN, 0.0, 0)
         with written_whole(file) as draft:

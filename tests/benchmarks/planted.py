@@ -167,6 +167,10 @@ class PlantedPerson:
         self.compared += 1
         return next((side for side, trial_id in sides.items() if self._method(trial_id) == said), "equal")
 
+    def hint(self, names: Sequence[str]) -> Sequence[str]:
+        """None."""
+        return ()
+
     def name_quality(self, query_id: int, answer: str) -> str:
         """Nobody asks them."""
         return ""

@@ -2,10 +2,10 @@
 
     python -m tests.benchmarks.promises --output docs/results/promises
 
-Per task and person: 200 answers, a filter as a study's worker makes its third one (strengths tested until the promise
-is earned), then drives of it and of the same filter without shield and promise, beside the reference policy, through
-scenarios that nothing else uses. On one core; every hundred scenarios a row is added to the table and the page is
-written anew. Interrupted, it goes on where it was; other --people and --scenarios add to what is there.
+Per task and person: 200 answers, a filter as a worker makes the third of a study of as many (strengths tested until
+the promise is earned), then drives of it and of the same filter without shield and promise, beside the reference
+policy, through scenarios that nothing else uses. On one core; every hundred scenarios a row is added to the table and
+the page is written anew. Interrupted, it goes on where it was; other --people and --scenarios add to what is there.
 """
 
 import argparse
@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from app.domain.study_settings import StudySettings
+from app.domain.study_settings import PAPER_PROTOCOL
 from app.installed_tasks import catalogue
 from tests.worker.at_hand import AtHand
 from worker.analysis.comparison import result_pages
@@ -98,7 +98,7 @@ def _draft(task: str, number: int, bench: BenchmarkUser, kept: Path) -> FilterDr
         progress=lambda stage, share: None,
         references={},
         study_seed=number,
-        version=len(StudySettings().milestones),
+        version=len(PAPER_PROTOCOL.milestones),
     )
     fit._gate_reference()  # of which a worker has made sure beforehand
     started = time.process_time()

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from app.domain.study_settings import StudySettings
+from app.domain.study_settings import PAPER_PROTOCOL
 from app.installed_tasks import catalogue
 from worker.analysis.comparison import result_pages
 from worker.analysis.filters.promise import Outcome
@@ -69,7 +69,7 @@ def _measured(task: str, user: str, options: argparse.Namespace) -> list[dict[st
         started = time.perf_counter()
         for lane in (Lane.REWARDS, Lane.LEARNING):
             compute.warm_up(lane, partial(learning.warm_up, task))
-        make_ready(compute, references, outcomes, task, StudySettings(), 0)
+        make_ready(compute, references, outcomes, task, PAPER_PROTOCOL, 0)
         ahead = round(time.perf_counter() - started, 1)
         runs = [{**_run(task, user, bench, compute, references, outcomes), "made_ready": ahead} for _ in range(2)]
     finally:
@@ -102,7 +102,7 @@ def _run(
         FilterConfig(),
         progress=lambda stage, share: None,
         references=references,
-        version=len(StudySettings().milestones),
+        version=len(PAPER_PROTOCOL.milestones),
         outcomes=outcomes,
     )
     draft = fitting.find_mode(bench.pool)

@@ -5,13 +5,15 @@
 Every cell is fitted and driven through 500 unseen scenarios as `python -m worker benchmark` does; when it is done a row
 is added to the table, with every single episode, and the page is written anew. What has a row is never run again, on
 whatever machine. One process on one core, at the lowest priority, so it can run beside other work; interrupted, it
-loses the present cell. Seeds are finished one by one, cheap methods first; --tasks, --users, --methods choose.
+loses the present cell. Seeds are finished one by one, cheap methods first; --tasks, --users, --methods choose. With
+--on-workers N the studio's workers do the cells (docs/deploy.md), N each at a time.
 """
 
 import argparse
 import csv
 import json
 import os
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -20,6 +22,7 @@ import numpy as np
 from tqdm import tqdm
 
 from app.installed_tasks import catalogue
+from app.settings import Settings
 from tests.benchmarks import rivals_report
 from worker.analysis.comparison import result_pages
 from worker.commands import options as spoken
@@ -27,6 +30,7 @@ from worker.domain.type_aliases import FloatArray
 from worker.experiments import benchmark_cell
 from worker.experiments.benchmark import PROFILES
 from worker.experiments.benchmark_cell import PAPER_USERS, BenchmarkConfig, Cell
+from worker.jobs import experiments
 from worker.ml.methods.registry import METHODS
 from worker.ml.teachers import Taste
 from worker.sim.costs import preference_rewards, stakes
@@ -62,6 +66,8 @@ def main() -> None:
     known = {rivals_report.name_of(row) for row in rows}
     missing = [cell for cell in _cells(options) if (cell.task, cell.taste.name, cell.method, cell.seed) not in known]
     if not options.report_only:
+        if options.on_workers:
+            missing = _have_measured(missing, rows, options)
         os.nice(19 - os.nice(0))
         _measure(missing, rows, options)
     if rows:
@@ -73,6 +79,27 @@ def _measure(missing: Sequence[Cell], rows: list[rivals_report.Row], options: ar
     for cell in tqdm(missing, unit="cell"):
         rows.append(_row(cell, options.work_directory))
         _write(rows, options.output.with_suffix(".csv"))
+
+
+def _have_measured(missing: Sequence[Cell], rows: list[rivals_report.Row], options: argparse.Namespace) -> list[Cell]:
+    """Have workers run the cells, and the reference policy's beside them; returns those that failed there."""
+    work, left = options.work_directory, list(missing)
+
+    def done() -> None:
+        for cell in [each for each in left if all(_has(part, work) for part in (each, _of(each, "reference")))]:
+            left.remove(cell)
+            rows.append(_row(cell, work))
+            _write(rows, options.output.with_suffix(".csv"))
+
+    needed = dict.fromkeys(part for each in missing for part in (_of(each, "reference"), each))
+    asked = [cell for cell in needed if not _has(cell, work)]
+    failures = experiments.on_workers(Settings(), options.on_workers, asked, TERMS, work, done)
+    sys.stderr.write("".join(f"{failure}\n" for failure in failures))
+    return left
+
+
+def _has(cell: Cell, work: Path) -> bool:
+    return cell.path(TERMS, work).exists()
 
 
 def _cells(options: argparse.Namespace) -> Iterator[Cell]:
@@ -142,6 +169,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument(
         "--work-directory", type=Path, default=Path("data/benchmark"), help="of rollouts and finished cells"
     )
+    parser.add_argument("--on-workers", type=int, metavar="N", help="how many cells each worker does at a time")
     parser.add_argument("--report-only", action="store_true", help="run nothing, write the page from the table")
     parser.add_argument("--output", type=Path, required=True, help="path without ending of the page and the table")
     return parser.parse_args()

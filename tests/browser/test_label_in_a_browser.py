@@ -81,6 +81,26 @@ def test_what_mattered_is_said_by_a_key_after_the_answer_or_passed_over(invited:
     assert said == [("right", "force"), ("left", None), ("equal", None)]
 
 
+@pytest.mark.parametrize("invited", [{"asks_for_hints": True, "introduction_pairs": 0}], indirect=True)
+def test_hints_are_asked_for_between_two_pairs_and_given_by_keyboard(invited: Invited, new_page: NewPage) -> None:
+    page = new_page()
+    page.goto(invited.link)
+    for number in range(3):
+        wait_ready(page, number)
+        page.keyboard.press(KEYS["left"])
+    expect(page.get_by_role("heading", name="the robot should do")).to_be_visible()
+    assert serious_findings(page) == []
+    box = page.get_by_role("checkbox", name="slower near me")
+    while not box.evaluate("box => box === document.activeElement"):
+        page.keyboard.press("Tab")
+    page.keyboard.press("Space")
+    page.keyboard.press("Enter")
+    wait_ready(page, 3)
+    assert serious_findings(page) == []
+    page.get_by_role("link", name="Hints").click()
+    expect(box).to_be_checked()
+
+
 def test_both_clips_start_together_and_loop_together(invited: Invited, new_page: NewPage) -> None:
     page = new_page()
     page.goto(invited.link)

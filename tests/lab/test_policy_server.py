@@ -1,5 +1,6 @@
 """A policy behind a websocket: what the studio asks it, and what is said when it does not do what it must."""
 
+import io
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -9,9 +10,13 @@ import pytest
 
 from tests.lab.conftest import write_plane
 from tests.lab.policy_server import serving, to_goal
-from worker.compute import simulation
+from worker.compute import baseline_fitting, simulation
+from worker.domain.trajectory import Trajectory
+from worker.domain.type_aliases import Act
 from worker.experiments import fit_response_surface
 from worker.experiments.check_lab import Checked, checked
+from worker.ml.filters.filter_module import FilterWeights
+from worker.ml.filters.filter_problem import act_of
 from worker.ml.policies import remote_policy
 from worker.ml.policies.onnx_policy import NotAPolicy
 from worker.ml.policies.policy_client import packed, unpacked
@@ -199,3 +204,27 @@ def test_a_server_that_was_started_again_is_asked_again(plane: Path, use: Callab
         simulation.run_episode("plane", policy.mean, 1)
     with serving(port=int(url.rpartition(":")[2])):
         assert simulation.run_episode("plane", policy.mean, 2).success
+
+
+def test_in_a_blinded_evaluation_a_robot_does_what_its_filter_does_to_what_the_server_says(
+    plane: Path, use: Callable[[Path], None]
+) -> None:
+    with serving() as url:
+        use(behind(plane, url))
+        fit_response_surface.find_ranges("plane", scenarios=1)
+        family, policy = registry.task("plane").modes, simulation.reference_policy("plane")
+        weights = FilterWeights(mode=family.named([axis.low for axis in family.axes]))
+        robots: list[tuple[Act, bytes]] = [
+            (policy.mean, baseline_fitting.controller_of_reference("plane")),
+            (act_of(family, policy, weights), baseline_fitting.controller_of_filter("plane", weights.to_bytes())),
+        ]
+        actions = []
+        for act, controller in robots:
+            filmed = simulation.film("plane", "quick", controller, 7)
+            shown = Trajectory.load(io.BytesIO(filmed.trajectory))
+            actions.append(np.asarray(shown.actions))
+            np.testing.assert_allclose(
+                actions[-1], np.asarray(simulation.run_episode("plane", act, 7).actions), atol=1e-6
+            )
+        assert np.abs(actions[0] - actions[1]).max() > 0.1
+    assert len({len(controller) for _, controller in robots}) == 1, "its length tells nothing"

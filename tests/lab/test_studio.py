@@ -12,13 +12,16 @@ from starlette.testclient import TestClient
 
 from app import __main__ as studio
 from app.db import Database
+from app.domain.choices import Method
 from app.domain.protocol import Language
 from app.domain.study_settings import StudySettings
 from app.installed_tasks import catalogue
-from app.services.studies import studies
+from app.services.studies import studies, task_limits
+from app.services.studies.task_limits import TaskCannot
 from app.settings import Settings
 from tests import factories
 from tests.app.conftest import agree
+from tests.app.study_pages import typed
 from tests.lab.conftest import forget
 
 ROOT = Path(__file__).parents[2]
@@ -56,7 +59,34 @@ def test_the_form_warns_of_a_policy_that_answers_from_a_server(
     use(plane)
     page = experimenter.get("/studies/new").text
     assert "The server must be running whenever clips are made" in page
-    assert "Blinded evaluation" in page
+
+
+@pytest.mark.parametrize("url", [None, "ws://127.0.0.1:8000"])
+def test_what_its_policy_does_not_allow_is_refused_on_the_form(
+    url: str | None, plane: Path, use: Callable[[Path], None], experimenter: TestClient, database: Database
+) -> None:
+    if url:
+        text = (plane / "lab.toml").read_text()
+        (plane / "lab.toml").write_text(text.replace('file = "policy.onnx"', f'url = "{url}"'))
+    use(plane)
+    form = typed(
+        experimenter,
+        name="Points",
+        task="plane",
+        evaluation="yes",
+        evaluation_methods=["reference", "prefft", "pbarl"],
+        evaluation_mode="physical",
+    )
+    refused = experimenter.post("/studies/new", data=form).text
+    assert "PrefFT would need the policy" in refused
+    assert ("a robot cannot be packed" in refused) == (url is not None)
+    form |= {"evaluation_methods": ["reference", "somebody_else", "average", "self_set", "pbarl"]}
+    made = experimenter.post("/studies/new", data=form | {"evaluation_mode": ["video"]}, follow_redirects=False)
+    assert made.status_code == 303, made.text
+    with database.reading() as session:
+        study = studies.find_study(session, "points")
+    with pytest.raises(TaskCannot, match="as printed"):
+        task_limits.require(study.task, study.settings.model_copy(update={"method": Method.PRINTED}))
 
 
 def test_the_web_server_imports_nothing_of_it(plane: Path, tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ from app.db import Database
 from app.domain.clips import Clip
 from app.domain.models import Bundle, Model, ModelKind, RunKind
 from app.domain.preferences import LabelEvent, Response
+from app.domain.protocol import EvaluationSettings
 from app.domain.run_keys import RunKey
 from app.domain.studies import Participant, Study
 from app.domain.study_settings import StudySettings
@@ -75,7 +76,9 @@ def context(database: Database, store: ArtefactStore) -> WorkerContext:
     return WorkerContext(database, store, AtHand())
 
 
-def make_study(context: WorkerContext, name: str = "On a plane") -> tuple[int, int]:
+def make_study(
+    context: WorkerContext, name: str = "On a plane", evaluation: EvaluationSettings | None = None
+) -> tuple[int, int]:
     """A study of the plane and its participant, by id."""
     settings = StudySettings(
         labels_per_participant=LABELS,
@@ -86,6 +89,7 @@ def make_study(context: WorkerContext, name: str = "On a plane") -> tuple[int, i
         evaluation_scenarios=30,
         harm_share=0.5,
         strategy="uniform",
+        evaluation=evaluation,
     )
     with context.database.writing() as session:
         study = studies.create_study(session, name, settings, task="plane", seed=3)

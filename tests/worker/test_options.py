@@ -113,7 +113,6 @@ def test_the_help_names_the_default_that_holds(capsys: pytest.CaptureFixture[str
 @pytest.mark.parametrize(
     ("command", "table", "config"),
     [
-        ("rehearse", rehearsing.OF_SETTINGS, StudySettings(strategy="uniform")),
         ("rehearse", rehearsing.OF_EVALUATION, EvaluationSettings()),
         ("rehearse", rehearsing.OF_MANNER, Manner(skip_share=0.02)),
         ("benchmark", benchmarking.OF_TERMS, None),
@@ -122,6 +121,22 @@ def test_the_help_names_the_default_that_holds(capsys: pytest.CaptureFixture[str
 def test_a_command_without_options_uses_the_usual_values(command: str, table: options.Table, config: Any) -> None:
     said = vars(cli.parser().parse_args([command]))
     assert {path: said[path] for path in table} == {path: config and getattr(config, path) for path in table}
+
+
+@pytest.mark.parametrize(
+    ("said", "labels", "milestones"),
+    [
+        ([], StudySettings().labels_per_participant, StudySettings().milestones),
+        (["--paper"], 200, (50, 100, 200)),
+        (["--paper", "--labels", "60", "--milestones", "30"], 60, (30, 60)),
+    ],
+)
+def test_a_rehearsal_asks_as_much_as_the_study_that_it_rehearses(
+    said: list[str], labels: int, milestones: tuple[int, ...]
+) -> None:
+    settings = rehearsing.settings_of(cli.parser().parse_args(["rehearse", *said]))
+    assert (settings.labels_per_participant, settings.milestones) == (labels, milestones)
+    assert settings.pool_scenarios * settings.pairs_per_scenario >= labels
 
 
 def test_a_benchmark_fills_parts_of_its_configuration() -> None:

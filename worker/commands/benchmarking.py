@@ -2,6 +2,7 @@
 
 import argparse
 import sys
+from functools import partial
 from pathlib import Path
 
 from app.installed_tasks import catalogue
@@ -10,6 +11,7 @@ from worker.commands import options
 from worker.commands.arguments import Commands, add_processes
 from worker.experiments import benchmark
 from worker.experiments.benchmark_cell import INDIRECT_USERS, OPPOSED_USERS
+from worker.jobs import experiments
 from worker.ml.methods.registry import METHODS
 
 OF_TERMS: options.Table = {
@@ -49,6 +51,11 @@ def add(commands: Commands) -> None:
     options.add(command, OF_TERMS, benchmark.PROFILES["full"], only_said=True)
     add_processes(command)
     command.add_argument(
+        "--on-workers",
+        action="store_true",
+        help="have the studio's workers do the cells, --processes each at a time (DATABASE_URL says whose)",
+    )
+    command.add_argument(
         "--work-directory", type=Path, help="finished cells; default: benchmark/ in the data directory"
     )
     command.add_argument(
@@ -67,7 +74,11 @@ def _benchmark(said: argparse.Namespace) -> int:
     ]
     tastes = {taste.name: taste for taste in [*said.users, *others]}
     selection = benchmark.Selection(said.methods, said.tasks, tuple(tastes.values()), said.seeds)
-    work = said.work_directory or Settings().data_dir / "benchmark"
+    settings = Settings()
+    work = said.work_directory or experiments.work_directory(settings)
     output = said.output or (work / "quick" if said.profile == "quick" else Path("docs/results/all_methods"))
     command = "python -m worker " + " ".join(sys.argv[1:] or ["benchmark"])
-    return benchmark.benchmark(selection, terms, work, output, said.processes, command, not said.report_only)
+    run: benchmark.Run | None = partial(benchmark.on_this_machine, said.processes)
+    if said.on_workers:
+        run = partial(experiments.on_workers, settings, said.processes)
+    return benchmark.benchmark(selection, terms, work, output, command, None if said.report_only else run)

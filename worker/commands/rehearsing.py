@@ -22,6 +22,7 @@ from worker.rehearsal import demo_study, rehearsal
 from worker.rehearsal.server import OwnStudio
 from worker.tasks import registry
 
+USUAL = StudySettings(strategy=Strategy.UNIFORM)
 OF_SETTINGS: options.Table = {
     "labels_per_participant": ("--labels", "labels per participant"),
     "retrain_every_labels": ("--retrain-every", "labels between two reward models"),
@@ -64,13 +65,17 @@ def _add_rehearsal(commands: Commands) -> None:
     rehearse.add_argument(
         "--omega", nargs=6, type=float, action="append", default=[], help="somebody with these six weights; repeatable"
     )
-    rehearse.add_argument("--paper", action="store_true", help="the paper's whole protocol, robots rated in the end")
+    rehearse.add_argument(
+        "--paper",
+        action="store_true",
+        help="the paper's whole protocol: 200 labels unless said, robots rated in the end",
+    )
     rehearse.add_argument(
         "--settings",
         type=Path,
         help="a study of these settings, in a file as the API has them; instead of most options",
     )
-    options.add(rehearse, OF_SETTINGS, StudySettings(strategy=Strategy.UNIFORM))
+    options.add(rehearse, OF_SETTINGS, USUAL, only_said=True)
     options.add(rehearse, OF_EVALUATION, EvaluationSettings())
     rehearse.add_argument("--clip-scenarios", type=int, help="size of the pool; default: just enough pairs")
     options.add(rehearse, OF_MANNER, Manner(skip_share=0.02))  # so that skipping is rehearsed as well
@@ -91,7 +96,7 @@ def _add_demo_study(commands: Commands) -> None:
 
 def _rehearse(said: argparse.Namespace) -> int:
     """Send scripted participants through the real pages and print what came out."""
-    settings, tastes = _settings(said), _tastes(said)
+    settings, tastes = settings_of(said), _tastes(said)
     try:
         _require_fitting(tastes, said.task)
     except (ValueError, registry.NotExplored) as error:
@@ -146,17 +151,18 @@ def _manner(said: argparse.Namespace) -> Manner:
     return options.filled(Manner(), OF_MANNER, said)
 
 
-def _settings(said: argparse.Namespace) -> StudySettings:
+def settings_of(said: argparse.Namespace) -> StudySettings:
+    """Those of the rehearsed study: what was said, else the usual or the paper's. Raises ValidationError, OSError."""
     if said.settings is not None:
         return StudySettings.model_validate_json(said.settings.read_bytes())
-    chosen = {name: getattr(said, name) for name in OF_SETTINGS}
+    usual = PAPER_PROTOCOL if said.paper else USUAL
+    chosen = {name: value for name in OF_SETTINGS if (value := getattr(said, name)) is not None}
     chosen["clip_quality"] = ClipQuality.QUICK  # nobody looks at them
-    enough = -(-said.labels_per_participant // StudySettings().pairs_per_scenario)
-    chosen["pool_scenarios"] = said.clip_scenarios or enough
+    labels = chosen.get("labels_per_participant", usual.labels_per_participant)
+    chosen["pool_scenarios"] = said.clip_scenarios or -(-labels // usual.pairs_per_scenario)
     if registry.lab(said.task) is not None:
         chosen["clip_steps"] = registry.installed_task(said.task).description.usual_clip_steps
-    if not said.paper:
-        return StudySettings(**chosen)
-    chosen["introduction_pairs"] = min(PAPER_PROTOCOL.introduction_pairs, said.labels_per_participant)
-    chosen["evaluation"] = EvaluationSettings(**{name: getattr(said, name) for name in OF_EVALUATION})
-    return StudySettings(**{**PAPER_PROTOCOL.model_dump(), **chosen})
+    if said.paper:
+        chosen["introduction_pairs"] = min(usual.introduction_pairs, labels)
+        chosen["evaluation"] = EvaluationSettings(**{name: getattr(said, name) for name in OF_EVALUATION})
+    return StudySettings(**{**usual.model_dump(), **chosen})

@@ -18,7 +18,6 @@ from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import Act
 from worker.ml.export import blinded_controller as controller
 from worker.ml.export.blinded_controller import Blinded
-from worker.ml.export.run_controller import Controller
 from worker.ml.filters import filter_problem
 from worker.ml.filters.filter_module import FilterWeights
 from worker.ml.filters.filter_problem import FilterProblem
@@ -96,7 +95,8 @@ def packed(task: str, study: str, participant: str, letter: str, model: bytes) -
 
 def drive(task: str, model: bytes, scenarios: Sequence[int]) -> list[Trajectory]:
     """One rollout per scenario."""
-    return learning.run_scenarios(task, Controller(model), scenarios, 0.0, 0)
+    act = controller.act_of_stored(model, simulation.reference_policy(task))
+    return learning.run_scenarios(task, act, scenarios, 0.0, 0)
 
 
 def observations(task: str) -> npt.NDArray[np.float32]:

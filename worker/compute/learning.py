@@ -13,7 +13,7 @@ import numpy.typing as npt
 from worker.analysis.filters.promise import Outcome, outcome_of
 from worker.compute.simulation import reference_rollouts, run_episode, signal_predictor
 from worker.domain.trajectory import Trajectory
-from worker.domain.type_aliases import Act, Float32Array
+from worker.domain.type_aliases import Act, Float32Array, FloatArray
 from worker.ml.rewards.loading import load_reward_model
 from worker.ml.rewards.pooled_prior import prior_of
 from worker.ml.rewards.reward_models import NEVER_WANTED, RewardModel
@@ -61,6 +61,7 @@ def fit_reward(
     earlier: Sequence[bytes] = (),
     recorded_signals: Sequence[str] | None = None,
     mattered: npt.NDArray[np.bool_] | None = None,
+    hints: FloatArray | None = None,
 ) -> tuple[bytes, dict[str, Any]]:
     """The stored reward model and its metrics.
 
@@ -68,6 +69,7 @@ def fit_reward(
     a pooled prior; ``recorded_signals``: what the signals are called when the clips were recorded elsewhere. Then there
     is no reference policy to normalise over, and what the person was shown takes its place.
     ``mattered``: (N, S) the signals that made the difference, as far as the person said so.
+    ``hints``: (H, S) which way the person wishes the signals, as in reward_training.fit().
     Raises ValueError for a kind there is not, and simulation.NoPredictor where the task's signals cannot be foreseen.
     """
     from worker.ml.rewards import reward_training
@@ -88,6 +90,7 @@ def fit_reward(
         costs=NEVER_WANTED if simulated is None else (*NEVER_WANTED, *simulated.costs),
         predictor=signal_predictor(task) if kind == "predicted" else None,
         mattered=mattered,
+        hints=hints,
     )
     return fitted.model.to_bytes(), {**fitted.metrics, "pooled_from": len(earlier)}
 

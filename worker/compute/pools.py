@@ -47,9 +47,11 @@ class Lane(StrEnum):
     """Filters and reports: a minute or so."""
     PATIENT = "patient"
     """Trainings of many minutes: one at a time on one core, and only with what the others leave."""
+    EXPERIMENTS = "experiments"
+    """What no study waits for."""
 
 
-_NICENESS = {Lane.CLIPS: 5, Lane.REWARDS: 5, Lane.LEARNING: 5, Lane.PATIENT: 15}
+_NICENESS = {Lane.CLIPS: 5, Lane.REWARDS: 5, Lane.LEARNING: 5, Lane.PATIENT: 15, Lane.EXPERIMENTS: 19}
 
 
 class Computing(Protocol):
@@ -93,7 +95,8 @@ class Compute:
 
     def __init__(self, processes: int, closing: threading.Event | None = None) -> None:
         """``closing``: when this is set, nothing more is begun, and whoever waits is Interrupted."""
-        self._sizes = {Lane.CLIPS: processes, Lane.REWARDS: 1, Lane.LEARNING: processes, Lane.PATIENT: 1}
+        alone = dict.fromkeys((Lane.REWARDS, Lane.PATIENT), 1)
+        self._sizes = {**dict.fromkeys(Lane, processes), **alone}
         self._lanes: dict[Lane, ThreadPoolExecutor] = {}
         self._seats: list[_Seat] = []
         self._mine = threading.local()
@@ -226,7 +229,8 @@ class _Seat:
                 raise EOFError
             ours, theirs = _FORKS.Pipe()
             with theirs:
-                process = _FORKS.Process(target=_serve, args=(theirs, self._niceness))
+                # A daemon: a program that ends without closing is not kept from it by a process that waits.
+                process = _FORKS.Process(target=_serve, args=(theirs, self._niceness), daemon=True)
                 process.start()  # waits for seconds while the server that forks is new
             with self._changing:
                 self._process, self._pipe = process, ours

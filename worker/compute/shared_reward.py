@@ -6,12 +6,11 @@ from dataclasses import replace
 import numpy as np
 
 from worker.compute.simulation import reference_rollouts
-from worker.domain.trajectory import SIGNALS
 from worker.domain.type_aliases import FloatArray
 from worker.ml.rewards.loading import load_reward_model
 from worker.ml.rewards.reward_models import UNDONE, StructuredReward
 from worker.ml.rewards.signal_scale import SignalScale
-from worker.ml.teachers import OMEGA, User
+from worker.ml.teachers import OF_LABS, OMEGA, User
 from worker.sim.costs import signal_weights
 from worker.tasks import registry
 
@@ -28,9 +27,17 @@ def of_people(task: str, rewards: Sequence[bytes], scale: SignalScale) -> bytes:
 
 
 def of_types(task: str, users: Sequence[str], scale: SignalScale) -> bytes:
-    """The mean of what the paper's types of users want, by their names. Raises ValueError for a type there is not."""
+    """The mean of what types of users want, by their names (see types_of). Raises ValueError for one there is not."""
     known = registry.task(task)
+    if known.is_a_labs:
+        minds = {taste.name: taste.signal_weights(known.signals) for taste in OF_LABS}
+        return _stored(task, np.array([minds[user] for user in users]), scale)
     return _stored(task, np.array([signal_weights(known, OMEGA[User(user)]) for user in users]), scale)
+
+
+def types_of(task: str) -> list[str]:
+    """The types of users whom somebody's filter may be made for while there are no people: the paper's, or a lab's."""
+    return [taste.name for taste in OF_LABS] if registry.task(task).is_a_labs else [user.value for user in OMEGA]
 
 
 def _stored(task: str, weights: FloatArray, scale: SignalScale) -> bytes:
@@ -42,4 +49,4 @@ def _stored(task: str, weights: FloatArray, scale: SignalScale) -> bytes:
         least_per_step=scale.least_per_step,
         most_per_step=scale.most_per_step,
     )
-    return replace(mean.normalised_over(reference), undone_column=SIGNALS.index(UNDONE)).to_bytes()
+    return replace(mean.normalised_over(reference), undone_column=registry.task(task).signals.index(UNDONE)).to_bytes()

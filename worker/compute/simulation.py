@@ -178,11 +178,10 @@ def record_clip(
 
 def film(name: str, quality: str, controller: bytes, scenario: int) -> RecordedClip:
     """Run a whole episode as a controller (see worker.ml.export.blinded_controller) acts, and render all of it."""
-    from worker.ml.export.run_controller import (
-        Controller,  # processes that never film controllers do without its runtime
-    )
+    from worker.ml.export import blinded_controller  # processes that never film controllers do without its runtime
 
-    return _recorded(name, quality, Controller(controller), scenario, 0, task(name).episode_steps)
+    act = blinded_controller.act_of_stored(controller, reference_policy(name))
+    return _recorded(name, quality, act, scenario, 0, task(name).episode_steps)
 
 
 def _recorded(name: str, quality: str, act: Act, scenario: int, first_step: int, step_count: int) -> RecordedClip:

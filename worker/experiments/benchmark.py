@@ -9,11 +9,11 @@ import platform
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -82,6 +82,12 @@ PROFILES = {
 """How much of everything; quick is for seeing it work and for tests, its numbers mean nothing."""
 
 
+Done: TypeAlias = Callable[[], None]
+"""Called whenever cells are finished."""
+Run: TypeAlias = Callable[[Sequence[Cell], BenchmarkConfig, Path, Done], list[str]]
+"""Makes the files of missing cells and returns what went wrong, cell by cell."""
+
+
 @dataclass(frozen=True)
 class Selection:
     """What is to be run; the tables also show what was run earlier under the same terms."""
@@ -113,38 +119,49 @@ def benchmark(
     terms: BenchmarkConfig,
     work: Path,
     output: Path,
-    processes: int,
     command: str,
-    run: bool = True,
+    run: Run | None,
 ) -> int:
-    """Run what is missing (unless ``run`` is False) and write the tables; returns the exit code.
+    """Run what is missing and write the tables; returns the exit code. ``run``: on_this_machine(), or on workers.
 
-    1: a cell failed, and its reason is on the standard error; all others were run. 130: interrupted.
+    None: nothing is run. 1: a cell failed, and its reason is on the standard error; all others were run. 130:
+    interrupted.
     """
     missing = [cell for cell in selection.cells() if not cell.path(terms, work).exists()]
     failures: list[str] = []
-    code = 0
+    code, reported = 0, time.monotonic()
 
-    def report() -> None:
-        _report(terms, work, output, command)
+    def report_now_and_then() -> None:
+        nonlocal reported
+        if time.monotonic() - reported > REPORT_EVERY_S:
+            _report(terms, work, output, command)
+            reported = time.monotonic()
 
-    if run and missing:
-        compute = Compute(processes)
+    if run is not None and missing:
         try:
-            _fill_caches(compute, processes, missing, terms, work)
-            failures = _run_cells(compute, processes, missing, terms, work, report)
+            failures = run(missing, terms, work, report_now_and_then)
         except KeyboardInterrupt:
             sys.stderr.write("Interrupted. The same command goes on from here.\n")
             code = INTERRUPTED
-        finally:
-            compute.close()
-    report()
+    _report(terms, work, output, command)
     for failure in failures:
         sys.stderr.write(failure + "\n")
     return code or (1 if failures else 0)
 
 
 # -- running -----------------------------------------------------------------------------------------------------------
+
+
+def on_this_machine(
+    processes: int, missing: Sequence[Cell], terms: BenchmarkConfig, work: Path, done: Done
+) -> list[str]:
+    """Spread the cells over processes; returns what went wrong, cell by cell."""
+    compute = Compute(processes)
+    try:
+        _fill_caches(compute, processes, missing, terms, work)
+        return _run_cells(compute, processes, missing, terms, work, done)
+    finally:
+        compute.close()
 
 
 def _fill_caches(compute: Compute, processes: int, missing: Sequence[Cell], terms: BenchmarkConfig, work: Path) -> None:
@@ -168,18 +185,23 @@ def fill_shelf(task: str, work: Path, what: str, scenarios: Sequence[int]) -> No
 
 
 def _run_cells(
-    compute: Compute, processes: int, missing: Sequence[Cell], terms: BenchmarkConfig, work: Path, report: Any
+    compute: Compute, processes: int, missing: Sequence[Cell], terms: BenchmarkConfig, work: Path, done: Done
 ) -> list[str]:
     return _in_parallel(
-        compute, processes, "cells", benchmark_cell.run_cell, [(cell, terms, work) for cell in missing], report
+        compute, processes, "cells", benchmark_cell.run_cell, [(cell, terms, work) for cell in missing], done
     )
 
 
 def _in_parallel(
-    compute: Compute, processes: int, what: str, function: Any, jobs: Sequence[tuple[Any, ...]], report: Any = None
+    compute: Compute,
+    processes: int,
+    what: str,
+    function: Any,
+    jobs: Sequence[tuple[Any, ...]],
+    done: Done | None = None,
 ) -> list[str]:
     """One job per free process; returns what went wrong, job by job, and goes on with the others."""
-    failures, reported = [], time.monotonic()
+    failures = []
     # One waiting thread per process: Compute waits for all jobs of a call, and cells take from a second to an hour.
     with ThreadPoolExecutor(processes) as threads, tqdm(total=len(jobs), unit=what.split()[-1], desc=what) as bar:
         waiting: dict[Future[Any], tuple[Any, ...]] = {
@@ -193,9 +215,8 @@ def _in_parallel(
                     error = future.exception()
                     if error is not None:
                         failures.append(f"{job[0]}: {type(error).__name__}: {error}")
-                if report and time.monotonic() - reported > REPORT_EVERY_S:
-                    report()
-                    reported = time.monotonic()
+                if done is not None:
+                    done()
         except BaseException:
             compute.close()
             threads.shutdown(wait=False, cancel_futures=True)

@@ -24,7 +24,7 @@ from app.settings import Settings
 from app.storage import ArtefactMissing, ArtefactStore, keep_private
 from worker.compute import learning, simulation
 from worker.compute.pools import Compute, ComputeLost, Interrupted, Lane
-from worker.jobs import reconcile
+from worker.jobs import experiments, reconcile
 from worker.jobs.learning import query_selection
 from worker.jobs.runtime import engine, records
 from worker.jobs.runtime.context import WorkerContext
@@ -78,6 +78,7 @@ def run(settings: Settings) -> int:
         store.files.require_usable()
         context = WorkerContext(database, store, compute, signing.load(settings))
         runner = JobRunner(context, Lanes(compute))
+        experiments.CellRunner(compute, experiments.work_directory(settings))
         try:
             compute.warm_up(Lane.CLIPS, simulation.warm_up)
             with engine.running(settings, database) as bond:

@@ -13,23 +13,27 @@ from worker.ml.filters.response_surface import CAUTION, SUCCESS_PENALTY, SUCCESS
 
 CANDIDATES = 4_000
 """Modes that are tried, the same for every member and at every retraining."""
+_NOTHING = 1e-9
+"""Standard deviations of return."""
 
 
-def expected_regret(surface: ResponseSurface, members: FloatArray) -> float:
-    """What knowing the person for certain could gain, in standard deviations of predicted return over all modes.
+def relative_regret(surface: ResponseSurface, members: FloatArray) -> float:
+    """What knowing the person for certain could gain, as a share of what it would gain over the reference policy.
 
     ``members`` (E, S): the weights of the reward model's members per unit of each signal. The mode for all is chosen
-    as response_surface.best_mode does, with caution; the one for each member by that member alone. Every member's
-    return counts in its own standard deviations: a member that is sure of little must not count for little.
+    as response_surface.best_mode does, with caution; the one for each member by that member alone. 0: nothing, also
+    where the reference policy is everybody's best; above 1: the mode for all is worse than the reference policy.
+    Shares are alike in all tasks, standard deviations over all modes are not: some tasks have many modes that nobody
+    wants (docs/results/advice_to_stop.md).
     """
     rng = np.random.default_rng(0)
     drawn = rng.uniform(surface.low, surface.high, (CANDIDATES, len(surface.low)))
-    modes = np.concatenate([np.zeros((1, drawn.shape[1])), drawn])
+    modes = np.concatenate([np.zeros((1, drawn.shape[1])), drawn])  # the first is the reference policy, worth 0
     signals, success = surface.predict(modes, CAUTION)
     lost = SUCCESS_PENALTY * np.maximum(-success - SUCCESS_TOLERANCE, 0.0)
-    returns = signals @ members.T  # (modes, E)
     unit = max(float((signals @ members.mean(axis=0)).std()), 1e-9)
-    for_all = (returns.mean(axis=1) - CAUTION * returns.std(axis=1)) / unit - lost
-    chosen = int(np.argmax(for_all))
-    own = returns / np.maximum(returns.std(axis=0), 1e-9) - lost[:, None]
-    return float((own.max(axis=0) - own[chosen]).mean())
+    returns = signals @ members.T / unit  # (modes, E)
+    chosen = int(np.argmax(returns.mean(axis=1) - CAUTION * returns.std(axis=1) - lost))
+    worth = returns - lost[:, None]
+    attainable = float(worth.max(axis=0).mean())
+    return 1.0 - float(worth[chosen].mean()) / attainable if attainable > _NOTHING else 0.0

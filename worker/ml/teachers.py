@@ -184,6 +184,15 @@ def speaks_most(gains: FloatArray, qualities: Mapping[str, Sequence[int]]) -> st
     return max(qualities, key=lambda name: float(gains[list(qualities[name])].sum()))
 
 
+def truest(directions: Mapping[str, FloatArray], wants: FloatArray, most: int) -> list[str]:
+    """The hints that say most of what somebody wants, at most so many: directions (S,) by name, wants (S,) by signal.
+
+    ``wants``: weights in units of the usual differences. Nothing that is not wanted is among them.
+    """
+    gains = {name: float(each @ wants) for name, each in directions.items()}
+    return [name for name in sorted(gains, key=lambda name: -gains[name]) if gains[name] > 0.0][:most]
+
+
 def segment_returns(rewards: FloatArray, myopia: float = 1.0) -> FloatArray:
     """(..., T) -> (...): summed rewards, later steps counting more when myopia < 1."""
     returns: FloatArray = rewards @ myopia ** np.arange(rewards.shape[-1] - 1, -1, -1)

@@ -29,6 +29,7 @@ class Asked(Enum):
 
     PAIR = re.compile(r"/p/queries/(\d+)/label$")
     BREAK = re.compile(r"/p/break$")
+    HINTS = re.compile(r"/p/hints$")
     SLIDERS = re.compile(r"/p/setting$")
     RATING = re.compile(r"/p/evaluation/trials/(\d+)/rating$")
     HEAD_TO_HEAD = re.compile(r"/p/head-to-heads/(\d+)/answer$")
@@ -41,11 +42,13 @@ class Asked(Enum):
 
 MATTERED = "mattered"
 """The field of what made the difference between two clips."""
+HINT = "hint-"
+"""Before the name of a hint in the name of its box."""
 OVER = ("finished", "ended")
 """Pages, by the name they give themselves, after which there is nothing to do: the end, and being sent back before."""
 WAITING = ("waiting", "self-setting-waiting", "evaluation-waiting")
 """Pages that wait for the studio."""
-UP_TO_PAIRS = ("consent", "demographics", "instructions", "practice", "pair", "break", "waiting")
+UP_TO_PAIRS = ("consent", "demographics", "instructions", "practice", "pair", "hints", "break", "waiting")
 """Pages up to the last pair."""
 
 
@@ -75,6 +78,9 @@ class Visitor(Protocol):
 
     def name_quality(self, query_id: int, answer: str) -> str:
         """What made the difference between them; empty: nothing in particular."""
+
+    def hint(self, names: Sequence[str]) -> Sequence[str]:
+        """Which of these hints."""
 
     def set_robot(self) -> Mapping[str, int]:
         """The place of every slider, by axis."""
@@ -204,6 +210,9 @@ def _filled_in(visitor: Visitor, asked: Asked, says: tuple[str, ...], form: Form
             said = visitor.answer(int(says[0]))
             mattered = visitor.name_quality(int(says[0]), said) if MATTERED in form.questions else ""
             return {"response": said, MATTERED: mattered}
+        case Asked.HINTS:
+            names = [name.removeprefix(HINT) for name in form.questions]
+            return {f"{HINT}{name}": "yes" for name in visitor.hint(names)}
         case Asked.SLIDERS:
             return {"goes_on": "true", **{f"axis-{axis}": str(stop) for axis, stop in visitor.set_robot().items()}}
         case Asked.RATING:
@@ -245,8 +254,9 @@ class _Page(HTMLParser):
         if tag == "input" and kind == "radio":
             choices = form.questions.get(name, Offered("choice")).choices
             form.questions[name] = Offered("choice", [*choices, value] if value else choices)
-        elif tag == "select":
+        elif tag == "select" or (kind == "checkbox" and name.startswith(HINT)):
             form.questions[name] = Offered("choice")
+            return
         elif tag == "textarea" or (tag == "input" and kind == "text"):
             form.questions[name] = Offered("number" if named.get("inputmode") == "decimal" else "text")
         if tag in ("input", "button") and (kind != "radio" or "checked" in named):

@@ -21,7 +21,7 @@ from app.domain.models import ModelKind
 from app.domain.preferences import Purpose, Query, Response
 from app.domain.protocol import MADE_FOR_YOU
 from app.domain.studies import Study
-from app.installed_tasks import qualities
+from app.installed_tasks import hints, qualities
 from app.questionnaires import library
 from app.services.evaluation import self_setting
 from app.storage import ArtefactStore
@@ -32,10 +32,11 @@ from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import FloatArray
 from worker.jobs.learning import dataset
 from worker.jobs.runtime import records
+from worker.ml.rewards.hint_directions import direction
 from worker.ml.rewards.loading import load_reward_model
 from worker.ml.rewards.reward_models import RewardModel
 from worker.ml.scripted_ratings import RatingManner, ScriptedRater
-from worker.ml.teachers import LabTaste, Manner, ScriptedTeacher, Taste, segment_returns, speaks_most
+from worker.ml.teachers import LabTaste, Manner, ScriptedTeacher, Taste, segment_returns, speaks_most, truest
 from worker.rehearsal.browser import Offered
 from worker.sim.costs import preference_rewards, signal_weights
 from worker.tasks import registry
@@ -108,16 +109,25 @@ class ScriptedPerson:
         with self._database.reading() as session:
             query = session.get_one(Query, query_id, options=dataset.CLIPS_AND_ROLLOUTS)
             pair = dataset.segment_pairs(self._store, [(query.left_clip, query.right_clip)])
-        taste, task = self._taste, self._task
-        weights = (
-            taste.signal_weights(task.signals)
-            if isinstance(taste, LabTaste)
-            else signal_weights(task, taste.omega, taste.per_signal)
-        )
-        gains = weights * pair.signal_differences()[0] * (1.0 if answer == Response.RIGHT else -1.0)
+        gains = self._weights() * pair.signal_differences()[0] * (1.0 if answer == Response.RIGHT else -1.0)
         named = qualities.of_task(self._task.name)
         columns = {name: [self._task.signals.index(each) for each in named[name]] for name in named}
         return speaks_most(gains, columns)
+
+    def hint(self, names: Sequence[str]) -> Sequence[str]:
+        """Those that say most of what this user wants, by their true weights and how much the study's clips differ."""
+        known, columns = hints.of_task(self._task.name), self._task.signals
+        with self._database.reading() as session:
+            scale = dataset.signal_scale(session, self._store, self._study_id)
+        directions = {name: direction(columns, known[name]) for name in names}
+        return truest(directions, self._weights() * scale.spread, hints.MOST)
+
+    def _weights(self) -> FloatArray:
+        """(S,) of the task's signals, above 0: wanted."""
+        taste, task = self._taste, self._task
+        if isinstance(taste, LabTaste):
+            return taste.signal_weights(task.signals)
+        return signal_weights(task, taste.omega, taste.per_signal)
 
     def rate(self, trial_id: int) -> tuple[int, int]:
         """Satisfaction and personalisation; ``rated`` keeps which method it really was."""

@@ -58,7 +58,18 @@ def environment_class(name: str) -> type[AssistiveEnv]:
             f"is of the task {kind.task.name!r} with {kind.task.episode_steps} steps an episode, not of {name!r} with "
             f"{description.episode_steps}",
         )
+    _check_hints(installed, description, kind.task)
     return kind
+
+
+def _check_hints(installed: InstalledTask, description: TaskDescription, task: Task) -> None:
+    for name, hint in description.hints.items():
+        unknown = sorted({*hint.less, *hint.more} - set(task.signals))
+        if unknown:
+            raise TaskBroken(
+                f"{installed.folder / 'task.toml'}: hints.{name} is about {unknown[0]}, which is no signal of it; "
+                f"there are {', '.join(task.signals)}."
+            )
 
 
 def task(name: str) -> Task:

@@ -16,6 +16,7 @@ from app.domain.clips import Clip
 from app.domain.preferences import LabelEvent, Purpose, Query
 from app.domain.studies import Awaited, Participant
 from app.services import participant_events
+from app.services.answers import hint_offers
 from app.services.participant_events import EventKind
 from app.storage import ArtefactStore
 
@@ -100,6 +101,8 @@ class NextPair:
     """The id of the query answered last, whose answer can be taken back."""
     break_due: bool = False
     """Whether a break is to be offered before the next pair."""
+    hints_due: bool = False
+    """Whether the person is to be asked for hints before the next pair."""
 
 
 # Statements that every answer needs are made once: making them took as long as running them.
@@ -161,6 +164,9 @@ def next_turn(session: Session, store: ArtefactStore, participant: Participant) 
     undoable_id = given.newest_query_id if given.newest_is_practice == progress.practising else None
     if _break_due(session, participant, progress):
         return NextPair(progress, None, (), undoable_id, break_due=True)
+    earnest = not progress.practising and not progress.finished
+    if earnest and hint_offers.are_due(session, participant, progress.answered):
+        return NextPair(progress, None, (), undoable_id, hints_due=True)
     ready = [] if progress.finished else list(islice(_ready(session, store, participant), 1 + PAIRS_AHEAD))
     query = ready[0] if ready else None
     if query is not None and query.served_at is None:

@@ -12,9 +12,9 @@ from app.domain.people import AuditEvent
 from app.domain.studies import Participant, Study
 from app.services import audit
 
-SMALL_REGRET = 0.2
-"""Standard deviations of predicted return. With scripted people the expected regret begins at one to two and passes
-this at 60 to 100 answers in two of our tasks; in the third it says little (docs/method.md, section 3)."""
+SMALL_REGRET = 0.08
+"""Of what a robot of one's own could gain, see worker.ml.stopping. Why so much, and how often it errs:
+docs/results/advice_to_stop.md."""
 IN_A_ROW = 3
 """Retrainings with a small regret: a single one is often chance."""
 _ACT = "more answers would hardly pay"
@@ -25,7 +25,7 @@ class Advice:
     """How much more answers could still gain."""
 
     regret: float
-    """The newest, see worker.ml.stopping."""
+    """The newest: the share of what could be gained that is still missing, see worker.ml.stopping."""
     enough_since: int | None
     """Answers after which it had been small for IN_A_ROW retrainings; None: not yet, or no longer."""
 
@@ -33,16 +33,21 @@ class Advice:
 def advice_of(models: Sequence[Model]) -> Advice | None:
     """From a participant's reward models in the order of their labels; None while there is nothing to go by."""
     known = [(model.label_count, regret) for model in models if (regret := _regret(model.metrics)) is not None]
-    if not known:
-        return None
+    return Advice(known[-1][1], enough_since(known)) if known else None
+
+
+def enough_since(
+    known: Sequence[tuple[int, float]], small: float = SMALL_REGRET, in_a_row: int = IN_A_ROW
+) -> int | None:
+    """Of numbers of answers and the regret after each: when it had been small often enough, and has been since."""
     since, row = None, 0
     for label_count, regret in known:
-        row = row + 1 if regret < SMALL_REGRET else 0
+        row = row + 1 if regret < small else 0
         if row == 0:
             since = None
-        elif row == IN_A_ROW:
+        elif row == in_a_row:
             since = label_count
-    return Advice(known[-1][1], since)
+    return since
 
 
 def note(session: Session, study: Study, participant: Participant) -> None:
@@ -59,5 +64,5 @@ def note(session: Session, study: Study, participant: Participant) -> None:
 
 def _regret(metrics: dict[str, Any]) -> float | None:
     advice = metrics.get("advice")
-    regret = advice.get("expected_regret") if isinstance(advice, dict) else None
+    regret = advice.get("relative_regret") if isinstance(advice, dict) else None
     return float(regret) if isinstance(regret, (int, float)) else None

@@ -47,11 +47,14 @@ _WORDS: Mapping[tuple[str, str], type[StrEnum]] = {
     ("participant", "ended_as"): Ending,
     ("head_to_head_answer", "response"): HeadToHeadResponse,
 }
+_NAMES = r"([a-z][a-z0-9_]{0,49}( [a-z][a-z0-9_]{0,49})*)?"
 _PATTERNS: Mapping[tuple[str, str], str] = {
     ("study", "task"): r"[a-z][a-z0-9_]{0,39}",  # names a folder of the worker
     ("study", "key_secret"): r"[0-9a-f]{64}",
     ("run", "workflow_id"): r"[ -~]+",
     ("label_event", "mattered"): r"[a-z][a-z0-9_]{0,39}",
+    ("hint_event", "hints"): _NAMES,
+    ("hint_event", "offered"): _NAMES,
     ("participant", "arm"): r"[a-z][a-z0-9_]{0,39}",
     ("assignment", "letter"): r"[A-E]",
     ("trial", "letter"): r"[A-E]",

@@ -11,6 +11,7 @@ from sqlalchemy.orm import Session, aliased, joinedload
 
 from app.domain.clips import Clip, Rollout
 from app.domain.evaluation import DonorDraw, HeadToHead, HeadToHeadAnswer, Rating, Trial
+from app.domain.hints import HintEvent
 from app.domain.models import Bundle, Model, ModelKind
 from app.domain.participation import Allocation, ConsentRecord, FormAnswer, ParticipantEvent, StageRecord
 from app.domain.preferences import LEARNED_FROM, Exclusion, LabelEvent, Query
@@ -339,6 +340,16 @@ def headtoheads(session: Session, study: Study, window: Window = EVERYTHING) -> 
                     each.shown_at,
                 ),
             )
+
+
+def hints(session: Session, study: Study, window: Window = EVERYTHING) -> KeyedRows:
+    for person, wanted in _present(session, study, window):
+        rows = select(HintEvent).where(HintEvent.participant_id == person.id, wanted.known(HintEvent))
+        given = session.scalars(rows.order_by(HintEvent.revision)).all()
+        for each in given:
+            if (each.revision, each.id) > wanted.after:
+                said = each.hints, each is not given[-1], each.answered, each.offered, each.created_at
+                yield (person.number, each.revision, each.id), (person.code, each.revision, *said)
 
 
 def settings(session: Session, study: Study, window: Window = EVERYTHING) -> KeyedRows:

@@ -7,6 +7,7 @@ from app.domain.choices import Strategy
 from app.domain.clips import Clip
 from app.domain.designs import Ending
 from app.domain.evaluation import DonorDraw, DonorRule, HeadToHead, HeadToHeadAnswer, HeadToHeadResponse, Rating, Trial
+from app.domain.hints import HintEvent
 from app.domain.models import Model, ModelKind
 from app.domain.participation import Allocation, ConsentRecord, FormAnswer, ParticipantEvent, StageRecord
 from app.domain.preferences import FOLLOWING, NO_LABELS, LabelEvent, Purpose, Query, Response, SkipReason
@@ -191,6 +192,22 @@ TABLES: Sequence[Table] = (
         export_rows.labels,
         (LabelEvent,),
         grows_by=LabelEvent,
+    ),
+    Table(
+        "hints",
+        "Every set of hints that a participant gave beside their answers; the last one counts.",
+        (
+            PARTICIPANT,
+            Column("revision", I, "First, second, ... set of this participant.", allowed="from 1"),
+            Column("hints", T, "Names of the hints, as the task calls them; empty: nothing special."),
+            Column("superseded", B, "Whether a later set counts instead."),
+            Column("answered", I, "How many answers this participant had given, practice not counted."),
+            Column("offered", T, "Everything that could be ticked, in the order of this participant's page."),
+            Column("created_at", W, "When it reached the server."),
+        ),
+        export_rows.hints,
+        (HintEvent,),
+        grows_by=HintEvent,
     ),
     Table(
         "forms",

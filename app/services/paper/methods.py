@@ -10,8 +10,9 @@ from sqlalchemy.orm import Session
 from app.domain.choices import Method, Strategy
 from app.domain.protocol import EvaluatedMethod, EvaluationMode, EvaluationSettings, Language
 from app.domain.studies import Study
-from app.installed_tasks import catalogue
+from app.installed_tasks import catalogue, hints
 from app.questionnaires import library
+from app.services.answers import hint_offers
 from app.services.evaluation import evaluation_plan, unblinding
 from app.services.exports import codebook, export_formats
 from app.services.paper import people
@@ -133,6 +134,11 @@ def _procedure(study: Study) -> Iterator[str]:
         "After each answer for one side participants could name what had made the difference, or pass this over; the "
         "reward model heard the answer once more, about the quality that was named alone."
         if settings.asks_what_mattered and study.material is None
+        else "",
+        f"After the introduction participants could give up to {hints.MOST} hints about how the robot was to move, "
+        "from a list in an order of their own, and change them later; the reward model heard each as one more answer "
+        "about the signals concerned."
+        if hint_offers.asks(study)
         else "",
     )
     chosen = settings.strategy.label.lower()

@@ -11,7 +11,9 @@ from sqlalchemy.orm import Session
 from app.domain.protocol import EvaluationMode, EvaluationSettings, PlannedTest
 from app.domain.studies import Study
 from app.domain.study_settings import StudySettings
+from app.installed_tasks import hints
 from app.questionnaires import library
+from app.services.answers import hint_offers
 from app.services.evaluation import unblinding
 from app.services.exports import codebook, export_formats
 from app.services.paper import recruitment
@@ -166,6 +168,9 @@ def _sampling(session: Session, study: Study, settings: StudySettings) -> Mappin
             f"again and {settings.catch_pairs} catch pairs; {settings.practice_pairs} practice pairs come before.",
             "After each answer for one side they can name what made the difference, or pass this over."
             if settings.asks_what_mattered and study.material is None
+            else "",
+            f"After the introduction they can give up to {hints.MOST} hints, and change them later."
+            if hint_offers.asks(study)
             else "",
             f"So far: {flow.consented} consented, {flow.completed} completed." if flow.consented else "",
         ),

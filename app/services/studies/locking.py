@@ -17,14 +17,14 @@ from app.domain.clips import Rollout
 from app.domain.described import Use, settings_of
 from app.domain.evaluation import Assignment
 from app.domain.preferences import Query
-from app.domain.studies import Deviation, Participant, Study, longest_clip_steps
+from app.domain.studies import Deviation, Participant, Study
 from app.domain.study_settings import StudySettings
 from app.errors import AppError
 from app.services import audit
 from app.services.exports import export_formats
 from app.services.participants import withdrawal
 from app.services.participants.enrolment import participant_seed
-from app.services.studies.studies import ClipsTooLong
+from app.services.studies import task_limits
 from app.storage import ArtefactStore
 
 SEEDS_LISTED = 50
@@ -89,7 +89,7 @@ def change(
     """Store other settings; of a locked study they become a deviation. Returns the names of what has changed.
 
     ``seed`` None: as it is. Previews whose pairs would not fit any more are ended.
-    Raises SettingsFixed, ClipsTooLong and ReasonMissing.
+    Raises SettingsFixed, TaskCannot and ReasonMissing.
     """
     before = _everything(study.name, study.task, study.seed, study.settings.model_dump(mode="json"))
     seed = study.seed if seed is None else seed
@@ -99,10 +99,9 @@ def change(
     refused = [key for key in changed if key in fixed]
     if refused:
         raise SettingsFixed(" ".join(sorted({f"{key.replace('_', ' ')}: {fixed[key]}" for key in refused})))
-    if settings.clip_steps > (longest_clip_steps(task) or settings.clip_steps):
-        raise ClipsTooLong
     if not changed:
         return []
+    task_limits.require(task, settings)
     if study.lock_hash is not None:
         _note_deviation(session, study, before, after, changed, actor, reason)
     study.name, study.task, study.seed = name, task, seed

@@ -11,19 +11,14 @@ from sqlalchemy.orm import Session
 
 from app.db import Base
 from app.domain.clips import Clip, Rollout
-from app.domain.studies import SEED_LIMIT, Study, longest_clip_steps
+from app.domain.studies import SEED_LIMIT, Study
 from app.domain.study_settings import StudySettings
 from app.errors import AppError
 from app.installed_tasks import catalogue
 from app.services import audit
+from app.services.studies import task_limits
 
 _Row = TypeVar("_Row", bound=Base)
-
-
-class ClipsTooLong(AppError):
-    """The clips of this study would be longer than an episode of its task. Choose fewer steps."""
-
-    status = HTTPStatus.UNPROCESSABLE_ENTITY
 
 
 class StudyNotFound(AppError):
@@ -42,11 +37,10 @@ def create_study(
 ) -> Study:
     """Open a study; the worker finds it and begins to fill its pool. Without a seed one is drawn and kept.
 
-    Without a task it is the usual one. Raises ClipsTooLong.
+    Without a task it is the usual one. Raises TaskCannot.
     """
     task = task or catalogue.usual()
-    if settings.clip_steps > (longest_clip_steps(task) or settings.clip_steps):
-        raise ClipsTooLong
+    task_limits.require(task, settings)
     study = Study(
         slug=free_slug(session, name),
         name=name,

@@ -15,7 +15,7 @@ from app.domain.preferences import Purpose, SkipReason
 from app.domain.protocol import Stage
 from app.domain.studies import Awaited, Participant
 from app.services import participant_events
-from app.services.answers import labelling, next_query
+from app.services.answers import hint_offers, labelling, next_query
 from app.services.participant_events import EventKind
 from app.services.participants import admission, time_left
 from app.services.participants.time_left import TimeLeft
@@ -98,7 +98,10 @@ def show_turn(request: Request, session: Session, studio: Studio, participant: P
         return JSONResponse(state)
     if turn.break_due:
         participant_events.note_once(session, participant, EventKind.BREAK_BEGUN, turn.progress.answered)
+    if turn.hints_due:
+        return go(request, "show_hints")
     context: dict[str, Any] = {"turn": turn, "state": state, "undo_uuid": uuid4()}
+    context["asks_for_hints"] = hint_offers.asks(participant.study) and not turn.progress.practising
     if state["state"] == "waiting":
         context["seconds_left"] = estimates.until_pair_s(session, participant.study)
     if turn.query is not None:
@@ -215,6 +218,8 @@ def _state(turn: next_query.NextPair) -> str:
         return "finished"
     if turn.break_due:
         return "break"
+    if turn.hints_due:
+        return "hints"
     return "waiting" if turn.query is None else "pair"
 
 

@@ -12,7 +12,7 @@ from app.installed_tasks.lab import LabDescription
 
 OF_A_SERVER = (
     "Its policy answers from a server. The server must be running whenever clips are made and filters are trained, and "
-    "training waits for its answers. Blinded evaluation is not available: leave it out."
+    "training waits for its answers."
 )
 _NEUTRAL = Words(tool="tool", target="target", carried="food or water")
 

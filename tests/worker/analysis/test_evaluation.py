@@ -47,7 +47,7 @@ def episodes(count: int, rng: np.random.Generator, cost: float = 0.0, success: b
 
 def test_pairing_by_scenario_finds_a_small_difference_among_large_ones() -> None:
     rng = np.random.default_rng(0)
-    found = evaluate(episodes(50, rng), episodes(50, rng, cost=0.1), np.arange(50), np.arange(50) + 1.0)
+    found = evaluate(episodes(50, rng), episodes(50, rng, cost=0.1), np.arange(50), np.arange(50) + 1.0, invented.TASK)
     change = found["costs"]["C_v"]
     assert change["delta"] == pytest.approx(2.0, abs=0.1)
     assert change["low"] > 1.9
@@ -57,13 +57,15 @@ def test_pairing_by_scenario_finds_a_small_difference_among_large_ones() -> None
 def test_preference_is_in_standard_deviations_of_the_reference_s_returns() -> None:
     rng = np.random.default_rng(0)
     before = rng.standard_normal(50) * 40
-    found = evaluate(episodes(50, rng), episodes(50, rng), before, before + 80)
+    found = evaluate(episodes(50, rng), episodes(50, rng), before, before + 80, invented.TASK)
     assert found["preference"]["delta"] == pytest.approx(80 / before.std())
 
 
 def test_the_result_is_plain_and_complete() -> None:
     rng = np.random.default_rng(0)
-    found = json.loads(json.dumps(evaluate(episodes(5, rng), episodes(5, rng), np.zeros(5), np.zeros(5))))
+    found = json.loads(
+        json.dumps(evaluate(episodes(5, rng), episodes(5, rng), np.zeros(5), np.zeros(5), invented.TASK))
+    )
     assert found["scenarios"] == 5
     assert set(found["costs"]) == set(COSTS)
     assert set(found["success"]) == {"reference", "filter", "delta", "low", "high"}
@@ -72,7 +74,7 @@ def test_the_result_is_plain_and_complete() -> None:
 def test_different_scenarios_cannot_be_compared() -> None:
     rng = np.random.default_rng(0)
     with pytest.raises(ValueError, match="same scenarios"):
-        evaluate(episodes(5, rng), episodes(5, rng)[::-1], np.zeros(5), np.zeros(5))
+        evaluate(episodes(5, rng), episodes(5, rng)[::-1], np.zeros(5), np.zeros(5), invented.TASK)
 
 
 def test_the_success_interval_covers_the_truth_about_as_often_as_it_says() -> None:

@@ -224,19 +224,20 @@ def test_compute_processes_die_with_a_worker_that_is_killed() -> None:
         assert ends(child)
 
 
-def test_processes_with_nothing_left_to_do_leave_without_a_word() -> None:
+@pytest.mark.parametrize(("last", "words"), [("compute.close()", ""), ("raise SystemExit", None)])
+def test_processes_with_nothing_left_to_do_leave_without_a_word_and_keep_nobody(last: str, words: str | None) -> None:
     program = (
         "from tests.worker.compute.test_pools import nothing, show_progress\n"
         "from worker.compute.pools import Compute, Lane\n"
         "if __name__ == '__main__':\n"
         "    compute = Compute(1)\n"
         "    compute.run(Lane.LEARNING, nothing, show_progress)\n"
-        "    compute.close()\n"
+        f"    {last}\n"
     )
     ended = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, timeout=PATIENCE_S, check=True
     )
-    assert ended.stderr == ""
+    assert words is None or ended.stderr == words
 
 
 def ends(pid: int) -> bool:

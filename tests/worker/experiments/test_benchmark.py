@@ -2,6 +2,7 @@
 
 import csv
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -45,7 +46,7 @@ def rows(path: Path) -> list[dict[str, str]]:
 
 def report(work: Path, output: Path, terms: BenchmarkConfig = TINY) -> int:
     """Write the tables and run nothing."""
-    return benchmark.benchmark(Selection(), terms, work, output, 1, "the command", run=False)
+    return benchmark.benchmark(Selection(), terms, work, output, "the command", None)
 
 
 @pytest.mark.long
@@ -100,7 +101,9 @@ def test_an_interrupted_benchmark_runs_what_is_missing_and_nothing_else(work: Pa
     reference, missing = (cell.path(TINY, work) for cell in cells)
     written = reference.stat().st_mtime_ns
     selection = Selection(["pbarl_n1"], ["feeding"], [SHY])
-    assert benchmark.benchmark(selection, TINY, work, tmp_path, 1, "the command") == 0
+    assert (
+        benchmark.benchmark(selection, TINY, work, tmp_path, "the command", partial(benchmark.on_this_machine, 1)) == 0
+    )
     assert missing.exists()
     assert reference.stat().st_mtime_ns == written
     assert "pbarl_n1" in [row["method"] for row in rows(tmp_path / "table1.csv")]

@@ -8,6 +8,7 @@ from sqlalchemy import select
 
 from app.db import Database
 from app.domain.clips import Clip
+from app.domain.hints import HintEvent
 from app.domain.preferences import Exclusion, LabelEvent, Query, Response
 from app.domain.studies import Participant
 from app.storage import ArtefactStore
@@ -65,6 +66,27 @@ def test_what_mattered_names_its_signals_and_is_part_of_the_fingerprint(
     assert named == [[], ["speed_m_s", "speed_squared_m2_s2"]]
     assert not before.mattered.any()
     assert before.label_hash != after.label_hash
+
+
+def test_the_newest_hints_point_where_they_say_and_are_part_of_the_fingerprint(
+    database: Database, store: ArtefactStore, participant: Participant, add_clips: AddClips, answer: Answer
+) -> None:
+    first, second, *_ = add_clips(7)
+    answer(first, second, Response.LEFT)
+
+    def after(revision: int, hints: str) -> dataset.Preferences:
+        with database.writing() as session:
+            event = {"revision": revision, "hints": hints, "client_uuid": f"hints {revision}"}
+            session.add(HintEvent(participant_id=participant.id, offered="", answered=1, **event))
+        with database.reading() as session:
+            return dataset.load_preferences(session, store, participant.id)
+
+    given, taken_back = after(1, "gone_from_the_task quicker"), after(2, "")
+    [direction] = given.hints
+    wished = {SIGNALS[column]: direction[column] for column in np.flatnonzero(direction)}
+    assert wished == {"distance_m": -1.0, "speed_m_s": 1.0, "speed_squared_m2_s2": 1.0}
+    assert taken_back.hints.shape == (0, len(SIGNALS))
+    assert given.label_hash != taken_back.label_hash
 
 
 def test_only_cant_tell_means_nothing_to_learn_from(

@@ -13,7 +13,9 @@ from worker.domain.type_aliases import Float32Array
 from worker.jobs.learning import query_plan
 from worker.ml.rewards.segments import SegmentPairs, Stretch
 
-WHOLE_STUDY = StudySettings(practice_pairs=2, introduction_pairs=10, repeated_pairs=20, catch_pairs=5)
+WHOLE_STUDY = StudySettings(
+    labels_per_participant=200, practice_pairs=2, introduction_pairs=10, repeated_pairs=20, catch_pairs=5
+)
 DELIVERED_AT = 10
 
 

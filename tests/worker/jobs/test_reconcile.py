@@ -158,7 +158,7 @@ def test_a_failed_run_is_tried_again_a_few_times_and_then_only_when_somebody_ask
 
 
 def test_milestones_that_were_passed_in_the_meantime_are_skipped() -> None:
-    settings = StudySettings(filter_milestones=(50, 100))
+    settings = StudySettings(labels_per_participant=200, filter_milestones=(50, 100))
     assert [due_work.filter_due(settings, count) for count in (49, 50, 99, 130, 199, 200)] == [
         0,
         50,

@@ -18,7 +18,7 @@ from worker.jobs.learning import dataset, query_selection, reward_metrics
 from worker.jobs.runtime.context import WorkerContext
 from worker.ml.filters.response_surface import ResponseSurface
 from worker.ml.rewards.reward_models import StructuredReward
-from worker.ml.stopping import expected_regret
+from worker.ml.stopping import relative_regret
 from worker.tasks.registry import task
 
 AddClips = Callable[..., list[Clip]]
@@ -96,14 +96,20 @@ def surface() -> ResponseSurface:
 
 def test_somebody_who_is_known_for_certain_leaves_nothing_to_gain(surface: ResponseSurface) -> None:
     wish = np.random.default_rng(1).standard_normal(len(SIGNALS))
-    assert expected_regret(surface, np.tile(wish, (8, 1))) == pytest.approx(0.0, abs=1e-9)
+    assert relative_regret(surface, np.tile(wish, (8, 1))) == pytest.approx(0.0, abs=1e-9)
 
 
 def test_the_less_is_known_the_more_could_be_gained(surface: ResponseSurface) -> None:
     rng = np.random.default_rng(2)
     wish, doubt = rng.standard_normal(len(SIGNALS)), rng.standard_normal((8, len(SIGNALS)))
-    regrets = [expected_regret(surface, wish + spread * doubt) for spread in (0.05, 0.5, 5.0)]
+    regrets = [relative_regret(surface, wish + spread * doubt) for spread in (0.05, 0.5, 5.0)]
     assert 0.0 <= regrets[0] < regrets[1] < regrets[2]
+    louder = relative_regret(surface, 7.0 * (wish + 0.5 * doubt))
+    assert louder == pytest.approx(regrets[1]), "nobody has to answer more because they feel more strongly"
+
+
+def test_of_somebody_who_minds_nothing_nothing_is_asked(surface: ResponseSurface) -> None:
+    assert relative_regret(surface, np.zeros((8, len(SIGNALS)))) == 0.0
 
 
 def test_a_share_of_the_pairs_is_drawn_at_random_and_stored_as_such(

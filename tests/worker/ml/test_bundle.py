@@ -54,7 +54,7 @@ def contents() -> BundleContents:
         policy=POLICY,
         recording=recording,
         metrics={
-            "evaluation": evaluate(episodes, episodes, np.arange(4), np.arange(4) + 1.0),
+            "evaluation": evaluate(episodes, episodes, np.arange(4), np.arange(4) + 1.0, invented.TASK),
             "notes": ["A note."],
             "weights": {
                 "speed_m_s": {"mean": -1.5, "low": -2.1, "high": -0.9},

@@ -123,6 +123,27 @@ def test_naming_nothing_changes_nothing(labelled: tuple[SegmentPairs, np.ndarray
     assert said.model.to_bytes() == unsaid.model.to_bytes()
 
 
+def test_no_hints_change_nothing(labelled: tuple[SegmentPairs, np.ndarray]) -> None:
+    said, unsaid = (fit(*labelled, "structured", 3, hints=hints) for hints in (np.zeros((0, len(SIGNALS))), None))
+    assert said.model.to_bytes() == unsaid.model.to_bytes()
+
+
+def test_a_hint_is_believed_at_first_and_outvoted_by_answers_that_say_the_opposite() -> None:
+    """Somebody who minds speed hints at the opposite."""
+    speed = SIGNALS.index("speed_m_s")
+    wrong = np.eye(len(SIGNALS))[[speed]]
+    shown = invented.pairs(60, np.random.default_rng(6))
+    answers = invented.answers_of(shown, DISLIKES_SPEED)
+
+    def weight(count: int, hints: np.ndarray | None) -> float:
+        few = SegmentPairs(shown.signals[:count], shown.observations[:count], shown.actions[:count])
+        found = fit(few, answers[:count], "structured", 0, scale=SignalScale.of(shown), hints=hints)
+        return float(found.metrics["weights"]["speed_m_s"]["mean"])
+
+    assert weight(1, wrong) > max(0.0, weight(1, None))
+    assert weight(60, wrong) < 0.5 * weight(60, None) < 0.0
+
+
 def test_weights_stay_finite_when_a_few_answers_can_be_explained_perfectly() -> None:
     shown = invented.pairs(12, np.random.default_rng(4))
     model = fit(shown, invented.answers_of(shown, 1e3 * DISLIKES_SPEED), "structured", 0).model

@@ -139,5 +139,5 @@ def test_a_rehearsal_can_use_any_reward_model_and_manner() -> None:
     words = "rehearse --reward preference_transformer --rationality 2 --myopia 0.9 --mistakes 0.1 --pooled-prior"
     options = cli.parser().parse_args(words.split())
     assert rehearsing._manner(options) == Manner(2.0, 0.9, 0.1, 0.10, 0.02)
-    assert rehearsing._settings(options).reward_kind == "preference_transformer"
-    assert rehearsing._settings(options).pooled_prior
+    assert rehearsing.settings_of(options).reward_kind == "preference_transformer"
+    assert rehearsing.settings_of(options).pooled_prior

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from worker.analysis.wilson import Z_95, wilson_interval
 from worker.domain.task import Task
-from worker.domain.trajectory import COSTS, SIGNALS, Trajectory
+from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import FloatArray
 
 
@@ -22,12 +22,12 @@ def evaluate(
     filtered: Sequence[Trajectory],
     reference_returns: npt.ArrayLike,
     filtered_returns: npt.ArrayLike,
-    task: Task | None = None,
+    task: Task,
 ) -> dict[str, Any]:
     """Everything the dashboard and the model card show, as plain values.
 
     ``*_returns`` (N,): learned returns of the same trajectories; their change is given in standard deviations of the
-    reference's returns. ``task``: whose signals and costs the columns are; None: those that all of ours share.
+    reference's returns. ``task``: whose signals and costs the columns are.
     Costs are means over episodes of the summed unweighted costs.
     Raises ValueError when the two lists are not the same scenarios in the same order.
     """
@@ -35,16 +35,15 @@ def evaluate(
         raise ValueError("Both must have been run on the same scenarios, in the same order.")
     before, after = np.asarray(reference_returns, np.float64), np.asarray(filtered_returns, np.float64)
     unit = max(float(before.std()), 1e-9)
-    costs, signals = (COSTS, SIGNALS) if task is None else (task.costs, task.signals)
     return {
         "scenarios": len(reference),
         "success": success_change(_successes(reference), _successes(filtered)),
         "preference": _with_interval((after - before) / unit),
         "costs": {
             name: mean_change(_summed(reference, column), _summed(filtered, column))
-            for column, name in enumerate(costs)
+            for column, name in enumerate(task.costs)
         },
-        "safety": {"reference": envelope(reference, signals), "filter": envelope(filtered, signals)},
+        "safety": {"reference": envelope(reference, task.signals), "filter": envelope(filtered, task.signals)},
     }
 
 
@@ -83,7 +82,7 @@ def _correlation(before: FloatArray, after: FloatArray) -> float:
     return float(corrected / np.sqrt(margins))
 
 
-def envelope(trajectories: Sequence[Trajectory], signals: Sequence[str] = SIGNALS) -> dict[str, float]:
+def envelope(trajectories: Sequence[Trajectory], signals: Sequence[str]) -> dict[str, float]:
     """The largest speed and force seen in these rollouts, and the 95th percentile of each episode's largest.
 
     Only what is measured: laboratories' environments have no person of ours, and a speed if they say what moves.

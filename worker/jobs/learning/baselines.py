@@ -33,6 +33,7 @@ from worker.jobs.runtime.records import Job
 from worker.ml.filters.filter_module import FilterWeights
 from worker.ml.policies.checkpoint import ask_to_pause, share_done
 from worker.ml.rewards.loading import load_reward_model
+from worker.tasks import registry
 
 CHUNK = 10
 """Unseen scenarios between two signs of life."""
@@ -178,7 +179,7 @@ def _save(context: WorkerContext, run_id: int, job: Job, method: str, reward: st
     returns = load_reward_model(context.store.read(reward)).returns
     metrics = {
         "method": method,
-        "evaluation": evaluate(reference, driven, returns(reference), returns(driven)),
+        "evaluation": evaluate(reference, driven, returns(reference), returns(driven), registry.task(study.task)),
         "notes": trained["notes"],
         "seconds": {"fit": trained["seconds"], "evaluation": round(time.perf_counter() - started, 1)},
     }

@@ -13,16 +13,18 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session, contains_eager, joinedload
 
 from app.domain.clips import Clip, Rollout
+from app.domain.hints import hints_of
 from app.domain.preferences import Label, Query, count_labels, current_labels
 from app.domain.studies import Participant, Study
 from app.errors import AppError
 from app.files.interface import Files
-from app.installed_tasks import qualities
+from app.installed_tasks import hints, qualities
 from app.storage import ArtefactStore
 from worker.domain.responses import TARGETS
 from worker.domain.trajectory import OutdatedTrajectory, Recorded, Recording, Trajectory
-from worker.domain.type_aliases import Float32Array
+from worker.domain.type_aliases import Float32Array, FloatArray
 from worker.ml import acquisition
+from worker.ml.rewards.hint_directions import direction
 from worker.ml.rewards.segments import SegmentPairs, Stretch
 from worker.ml.rewards.signal_scale import SignalScale
 from worker.tasks import registry
@@ -51,18 +53,24 @@ class Preferences:
     """(N,) in {0, 1/2, 1}"""
     mattered: npt.NDArray[np.bool_]
     """(N, S) which signals made the difference, as far as somebody said so"""
+    hints: FloatArray
+    """(H, S) which way this person wishes the signals, see worker.ml.rewards.hint_directions"""
     label_count: int
     """How many labels were given, those without a target and those that were excluded included."""
     label_hash: str
 
 
-def label_hash(labels: Sequence[Label]) -> str:
-    """A fingerprint of who was shown what and said what: the same labels give the same hash on any machine."""
+def label_hash(labels: Sequence[Label], given: Sequence[str] = ()) -> str:
+    """A fingerprint of who was shown what and said what: the same labels give the same hash on any machine.
+
+    ``given``: the names of hints.
+    """
     lines = [
         f"{each.query.ordinal} {each.query.left_clip.video_sha256} {each.query.right_clip.video_sha256} {each.response}"
         + (f" {each.event.mattered}" if each.event.mattered else "")
         for each in labels
     ]
+    lines += [f"hint {name}" for name in given]
     return hashlib.sha256("\n".join(lines).encode()).hexdigest()
 
 
@@ -77,6 +85,7 @@ def load_preferences(session: Session, store: ArtefactStore, participant_id: int
     labels = labels_with_clips(session, participant_id)
     said = [(label, target) for label in labels if (target := TARGETS[label.response]) is not None]
     study = session.get_one(Study, session.get_one(Participant, participant_id).study_id)
+    hinted = hints_of(session, participant_id)
     return Preferences(
         pairs=segment_pairs(store, [(each.query.left_clip, each.query.right_clip) for each, _ in said])
         if said
@@ -84,7 +93,8 @@ def load_preferences(session: Session, store: ArtefactStore, participant_id: int
         targets=np.array([target for _, target in said], np.float32),
         mattered=named_signals(study, [label.event.mattered for label, _ in said]),
         label_count=given.get(participant_id, 0),
-        label_hash=label_hash(labels),
+        hints=directions(study, hinted),
+        label_hash=label_hash(labels, hinted),
     )
 
 
@@ -92,6 +102,13 @@ def named_signals(study: Study, said: Sequence[str | None]) -> npt.NDArray[np.bo
     """(N, S) the signals that each named quality is about; none where nothing was said."""
     known, groups = list(signal_names(study)), qualities.of_task(study.task)
     return np.array([np.isin(known, groups.get(name or "", ())) for name in said], bool).reshape(len(said), len(known))
+
+
+def directions(study: Study, given: Sequence[str]) -> FloatArray:
+    """(H, S) of the hints with these names; of what the task does not know any more, nothing."""
+    known, names = hints.of_task(study.task), signal_names(study)
+    found = [direction(names, known[name]) for name in given if name in known]
+    return np.array(found).reshape(len(found), len(names))
 
 
 def segment_pairs(store: ArtefactStore, pairs: Sequence[tuple[Clip, Clip]]) -> SegmentPairs:

@@ -21,7 +21,6 @@ from worker.jobs.learning import dataset, filters
 from worker.jobs.runtime import records
 from worker.jobs.runtime.context import Step, WorkerContext
 from worker.jobs.runtime.records import Job
-from worker.ml.teachers import OMEGA
 
 STAGES = ("mode", "residual", "gate", "promise")
 
@@ -63,7 +62,7 @@ def _mark(drawn: DonorDraw) -> str:
 def _draw(context: WorkerContext, job: Job, method: EvaluatedMethod) -> str:
     with context.database.writing() as session:
         study, participant = session.get_one(Study, job.study_id), session.get_one(Participant, job.participant)
-        return _mark(donors.draw(session, study, participant, method, [user.value for user in OMEGA]))
+        return _mark(donors.draw(session, study, participant, method, shared_reward.types_of(study.task)))
 
 
 def _lent(context: WorkerContext, job: Job, run_id: int, method: EvaluatedMethod, mark: str) -> tuple[str, list[str]]:

@@ -16,7 +16,7 @@ from worker.ml.filters.response_surface import ResponseSurface
 from worker.ml.rewards.loading import load_reward_model
 from worker.ml.rewards.reward_models import RewardModel, StructuredReward
 from worker.ml.rewards.segments import LEFT, SegmentPairs, Stretch
-from worker.ml.stopping import expected_regret
+from worker.ml.stopping import relative_regret
 from worker.tasks import registry
 
 FEWEST_CLIPS = 12
@@ -43,7 +43,7 @@ def insight(context: WorkerContext, participant_id: int, stored_model: bytes) ->
         found["costs"] = weights_of_costs(sums, returns, registry.task(task).costs)
     regret = _regret(task, model)
     if regret is not None:
-        found["advice"] = {"expected_regret": round(regret, 4)}
+        found["advice"] = {"relative_regret": round(regret, 4)}
     return found
 
 
@@ -105,4 +105,4 @@ def _regret(task: str, model: RewardModel) -> float | None:
         return None
     described = registry.task(task)
     surface = ResponseSurface.load(surface_file(task), described.modes, described.signals)
-    return expected_regret(surface, model.signal_weights(()))
+    return relative_regret(surface, model.signal_weights(()))

@@ -53,6 +53,7 @@ def _fit(context: WorkerContext, run_id: int, participant_id: int) -> None:
         [context.store.read(model.artefact_sha256) for model in earlier],
         recorded_signals,
         preferences.mattered,
+        preferences.hints,
     )
     artefact = context.store.put(stored)
     metrics |= {"notes": notes, **reward_metrics.insight(context, participant_id, stored)}

@@ -23,6 +23,7 @@ from app.settings import Settings
 
 log = logging.getLogger("worker")
 
+NAME = "pbarl-studio"
 VERSION = "5"
 """Raised when steps or names of workflows change, so that a half-finished one could not be resumed: it begins anew."""
 
@@ -67,6 +68,12 @@ def file_of(settings: Settings) -> Path | None:
     return settings.data_dir.resolve() / "engine.sqlite3" if settings.sqlalchemy_url.startswith("sqlite") else None
 
 
+def address(settings: Settings) -> str:
+    """Of the engine's notes, as SQLAlchemy takes it."""
+    path = file_of(settings)
+    return settings.sqlalchemy_url if path is None else f"sqlite:///{path}"
+
+
 @contextmanager
 def running(settings: Settings, database: Database) -> Iterator["Bond"]:
     """The engine at work, on a file that can be trusted."""
@@ -94,11 +101,10 @@ def running(settings: Settings, database: Database) -> Iterator["Bond"]:
 
 def launch(settings: Settings) -> None:
     """Start the engine on its file as it is."""
-    path = file_of(settings)
     DBOS(
         config={
-            "name": "pbarl-studio",
-            "system_database_url": settings.sqlalchemy_url if path is None else f"sqlite:///{path}",
+            "name": NAME,
+            "system_database_url": address(settings),
             "executor_id": settings.worker_name,
             "application_version": VERSION,
             "log_level": "ERROR",
@@ -113,7 +119,7 @@ def launch(settings: Settings) -> None:
 def is_at_it(name: str) -> bool:
     """Whether the engine will do this, or somebody has just begun; not whether it has once been done."""
     known = DBOS.get_workflow_status(name)
-    if known is None or _is_over(known):
+    if known is None or is_over(known):
         return False
     begun_ms = known.updated_at or 0
     return known.status != "PENDING" or now().timestamp() - begun_ms / 1000 < SILENCE.total_seconds()
@@ -130,7 +136,7 @@ def resume(name: str) -> bool:
     known = DBOS.get_workflow_status(name)
     if known is None:
         return False
-    if _is_over(known):
+    if is_over(known):
         DBOS.delete_workflow(name)
         return False
     if known.status == "PENDING":  # whatever waits in a queue is going to be done
@@ -191,7 +197,7 @@ class Bond:
         self._signed = _as_text(moment)
 
 
-def _is_over(known: WorkflowStatus) -> bool:
+def is_over(known: WorkflowStatus) -> bool:
     """Whether the engine will never touch it again: what an earlier version has left half done is never resumed."""
     return known.status in _ENDED or known.app_version not in (None, VERSION)
 

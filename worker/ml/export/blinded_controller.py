@@ -23,10 +23,12 @@ from worker.domain.type_aliases import Act, Float32Array
 from worker.ml.export import run_controller
 from worker.ml.export.bundle import described_space
 from worker.ml.export.run_controller import INPUT, OUTPUT, Controller
-from worker.ml.filters.filter_onnx import LARGEST_DIFFERENCE, ExportDiffers
+from worker.ml.filters.filter_onnx import LARGEST_DIFFERENCE, ExportDiffers, OnnxFilter
 from worker.ml.filters.filter_problem import FilterAct
 from worker.ml.methods.preference_rl import PolicyAct
+from worker.ml.policies.policy_onnx import IR_VERSION, OPSET
 from worker.ml.policies.reference import ReferencePolicy
+from worker.ml.policies.remote_policy import RemotePolicy
 from worker.ml.policies.stored_policy import stored_policy
 
 SCHEMA_VERSION = 1
@@ -56,18 +58,22 @@ class Blinded:
 def of_act(act: Act, observations: Float32Array) -> bytes:
     """A fitted method as one ONNX model, compared with the method itself in these observations, (N, D).
 
-    Raises NotExportable for a method that is neither a policy nor a filter around one, and ExportDiffers.
+    Where the policy answers from a server, the model has what the server says as another input. Raises NotExportable
+    for a method that is neither a policy nor a filter around one, and ExportDiffers.
     """
     if isinstance(act, PolicyAct):
-        joined = onnx.load_from_string(stored_policy(act.policy))
-        named = {_POLICY_MEAN: OUTPUT}
-        stored = _blinded([*joined.graph.node], joined.graph.initializer, named, joined, act.policy)
+        stored = _of_policy(act.policy)
     elif isinstance(act, FilterAct) and act.gate == 1.0:
         stored = _of_filter(act)
     else:
         raise NotExportable(f"{type(act).__name__} cannot be written as a controller.")
     _compare(stored, act, observations)
     return stored
+
+
+def act_of_stored(stored: bytes, policy: ReferencePolicy) -> Act:
+    """What of_act() has written, as a rollout's callable. ``policy``: the frozen one, if need be to be asked."""
+    return FilterAct(policy, OnnxFilter(stored)) if isinstance(policy, RemotePolicy) else Controller(stored)
 
 
 def write(blinded: Blinded) -> bytes:
@@ -110,17 +116,36 @@ def _manifest(blinded: Blinded) -> dict[str, Any]:
     }
 
 
+def _of_policy(policy: ReferencePolicy) -> bytes:
+    """The policy's graph; of a server nothing but what it says."""
+    if isinstance(policy, RemotePolicy):
+        said = helper.make_node("Identity", [_POLICY_MEAN], [OUTPUT])
+        return _blinded([said], [], _SAID, (OPSET, IR_VERSION), policy)
+    graph = onnx.load_from_string(stored_policy(policy))
+    return _blinded([*graph.graph.node], graph.graph.initializer, {_POLICY_MEAN: OUTPUT}, _versions(graph), policy)
+
+
 def _of_filter(act: FilterAct) -> bytes:
     """The policy's graph, and the filter's behind it."""
+    if isinstance(act.policy, RemotePolicy):
+        alone = onnx.load_from_string(act.exported.stored)
+        return _blinded([*alone.graph.node], alone.graph.initializer, _SAID, _versions(alone), act.policy)
     policy = onnx.load_from_string(stored_policy(act.policy))
     filtering = onnx.load_from_string(act.exported.stored)
     mean = {_POLICY_MEAN: f"policy/{_POLICY_MEAN}"}
     nodes = [*_renamed(policy, "policy", {INPUT: INPUT}), *_renamed(filtering, "filter", {**_ENDS, **mean})]
     constants = [each for model in (policy, filtering) for each in model.graph.initializer]
-    return _blinded(nodes, constants, {}, filtering, act.policy)
+    return _blinded(nodes, constants, {}, _versions(filtering), act.policy)
 
 
 _ENDS = {INPUT: INPUT, OUTPUT: OUTPUT}
+_SAID = {_POLICY_MEAN: _POLICY_MEAN}
+"""What a server says goes in as it is."""
+
+
+def _versions(model: ModelProto) -> tuple[int, int]:
+    """Of the operators and of the format."""
+    return max(each.version for each in model.opset_import if each.domain == ""), model.ir_version
 
 
 def _renamed(model: ModelProto, prefix: str, kept: dict[str, str]) -> list[NodeProto]:
@@ -141,7 +166,7 @@ def _blinded(
     nodes: list[NodeProto],
     constants: Iterable[TensorProto],
     named: dict[str, str],
-    like: ModelProto,
+    versions: tuple[int, int],
     policy: ReferencePolicy,
 ) -> bytes:
     """A model of these nodes in which every name is a number. ``named``: values that become input or output."""
@@ -162,13 +187,14 @@ def _blinded(
         tensor.CopyFrom(constant)
         tensor.name, tensor.doc_string = number(constant.name), ""
         tensors.append(tensor)
-    sizes = {INPUT: len(policy.offset), OUTPUT: policy.action_size}
+    sizes = {INPUT: len(policy.offset), OUTPUT: policy.action_size, _POLICY_MEAN: policy.action_size}
     ends = {
         name: helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", size]) for name, size in sizes.items()
     }
-    graph = helper.make_graph(plain, "controller", [ends[INPUT]], [ends[OUTPUT]], tensors)
-    opset = max(each.version for each in like.opset_import if each.domain == "")
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", opset)], ir_version=like.ir_version)
+    inputs = [ends[name] for name in (INPUT, *(_SAID if named is _SAID else ()))]
+    graph = helper.make_graph(plain, "controller", inputs, [ends[OUTPUT]], tensors)
+    opset, ir_version = versions
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", opset)], ir_version=ir_version)
     onnx.checker.check_model(model)
     return _padded(model)
 
@@ -184,9 +210,11 @@ def _padded(model: ModelProto) -> bytes:
     return stored
 
 
-def _compare(stored: bytes, act: Act, observations: Float32Array) -> None:
+def _compare(stored: bytes, act: "PolicyAct | FilterAct", observations: Float32Array) -> None:
     expected = np.array([act(each) for each in observations]).clip(-1.0, 1.0)
-    difference = float(np.abs(Controller(stored).batch(observations) - expected).max())
+    written = act_of_stored(stored, act.policy)
+    said = np.array([written(each) for each in observations])
+    difference = float(np.abs(said - expected).max())
     if not difference <= LARGEST_DIFFERENCE:
         raise ExportDiffers(f"{ExportDiffers.__doc__} The largest difference is {difference:.1e}.")
 

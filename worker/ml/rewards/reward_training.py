@@ -28,6 +28,8 @@ MEMBERS = 8
 LARGEST_GRADIENT = 1e-6
 """At what counts as the posterior's mode."""
 CALIBRATION_FOLDS = 5
+HINT_STRENGTH = 1.0
+"""Standard deviations of a pair by which the clips of a hint differ (docs/results/hints.md)."""
 _PINNED = 1e6
 """Prior precision of a weight that is held at 0."""
 
@@ -55,6 +57,7 @@ def fit(
     costs: Sequence[str] = NEVER_WANTED,
     predictor: SignalPredictor | None = None,
     mattered: npt.ArrayLike | None = None,
+    hints: npt.ArrayLike | None = None,
 ) -> FitResult:
     """Fit an ensemble to N pairs and their targets P(right preferred) in {0, 1/2, 1}.
 
@@ -67,23 +70,26 @@ def fit(
     ``predictor``: of the signals, which the kind "predicted" needs.
     ``mattered``: (N, S) bool, the signals that somebody named as what made the difference, for the kinds that are
     linear in signals. The answer is then heard once more, about these signals alone.
+    ``hints``: (H, S) which way somebody wishes the signals, for the same kinds: -1 less, 1 more, 0 neither. Each is
+    heard as one more answer, between clips that differ in these signals alone.
     Raises ValueError for targets outside {0, 1/2, 1}, a count that differs from the pairs', or a missing predictor.
     """
     started = time.perf_counter()
     answers = _checked(pairs, targets)
     metrics: dict[str, Any] = {"kind": kind, "trained_on": len(pairs), "seed": seed}
     known = prior or Prior.standard(len(signal_names))
+    extra = _Extra.of(len(pairs), len(signal_names), mattered, hints)
     model: RewardModel
     if kind == "structured":
         spread = scale or SignalScale.of(pairs)
-        model, found = _fit_structured(pairs, answers, seed, spread, known, signal_names, costs, mattered)
+        model, found = _fit_structured(pairs, answers, seed, spread, known, signal_names, costs, extra)
     elif kind == "predicted":
         if predictor is None:
             raise ValueError("The kind 'predicted' needs a predictor of the signals.")
         foreseen = predictor.completed(pairs.signals, pairs.observations, pairs.actions).astype(np.float32)
         completed = replace(pairs, signals=foreseen)
         wider = _wider(scale or SignalScale.of(completed), completed)
-        linear, found = _fit_structured(completed, answers, seed, wider, known, signal_names, costs, mattered)
+        linear, found = _fit_structured(completed, answers, seed, wider, known, signal_names, costs, extra)
         model = PredictedReward.with_predictor(linear, predictor)
     elif kind == "mlp":
         model, found = fit_mlp(pairs, answers, seed, mlp or MlpTraining())
@@ -132,6 +138,33 @@ def _normalised_over_segments(model: RewardModel, pairs: SegmentPairs) -> Reward
 # -- structured: Bayesian logistic regression --------------------------------------------------------------------------
 
 
+@dataclass(frozen=True)
+class _Extra:
+    """What somebody said beside the answers."""
+
+    named: npt.NDArray[np.bool_]
+    """(N, S) the signals that made the difference"""
+    hints: FloatArray
+    """(H, S) in {-1, 0, 1}"""
+
+    @classmethod
+    def of(cls, count: int, width: int, mattered: npt.ArrayLike | None, hints: npt.ArrayLike | None) -> "_Extra":
+        named = np.zeros((count, width), bool) if mattered is None else np.asarray(mattered, bool)
+        return cls(named, np.zeros((0, width)) if hints is None else np.asarray(hints, np.float64))
+
+    def without(self, left_out: npt.NDArray[np.bool_]) -> "_Extra":
+        """Without some of the answers."""
+        return replace(self, named=self.named[~left_out])
+
+    def heard(self, features: FloatArray, answers: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The answers, those of which somebody said what mattered once more, as if nothing else differed, and hints."""
+        said = self.named.any(axis=1)
+        return (
+            np.concatenate([features, (features * self.named)[said], HINT_STRENGTH * self.hints]),
+            np.concatenate([answers, answers[said], np.ones(len(self.hints))]),
+        )
+
+
 def _fit_structured(
     pairs: SegmentPairs,
     answers: FloatArray,
@@ -140,12 +173,11 @@ def _fit_structured(
     prior: Prior,
     signal_names: Sequence[str],
     never_wanted: Sequence[str],
-    mattered: npt.ArrayLike | None,
+    extra: _Extra,
 ) -> tuple[StructuredReward, dict[str, Any]]:
     features = pairs.signal_differences() / scale.spread
-    named = np.zeros(features.shape, bool) if mattered is None else np.asarray(mattered, bool)
     costs = [column for column, name in enumerate(signal_names) if name in never_wanted]
-    mean, covariance = posterior(*_heard(features, answers, named), prior, costs)
+    mean, covariance = posterior(*extra.heard(features, answers), prior, costs)
     members = _antithetic(mean, covariance, np.random.default_rng(seed)) / scale.spread
     deviation = 1.96 * np.sqrt(np.diag(covariance))
     weights = {
@@ -155,20 +187,14 @@ def _fit_structured(
     return StructuredReward(members, least_per_step=scale.least_per_step, most_per_step=scale.most_per_step), {
         "weights": weights,
         "weights_unit": "log odds per standard deviation of a pair",
-        "held_out": _held_out(features, answers, named, seed, prior, costs),
+        "held_out": _held_out(features, answers, extra, seed, prior, costs),
     }
-
-
-def _heard(features: FloatArray, answers: FloatArray, named: npt.NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
-    """The answers, and once more those of which somebody said what mattered: as if only that had differed."""
-    said = named.any(axis=1)
-    return np.concatenate([features, (features * named)[said]]), np.concatenate([answers, answers[said]])
 
 
 def _held_out(
     features: FloatArray,
     answers: FloatArray,
-    named: npt.NDArray[np.bool_],
+    extra: _Extra,
     seed: int,
     prior: Prior,
     costs: Sequence[int],
@@ -179,7 +205,7 @@ def _held_out(
     logits = np.zeros((MEMBERS, len(answers)))
     for each in range(min(CALIBRATION_FOLDS, len(answers))):
         inside = fold == each
-        heard = _heard(features[~inside], answers[~inside], named[~inside])
+        heard = extra.without(inside).heard(features[~inside], answers[~inside])
         mean, covariance = posterior(*heard, prior, costs)
         logits[:, inside] = _antithetic(mean, covariance, rng) @ features[inside].T
     return HeldOut(logits, answers, allows_for_lapses=True)

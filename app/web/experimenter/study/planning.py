@@ -17,7 +17,6 @@ from app.services.accounts import browser_sessions
 from app.services.paper import osf
 from app.services.participants import enrolment
 from app.services.studies import locking, membership, preregistration, studies
-from app.services.studies.studies import ClipsTooLong
 from app.web.experimenter.study.study_form import study_form
 from app.web.experimenter.study.study_form.form_fields import FIELDS, SECTIONS
 from app.web.experimenter.study.study_form.study_form import FormInvalid, Preset, StudyForm, TypedStudy
@@ -128,7 +127,7 @@ def change_settings(
     except locking.ReasonMissing as missing:
         errors = {"reason": missing.message}
         return _form_page(request, experimenter, form, errors=errors, study=study, session=session)
-    except (locking.SettingsFixed, ClipsTooLong) as refused:
+    except locking.SettingsFixed as refused:
         return _form_page(request, experimenter, form, errors={"": refused.message}, study=study, session=session)
     return _see(request, "show_study", slug=slug)
 

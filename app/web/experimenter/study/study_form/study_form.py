@@ -10,9 +10,10 @@ from pydantic import ConfigDict, Field, ValidationError, create_model
 
 from app.domain.designs import Arm, Screen
 from app.domain.protocol import FormItem
-from app.domain.studies import NAME_LENGTH, SEED_LIMIT, longest_clip_steps, usual_clip_steps
+from app.domain.studies import NAME_LENGTH, SEED_LIMIT, usual_clip_steps
 from app.domain.study_settings import PAPER_PROTOCOL, StudySettings
 from app.installed_tasks import catalogue
+from app.services.studies import task_limits
 from app.web.experimenter.study.study_form import form_lines
 from app.web.experimenter.study.study_form.form_fields import BY_NAME, FIELDS, LINES, FormField, Kind
 from app.web.texts.own_texts import CONSENT
@@ -173,6 +174,8 @@ def typed_study(form: StudyForm, own_task: str | None = None) -> Typed:
     if seed is not None and seed >= SEED_LIMIT:
         errors["seed"] = f"Enter a number below {SEED_LIMIT}."
     settings = _settings(errors, values)
+    if settings is not None:
+        errors |= task_limits.complaints(task, settings)
     if errors or settings is None:
         if len(errors) > 1:
             errors.pop("", None)  # a rule about several fields is premature while one of them is wrong
@@ -238,8 +241,6 @@ def _clip_steps(errors: dict[str, str], form: StudyForm, task: str, typed: int |
     if not form.clip_steps.strip():
         errors.pop("clip_steps", None)
         return usual_clip_steps(task)
-    if typed is not None and typed > (longest_clip_steps(task) or typed):
-        errors["clip_steps"] = f"An episode of this task has {longest_clip_steps(task)} steps. Enter at most as many."
     return typed
 
 

@@ -1,0 +1,55 @@
+"""What the task of a study does not allow, whatever else its settings are."""
+
+from collections.abc import Mapping
+from http import HTTPStatus
+
+from app.domain.choices import Method, RewardKind
+from app.domain.protocol import NEEDS_WEIGHTS, EvaluationMode
+from app.domain.studies import longest_clip_steps
+from app.domain.study_settings import StudySettings
+from app.errors import AppError
+from app.installed_tasks import catalogue
+
+_NEEDS_WEIGHTS = (
+    "would need the policy's own weights, and this task's policy is only asked what it does. Choose something else."
+)
+
+
+class TaskCannot(AppError):
+    """This study asks for something that its task does not allow."""
+
+    status = HTTPStatus.UNPROCESSABLE_ENTITY
+
+
+def require(task: str, settings: StudySettings) -> None:
+    """Raises TaskCannot, which says what has to be changed."""
+    found = complaints(task, settings)
+    if found:
+        raise TaskCannot(" ".join(found.values()))
+
+
+def complaints(task: str, settings: StudySettings) -> Mapping[str, str]:
+    """What is wrong, by the form's field; nothing of a task that is not installed here."""
+    found: dict[str, str] = {}
+    longest = longest_clip_steps(task)
+    if longest is not None and settings.clip_steps > longest:
+        found["clip_steps"] = f"An episode of this task has {longest} steps. Enter at most as many."
+    installed = catalogue.find(task)
+    if installed is None:
+        return found
+    if not installed.description.policy_is_looked_into:
+        if settings.method is Method.PRINTED:
+            found["method"] = f"PbARL as printed {_NEEDS_WEIGHTS}"
+        if settings.reward_kind is RewardKind.PREDICTED:
+            found["reward_kind"] = "The signals of this task cannot be foreseen. Choose another reward model."
+    if settings.evaluation is None:
+        return found
+    asked = {*settings.evaluation.methods, *(method for arm in settings.arms for method in arm.methods)}
+    in_need = [method.label for method in NEEDS_WEIGHTS if method in asked]
+    if in_need and not installed.description.policy_is_looked_into:
+        found["evaluation_methods"] = f"{' and '.join(in_need)} {_NEEDS_WEIGHTS}"
+    if installed.description.policy_is_a_server and settings.evaluation.mode is EvaluationMode.PHYSICAL:
+        found["evaluation_mode"] = (
+            "This task's policy answers from a server, so a robot cannot be packed for its operator. Show videos."
+        )
+    return found
