@@ -6,6 +6,7 @@ from collections.abc import Callable
 from datetime import timedelta
 from typing import Any
 
+import pandas as pd
 import pytest
 from fastapi.testclient import TestClient
 from sqlalchemy import select
@@ -26,7 +27,7 @@ from tests import factories
 from tests.finished_study import make_finished_study
 from tests.made_once import made_once
 from worker.analysis.study.report import make_report
-from worker.analysis.study.statistics import MEASURED_ERROR_PERCENT
+from worker.analysis.study.statistics import MEASURED_ERROR_PERCENT, rating_report
 from worker.jobs.publishing import report_files
 
 Finished = Callable[..., Study]
@@ -208,3 +209,35 @@ def test_figures_are_shown_and_cannot_run_anything(experimenter: TestClient, fin
     assert (answer.content, answer.headers["content-type"]) == (b"<svg/>", "image/svg+xml")
     assert "sandbox" in answer.headers["content-security-policy"]
     assert experimenter.get(f"/studies/{study.slug}/results/figures/secrets.svg").status_code == 404
+
+
+def test_between_arms_order_and_equivalence_are_on_the_page_and_in_the_text(
+    experimenter: TestClient, finished: Finished, database: Database
+) -> None:
+    study = finished()
+    said = {"reference": (2, 3, 3, 2, 4), "prefft": (3, 2, 3, 2, 4), "pbarl": (5, 4, 5, 4, 4)}
+    people = [
+        (f"{method}{number}", method, value) for method, all_of in said.items() for number, value in enumerate(all_of)
+    ]
+    rows = pd.DataFrame(people, columns=["participant", "method", "satisfaction"])
+    with database.writing() as session:
+        report = session.scalars(select(Report)).one()
+        ratings = rating_report(rows.assign(personalisation=rows["satisfaction"]), list(said), between=True, bound=1.0)
+        report.contents = {**report.contents, "ratings": ratings}
+        here = session.get_one(Study, study.id)
+        arms = [{"name": f"arm{place}", "methods": [method]} for place, method in enumerate(said)]
+        here.stored_settings = {**here.stored_settings, "arms": arms}
+    text = " ".join(results(experimenter, study).split())
+    equal, order = (
+        ratings["scales"]["satisfaction"]["comparisons"][0][f"{name}_between"]
+        for name in ("equivalence", "cumulative_link")
+    )
+    assert f"t({round(equal['degrees_of_freedom'])}) =" in text
+    assert "shown to be less than 1 points apart, 5 and 5 people" in text
+    assert "5 and 5 people, 10 ratings" in text
+    paper = experimenter.get(f"/studies/{study.slug}/results/methods_and_results.md").text
+    assert f"odds ratio of a higher rating {order['odds_ratio']:.2f}" in paper
+    assert re.search(
+        r"\| Equivalence, two one-sided Welch t, between people \| exploratory \| difference 0\.00, 90 %", paper
+    )
+    assert "n = 5 and 5 people, 10 ratings" in paper

@@ -165,7 +165,7 @@ def _table(rows: Sequence[dict[str, Any]]) -> str:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure everything and write all files."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--studies", type=int, default=500, help="of each truth; thrice as many without effect, half of order")
+    parser.add_argument("--studies", type=int, default=500, help="of each truth; 3 times without effect, half of order")
     parser.add_argument("--to", type=Path, default=RESULTS, help="folder to write to")
     options = parser.parse_args(arguments)
     between = [between_row(truth, studies_of(truth, options.studies)) for truth in tqdm(TRUTHS, file=sys.stderr)]

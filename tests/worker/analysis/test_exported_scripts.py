@@ -338,6 +338,24 @@ def test_arms_and_missing_ratings_are_computed_alike(
         assert_same(reported, script[name](study), name)
 
 
+@pytest.mark.skipif(shutil.which("Rscript") is None, reason="R is not installed")
+def test_the_r_script_computes_arms_alike(script: dict[str, Any], tmp_path: Path) -> None:
+    """Few enough people that the permutation test counts all ways."""
+    methods, arms = ["reference", "pbarl"], [("reference",), ("reference", "pbarl"), ("pbarl",)]
+    ratings = ratings_of(15, arms, seed=1)
+    who = pd.DataFrame({"participant": ratings["participant"].unique(), "arm": "one"})
+    (tmp_path / "csv").mkdir()
+    invented(script, tmp_path / "csv", ratings=ratings, participants=who, methods=bounded(methods))
+    call = (
+        "source(commandArgs(TRUE)[1]); write.csv(comparisons(read_study(commandArgs(TRUE)[2])), commandArgs(TRUE)[3])"
+    )
+    run("Rscript", "-e", call, ANALYSIS / "analysis.R", tmp_path / "csv", tmp_path / "comparisons.csv")
+    reported = ratings_tables(rating_report(ratings, methods, between=True, bound=0.4))["comparisons"]
+    assert {"cumulative_link_between", "equivalence_between"} <= {each["test"] for each in reported if "p" in each}
+    computed = pd.read_csv(tmp_path / "comparisons.csv", index_col=0).to_dict("records")
+    assert_same(reported, computed, "comparisons")
+
+
 @pytest.mark.parametrize("people", [3, 4, 9])
 def test_head_to_heads_with_equal_answers_are_computed_alike(
     script: dict[str, Any], tmp_path: Path, people: int
