@@ -1,6 +1,7 @@
 """Tests between people, and of order and period: as scipy, statsmodels, and paper and pencil have them."""
 
 import csv
+import math
 from itertools import combinations
 
 import numpy as np
@@ -175,7 +176,7 @@ def test_what_is_offered_between_arms_never_erred_clearly_more_often_than_promis
     level = [row for row in alike if len(set(row["people"].split(" and "))) == 1]
 
     def errs(row: dict[str, str], test: str) -> bool:
-        return float(row[f"{test}_percent"]) > 5.0 + 3 * (5.0 * 95.0 / int(row["studies"])) ** 0.5
+        return float(row[f"{test}_percent"]) > 5.0 + 3 * math.sqrt(5.0 * 95.0 / int(row["studies"]))
 
     for test, those in (("cumulative_link", alike), ("equivalence", bound), ("welch_t", level), ("permutation", level)):
         assert not [row for row in those if errs(row, test)], test
