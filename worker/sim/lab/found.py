@@ -20,7 +20,7 @@ from worker.whole_files import written_whole
 
 FOUND_FILE = "found.json"
 _OF_FILES = {"file", "gain", "activation"}
-_WORDS = {"title", "summary", "words", "instructions", "sliders", "usual_clip_steps"}
+_WORDS = {"title", "summary", "words", "instructions", "sliders", "hints", "usual_clip_steps"}
 """Nothing that was found depends on these."""
 _OF_SERVERS = {"inputs", "prompt", "execution_horizon"}
 
