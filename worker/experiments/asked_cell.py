@@ -26,9 +26,11 @@ def as_text(cell: Cell, terms: BenchmarkConfig) -> str:
 
 
 def run_asked(asked: str, work: Path) -> bytes:
-    """The finished cell's file. ``asked``: made by as_text(). Raises ValueError where the code is another."""
+    """The finished cell's file. ``asked``: made by as_text(). Raises ValueError for other code, or another place."""
     told = _ASKED.validate_json(asked)
     if told.code != code_mark():
         raise ValueError(f"This worker's code is not that of whoever asks ({code_mark()}, {told.code}). Update one.")
     path = told.cell.path(told.terms, work)
+    if not path.resolve().is_relative_to(work.resolve()):
+        raise ValueError(f"A cell called {told.cell.taste.name!r} would lie outside the directory of cells.")
     return (path if path.exists() else run_cell(told.cell, told.terms, work)).read_bytes()

@@ -6,13 +6,13 @@ keeps what came out until the command has fetched it. A command that was interru
 
 import base64
 import sys
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from time import sleep
 from typing import TYPE_CHECKING
 
-from dbos import DBOS, DBOSClient, DBOSConfiguredInstance, WorkflowStatus
+from dbos import DBOS, DBOSClient, DBOSConfiguredInstance, WorkflowHandle, WorkflowStatus
 from sqlalchemy import select
 from tqdm import tqdm
 
@@ -95,7 +95,7 @@ def on_workers(
                 bar.update(1)
                 done()
             if waiting:
-                time.sleep(LOOK_S)
+                sleep(LOOK_S)
         return failures
 
 
@@ -133,9 +133,8 @@ class _Queue:
         for name in waiting:
             status = known.get(name)
             if status is not None and (status.status == "SUCCESS" or (name in self._mine and engine.is_over(status))):
-                outcome = self._outcome(name)
-                self._client.delete_workflow(name)
-                yield name, outcome
+                yield name, self._outcome(name, status)
+                self._client.delete_workflow(name)  # only now: whoever asked has put it away
             elif status is None or engine.is_over(status):
                 self._ask(name, status)
             elif status.status == "PENDING" and status.executor_id not in present:
@@ -145,10 +144,13 @@ class _Queue:
             tqdm.write("No worker is running. Start one: python -m worker run", file=sys.stderr)
         self._told_of_nobody = not present
 
-    def _outcome(self, name: str) -> bytes | str:
+    def _outcome(self, name: str, ended: WorkflowStatus) -> bytes | str:
+        handle: WorkflowHandle[str] = self._client.retrieve_workflow(name)
+        if ended.status == "SUCCESS":
+            return base64.b64decode(handle.get_result())
         try:
-            return base64.b64decode(self._client.retrieve_workflow(name).get_result())
-        except Exception as error:  # whatever the worker met with
+            return str(handle.get_result())
+        except Exception as error:  # whatever the worker met with, of any library
             return f"{type(error).__name__}: {error}"
 
     def take_back(self) -> None:

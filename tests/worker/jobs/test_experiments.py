@@ -85,7 +85,7 @@ def test_an_interrupted_command_takes_back_what_nobody_has_begun_and_the_next_on
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("worker.jobs.experiments.time.sleep", interrupt)
+        patch.setattr("worker.jobs.experiments.sleep", interrupt)
         with pytest.raises(KeyboardInterrupt):
             collected(settings, tmp_path / "ours")
     with worker(settings, database, theirs):
@@ -110,7 +110,7 @@ def test_what_a_worker_that_never_comes_back_was_at_is_done_by_another(
     begun, may_go_on = threading.Event(), threading.Event()
 
     class Held(Compute):
-        def run(self, *_: object) -> bytes:  # type: ignore[override]
+        def run(self, *_: object) -> bytes:  # type: ignore[override]  # asked for whatever, it hangs
             begun.set()
             may_go_on.wait()
             raise SystemExit  # the engine keeps no outcome: as if the process had gone
@@ -128,6 +128,12 @@ def test_what_a_worker_that_never_comes_back_was_at_is_done_by_another(
         asking.join()
     may_go_on.set()
     assert first.path(TERMS, tmp_path / "ours").read_bytes() == b"cell 0"
+
+
+def test_a_cell_whose_name_leads_out_of_the_directory_is_refused(tmp_path: Path) -> None:
+    outside = replace(PAPER_USERS["cautious"], name="../../../../outside")
+    with pytest.raises(ValueError, match="outside the directory"):
+        asked_cell.run_asked(asked_cell.as_text(replace(CELLS[0], taste=outside), TERMS), tmp_path / "work")
 
 
 def test_whatever_the_terms_a_cell_is_the_same_after_it_was_told() -> None:

@@ -191,7 +191,7 @@ def _blinded(
     ends = {
         name: helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", size]) for name, size in sizes.items()
     }
-    inputs = [ends[name] for name in (INPUT, *(_SAID if named is _SAID else ()))]
+    inputs = [ends[INPUT], *([ends[_POLICY_MEAN]] if isinstance(policy, RemotePolicy) else [])]
     graph = helper.make_graph(plain, "controller", inputs, [ends[OUTPUT]], tensors)
     opset, ir_version = versions
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", opset)], ir_version=ir_version)
