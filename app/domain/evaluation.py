@@ -91,6 +91,16 @@ class Donors(BaseModel):
     types: tuple[str, ...] = Field(default=(), max_length=100)
     candidates: tuple[int, ...] = Field(default=(), max_length=100_000)
 
+    @property
+    def share_a_filter(self) -> bool:
+        """Whether one is fitted to their wishes; a person's own is there already."""
+        return bool(self.types) or len(self.people) > 1
+
+    @property
+    def without_candidates(self) -> "Donors":
+        """Whose filter it is, and nothing else."""
+        return Donors(people=self.people, types=self.types)
+
     def without(self, number: int) -> "Donors":
         """The same after somebody has withdrawn."""
         people, candidates = (
@@ -120,6 +130,29 @@ class DonorDraw(Base):
     @property
     def donors(self) -> Donors:
         """Who, validated."""
+        return Donors.model_validate(self.stored_donors)
+
+
+class SharedFilter(Base):
+    """A filter fitted to the wishes of several people or types of users, once for everybody in a study who is shown it.
+
+    Not in archives: it is fitted again where it is needed.
+    """
+
+    __tablename__ = "shared_filter"
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    study_id: Mapped[int] = mapped_column(ForeignKey("study.id"), index=True)
+    stored_donors: Mapped[dict[str, Any]]
+    asked_at: Mapped[datetime] = mapped_column(default=now)
+    artefact_sha256: Mapped[str | None] = mapped_column(String(64))
+    """The controller; None while it is not fitted."""
+    metrics: Mapped[dict[str, Any] | None]
+    """What is to be said about it, as of a Model; None while it is not fitted."""
+
+    @property
+    def donors(self) -> Donors:
+        """To whose wishes it is fitted, validated."""
         return Donors.model_validate(self.stored_donors)
 
 

@@ -18,6 +18,8 @@ class RunKind(StrEnum):
     FILTER = "filter"
     METHOD = "method"
     """A method that is only evaluated, such as PrefFT."""
+    SHARED = "shared"
+    """A filter for several people or types of users together."""
     FILMS = "films"
     """Videos of methods on unseen scenarios."""
     REPORT = "report"

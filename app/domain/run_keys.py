@@ -11,6 +11,7 @@ filter/participant-3/labels-200/answer-345-exclusion-6
 method/participant-3/prefft/labels-200/answer-345
 films/participant-3/trials/labels-200/answer-345
 films/participant-3/again-8-1763811000          lost files of film 8
+shared/study-1/filter-7-19ab0c3d4e5             what shared filter 7 asks for, which was asked for at that moment
 report/study-1/basis-0123456789abcdef           the report of what there was then
 export/study-1/archive-4                        the file that export 4 asks for
 power/study-1/plan-4                            the simulation that power plan 4 asks for
@@ -33,7 +34,11 @@ ROWS = {
 SCENARIO, WHOLE, AGAIN = "scenario", "whole", "again"
 PREVIEW, SETTING = "preview", "setting"
 BEFORE_AFTER, TRIALS, CONTROLLERS = "before-after", "trials", "controllers"
+SHARED_FILTER = "filter"
 BASIS, PLAN = "basis", "plan"
+
+_ASKED_FOR = (RunKind.SHARED, RunKind.EXPORT, RunKind.POWER)
+"""Kinds of which each run is what one row asks for."""
 
 _PATTERN = re.compile(
     r"(?P<kind>[a-z]+)/(?:study-(?P<study>\d+)|participant-(?P<participant>\d+))"
@@ -75,7 +80,7 @@ class RunKey:
     @property
     def series(self) -> "RunKey":
         """What a later run makes good: the same work, from whichever labels or after whichever loss."""
-        of_row = self.number if self.subject == AGAIN or self.kind in (RunKind.EXPORT, RunKind.POWER) else None
+        of_row = self.number if self.subject == AGAIN or self.kind in _ASKED_FOR else None
         subject = self.subject if of_row or self.kind in (RunKind.METHOD, RunKind.FILMS) else ""
         return RunKey(self.kind, self.study_id, self.participant_id, subject, of_row)
 

@@ -9,11 +9,11 @@ from fastapi.testclient import TestClient
 from sqlalchemy.orm import Session
 
 from app.db import Database, now
-from app.domain.evaluation import Rating
+from app.domain.evaluation import Rating, SharedFilter
 from app.domain.models import Model, ModelKind, Run, RunKind, RunStatus
 from app.domain.protocol import EvaluatedMethod, EvaluationSettings
 from app.domain.studies import Awaited, Participant, Study
-from app.services.evaluation import robot_preparation
+from app.services.evaluation import donors, robot_preparation
 from app.services.runs import estimates
 from app.storage import ArtefactStore
 from tests import factories
@@ -99,6 +99,31 @@ def test_what_was_never_done_here_is_said_to_be_unknown(look: Look) -> None:
 def test_the_first_robot_is_foretold_from_what_it_took_before(database: Database, study: Study, look: Look) -> None:
     somebody_before(database, study)
     assert "About 2 minutes to go" in look(), "PrefFT beside the filter, then two of six films: 100 + 10 s"
+
+
+def test_a_filter_of_others_that_is_not_fitted_yet_counts_and_its_trouble_is_told(
+    database: Database, study: Study, person: tuple[Participant, str], look: Look
+) -> None:
+    somebody_before(database, study)
+    with database.writing() as session:
+        lent = EvaluationSettings(methods=(EvaluatedMethod.REFERENCE, EvaluatedMethod.PBARL, EvaluatedMethod.AVERAGE))
+        here = session.get_one(Study, study.id)
+        here.stored_settings = here.settings.model_copy(update={"evaluation": lent}).model_dump(mode="json")
+        shared = SharedFilter(study_id=study.id, stored_donors={"types": ["neutral"]})
+        session.add(shared)
+        session.flush()
+        participant = session.get_one(Participant, person[0].id)
+        donors.draw(session, here, participant, EvaluatedMethod.AVERAGE, ["neutral"])
+        earlier, _ = factories.make_participant(session, study)
+        took(session, earlier, here, RunKind.METHOD, 10, "average")
+        took(session, earlier, here, RunKind.FILMS, 30, "trials")
+        run = factories.make_run(session, study, kind=RunKind.SHARED, status=RunStatus.RUNNING, progress=0.5)
+        run.workflow_id = str(donors.key_of(shared))
+        run.started_at, run.finished_at = now() - timedelta(seconds=240), None
+    assert "About 4 minutes to go" in look()
+    with database.writing() as session:
+        session.get_one(Run, run.id).status = RunStatus.FAILED
+    assert "Something went wrong" in look()
 
 
 def test_a_slower_machine_and_what_is_done_are_both_counted(

@@ -33,6 +33,7 @@ STORED = {
     "report/study-1/basis-0123456789012345": RunKey(RunKind.REPORT, 1, subject=BASIS, mark="0123456789012345"),
     "report/study-1/basis-abcdefabcdefabcd": RunKey(RunKind.REPORT, 1, subject=BASIS, mark="abcdefabcdefabcd"),
     "export/study-1/archive-4": RunKey(RunKind.EXPORT, 1, subject="archive", number=4),
+    "shared/study-1/filter-7-19ab0c3d4e5": RunKey(RunKind.SHARED, 1, subject="filter", number=7, mark="19ab0c3d4e5"),
     "power/study-1/plan-4": RunKey(RunKind.POWER, 1, subject="plan", number=4),
     "reward/participant-3/labels-20/imported-0b9c-1f": RunKey(
         RunKind.REWARD, participant_id=3, labels=20, copy="/imported-0b9c-1f"

@@ -23,7 +23,7 @@ from app.services.evaluation import evaluation_plan, self_setting
 from worker.domain import scenarios
 from worker.jobs.clips import preview_films, repairs
 from worker.jobs.publishing import export_files, power_plans, report_files
-from worker.jobs.runtime import due_evaluation
+from worker.jobs.runtime import due_evaluation, due_lending
 from worker.jobs.runtime.due_work import (
     answers_known,
     filter_due,
@@ -69,7 +69,8 @@ def due(session: Session, lost: Mapping[str, int] | None = None) -> Iterator[tup
             jobs = (*repairs.due(session, study, lost or {}), *_all_due(session, study, succeeded))
         for job in jobs:
             attempt = _attempt_due(runs.get(job.key), now())
-            if attempt is not None and (job.participant_id, job.kind) not in at_work:
+            free = attempt is not None and (job.participant_id, job.kind) not in at_work
+            if attempt is not None and free and not due_lending.is_missing(session, job):
                 yield job, attempt
 
 
@@ -77,6 +78,7 @@ def _all_due(session: Session, study: Study, succeeded: Collection[str]) -> Iter
     yield from preview_films.due_now(session, study)
     yield from _missing_clips(session, study)
     yield from _stale_models(session, study, succeeded)
+    yield from due_lending.due(session, study)
     yield from report_files.due(session, study)
     yield from export_files.due(session, study)
     yield from power_plans.due(session, study)

@@ -26,7 +26,7 @@ from worker.compute import learning, simulation
 from worker.compute.pools import Compute, ComputeLost, Interrupted, Lane
 from worker.jobs import experiments, reconcile
 from worker.jobs.learning import query_selection
-from worker.jobs.runtime import engine, records
+from worker.jobs.runtime import due_lending, engine, records
 from worker.jobs.runtime.context import WorkerContext
 from worker.jobs.runtime.lanes import Lanes
 from worker.jobs.runtime.records import Job, as_arguments
@@ -188,10 +188,14 @@ class _Rounds:
             lost = reconcile.abandoned(session, self._runner.in_hand)
             answered = reconcile.studies_with_answers(session)
             withdrawn, deleted = erasure.unfinished(session), erasure.unfinished_studies(session)
+            lending = due_lending.unsettled(session)
             lanes.who_waits = WhoWaits.look(session)
         self._start_most_urgent(due)
         for participant_id in hungry - self._refused:
             self._refill(participant_id)
+        for study_id in lending:
+            with self._context.database.writing() as session:
+                due_lending.settle(session, study_id)
         for participant_id in withdrawn:
             self._erase(erasure.erase_traces, participant_id)
         for study_id in deleted:

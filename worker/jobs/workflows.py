@@ -50,6 +50,7 @@ BODIES: dict[RunKind, Callable[[WorkerContext, Job, int, Step], None]] = {
     RunKind.REWARD: Imported("worker.jobs.learning.reward_models:train_reward"),
     RunKind.FILTER: Imported("worker.jobs.learning.filters:train_filter"),
     RunKind.METHOD: Imported("worker.jobs.learning.baselines:train_method"),
+    RunKind.SHARED: Imported("worker.jobs.learning.shared_filters:fit"),
     RunKind.FILMS: Imported("worker.jobs.clips.evaluation_films:make_films"),
     RunKind.REPORT: Imported("worker.jobs.publishing.report_files:make"),
     RunKind.EXPORT: Imported("worker.jobs.publishing.export_files:make"),

@@ -28,6 +28,7 @@ from sqlalchemy import ColumnElement, Table, and_, or_, select
 from sqlalchemy.orm import Session
 
 from app.db import Base, now
+from app.domain.evaluation import SharedFilter
 from app.domain.models import Export, Report, Run, RunKind
 from app.domain.people import ApiToken, BrowserSession, StudyMember
 from app.domain.power_plan import PowerPlan
@@ -44,11 +45,13 @@ FORMAT, VERSION = "pbarl-studio-archive", 2
 MANIFEST, SEALED = "manifest.json", "sealed"
 LARGEST_MANIFEST_BYTES = 8 << 20
 LARGEST_ROW_BYTES = 4 << 20
-LEFT_OUT = {each.__tablename__ for each in (BrowserSession, StudyMember, ApiToken, Report, Export, PowerPlan)}
+LEFT_OUT = {
+    each.__tablename__ for each in (BrowserSession, StudyMember, ApiToken, Report, Export, PowerPlan, SharedFilter)
+}
 """Who may come in is a matter of each installation; reports and files are made again."""
 SECRETS = {"study": {"join_token"}, "participant": {"token_sha256", "link_revoked_at"}}
 """Columns that never leave: with them somebody could answer in somebody else's name; and links are new elsewhere."""
-REMADE = (RunKind.REPORT, RunKind.EXPORT, RunKind.POWER)
+REMADE = (RunKind.SHARED, RunKind.REPORT, RunKind.EXPORT, RunKind.POWER)
 _ROWS_AT_ONCE = 500
 _SHA256 = r"^[0-9a-f]{64}$"
 

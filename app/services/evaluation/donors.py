@@ -11,10 +11,10 @@ from typing import TypeVar
 from sqlalchemy import delete, select
 from sqlalchemy.orm import Session
 
-from app.domain.evaluation import Controller, DonorDraw, DonorRule, Donors, Film, Trial
+from app.domain.evaluation import Controller, DonorDraw, DonorRule, Donors, Film, SharedFilter, Trial
 from app.domain.models import Model, ModelKind, Run, RunKind, RunStatus
 from app.domain.protocol import EvaluatedMethod
-from app.domain.run_keys import CONTROLLERS, TRIALS, read
+from app.domain.run_keys import CONTROLLERS, SHARED_FILTER, TRIALS, RunKey, read
 from app.domain.studies import Participant, Study
 from app.services.evaluation import evaluation_plan, unblinding
 
@@ -33,19 +33,25 @@ def draw(
     known = find(session, participant.id, method)
     if known is not None:
         return known
-    people = candidates(session, study, participant)
-    if method is EvaluatedMethod.SOMEBODY_ELSE:
-        rule, donors = _one(session, study, participant, people, types)
-    elif len(people) >= FEWEST_PEOPLE:
-        rule, donors = DonorRule.MEAN_OF_PEOPLE, Donors(people=tuple(people), candidates=tuple(people))
-    else:
-        rule, donors = DonorRule.MEAN_OF_TYPES, Donors(types=tuple(types), candidates=tuple(people))
+    rule, donors = foresee(session, study, participant, method, types)
     drawn = DonorDraw(
         participant_id=participant.id, method=method, rule=rule, stored_donors=donors.model_dump(mode="json")
     )
     session.add(drawn)
     session.flush()
     return drawn
+
+
+def foresee(
+    session: Session, study: Study, participant: Participant, method: EvaluatedMethod, types: Sequence[str]
+) -> tuple[DonorRule, Donors]:
+    """What would be drawn now."""
+    people = candidates(session, study, participant)
+    if method is EvaluatedMethod.SOMEBODY_ELSE:
+        return _one(session, study, participant, people, types)
+    if len(people) >= FEWEST_PEOPLE:
+        return DonorRule.MEAN_OF_PEOPLE, Donors(people=tuple(people), candidates=tuple(people))
+    return DonorRule.MEAN_OF_TYPES, Donors(types=tuple(types), candidates=tuple(people))
 
 
 def find(session: Session, participant_id: int, method: str) -> DonorDraw | None:
@@ -109,6 +115,33 @@ def _one(
     return DonorRule.TYPE_OF_USER, Donors(types=(drawn(types),))
 
 
+def shared_filters(session: Session, study: Study) -> Sequence[SharedFilter]:
+    """Those of several people or types of users, fitted or not, the first that was asked for first."""
+    theirs = select(SharedFilter).where(SharedFilter.study_id == study.id)
+    return session.scalars(theirs.order_by(SharedFilter.id)).all()
+
+
+def shared_filter(session: Session, study: Study, whose: Donors) -> SharedFilter | None:
+    """The one for these donors; None while nobody has asked for it."""
+    alike = (each for each in shared_filters(session, study) if each.donors == whose.without_candidates)
+    return next(alike, None)
+
+
+def awaited_by(session: Session, participant: Participant, method: str) -> SharedFilter | None:
+    """What is still to be fitted before the participant can be lent it; None when there is nothing. Loads the study."""
+    drawn = find(session, participant.id, method)
+    if drawn is None or not drawn.donors.share_a_filter:
+        return None
+    shared = shared_filter(session, session.get_one(Study, participant.study_id), drawn.donors)
+    return shared if shared is not None and shared.artefact_sha256 is None else None
+
+
+def key_of(shared: SharedFilter) -> RunKey:
+    """The key of the run that fits it; with the moment, for ids may be given again."""
+    moment = f"{round(shared.asked_at.timestamp() * 1000):x}"
+    return RunKey(RunKind.SHARED, study_id=shared.study_id, subject=SHARED_FILTER, number=shared.id, mark=moment)
+
+
 def counts(session: Session, study: Study) -> dict[str, Counter[str]]:
     """How many participants were lent a filter by which rule, by method; nothing while the study is blinded."""
     if unblinding.is_blinded(study):
@@ -129,8 +162,8 @@ def numbers_in(draws: Iterable[DonorDraw]) -> set[int]:
 def release(session: Session, participant: Participant) -> tuple[dict[str, int], set[str]]:
     """Take the participant, who has withdrawn, out of what was drawn for others; doing it again changes nothing.
 
-    What was made of their filter for somebody who has not begun to look is erased, to be drawn and made anew. Returns
-    the erased rows by table, and the files that they named.
+    What was made of their filter for somebody who has not begun to look is erased, to be drawn and made anew; an
+    average of enough others stays. Returns the erased rows by table, and the files that they named.
     """
     study = session.get_one(Study, participant.study_id)
     begun = evaluation_plan.begun(session, study)
@@ -142,14 +175,21 @@ def release(session: Session, participant: Participant) -> tuple[dict[str, int],
             continue
         was = each.donors
         each.stored_donors = was.without(participant.number).model_dump(mode="json")
-        if participant.number not in was.people or each.method != EvaluatedMethod.SOMEBODY_ELSE:
+        if participant.number not in was.people:
+            continue
+        if each.method == EvaluatedMethod.AVERAGE and len(was.people) > FEWEST_PEOPLE:
             continue
         if each.participant_id in begun:
-            each.rule = DonorRule.WITHDREW
+            each.rule = DonorRule.WITHDREW if each.method == EvaluatedMethod.SOMEBODY_ELSE else each.rule
             continue
         files |= _take_back(session, each.participant_id, each.method, rows)
         session.delete(each)
         rows[DonorDraw.__tablename__] += 1
+    for shared in shared_filters(session, study):
+        if participant.number in shared.donors.people:
+            files |= {shared.artefact_sha256} if shared.artefact_sha256 else set()
+            session.delete(shared)
+            rows[SharedFilter.__tablename__] += 1
     session.flush()
     return dict(rows), files
 

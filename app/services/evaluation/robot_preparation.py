@@ -5,14 +5,13 @@ from dataclasses import dataclass
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
+from app.domain.evaluation import SharedFilter
 from app.domain.models import Model, ModelKind, Run, RunKind, RunStatus
-from app.domain.protocol import EvaluatedMethod, EvaluationMode
-from app.domain.run_keys import BEFORE_AFTER, CONTROLLERS, TRIALS
+from app.domain.protocol import FROM_OTHERS, EvaluatedMethod, EvaluationMode
+from app.domain.run_keys import BEFORE_AFTER, CONTROLLERS, SHARED_FILTER, TRIALS
 from app.domain.studies import Participant
-from app.services.evaluation import evaluation_plan
+from app.services.evaluation import donors, evaluation_plan
 from app.services.runs import estimates
-
-"""What films are for, as the worker names its runs."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +90,25 @@ def _learning(session: Session, participant: Participant) -> _Part:
 def _training(session: Session, participant: Participant, method: EvaluatedMethod, trained: bool) -> _Part:
     if trained:
         return _Part(estimates.usual_s(session, participant.study, RunKind.METHOD, method), 0.0, 1.0)
-    return _part(session, participant, RunKind.METHOD, method)
+    own, fitting = _part(session, participant, RunKind.METHOD, method), _fitting(session, participant, method)
+    if fitting is None:
+        return own
+    usual = None if own.usual_s is None or fitting.usual_s is None else own.usual_s + fitting.usual_s
+    left = None if own.left_s is None or fitting.left_s is None else own.left_s + fitting.left_s
+    return _Part(usual, left, fitting.progress * fitting.usual_s / usual if fitting.usual_s and usual else 0.0)
+
+
+def _fitting(session: Session, participant: Participant, method: EvaluatedMethod) -> _Part | None:
+    """The filter of several others that the method waits for; None when there is none, or it is there."""
+    shared = donors.awaited_by(session, participant, method)
+    if shared is None:
+        return None
+    usual = estimates.usual_s(session, participant.study, RunKind.SHARED, SHARED_FILTER)
+    return _as_part(_run_of(session, shared), usual)
+
+
+def _run_of(session: Session, shared: SharedFilter) -> Run | None:
+    return session.scalar(select(Run).where(Run.workflow_id == str(donors.key_of(shared))))
 
 
 def _showing(session: Session, participant: Participant, what: str) -> _Part:
@@ -105,7 +122,10 @@ def _showing(session: Session, participant: Participant, what: str) -> _Part:
 
 def _part(session: Session, participant: Participant, kind: RunKind, what: str = "") -> _Part:
     run = estimates.newest_run(session, participant, kind, what)
-    usual = estimates.usual_s(session, participant.study, kind, what)
+    return _as_part(run, estimates.usual_s(session, participant.study, kind, what))
+
+
+def _as_part(run: Run | None, usual: float | None) -> _Part:
     at_work = run is not None and run.status == RunStatus.RUNNING
     return _Part(usual, estimates.left_s(run, usual), run.progress if run is not None and at_work else 0.0)
 
@@ -139,5 +159,7 @@ def _is_trained(
 
 def _has_failed(session: Session, participant: Participant) -> bool:
     runs = session.scalars(select(Run).where(Run.participant_id == participant.id).order_by(Run.id))
-    newest = {run.kind: run for run in runs}
-    return any(run.status == RunStatus.FAILED for run in newest.values())
+    awaited = [donors.awaited_by(session, participant, method) for method in FROM_OTHERS]
+    fitting = [_run_of(session, shared) for shared in awaited if shared is not None]
+    newest = [*{run.kind: run for run in runs}.values(), *fitting]
+    return any(run is not None and run.status == RunStatus.FAILED for run in newest)

@@ -13,7 +13,7 @@ from sqlalchemy.orm import InstrumentedAttribute, Session
 from app.db import Base, now
 from app.domain import participation, preferences  # noqa: F401  (their tables belong to what is erased)
 from app.domain.clips import Clip, Rollout
-from app.domain.evaluation import Controller, Film
+from app.domain.evaluation import Controller, Film, SharedFilter
 from app.domain.models import Bundle, Export, Model, Report, Run, RunKind
 from app.domain.self_setting import PreviewFilm
 from app.domain.studies import Participant, Study
@@ -34,6 +34,7 @@ ARTEFACT_COLUMNS: tuple[InstrumentedAttribute[Any], ...] = (
     PreviewFilm.video_sha256,
     PreviewFilm.poster_sha256,
     Controller.artefact_sha256,
+    SharedFilter.artefact_sha256,
     Model.artefact_sha256,
     Bundle.artefact_sha256,
     Export.artefact_sha256,
@@ -73,7 +74,7 @@ def erase(session: Session, store: ArtefactStore, participant: Participant) -> N
     artefacts |= files
     _erase_rows(session, personal_rows(participant.id), erased)
     for table, count in lent.items():
-        erased.rows[table] += count
+        erased.rows[table] = erased.rows.get(table, 0) + count
     session.expire_all()  # what the session remembers of those rows is gone as well
     _erase_files(session, store, artefacts, erased)
     store.unfinished.forget(store.unfinished.folder(participant.id))

@@ -100,7 +100,7 @@ def _what_matters(kind: RunKind, settings: StudySettings) -> tuple[object, ...]:
     match kind:
         case RunKind.REWARD:
             return (settings.reward_kind,)
-        case RunKind.FILTER:
+        case RunKind.FILTER | RunKind.SHARED:
             return settings.method, settings.evaluation_scenarios
         case RunKind.METHOD:
             return evaluation.fine_tuning_steps if evaluation else None, settings.evaluation_scenarios

@@ -16,7 +16,7 @@ from app.domain.clips import Clip
 from app.domain.evaluation import Controller, Film, Trial
 from app.domain.models import Model, ModelKind, Run, RunKind, RunStatus
 from app.domain.preferences import Query, Response
-from app.domain.protocol import EvaluatedMethod, EvaluationMode, EvaluationSettings
+from app.domain.protocol import FROM_OTHERS, EvaluatedMethod, EvaluationMode, EvaluationSettings
 from app.domain.studies import Participant, Study
 from app.services.evaluation import evaluation_plan
 from app.storage import ArtefactStore
@@ -25,7 +25,7 @@ from worker.domain.trajectory import SIGNALS
 from worker.jobs import reconcile
 from worker.jobs.clips.evaluation_films import make_films
 from worker.jobs.learning.baselines import train_method
-from worker.jobs.runtime import records
+from worker.jobs.runtime import due_lending, records
 from worker.jobs.runtime.context import WorkerContext
 from worker.jobs.runtime.records import Job
 from worker.ml.filters.filter_module import FilterWeights
@@ -63,6 +63,11 @@ def all_said(add_clips: Callable[[int], list[Clip]], answer: Callable[[Clip, Cli
 
 
 def due(database: Database, *kinds: RunKind) -> list[Job]:
+    """What a round of the worker finds, after it has drawn what was to be drawn."""
+    with database.writing() as session:
+        for study_id in due_lending.unsettled(session):
+            due_lending.settle(session, study_id)
+        assert due_lending.unsettled(session) == []
     with database.reading() as session:
         return [job for job, _ in reconcile.due(session) if job.kind in kinds]
 
@@ -179,7 +184,8 @@ def test_nothing_is_filmed_before_the_filter_and_no_trial_before_every_method(
 @pytest.mark.usefixtures("all_said")
 def test_only_what_is_not_there_is_trained(context: WorkerContext, database: Database, study: Study) -> None:
     there = [EvaluatedMethod.REFERENCE, EvaluatedMethod.PBARL]
-    missing = [method for method in EvaluatedMethod if method not in (*there, EvaluatedMethod.SELF_SET)]
+    not_trained = {*there, EvaluatedMethod.SELF_SET, *FROM_OTHERS}
+    missing = [method for method in EvaluatedMethod if method not in not_trained]
     for methods in (there + missing[:3], there + missing[3:]):
         settle(database, study, methods=tuple(methods))
         for reward in due(database, RunKind.REWARD):

@@ -1,14 +1,15 @@
 """What a participant is shown of others: made of what was drawn, and never of somebody who has withdrawn."""
 
 from collections.abc import Callable
+from datetime import timedelta
 from typing import Any
 
 import pytest
 from sqlalchemy import select
 
-from app.db import Database
+from app.db import Database, now
 from app.domain.clips import Clip
-from app.domain.evaluation import DonorRule
+from app.domain.evaluation import DonorRule, Donors
 from app.domain.models import Model, ModelKind, RunKind
 from app.domain.preferences import Query, Response
 from app.domain.protocol import EvaluatedMethod
@@ -17,19 +18,21 @@ from app.domain.studies import Participant, Study
 from app.services.evaluation import donors
 from app.services.participants import withdrawal
 from app.storage import ArtefactStore
+from tests import factories
 from tests.worker.at_hand import AtHand, at_once
 from tests.worker.jobs.test_evaluation_films import LABELS, done, due, learn, names, settle
 from worker.compute import baseline_fitting
 from worker.jobs.clips.evaluation_films import make_films
-from worker.jobs.learning import filters, lent_filters
+from worker.jobs.learning import filters, lent_filters, shared_filters
 from worker.jobs.learning.baselines import train_method
 from worker.jobs.learning.lent_filters import LoanEnded
-from worker.jobs.runtime import records
+from worker.jobs.runtime import due_lending, records
 from worker.jobs.runtime.context import WorkerContext
 from worker.jobs.runtime.records import Job
 from worker.ml.filters.filter_module import FilterWeights
 from worker.ml.filters.filter_problem import FilterConfig
 
+FITTED = b"a controller"
 DONOR = FilterWeights(mode={"speed_far": 0.8}).to_bytes()
 
 
@@ -58,6 +61,17 @@ def donor(database: Database, store: ArtefactStore, study: Study) -> Participant
         records.save_model(session, run_id, ModelKind.FILTER, store.put(DONOR), {})
         records.finish_run(session, run_id)
     return person
+
+
+def fitted(context: WorkerContext, job: Job) -> str:
+    """The filter that the job fits, without the minutes it takes: its artefact."""
+    done(context, job)
+    artefact = context.store.put(FITTED)
+    with context.database.writing() as session:
+        shared = due_lending.find(session, job)
+        assert shared is not None
+        shared.artefact_sha256, shared.metrics = artefact, {"notes": ["As it was fitted."]}
+    return artefact
 
 
 def method_job(context: WorkerContext, study: Study, *methods: str) -> Job:
@@ -91,23 +105,92 @@ def test_somebody_else_s_filter_is_taken_as_it_is_and_the_model_does_not_say_who
 
 
 @pytest.mark.usefixtures("all_said")
-def test_what_was_fitted_to_types_of_users_is_fitted_once_for_a_study(
+def test_nobody_is_lent_what_is_not_fitted_and_the_same_is_fitted_once_for_a_study(
     context: WorkerContext, study: Study, donor: Participant
 ) -> None:
-    job = method_job(context, study, "average")
-    types = ["neutral", "cautious", "impatient"]
-    fitted = context.store.put(b"fitted for the first")
+    settle(context.database, study, trials=1, methods=("pbarl", "average"))
+    learn(context)
     with context.database.writing() as session:
-        first = session.get_one(Participant, donor.id)
-        donors.draw(session, session.get_one(Study, study.id), first, EvaluatedMethod.AVERAGE, types)
-        earlier = Job(RunKey(RunKind.METHOD, participant_id=first.id, subject="average", labels=LABELS), study.id)
-        run_id = records.begin_run(session, earlier, seed=1)
-        records.set_labels(session, run_id, LABELS, "hash of the first")
-        metrics = {"method": "average", "notes": ["As it was fitted."]}
-        records.save_model(session, run_id, ModelKind.METHOD, fitted, metrics)
+        job = Job(RunKey(RunKind.REWARD, participant_id=donor.id, labels=LABELS), study.id)
         run_id = records.begin_run(session, job, seed=1)
-    made = lent_filters.make(context, job, run_id, at_once, EvaluatedMethod.AVERAGE)
-    assert (made["artefact"], made["notes"]) == (fitted, ["As it was fitted."])
+        records.set_labels(session, run_id, LABELS, "hash of the donor")
+        records.save_model(session, run_id, ModelKind.REWARD, "0" * 64, {})
+    assert due(context.database, RunKind.METHOD) == []
+    (fitting,) = due(context.database, RunKind.SHARED)
+    assert fitting.study_id == study.id
+    fitted(context, fitting)
+    (job,) = due(context.database, RunKind.METHOD)
+    assert names([job]) == ["method/participant-1/average"]
+    taken = lent_filters.take(context, job, 0, at_once, EvaluatedMethod.AVERAGE)
+    assert context.store.read(str(taken["artefact"])) == FITTED
+    assert taken["notes"] == ["As it was fitted."]
+    with context.database.reading() as session:
+        drawn = [donors.find(session, person, "average") for person in (1, donor.id)]
+    assert [each.donors.types for each in drawn if each] == [("neutral", "cautious", "impatient")] * 2
+
+
+class TestAhead:
+    """Filters for several are asked for while somebody still answers, for what would be drawn for them now."""
+
+    @pytest.fixture
+    def answering(self, context: WorkerContext, study: Study, participant: Participant) -> Participant:
+        """Somebody who is here, has given half of the answers, and is going to be shown both robots of others."""
+        settle(context.database, study, trials=1, methods=("pbarl", "somebody_else", "average"))
+        with context.database.writing() as session:
+            person = session.get_one(Participant, participant.id)
+            person.last_seen_at = now()
+            factories.make_model(session, study, person, ModelKind.REWARD, {}, LABELS // 2)
+        return person
+
+    def asked(self, context: WorkerContext, study: Study) -> list[Donors]:
+        due(context.database)
+        with context.database.reading() as session:
+            return [each.donors for each in donors.shared_filters(session, study)]
+
+    @pytest.mark.usefixtures("answering")
+    def test_while_nobody_has_finished_one_of_a_type_and_one_of_all(self, context: WorkerContext, study: Study) -> None:
+        one, everybody = self.asked(context, study)
+        assert len(one.types) == 1
+        assert everybody == Donors(types=("neutral", "cautious", "impatient"))
+        assert len(due(context.database, RunKind.SHARED)) == 2
+        with context.database.reading() as session:
+            assert donors.find(session, 1, "average") is None, "drawn is after the last answer"
+
+    def test_nothing_for_whoever_has_left(self, context: WorkerContext, study: Study, answering: Participant) -> None:
+        with context.database.writing() as session:
+            session.get_one(Participant, answering.id).last_seen_at = now() - timedelta(hours=1)
+        assert self.asked(context, study) == []
+
+    @pytest.mark.usefixtures("answering")
+    def test_once_somebody_has_finished_no_type_is_fitted_any_more(
+        self, context: WorkerContext, study: Study, request: pytest.FixtureRequest
+    ) -> None:
+        first, _ = due(context.database, RunKind.SHARED)
+        request.getfixturevalue("donor")
+        (left,) = self.asked(context, study)
+        assert len(left.types) == 3
+        with context.database.writing() as session:
+            run_id = records.begin_run(session, first, seed=1)
+        stored = set[str]()
+        shared_filters.fit(context.noting(stored), first, run_id, at_once)
+        assert stored == set()
+
+    @pytest.mark.usefixtures("answering")
+    def test_the_mean_of_people_goes_with_each_of_them(self, context: WorkerContext, study: Study) -> None:
+        with context.database.writing() as session:
+            people = [factories.make_participant(session, study)[0] for _ in range(3)]
+            for person in people:
+                factories.make_model(session, study, person, ModelKind.FILTER, {}, LABELS)
+        (mean,) = self.asked(context, study)
+        assert mean == Donors(people=tuple(person.number for person in people))
+        (fitting,) = due(context.database, RunKind.SHARED)
+        artefact = fitted(context, fitting)
+        with context.database.writing() as session:
+            gone = session.get_one(Participant, people[0].id)
+            withdrawal.withdraw(session, context.store, gone, gone.code)
+        assert not context.store.has(artefact)
+        (few,) = self.asked(context, study)
+        assert len(few.types) == 3, "an average of two would tell too much about each of them"
 
 
 @pytest.mark.usefixtures("all_said")
@@ -149,11 +232,13 @@ def test_while_nobody_has_finished_a_filter_is_fitted_to_types_of_users(
 ) -> None:
     small = FilterConfig(mode_attempts=1, gate_scenarios=6, residual_rounds=0, evaluation_scenarios=10)
     monkeypatch.setattr(filters, "filter_config", lambda _settings: small)
-    job = method_job(context, study, method)
-    with context.database.writing() as session:
-        run_id = records.begin_run(session, job, seed=1)
-    made = lent_filters.make(context, job, run_id, at_once, EvaluatedMethod(method))
-    assert context.store.has(str(made["artefact"]))
+    settle(context.database, study, trials=1, methods=("pbarl", method))
+    learn(context)
+    (fitting,) = due(context.database, RunKind.SHARED)
+    done(context, fitting, shared_filters.fit)
+    (job,) = due(context.database, RunKind.METHOD)
+    taken = lent_filters.take(context, job, 0, at_once, EvaluatedMethod(method))
+    assert context.store.has(str(taken["artefact"]))
     with context.database.reading() as session:
         drawn = donors.find(session, 1, method)
     assert drawn is not None

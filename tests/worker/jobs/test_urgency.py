@@ -10,7 +10,10 @@ import pytest
 from sqlalchemy.orm import Session
 
 from app.db import Database, now
+from app.domain.evaluation import Donors, SharedFilter
+from app.domain.protocol import EvaluatedMethod
 from app.domain.studies import Awaited, Participant, Study
+from app.services.evaluation import donors
 from tests.worker.invented import job_of
 from worker.compute.pools import Compute, Lane
 from worker.jobs.runtime.lanes import Lanes
@@ -105,6 +108,21 @@ def test_clips_are_as_urgent_as_whoever_needs_pairs_of_them(
     with database.writing() as session:
         add_person(session, study, awaited, **ago_s)
     assert level(database, clips(study)) is expected
+
+
+def test_a_filter_for_several_is_as_urgent_as_whoever_is_to_be_lent_it(database: Database, study: Study) -> None:
+    with database.writing() as session:
+        person = add_person(session, study, Awaited.ROBOTS, seen=2, waiting=30)
+        drawn = donors.draw(session, study, person, EvaluatedMethod.AVERAGE, ["neutral", "cautious"])
+        add_person(session, study, seen=2)
+        theirs, another = (
+            SharedFilter(study_id=study.id, stored_donors=Donors(types=types).model_dump(mode="json"))
+            for types in (drawn.donors.types, ("impatient",))
+        )
+        session.add_all([theirs, another])
+        session.flush()
+        jobs = [Job(donors.key_of(each), study.id) for each in (theirs, another)]
+    assert [level(database, job) for job in jobs] == [Level.WAITING, Level.POOL]
 
 
 def test_a_report_is_asked_for_once_the_study_is_unblinded(database: Database, study: Study) -> None:

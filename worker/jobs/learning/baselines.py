@@ -50,7 +50,7 @@ def train_method(context: WorkerContext, job: Job, run_id: int, step: Step) -> N
     method = EvaluatedMethod(job.about.subject)
     reward = step("reward", _choose_reward, context, run_id, job)
     if method in FROM_OTHERS:
-        trained = lent_filters.make(context, job, run_id, step, method)
+        trained = lent_filters.take(context, job, run_id, step, method)
     elif method is EvaluatedMethod.SELF_SET:
         trained = step("setting", _as_set, context, run_id, job)
     else:

@@ -32,6 +32,7 @@ QUEUES = {
     RunKind.REWARD: 1,
     RunKind.FILTER: 1,
     RunKind.METHOD: 1,
+    RunKind.SHARED: 1,
     RunKind.FILMS: 1,
     RunKind.REPORT: 1,
     RunKind.EXPORT: 1,

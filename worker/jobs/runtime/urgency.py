@@ -16,8 +16,10 @@ from sqlalchemy.orm import Session
 
 from app.db import now
 from app.domain.models import RunKind
+from app.domain.protocol import FROM_OTHERS
 from app.domain.run_keys import BEFORE_AFTER
 from app.domain.studies import Awaited, Participant, Study
+from app.services.evaluation import donors
 from worker.jobs.runtime.records import Job
 
 PRESENT_WITHIN = timedelta(seconds=90)
@@ -39,7 +41,7 @@ class Level(IntEnum):
     DUE = 3
     """A participant needs it who is not here."""
     POOL = 4
-    """Clips of a study with participants."""
+    """Clips of a study with participants, and filters that somebody may be shown later."""
     UNOPENED = 5
     """Clips of a study that has none."""
     UNREAD = 6
@@ -54,8 +56,9 @@ class Urgency(NamedTuple):
     step: int
 
 
-_STEPS = {RunKind.CLIPS: 0, RunKind.REWARD: 0, RunKind.FILTER: 1, RunKind.METHOD: 2, RunKind.FILMS: 3}
-_LAST_STEP = 4
+_ORDER = (RunKind.REWARD, RunKind.FILTER, RunKind.SHARED, RunKind.METHOD, RunKind.FILMS)
+_STEPS = {RunKind.CLIPS: 0} | {kind: step for step, kind in enumerate(_ORDER)}
+_LAST_STEP = len(_ORDER)
 
 
 @dataclass(frozen=True)
@@ -73,6 +76,8 @@ class WhoWaits:
 
     people: Mapping[int, _Person] = field(default_factory=dict)
     just_unblinded: frozenset[int] = frozenset()
+    shared_awaited: Mapping[str, datetime] = field(default_factory=dict)
+    """Keys of filters for several, with since when somebody looks at a waiting page who is to be lent them."""
 
     @classmethod
     def look(cls, session: Session) -> "WhoWaits":
@@ -97,7 +102,7 @@ class WhoWaits:
             for row in rows
         }
         unblinded = session.scalars(select(Study.id).where(Study.unblinded_at > moment - ASKED_WITHIN))
-        return cls(people, frozenset(unblinded))
+        return cls(people, frozenset(unblinded), _shared_awaited(session, people))
 
     def urgency(self, job: Job) -> Urgency:
         """How soon the job is to be done."""
@@ -107,6 +112,9 @@ class WhoWaits:
             return Urgency(Level.ASKED, _BEGINNING, 0)
         if job.kind == RunKind.REPORT:
             return Urgency(Level.UNREAD, _BEGINNING, 0)
+        if job.kind == RunKind.SHARED:
+            since = self.shared_awaited.get(job.key)
+            return Urgency(Level.WAITING if since else Level.POOL, since or _BEGINNING, _STEPS[RunKind.SHARED])
         person = None if job.participant_id is None else self.people.get(job.participant_id)
         return self._of_study(job.study_id) if person is None else _of_person(person, job)
 
@@ -120,6 +128,19 @@ class WhoWaits:
         if waiting:
             return Urgency(Level.WAITING, min(waiting), 0)
         return Urgency(Level.ANSWERING if comparing else Level.POOL, _BEGINNING, 0)
+
+
+def _shared_awaited(session: Session, people: Mapping[int, _Person]) -> dict[str, datetime]:
+    found: dict[str, datetime] = {}
+    for number, person in people.items():
+        if not person.present or person.awaited != Awaited.ROBOTS or person.waiting_since is None:
+            continue
+        for method in FROM_OTHERS:
+            shared = donors.awaited_by(session, session.get_one(Participant, number), method)
+            if shared is not None:
+                key = str(donors.key_of(shared))
+                found[key] = min(found.get(key, person.waiting_since), person.waiting_since)
+    return found
 
 
 def _of_person(person: _Person, job: Job) -> Urgency:

@@ -1,0 +1,139 @@
+"""Filters that are lent: whose turn it is to draw, and which filters for several donors are to be fitted for that.
+
+Those do not depend on what their borrower answers, so they are fitted while people answer, for what would be drawn for
+them now. What is drawn in the end is another matter: by then somebody else may have finished, whose filter comes first.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from datetime import timedelta
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from app.db import now
+from app.domain.evaluation import Donors, SharedFilter
+from app.domain.models import Model, ModelKind, RunKind
+from app.domain.protocol import FROM_OTHERS, EvaluatedMethod
+from app.domain.studies import Participant, Study
+from app.errors import AppError
+from app.services.evaluation import donors, evaluation_plan
+from worker.compute import shared_reward
+from worker.jobs.runtime.records import Job, models_of, newest_model
+
+SEEN_WITHIN = timedelta(minutes=30)
+"""Whoever was here so recently may give the last answer soon."""
+
+
+@dataclass(frozen=True)
+class _Needs:
+    """What one study needs beyond what it has."""
+
+    draws: Sequence[tuple[Participant, EvaluatedMethod]]
+    filters: Sequence[Donors]
+    """that nobody has asked for"""
+    superfluous: Sequence[SharedFilter]
+    """asked for, not fitted, and nobody's any more"""
+
+    def __bool__(self) -> bool:
+        return bool(self.draws or self.filters or self.superfluous)
+
+
+def unsettled(session: Session) -> list[int]:
+    """Ids of studies in which settle() has something to do."""
+    at_work = select(Study).where(Study.deleted_at.is_(None), Study.put_away_at.is_(None)).order_by(Study.id)
+    return [study.id for study in session.scalars(at_work).all() if _has_needs(session, study)]
+
+
+def settle(session: Session, study_id: int) -> None:
+    """Draw for whom it is time, and ask for the filters that are needed, now or soon. Twice is once."""
+    study = session.scalars(select(Study).where(Study.id == study_id).with_for_update()).one()
+    types = shared_reward.types_of(study.task)
+    for participant, method in _needs(session, study).draws:
+        donors.draw(session, study, participant, method, types)
+    needs = _needs(session, study)
+    for whose in needs.filters:
+        session.add(SharedFilter(study_id=study.id, stored_donors=whose.model_dump(mode="json")))
+    for each in needs.superfluous:
+        session.delete(each)
+
+
+def due(session: Session, study: Study) -> list[Job]:
+    """The filters to be fitted, the first that was asked for first."""
+    asked = [each for each in donors.shared_filters(session, study) if each.artefact_sha256 is None]
+    return [Job(donors.key_of(each), study.id) for each in asked]
+
+
+def find(session: Session, job: Job) -> SharedFilter | None:
+    """What the job fits; None when nobody needs it any more."""
+    shared = session.get(SharedFilter, job.number)
+    return shared if shared is not None and donors.key_of(shared) == job.about else None
+
+
+def is_missing(session: Session, job: Job) -> bool:
+    """Whether the method that the job makes is still to be drawn, or to be fitted to the donors that were."""
+    if job.kind != RunKind.METHOD or job.about.subject not in FROM_OTHERS:
+        return False
+    drawn = donors.find(session, job.participant, job.about.subject)
+    if drawn is None:
+        return True
+    if not drawn.donors.share_a_filter:
+        return False
+    shared = donors.shared_filter(session, session.get_one(Study, job.study_id), drawn.donors)
+    return shared is None or shared.artefact_sha256 is None
+
+
+def _has_needs(session: Session, study: Study) -> bool:
+    try:
+        return bool(_needs(session, study))
+    except AppError:  # a laboratory's task that is not here: whoever tries to learn in this study is told
+        return False
+
+
+def _needs(session: Session, study: Study) -> _Needs:
+    draws: list[tuple[Participant, EvaluatedMethod]] = []
+    wanted: list[Donors] = []
+    for participant, method, all_said in _borrowers(session, study):
+        drawn = donors.find(session, participant.id, method)
+        if drawn is None and all_said:
+            draws.append((participant, method))
+        types = shared_reward.types_of(study.task)
+        whose = donors.foresee(session, study, participant, method, types)[1] if drawn is None else drawn.donors
+        if whose.share_a_filter:
+            wanted.append(whose.without_candidates)
+    there = donors.shared_filters(session, study)
+    asked = [each.donors for each in there]
+    return _Needs(
+        draws,
+        [whose for whose in dict.fromkeys(wanted) if whose not in asked],
+        [each for each in there if each.artefact_sha256 is None and each.donors not in wanted],
+    )
+
+
+def _borrowers(session: Session, study: Study) -> Iterator[tuple[Participant, EvaluatedMethod, bool]]:
+    """Who is to be shown a robot of others that is not made yet, which one, and whether they have given all answers."""
+    if study.settings.evaluation is None or study.material is not None:
+        return
+    begun = evaluation_plan.begun(session, study)
+    here = select(Participant).where(Participant.study_id == study.id, Participant.withdrawn_at.is_(None))
+    for participant in session.scalars(here.where(Participant.ended_as.is_(None)).order_by(Participant.id)).all():
+        settings = evaluation_plan.settings_for(study, participant.arm)
+        lent = [method for method in settings.methods if method in FROM_OTHERS] if settings else []
+        reward = newest_model(session, participant.id, ModelKind.REWARD) if lent else None
+        if reward is None or participant.id in begun:
+            continue
+        all_said = reward.label_count >= study.settings.labels_per_participant
+        made = _made(session, participant.id, reward)
+        for method in lent:
+            if method not in made and (all_said or _is_here(participant)):
+                yield participant, method, all_said
+
+
+def _made(session: Session, participant_id: int, reward: Model) -> set[str]:
+    """The methods that were made since this reward model."""
+    models = models_of(session, participant_id, ModelKind.METHOD)
+    return {str(each.metrics.get("method")) for each in models if each.label_hash == reward.label_hash}
+
+
+def _is_here(participant: Participant) -> bool:
+    return participant.last_seen_at is not None and now() - participant.last_seen_at < SEEN_WITHIN
