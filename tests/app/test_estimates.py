@@ -120,7 +120,7 @@ def test_a_filter_of_others_that_is_not_fitted_yet_counts_and_its_trouble_is_tol
         run = factories.make_run(session, study, kind=RunKind.SHARED, status=RunStatus.RUNNING, progress=0.5)
         run.workflow_id = str(donors.key_of(shared))
         run.started_at, run.finished_at = now() - timedelta(seconds=240), None
-    assert "About 4 minutes to go" in look()
+    assert "About 5 minutes to go" in look()
     with database.writing() as session:
         session.get_one(Run, run.id).status = RunStatus.FAILED
     assert "Something went wrong" in look()
