@@ -31,7 +31,7 @@ from worker.rehearsal.participant_steps import ScriptedPerson
 from worker.rehearsal.server import POLL_S, OwnStudio, wait_until
 
 PACE_S = 2.0
-"""Between two answers: slow enough for a filter to be in the making when the last one comes."""
+"""Between two answers: slow enough for a filter to be in the making when the last one comes; people are slower."""
 PATIENCE_S = 3600.0
 TOLD = re.compile(r"bout (a|\d+) minutes? to go")
 
@@ -42,6 +42,7 @@ def main() -> None:
     parser.add_argument("--people", type=int, default=2, help="one after the other")
     parser.add_argument("--labels", type=int, default=12)
     parser.add_argument("--methods", type=EvaluatedMethod, nargs="+", default=list(EvaluationSettings().methods))
+    parser.add_argument("--pace", type=float, default=PACE_S, help="seconds between two answers")
     parser.add_argument("--whole", action="store_true", help="filters, promise and trials as studies usually have them")
     options = parser.parse_args()
     evaluation = EvaluationSettings(fine_tuning_steps=options.steps, methods=tuple(options.methods))
@@ -63,7 +64,7 @@ def main() -> None:
             person = ScriptedPerson(database, store, study, TASTES["cautious"], Manner(), participant.number)
             with FormBrowser(studio.settings.base_url, f"/p/{token}") as visitor:
                 while visitor.page in UP_TO_PAIRS:
-                    time.sleep(PACE_S if visitor.query_id() else POLL_S)
+                    time.sleep(options.pace if visitor.query_id() else POLL_S)
                     visitor.act(person)
                 _wait(database, visitor, participant.id)
             _report_runs(database, participant.id)

@@ -82,7 +82,14 @@ def test_of_one_person_what_the_first_robot_needs_comes_before_the_debrief(datab
         waits = WhoWaits.look(session)
     mixed = [*reversed(wanted)]
     assert sorted(mixed, key=waits.urgency) == wanted
-    assert [waits.urgency(job).level for job in wanted] == [Level.WAITING, Level.WAITING, Level.ANSWERING]
+    assert [waits.urgency(job).level for job in wanted] == [Level.WAITING, Level.WAITING, Level.DUE]
+
+
+def test_whoever_rates_the_first_robot_waits_for_the_next(database: Database, study: Study) -> None:
+    with database.writing() as session:
+        person = add_person(session, study, seen=1)
+    assert level(database, films(person)) is Level.WAITING
+    assert level(database, films(person, "before-after")) is Level.ANSWERING
 
 
 def test_whoever_looks_at_the_debrief_waits_for_its_films(database: Database, study: Study) -> None:

@@ -210,7 +210,7 @@ def _driven(
     for first in range(0, len(scenarios), CHUNK):
         beat = beat_at(first / len(scenarios))
         driven += context.compute.run(
-            Lane.PATIENT, beat, baseline_fitting.drive, task, model, scenarios[first : first + CHUNK]
+            Lane.LEARNING, beat, baseline_fitting.drive, task, model, scenarios[first : first + CHUNK]
         )
     return driven
 

@@ -39,7 +39,7 @@ class Level(IntEnum):
     ASKED = 2
     """An experimenter has asked for it."""
     DUE = 3
-    """A participant needs it who is not here."""
+    """A participant needs it who is not here, or waits for something else first."""
     POOL = 4
     """Clips of a study with participants, and filters that somebody may be shown later."""
     UNOPENED = 5
@@ -148,10 +148,13 @@ def _of_person(person: _Person, job: Job) -> Urgency:
     step = _LAST_STEP if before_after else _STEPS.get(RunKind(job.kind), _LAST_STEP)
     if not person.present:
         return Urgency(Level.DUE, person.seen_at or _BEGINNING, step)
-    needed_for_it = not before_after or person.awaited == Awaited.DEBRIEF
-    if person.awaited and person.waiting_since and needed_for_it:
-        return Urgency(Level.WAITING, person.waiting_since, step)
-    return Urgency(Level.ANSWERING, person.waiting_since or person.seen_at or _BEGINNING, step)
+    if person.awaited and person.waiting_since:
+        comes_later = before_after and person.awaited != Awaited.DEBRIEF
+        return Urgency(Level.DUE if comes_later else Level.WAITING, person.waiting_since, step)
+    since = person.waiting_since or person.seen_at or _BEGINNING
+    if job.kind == RunKind.FILMS and not before_after:  # they rate the first robots already, and the next one is due
+        return Urgency(Level.WAITING, since, step)
+    return Urgency(Level.ANSWERING, since, step)
 
 
 class Gate:
