@@ -14,7 +14,7 @@ from app.domain.hints import HintEvent
 from app.domain.models import ModelKind
 from app.domain.participation import Allocation, ConsentRecord, FormAnswer, ParticipantEvent, StageRecord
 from app.domain.preferences import Purpose, Query, Response
-from app.domain.protocol import EvaluatedMethod, EvaluationSettings
+from app.domain.protocol import PAPER_METHODS, EvaluatedMethod, EvaluationSettings
 from app.domain.self_setting import SelfSetting
 from app.domain.studies import Participant, Study
 from app.questionnaires import library
@@ -40,7 +40,7 @@ def _make(session: Session, store: ArtefactStore, people: int, labels: int, unbl
         "Feeding, finished",
         labels_per_participant=10,
         instruments=("tia",),
-        evaluation=EvaluationSettings(head_to_heads=1, instruments=("tia",)),
+        evaluation=EvaluationSettings(methods=PAPER_METHODS, head_to_heads=1, instruments=("tia",)),
     )
     study.key_secret = sha256(study.slug.encode()).hexdigest()  # else each run had other letters, so other ratings
     study.unblinded_at = now() if unblinded else None

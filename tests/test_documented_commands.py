@@ -132,6 +132,7 @@ RUN: dict[str, str | Elsewhere | OnlyParsed] = {
     "on_postgresql": OnlyParsed("runs the suite itself, and needs a PostgreSQL server"),
     "on_s3": OnlyParsed("runs the suite itself"),
     "cluster": REAL_TIME,
+    "second_worker": REAL_TIME,
     "onlookers": "--people 1 --labels 40 --labellers 1 --dashboards 1 --seconds 1 --thought 0.1",
     "page_times": "--people 1 --labels 20 --times 2",
     "pages": OnlyParsed("photographs a real studio, which takes minutes, and writes to docs/pictures"),

@@ -92,6 +92,7 @@ LETTERS = "ABCDE"
 """Of robots in a blinded evaluation, in the order in which somebody meets them."""
 MADE_FOR_YOU = "made_for_you"
 """The question which robot was made for somebody."""
+PAPER_METHODS = (EvaluatedMethod.REFERENCE, EvaluatedMethod.PREFFT, EvaluatedMethod.PBARL)
 FROM_OTHERS = (EvaluatedMethod.SOMEBODY_ELSE, EvaluatedMethod.AVERAGE)
 """Methods that show somebody what others have taught; who takes part must be told that."""
 
@@ -109,7 +110,7 @@ class EvaluationSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     methods: tuple[EvaluatedMethod, ...] = setting(
-        (EvaluatedMethod.REFERENCE, EvaluatedMethod.PREFFT, EvaluatedMethod.PBARL),
+        (EvaluatedMethod.REFERENCE, EvaluatedMethod.PBARL, EvaluatedMethod.SOMEBODY_ELSE),
         Section.EVALUATION,
         "Methods",
         complaint="Choose two methods at least, and five at most.",

@@ -14,7 +14,7 @@ from app.db import Database, now
 from app.domain.evaluation import Assignment, Controller, Rating, Trial
 from app.domain.models import ModelKind
 from app.domain.people import AuditEvent
-from app.domain.protocol import EvaluationMode, EvaluationSettings
+from app.domain.protocol import PAPER_METHODS, EvaluationMode, EvaluationSettings
 from app.domain.studies import Participant, Study
 from app.services.evaluation import unblinding
 from app.services.exports import export_tables
@@ -71,7 +71,7 @@ def laboratory(
     database: Database, store: ArtefactStore, experimenter: TestClient, request: pytest.FixtureRequest
 ) -> Laboratory:
     with database.writing() as session:
-        settings = EvaluationSettings(mode=getattr(request, "param", EvaluationMode.PHYSICAL))
+        settings = EvaluationSettings(methods=PAPER_METHODS, mode=getattr(request, "param", EvaluationMode.PHYSICAL))
         study = factories.make_study(session, evaluation=settings)
         participant, _ = factories.make_participant(session, study)
         factories.answer_everything(session, store, study, participant)

@@ -14,6 +14,7 @@ import tempfile
 import threading
 import time
 from collections import Counter
+from collections.abc import Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -94,6 +95,10 @@ class Cluster:
 
     folder: Path
     database_url: str
+    web_servers: int = WEB
+    worker_count: int = WORKERS
+    pinned: bool = False
+    """each worker has one core, and no two the same"""
     web: list[subprocess.Popen[bytes]] = field(default_factory=list)
     workers: dict[str, subprocess.Popen[bytes]] = field(default_factory=dict)
     served: Counter[int] = field(default_factory=Counter)
@@ -109,14 +114,14 @@ class Cluster:
     def start(self) -> str:
         """Everything, one after the other; returns the proxy's address."""
         subprocess.run([sys.executable, "-m", "app", "migrate"], check=True, env=self._environment("migrate"))
-        ports = [free_port() for _ in range(WEB)]
+        ports = [free_port() for _ in range(self.web_servers)]
         for number, port in enumerate(ports):
             self.web.append(self._program(f"web-{number}", ["app", "web"], PORT=str(port), TRUSTED_PROXIES="127.0.0.1"))
         for port in ports:
             wait_until(PATIENCE_S, "no web server", partial(_answers, port))
-        for number in range(WORKERS):
-            directory = f"worker-{number}"
-            self.workers[directory] = self._program(directory, ["worker", "run"], COMPUTE_PROCESSES="1")
+        for number in range(self.worker_count):
+            directory, core = f"worker-{number}", ["taskset", "-c", str(number)] if self.pinned else []
+            self.workers[directory] = self._program(directory, ["worker", "run"], core, COMPUTE_PROCESSES="1")
             wait_until(PATIENCE_S, "no worker", partial(self._name_of, directory))
         proxy = ThreadingHTTPServer(("127.0.0.1", 0), _proxy_to(ports, self.served))
         threading.Thread(target=proxy.serve_forever, daemon=True).start()
@@ -149,7 +154,7 @@ class Cluster:
 
     def report(self, database: Database) -> None:
         """What each had to do, and what is left where."""
-        _say(f"requests by web server  {', '.join(str(self.served[number]) for number in range(WEB))}")
+        _say(f"requests by web server  {', '.join(str(self.served[number]) for number in range(self.web_servers))}")
         for line in self.told:
             _say(line)
         with database.reading() as session:
@@ -171,8 +176,10 @@ class Cluster:
         place = {"DATABASE_URL": self.database_url, "STORAGE_URL": f"s3://{on_s3.BUCKET}/cluster"}
         return {**ours, **place, **key, "DATA_DIR": str(self.folder / name), **more}
 
-    def _program(self, name: str, module: list[str], **more: str) -> subprocess.Popen[bytes]:
-        command = ["setpriv", "--pdeathsig", "KILL", sys.executable, "-m", *module]
+    def _program(
+        self, name: str, module: list[str], before: Sequence[str] = (), **more: str
+    ) -> subprocess.Popen[bytes]:
+        command = ["setpriv", "--pdeathsig", "KILL", *before, sys.executable, "-m", *module]
         with (self.folder / f"{name}.log").open("wb") as log:
             return subprocess.Popen(command, env=self._environment(name, **more), stdout=log, stderr=log)
 

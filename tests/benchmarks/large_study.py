@@ -15,7 +15,7 @@ from app.domain.evaluation import Rating
 from app.domain.models import ModelKind
 from app.domain.participation import ConsentRecord, FormAnswer, ParticipantEvent, StageRecord
 from app.domain.preferences import LabelEvent, Purpose, Query
-from app.domain.protocol import EvaluationSettings, FormItem, Stage
+from app.domain.protocol import PAPER_METHODS, EvaluationSettings, FormItem, Stage
 from app.domain.studies import Deviation, Participant, Study
 from app.services import audit
 from app.services.evaluation import evaluation_plan
@@ -42,7 +42,7 @@ def make_study(session: Session, labels: int, **settings: Any) -> Study:
         "retrain_every_labels": RETRAIN_EVERY_LABELS,
         "break_every": 50,
         "questionnaire": questions,
-        "evaluation": EvaluationSettings(),
+        "evaluation": EvaluationSettings(methods=PAPER_METHODS),
     }
     return factories.make_study(session, **{**usual, **settings})
 

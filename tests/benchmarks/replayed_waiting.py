@@ -27,7 +27,7 @@ from app.__main__ import migrate
 from app.db import Database, now
 from app.domain.clips import Rollout
 from app.domain.models import ModelKind, Run, RunKind, RunStatus
-from app.domain.protocol import EvaluationSettings
+from app.domain.protocol import PAPER_METHODS, EvaluationSettings
 from app.domain.studies import Participant, Study
 from app.domain.study_settings import PAPER_PROTOCOL, StudySettings
 from app.services.studies import studies
@@ -145,7 +145,7 @@ class Lab:
             "practice_pairs": 0,
             "filter_milestones": (),
             "pool_scenarios": 1,
-            "evaluation": EvaluationSettings(fine_tuning_steps=2_000, trials=TRIALS),
+            "evaluation": EvaluationSettings(methods=PAPER_METHODS, fine_tuning_steps=2_000, trials=TRIALS),
         }
         with self.database.writing() as session:
             studies.create_study(session, "Nobody's", StudySettings(pool_scenarios=500), seed=1)

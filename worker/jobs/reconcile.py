@@ -15,7 +15,7 @@ from sqlalchemy.orm import Session
 from app.db import now
 from app.domain import run_keys
 from app.domain.clips import Clip, Rollout
-from app.domain.models import Run, RunKind, RunStatus
+from app.domain.models import Model, ModelKind, Run, RunKind, RunStatus
 from app.domain.preferences import LabelEvent, Query, count_labels
 from app.domain.run_keys import SCENARIO, WHOLE, RunKey
 from app.domain.studies import Participant, Study
@@ -62,11 +62,13 @@ def due(session: Session, lost: Mapping[str, int] | None = None) -> Iterator[tup
     learning = learning.where(Run.participant_id.is_not(None))
     at_work = {(person, kind) for person, kind in session.execute(learning.where(~_is_silent()))}
     succeeded = {name for name, run in runs.items() if run.status == RunStatus.SUCCEEDED}
+    left_a_method = select(Run.workflow_id).join(Model, Model.run_id == Run.id).where(Model.kind == ModelKind.METHOD)
+    trained = set(session.scalars(left_a_method))
     for study in session.scalars(select(Study).where(Study.deleted_at.is_(None)).order_by(Study.id)).all():
         if study.put_away_at is not None:
             jobs: Iterable[Job] = export_files.due(session, study)  # somebody has asked for those
         else:
-            jobs = (*repairs.due(session, study, lost or {}), *_all_due(session, study, succeeded))
+            jobs = (*repairs.due(session, study, lost or {}), *_all_due(session, study, succeeded, trained))
         for job in jobs:
             attempt = _attempt_due(runs.get(job.key), now())
             free = attempt is not None and (job.participant_id, job.kind) not in at_work
@@ -74,10 +76,10 @@ def due(session: Session, lost: Mapping[str, int] | None = None) -> Iterator[tup
                 yield job, attempt
 
 
-def _all_due(session: Session, study: Study, succeeded: Collection[str]) -> Iterator[Job]:
+def _all_due(session: Session, study: Study, succeeded: Collection[str], trained: Collection[str]) -> Iterator[Job]:
     yield from preview_films.due_now(session, study)
     yield from _missing_clips(session, study)
-    yield from _stale_models(session, study, succeeded)
+    yield from _stale_models(session, study, succeeded, trained)
     yield from due_lending.due(session, study)
     yield from report_files.due(session, study)
     yield from export_files.due(session, study)
@@ -187,7 +189,7 @@ def _clips_by_scenario(session: Session, study: Study, step_count: int | None) -
     return dict(session.execute(counted).all())
 
 
-def _stale_models(session: Session, study: Study, succeeded: Collection[str]) -> list[Job]:
+def _stale_models(session: Session, study: Study, succeeded: Collection[str], trained: Collection[str]) -> list[Job]:
     jobs, settings = [], study.settings
     answers, exclusions = last_answers(session, present_ids(study)), last_exclusions(session, present_ids(study))
     begun, rating = evaluation_plan.begun(session, study), _rating(session, study)
@@ -203,7 +205,8 @@ def _stale_models(session: Session, study: Study, succeeded: Collection[str]) ->
                 jobs.append(Job(replace(reward, kind=RunKind.FILTER, labels=milestone), study.id))
         if count >= settings.labels_per_participant and study.material is None and participant_id in rating:
             arm, shown = rating[participant_id], participant_id in begun
-            jobs += due_evaluation.due(study, reward, succeeded, shown, arm, has_set=participant_id in have_set)
+            has_set = participant_id in have_set
+            jobs += due_evaluation.due(study, reward, succeeded, trained, shown, arm, has_set=has_set)
     return jobs
 
 

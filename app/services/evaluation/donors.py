@@ -14,7 +14,7 @@ from sqlalchemy.orm import Session
 from app.domain.evaluation import Controller, DonorDraw, DonorRule, Donors, Film, SharedFilter, Trial
 from app.domain.models import Model, ModelKind, Run, RunKind, RunStatus
 from app.domain.protocol import EvaluatedMethod
-from app.domain.run_keys import CONTROLLERS, SHARED_FILTER, TRIALS, RunKey, read
+from app.domain.run_keys import CONTROLLERS, OTHERS, SHARED_FILTER, TRIALS, RunKey, read
 from app.domain.studies import Participant, Study
 from app.services.evaluation import evaluation_plan, unblinding
 
@@ -223,7 +223,7 @@ def _make_again(session: Session, borrower_id: int, method: str) -> None:
         about = read(run.workflow_id)
         of_loan = about is not None and (
             (about.kind is RunKind.METHOD and about.subject == method)
-            or (about.kind is RunKind.FILMS and about.subject in (TRIALS, CONTROLLERS))
+            or (about.kind is RunKind.FILMS and about.subject in (TRIALS, OTHERS, CONTROLLERS))
         )
         if of_loan and run.status == RunStatus.SUCCEEDED:
             run.status = RunStatus.RETRY

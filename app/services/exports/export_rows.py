@@ -15,7 +15,7 @@ from app.domain.hints import HintEvent
 from app.domain.models import Bundle, Model, ModelKind
 from app.domain.participation import Allocation, ConsentRecord, FormAnswer, ParticipantEvent, StageRecord
 from app.domain.preferences import LEARNED_FROM, Exclusion, LabelEvent, Query
-from app.domain.protocol import LETTERS
+from app.domain.protocol import LETTERS, EvaluatedMethod
 from app.domain.self_setting import SelfSetting
 from app.domain.studies import Deviation, Participant, Study, code_of
 from app.questionnaires import library
@@ -405,20 +405,22 @@ def models(session: Session, study: Study, window: Window = EVERYTHING) -> Keyed
                     each.seed,
                     None if blinded and each.kind == ModelKind.METHOD else each.artefact_sha256,
                     each.created_at,
-                    each.metrics,
+                    _while_training(each),
                 ),
             )
 
 
 def evaluations(session: Session, study: Study, window: Window = EVERYTHING) -> KeyedRows:
+    """Of filters and of the methods that they are compared with, by name: letters say nothing of these numbers."""
     for person, wanted in _present(session, study, window):
         rows = session.execute(
             select(Model, Bundle)
             .outerjoin(Bundle, Bundle.model_id == Model.id)
-            .where(Model.participant_id == person.id, Model.kind == ModelKind.FILTER, wanted.known(Model))
+            .where(Model.participant_id == person.id, Model.kind.in_(_MEASURED), wanted.known(Model))
             .order_by(Model.label_count, Model.id)
         ).all()
-        for place, (model, bundle) in enumerate(rows, 1):
+        newest = {_method_of(model): model.id for model, _ in rows}
+        for model, bundle in rows:
             measured = model_metrics.filter_version(model, bundle)
             named = [("success", measured.success), ("preference", measured.preference)]
             named += [(cost.symbol, cost) for cost in measured.costs]
@@ -429,8 +431,9 @@ def evaluations(session: Session, study: Study, window: Window = EVERYTHING) -> 
                         (person.number, *key),
                         (
                             person.code,
+                            _method_of(model),
                             measured.label_count,
-                            place == len(rows),
+                            newest[_method_of(model)] == model.id,
                             measured.bundle_version,
                             measured.scenarios,
                             name,
@@ -441,6 +444,20 @@ def evaluations(session: Session, study: Study, window: Window = EVERYTHING) -> 
                             change.high,
                         ),
                     )
+
+
+_MEASURED = (ModelKind.FILTER, ModelKind.METHOD)
+
+
+def _method_of(model: Model) -> str:
+    return EvaluatedMethod.PBARL.value if model.kind == ModelKind.FILTER else str(model.metrics.get("method"))
+
+
+def _while_training(model: Model) -> dict[str, Any]:
+    """Methods are measured after they have been kept: that is in evaluations(), for here no row changes."""
+    if model.kind != ModelKind.METHOD:
+        return model.metrics
+    return {name: value for name, value in model.metrics.items() if name not in ("evaluation", "seconds")}
 
 
 def clips(session: Session, study: Study, window: Window = EVERYTHING) -> KeyedRows:

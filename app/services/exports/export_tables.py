@@ -31,6 +31,7 @@ def _words(values: Iterable[Any]) -> str:
     return ", ".join(value.value for value in values)
 
 
+MEASURED_METHODS = [each for each in EvaluatedMethod if each is not EvaluatedMethod.REFERENCE]
 T, I, N = ColumnKind.TEXT, ColumnKind.INTEGER, ColumnKind.NUMBER  # noqa: E741
 B, W, J = ColumnKind.BOOLEAN, ColumnKind.TIME, ColumnKind.JSON
 
@@ -438,11 +439,18 @@ TABLES: Sequence[Table] = (
     ),
     Table(
         "evaluations",
-        "What each filter changes on unseen simulated scenarios, against the reference policy; one row per measure.",
+        "What each filter, and each method it is compared with, changes on unseen simulated scenarios, against the "
+        "reference policy; one row per measure.",
         (
             PARTICIPANT,
-            Column("label_count", I, "Answers the filter has learned from."),
-            Column("newest", B, "Whether it is the participant's newest filter."),
+            Column(
+                "method",
+                T,
+                "pbarl: the participant's own filter.",
+                allowed=_words(MEASURED_METHODS),
+            ),
+            Column("label_count", I, "Answers it has learned from, or the participant had given."),
+            Column("newest", B, "Whether it is the participant's newest of the method."),
             Column("bundle_version", I, "Version of the published bundle, if there is one."),
             Column("scenarios", I, "Unseen scenarios it was measured on."),
             Column(

@@ -9,18 +9,19 @@ from typing import Any
 
 import numpy as np
 import pytest
-from sqlalchemy import select
+from sqlalchemy import func, select
 
 from app.db import Database
 from app.domain.clips import Clip
 from app.domain.evaluation import Controller, Film, Trial
 from app.domain.models import Model, ModelKind, Run, RunKind, RunStatus
 from app.domain.preferences import Query, Response
-from app.domain.protocol import FROM_OTHERS, EvaluatedMethod, EvaluationMode, EvaluationSettings
+from app.domain.protocol import FROM_OTHERS, PAPER_METHODS, EvaluatedMethod, EvaluationMode, EvaluationSettings
 from app.domain.studies import Participant, Study
 from app.services.evaluation import evaluation_plan
 from app.storage import ArtefactStore
 from tests.worker.at_hand import AtHand, at_once
+from worker.compute import baseline_fitting
 from worker.domain.trajectory import SIGNALS
 from worker.jobs import reconcile
 from worker.jobs.clips.evaluation_films import make_films
@@ -48,7 +49,7 @@ def settle(database: Database, study: Study, **evaluation: Any) -> None:
             "filter_milestones": (),
             "evaluation_scenarios": 10,
             "harm_share": 0.5,
-            "evaluation": EvaluationSettings(**evaluation),
+            "evaluation": EvaluationSettings(**{"methods": PAPER_METHODS, **evaluation}),
         }
         settings = study.settings.model_copy(update=changed)
         session.get_one(Study, study.id).stored_settings = settings.model_dump(mode="json")
@@ -83,12 +84,23 @@ def done(context: WorkerContext, job: Job, work: Callable[..., None] | None = No
     return run_id
 
 
-def learn(context: WorkerContext) -> None:
-    """The reward model and the filter of the last label, without the minutes they take."""
+def keep(context: WorkerContext, job: Job, controller: bytes = b"a controller") -> int:
+    """The method that the job makes, not measured yet."""
+    with context.database.writing() as session:
+        run_id = records.begin_run(session, job, seed=1)
+        records.set_labels(session, run_id, LABELS, "hash")
+        metrics = {"method": job.about.subject, "notes": [], "seconds": {}}
+        records.save_model(session, run_id, ModelKind.METHOD, context.store.put(controller), metrics)
+    return run_id
+
+
+def learn(context: WorkerContext, *kinds: RunKind) -> None:
+    """The reward model and the filter of the last label, or what is named, without the minutes they take."""
     rng = np.random.default_rng(0)
     reward = StructuredReward(0.1 * rng.standard_normal((8, len(SIGNALS)))).to_bytes()
     filtering = FilterWeights(mode={"speed_far": -0.5}).to_bytes()
-    for kind, stored in ((RunKind.REWARD, reward), (RunKind.FILTER, filtering)):
+    stored_of = {RunKind.REWARD: reward, RunKind.FILTER: filtering}
+    for kind, stored in [(kind, stored_of[kind]) for kind in kinds or stored_of]:
         (job,) = due(context.database, kind)
         run_id = done(context, job)
         with context.database.writing() as session:
@@ -177,8 +189,38 @@ def test_nothing_is_filmed_before_the_filter_and_no_trial_before_every_method(
     done(context, filtering)
     assert names(due(database, RunKind.FILMS)) == ["films/participant-1/before-after"]
     (method,) = due(database, RunKind.METHOD)
-    done(context, method)
+    run_id = keep(context, method)
     assert names(due(database, RunKind.FILMS)) == ["films/participant-1/trials", "films/participant-1/before-after"]
+    with database.reading() as session:
+        assert session.get_one(Run, run_id).status == RunStatus.RUNNING, "it is measured while it is filmed"
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("all_said")
+def test_while_their_own_filter_is_fitted_the_other_robots_are_filmed_and_nothing_is_shown(
+    context: WorkerContext, database: Database, study: Study, participant: Participant
+) -> None:
+    settle(database, study, trials=1, methods=("reference", "prefft", "pbarl"))
+    (reward,) = due(database, RunKind.REWARD)
+    done(context, reward)
+    (method,) = due(database, RunKind.METHOD)
+    keep(context, method, baseline_fitting.controller_of_filter("feeding", FilterWeights(mode={}).to_bytes()))
+    (others,) = due(database, RunKind.FILMS)
+    assert names([others]) == ["films/participant-1/others"]
+    run_id = done(context, others, make_films)
+    with database.reading() as session:
+        films = session.scalars(select(Film)).all()
+        assert sorted(film.method for film in films) == ["prefft", "reference"]
+        assert all(trial.film_id is None for trial in evaluation_plan.trials_of(session, participant.id))
+    learn(context, RunKind.FILTER)
+    trials, _ = due(database, RunKind.FILMS)
+    assert names([trials]) == ["films/participant-1/trials"]
+    make_films(context, others, run_id, at_once)
+    done(context, trials, make_films)
+    with database.reading() as session:
+        assert {film.id for film in films} < set(session.scalars(select(Film.id)))
+        assert session.scalar(select(func.count(Film.id))) == len(films) + 1, "what is there is not filmed again"
+        assert all(trial.film_id is not None for trial in evaluation_plan.trials_of(session, participant.id))
 
 
 @pytest.mark.usefixtures("all_said")

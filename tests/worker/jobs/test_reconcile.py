@@ -11,7 +11,7 @@ from app.domain.clips import Clip
 from app.domain.evaluation import Trial
 from app.domain.models import Run, RunKind, RunStatus
 from app.domain.preferences import Exclusion, LabelEvent, Query, Response
-from app.domain.protocol import EvaluationSettings
+from app.domain.protocol import PAPER_METHODS, EvaluationSettings
 from app.domain.studies import Participant, Study
 from app.domain.study_settings import StudySettings
 from tests.worker.invented import job_of
@@ -217,7 +217,7 @@ def test_whoever_has_been_shown_robots_keeps_them_when_an_answer_is_excluded(
     database: Database, study: Study, labels: Callable[[int], list[Query]], found: Callable[[], dict[str, int]]
 ) -> None:
     with database.writing() as session:
-        settings = study.settings.model_copy(update={"evaluation": EvaluationSettings()})
+        settings = study.settings.model_copy(update={"evaluation": EvaluationSettings(methods=PAPER_METHODS)})
         session.get_one(Study, study.id).stored_settings = settings.model_dump(mode="json")
     given = labels(20)
     exclude(database, given[3])

@@ -1,19 +1,20 @@
 """What an evaluation shows: films of the robots in scenarios that nothing else uses, or controllers for a real one.
 
-Three kinds of runs: ``before-after`` (the participant's robot beside the reference, for debriefing and experimenters),
-``trials`` (everything that is rated in video mode), ``controllers`` (one file per letter in physical mode).
+Four kinds of runs: ``before-after`` (the participant's robot beside the reference, for debriefing and experimenters),
+``trials`` (everything that is rated in video mode), ``others`` (what of it is not their own robot, while that is still
+learning), ``controllers`` (one file per letter in physical mode).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from app.domain.evaluation import Controller, Film, Trial
-from app.domain.models import Model, ModelKind
+from app.domain.models import Model, ModelKind, RunKind
 from app.domain.protocol import EvaluatedMethod
-from app.domain.run_keys import BEFORE_AFTER, CONTROLLERS, TRIALS
+from app.domain.run_keys import BEFORE_AFTER, CONTROLLERS, OTHERS, TRIALS
 from app.domain.studies import Participant, Study
 from app.services.evaluation import evaluation_plan
 from worker.compute import baseline_fitting, simulation
@@ -48,7 +49,7 @@ def make_films(context: WorkerContext, job: Job, run_id: int, step: Step) -> Non
     what = job.about.subject
     shots = step("plan", _plan, context, job, what)
     for first in range(0, len(shots), AT_A_TIME):
-        if step(f"is-outdated-{first}", _is_outdated, context, job):
+        if step(f"is-outdated-{first}", _is_outdated, context, job, what):
             return
         context.report(run_id, f"{_DOING[what]} {first + 1} of {len(shots)}", first / len(shots))
         some = shots[first : first + AT_A_TIME]
@@ -69,12 +70,19 @@ def _check(context: WorkerContext, job: Job, what: str) -> None:
         raise LoanEnded
 
 
-_DOING = {BEFORE_AFTER: "filming before and after,", TRIALS: "filming robot", CONTROLLERS: "packing robot"}
+_DOING = {
+    BEFORE_AFTER: "filming before and after,",
+    TRIALS: "filming robot",
+    OTHERS: "filming robot",
+    CONTROLLERS: "packing robot",
+}
 
 
-def _is_outdated(context: WorkerContext, job: Job) -> bool:
+def _is_outdated(context: WorkerContext, job: Job, what: str) -> bool:
     with context.database.reading() as session:
-        return due_work.is_outdated(session, job)
+        own = replace(job.about, kind=RunKind.FILTER, subject="")
+        comes_with_the_rest = what == OTHERS and records.has_succeeded(session, str(own))
+        return comes_with_the_rest or due_work.is_outdated(session, job)
 
 
 def _plan(context: WorkerContext, job: Job, what: str) -> list[list[Any]]:
@@ -94,13 +102,16 @@ def _plan(context: WorkerContext, job: Job, what: str) -> list[list[Any]]:
             ]
         evaluation_plan.draw(session, study, participant)
         letters = {each.letter: each.method for each in evaluation_plan.assignments_of(session, participant.id)}
+        if what == OTHERS:
+            letters = {letter: method for letter, method in letters.items() if method != EvaluatedMethod.PBARL}
         trials = evaluation_plan.trials_of(session, participant.id)
         models = {method: _newest_model(session, participant.id, method) for method in letters.values()}
         models |= {trial.film.method: trial.film.model_id for trial in trials if trial.shown_at and trial.film}
         if what == CONTROLLERS:
             shots = [[method, models[method], letter] for letter, method in letters.items()]
             return sorted(shots, key=lambda shot: evaluation_plan.mark(study.key_secret, "made", participant.id, *shot))
-        return [[letters[each.letter], models[letters[each.letter]], each.scenario] for each in trials]
+        named = [(letters[each.letter], each.scenario) for each in trials if each.letter in letters]
+        return [[method, models[method], scenario] for method, scenario in named]
 
 
 def _newest_model(session: Session, participant_id: int, method: str) -> int | None:
@@ -135,7 +146,7 @@ def _film(context: WorkerContext, run_id: int, job: Job, shots: list[list[Any]])
     with context.database.writing() as session:
         for (robot, scenario), columns in zip(missing, files, strict=True):
             _save(session, job.participant, robot, scenario, columns)
-        for method, model_id, scenario in shots:
+        for method, model_id, scenario in shots if job.about.subject != OTHERS else ():  # all are shown, or none
             _show(session, job.participant, method, scenario, model_id)
 
 

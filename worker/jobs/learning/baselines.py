@@ -9,10 +9,11 @@ participant's, so a killed worker goes on where it was; the folder is removed at
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+
+from sqlalchemy import select
 
 from app.domain.choices import RewardKind
-from app.domain.models import ModelKind
+from app.domain.models import Model, ModelKind
 from app.domain.protocol import FROM_OTHERS, EvaluatedMethod
 from app.domain.studies import Participant, Study
 from app.errors import AppError
@@ -49,15 +50,19 @@ def train_method(context: WorkerContext, job: Job, run_id: int, step: Step) -> N
     """Train the method that the job names, drive it through unseen scenarios, and keep it."""
     method = EvaluatedMethod(job.about.subject)
     reward = step("reward", _choose_reward, context, run_id, job)
-    if method in FROM_OTHERS:
-        trained = lent_filters.take(context, job, run_id, step, method)
-    elif method is EvaluatedMethod.SELF_SET:
-        trained = step("setting", _as_set, context, run_id, job)
-    else:
-        trained = step("train", _train, context, run_id, job, method.value, reward)
-    if not trained:
-        return  # the last answer was given again, and the same method is due anew
-    step("save", _save, context, run_id, job, method.value, reward, trained)
+    artefact = step("kept", _kept, context, run_id)  # by an attempt that failed after that
+    if not artefact:
+        if method in FROM_OTHERS:
+            trained = lent_filters.take(context, job, run_id, step, method)
+        elif method is EvaluatedMethod.SELF_SET:
+            trained = step("setting", _as_set, context, run_id, job)
+        else:
+            trained = step("train", _train, context, run_id, job, method.value, reward)
+        if not trained:
+            return  # the last answer was given again, and the same method is due anew
+        step("keep", _keep, context, run_id, job, method.value, trained)
+        artefact = trained["artefact"]
+    step("measure", _measure, context, run_id, job, reward, artefact)
 
 
 def _choose_reward(context: WorkerContext, run_id: int, job: Job) -> str:
@@ -163,12 +168,18 @@ def _action_reward(context: WorkerContext, run_id: int, job: Job, reward: str, f
     return stored
 
 
-def _save(context: WorkerContext, run_id: int, job: Job, method: str, reward: str, trained: dict[str, object]) -> None:
+def _kept(context: WorkerContext, run_id: int) -> str:
+    with context.database.reading() as session:
+        return session.scalar(select(Model.artefact_sha256).where(Model.run_id == run_id)) or ""
+
+
+def _measure(context: WorkerContext, run_id: int, job: Job, reward: str, artefact: str) -> None:
+    """What the method does in unseen scenarios; nobody waits for it, so it is filmed meanwhile. Raises LoanEnded."""
     started = time.perf_counter()
     with context.database.reading() as session:
         study = session.get_one(Study, job.study_id)
     scenarios = first_of(EVALUATION, study.settings.evaluation_scenarios)
-    model = context.store.read(str(trained["artefact"]))
+    model = context.store.read(artefact)
 
     def beat_at(share: float) -> Callable[[], None]:
         words, done = "driving the method through unseen scenarios", TRAINING_SHARE + (1 - TRAINING_SHARE) * share
@@ -177,21 +188,19 @@ def _save(context: WorkerContext, run_id: int, job: Job, method: str, reward: st
     driven = _driven(context, study.task, model, scenarios, beat_at)
     reference = _reference(context, study.task, scenarios, context.beat(run_id))
     returns = load_reward_model(context.store.read(reward)).returns
-    metrics = {
-        "method": method,
-        "evaluation": evaluate(reference, driven, returns(reference), returns(driven), registry.task(study.task)),
-        "notes": trained["notes"],
-        "seconds": {"fit": trained["seconds"], "evaluation": round(time.perf_counter() - started, 1)},
-    }
-    _keep(context, run_id, job, method, trained, metrics)
-    context.store.unfinished.forget(_folder(context, job, run_id))
+    evaluation = evaluate(reference, driven, returns(reference), returns(driven), registry.task(study.task))
+    with context.database.writing() as session:
+        kept = session.scalar(select(Model).where(Model.run_id == run_id))
+        if kept is None:
+            raise LoanEnded
+        took = {**kept.metrics["seconds"], "evaluation": round(time.perf_counter() - started, 1)}
+        kept.metrics = {**kept.metrics, "evaluation": evaluation, "seconds": took}
 
 
-def _keep(
-    context: WorkerContext, run_id: int, job: Job, method: str, trained: dict[str, object], metrics: dict[str, Any]
-) -> None:
+def _keep(context: WorkerContext, run_id: int, job: Job, method: str, trained: dict[str, object]) -> None:
     """Record the model; nothing is left of somebody else's filter if they have withdrawn. Raises LoanEnded then."""
     artefact = str(trained["artefact"])
+    metrics = {"method": method, "notes": trained["notes"], "seconds": {"fit": trained["seconds"]}}
     with context.database.writing() as session:
         try:
             if method in FROM_OTHERS:
@@ -201,6 +210,7 @@ def _keep(
                 context.store.delete(sha256)
             raise
         records.save_model(session, run_id, ModelKind.METHOD, artefact, metrics)
+    context.store.unfinished.forget(_folder(context, job, run_id))
 
 
 def _driven(
@@ -210,7 +220,7 @@ def _driven(
     for first in range(0, len(scenarios), CHUNK):
         beat = beat_at(first / len(scenarios))
         driven += context.compute.run(
-            Lane.LEARNING, beat, baseline_fitting.drive, task, model, scenarios[first : first + CHUNK]
+            Lane.PATIENT, beat, baseline_fitting.drive, task, model, scenarios[first : first + CHUNK]
         )
     return driven
 

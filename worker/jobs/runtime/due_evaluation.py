@@ -5,7 +5,7 @@ from dataclasses import replace
 
 from app.domain.models import RunKind
 from app.domain.protocol import EvaluatedMethod, EvaluationMode
-from app.domain.run_keys import BEFORE_AFTER, CONTROLLERS, TRIALS, RunKey
+from app.domain.run_keys import BEFORE_AFTER, CONTROLLERS, OTHERS, TRIALS, RunKey
 from app.domain.studies import Study
 from app.services.evaluation import evaluation_plan
 from worker.jobs.runtime.records import Job
@@ -15,6 +15,7 @@ def due(
     study: Study,
     reward: RunKey,
     succeeded: Collection[str],
+    trained: Collection[str],
     robots_shown: bool,
     arm: str | None = None,
     *,
@@ -22,6 +23,7 @@ def due(
 ) -> list[Job]:
     """What is to be trained, filmed or packed for somebody who has given all labels. ``reward``: their last model's.
 
+    ``succeeded``, ``trained``: keys of finished runs, and of those that have left a method, measured or not.
     ``has_set``: they are through with the sliders, where there are any, so the robot that they have set can be made.
     Whoever has been shown robots rates those: other ones, learned without an excluded answer, would be for nobody.
     """
@@ -29,9 +31,8 @@ def due(
         return []
     jobs = [] if robots_shown else _methods(study, reward, arm)
     jobs = [job for job in jobs if has_set or job.about.subject != EvaluatedMethod.SELF_SET]
-    if str(replace(reward, kind=RunKind.FILTER)) in succeeded:
-        jobs += _films(study, reward, succeeded, robots_shown, arm)
-    return jobs
+    has_filter = str(replace(reward, kind=RunKind.FILTER)) in succeeded
+    return jobs + _films(study, reward, trained, has_filter, robots_shown, arm)
 
 
 def _methods(study: Study, reward: RunKey, arm: str | None) -> list[Job]:
@@ -44,20 +45,20 @@ def _methods(study: Study, reward: RunKey, arm: str | None) -> list[Job]:
     ]
 
 
-def _all_trained(study: Study, reward: RunKey, succeeded: Collection[str], arm: str | None) -> bool:
-    """Whether everything that is due has been done."""
-    return all(job.key in succeeded for job in _methods(study, reward, arm))
-
-
-def _films(study: Study, reward: RunKey, succeeded: Collection[str], robots_shown: bool, arm: str | None) -> list[Job]:
-    """What is to be filmed or packed for somebody whose last filter is there. ``reward``: their last model's.
+def _films(
+    study: Study, reward: RunKey, trained: Collection[str], has_filter: bool, robots_shown: bool, arm: str | None
+) -> list[Job]:
+    """What is to be filmed or packed for somebody; without their last filter, trials of the others. ``reward``: theirs.
 
     ``robots_shown``: they have begun to rate, so that what they rate stays.
     """
-    wanted = [BEFORE_AFTER] if study.material is None else []
+    wanted = [BEFORE_AFTER] if has_filter and study.material is None else []
     settings = None if robots_shown else evaluation_plan.settings_for(study, arm)
-    if settings and _all_trained(study, reward, succeeded, arm):
-        wanted.append(TRIALS if settings.mode is EvaluationMode.VIDEO else CONTROLLERS)
+    if settings and all(job.key in trained for job in _methods(study, reward, arm)):
+        if settings.mode is EvaluationMode.VIDEO:
+            wanted.append(TRIALS if has_filter else OTHERS)
+        elif has_filter:
+            wanted.append(CONTROLLERS)
     return [
         Job(replace(reward, kind=RunKind.FILMS, subject=what), study.id)
         for what in reversed(wanted)  # the debrief comes last
