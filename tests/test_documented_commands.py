@@ -107,6 +107,7 @@ RUN: dict[str, str | Elsewhere | OnlyParsed] = {
         "test_a_restored_studio_has_every_answer_that_was_acknowledged_before_the_backup_began"
     ),
     "api_pages": "--people 1 --answers 20",
+    "changed_physics": ROLLOUTS,
     "chosen_modes": ROLLOUTS,
     "following_pairs": ROLLOUTS,
     "hints": ROLLOUTS,
@@ -127,6 +128,7 @@ RUN: dict[str, str | Elsewhere | OnlyParsed] = {
     "reliability": OnlyParsed("computes each truth from 400 000 people; what it measures has tests of its own"),
     "in_lerobot": OnlyParsed("needs the library lerobot, in an environment of its own"),
     "in_imitation": OnlyParsed("needs the library imitation, in an environment of its own"),
+    "in_stable_baselines3": ROLLOUTS,
     "kills": REAL_TIME,
     "labellers": "--labellers 2 --thought 0.2 --people 1 --labels 40 --seconds 1 --rounds 1 --settling 0",
     "on_postgresql": OnlyParsed("runs the suite itself, and needs a PostgreSQL server"),
