@@ -78,5 +78,5 @@ class Allocation(Base):
     lot: Mapped[float]
     """In [0, 1), from the study's secret and the participant's number; picks among the arms that were behind."""
     considered: Mapped[dict[str, Any]]
-    """By arm: completed, on_their_way, and whether it was open."""
+    """By arm: completed, on_their_way, how many of these were silent, and whether it was open."""
     created_at: Mapped[datetime] = mapped_column(default=now)

@@ -59,6 +59,21 @@ class TestWhoComesIntoWhichArm:
         assert {choose(level | {"b": Load(0, 0, False)}, lot) for lot in (0.0, 0.999)} == {"a", "c"}
         assert choose({"a": Load(3, 1, False)}, 0.5) is None
 
+    def test_whoever_has_been_silent_for_ten_minutes_decides_between_level_arms_only(self, database: Database) -> None:
+        assert choose({"a": Load(3, 9, True, silent=7), "b": Load(3, 3, True)}, 0.999) == "a"
+        assert choose({"a": Load(3, 9, True, silent=7), "b": Load(3, 3, True, silent=1)}, 0.0) == "b"
+        assert choose({"a": Load(3, 9, True, silent=7), "b": Load(3, 2, True)}, 0.0) == "b"
+        with database.writing() as session:
+            study = factories.make_study(session, **BETWEEN)
+            arm = arrive(session, study, seen_ago=timedelta(minutes=11)).arm or ""
+            there = arms.loads(session, study, now())[arm]
+            assert (there.on_their_way, there.silent) == (1, 1)
+            assert arrive(session, study, seen_ago=timedelta(minutes=9)).arm != arm
+            assert arrive(session, study).arm == arm, "who is behind without whoever is silent"
+
+    def test_fifty_at_once_leave_arms_level_within_a_few_although_half_drop_out(self) -> None:
+        assert simulation.row(2, 50.0, 0.5, 3000, 2, 0)["apart_at_end"] <= 8
+
     @pytest.mark.parametrize("dropout", [0.1, 0.3, 0.6])
     def test_completed_arms_stay_within_two_with_dropouts(self, dropout: float) -> None:
         found = simulation.row(3, 0.0, dropout, 2000, 1, 0)

@@ -17,11 +17,12 @@ import numpy as np
 
 from app.domain.protocol import EvaluatedMethod, EvaluationSettings
 from app.domain.study_settings import StudySettings
-from app.services.participants.arms import Load, choose, is_open
+from app.services.participants.arms import SILENT_AFTER, Load, choose, is_open
 from worker.analysis.comparison import result_pages
 
 RESULTS = Path("docs/results")
 DROPOUTS, AT_ONCE, ARMS, QUOTA = (0.1, 0.3, 0.5), (0.0, 2.0, 10.0, 50.0), (2, 4), 100
+SILENT = SILENT_AFTER.total_seconds() / 3600
 AWAY = 1.0
 """Hours without a sign after which somebody counts as dropped out; a whole study takes as long."""
 METHODS = tuple(EvaluatedMethod)
@@ -45,7 +46,8 @@ def simulate(
     one comes when it is known what has become of the one before.
     """
     names = [each.name for each in settings.arms]
-    completed, on_their_way, turned_away = Counter[str](), Counter[str](), 0
+    completed, turned_away = Counter[str](), 0
+    last_signs: dict[str, dict[int, float]] = {name: {} for name in names}
     over: list[tuple[float, int, str, bool]] = []
     moment, largest = 0.0, 0
     apart: list[int] = []
@@ -53,8 +55,8 @@ def simulate(
     def let_go(until: float) -> None:
         nonlocal largest
         while over and over[0][0] <= until:
-            _, _, arm, done = heapq.heappop(over)
-            on_their_way[arm] -= 1
+            _, person, arm, done = heapq.heappop(over)
+            del last_signs[arm][person]
             completed[arm] += done
             apart.append(max(completed[name] for name in names) - min(completed[name] for name in names))
 
@@ -63,18 +65,19 @@ def simulate(
         let_go(moment)
         if not at_once:
             moment = 0.0
-        expected = {name: completed[name] + on_their_way[name] for name in names}
-        loads = {
-            name: Load(completed[name], on_their_way[name], is_open(settings, name, expected[name])) for name in names
-        }
+        loads = {}
+        for name, signs in last_signs.items():
+            silent = sum(sign < moment - SILENT for sign in signs.values())
+            opened = is_open(settings, name, completed[name] + len(signs))
+            loads[name] = Load(completed[name], len(signs), opened, silent)
         arm = choose(loads, float(rng.random()))
         if arm is None:
             turned_away += 1
             continue
-        on_their_way[arm] += 1
         drops = bool(rng.random() < dropout)
         stays = float(rng.uniform(0.5, 1.0))
-        known = moment + (stays * float(rng.random()) + AWAY if drops else stays)
+        last_signs[arm][number] = moment + (stays * float(rng.random()) if drops else stays)
+        known = last_signs[arm][number] + (AWAY if drops else 0.0)
         heapq.heappush(over, (known, number, arm, not drops))
     let_go(np.inf)
     within = 100.0 * float(np.mean(np.array(apart) <= LEVEL)) if apart else 100.0

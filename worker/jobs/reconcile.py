@@ -203,8 +203,12 @@ def _stale_models(session: Session, study: Study, succeeded: Collection[str], tr
             milestone = filter_due(settings, count)
             if milestone and str(reward) in succeeded and study.material is None:  # no simulator, no filter
                 jobs.append(Job(replace(reward, kind=RunKind.FILTER, labels=milestone), study.id))
-        if count >= settings.labels_per_participant and study.material is None and participant_id in rating:
-            arm, shown = rating[participant_id], participant_id in begun
+        if not labels or study.material is not None or participant_id not in rating:
+            continue
+        arm, shown = rating[participant_id], participant_id in begun
+        if count < settings.labels_per_participant:
+            jobs += due_evaluation.due_ahead(study, participant_id, arm)
+        else:
             has_set = participant_id in have_set
             jobs += due_evaluation.due(study, reward, succeeded, trained, shown, arm, has_set=has_set)
     return jobs

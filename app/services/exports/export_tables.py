@@ -75,7 +75,7 @@ TABLES: Sequence[Table] = (
                 "digits of SHA-256 of <secret>/evaluation/arm/<number of the participant>, divided by 16^13.",
                 allowed="0 to 1",
             ),
-            Column("considered", J, "By arm, as it was then: completed, on_their_way, open."),
+            Column("considered", J, "By arm, as it was then: completed, on_their_way, of these silent, open."),
             Column("allocated_at", W, "When."),
         ),
         export_rows.allocations,

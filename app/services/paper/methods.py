@@ -67,8 +67,9 @@ def _design(study: Study) -> Iterator[str]:
     between = (
         f"The study was between subjects with {len(settings.arms)} arms. Whoever had consented"
         + (" and passed the screening" if settings.screening else "")
-        + " came into the open arm with the fewest people who had completed it or were on their way through it; ties "
-        "were decided by lots drawn from a secret fixed before the study (minimisation on completions). "
+        + " came into the open arm with the fewest people who had completed it or were on their way through it; who "
+        "had been silent for ten minutes only decided between arms that were level otherwise, and remaining ties were "
+        "decided by lots drawn from a secret fixed before the study (minimisation on completions). "
         + (f"Each arm closed after {settings.arm_quota} completions. " if settings.arm_quota else "")
         + "Dropouts were replaced."
     )

@@ -132,7 +132,8 @@ def _randomisation(study: Study, settings: StudySettings, evaluation: Evaluation
         if evaluation
         else "",
         "Arms: minimisation on completions. Whoever arrives comes into the open arm with the fewest people who have "
-        "completed it or are on their way through it; lots decide ties. Who has given no sign for "
+        "completed it or are on their way through it; who has been silent for ten minutes only decides between arms "
+        "that are level otherwise, and lots decide remaining ties. Who has given no sign for "
         f"{settings.arm_away_minutes} minutes counts as dropped out and is replaced."
         if settings.arms
         else "",

@@ -2,9 +2,10 @@
 
 Somebody who arrives (has agreed, and passed the questions at the start) comes into the open arm with the fewest people
 who have completed it or are on their way through it; a lot decides between arms that are level (Pocock and Simon 1975,
-Biometrics 31, 103, with the arm alone as factor and certainty for the arm that is behind). Who has given no sign for a
-while is not on their way, so that the next one replaces them; should they come back, they count again. An arm is open
-unless it has been stopped or as many as its quota have completed it or are about to. The lot follows from the study's
+Biometrics 31, 103, with the arm alone as factor and certainty for the arm that is behind). Who has been silent for ten
+minutes has left in most cases, or comes back another day, and only decides between arms that are level otherwise. Who
+has given no sign for as long as the study says is not on their way at all, so that the next one replaces them; should
+they come back, they count again. An arm is open unless it has been stopped or as many as its quota have completed it or are about to. The lot follows from the study's
 secret and the participant's number, and is kept with the counts, so that it can be drawn again after unblinding.
 How far apart completed arms come: docs/results/arms.md.
 """
@@ -22,6 +23,7 @@ from app.domain.studies import Participant, Study
 from app.domain.study_settings import StudySettings
 from app.services.evaluation import evaluation_plan
 
+SILENT_AFTER = timedelta(minutes=10)
 _DIGITS = 13
 """Hexadecimal ones of a lot: all that a float holds."""
 
@@ -33,17 +35,24 @@ class Load:
     completed: int
     on_their_way: int
     open: bool
+    silent: int = 0
+    """of those on their way"""
 
     @property
     def expected(self) -> int:
         """How many will have completed it if nobody else drops out."""
         return self.completed + self.on_their_way
 
+    @property
+    def rank(self) -> tuple[int, int]:
+        """The arm with the smallest is next."""
+        return self.expected - self.silent, self.silent
+
 
 def choose(loads: Mapping[str, Load], lot: float) -> str | None:
     """The arm of the next person; None where no arm is open. ``lot`` in [0, 1)."""
-    open_arms = {name: load.expected for name, load in loads.items() if load.open}
-    behind = [name for name, expected in open_arms.items() if expected == min(open_arms.values())]
+    open_arms = {name: load.rank for name, load in loads.items() if load.open}
+    behind = [name for name, rank in open_arms.items() if rank == min(open_arms.values())]
     return behind[int(lot * len(behind))] if behind else None
 
 
@@ -57,17 +66,18 @@ def loads(session: Session, study: Study, moment: datetime) -> Mapping[str, Load
     settings = study.settings
     seen = Participant.last_seen_at > moment - timedelta(minutes=settings.arm_away_minutes)
     done = Participant.completed_at.is_not(None)
-    there = done | (seen & Participant.ended_as.is_(None))
+    coming = ~done & seen & Participant.ended_as.is_(None)
+    silent = coming & (Participant.last_seen_at <= moment - SILENT_AFTER)
     counted = (
-        select(Participant.arm, func.sum(case((done, 1), else_=0)), func.sum(case((there, 1), else_=0)))
+        select(Participant.arm, *(func.sum(case((each, 1), else_=0)) for each in (done, coming, silent)))
         .where(Participant.study_id == study.id, Participant.is_preview.is_(False), Participant.withdrawn_at.is_(None))
         .group_by(Participant.arm)
     )
-    found = {arm: (completed, expected) for arm, completed, expected in session.execute(counted)}
-    counts = {each.name: found.get(each.name, (0, 0)) for each in settings.arms}
+    found = {arm: numbers for arm, *numbers in session.execute(counted)}
+    counts = {each.name: found.get(each.name, (0, 0, 0)) for each in settings.arms}
     return {
-        name: Load(completed, expected - completed, is_open(settings, name, expected))
-        for name, (completed, expected) in counts.items()
+        name: Load(completed, coming, is_open(settings, name, completed + coming), silent)
+        for name, (completed, coming, silent) in counts.items()
     }
 
 

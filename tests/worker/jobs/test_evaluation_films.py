@@ -73,6 +73,12 @@ def due(database: Database, *kinds: RunKind) -> list[Job]:
         return [job for job, _ in reconcile.due(session) if job.kind in kinds]
 
 
+def answers_wanted(database: Database, study: Study, count: int) -> None:
+    with database.writing() as session:
+        asked = session.get_one(Study, study.id)
+        asked.stored_settings = {**asked.stored_settings, "labels_per_participant": count}
+
+
 def done(context: WorkerContext, job: Job, work: Callable[..., None] | None = None) -> int:
     with context.database.writing() as session:
         run_id = records.begin_run(session, job, seed=1)
@@ -221,6 +227,49 @@ def test_while_their_own_filter_is_fitted_the_other_robots_are_filmed_and_nothin
         assert {film.id for film in films} < set(session.scalars(select(Film.id)))
         assert session.scalar(select(func.count(Film.id))) == len(films) + 1, "what is there is not filmed again"
         assert all(trial.film_id is not None for trial in evaluation_plan.trials_of(session, participant.id))
+
+
+@pytest.mark.usefixtures("all_said")
+def test_the_reference_is_filmed_while_somebody_answers_and_not_again_when_it_is_shown(
+    context: WorkerContext, database: Database, study: Study, participant: Participant
+) -> None:
+    settle(database, study, methods=("reference", "pbarl"), trials=1)
+    answers_wanted(database, study, LABELS + 1)
+    (ahead,) = due(database, RunKind.FILMS)
+    assert ahead.key == "films/participant-1/ahead"
+    done(context, ahead, make_films)
+    assert due(database, RunKind.FILMS) == []
+    with database.reading() as session:
+        films = session.scalars(select(Film)).all()
+        compared = evaluation_plan.comparison_scenarios(participant)
+        expected = [evaluation_plan.trial_scenario(participant, 1), *compared]
+        assert [(film.method, film.model_id, film.scenario) for film in films] == [
+            ("reference", None, scenario) for scenario in expected
+        ]
+    answers_wanted(database, study, LABELS)
+    learn(context)
+    for filming in due(database, RunKind.FILMS):
+        done(context, filming, make_films)
+    with database.reading() as session:
+        methods = session.scalars(select(Film.method).order_by(Film.id)).all()
+        assert methods == ["reference"] * len(films) + ["pbarl"] * len(films)
+        assert all(trial.film_id is not None for trial in evaluation_plan.trials_of(session, participant.id))
+
+
+@pytest.mark.parametrize(
+    "evaluation", [None, {"methods": ("pbarl", "average")}, {"methods": ("reference", "pbarl"), "mode": "physical"}]
+)
+@pytest.mark.usefixtures("all_said")
+def test_nothing_is_filmed_ahead_that_will_not_be_shown(
+    database: Database, study: Study, evaluation: dict[str, Any] | None
+) -> None:
+    settle(database, study, **(evaluation or {}))
+    answers_wanted(database, study, LABELS + 1)
+    if evaluation is None:
+        with database.writing() as session:
+            plain = session.get_one(Study, study.id)
+            plain.stored_settings = {**plain.stored_settings, "evaluation": None}
+    assert due(database, RunKind.FILMS) == []
 
 
 @pytest.mark.usefixtures("all_said")

@@ -11,11 +11,13 @@ from sqlalchemy.orm import Session
 
 from app.db import Database, now
 from app.domain.evaluation import Donors, SharedFilter
+from app.domain.models import ModelKind
 from app.domain.protocol import EvaluatedMethod
 from app.domain.studies import Awaited, Participant, Study
 from app.services.evaluation import donors
 from tests.worker.invented import job_of
 from worker.compute.pools import Compute, Lane
+from worker.jobs.runtime import records
 from worker.jobs.runtime.lanes import Lanes
 from worker.jobs.runtime.records import Job
 from worker.jobs.runtime.urgency import Gate, Level, Urgency, WhoWaits
@@ -90,6 +92,27 @@ def test_whoever_rates_the_first_robot_waits_for_the_next(database: Database, st
         person = add_person(session, study, seen=1)
     assert level(database, films(person)) is Level.WAITING
     assert level(database, films(person, "before-after")) is Level.ANSWERING
+
+
+def test_films_that_somebody_may_be_shown_later_come_after_the_clips_that_they_compare(
+    database: Database, study: Study
+) -> None:
+    with database.writing() as session:
+        person = add_person(session, study, seen=1)
+    ahead = job_of(f"films/participant-{person.id}/ahead", study.id)
+    assert (level(database, clips(study)), level(database, ahead)) == (Level.ANSWERING, Level.POOL)
+
+
+def test_nobody_waits_for_the_numbers_of_a_method_that_can_be_shown(database: Database, study: Study) -> None:
+    with database.writing() as session:
+        person = add_person(session, study, Awaited.ROBOTS, seen=1, waiting=60)
+        method = job_of(f"method/participant-{person.id}/average/labels-20/answer-9", study.id)
+        run_id = records.begin_run(session, method, seed=1)
+    assert level(database, method) is Level.WAITING
+    with database.writing() as session:
+        records.set_labels(session, run_id, 20, "hash")
+        records.save_model(session, run_id, ModelKind.METHOD, "0" * 64, {"method": "average"})
+    assert level(database, method) is Level.DUE
 
 
 def test_whoever_looks_at_the_debrief_waits_for_its_films(database: Database, study: Study) -> None:

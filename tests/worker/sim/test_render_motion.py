@@ -9,7 +9,7 @@ from worker.domain.trajectory import Trajectory
 from worker.sim.human import BROAD, LEFT, RIGHT
 from worker.sim.jaco import JACO
 from worker.sim.render.camera import lamp, scene_camera
-from worker.sim.render.interpolation import ClipMotion, clip_motion, quaternions, smoothly
+from worker.sim.render.interpolation import STILL_M, ClipMotion, clip_motion, quaternions, smoothly
 from worker.sim.render.rectangles import GRID_PX, cover, on_grid
 from worker.sim.render.task_look import TaskLook
 from worker.tasks.feeding.environment import SPOON
@@ -64,6 +64,34 @@ def test_food_lost_far_from_the_mouth_just_disappears() -> None:
     gone = np.isnan(motion_of(trajectory, 0, 20).particles_m[:, 3, 0])
     assert not gone[:14].any()
     assert gone[14:].all()
+
+
+def test_what_stands_still_is_drawn_once_and_what_creeps_again_when_it_has_moved_visibly() -> None:
+    standing, creeping = waving_trajectory(20), waving_trajectory(20)
+    for trajectory in (standing, creeping):
+        trajectory.joint_positions[6:] = trajectory.joint_positions[6]
+        trajectory.contact_force_n[:] = 0.0
+        trajectory.particles[:] = np.nan
+    creeping.target_m[10:] += np.linspace(0.0, 2.2 * STILL_M, 11)[:, None]
+    motion = motion_of(standing, 8, 12)
+    assert motion.stretches() == [range(len(motion))]
+    crept = motion_of(creeping, 8, 12)
+    assert len(crept.stretches()) == 3
+    for stretch in crept.stretches():
+        assert np.abs(crept.target_m[stretch] - crept.target_m[stretch.start]).max() <= STILL_M
+
+
+def test_every_frame_of_a_moving_arm_is_drawn() -> None:
+    motion = motion_of(waving_trajectory(20), 4, 10)
+    assert [len(each) for each in motion.stretches()] == [1] * len(motion)
+
+
+def test_food_that_is_gone_is_seen_to_go_from_a_robot_that_stands_still() -> None:
+    trajectory = waving_trajectory(20)
+    trajectory.joint_positions[:] = trajectory.joint_positions[0]
+    trajectory.particles[:] = trajectory.particles[0]
+    trajectory.particles[10:, 3] = np.nan
+    assert len(motion_of(trajectory, 0, 20).stretches()) == 2
 
 
 @pytest.mark.parametrize(("first", "count"), [(-1, 5), (0, 0), (15, 6)])

@@ -1,8 +1,9 @@
 """What an evaluation shows: films of the robots in scenarios that nothing else uses, or controllers for a real one.
 
-Four kinds of runs: ``before-after`` (the participant's robot beside the reference, for debriefing and experimenters),
+Five kinds of runs: ``before-after`` (the participant's robot beside the reference, for debriefing and experimenters),
 ``trials`` (everything that is rated in video mode), ``others`` (what of it is not their own robot, while that is still
-learning), ``controllers`` (one file per letter in physical mode).
+learning), ``ahead`` (what of both is the reference, while they still answer), ``controllers`` (one file per letter in
+physical mode).
 """
 
 from dataclasses import dataclass, replace
@@ -14,7 +15,7 @@ from sqlalchemy.orm import Session
 from app.domain.evaluation import Controller, Film, Trial
 from app.domain.models import Model, ModelKind, RunKind
 from app.domain.protocol import EvaluatedMethod
-from app.domain.run_keys import BEFORE_AFTER, CONTROLLERS, OTHERS, TRIALS
+from app.domain.run_keys import AHEAD, BEFORE_AFTER, CONTROLLERS, OTHERS, TRIALS
 from app.domain.studies import Participant, Study
 from app.services.evaluation import evaluation_plan
 from worker.compute import baseline_fitting, simulation
@@ -28,6 +29,8 @@ from worker.jobs.runtime import due_work, records
 from worker.jobs.runtime.context import Step, WorkerContext
 from worker.jobs.runtime.records import Job
 
+SHOWN = (TRIALS, BEFORE_AFTER)
+"""Runs whose films are given to the trials they fit; all of somebody's robots are shown, or none."""
 AT_A_TIME = 2
 """Films between two marks of progress."""
 
@@ -74,6 +77,7 @@ _DOING = {
     BEFORE_AFTER: "filming before and after,",
     TRIALS: "filming robot",
     OTHERS: "filming robot",
+    AHEAD: "filming the reference,",
     CONTROLLERS: "packing robot",
 }
 
@@ -100,6 +104,8 @@ def _plan(context: WorkerContext, job: Job, what: str) -> list[list[Any]]:
                 for scenario in evaluation_plan.comparison_scenarios(participant)
                 for method in methods
             ]
+        if what == AHEAD:
+            return [[EvaluatedMethod.REFERENCE.value, None, each] for each in _scenarios(study, participant)]
         evaluation_plan.draw(session, study, participant)
         letters = {each.letter: each.method for each in evaluation_plan.assignments_of(session, participant.id)}
         if what == OTHERS:
@@ -112,6 +118,14 @@ def _plan(context: WorkerContext, job: Job, what: str) -> list[list[Any]]:
             return sorted(shots, key=lambda shot: evaluation_plan.mark(study.key_secret, "made", participant.id, *shot))
         named = [(letters[each.letter], each.scenario) for each in trials if each.letter in letters]
         return [[method, models[method], scenario] for method, scenario in named]
+
+
+def _scenarios(study: Study, participant: Participant) -> list[int]:
+    """Of the trials, then of before and after."""
+    settings = evaluation_plan.settings_for(study, participant.arm)
+    repetitions = range(1, settings.trials + 1) if settings else ()
+    rated = [evaluation_plan.trial_scenario(participant, repetition) for repetition in repetitions]
+    return [*rated, *evaluation_plan.comparison_scenarios(participant)]
 
 
 def _newest_model(session: Session, participant_id: int, method: str) -> int | None:
@@ -146,7 +160,7 @@ def _film(context: WorkerContext, run_id: int, job: Job, shots: list[list[Any]])
     with context.database.writing() as session:
         for (robot, scenario), columns in zip(missing, files, strict=True):
             _save(session, job.participant, robot, scenario, columns)
-        for method, model_id, scenario in shots if job.about.subject != OTHERS else ():  # all are shown, or none
+        for method, model_id, scenario in shots if job.about.subject in SHOWN else ():
             _show(session, job.participant, method, scenario, model_id)
 
 

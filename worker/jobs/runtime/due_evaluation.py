@@ -5,10 +5,17 @@ from dataclasses import replace
 
 from app.domain.models import RunKind
 from app.domain.protocol import EvaluatedMethod, EvaluationMode
-from app.domain.run_keys import BEFORE_AFTER, CONTROLLERS, OTHERS, TRIALS, RunKey
+from app.domain.run_keys import AHEAD, BEFORE_AFTER, CONTROLLERS, OTHERS, TRIALS, RunKey
 from app.domain.studies import Study
 from app.services.evaluation import evaluation_plan
 from worker.jobs.runtime.records import Job
+
+
+def due_ahead(study: Study, participant_id: int, arm: str | None) -> list[Job]:
+    """What can be filmed for somebody who is still answering: the reference depends on no answer."""
+    settings = evaluation_plan.settings_for(study, arm)
+    is_shown = settings and settings.mode is EvaluationMode.VIDEO and EvaluatedMethod.REFERENCE in settings.methods
+    return [Job(RunKey(RunKind.FILMS, participant_id=participant_id, subject=AHEAD), study.id)] if is_shown else []
 
 
 def due(

@@ -15,9 +15,9 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from app.db import now
-from app.domain.models import RunKind
+from app.domain.models import Model, Run, RunKind, RunStatus
 from app.domain.protocol import FROM_OTHERS
-from app.domain.run_keys import BEFORE_AFTER
+from app.domain.run_keys import AHEAD, BEFORE_AFTER
 from app.domain.studies import Awaited, Participant, Study
 from app.services.evaluation import donors
 from worker.jobs.runtime.records import Job
@@ -41,7 +41,7 @@ class Level(IntEnum):
     DUE = 3
     """A participant needs it who is not here, or waits for something else first."""
     POOL = 4
-    """Clips of a study with participants, and filters that somebody may be shown later."""
+    """Clips of a study with participants, and filters and films that somebody may be shown later."""
     UNOPENED = 5
     """Clips of a study that has none."""
     UNREAD = 6
@@ -78,6 +78,8 @@ class WhoWaits:
     just_unblinded: frozenset[int] = frozenset()
     shared_awaited: Mapping[str, datetime] = field(default_factory=dict)
     """Keys of filters for several, with since when somebody looks at a waiting page who is to be lent them."""
+    measuring: frozenset[str] = frozenset()
+    """Keys of runs that have left their method and only measure it: nobody waits for the numbers"""
 
     @classmethod
     def look(cls, session: Session) -> "WhoWaits":
@@ -102,7 +104,9 @@ class WhoWaits:
             for row in rows
         }
         unblinded = session.scalars(select(Study.id).where(Study.unblinded_at > moment - ASKED_WITHIN))
-        return cls(people, frozenset(unblinded), _shared_awaited(session, people))
+        left = select(Run.workflow_id).join(Model, Model.run_id == Run.id).where(Run.kind == RunKind.METHOD)
+        measuring = session.scalars(left.where(Run.status == RunStatus.RUNNING))
+        return cls(people, frozenset(unblinded), _shared_awaited(session, people), frozenset(measuring))
 
     def urgency(self, job: Job) -> Urgency:
         """How soon the job is to be done."""
@@ -115,8 +119,13 @@ class WhoWaits:
         if job.kind == RunKind.SHARED:
             since = self.shared_awaited.get(job.key)
             return Urgency(Level.WAITING if since else Level.POOL, since or _BEGINNING, _STEPS[RunKind.SHARED])
+        if job.about.subject == AHEAD:
+            return Urgency(Level.POOL, _BEGINNING, _LAST_STEP)
         person = None if job.participant_id is None else self.people.get(job.participant_id)
-        return self._of_study(job.study_id) if person is None else _of_person(person, job)
+        if person is None:
+            return self._of_study(job.study_id)
+        found = _of_person(person, job)
+        return found._replace(level=max(found.level, Level.DUE)) if job.key in self.measuring else found
 
     def _of_study(self, study_id: int) -> Urgency:
         """Of its clips, for which those wait who compare."""

@@ -3,7 +3,7 @@
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from itertools import chain
+from itertools import chain, repeat
 from typing import NamedTuple
 
 import numpy as np
@@ -143,14 +143,16 @@ class ClipRenderer:
             inset.start(inset_still, resting, itch_m, lamp_depth)
         force_n = motion.force_n if style.highlight_pressing else np.zeros(len(motion))
         highlight = Highlight(camera, force_n, motion.frames[:, -1, :3, 3], motion.target_m, style.scale)
-        for index, parts in enumerate(moving_parts(shoot)):
+        stretches = motion.stretches()
+        drawn = [each.start for each in stretches]
+        for alike, index, parts in zip(stretches, drawn, moving_parts(shoot, drawn), strict=True):
             itch_m = motion.target_m[index] if shoot.look.itch else None
             frame = Frame([*person.moving(index), *parts], moving_lamp_depth(shoot.kit), itch_m)
             picture = main.frame(frame)
             highlight.draw(picture, index)
             if inset:
                 _paste_inset(picture, inset.frame(frame), shoot.look, highlight.border(index), style.scale)
-            yield picture
+            yield from repeat(picture, len(alike))
 
     def _main_view(self, camera: Camera, task: str, body: str) -> tuple[View, Still]:
         """The whole picture, and what never moves in it, from memory if it was drawn lately."""

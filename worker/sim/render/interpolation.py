@@ -1,6 +1,7 @@
 """From a trajectory at 10 Hz to the poses of every frame of a clip."""
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -17,6 +18,13 @@ SWALLOWED_WITHIN_M = 0.06
 THROAT_DEPTH_M = 0.035
 STILL_RAD = 2e-3
 """Arms and head that turn by less than this during a clip are drawn as standing still: a fifth of a pixel."""
+STILL_M = 4e-4
+"""A picture is shown until something in it has moved by this since it was drawn: half a pixel in the close-up."""
+REACH_M, ARM_M = 0.2, 0.7
+"""How far from where it turns what is drawn of a link, the tool or the head reaches, and a person's arm."""
+STILL_N = 0.05
+"""A force that changes by less looks the same."""
+_GONE_M = 100.0
 
 
 @dataclass(frozen=True)
@@ -49,6 +57,27 @@ class ClipMotion:
     def arm_moves(self, side: int) -> bool:
         """Whether the person's right or left arm moves visibly during the clip."""
         return float(np.abs(self.arms_rad[:, side] - self.arms_rad[0, side]).max()) > STILL_RAD
+
+    def stretches(self) -> list[range]:
+        """The frames in runs that look alike, so that one picture of the first is enough for each."""
+        moved, starts = self._places_m(), [0]
+        for index in range(1, len(self)):
+            if np.abs(moved[index] - moved[starts[-1]]).max() > STILL_M:
+                starts.append(index)
+        return [range(*ends) for ends in pairwise([*starts, len(self)])]
+
+    def _places_m(self) -> FloatArray:
+        """(N, X) whatever can be seen to change, as places of points."""
+        parts = (
+            self.frames[:, :, :3, 3],
+            REACH_M * self.frames[:, :, :3, :3],
+            np.nan_to_num(self.particles_m, nan=_GONE_M),
+            2 * REACH_M * self.head_quaternions,
+            ARM_M * self.arms_rad,
+            self.target_m,
+            STILL_M / STILL_N * self.force_n,
+        )
+        return np.concatenate([each.reshape(len(self), -1) for each in parts], axis=1)
 
 
 def clip_motion(

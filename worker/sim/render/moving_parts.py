@@ -1,6 +1,6 @@
 """Who and what is filmed in one clip: the person posed, at rest or moving, and the robot frame by frame."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
 
@@ -87,14 +87,14 @@ class FilmedPerson:
         return [Part(stage, self._corners_m, BODY_LIGHT, alive=True, pose=self._pose)]
 
 
-def moving_parts(shoot: Shoot) -> Iterator[list[Part]]:
-    """The robot, its tool and the particles, posed frame by frame."""
+def moving_parts(shoot: Shoot, frames: Iterable[int]) -> Iterator[list[Part]]:
+    """The robot, its tool and the particles, posed for one frame after the other."""
     kit, motion = shoot.kit, shoot.motion
     turned = np.einsum("nlij,lcj->nlci", motion.frames[..., :3, :3], kit.corners_m)
     links_m = turned + motion.frames[:, :, None, :3, 3]
     turns = quaternions(motion.frames[..., :3, :3]).tolist()
     places = motion.frames[..., :3, 3].tolist()
-    for index in range(len(motion)):
+    for index in frames:
         for part in range(len(kit.names)):
             kit.place(part, places[index][part], turns[index][part])
         kit.place_particles(motion.particles_m[index])
