@@ -108,9 +108,9 @@ def _answered(bench: Bench, chain: Chain) -> Iterator[FloatArray]:
         yield members
         known.append((count, relative_regret(bench.surface, members)))
         ends = range(1, len(known) + 1)
-        if count == TOLD_BY and (chain.user, chain.seed) in TRIED_LATER:
-            if all(stopping_advice.enough_since(known[:end]) is None for end in ends):
-                return
+        told = any(stopping_advice.enough_since(known[:end]) is not None for end in ends)
+        if count == TOLD_BY and not told and (chain.user, chain.seed) in TRIED_LATER:
+            return
 
 
 def regret_in_deviations(surface: ResponseSurface, members: FloatArray) -> float:

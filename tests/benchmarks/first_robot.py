@@ -5,6 +5,7 @@ short of clips. From the last answer on they look at the waiting page like a bro
 
     python -m tests.benchmarks.first_robot --steps 1000 --people 2
     python -m tests.benchmarks.first_robot --whole --labels 60 --methods reference pbarl somebody_else average
+    python -m tests.benchmarks.first_robot --whole --unhurried --people 1 --at-once 2
 """
 
 import argparse
@@ -12,14 +13,20 @@ import re
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 
 from sqlalchemy import select
 
 from app.db import Database
-from app.domain.evaluation import Film, Trial
+from app.domain.evaluation import Film, SharedFilter, Trial
 from app.domain.models import Run, RunKind, RunStatus
+from app.domain.preferences import count_labels
 from app.domain.protocol import EvaluatedMethod, EvaluationSettings
+from app.domain.run_keys import AHEAD, RunKey
+from app.domain.studies import Participant, Study
 from app.domain.study_settings import PAPER_PROTOCOL, StudySettings
 from app.services.evaluation import evaluation_plan
 from app.services.participants import enrolment
@@ -43,6 +50,8 @@ def main() -> None:
     parser.add_argument("--labels", type=int, default=12)
     parser.add_argument("--methods", type=EvaluatedMethod, nargs="+", default=list(EvaluationSettings().methods))
     parser.add_argument("--pace", type=float, default=PACE_S, help="seconds between two answers")
+    parser.add_argument("--at-once", type=int, default=0, help="so many more, who give their last answers together")
+    parser.add_argument("--unhurried", action="store_true", help="the last answer comes when all is made ahead")
     parser.add_argument("--whole", action="store_true", help="filters, promise and trials as studies usually have them")
     options = parser.parse_args()
     evaluation = EvaluationSettings(fine_tuning_steps=options.steps, methods=tuple(options.methods))
@@ -58,43 +67,117 @@ def main() -> None:
             study = studies.create_study(
                 session, "Somebody's", StudySettings(**{**PAPER_PROTOCOL.model_dump(), **small}), seed=2
             )
-            tokens = [enrolment.add_participant(session, study) for _ in range(options.people)]
-        for participant, token in tokens:
-            store = ArtefactStore(Path(directory) / "artefacts")
-            person = ScriptedPerson(database, store, study, TASTES["cautious"], Manner(), participant.number)
-            with FormBrowser(studio.settings.base_url, f"/p/{token}") as visitor:
-                while visitor.page in UP_TO_PAIRS:
-                    time.sleep(options.pace if visitor.query_id() else POLL_S)
-                    visitor.act(person)
-                _wait(database, visitor, participant.id)
-            _report_runs(database, participant.id)
+            groups = [1] * options.people + ([options.at_once] if options.at_once else [])
+            tokens = [[enrolment.add_participant(session, study) for _ in range(count)] for count in groups]
+        store = ArtefactStore(Path(directory) / "artefacts")
+        for invited in tokens:
+            with ExitStack() as browsers:
+                people = [
+                    Answering(
+                        participant,
+                        ScriptedPerson(database, store, study, TASTES["cautious"], Manner(), participant.number),
+                        browsers.enter_context(FormBrowser(studio.settings.base_url, f"/p/{token}")),
+                    )
+                    for participant, token in invited
+                ]
+                _answer(database, study, people, options)
+                _wait(database, people)
+            for person in people:
+                _report_runs(database, person.participant.id)
         database.dispose()
 
 
-def _wait(database: Database, visitor: FormBrowser, participant_id: int) -> None:
-    """Look at the waiting page until there is a robot to rate, then see when the rest is there."""
+@dataclass
+class Answering:
+    """Somebody at their page."""
+
+    participant: Participant
+    person: ScriptedPerson
+    visitor: FormBrowser
+    first_s: float | None = None
+    """from the last answer to the first robot"""
+
+    def answers(self) -> None:
+        """One page."""
+        self.visitor.act(self.person)
+
+
+def _answer(database: Database, study: Study, people: Sequence[Answering], options: argparse.Namespace) -> None:
+    """All pairs; the last answers are given one right after the other."""
+    last = [each for each in people if not _go_on(database, study, each, options.labels - 1, options.pace)]
+    if options.unhurried:
+        for each in last:
+            wait_until(PATIENCE_S, "not all is made ahead", lambda each=each: _is_made_ahead(database, each) or None)
+    before_last_answers()
+    for each in last:
+        _go_on(database, study, each, sys.maxsize, POLL_S)
+
+
+def before_last_answers() -> None:
+    """What is to happen then, such as making the machine quiet."""
+
+
+def _go_on(database: Database, study: Study, each: Answering, count: int, pace_s: float) -> bool:
+    """Answer until so many labels are given; whether there are no pairs any more."""
+    mine = select(Participant.id).where(Participant.id == each.participant.id)
+    while each.visitor.page in UP_TO_PAIRS:
+        with database.reading() as session:
+            given = count_labels(session, mine).get(each.participant.id, 0)
+        if given >= count:
+            return False
+        time.sleep(pace_s if each.visitor.query_id() else POLL_S)
+        each.answers()
+    return True
+
+
+def _is_made_ahead(database: Database, each: Answering) -> bool:
+    """Filters of others, and films of the reference."""
+    ahead = RunKey(RunKind.FILMS, participant_id=each.participant.id, subject=AHEAD)
+    filters = select(Run.id).where(Run.kind == RunKind.FILTER, Run.status == RunStatus.RUNNING)
+    with database.reading() as session:
+        asked = session.scalars(select(SharedFilter)).all()
+        fitted = [shared.artefact_sha256 for shared in asked]
+        running = session.scalar(filters.where(Run.participant_id == each.participant.id).limit(1))
+        filmed = session.scalar(select(Run.status).where(Run.workflow_id == str(ahead)))
+    return bool(fitted) and None not in fitted and filmed == RunStatus.SUCCEEDED and running is None
+
+
+def _wait(database: Database, people: Sequence[Answering]) -> None:
+    """Look at the waiting pages until there are robots to rate, then see when the rest is there."""
     began = time.monotonic()
     told: list[tuple[float, float]] = []
 
-    def robot() -> bool | None:
-        visitor.look()
-        words = TOLD.search(visitor.text)
-        if visitor.page in WAITING and words:
-            told.append((time.monotonic() - began, 60.0 * (1 if words[1] == "a" else int(words[1]))))
-        return visitor.page not in WAITING or None
+    def robots() -> bool | None:
+        for each in people:
+            if each.first_s is not None:
+                continue
+            each.visitor.look()
+            words = TOLD.search(each.visitor.text)
+            if each.visitor.page in WAITING and words and each is people[0]:
+                told.append((time.monotonic() - began, 60.0 * (1 if words[1] == "a" else int(words[1]))))
+            if each.visitor.page not in WAITING:
+                each.first_s = time.monotonic() - began
+                _say(f"{each.participant.code}: first robot after {each.first_s:6.0f} s")
+        return all(each.first_s is not None for each in people) or None
 
-    wait_until(PATIENCE_S, "no robot to rate", robot)
-    first_s = time.monotonic() - began
-    _say(f"first robot after      {first_s:6.0f} s")
+    wait_until(PATIENCE_S, "no robot to rate", robots)
+    first_s = people[0].first_s or 0.0
     for share in (0.1, 0.25, 0.5, 0.75):
         late = [each for each in told if each[0] >= share * first_s]
         if late:
             at_s, left_s = late[0]
             _say(f"  told at {at_s:4.0f} s: {left_s / 60:.0f} min to go, in truth {(first_s - at_s) / 60:.1f}")
-    wait_until(PATIENCE_S, "not all robots", lambda: _all_films(database, participant_id) or None)
-    _say(f"every robot after      {time.monotonic() - began:6.0f} s")
-    wait_until(PATIENCE_S, "no before and after", lambda: _debriefed(database, participant_id) or None)
-    _say(f"before and after after {time.monotonic() - began:6.0f} s")
+    for each in people:
+        wait_until(PATIENCE_S, "not all robots", lambda each=each: _all_films(database, each.participant.id) or None)
+        _say(f"{each.participant.code}: every robot after {time.monotonic() - began:6.0f} s")
+    after_all_films()
+    for each in people:
+        wait_until(PATIENCE_S, "no debrief", lambda each=each: _debriefed(database, each.participant.id) or None)
+        _say(f"{each.participant.code}: before and after after {time.monotonic() - began:6.0f} s")
+
+
+def after_all_films() -> None:
+    """What is to happen then."""
 
 
 def _all_films(database: Database, participant_id: int) -> bool:

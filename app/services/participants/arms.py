@@ -5,9 +5,9 @@ who have completed it or are on their way through it; a lot decides between arms
 Biometrics 31, 103, with the arm alone as factor and certainty for the arm that is behind). Who has been silent for ten
 minutes has left in most cases, or comes back another day, and only decides between arms that are level otherwise. Who
 has given no sign for as long as the study says is not on their way at all, so that the next one replaces them; should
-they come back, they count again. An arm is open unless it has been stopped or as many as its quota have completed it or are about to. The lot follows from the study's
-secret and the participant's number, and is kept with the counts, so that it can be drawn again after unblinding.
-How far apart completed arms come: docs/results/arms.md.
+they come back, they count again. An arm is open unless it has been stopped or as many as its quota have completed it or
+are about to. The lot follows from the study's secret and the participant's number, and is kept with the counts, so that
+it can be drawn again after unblinding. How far apart completed arms come: docs/results/arms.md.
 """
 
 from collections.abc import Mapping

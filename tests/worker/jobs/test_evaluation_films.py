@@ -17,6 +17,7 @@ from app.domain.evaluation import Controller, Film, Trial
 from app.domain.models import Model, ModelKind, Run, RunKind, RunStatus
 from app.domain.preferences import Query, Response
 from app.domain.protocol import FROM_OTHERS, PAPER_METHODS, EvaluatedMethod, EvaluationMode, EvaluationSettings
+from app.domain.run_keys import TRIALS
 from app.domain.studies import Participant, Study
 from app.services.evaluation import evaluation_plan
 from app.storage import ArtefactStore
@@ -24,6 +25,7 @@ from tests.worker.at_hand import AtHand, at_once
 from worker.compute import baseline_fitting
 from worker.domain.trajectory import SIGNALS
 from worker.jobs import reconcile
+from worker.jobs.clips import evaluation_films
 from worker.jobs.clips.evaluation_films import make_films
 from worker.jobs.learning.baselines import train_method
 from worker.jobs.runtime import due_lending, records
@@ -222,6 +224,9 @@ def test_while_their_own_filter_is_fitted_the_other_robots_are_filmed_and_nothin
     trials, _ = due(database, RunKind.FILMS)
     assert names([trials]) == ["films/participant-1/trials"]
     make_films(context, others, run_id, at_once)
+    filmed, *rest = evaluation_films._portions(context, trials, TRIALS)
+    assert {method for method, *_ in filmed} == {"prefft", "reference"}
+    assert [[method for method, *_ in portion] for portion in rest] == [["pbarl"]]
     done(context, trials, make_films)
     with database.reading() as session:
         assert {film.id for film in films} < set(session.scalars(select(Film.id)))

@@ -17,6 +17,7 @@ from app.domain.studies import Awaited, Participant, Study
 from app.services.evaluation import donors
 from tests.worker.invented import job_of
 from worker.compute.pools import Compute, Lane
+from worker.jobs.runtime import lanes as lanes_module
 from worker.jobs.runtime import records
 from worker.jobs.runtime.lanes import Lanes
 from worker.jobs.runtime.records import Job
@@ -235,7 +236,32 @@ def test_a_long_job_that_began_earlier_gives_way_within_one_task(database: Datab
     assert len(compute.order) == 8, "and the long job is finished afterwards"
 
 
-def test_while_somebody_waits_no_lane_takes_what_nobody_is_here_for(database: Database, study: Study) -> None:
+def test_between_two_works_of_somebody_who_waits_nothing_else_slips_in(
+    database: Database, study: Study, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with database.writing() as session:
+        waiting = add_person(session, study, Awaited.ROBOTS, seen=1, waiting=5)
+    lanes = Lanes(Compute(1))
+    with database.reading() as session:
+        lanes.who_waits = WhoWaits.look(session)
+    with lanes.working(Lane.LEARNING, films(waiting)):
+        pass
+    assert lanes._holds_back(Lane.CLIPS, Level.UNOPENED)
+    assert not lanes._holds_back(Lane.CLIPS, Level.WAITING)
+    lanes.who_waits = WhoWaits()
+    assert not lanes._holds_back(Lane.CLIPS, Level.UNOPENED), "nobody waits any more"
+    monkeypatch.setattr(lanes_module, "LINGER_S", 0.0)
+    with database.reading() as session:
+        lanes.who_waits = WhoWaits.look(session)
+    with lanes.working(Lane.LEARNING, films(waiting)):
+        pass
+    assert not lanes._holds_back(Lane.CLIPS, Level.UNOPENED), "and not for ever, whatever they still wait for"
+
+
+def test_while_somebody_waits_no_lane_takes_what_nobody_is_here_for(
+    database: Database, study: Study, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lanes_module, "LINGER_S", 0.0)
     with database.writing() as session:
         waiting = add_person(session, study, Awaited.ROBOTS, seen=1, waiting=5)
         unopened = add_study(session, "unopened", study)

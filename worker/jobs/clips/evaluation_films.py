@@ -6,6 +6,7 @@ learning), ``ahead`` (what of both is the reference, while they still answer), `
 physical mode).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -50,13 +51,14 @@ def make_films(context: WorkerContext, job: Job, run_id: int, step: Step) -> Non
         repairs.make_again(context, job, run_id, step)
         return
     what = job.about.subject
-    shots = step("plan", _plan, context, job, what)
-    for first in range(0, len(shots), AT_A_TIME):
-        if step(f"is-outdated-{first}", _is_outdated, context, job, what):
+    portions, done = step("plan", _portions, context, job, what), 0
+    count = sum(map(len, portions))
+    for some in portions:
+        if step(f"is-outdated-{done}", _is_outdated, context, job, what):
             return
-        context.report(run_id, f"{_DOING[what]} {first + 1} of {len(shots)}", first / len(shots))
-        some = shots[first : first + AT_A_TIME]
-        step(f"shots-{first}", _pack if what == CONTROLLERS else _film, context, run_id, job, some)
+        context.report(run_id, f"{_DOING[what]} {done + 1} of {count}", done / count)
+        step(f"shots-{done}", _pack if what == CONTROLLERS else _film, context, run_id, job, some)
+        done += len(some)
     step("check", _check, context, job, what)
 
 
@@ -87,6 +89,23 @@ def _is_outdated(context: WorkerContext, job: Job, what: str) -> bool:
         own = replace(job.about, kind=RunKind.FILTER, subject="")
         comes_with_the_rest = what == OTHERS and records.has_succeeded(session, str(own))
         return comes_with_the_rest or due_work.is_outdated(session, job)
+
+
+def _portions(context: WorkerContext, job: Job, what: str) -> list[list[list[Any]]]:
+    """What is planned: first all that is filmed already, then the rest, so many at a time that no process is idle."""
+    shots = _plan(context, job, what)
+    filmed = []
+    if what != CONTROLLERS:
+        with context.database.reading() as session:
+            filmed = [each for each in shots if _film_of(session, job, each) is not None]
+    rest = [each for each in shots if each not in filmed]
+    portions = [rest[first : first + AT_A_TIME] for first in range(0, len(rest), AT_A_TIME)]
+    return [filmed, *portions] if filmed else portions
+
+
+def _film_of(session: Session, job: Job, shot: Sequence[Any]) -> Film | None:
+    method, model_id, scenario = shot
+    return evaluation_plan.film_of(session, job.participant, method, scenario, model_id)
 
 
 def _plan(context: WorkerContext, job: Job, what: str) -> list[list[Any]]:
@@ -145,15 +164,12 @@ def _newest_model(session: Session, participant_id: int, method: str) -> int | N
 
 def _film(context: WorkerContext, run_id: int, job: Job, shots: list[list[Any]]) -> None:
     task = _task(context, job)
-    wanted = dict.fromkeys((method, model_id) for method, model_id, _ in shots)
-    robots = {method: _robot(context, run_id, task, method, model_id) for method, model_id in wanted}
     with context.database.reading() as session:
         quality = session.get_one(Study, job.study_id).settings.clip_quality.value
-        missing = [
-            (robots[method], scenario)
-            for method, model_id, scenario in shots
-            if evaluation_plan.film_of(session, job.participant, method, scenario, model_id) is None
-        ]
+        unfilmed = [each for each in shots if _film_of(session, job, each) is None]
+    wanted = dict.fromkeys((method, model_id) for method, model_id, _ in unfilmed)
+    robots = {method: _robot(context, run_id, task, method, model_id) for method, model_id in wanted}
+    missing = [(robots[method], scenario) for method, _, scenario in unfilmed]
     arguments = [(task, quality, robot.controller, scenario) for robot, scenario in missing]
     recorded = context.compute.run_all(Lane.CLIPS, context.beat(run_id), simulation.film, arguments)
     files = [_stored(context, each) for each in recorded]

@@ -5,6 +5,7 @@ of many minutes ask is_needed_elsewhere() and pause at a checkpoint. Lanes share
 somebody waits for is in any lane but the patient one, no lane takes tasks that nobody is here for.
 """
 
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from contextlib import contextmanager
@@ -21,6 +22,8 @@ R = TypeVar("R")
 
 AHEAD = 1
 """Tasks in a lane beside those at work, so that no process waits for its next."""
+LINGER_S = 5.0
+"""So long after work that somebody waits for its lane stays theirs: what they need next comes a few seconds later."""
 
 
 @dataclass
@@ -32,6 +35,8 @@ class Lanes:
 
     def __post_init__(self) -> None:
         self._in_hand: list[tuple[Lane, Job]] = []
+        self._lately: dict[tuple[Lane, Job], float] = {}
+        """until when work that is done counts as if it were in hand"""
         self._gates = {
             lane: Gate(
                 self.compute.size(lane) + (AHEAD if lane != Lane.PATIENT else 0), partial(self._holds_back, lane)
@@ -53,11 +58,15 @@ class Lanes:
         try:
             yield
         finally:
+            moment = time.monotonic()
+            still = {each: until for each, until in self._lately.items() if until > moment}
+            self._lately = still | {(lane, job): moment + LINGER_S}
             self._in_hand.remove((lane, job))
 
     def _holds_back(self, lane: Lane, level: Level) -> bool:
         """In a lane whose work somebody waits for, everything else; in the others, what nobody is here for."""
-        awaited = {where for where, job in tuple(self._in_hand) if self._level(job) == Level.WAITING}
+        lately = [each for each, until in self._lately.items() if until > time.monotonic()]
+        awaited = {where for where, job in (*tuple(self._in_hand), *lately) if self._level(job) == Level.WAITING}
         return (level > Level.WAITING and lane in awaited) or (level > Level.ASKED and bool(awaited))
 
     def _level(self, job: Job) -> Level:
