@@ -6,8 +6,8 @@ Scripted users (5 % mistakes, 10 % "equal") answer 200 pairs of a pool as large 
 After every tenth answer up to 100 and every twentieth after that a model is fitted and picks a mode. Told that more
 answers hardly pay: whom app.services.answers.stopping_advice says it of within 100 answers. Wrong: who would have
 gained more than 3 % of what they mind and like under the reference policy by going on to 200. The rule was chosen by
-the first 18 chains of a task and tried on the others, of whom most go on beyond 100 answers only if they are told: the
-others cannot be told wrongly. The pools and every finished chain are kept under data/: repeat the command to go on.
+the first 18 chains of a task and tried on the others. The pools and every finished chain are kept under data/: repeat
+the command to go on.
 """
 
 import csv
@@ -39,8 +39,6 @@ TRIED_ON = [
     *((f"person-{number}", 0) for number in range(4, 31)),
     *product((user for user in answering.PEOPLE if not user.startswith("person")), (2, 3, 4)),
 ]
-TRIED_LATER = [(f"person-{number}", 0) for number in range(31, 331)]
-"""Who go on beyond TOLD_BY answers only if they are told."""
 RULES = {
     "relative regret (the advice)": ("relative_regret", stopping_advice.SMALL_REGRET, stopping_advice.IN_A_ROW),
     "regret in deviations (before)": ("regret_in_deviations", 0.2, 3),
@@ -71,7 +69,7 @@ def main() -> None:
     kept, benches, rows = options.pools / "advice", dict[str, Bench](), list[Row]()
     kept.mkdir(parents=True, exist_ok=True)
     # User by user, so that whoever stops early has all tasks.
-    planned = [Chain(task, *who, "") for who in CHOSEN_BY + TRIED_ON + TRIED_LATER for task in catalogue.names()]
+    planned = [Chain(task, *who, "") for who in CHOSEN_BY + TRIED_ON for task in catalogue.names()]
     for chain in tqdm(planned, unit="chain", mininterval=5):
         if chain.task not in benches:
             benches[chain.task] = Bench(chain.task, options.pools, {"": Variant()})
@@ -86,31 +84,19 @@ def main() -> None:
 
 def _measured(bench: Bench, chain: Chain, file: Path) -> Iterator[Row]:
     if not file.exists():
-        members = np.array([*_answered(bench, chain)])
+        models = [each.model for each in bench.answered(chain, COUNTS)]
+        members = np.array([model.signal_weights(()) for model in models])
         modes = np.array([best_mode(bench.surface, each, chain.seed) for each in members])
         unfinished = file.with_suffix(".partial.npz")
         np.savez(unfinished, allow_pickle=False, members=members, modes=modes)
         unfinished.rename(file)
     with np.load(file, allow_pickle=False) as stored:
-        known = list(zip(COUNTS, stored["members"], stored["modes"], strict=False))
+        known = list(zip(COUNTS, stored["members"], stored["modes"], strict=True))
     for count, members, mode in known:
         gained = bench.gained(chain.user, mode)
         regrets = relative_regret(bench.surface, members), regret_in_deviations(bench.surface, members)
         who = chain.task, chain.user, chain.seed
         yield Row(*who, count, *(round(each, 4) for each in (gained["gain_percent"], gained["best_percent"], *regrets)))
-
-
-def _answered(bench: Bench, chain: Chain) -> Iterator[FloatArray]:
-    """(E, S) weights of the model after each of COUNTS."""
-    known: list[tuple[int, float]] = []
-    for count, fitted in zip(COUNTS, bench.answered(chain, COUNTS), strict=True):
-        members = fitted.model.signal_weights(())
-        yield members
-        known.append((count, relative_regret(bench.surface, members)))
-        ends = range(1, len(known) + 1)
-        told = any(stopping_advice.enough_since(known[:end]) is not None for end in ends)
-        if count == TOLD_BY and not told and (chain.user, chain.seed) in TRIED_LATER:
-            return
 
 
 def regret_in_deviations(surface: ResponseSurface, members: FloatArray) -> float:

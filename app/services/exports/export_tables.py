@@ -71,8 +71,9 @@ TABLES: Sequence[Table] = (
             Column(
                 "lot",
                 N,
-                "Picked among the open arms with the fewest people completed or on their way. The first 13 hexadecimal "
-                "digits of SHA-256 of <secret>/evaluation/arm/<number of the participant>, divided by 16^13.",
+                "Picked among the open arms with the smallest completed + on_their_way - silent, of these the fewest "
+                "silent. The first 13 hexadecimal digits of SHA-256 of <secret>/evaluation/arm/<number of the "
+                "participant>, divided by 16^13.",
                 allowed="0 to 1",
             ),
             Column("considered", J, "By arm, as it was then: completed, on_their_way, of these silent, open."),
