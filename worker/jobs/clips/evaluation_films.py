@@ -94,7 +94,7 @@ def _is_outdated(context: WorkerContext, job: Job, what: str) -> bool:
 def _portions(context: WorkerContext, job: Job, what: str) -> list[list[list[Any]]]:
     """What is planned: first all that is filmed already, then the rest, so many at a time that no process is idle."""
     shots = _plan(context, job, what)
-    filmed = []
+    filmed: list[list[Any]] = []
     if what != CONTROLLERS:
         with context.database.reading() as session:
             filmed = [each for each in shots if _film_of(session, job, each) is not None]
