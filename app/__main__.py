@@ -261,6 +261,9 @@ def web(settings: Settings) -> int:
     """Run the web server alone, on a database that is already of this version."""
     import uvicorn  # it takes longer to load than most commands take
 
+    from app.web.http import connections
+
+    connections.allow_many_files()
     _require_free_port(settings)
     store = ArtefactStore.of(settings)
     store.files.require_usable()
@@ -277,6 +280,8 @@ def web(settings: Settings) -> int:
             access_log=False,  # it would tell personal links; ours tells routes
             proxy_headers=bool(settings.trusted_proxies),  # left alone, uvicorn believes whoever asks from this machine
             forwarded_allow_ips=settings.trusted_proxies or None,
+            timeout_keep_alive=connections.KEPT_OPEN_S,
+            http=connections.Connection,
             timeout_graceful_shutdown=5,
         )
     return 0

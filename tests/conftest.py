@@ -31,6 +31,7 @@ from app.main import create_routes, make_studio, serve
 from app.services.accounts import accounts, browser_sessions
 from app.settings import Settings
 from app.storage import ArtefactStore
+from app.web.http.connections import Connection
 from tests import buckets, databases
 from tests.databases import make_tables
 
@@ -199,7 +200,9 @@ def experimenter(client: TestClient, experimenter_cookie: str) -> TestClient:
 @contextmanager
 def serving(application: FastAPI) -> Iterator[str]:
     """Runs a real server on a free port; gives its address."""
-    server = uvicorn.Server(uvicorn.Config(application, port=0, log_level="warning", timeout_graceful_shutdown=3))
+    server = uvicorn.Server(
+        uvicorn.Config(application, port=0, http=Connection, log_level="warning", timeout_graceful_shutdown=3)
+    )
     thread = threading.Thread(target=server.run)
     thread.start()
     while not server.started:

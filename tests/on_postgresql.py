@@ -13,6 +13,7 @@ import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from urllib.parse import parse_qs, urlsplit
 
 import psycopg
 
@@ -74,26 +75,45 @@ def serving(programs: Path, configuration: Mapping[str, str] = FAST) -> Iterator
     with tempfile.TemporaryDirectory(prefix="studio-postgresql-", ignore_cleanup_errors=True) as folder:
         if os.geteuid() == 0:
             shutil.chown(folder, SERVER_USER)
-        data = f"{folder}/data"
-        making = [f"{programs}/initdb", "-D", data, "-U", "studio", "-E", "UTF8", "--locale=C.UTF-8", "--no-sync"]
-        _run([*making, "--auth=trust"], folder)
-        settings = {**configuration, "listen_addresses": "", "unix_socket_directories": folder}
-        options = [word for name, setting in settings.items() for word in ("-c", f"{name}={setting}")]
-        with open(f"{folder}/log", "w") as log:  # noqa: PTH123  (ours, while the directory is the server's)
-            server = subprocess.Popen(
-                _as_server_user([f"{programs}/postgres", "-D", data, *options]), cwd=folder, stderr=log
-            )
-        try:
-            until(lambda: server.poll() is not None or _answers(folder))
-            if server.poll() is not None:
-                raise RuntimeError(Path(folder, "log").read_text())
-            yield f"postgresql+psycopg://studio@/postgres?host={folder}"
-        finally:
-            server.terminate()
-            server.wait()
+        data = Path(folder, "data")
+        making = [f"{programs}/initdb", "-D", str(data), "-U", "studio", "-E", "UTF8", "--locale=C.UTF-8", "--no-sync"]
+        run([*making, "--auth=trust"], folder)
+        with running(programs, data, configuration) as url:
+            yield url
 
 
-def _run(command: Sequence[str], folder: str) -> None:
+@contextmanager
+def running(programs: Path, data: Path, configuration: Mapping[str, str]) -> Iterator[str]:
+    """The same on a data directory that is there; its socket and its log lie beside it."""
+    folder = str(data.parent)
+    settings = {**configuration, "listen_addresses": "", "unix_socket_directories": folder}
+    options = [word for name, setting in settings.items() for word in ("-c", f"{name}={setting}")]
+    with open(f"{folder}/log", "w") as log:  # noqa: PTH123  (ours, while the directory is the server's)
+        server = subprocess.Popen(
+            _as_server_user([f"{programs}/postgres", "-D", str(data), *options]), cwd=folder, stderr=log
+        )
+    try:
+        until(lambda: server.poll() is not None or _answers(folder))
+        if server.poll() is not None:
+            raise RuntimeError(Path(folder, "log").read_text())
+        yield f"postgresql+psycopg://studio@/postgres?host={folder}"
+    finally:
+        server.terminate()
+        server.wait()
+
+
+def folder_of(url: str) -> str:
+    """Where the socket and the data directory of a server of ours are."""
+    return parse_qs(urlsplit(url).query)["host"][0]
+
+
+def process_of(url: str) -> int:
+    """The number of the process that serves a database of ours, and is the parent of all that work for it."""
+    return int(Path(folder_of(url), "data", "postmaster.pid").read_text().split()[0])
+
+
+def run(command: Sequence[str], folder: str) -> None:
+    """A program of PostgreSQL, as the user that its server has. Raises RuntimeError with what it says."""
     made = subprocess.run(_as_server_user(command), cwd=folder, capture_output=True, text=True, check=False)
     if made.returncode:
         raise RuntimeError(made.stderr)

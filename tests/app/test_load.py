@@ -4,13 +4,14 @@ import asyncio
 import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from datetime import timedelta
 
 import pytest
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
 from sqlalchemy import Engine, event, select
 from sqlalchemy.exc import OperationalError
-from sqlalchemy.orm import Session
+from sqlalchemy.orm import ORMExecuteState, Session
 from starlette.routing import NoMatchFound
 
 from app.db import Database
@@ -18,6 +19,7 @@ from app.domain.models import ModelKind
 from app.domain.participation import ParticipantEvent
 from app.domain.studies import Participant, Study
 from app.errors import AppError
+from app.services.answers import next_query
 from app.services.monitoring import participant_status
 from app.services.monitoring.participant_status import GivenAnswer
 from app.services.monitoring.tallies import Tallies
@@ -56,8 +58,9 @@ def saved(person: TakingPart, place: int) -> list[tuple[str, object]]:
 
 
 def test_an_answer_takes_few_statements_however_much_was_answered_before(
-    taking_part: TakingPart, store: ArtefactStore
+    taking_part: TakingPart, store: ArtefactStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(next_query, "SEEN_EVERY", timedelta(days=1))  # else one statement more in a slow test
     taking_part.turn()
     early = saved(taking_part, 0)
     for query in taking_part.queries[1:8]:
@@ -69,6 +72,20 @@ def test_an_answer_takes_few_statements_however_much_was_answered_before(
     late = saved(taking_part, 8)
     assert len(early) <= len(late) <= MOST_STATEMENTS_PER_ANSWER
     assert len(late) - len(early) <= 2, "those for the time that is left, once the pace is known"
+
+
+def test_what_is_next_is_asked_in_one_statement_however_many_pairs_wait(taking_part: TakingPart) -> None:
+    taking_part.turn()
+    portions: list[object] = []
+
+    def note(context: ORMExecuteState) -> None:
+        portions.append(context.execution_options.get("yield_per"))  # a cursor on PostgreSQL: four ways there and back
+
+    event.listen(Session, "do_orm_execute", note)
+    taking_part.answer(taking_part.queries[0]).raise_for_status()
+    event.remove(Session, "do_orm_execute", note)
+    assert portions
+    assert set(portions) == {None}
 
 
 @pytest.mark.sqlite("PostgreSQL plans by statistics, and scans small tables")

@@ -1,9 +1,10 @@
 """Prints how long saving an answer and getting the next pair takes with many labellers, a busy worker, and dashboards.
 
     python -m tests.benchmarks.labellers --labellers 200 --thought 2 --dashboards 3 --seconds 60
+    python -m tests.benchmarks.labellers --labellers 1000 --thought 12 8 6 4 3 --servers 3 --postgresql
 
 The worker is the real one: it fills the study's pool of clips all the time, at its lower priority. Phases without and
-with it take turns, so that the machine's mood falls out of their ratio.
+with it take turns, so that the machine's mood falls out of their ratio; each is there for every time of thinking.
 """
 
 import argparse
@@ -20,7 +21,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import timedelta
-from itertools import cycle
+from itertools import cycle, product
 from pathlib import Path
 from statistics import quantiles
 from typing import Any
@@ -42,6 +43,8 @@ from tests.waiting import free_port
 STUDY = "/studies/feeding-at-home"
 GIVEN = 3
 """Answers of each labeller before it begins."""
+AT_THE_DOOR = 20
+"""How many open their personal links at the same time."""
 _TICK_S = 1 / os.sysconf("SC_CLK_TCK")
 
 
@@ -50,6 +53,8 @@ class Phase:
     """What was measured while something held."""
 
     name: str
+    thought_s: float
+    """how long everybody looks at a pair, on average"""
     times_ms: list[float] = field(default_factory=list)
     errors: list[str] = field(default_factory=list)
     seconds: float = 0.0
@@ -58,6 +63,8 @@ class Phase:
     ours_s: float = 0.0
     """that of this program, which plays the labellers"""
     worker_s: float = 0.0
+    database_s: float = 0.0
+    """that of PostgreSQL's server; SQLite's is the web servers'"""
     busy_s: float = 0.0
     """that of the whole machine, with whoever else is at work"""
 
@@ -109,58 +116,63 @@ async def _race(
     pids: Sequence[int],
     options: argparse.Namespace,
 ) -> None:
-    phases = {name: Phase(name) for name in ("no worker", "worker busy")}
-    current = Phase("between phases")
+    postgresql = on_postgresql.process_of(settings.database_url) if options.postgresql else None
+    phases = {key: Phase(*key) for key in product(("no worker", "worker busy"), options.thought)}
+    current = Phase("between phases", options.thought[0])
+    door = asyncio.Semaphore(AT_THE_DOOR)
     labellers = [
-        Labeller(address, token, options.thought, options.clips)
-        for address, token in zip(cycle(addresses), tokens, strict=False)
+        Labeller(address, token, options.clips, door) for address, token in zip(cycle(addresses), tokens, strict=False)
     ]
     answering = [asyncio.create_task(each.answer(lambda: current)) for each in labellers]
+    await asyncio.gather(*(each.is_in.wait() for each in labellers))
     looking = [asyncio.create_task(_look(addresses[0], cookie)) for _ in range(options.dashboards)]
-    for _ in range(options.rounds):
-        for name, phase in phases.items():
+    for turn in range(options.rounds):
+        for thought_s, name in product(options.thought, ("no worker", "worker busy")):
+            phase, current = phases[name, thought_s], Phase("between phases", thought_s)
             with ExitStack() as stack:
                 worker = None
                 if name == "worker busy":
                     worker = stack.enter_context(_program(settings, "worker", "run"))
-                await asyncio.sleep(options.settling)
-                current, before = phase, _Clocks(pids, worker)
+                await asyncio.sleep(max(options.settling, 1.5 * thought_s))
+                current, before = phase, _Clocks(pids, worker, postgresql)
                 await asyncio.sleep(options.seconds / options.rounds)
-                current = Phase("between phases")
-                before.add_to(phase, _Clocks(pids, worker))
+                current = Phase("between phases", thought_s)
+                before.add_to(phase, _Clocks(pids, worker, postgresql))
+            if turn == options.rounds - 1:
+                _print(phase, options)
     for task in (*answering, *looking):
         task.cancel()
     ended = await asyncio.gather(*answering, *looking, return_exceptions=True)
     fallen = [each for each in ended if isinstance(each, Exception)]
     _say(f"labellers and dashboards that fell: {len(fallen)} {fallen[:2]}")
-    for phase in phases.values():
-        _print(phase, options)
 
 
 class _Clocks:
     """Processor time used so far."""
 
-    def __init__(self, web: Sequence[int], worker: "subprocess.Popen[bytes] | None") -> None:
+    def __init__(self, web: Sequence[int], worker: "subprocess.Popen[bytes] | None", postgresql: int | None) -> None:
         self.at_s = time.perf_counter()
         self.web_s = sum(map(_processor_s, web))
         self.ours_s = time.process_time()
         self.worker_s = 0.0 if worker is None else _of_group(os.getpgid(worker.pid))
+        self.database_s = 0.0 if postgresql is None else _of_children(postgresql)
         fields = [int(each) for each in Path("/proc/stat").read_text().split("\n", 1)[0].split()[1:]]
         self.busy_s = _TICK_S * (sum(fields[:8]) - fields[3] - fields[4])
 
     def add_to(self, phase: Phase, later: "_Clocks") -> None:
         """Put what has passed until then to what was measured."""
         phase.seconds += later.at_s - self.at_s
-        for name in ("web_s", "ours_s", "worker_s", "busy_s"):
+        for name in ("web_s", "ours_s", "worker_s", "database_s", "busy_s"):
             setattr(phase, name, getattr(phase, name) + getattr(later, name) - getattr(self, name))
 
 
 class Labeller:
     """A browser with next to no processor time of its own, so that the server's share is what is measured."""
 
-    def __init__(self, address: str, token: str, thought_s: float, clips: bool) -> None:
+    def __init__(self, address: str, token: str, clips: bool, door: asyncio.Semaphore) -> None:
         self._random = random.Random(token)  # noqa: S311  (no secret)
-        self._address, self._token, self._thought_s, self._clips = address, token, thought_s, clips
+        self._address, self._token, self._clips, self._door = address, token, clips, door
+        self.is_in = asyncio.Event()
         self._cookie = ""
         self._loaded: set[str] = set()
         self._streams: tuple[StreamReader, StreamWriter] | None = None
@@ -173,14 +185,16 @@ class Labeller:
             self._hang_up()
 
     async def _compare(self, phase: Any) -> None:
-        await asyncio.sleep(self._random.uniform(0, self._thought_s))
-        _, headers, _ = await self._ask("GET", f"/p/{self._token}")
-        self._cookie = headers["set-cookie"]
-        pair = await self._next()
+        async with self._door:
+            _, headers, _ = await self._ask("GET", f"/p/{self._token}")
+            self._cookie = headers["set-cookie"]
+            pair = await self._next()
+        self.is_in.set()
+        await asyncio.sleep(self._random.uniform(0, phase().thought_s))
         while pair:
             if self._clips:
                 await self._load(pair)
-            await asyncio.sleep(self._random.uniform(0.5, 1.5) * self._thought_s)
+            await asyncio.sleep(self._random.uniform(0.5, 1.5) * phase().thought_s)
             form = {"response": "left", "client_uuid": str(uuid4()), "response_time_ms": "4000", "watched_whole": "1"}
             during, started = phase(), time.perf_counter()
             try:
@@ -209,6 +223,8 @@ class Labeller:
 
     async def _ask(self, method: str, path: str, form: str = "") -> tuple[int, Mapping[str, str], bytes]:
         place = urlsplit(self._address)
+        if self._streams is not None and self._streams[0].at_eof():  # the server does not wait as long as people think
+            self._hang_up()
         if self._streams is None:
             self._streams = await asyncio.open_connection(place.hostname, place.port)
         reader, writer = self._streams
@@ -275,25 +291,34 @@ def _program(settings: Settings, *command: str, **environment: str) -> Iterator[
 
 def _of_group(group: int) -> float:
     """Processor time of all processes of a group."""
-    used_s = 0.0
+    return sum(used_s for _, _, its_group, used_s in _processes() if its_group == group)
+
+
+def _of_children(parent: int) -> float:
+    """Processor time of a process and those it has started."""
+    return sum(used_s for process, its_parent, _, used_s in _processes() if parent in (process, its_parent))
+
+
+def _processes() -> Iterator[tuple[int, int, int, float]]:
+    """Number, parent, group, and processor time of each, with what its ended children used."""
     for path in Path("/proc").glob("[0-9]*/stat"):
         with suppress(OSError):
             fields = path.read_text().rpartition(")")[2].split()
-            if int(fields[2]) == group:
-                used_s += _TICK_S * sum(int(each) for each in fields[11:15])
-    return used_s
+            used_s = _TICK_S * sum(int(each) for each in fields[11:15])
+            yield int(path.parent.name), int(fields[1]), int(fields[2]), used_s
 
 
 def _print(phase: Phase, options: argparse.Namespace) -> None:
-    _say(f"{phase.name}: {options.labellers} labellers, {options.dashboards} dashboards")
+    thinking = f"{options.labellers} labellers who think for {phase.thought_s:g} s"
+    _say(f"{phase.name}: {thinking}, {options.dashboards} dashboards")
     if len(phase.times_ms) < 2:
         _say(f"  too few answers; errors: {phase.errors[:3]}")
         return
     cuts, count = quantiles(phase.times_ms, n=100), len(phase.times_ms)
-    others_s = phase.busy_s - phase.web_s - phase.ours_s - phase.worker_s
+    shares = {"web": phase.web_s, "database": phase.database_s, "worker": phase.worker_s, "labellers": phase.ours_s}
+    shares["others"] = phase.busy_s - sum(shares.values())
     _say(f"  save and next p50 {cuts[49]:.0f} ms, p95 {cuts[94]:.0f} ms, p99 {cuts[98]:.0f} ms")
     _say(f"  {count} answers, {count / phase.seconds:.0f} per second; errors: {len(phase.errors)} {phase.errors[:2]}")
-    shares = {"web": phase.web_s, "worker": phase.worker_s, "labellers": phase.ours_s, "others": others_s}
     told = ", ".join(f"{name} {used_s / phase.seconds:.0%}" for name, used_s in shares.items())
     _say(f"  of one processor: {told}; {1000 * phase.web_s / count:.1f} ms of the web server's for each answer")
 
@@ -302,7 +327,7 @@ def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--labellers", type=int, default=200)
     parser.add_argument(
-        "--thought", type=float, default=2.0, help="seconds per pair, on average; from half to 1.5 of it"
+        "--thought", type=float, nargs="+", default=[2.0], help="seconds per pair, on average; from half to 1.5 of it"
     )
     parser.add_argument("--dashboards", type=int, default=3)
     parser.add_argument("--people", type=int, default=20, help="others in the study, who are through with it")

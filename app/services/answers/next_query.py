@@ -135,6 +135,7 @@ _newest_response = (
 )  # NULL when there is no event, and when the newest takes an answer back
 _WAITING = (
     select(
+        Query.ordinal,
         Query.id,
         Query.purpose,
         Query.served_at,
@@ -142,9 +143,13 @@ _WAITING = (
     )
     .join(_left, _left.id == Query.left_clip_id)
     .join(_right, _right.id == Query.right_clip_id)
-    .where(Query.participant_id == bindparam("participant_id"), _newest_response.is_(None))
+    .where(
+        Query.participant_id == bindparam("participant_id"),
+        Query.ordinal > bindparam("after"),
+        _newest_response.is_(None),
+    )
     .order_by(Query.ordinal)
-    .execution_options(yield_per=1 + PAIRS_AHEAD)  # the rest of the list is of no interest
+    .limit(1 + PAIRS_AHEAD)  # the rest is of no interest, as long as these have their files
 )
 _SERVE = (
     update(Query)
@@ -233,8 +238,10 @@ def waits(participant: Participant, awaited: Awaited | None) -> None:
 
 
 def _ready(session: Session, store: ArtefactStore, participant: Participant) -> Iterator[ReadyQuery]:
-    with session.execute(_WAITING, {"participant_id": participant.id}) as rows:
-        for query_id, purpose, served_at, *clips in rows:
+    after = -1
+    while rows := session.execute(_WAITING, {"participant_id": participant.id, "after": after}).all():
+        after = rows[-1].ordinal
+        for _, query_id, purpose, served_at, *clips in rows:
             half = len(clips) // 2
             query = ReadyQuery(query_id, purpose, served_at, ClipFiles(*clips[:half]), ClipFiles(*clips[half:]))
             files = (sha256 for clip in (query.left, query.right) for sha256 in (clip.video_sha256, clip.poster_sha256))
