@@ -36,7 +36,7 @@ from worker.experiments.benchmark_cell import BenchmarkConfig, BenchmarkUser, Ce
 from worker.experiments.rollout_cache import RolloutCache
 from worker.ml import acquisition
 from worker.ml.filters.response_surface import CAUTION, ResponseSurface, best_mode
-from worker.ml.rewards import bradley_terry, pooled_prior
+from worker.ml.rewards import bradley_terry, prior
 from worker.ml.rewards.reward_models import RewardModel
 from worker.ml.teachers import TASTES, Manner, Taste, User
 from worker.sim.costs import signal_weights, stakes
@@ -58,7 +58,7 @@ HESITANT = Manner(rationality=3.0)
 class Choice:
     """What is chosen for everybody."""
 
-    deviation: float = pooled_prior.DEVIATION
+    deviation: float = prior.DEVIATION
     lapses: float = bradley_terry.LAPSES
     caution: float = CAUTION
     rule: acquisition.Strategy = BenchmarkConfig.rule
@@ -107,7 +107,7 @@ class UnkeptBench(BenchmarkUser):
 def answer(question: Question, work: Path) -> dict[str, Any]:
     """Regrets (U,) in %, by how much the own mode beats the best of the others' for each user, predicted success."""
     torch.set_num_threads(1)
-    pooled_prior.DEVIATION, bradley_terry.LAPSES = question.choice.deviation, question.choice.lapses
+    prior.DEVIATION, bradley_terry.LAPSES = question.choice.deviation, question.choice.lapses
     task = registry.task(question.task)
     surface = ResponseSurface.load(surface_file(task.name), task.modes)
     wishes = np.array([signal_weights(task, TASTES[user].omega, TASTES[user].per_signal) for user in USERS])
