@@ -5,7 +5,7 @@
 Scripted users label a pool as a study asks them to, and the search picks their mode; no filter is trained. The regret
 is what the response surface predicts the best mode of somebody's true weights to gain beyond the picked one, in % of
 what they mind and like under the reference policy. One choice at a time is changed: the prior's deviation, the share of
-lapses that the likelihood allows for, the caution about the members' spread, the rule that picks pairs. Label seeds
+lapses that the likelihood allows for, the rule that picks pairs. Label seeds
 from 100 on, which the tables of the benchmark do not use. Finished rows are kept under data/; repeat the command to go
 on.
 """
@@ -35,7 +35,7 @@ from worker.domain.task import Task
 from worker.experiments.benchmark_cell import BenchmarkConfig, BenchmarkUser, Cell
 from worker.experiments.rollout_cache import RolloutCache
 from worker.ml import acquisition
-from worker.ml.filters.response_surface import CAUTION, ResponseSurface, best_mode
+from worker.ml.filters.response_surface import ResponseSurface, best_mode
 from worker.ml.rewards import bradley_terry, prior
 from worker.ml.rewards.reward_models import RewardModel
 from worker.ml.teachers import TASTES, Manner, Taste, User
@@ -47,7 +47,7 @@ USERS = tuple(user.value for user in User)
 HARDLY_ANY = 0.001
 """Share of lapses. With none at all a sure model finds a slip impossible, and its likelihood has no logarithm."""
 COLUMNS = (
-    *("task", "labels", "hesitant", "deviation", "lapses", "caution", "rule", "seed", "user"),
+    *("task", "labels", "hesitant", "deviation", "lapses", "rule", "seed", "user"),
     *("regret_percent", "own_advantage_percent", "success_points"),
 )
 HESITANT = Manner(rationality=3.0)
@@ -60,7 +60,6 @@ class Choice:
 
     deviation: float = prior.DEVIATION
     lapses: float = bradley_terry.LAPSES
-    caution: float = CAUTION
     rule: acquisition.Strategy = BenchmarkConfig.rule
 
     @property
@@ -78,8 +77,6 @@ CHOICES = (
     Choice(deviation=2.0),
     Choice(deviation=6.0),
     Choice(lapses=HARDLY_ANY),
-    Choice(caution=0.0),
-    Choice(caution=2.0),
     Choice(rule="uniform"),
     Choice(rule="disagreement"),
     Choice(rule="information_gain"),
@@ -121,7 +118,7 @@ def answer(question: Question, work: Path) -> dict[str, Any]:
             Cell(task.name, TASTES[user], "pbarl", question.seed), terms, RolloutCache(task.name, work), work
         )
         learned = bench.reward.signal_weights([])
-        mode = best_mode(surface, learned, question.seed, caution=question.choice.caution)
+        mode = best_mode(surface, learned, question.seed)
         change, success = surface.predict(mode)
         gains.append(wishes @ change / unit)
         lost.append(100 * float(success))

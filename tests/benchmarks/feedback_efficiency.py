@@ -261,7 +261,7 @@ class Bench:
             said = np.array([TARGETS[teacher.answer(left, right, rng)] for left, right in rewards[rows]])
             features = self.pool.segments(self.pairs[rows]).signal_differences() / self.scale.spread
             weights.append(reward_training.posterior(features, said, self.prior).mean)
-        return self.prior.or_like(weights)
+        return self.prior.or_like("earlier", weights)
 
     def rewards(self, user: str, pool: Pool) -> FloatArray:
         """True preference rewards, (C, T)."""

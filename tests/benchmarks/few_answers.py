@@ -3,12 +3,12 @@
     python -m tests.benchmarks.few_answers
 
 Scripted users (5 % mistakes, 10 % "equal") answer pairs of a pool as large as a study's, chosen by entropy, 30 % at
-random, a model every ten answers, every twenty from 100 on. "before" is what was done until decision 135: nobody is known, and a mode's return
-counts less by the deviation of the model's members. "pooled": twelve earlier people of the population are known as
-well; before, they were the whole prior. The search picks the user's mode without trials; its gain of the true
-preference, in % of what the user minds and likes under the reference policy, is what the response surface predicts.
-Models are posteriors without the temperature of their probabilities, which hardly matters to what is asked. Every
-finished chain is kept in --output: repeat the command to go on.
+random, a model every ten answers, every twenty from 100 on. "before" is what was done until decision 135: nobody is
+known, and a mode's return counts less by the deviation of the model's members. "pooled": twelve earlier people of the
+population are known as well; before, they were the whole prior. The search picks the user's mode without trials; its
+gain of the true preference, in % of what the user minds and likes under the reference policy, is what the response
+surface predicts. Models are posteriors without the temperature of their probabilities, which hardly matters to what is
+asked. Every finished chain is kept in --output: repeat the command to go on.
 """
 
 import csv
@@ -23,10 +23,12 @@ from scipy import stats
 from tqdm import tqdm
 
 from app.installed_tasks import catalogue
+from app.services.answers import stopping_advice
 from tests.benchmarks import answering
 from tests.benchmarks.answering import Bench, Variant
 from tests.benchmarks.chosen_modes import stake
 from worker.analysis.comparison import result_pages
+from worker.analysis.wilson import wilson_interval
 from worker.domain.responses import TARGETS
 from worker.domain.trajectory import SIGNALS
 from worker.domain.type_aliases import FloatArray
@@ -36,6 +38,7 @@ from worker.ml.rewards.bradley_terry import probability_right
 from worker.ml.rewards.prior import Population, Prior
 from worker.ml.rewards.reward_models import NEVER_WANTED
 from worker.ml.rewards.reward_training import antithetic, posterior
+from worker.ml.stopping import relative_regret
 from worker.ml.teachers import TASTES, Manner, ScriptedTeacher, Taste
 from worker.sim.costs import preference_rewards, signal_weights
 
@@ -49,8 +52,9 @@ FIRST = 500
 """of the numbers of people whom no choice was made by"""
 VARIANTS = {"before": COUNTS, "now": COUNTS, "before, pooled": FEW, "now, pooled": FEW}
 COSTS = [column for column, name in enumerate(SIGNALS) if name in NEVER_WANTED]
+GROUPS = ("named", "drawn", "outside")
 WORTHWHILE = (3.0, 60.0)
-"""% of the stake that the best mode gains: others outside the population are drawn again"""
+"""% of the stake that the best mode gains. Others outside the population are drawn again"""
 
 
 class Row(NamedTuple):
@@ -67,6 +71,10 @@ class Row(NamedTuple):
     success_points: float
     like_nobody_known: float
     """how likely it is that the user is of none of the prior's populations"""
+    told_after: int
+    """answers after which it was said that more hardly pay; 0: not yet, or not looked at"""
+    told_gain: float
+    """gain_percent of the mode at that time"""
     mode: str
 
 
@@ -80,7 +88,12 @@ class Wish(NamedTuple):
     """(S,)"""
     unit: float
     """a hundredth of the stake"""
-    best_percent: float
+    best: float
+    """% of the stake that the best mode gains"""
+
+    def gain(self, surface: ResponseSurface, mode: FloatArray) -> float:
+        """% of the stake that a mode gains."""
+        return float(surface.predict(mode)[0] @ self.weights / self.unit)
 
 
 class FewAnswers(Bench):
@@ -98,25 +111,31 @@ class FewAnswers(Bench):
 
     def rows(self, chain: Chain) -> Iterator[Row]:
         """Answer, learn, choose, and so on."""
-        task, group, user, seed, variant = chain
+        _, group, user, seed, variant = chain
         taste, rng = self.tastes[group][user], np.random.default_rng([seed, 7])
         wish, rewards = self.wish(taste), self._rewards(taste)
         teacher = ScriptedTeacher.calibrated(Manner(), rewards)
+        search = cautious_mode if variant.startswith("before") else best_mode
         asked, answers, members = np.zeros(0, np.int64), np.zeros(0), None
+        regrets, told_after, told_gain = list[tuple[int, float]](), 0, 0.0
         for count in sorted(each for each in CHOOSE_AT if each <= VARIANTS[variant][-1]):
             added = self._ask(count - len(asked), asked, members, rng)
             said = [TARGETS[teacher.answer(left, right, rng)] for left, right in rewards[added]]
             asked, answers = np.concatenate([asked, added]), np.concatenate([answers, said])
             found = posterior(self.features[asked], answers, self.priors[variant], COSTS)
             members = antithetic(found.mean, found.covariance, np.random.default_rng(seed))
+            wanted = members / self.scale.spread
+            if variant == "now" and count % 10 == 0 and not told_after:
+                regrets.append((count, relative_regret(self.surface, wanted)))
+                if stopping_advice.enough_since(regrets):
+                    told_after, told_gain = count, wish.gain(self.surface, search(self.surface, wanted, seed))
             if count in VARIANTS[variant]:
-                search = cautious_mode if variant.startswith("before") else best_mode
-                mode = search(self.surface, members / self.scale.spread, seed)
-                change, success = self.surface.predict(mode)
-                gain = float(change @ wish.weights / wish.unit)
+                mode = search(self.surface, wanted, seed)
                 nobody = float(found.shares[0]) if variant.startswith("now") else 1.0
-                numbers = (round(each, 3) for each in (gain, wish.best_percent, 100 * float(success), nobody))
-                yield Row(task, group, user, seed, variant, count, *numbers, " ".join(f"{each:.3f}" for each in mode))
+                success = 100 * float(self.surface.predict(mode)[1])
+                numbers = [round(each, 3) for each in (wish.gain(self.surface, mode), wish.best, success, nobody)]
+                rounded = " ".join(f"{each:.3f}" for each in mode)
+                yield Row(*chain, count, *numbers, told_after, round(told_gain, 3), rounded)
 
     def _ask(
         self, count: int, asked: acquisition.Indices, members: FloatArray | None, rng: np.random.Generator
@@ -129,10 +148,8 @@ class FewAnswers(Bench):
 
     def wish(self, taste: Taste) -> Wish:
         """See Wish."""
-        weights = signal_weights(self.task, taste.omega, taste.per_signal)
-        unit = stake(self.task, taste) / 100
-        change, _ = self.surface.predict(best_mode(self.surface, weights, 0))
-        return Wish(weights, unit, float(change @ weights / unit))
+        wish = Wish(signal_weights(self.task, taste.omega, taste.per_signal), stake(self.task, taste) / 100, 0.0)
+        return wish._replace(best=wish.gain(self.surface, best_mode(self.surface, wish.weights, 0)))
 
     def _rewards(self, taste: Taste) -> FloatArray:
         """(M, 2, T) true preference rewards of all pairs."""
@@ -148,8 +165,8 @@ class FewAnswers(Bench):
         return {
             "before": nobody,
             "now": self.prior,
-            "before, pooled": Prior((Population.of(np.array(earlier)),)),
-            "now, pooled": self.prior.or_like(known),
+            "before, pooled": Prior((Population.of("earlier", np.array(earlier)),)),
+            "now, pooled": self.prior.or_like("earlier", known),
         }
 
     def _earlier(self, number: int, prior: Prior) -> FloatArray:
@@ -164,7 +181,7 @@ class FewAnswers(Bench):
     def _outsider(self, number: int) -> Taste:
         """Somebody whom the population does not have, and for whom something is to be gained."""
         drawn = (self._drawn_outside(number, np.random.default_rng([number, attempt, 77])) for attempt in range(1000))
-        return next(each for each in drawn if WORTHWHILE[0] <= self.wish(each).best_percent <= WORTHWHILE[1])
+        return next(each for each in drawn if WORTHWHILE[0] <= self.wish(each).best <= WORTHWHILE[1])
 
     def _drawn_outside(self, number: int, rng: np.random.Generator) -> Taste:
         """By turns: two signals minded instead of liked or the reverse, each as much as all else together where nobody
@@ -181,7 +198,10 @@ class FewAnswers(Bench):
             return Taste(f"single-{number}", (0.1,) * 6, {name: 3 * sign * usual / size[name]})
         if kind == "extreme":
             omega = tuple(float(each) for each in 25.0 ** rng.uniform(-1.0, 1.0, 6))
-            much = {str(name): float(rng.choice([-1, 1]) * 5.0 ** rng.uniform(-1, 1)) for name in rng.choice(free, 3, replace=False)}
+            much = {
+                str(name): float(rng.choice([-1, 1]) * 5.0 ** rng.uniform(-1, 1))
+                for name in rng.choice(free, 3, replace=False)
+            }
             return Taste(f"extreme-{number}", omega, {name: each * usual / size[name] for name, each in much.items()})
         omega = tuple(float(each) for each in 5.0 ** rng.uniform(-1.0, 1.0, 6))
         wants = dict(zip(SIGNALS, signal_weights(self.task, omega), strict=True))
@@ -231,7 +251,10 @@ def main() -> None:
         for user, seed in product(tastes, range(options.seeds))
         for variant in VARIANTS
     ]
-    planned.sort(key=lambda chain: (chain[3], "pooled" in chain[4]))
+    places = {
+        user: place for bench in benches.values() for group in GROUPS for place, user in enumerate(bench.tastes[group])
+    }
+    planned.sort(key=lambda chain: (chain[3], "pooled" in chain[4], places[chain[2]]))  # who stops early has all tasks
     done = finished(file)
     with file.open("a", newline="") as stream:
         writer = csv.writer(stream, lineterminator="\n")
@@ -243,7 +266,11 @@ def main() -> None:
                 writer.writerows(done[chain])
                 stream.flush()
     rows = [row for chain in planned for row in done[chain]]
-    page.write_text(result_pages.page(page, TITLE, "\n\n".join([table_of_gains(rows), table_of_pooling(benches, rows)])))
+    page.write_text(
+        result_pages.page(
+            page, TITLE, "\n\n".join([table_of_gains(rows), table_of_pooling(benches, rows), table_of_advice(rows)])
+        )
+    )
 
 
 def finished(file: Path) -> dict[Chain, list[Row]]:
@@ -251,8 +278,9 @@ def finished(file: Path) -> dict[Chain, list[Row]]:
     found: dict[Chain, list[Row]] = {}
     for row in csv.DictReader(file.read_text().splitlines()) if file.exists() else []:
         who = row["task"], row["group"], row["user"], int(row["seed"]), row["variant"]
-        numbers = (float(row[name]) for name in Row._fields[6:10])
-        found.setdefault(who, []).append(Row(*who, int(row["labels"]), *numbers, row["mode"]))
+        numbers = [float(row[name]) for name in Row._fields[6:10]]
+        told = int(row["told_after"]), float(row["told_gain"])
+        found.setdefault(who, []).append(Row(*who, int(row["labels"]), *numbers, *told, row["mode"]))
     return {chain: rows for chain, rows in found.items() if len(rows) == len(VARIANTS[chain[4]])}
 
 
@@ -278,7 +306,7 @@ def table_of_gains(rows: Sequence[Row]) -> str:
         "| now 25 - before 100 | now 50 - before 200 | both at 100 | both at 200 |",
         "|" + "---|" * 15,
     ]
-    for task, group in product(catalogue.names(), ("named", "drawn", "outside")):
+    for task, group in product(catalogue.names(), GROUPS):
         gains = {
             (variant, count): _by_user(rows, task, group, variant, count)
             for variant, count in product(("before", "now"), COUNTS)
@@ -299,10 +327,8 @@ def table_of_pooling(benches: Mapping[str, FewAnswers], rows: Sequence[Row]) -> 
         "| people | answers | prior | gained, % | own mode best | own beyond the better of the others' |",
         "|---|---|---|---|---|---|",
     ]
-    for group, count, variant in product(("named", "drawn", "outside"), FEW, VARIANTS):
-        chosen = [
-            row for row in rows if (row.group, row.labels, row.variant, row.seed) == (group, count, variant, 0)
-        ]
+    for group, count, variant in product(GROUPS, FEW, VARIANTS):
+        chosen = [row for row in rows if (row.group, row.labels, row.variant, row.seed) == (group, count, variant, 0)]
         advantages = np.concatenate(
             [_advantages(benches[task], [row for row in chosen if row.task == task]) for task in benches]
         )
@@ -311,6 +337,21 @@ def table_of_pooling(benches: Mapping[str, FewAnswers], rows: Sequence[Row]) -> 
             f"| {group} | {count} | {variant} | {gained:.1f} | {(advantages > 0).sum()} of {len(advantages)} "
             f"| {_interval(advantages)} |"
         )
+    return "\n".join(lines)
+
+
+def table_of_advice(rows: Sequence[Row]) -> str:
+    """Who is told within 100 answers that more hardly pay, and what going on to 200 would have gained them."""
+    lines = ["| task | people | told | after | would have gained more than 3 points | in the mean |", "|" + "---|" * 6]
+    for task, group in product(catalogue.names(), GROUPS):
+        last = [row for row in rows if (row.task, row.group, row.variant, row.labels) == (task, group, "now", 200)]
+        told = [row for row in last if 0 < row.told_after <= 100]
+        lost = np.array([row.gain_percent - row.told_gain for row in told])
+        after = f"{np.mean([row.told_after for row in told]):.0f}" if told else "-"
+        mean = f"{lost.mean():.1f}" if told else "-"
+        low, high = wilson_interval(int((lost > 3.0).sum()), len(told)) if told else (0.0, 1.0)
+        wrong = f"{(lost > 3.0).sum()} of {len(told)} [{100 * max(low, 0.0):.0f}, {100 * high:.0f} %]"
+        lines.append(f"| {task.capitalize()} | {group} | {len(told)} of {len(last)} | {after} | {wrong} | {mean} |")
     return "\n".join(lines)
 
 

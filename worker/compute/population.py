@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 
 from worker.domain.type_aliases import FloatArray
-from worker.ml.rewards.prior import Prior, standardised_weights
+from worker.ml.rewards.prior import EARLIER, SCRIPTED, Prior, standardised_weights
 from worker.ml.rewards.reward_models import RewardModel
 from worker.ml.teachers import random_taste
 from worker.sim.costs import signal_weights
@@ -23,8 +23,8 @@ def prior_of(task: str | None, spread: FloatArray, earlier: Sequence[RewardModel
     prior = Prior.standard(len(spread))
     if task is not None and not registry.task(task).is_a_labs:
         wants = scripted_weights(task) * spread
-        prior = prior.or_like(DECIDEDNESS * wants / np.linalg.norm(wants, axis=1, keepdims=True))
-    return prior.or_like(standardised_weights(earlier, spread))
+        prior = prior.or_like(SCRIPTED, DECIDEDNESS * wants / np.linalg.norm(wants, axis=1, keepdims=True))
+    return prior.or_like(EARLIER, standardised_weights(earlier, spread))
 
 
 @cache

@@ -18,6 +18,8 @@ from worker.ml.rewards.reward_models import RewardModel, StructuredReward
 DEVIATION = 4.0
 """Of every weight of somebody who is like nobody known: wide, because a narrow prior spreads what is wanted over all
 signals that go along with it (docs/results/chosen_modes.md)."""
+NOBODY_KNOWN, SCRIPTED, EARLIER = "nobody known", "scripted people", "earlier participants"
+"""What populations are called."""
 FEWEST_PEOPLE = 3
 """Fewer are no population."""
 SHARED, OWN, FLOOR = 0.7, 0.3, 0.05
@@ -28,6 +30,8 @@ SHARED, OWN, FLOOR = 0.7, 0.3, 0.05
 class Population:
     """People whose weights are N(mean, covariance), in log odds per standard deviation of a pair."""
 
+    name: str
+    """in a model's metrics"""
     mean: FloatArray
     """(S,)"""
     covariance: FloatArray
@@ -36,14 +40,14 @@ class Population:
     @classmethod
     def anybody(cls, size: int) -> Self:
         """N(0, DEVIATION^2 I)"""
-        return cls(np.zeros(size), DEVIATION**2 * np.eye(size))
+        return cls(NOBODY_KNOWN, np.zeros(size), DEVIATION**2 * np.eye(size))
 
     @classmethod
-    def of(cls, weights: FloatArray) -> Self:
+    def of(cls, name: str, weights: FloatArray) -> Self:
         """From the weights of P people, (P, S): their mean, .7 covariance + .3 diagonal + .05 of anybody()."""
         covariance = np.cov(weights, rowvar=False)
         shrunk = SHARED * covariance + OWN * np.diag(np.diag(covariance))
-        return cls(weights.mean(axis=0), shrunk + FLOOR * cls.anybody(weights.shape[-1]).covariance)
+        return cls(name, weights.mean(axis=0), shrunk + FLOOR * cls.anybody(weights.shape[-1]).covariance)
 
 
 @dataclass(frozen=True)
@@ -57,10 +61,10 @@ class Prior:
         """Nobody is known."""
         return cls((Population.anybody(size),))
 
-    def or_like(self, weights: npt.ArrayLike) -> "Prior":
+    def or_like(self, name: str, weights: npt.ArrayLike) -> "Prior":
         """Or like P people with these weights, (P, S); too few are left out."""
         given = np.asarray(weights, np.float64)
-        return Prior((*self.populations, Population.of(given))) if len(given) >= FEWEST_PEOPLE else self
+        return Prior((*self.populations, Population.of(name, given))) if len(given) >= FEWEST_PEOPLE else self
 
 
 def standardised_weights(models: Sequence[RewardModel], spread: FloatArray) -> list[FloatArray]:

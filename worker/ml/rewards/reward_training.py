@@ -188,7 +188,7 @@ def _fit_structured(
     return StructuredReward(members, least_per_step=scale.least_per_step, most_per_step=scale.most_per_step), {
         "weights": weights,
         "weights_unit": "log odds per standard deviation of a pair",
-        "like_nobody_known": float(shares[0]),
+        "population_shares": {each.name: float(share) for each, share in zip(prior.populations, shares, strict=True)},
         "held_out": _held_out(features, answers, extra, seed, prior, costs),
     }
 
@@ -249,9 +249,7 @@ class _Laplace(NamedTuple):
     """log p(labels | population), but for a constant"""
 
 
-def _in_population(
-    features: FloatArray, answers: FloatArray, population: Population, costs: Sequence[int]
-) -> _Laplace:
+def _in_population(features: FloatArray, answers: FloatArray, population: Population, costs: Sequence[int]) -> _Laplace:
     pinned: set[int] = set()
     while True:
         found = _laplace(features, answers, population, sorted(pinned))
