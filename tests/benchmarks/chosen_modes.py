@@ -5,9 +5,8 @@
 Scripted users label a pool as a study asks them to, and the search picks their mode; no filter is trained. The regret
 is what the response surface predicts the best mode of somebody's true weights to gain beyond the picked one, in % of
 what they mind and like under the reference policy. One choice at a time is changed: the prior's deviation, the share of
-lapses that the likelihood allows for, the rule that picks pairs. Label seeds
-from 100 on, which the tables of the benchmark do not use. Finished rows are kept under data/; repeat the command to go
-on.
+lapses that the likelihood allows for, the rule that picks pairs. Label seeds from 100 on, which the tables of the
+benchmark do not use. Finished rows are kept under data/; repeat the command to go on.
 """
 
 import argparse

@@ -12,6 +12,7 @@ asked. Every finished chain is kept in --output: repeat the command to go on.
 """
 
 import csv
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import product
 from pathlib import Path
@@ -43,8 +44,8 @@ from worker.ml.teachers import TASTES, Manner, ScriptedTeacher, Taste
 from worker.sim.costs import preference_rewards, signal_weights
 
 TITLE = "# What 25 answers lead to"
-COUNTS = (10, 25, 50, 100, 200)
-FEW = (10, 25, 50)
+COUNTS = (25, 50, 100, 200)
+FEW = (25,)
 """of the variants that know earlier people"""
 CHOOSE_AT = (*range(10, 101, 10), 25, *range(120, 201, 20))
 EARLIER = range(900, 912)
@@ -240,6 +241,7 @@ def main() -> None:
     """See the module."""
     told = answering.parser(__doc__, "few_answers", seeds=1)
     told.add_argument("--people", type=int, default=12, help="drawn, and as many outside")
+    told.add_argument("--minutes", type=float, default=1e6, help="then write the page from what is finished")
     options = told.parse_args()
     torch.set_num_threads(1)
     file, page = options.output.with_suffix(".csv"), options.output.with_suffix(".md")
@@ -254,18 +256,20 @@ def main() -> None:
     places = {
         user: place for bench in benches.values() for group in GROUPS for place, user in enumerate(bench.tastes[group])
     }
-    planned.sort(key=lambda chain: (chain[3], "pooled" in chain[4], places[chain[2]]))  # who stops early has all tasks
+    planned.sort(key=lambda chain: (chain[3], places[chain[2]]))  # who stops early has all tasks and groups
     done = finished(file)
     with file.open("a", newline="") as stream:
         writer = csv.writer(stream, lineterminator="\n")
         if not done:
             writer.writerow(Row._fields)
+        until = time.monotonic() + 60 * options.minutes
         for chain in tqdm(planned, unit="chain", mininterval=5):
-            if chain not in done:
+            if chain not in done and time.monotonic() < until:
                 done[chain] = list(benches[chain[0]].rows(chain))
                 writer.writerows(done[chain])
                 stream.flush()
-    rows = [row for chain in planned for row in done[chain]]
+    whole = [chain for chain in planned if all((*chain[:4], variant) in done for variant in VARIANTS)]
+    rows = [row for chain in whole for row in done[chain]]
     page.write_text(
         result_pages.page(
             page, TITLE, "\n\n".join([table_of_gains(rows), table_of_pooling(benches, rows), table_of_advice(rows)])
@@ -312,7 +316,7 @@ def table_of_gains(rows: Sequence[Row]) -> str:
             for variant, count in product(("before", "now"), COUNTS)
         }
         best = np.mean([row.best_percent for row in rows if (row.task, row.group) == (task, group)])
-        means = [f"{gains[variant, count].mean():.1f}" for variant in ("before", "now") for count in COUNTS[1:]]
+        means = [f"{gains[variant, count].mean():.1f}" for variant in ("before", "now") for count in COUNTS]
         compared = [
             _interval(gains["now", now] - gains["before", before])
             for now, before in ((25, 100), (50, 200), (100, 100), (200, 200))
