@@ -134,9 +134,17 @@ class FewAnswers(Bench):
                 mode = search(self.surface, wanted, seed)
                 nobody = float(found.shares[0]) if variant.startswith("now") else 1.0
                 success = 100 * float(self.surface.predict(mode)[1])
-                numbers = [round(each, 3) for each in (wish.gain(self.surface, mode), wish.best, success, nobody)]
-                rounded = " ".join(f"{each:.3f}" for each in mode)
-                yield Row(*chain, count, *numbers, told_after, round(told_gain, 3), rounded)
+                yield Row(
+                    *chain,
+                    labels=count,
+                    gain_percent=round(wish.gain(self.surface, mode), 3),
+                    best_percent=round(wish.best, 3),
+                    success_points=round(success, 3),
+                    like_nobody_known=round(nobody, 3),
+                    told_after=told_after,
+                    told_gain=round(told_gain, 3),
+                    mode=" ".join(f"{each:.3f}" for each in mode),
+                )
 
     def _ask(
         self, count: int, asked: acquisition.Indices, members: FloatArray | None, rng: np.random.Generator
@@ -282,9 +290,18 @@ def finished(file: Path) -> dict[Chain, list[Row]]:
     found: dict[Chain, list[Row]] = {}
     for row in csv.DictReader(file.read_text().splitlines()) if file.exists() else []:
         who = row["task"], row["group"], row["user"], int(row["seed"]), row["variant"]
-        numbers = [float(row[name]) for name in Row._fields[6:10]]
-        told = int(row["told_after"]), float(row["told_gain"])
-        found.setdefault(who, []).append(Row(*who, int(row["labels"]), *numbers, *told, row["mode"]))
+        known = Row(
+            *who,
+            labels=int(row["labels"]),
+            gain_percent=float(row["gain_percent"]),
+            best_percent=float(row["best_percent"]),
+            success_points=float(row["success_points"]),
+            like_nobody_known=float(row["like_nobody_known"]),
+            told_after=int(row["told_after"]),
+            told_gain=float(row["told_gain"]),
+            mode=row["mode"],
+        )
+        found.setdefault(who, []).append(known)
     return {chain: rows for chain, rows in found.items() if len(rows) == len(VARIANTS[chain[4]])}
 
 
