@@ -361,11 +361,11 @@ class StudySettings(BaseModel):
         Section.LEARNING,
         "Where the model starts",
         options=(
-            ("no", "From nothing", "Only the participant's own answers count."),
+            ("no", "From what is known of the task", "In our tasks from scripted people, elsewhere from nothing."),
             (
                 "yes",
-                "From earlier participants",
-                "Helps with up to 100 answers; with ten or so it pulls people together. Structured models only.",
+                "Also from earlier participants",
+                "Whoever is not like them is soon not taken for one of them. Structured models only.",
             ),
         ),
     )

@@ -12,7 +12,7 @@ from sqlalchemy.orm import Session
 
 from app.db import Database, now
 from app.domain.designs import Arm, Ending
-from app.domain.models import Report
+from app.domain.models import ModelKind, Report
 from app.domain.power_plan import PowerInputs
 from app.domain.preferences import LabelEvent, Query
 from app.domain.protocol import EvaluatedMethod, EvaluationSettings
@@ -211,6 +211,18 @@ def test_pairs_that_follow_the_person_are_told_where_there_are_any(
         study.material = material
     said = text_of(experimenter, study, path)
     assert said.count("From the tenth answer on 25 %") == times
+
+
+def test_whom_the_newest_model_expected_is_told(
+    experimenter: TestClient, finished: Finished, database: Database
+) -> None:
+    study = finished()
+    assert ", starting from nothing." in text_of(experimenter, study), "models of before say nothing of populations"
+    with database.writing() as session:
+        shares = {"nobody known": 0.2, "scripted people": 0.7, "earlier participants": 0.1}
+        metrics = factories.reward_metrics() | {"population_shares": shares}
+        factories.make_model(session, session.get_one(Study, study.id), _people(session)[0], ModelKind.REWARD, metrics)
+    assert ", starting from scripted people and earlier participants (or from nothing" in text_of(experimenter, study)
 
 
 @pytest.mark.parametrize("asks", [True, False])

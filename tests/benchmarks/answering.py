@@ -20,6 +20,7 @@ from app.installed_tasks import catalogue, hints, qualities
 from tests.benchmarks.chosen_modes import stake
 from worker.analysis.comparison import result_pages
 from worker.compute import simulation
+from worker.compute.population import prior_of
 from worker.domain.responses import TARGETS
 from worker.domain.type_aliases import Float32Array, FloatArray
 from worker.experiments.benchmark_cell import CHOOSE_EVERY
@@ -106,6 +107,7 @@ class Bench:
         self.pool = _pool(name, directory)
         self.pairs = acquisition.matched_pairs(self.pool.scenarios)
         self.scale = SignalScale.of(self.segments(self.pairs), self.pool.means)
+        self.prior = prior_of(name, self.scale.spread)
         self._of_users = dict[str, tuple[FloatArray, float, float]]()
 
     def segments(self, rows: acquisition.Indices) -> SegmentPairs:
@@ -137,7 +139,14 @@ class Bench:
             named = np.concatenate([named, self._named(variant, taste, added, said, saying)])
             asked = self.segments(self.pairs[rows])
             model = reward_training.fit(
-                asked, answers, "structured", chain.seed, scale=self.scale, mattered=named, hints=hinted
+                asked,
+                answers,
+                "structured",
+                chain.seed,
+                scale=self.scale,
+                prior=self.prior,
+                mattered=named,
+                hints=hinted,
             ).model
             yield Fitted(rows, answers, model)
 

@@ -5,9 +5,8 @@
 Scripted users label a pool as a study asks them to, and the search picks their mode; no filter is trained. The regret
 is what the response surface predicts the best mode of somebody's true weights to gain beyond the picked one, in % of
 what they mind and like under the reference policy. One choice at a time is changed: the prior's deviation, the share of
-lapses that the likelihood allows for, the caution about the members' spread, the rule that picks pairs. Label seeds
-from 100 on, which the tables of the benchmark do not use. Finished rows are kept under data/; repeat the command to go
-on.
+lapses that the likelihood allows for, the rule that picks pairs. Label seeds from 100 on, which the tables of the
+benchmark do not use. Finished rows are kept under data/; repeat the command to go on.
 """
 
 import argparse
@@ -35,8 +34,8 @@ from worker.domain.task import Task
 from worker.experiments.benchmark_cell import BenchmarkConfig, BenchmarkUser, Cell
 from worker.experiments.rollout_cache import RolloutCache
 from worker.ml import acquisition
-from worker.ml.filters.response_surface import CAUTION, ResponseSurface, best_mode
-from worker.ml.rewards import bradley_terry, pooled_prior
+from worker.ml.filters.response_surface import ResponseSurface, best_mode
+from worker.ml.rewards import bradley_terry, prior
 from worker.ml.rewards.reward_models import RewardModel
 from worker.ml.teachers import TASTES, Manner, Taste, User
 from worker.sim.costs import signal_weights, stakes
@@ -47,7 +46,7 @@ USERS = tuple(user.value for user in User)
 HARDLY_ANY = 0.001
 """Share of lapses. With none at all a sure model finds a slip impossible, and its likelihood has no logarithm."""
 COLUMNS = (
-    *("task", "labels", "hesitant", "deviation", "lapses", "caution", "rule", "seed", "user"),
+    *("task", "labels", "hesitant", "deviation", "lapses", "rule", "seed", "user"),
     *("regret_percent", "own_advantage_percent", "success_points"),
 )
 HESITANT = Manner(rationality=3.0)
@@ -58,9 +57,8 @@ HESITANT = Manner(rationality=3.0)
 class Choice:
     """What is chosen for everybody."""
 
-    deviation: float = pooled_prior.DEVIATION
+    deviation: float = prior.DEVIATION
     lapses: float = bradley_terry.LAPSES
-    caution: float = CAUTION
     rule: acquisition.Strategy = BenchmarkConfig.rule
 
     @property
@@ -78,8 +76,6 @@ CHOICES = (
     Choice(deviation=2.0),
     Choice(deviation=6.0),
     Choice(lapses=HARDLY_ANY),
-    Choice(caution=0.0),
-    Choice(caution=2.0),
     Choice(rule="uniform"),
     Choice(rule="disagreement"),
     Choice(rule="information_gain"),
@@ -107,7 +103,7 @@ class UnkeptBench(BenchmarkUser):
 def answer(question: Question, work: Path) -> dict[str, Any]:
     """Regrets (U,) in %, by how much the own mode beats the best of the others' for each user, predicted success."""
     torch.set_num_threads(1)
-    pooled_prior.DEVIATION, bradley_terry.LAPSES = question.choice.deviation, question.choice.lapses
+    prior.DEVIATION, bradley_terry.LAPSES = question.choice.deviation, question.choice.lapses
     task = registry.task(question.task)
     surface = ResponseSurface.load(surface_file(task.name), task.modes)
     wishes = np.array([signal_weights(task, TASTES[user].omega, TASTES[user].per_signal) for user in USERS])
@@ -121,7 +117,7 @@ def answer(question: Question, work: Path) -> dict[str, Any]:
             Cell(task.name, TASTES[user], "pbarl", question.seed), terms, RolloutCache(task.name, work), work
         )
         learned = bench.reward.signal_weights([])
-        mode = best_mode(surface, learned, question.seed, caution=question.choice.caution)
+        mode = best_mode(surface, learned, question.seed)
         change, success = surface.predict(mode)
         gains.append(wishes @ change / unit)
         lost.append(100 * float(success))

@@ -32,6 +32,7 @@ from tests.benchmarks.chosen_modes import stake
 from tests.benchmarks.feedback_report import LINEAR, NAMED, Row
 from tests.benchmarks.pool_rollouts import Pool, pool_rollouts
 from worker.compute import learning, simulation
+from worker.compute.population import prior_of
 from worker.compute.simulation import surface_file
 from worker.domain.responses import TARGETS
 from worker.domain.scenarios import EVALUATION, first_of
@@ -41,7 +42,7 @@ from worker.ml import acquisition
 from worker.ml.filters.gate import signal_changes, successes
 from worker.ml.filters.response_surface import ResponseSurface, best_mode
 from worker.ml.rewards import calibration, reward_training
-from worker.ml.rewards.pooled_prior import Prior
+from worker.ml.rewards.prior import Prior
 from worker.ml.rewards.reward_models import RewardModel
 from worker.ml.rewards.signal_scale import SignalScale
 from worker.ml.teachers import TASTES, Manner, ScriptedTeacher, Taste, User, random_taste
@@ -171,7 +172,7 @@ class Bench:
         return None if members is None else acquisition.score(chain.rule, members)
 
     def _fit(self, chain: Chain, rows: Indices, answers: FloatArray) -> reward_training.FitResult:
-        prior = self.prior if chain.pooled else None
+        prior = self.pooled_prior if chain.pooled else self.prior
         pairs = self.pool.segments(self.pairs[rows])
         return reward_training.fit(
             pairs,
@@ -245,7 +246,12 @@ class Bench:
 
     @cached_property
     def prior(self) -> Prior:
-        """From earlier people of the population, each with 200 answers."""
+        """What the studio expects of anybody."""
+        return prior_of(self.task.name, self.scale.spread)
+
+    @cached_property
+    def pooled_prior(self) -> Prior:
+        """The same, and earlier people of the population, each with 200 answers."""
         weights = []
         for number in EARLIER_PEOPLE:
             rng = np.random.default_rng([number, 9])
@@ -254,8 +260,8 @@ class Bench:
             rows = rng.choice(len(self.pairs), 200, replace=False)
             said = np.array([TARGETS[teacher.answer(left, right, rng)] for left, right in rewards[rows]])
             features = self.pool.segments(self.pairs[rows]).signal_differences() / self.scale.spread
-            weights.append(reward_training.posterior(features, said)[0])
-        return Prior.pooled(weights)
+            weights.append(reward_training.posterior(features, said, self.prior).mean)
+        return self.prior.or_like("earlier", weights)
 
     def rewards(self, user: str, pool: Pool) -> FloatArray:
         """True preference rewards, (C, T)."""

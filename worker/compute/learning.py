@@ -11,11 +11,11 @@ import numpy as np
 import numpy.typing as npt
 
 from worker.analysis.filters.promise import Outcome, outcome_of
+from worker.compute.population import prior_of
 from worker.compute.simulation import reference_rollouts, run_episode, signal_predictor
 from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import Act, Float32Array, FloatArray
 from worker.ml.rewards.loading import load_reward_model
-from worker.ml.rewards.pooled_prior import prior_of
 from worker.ml.rewards.reward_models import NEVER_WANTED, RewardModel
 from worker.ml.rewards.segments import SegmentPairs
 from worker.ml.rewards.signal_scale import SignalScale
@@ -77,7 +77,7 @@ def fit_reward(
     if kind not in get_args(reward_training.RewardKind):
         raise ValueError(f"There is no reward model of the kind {kind!r}.")
     simulated = None if recorded_signals is not None else registry.task(task)
-    prior = prior_of([_model(each) for each in earlier], scale.spread)
+    prior = prior_of(task if recorded_signals is None else None, scale.spread, [_model(each) for each in earlier])
     fitted = reward_training.fit(
         pairs,
         targets,

@@ -19,6 +19,7 @@ import torch
 
 import worker
 from worker.compute import learning, simulation
+from worker.compute.population import prior_of
 from worker.compute.simulation import surface_file
 from worker.domain.responses import TARGETS
 from worker.domain.scenarios import EVALUATION, POOL, first_of
@@ -173,6 +174,7 @@ class BenchmarkUser:
         self.rows = acquisition.matched_pairs([each.scenario for each in self.pool])
         episode_means = [each.signals.mean(axis=0, dtype=np.float64) for each in self.pool]
         self.scale = SignalScale.of(self._cut(self.rows), episode_means)
+        self.prior = prior_of(cell.task, self.scale.spread)
         self.labelled, self.targets = self._label()
         self.reward = self._kept_reward(cell.path(terms, work).with_name(f"reward-seed{cell.seed}.safetensors"))
 
@@ -234,7 +236,9 @@ class BenchmarkUser:
         """The first labels are chosen at random, later ones by a structured model of those before."""
         if self.terms.rule == "uniform" or not len(asked):
             return "uniform", None
-        model = reward_training.fit(self._cut(asked), targets, "structured", self.cell.seed, scale=self.scale).model
+        model = reward_training.fit(
+            self._cut(asked), targets, "structured", self.cell.seed, scale=self.scale, prior=self.prior
+        ).model
         return self.terms.rule, acquisition.score(self.terms.rule, model.member_probabilities(self._cut(candidates)))
 
     def _cut(self, rows: npt.NDArray[np.int64]) -> SegmentPairs:
@@ -271,6 +275,7 @@ class BenchmarkUser:
             kind,
             self.cell.seed,
             scale=self.scale,
+            prior=self.prior,
             reference=simulation.reference_rollouts(self.cell.task),
             predictor=simulation.signal_predictor(self.cell.task) if kind == "predicted" else None,
         ).model

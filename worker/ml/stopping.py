@@ -21,7 +21,7 @@ def relative_regret(surface: ResponseSurface, members: FloatArray) -> float:
     """What knowing the person for certain could gain, as a share of what it would gain over the reference policy.
 
     ``members`` (E, S): the weights of the reward model's members per unit of each signal. The mode for all is chosen
-    as response_surface.best_mode does, with caution; the one for each member by that member alone. 0: nothing, also
+    as response_surface.best_mode does, the one for each member by that member alone. 0: nothing, also
     where the reference policy is everybody's best; above 1: the mode for all is worse than the reference policy.
     Shares are alike in all tasks, standard deviations over all modes are not: some tasks have many modes that nobody
     wants (docs/results/advice_to_stop.md).
@@ -33,7 +33,7 @@ def relative_regret(surface: ResponseSurface, members: FloatArray) -> float:
     lost = SUCCESS_PENALTY * np.maximum(-success - SUCCESS_TOLERANCE, 0.0)
     unit = max(float((signals @ members.mean(axis=0)).std()), 1e-9)
     returns = signals @ members.T / unit  # (modes, E)
-    chosen = int(np.argmax(returns.mean(axis=1) - CAUTION * returns.std(axis=1) - lost))
     worth = returns - lost[:, None]
+    chosen = int(np.argmax(worth.mean(axis=1)))
     attainable = float(worth.max(axis=0).mean())
     return 1.0 - float(worth[chosen].mean()) / attainable if attainable > _NOTHING else 0.0

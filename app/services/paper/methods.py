@@ -5,11 +5,13 @@ Nothing here depends on which letter hides which method, so that it can be read 
 
 from collections.abc import Iterator
 
+from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from app.domain.choices import Method, Strategy
+from app.domain.models import Model, ModelKind
 from app.domain.protocol import EvaluatedMethod, EvaluationMode, EvaluationSettings, Language
-from app.domain.studies import Study
+from app.domain.studies import Participant, Study
 from app.installed_tasks import catalogue, hints
 from app.questionnaires import library
 from app.services.answers import hint_offers
@@ -46,7 +48,7 @@ def methods_part(session: Session, study: Study) -> Iterator[str]:
     yield "## Design"
     yield from _design(study)
     yield "## Materials and procedure"
-    yield from _procedure(study)
+    yield from _procedure(session, study)
     yield "## Measures"
     yield from _measures(study)
     yield "## Exclusions and attention"
@@ -100,7 +102,7 @@ def _method(study: Study, evaluation: EvaluationSettings, method: EvaluatedMetho
     return f"{unblinding.NAMES[method]} ({METHODS[method]}{more})"
 
 
-def _procedure(study: Study) -> Iterator[str]:
+def _procedure(session: Session, study: Study) -> Iterator[str]:
     settings = study.settings
     installed = catalogue.find(study.task)
     title = installed.description.title if installed else study.task
@@ -157,7 +159,7 @@ def _procedure(study: Study) -> Iterator[str]:
         else "",
         f"The reward model was “{settings.reward_kind.label}”, trained anew every "
         f"{count(settings.retrain_every_labels, 'answer')}"
-        + (", starting from earlier participants." if settings.pooled_prior else ", starting from nothing."),
+        f", starting from {_starting_from(session, study)}.",
         f"Action filters were trained after {listed(map(str, settings.milestones))} answers and measured on "
         f"{settings.evaluation_scenarios} unseen simulated scenarios each; they were allowed to cost "
         f"{percent(settings.success_tolerance)} of success, and to be worse than the pre-trained policy in at most "
@@ -167,6 +169,22 @@ def _procedure(study: Study) -> Iterator[str]:
     )
     languages = [LANGUAGES[each] for each in settings.offered_languages]
     yield f"Pages were in {listed(languages, 'or')}{', as participants chose' if len(languages) > 1 else ''}."
+
+
+def _starting_from(session: Session, study: Study) -> str:
+    """Whom reward models expect before the first answer: what the newest one says of itself."""
+    newest = (
+        select(Model.metrics)
+        .join(Participant, Participant.id == Model.participant_id)
+        .where(Participant.study_id == study.id, Model.kind == ModelKind.REWARD)
+        .order_by(Model.id.desc())
+        .limit(1)
+    )
+    shares = (session.scalar(newest) or {}).get("population_shares", {})
+    known = [name for name in shares if name != "nobody known"]
+    if known:
+        return f"{listed(known)} (or from nothing, as far as answers contradicted that)"
+    return "earlier participants" if study.settings.pooled_prior else "nothing"
 
 
 def _measures(study: Study) -> Iterator[str]:

@@ -11,7 +11,7 @@ from worker.domain.trajectory import SIGNALS
 from worker.ml.rewards import bradley_terry, preference_loss, reward_training
 from worker.ml.rewards.loading import load_reward_model
 from worker.ml.rewards.network_training import MlpTraining, TransformerTraining
-from worker.ml.rewards.pooled_prior import DEVIATION
+from worker.ml.rewards.prior import DEVIATION
 from worker.ml.rewards.reward_models import CLIP, RewardModel, StructuredReward, stored_config
 from worker.ml.rewards.reward_training import fit, posterior
 from worker.ml.rewards.segments import SegmentPairs
@@ -75,7 +75,7 @@ def test_the_structured_fit_minimises_the_right_form_of_equation_2_for_people_wh
 ) -> None:
     shown, targets = labelled
     features = shown.signal_differences() / SignalScale.of(shown).spread
-    mean, covariance = posterior(features, targets)
+    mean, covariance, _ = posterior(features, targets)
     weights = torch.tensor(mean, requires_grad=True)
     logits = torch.tensor(features) @ weights
     said, y = 0.05 + 0.9 * torch.sigmoid(logits), torch.tensor(targets)

@@ -1,0 +1,72 @@
+"""What somebody may want before their first answer: they are of one of several populations, or like nobody known.
+
+For the kinds that are linear in signals, whose weights mean the same for everybody. Every population is a Gaussian, and
+the answers themselves say which of them somebody is of (reward_training.posterior). So a prior can be narrow where it
+is right and is soon out of the way where it is not: nobody is pulled towards people whom their answers contradict.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+import numpy.typing as npt
+
+from worker.domain.type_aliases import FloatArray
+from worker.ml.rewards.reward_models import RewardModel, StructuredReward
+
+DEVIATION = 4.0
+"""Of every weight of somebody who is like nobody known: wide, because a narrow prior spreads what is wanted over all
+signals that go along with it (docs/results/chosen_modes.md)."""
+NOBODY_KNOWN, SCRIPTED, EARLIER = "nobody known", "scripted people", "earlier participants"
+"""What populations are called."""
+FEWEST_PEOPLE = 3
+"""Fewer are no population."""
+SHARED, OWN, FLOOR = 0.7, 0.3, 0.05
+"""Shares of the covariance and of its diagonal, and of the variance of somebody who is like nobody known."""
+
+
+@dataclass(frozen=True)
+class Population:
+    """People whose weights are N(mean, covariance), in log odds per standard deviation of a pair."""
+
+    name: str
+    """in a model's metrics"""
+    mean: FloatArray
+    """(S,)"""
+    covariance: FloatArray
+    """(S, S)"""
+
+    @classmethod
+    def anybody(cls, size: int) -> Self:
+        """N(0, DEVIATION^2 I)"""
+        return cls(NOBODY_KNOWN, np.zeros(size), DEVIATION**2 * np.eye(size))
+
+    @classmethod
+    def of(cls, name: str, weights: FloatArray) -> Self:
+        """From the weights of P people, (P, S): their mean, .7 covariance + .3 diagonal + .05 of anybody()."""
+        covariance = np.cov(weights, rowvar=False)
+        shrunk = SHARED * covariance + OWN * np.diag(np.diag(covariance))
+        return cls(name, weights.mean(axis=0), shrunk + FLOOR * cls.anybody(weights.shape[-1]).covariance)
+
+
+@dataclass(frozen=True)
+class Prior:
+    """The populations that somebody may be of, each as likely as the others; the first is anybody()."""
+
+    populations: tuple[Population, ...]
+
+    @classmethod
+    def standard(cls, size: int) -> Self:
+        """Nobody is known."""
+        return cls((Population.anybody(size),))
+
+    def or_like(self, name: str, weights: npt.ArrayLike) -> "Prior":
+        """Or like P people with these weights, (P, S); too few are left out."""
+        given = np.asarray(weights, np.float64)
+        return Prior((*self.populations, Population.of(name, given))) if len(given) >= FEWEST_PEOPLE else self
+
+
+def standardised_weights(models: Sequence[RewardModel], spread: FloatArray) -> list[FloatArray]:
+    """What earlier participants' reward models weigh, (S,) each as in Population; ``spread`` (S,) as in SignalScale."""
+    return [each.weights.mean(axis=0) * spread for each in models if isinstance(each, StructuredReward)]
