@@ -51,6 +51,7 @@ def model_card(manifest: Mapping[str, Any]) -> str:
     """Markdown, from the manifest."""
     sections = [
         _what(manifest),
+        _choice(manifest.get("choice")),
         _REFERENCE if manifest.get("uses_reference_policy") else _way(manifest),
         _promise(manifest),
         _shield(manifest),
@@ -94,9 +95,31 @@ def _what(manifest: Mapping[str, Any]) -> str:
     )
 
 
+def _choice(choice: Mapping[str, Any] | None) -> str:
+    """Which of several policies it is, and how surely."""
+    if not choice:
+        return ""
+    chances = sorted(choice["chances"].items(), key=lambda each: -each[1])
+    clear = "" if choice["sure"] else " **That is not clear: other policies may suit this person as well or better.**"
+    return "\n".join(
+        [
+            "## The choice",
+            "",
+            f"Of {len(chances)} policies **{choice['policy']}** was chosen for this person, and is the policy of this "
+            f"bundle; the filter leaves its actions as they are.{clear}",
+            "",
+            "| policy | chance of being the best |",
+            "|---|---|",
+            *(f"| {name} | {chance:.0%} |" for name, chance in chances),
+            "",
+            "Of those that keep the task; from the reward model's posterior, over held-out scenarios.",
+        ]
+    )
+
+
 def _way(manifest: Mapping[str, Any]) -> str:
     """The person's mode in words."""
-    if manifest["method"] != "studio":
+    if manifest["method"] != "studio" or manifest.get("choice"):
         return ""
     rows = [
         f"| {axis['name']} | {manifest['mode'].get(axis['name'], 0.0):+.2f} | {axis['low']:g} to {axis['high']:g} "

@@ -276,6 +276,11 @@ def main(manifest: Mapping[str, Any], run: Run, means: Means | None, options: ar
     """Serve until a signal; the exit code."""
     interface = manifest["interface"]
     policy: PolicyServer | Means
+    if options.upstream and interface["policy"].get("settings"):
+        sys.stderr.write(
+            "FAILED: this bundle's policy has settings that a server does not know: leave --upstream out.\n"
+        )
+        return 1
     if options.upstream:
         policy = PolicyServer(options.upstream, answer_s=options.upstream_s)
         try:
