@@ -1,9 +1,12 @@
 """Check a lab.toml: what is missing or wrong, in words; three episodes, and a contact sheet of them."""
 
+import contextlib
+import re
 import sys
 import time
 from collections.abc import Mapping
 from functools import cache
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,6 +17,8 @@ from tqdm import tqdm
 from app.installed_tasks import lab
 from app.installed_tasks.description import InstalledTask, TaskRefused
 from app.installed_tasks.lab import LabDescription
+from app.paths import LOCK
+from worker.compute.lab_clips import SAME_WITHIN
 from worker.compute.lab_policies import policy_of
 from worker.domain.scenarios import POLICY_TEST
 from worker.domain.trajectory import Trajectory
@@ -29,6 +34,8 @@ EPISODES, PICTURES = 3, 6
 SLOW_EPISODE_S = 5.0
 """Above this the exploration's five thousand episodes take more than three hours on two processes."""
 EXPLORED_EPISODES = 6000
+REPEATED_WITHIN = SAME_WITHIN / 10
+"""Largest difference of an episode repeated: MuJoCo's solver begins where it was, and differs in the last digits."""
 SHEET_WIDTH_PX = 1440
 
 
@@ -113,7 +120,7 @@ def _run(
             take=lambda step, row=row: row.append if step in shown else None,  # type: ignore[misc]
         )
         rows.append(row)
-        if not np.array_equal(again.observations, trajectories[-1].observations):
+        if np.abs(again.observations - trajectories[-1].observations).max() > REPEATED_WITHIN:
             return Checked((_not_repeated(again, trajectories[-1], described),), (), None)
     failed = []
     for name in described.policies:
@@ -208,10 +215,27 @@ def _remarks(
             f"This is a slow environment: exploring it takes about {hours:.0f} hours on two processes. Lower "
             "episode_steps, use a quicker simulation, or explore fewer scenarios (--scenarios)."
         )
+    if changed := replaced_packages(LOCK.read_text() if LOCK.is_file() else ""):
+        ours = " ".join(each.partition(" ")[0] for each in changed)
+        remarks.append(
+            f"An installation has replaced packages of the studio: {'; '.join(changed)}. Put them back with python -m "
+            f"pip install {ours}; what needs others, such as a policy server, belongs into an environment of its own."
+        )
     missing = [language for language in ("en", "de") if language not in described.instructions]
     if missing:
         remarks.append(f"instructions.{missing[0]} is missing: participants of that language read neutral words.")
     return tuple(remarks)
+
+
+def replaced_packages(lock: str) -> list[str]:
+    """Packages that are installed in another version than the lock's, each with both."""
+    pinned = re.findall(r"^([a-z0-9._-]+)==([^\s;\\]+)", lock, re.MULTILINE)
+    found = []
+    for name, wanted in pinned:
+        with contextlib.suppress(PackageNotFoundError):
+            if (there := version(name)) != wanted:
+                found.append(f"{name}=={wanted} was replaced by {there}")
+    return found
 
 
 def _write(sheet: Path, rows: list[list[Picture]]) -> None:

@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from app.domain.models import Bundle, Model
 
 COST_SYMBOLS = ("C_d", "C_v", "C_f", "C_hf", "C_fd", "C_fdv")
+"""Of the paper; a laboratory has costs of its own."""
 """The paper's six preference costs; what each is called depends on the task."""
 
 
@@ -152,7 +153,8 @@ def filter_version(model: Model, bundle: Bundle | None) -> FilterVersion:
     """What is known about one filter; unreadable numbers are left out."""
     metrics = _read(_Filter, model.metrics)
     evaluation = metrics.evaluation
-    costs = [_change("", symbol, evaluation.costs.get(symbol), more_is_better=False) for symbol in COST_SYMBOLS]
+    of_labs = [name for name in evaluation.costs if name not in COST_SYMBOLS]
+    costs = [_change("", name, evaluation.costs.get(name), more_is_better=False) for name in (*COST_SYMBOLS, *of_labs)]
     return FilterVersion(
         label_count=model.label_count,
         created_at=model.created_at,

@@ -35,11 +35,13 @@ The second command checks every file, runs the filter over `recorded/` and compa
 Your own recording: `python run_filter.py --observations o.npy --output a.npy`.
 In a control loop, at every control step: `policy.onnx` turns the observation into the reference policy's mean action,
 and `filter.onnx` turns both into the action to execute.
-`manifest.json` lists every number with its unit and range; all are SI units in the robot's base frame."""
+`manifest.json` lists every number with its unit and range; {units}."""
+_AS_OURS = "all are SI units in the robot's base frame"
+_AS_A_LABS = "units and frame are those of the laboratory's own environment (`interface` in the manifest)"
 
 _LIMITS = """## Limits
 
-* Measured in simulation, with a model of one arm and one seated person. Nothing here was run on a robot.
+* Measured in simulation{simulated}. Nothing here was run on a robot.
 * The intervals cover the choice of scenarios. They do not cover a second training, other labels, or other bodies.
 * "Preference" is the return of a model learned from this person's own labels, not their satisfaction.
 * The largest speeds and forces are what happened in these simulated scenarios. They are not guaranteed bounds: keep the
@@ -58,9 +60,9 @@ def model_card(manifest: Mapping[str, Any]) -> str:
         _matters(manifest),
         _measured(manifest.get("evaluation")),
         _notes(manifest),
-        _USE,
+        _USE.format(units=_AS_A_LABS if _is_a_labs(manifest) else _AS_OURS),
         _server(manifest),
-        _LIMITS,
+        _LIMITS.format(simulated="" if _is_a_labs(manifest) else ", with a model of one arm and one seated person"),
     ]
     return "\n\n".join(section for section in sections if section) + "\n"
 
@@ -70,6 +72,11 @@ _REFERENCE = """## This is the reference policy
 **The filter in this bundle changes nothing: every action is the reference policy's own.** Nothing that was learned from
 this person's comparisons was surely better for them without a price in success, force, speed or spills; the notes say
 what was tried."""
+
+
+def _is_a_labs(manifest: Mapping[str, Any]) -> bool:
+    interface = manifest.get("interface") or {}
+    return bool(interface.get("adds_previous_action_and_share"))
 
 
 def _server(manifest: Mapping[str, Any]) -> str:
