@@ -54,17 +54,22 @@ def test_what_is_not_asked_stays_as_it_is(experimenter: TestClient, database: Da
         ({"reward_kind": "mlp"}, "reward kind"),
         ({"strategy": "contested"}, "strategy"),
         ({"following_share": "20"}, "following share"),
-        ({"arms": "one | reference\ntwo | pbarl"}, "arms"),
     ],
 )
 def test_whoever_sends_it_nevertheless_is_refused_in_words(
     experimenter: TestClient, database: Database, recorded: Study, sent: dict[str, str], said: str
 ) -> None:
     for address in (SETTINGS, "/studies/new?like=handover"):
-        form = typed(experimenter, address, **sent) | ({"evaluation": ["yes"]} if "arms" in sent else {})
-        answer = experimenter.post(address.partition("?")[0], data=form)
+        answer = experimenter.post(address.partition("?")[0], data=typed(experimenter, address, **sent))
         assert answer.status_code == 422
         assert "A study of recordings has no simulator, which is needed for:" in answer.text
         assert said in answer.text
     with database.reading() as session:
         assert session.scalars(select(Study)).one().settings == recorded.settings
+
+
+def test_what_is_wrong_with_a_setting_without_a_field_is_said_at_the_top(
+    experimenter: TestClient, recorded: Study
+) -> None:
+    answer = experimenter.post(SETTINGS, data=typed(experimenter, SETTINGS, pool_scenarios="0"))
+    assert (answer.status_code, "Enter at least 1" in answer.text) == (422, True)

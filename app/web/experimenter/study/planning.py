@@ -268,6 +268,8 @@ def _form_page(
     """``own_task``: may stay although it is not installed here, as that of a ``study`` may."""
     own_task = study.task if study is not None else own_task
     recorded = study.material is not None if study is not None else own_task is not None
+    if errors and recorded:
+        errors = _at_the_top(errors)
     elsewhere = [own_task] if own_task and (recorded or catalogue.find(own_task) is None) else []
     offered = elsewhere if recorded else [*catalogue.names(), *elsewhere]
     fixed = locking.fixed_settings(session, study) if study is not None and session is not None else {}
@@ -286,6 +288,13 @@ def _form_page(
     return page(
         request, "experimenter/new_study.html", context, HTTPStatus.UNPROCESSABLE_ENTITY if errors else HTTPStatus.OK
     )
+
+
+def _at_the_top(errors: Mapping[str, str]) -> Mapping[str, str]:
+    """What is wrong with settings for which the form of recordings has no field."""
+    hidden = [said for name, said in errors.items() if name in {"", *SIMULATED}]
+    shown = {name: said for name, said in errors.items() if name not in {"", *SIMULATED}}
+    return {**shown, "": " ".join(hidden)} if hidden else shown
 
 
 def _see(request: Request, name: str, **parameters: str) -> RedirectResponse:
