@@ -279,6 +279,7 @@ def _form_page(
         "errors": errors or {},
         "first_wrong": next((each for each in StudyForm.model_fields if each in (errors or {})), None),
         "sections": OF_RECORDINGS if recorded else SECTIONS,
+        "recorded": recorded,
         "tasks": [(name, task_words.words_of(name)) for name in offered],
         "broken_tasks": catalogue.installed().broken,
         "presets": list(Preset),
