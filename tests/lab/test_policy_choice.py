@@ -27,7 +27,7 @@ from app.services.studies import task_limits
 from app.storage import ArtefactStore
 from tests.lab.conftest import way_to_goal
 from tests.lab.policy_server import serving, to_goal
-from tests.lab.test_whole_loop import LABELS, QUICK, SLOW, answer, do, film, make_study, weighed
+from tests.lab.test_whole_loop import LABELS, QUICK, SLOW, answer, do, film, lend, make_study, weighed
 from tests.worker.at_hand import AtHand
 from worker.compute import simulation
 from worker.experiments import fit_response_surface
@@ -166,7 +166,10 @@ def learned(context: WorkerContext, minds: dict[str, float], *more: tuple[Any, R
     with context.database.reading() as session:
         last = f"answer-{session.scalar(select(func.max(LabelEvent.id)))}"
     known = RunKey(RunKind.REWARD, participant_id=person_id, labels=LABELS, answers=last)
-    for act, kind, subject in ((train_reward, RunKind.REWARD, ""), (train_filter, RunKind.FILTER, ""), *more):
+    do(context, train_reward, known, study_id)
+    if more:
+        lend(context, study_id)
+    for act, kind, subject in ((train_filter, RunKind.FILTER, ""), *more):
         do(context, act, replace(known, kind=kind, subject=subject), study_id)
     with context.database.reading() as session:
         of_person = select(Model).where(Model.participant_id == person_id, Model.kind == ModelKind.FILTER)
