@@ -200,7 +200,8 @@ def test_a_policys_actions_are_mapped_to_the_studios_range_and_multiplied(plane:
 
 def test_packages_of_the_studio_that_an_installation_has_replaced_are_named() -> None:
     lock = f"numpy==0.1 \\\n    --hash=sha256:00\nonnx=={version('onnx')} \\\nnot-installed-here==1.0\n"
-    assert replaced_packages(lock) == [f"numpy==0.1 was replaced by {version('numpy')}"]
+    assert replaced_packages([lock]) == [f"numpy==0.1 was replaced by {version('numpy')}"]
+    assert replaced_packages([lock, f"numpy=={version('numpy')}\n"]) == [], "of development"
 
 
 def test_a_repetition_that_differs_in_the_last_digits_is_the_same_episode(plane: Path) -> None:
@@ -215,5 +216,5 @@ def test_a_repetition_that_differs_in_the_last_digits_is_the_same_episode(plane:
 
 def test_check_tells_of_replaced_packages(plane: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "requirements.lock").write_text("numpy==0.1\n")
-    monkeypatch.setattr("worker.experiments.check_lab.LOCK", tmp_path / "requirements.lock")
+    monkeypatch.setattr("worker.experiments.check_lab.LOCKS", [tmp_path / "requirements.lock"])
     assert "has replaced packages of the studio: numpy==0.1 was replaced" in " ".join(found(plane).remarks)

@@ -48,7 +48,7 @@ POLICIES = """
 gain = 1.0
 
 [policies.slow]
-gain = 0.25
+gain = 0.3
 
 [policies.blunt]
 file = "blunt.onnx"
@@ -72,7 +72,7 @@ def add(folder: Path, text: str) -> None:
 def test_a_policy_is_as_the_first_one_but_for_what_it_says_itself(several: Path) -> None:
     described = lab.read(several / "lab.toml").description
     assert isinstance(described, lab.LabDescription)
-    assert (described.policies["slow"].file, described.policies["slow"].gain) == ("policy.onnx", 0.25)
+    assert (described.policies["slow"].file, described.policies["slow"].gain) == ("policy.onnx", 0.3)
     assert (described.policies["blunt"].file, described.policies["blunt"].gain) == ("blunt.onnx", 0.5)
 
 
@@ -199,7 +199,7 @@ def test_two_opposed_people_are_given_different_policies_in_bundles_that_say_whi
     assert manifests["quick"]["choice"]["policy"] in {"quick", "blunt"}
     assert manifests["slow"]["choice"]["sure"]
     assert sum(manifests["slow"]["choice"]["chances"].values()) == pytest.approx(1.0, abs=0.01)
-    assert manifests["slow"]["interface"]["policy"]["gain"] == 0.25, "of the policy that was chosen"
+    assert manifests["slow"]["interface"]["policy"]["gain"] == 0.3, "of the policy that was chosen"
     assert set(METHODS) <= found["quick"].keys()
     assert len({found["quick"][method] for method in METHODS}) == len(METHODS), "every robot acts differently"
     names, costs = registry.task("plane").signals, {}

@@ -4,7 +4,7 @@ import contextlib
 import re
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -17,7 +17,7 @@ from tqdm import tqdm
 from app.installed_tasks import lab
 from app.installed_tasks.description import InstalledTask, TaskRefused
 from app.installed_tasks.lab import LabDescription
-from app.paths import LOCK
+from app.paths import LOCKS
 from worker.compute.lab_clips import SAME_WITHIN
 from worker.compute.lab_policies import policy_of
 from worker.domain.scenarios import POLICY_TEST
@@ -215,7 +215,7 @@ def _remarks(
             f"This is a slow environment: exploring it takes about {hours:.0f} hours on two processes. Lower "
             "episode_steps, use a quicker simulation, or explore fewer scenarios (--scenarios)."
         )
-    if changed := replaced_packages(LOCK.read_text() if LOCK.is_file() else ""):
+    if changed := replaced_packages(each.read_text() for each in LOCKS if each.is_file()):
         ours = " ".join(each.partition(" ")[0] for each in changed)
         remarks.append(
             f"An installation has replaced packages of the studio: {'; '.join(changed)}. Put them back with python -m "
@@ -227,14 +227,17 @@ def _remarks(
     return tuple(remarks)
 
 
-def replaced_packages(lock: str) -> list[str]:
-    """Packages that are installed in another version than the lock's, each with both."""
-    pinned = re.findall(r"^([a-z0-9._-]+)==([^\s;\\]+)", lock, re.MULTILINE)
+def replaced_packages(locks: Iterable[str]) -> list[str]:
+    """Packages that are installed in a version that no lock has, each with both."""
+    pinned: dict[str, list[str]] = {}
+    for lock in locks:
+        for name, wanted in re.findall(r"^([a-z0-9._-]+)==([^\s;\\]+)", lock, re.MULTILINE):
+            pinned.setdefault(name, []).append(wanted)
     found = []
-    for name, wanted in pinned:
+    for name, wanted in pinned.items():
         with contextlib.suppress(PackageNotFoundError):
-            if (there := version(name)) != wanted:
-                found.append(f"{name}=={wanted} was replaced by {there}")
+            if (there := version(name)) not in wanted:
+                found.append(f"{name}=={wanted[0]} was replaced by {there}")
     return found
 
 
