@@ -163,5 +163,5 @@ def test_a_participants_page_has_the_labs_own_costs_and_says_which_policy_was_ch
     page = " ".join(experimenter.get(address).text.split())
     assert "effort (m)" in page
     assert "<strong>careful one</strong> was chosen" in page
-    assert "<dt>careful one</dt><dd>70 %</dd></div> <div><dt>reference</dt><dd>30 %</dd>" in page
+    assert "<dt>careful one</dt><dd>70 %</dd></div><div><dt>reference</dt><dd>30 %</dd>" in page
     assert "Gate" not in page, "nothing is weakened where a policy is chosen"

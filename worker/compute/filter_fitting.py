@@ -37,6 +37,7 @@ from worker.ml.filters.filter_problem import (
     GateTrial,
     ReportProgress,
 )
+from worker.ml.filters.policy_choice import SURE
 from worker.ml.filters.response_surface import ResponseSurface
 from worker.ml.policies.reference import ReferencePolicy
 from worker.ml.rewards.loading import load_reward_model
@@ -194,7 +195,7 @@ class FilterFit:
             "seconds": {**draft.seconds, "evaluation": round(time.perf_counter() - started, 1)},
             "weights": learned.get("weights"),
             "costs": learned.get("costs"),
-            "choice": {**draft.choice, "policy": _chosen(self.problem.task, draft.weights)} if draft.choice else None,
+            "choice": _choice(self.problem.task, draft),
         }
         contents = BundleContents(
             task=self._bundled_task(draft.weights),
@@ -289,8 +290,12 @@ class FilterFit:
         return self.references[key]
 
 
-def _chosen(task: Task, weights: FilterWeights) -> str:
-    return task.modes.policy(task.modes.vector(weights.mode)) or REFERENCE
+def _choice(task: Task, draft: FilterDraft) -> dict[str, Any] | None:
+    """Which of several policies it is in the end, and whether the answers clearly say so; None: a filter."""
+    if not draft.choice:
+        return None
+    policy = task.modes.policy(task.modes.vector(draft.weights.mode)) or REFERENCE
+    return {"policy": policy, "chances": dict(draft.choice), "sure": draft.choice[policy] >= SURE}
 
 
 def moves_nothing(weights: FilterWeights) -> bool:

@@ -53,7 +53,7 @@ def choose(
     weights = FilterWeights(mode=mode if chosen == REFERENCE else {**mode, chosen: 1.0})
     ordered = [trial for name, trial in trials.items() if name != chosen]
     last: list[GateTrial] = [] if chosen == REFERENCE else [trials[chosen]]
-    choice = {"chances": {name: round(each, 3) for name, each in chances.items()}, "sure": chances[chosen] >= SURE}
+    choice = {name: round(each, 3) for name, each in chances.items()}
     draft = FilterDraft(weights, trials=(*ordered, *last), notes=tuple(notes))
     return replace(draft, choice=choice).timed("mode", started)
 
