@@ -200,7 +200,6 @@ def test_two_opposed_people_are_given_different_policies_in_bundles_that_say_whi
     for manifest in manifests.values():
         policy, chances = manifest["choice"]["policy"], manifest["choice"]["chances"]
         assert sum(chances.values()) == pytest.approx(1.0, abs=0.01)
-        assert policy == max(chances, key=lambda each: chances[each])
         clear = not any("do not clearly say" in note for note in manifest["notes"])
         assert manifest["choice"]["sure"] == clear == (chances[policy] >= policy_choice.SURE)
     assert manifests["slow"]["interface"]["policy"]["gain"] == 0.3, "of the policy that was chosen"
