@@ -269,6 +269,7 @@ class StudySettings(BaseModel):
         unit="pairs",
         ge=0,
         le=20,
+        simulated=True,
     )
     panel_parameter: str = setting(
         "PROLIFIC_PID",
@@ -283,7 +284,7 @@ class StudySettings(BaseModel):
     screen_out_code: str = setting(
         "", Section.PANEL, "Code of who may not take part", "Also where no arm is open.", max_length=80
     )
-    attention_code: str = setting("", Section.PANEL, "Code of who missed catch pairs", max_length=80)
+    attention_code: str = setting("", Section.PANEL, "Code of who missed catch pairs", max_length=80, simulated=True)
     return_url: str = setting(
         "",
         Section.PANEL,

@@ -31,6 +31,9 @@ def test_nothing_is_asked_that_needs_a_simulator(experimenter: TestClient, recor
     assert not asked & SIMULATED
     assert not [name for name in SIMULATED if f'id="{name}"' in page]
     assert "Blinded evaluation" not in page
+    assert 'value="contested"' not in page
+    assert "catch pairs" not in page
+    assert "task-picture" not in page, "there is no seated person in somebody's recordings"
     assert page.count('class="task-card"') == 1, "a copy shows the same recordings"
 
 

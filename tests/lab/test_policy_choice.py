@@ -106,17 +106,17 @@ def test_check_runs_every_policy_and_says_which_row_of_the_sheet_is_whose(severa
     )
 
 
-def test_exploring_leaves_out_policies_that_lose_the_task_or_do_nothing_else(
+def test_exploring_tells_of_policies_that_lose_the_task_or_do_nothing_else(
     several: Path, use: Callable[[Path], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     add(several, "[policies.lazy]\ngain = 0.01\n\n[policies.alike]\ngain = 0.499\n")
     use(several)
     monkeypatch.setattr(fit_response_surface, "Compute", lambda _: AtHand())
     record = fit_response_surface.explore("plane", several / "blocks", 1)
-    assert record == {"policies": ["quick", "slow", "blunt"]}
-    dropped = registry.found_out("plane").dropped
-    assert "success falls by" in dropped["lazy"]
-    assert dropped["alike"] == "changes nothing that is measured"
+    assert record == {"policies": ["quick", "slow", "blunt", "lazy", "alike"]}, "studies count on all of them"
+    lazy, alike = registry.found_out("plane").notes
+    assert lazy.startswith("The policy lazy: success falls by")
+    assert alike == "The policy alike: changes nothing that is measured. Better take it out of policies."
 
 
 def test_a_study_asks_for_no_more_ways_than_there_are_policies_and_for_no_sliders(

@@ -127,7 +127,7 @@ def find(
     kept, dropped = [], dict(found.dropped)
     if found.chooses:
         found = _told_apart(found, described, folder, environment, reference, progress)
-        kept, dropped = list(found.axes), found.dropped
+        kept = list(found.axes)
     for number, axis in enumerate(found.axes if not found.chooses else ()):
         progress(f"trying {axis.name}", number / len(found.axes))
         ends = []
@@ -147,7 +147,7 @@ def find(
         found,
         axes=tuple(kept),
         dropped=dropped,
-        notes=_notes(success, at_limit, described),
+        notes=(*found.notes, *_notes(success, at_limit, described)),
         witness=_witness(reference[-1]),
         reference={"episodes": float(scenarios), "success": success, "actions_at_limit": round(at_limit, 3)},
     )
@@ -161,20 +161,20 @@ def _told_apart(
     reference: Sequence[Trajectory],
     progress: Callable[[str, float], None],
 ) -> Found:
-    """The policies that keep success and do something else that is measured, and what servers answer."""
-    kept, dropped, answered = [], dict(found.dropped), {}
+    """What servers answer, and which policies lose success or do nothing else that is measured.
+
+    They stay, for studies count on them: the choice guards the task for every person anyway.
+    """
+    notes, answered = [], {}
     for number, axis in enumerate(found.axes):
         progress(f"trying the policy {axis.name}", number / len(found.axes))
         policy = policy_of(described, folder, found, axis.name)
-        said = asked_first(policy, environment, reference[0].scenario)
+        if said := asked_first(policy, environment, reference[0].scenario):
+            answered[axis.name] = said
         changed = [environment.episode(policy.mean, each.scenario) for each in reference]
         if why := _lost(reference, changed) or ("" if _seen(reference, changed) else CHANGES_NOTHING):
-            dropped[axis.name] = why
-            continue
-        kept.append(axis)
-        if said is not None:
-            answered[axis.name] = said
-    return replace(found, axes=tuple(kept), dropped=dropped, answered_others=answered)
+            notes.append(f"The policy {axis.name}: {why}. Better take it out of policies.")
+    return replace(found, notes=tuple(notes), answered_others=answered)
 
 
 def _usable_end(
