@@ -188,7 +188,7 @@ class FilterLoop:
         for each in fields:
             places.append((each["name"], list(range(first, first + each["size"]))))
             first += each["size"]
-        if "observation" not in dict(places) or np.size(message.get("observation")) == size:
+        if "observation" not in dict(places) or np.size(message.get("observation", ())) == size:
             # environments with goals call one of their fields so: which is meant, its length says
             places = [("observation", list(range(size))), *(place for place in places if place[0] != "observation")]
         for name, columns in places:
