@@ -223,14 +223,14 @@ def test_each_of_several_policies_may_answer_from_a_server_of_its_own(
     plane: Path, use: Callable[[Path], None], database: Database, store: ArtefactStore
 ) -> None:
     def slowly(message: dict[str, Any]) -> dict[str, Any]:
-        return {"actions": 0.4 * to_goal(message)["actions"]}
+        return {"actions": 0.7 * to_goal(message)["actions"]}
 
     with serving() as usual, serving(slowly) as slow:
         text = (plane / "lab.toml").read_text().replace('file = "policy.onnx"', f'url = "{usual}"')
         (plane / "lab.toml").write_text(text)
         add(
             plane,
-            f'[policies.slow]\nurl = "{slow}"\n\n[policies.slower]\ngain = 0.25\n\n[policies.quick]\ngain = 0.9\n',
+            f'[policies.slow]\nurl = "{slow}"\n\n[policies.slower]\ngain = 0.3\n\n[policies.quick]\ngain = 0.9\n',
         )
         use(plane)
         fit_response_surface.find_ranges("plane", scenarios=4)
