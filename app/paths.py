@@ -4,6 +4,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
+LOCKS = (ROOT / "requirements.lock", ROOT / "requirements-dev.lock")
 MIGRATIONS = ROOT / "migrations"
 STATIC = ROOT / "static"
 TEMPLATES = ROOT / "templates"

@@ -52,6 +52,8 @@ class Shown:
     """(value, label, hint) of a switch that is shown as two choices, ``no`` and ``yes``."""
     new_row: bool = False
     """The row of fields before it ends."""
+    simulated: bool = False
+    """It is about what a simulator makes: studies of recordings have none of it."""
 
     def __call__(self, schema: dict[str, Any]) -> None:
         """Add to the JSON schema what it has no word for: the unit. A share is stored without one."""
@@ -70,10 +72,11 @@ def setting(
     complaint: str = "",
     options: tuple[tuple[str, str, str], ...] = (),
     new_row: bool = False,
+    simulated: bool = False,
     **bounds: Any,
 ) -> Any:
     """A field of a model of settings. ``bounds`` are pydantic's: ge, le, min_length, max_length, pattern."""
-    shown = Shown(section, label, hint, unit, fixed_by, complaint, options, new_row)
+    shown = Shown(section, label, hint, unit, fixed_by, complaint, options, new_row, simulated)
     return Field(default, title=label, description=hint or None, json_schema_extra=shown, **bounds)
 
 

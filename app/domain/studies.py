@@ -32,6 +32,13 @@ def usual_clip_steps(task: str) -> int:
     return installed.description.usual_clip_steps if installed else USUAL_CLIP_STEPS
 
 
+def usual_behaviours(task: str, wanted: int) -> int:
+    """So many ways of doing a scenario, or as many as there are."""
+    installed = catalogue.find(task)
+    most = installed.description.most_behaviours if installed else None
+    return wanted if most is None else min(wanted, most)
+
+
 def control_rate_hz(task: str) -> float:
     """Control steps per second; a laboratory's task has its own."""
     installed = catalogue.find(task)

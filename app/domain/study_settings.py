@@ -165,6 +165,7 @@ class StudySettings(BaseModel):
         fixed_by=Use.PAIRS,
         ge=0,
         le=20,
+        simulated=True,
     )
     break_every: int = setting(50, Section.PAIRS, "Offer a break every", "0: never.", unit="answers", ge=0, le=500)
     answer_after_first_play: bool = setting(
@@ -183,6 +184,7 @@ class StudySettings(BaseModel):
                 "answer once more, about that quality alone. Structured models of simulated clips only.",
             ),
         ),
+        simulated=True,
     )
     asks_for_hints: bool = setting(
         False,
@@ -197,6 +199,7 @@ class StudySettings(BaseModel):
                 "change them later. Each is heard as one more answer. Structured models of simulated clips only.",
             ),
         ),
+        simulated=True,
     )
     evaluation: EvaluationSettings | None = setting(
         None,
@@ -204,12 +207,14 @@ class StudySettings(BaseModel):
         "Evaluate methods at the end",
         "Balanced random order, unseen scenarios. Nobody knows which letter is which until you unblind the study.",
         fixed_by=Use.EVALUATION,
+        simulated=True,
     )
     debrief: bool = setting(
         False,
         Section.EVALUATION,
         "Show people their own robot at the end",
         "Before and after, side by side, and what it learned.",
+        simulated=True,
     )
     arms: tuple[Arm, ...] = setting(
         (),
@@ -219,9 +224,15 @@ class StudySettings(BaseModel):
         "participants never see them. Empty: everybody meets every method.",
         fixed_by=Use.ARMS,
         max_length=MOST_ARMS,
+        simulated=True,
     )
     stopped_arms: tuple[str, ...] = setting(
-        (), Section.DESIGN, "Arms that take nobody in any more", "Names, with commas.", max_length=MOST_ARMS
+        (),
+        Section.DESIGN,
+        "Arms that take nobody in any more",
+        "Names, with commas.",
+        max_length=MOST_ARMS,
+        simulated=True,
     )
     arm_quota: int = setting(
         0,
@@ -231,6 +242,7 @@ class StudySettings(BaseModel):
         unit="people",
         ge=0,
         le=100_000,
+        simulated=True,
     )
     arm_away_minutes: int = setting(
         60,
@@ -240,6 +252,7 @@ class StudySettings(BaseModel):
         unit="minutes",
         ge=5,
         le=43_200,
+        simulated=True,
     )
     screening: tuple[Screen, ...] = setting(
         (),
@@ -256,6 +269,7 @@ class StudySettings(BaseModel):
         unit="pairs",
         ge=0,
         le=20,
+        simulated=True,
     )
     panel_parameter: str = setting(
         "PROLIFIC_PID",
@@ -270,7 +284,7 @@ class StudySettings(BaseModel):
     screen_out_code: str = setting(
         "", Section.PANEL, "Code of who may not take part", "Also where no arm is open.", max_length=80
     )
-    attention_code: str = setting("", Section.PANEL, "Code of who missed catch pairs", max_length=80)
+    attention_code: str = setting("", Section.PANEL, "Code of who missed catch pairs", max_length=80, simulated=True)
     return_url: str = setting(
         "",
         Section.PANEL,
@@ -295,6 +309,7 @@ class StudySettings(BaseModel):
         "Also train a filter after",
         "Numbers of answers, with commas. One is always trained at the end.",
         unit="answers",
+        simulated=True,
     )
     success_tolerance: float = setting(
         0.035,
@@ -304,6 +319,7 @@ class StudySettings(BaseModel):
         unit="%",
         ge=0.0,
         le=0.5,
+        simulated=True,
     )
     harm_share: float = setting(
         0.05,
@@ -315,8 +331,11 @@ class StudySettings(BaseModel):
         ge=0.01,
         le=0.5,
         new_row=True,
+        simulated=True,
     )
-    harm_confidence: float = setting(0.95, Section.LEARNING, "Confidence of that promise", unit="%", ge=0.8, le=0.99)
+    harm_confidence: float = setting(
+        0.95, Section.LEARNING, "Confidence of that promise", unit="%", ge=0.8, le=0.99, simulated=True
+    )
     harm_force_n: int = setting(
         5,
         Section.LEARNING,
@@ -325,17 +344,29 @@ class StudySettings(BaseModel):
         unit="N",
         ge=0,
         le=50,
+        simulated=True,
     )
     harm_spilled: float = setting(
-        0.25, Section.LEARNING, "Worse: more of the portion spilled", unit="%", ge=0.0, le=1.0
+        0.25, Section.LEARNING, "Worse: more of the portion spilled", unit="%", ge=0.0, le=1.0, simulated=True
     )
     evaluation_scenarios: int = setting(
-        100, Section.LEARNING, "Scenarios that measure a filter", "Never seen in training.", ge=10, le=1000
+        100,
+        Section.LEARNING,
+        "Scenarios that measure a filter",
+        "Never seen in training.",
+        ge=10,
+        le=1000,
+        simulated=True,
     )
     method: Method = setting(
-        Method.STUDIO, Section.LEARNING, "Method", complaint="Choose “studio” or “printed”.", new_row=True
+        Method.STUDIO,
+        Section.LEARNING,
+        "Method",
+        complaint="Choose “studio” or “printed”.",
+        new_row=True,
+        simulated=True,
     )
-    reward_kind: RewardKind = setting(RewardKind.STRUCTURED, Section.LEARNING, "Reward model")
+    reward_kind: RewardKind = setting(RewardKind.STRUCTURED, Section.LEARNING, "Reward model", simulated=True)
     strategy: Strategy = setting(Strategy.ENTROPY, Section.LEARNING, "How pairs are chosen")
     random_share: float = setting(
         0.3,
@@ -355,6 +386,7 @@ class StudySettings(BaseModel):
         unit="%",
         ge=0.0,
         le=0.9,
+        simulated=True,
     )
     pooled_prior: bool = setting(
         False,
@@ -368,13 +400,21 @@ class StudySettings(BaseModel):
                 "Whoever is not like them is soon not taken for one of them. Structured models only.",
             ),
         ),
+        simulated=True,
     )
-    advisor: Advisor = setting(Advisor.SHOW, Section.LEARNING, "When more answers hardly pay")
+    advisor: Advisor = setting(Advisor.SHOW, Section.LEARNING, "When more answers hardly pay", simulated=True)
     pool_scenarios: int = setting(
-        48, Section.CLIPS, "Situations", "Each with its own start and seating position.", ge=1, le=500
+        48, Section.CLIPS, "Situations", "Each with its own start and seating position.", ge=1, le=500, simulated=True
     )
     behaviours_per_scenario: int = setting(
-        6, Section.CLIPS, "Ways of doing each", "Pairs show two of them.", fixed_by=Use.CLIPS, ge=2, le=8
+        6,
+        Section.CLIPS,
+        "Ways of doing each",
+        "Pairs show two of them.",
+        fixed_by=Use.CLIPS,
+        ge=2,
+        le=8,
+        simulated=True,
     )
     clip_steps: int = setting(
         USUAL_CLIP_STEPS,
@@ -385,9 +425,12 @@ class StudySettings(BaseModel):
         fixed_by=Use.CLIPS,
         ge=SHORTEST_CLIP_STEPS,
         le=LONGEST_CLIP_STEPS,
+        simulated=True,
     )
-    clip_quality: ClipQuality = setting(ClipQuality.SHARP, Section.CLIPS, "Quality", fixed_by=Use.CLIPS)
-    planned_tests: tuple[PlannedTest, ...] = setting((PlannedTest.PAIRED_T,), Section.TESTS, "Tests on the ratings")
+    clip_quality: ClipQuality = setting(ClipQuality.SHARP, Section.CLIPS, "Quality", fixed_by=Use.CLIPS, simulated=True)
+    planned_tests: tuple[PlannedTest, ...] = setting(
+        (PlannedTest.PAIRED_T,), Section.TESTS, "Tests on the ratings", simulated=True
+    )
     equivalence_bound: float = setting(
         0.5,
         Section.TESTS,
@@ -396,6 +439,7 @@ class StudySettings(BaseModel):
         unit="points",
         ge=0.1,
         le=2.0,
+        simulated=True,
     )
 
     @model_validator(mode="after")

@@ -135,6 +135,11 @@ class DescribedTask(BaseModel):
         """Whether the policy answers from elsewhere."""
         return False
 
+    @property
+    def most_behaviours(self) -> int | None:
+        """In how many ways a scenario can be executed; None: in as many as are asked for."""
+        return None
+
     @model_validator(mode="after")
     def _shown_within_the_episode(self) -> Self:
         if self.usual_clip_steps > self.episode_steps:

@@ -27,6 +27,8 @@ NAME = r"[a-z][a-z0-9_]{0,39}"
 LARGEST_RATE_HZ = 100.0
 
 ANY_FRAME = "the environment's own"
+REFERENCE = "reference"
+"""What the frozen policy is called among those of which one is chosen."""
 
 _Columns = Annotated[str, Field(pattern=r"^([A-Za-z_]\w*)?(\[\d+:\d+\])?$", min_length=1)]
 """Columns of an observation: a key of a Dict, a range of columns as in [0:3], or both."""
@@ -92,6 +94,8 @@ class LabPolicy(_Table):
     """its actions are multiplied by this, so that somebody may also want it quicker"""
     activation: Literal["relu", "tanh", "elu"] | None = None
     """of a Stable-Baselines3 network; None: what its algorithm uses unless told otherwise"""
+    settings: dict[str, float] = {}
+    """actions, by name, that stay at a value in the environment's own unit, as a controller's stiffness does"""
 
     @model_validator(mode="after")
     def _one_of_both(self) -> Self:
@@ -100,6 +104,8 @@ class LabPolicy(_Table):
         of_servers = {"answer_s", "inputs", "prompt", "execution_horizon"} & self.model_fields_set
         if self.file and of_servers:
             raise ValueError(f"{min(of_servers)} is for policy servers (url), and this policy is a file")
+        if self.url and self.settings:
+            raise ValueError("settings are for policies in files; a server answers with every action itself")
         return self
 
 
@@ -151,6 +157,14 @@ def _name(name: str) -> str:
     return name
 
 
+def _like(policy: dict[str, Any], own: Any) -> Any:
+    """What an entry of ``policies`` says, and for the rest what ``policy`` says."""
+    if not isinstance(own, dict):
+        return own
+    elsewhere = {"file", "url"} if {"file", "url"} & own.keys() else set()
+    return {**{key: value for key, value in policy.items() if key not in elsewhere}, **own}
+
+
 class LabDescription(DescribedTask):
     """What ``lab.toml`` says."""
 
@@ -161,11 +175,33 @@ class LabDescription(DescribedTask):
     """as in DescribedTask; a language without them reads neutral words"""
     environment: LabEnvironment
     policy: LabPolicy
+    policies: dict[Annotated[str, AfterValidator(_name)], LabPolicy] = Field(default_factory=dict, max_length=7)
+    """Others among which one is chosen for a person, instead of a filter; what is not said is as in ``policy``."""
     success: Measured
     """Whether the task has succeeded so far; what it says at the last step counts."""
     signals: dict[Annotated[str, AfterValidator(_name)], LabSignal] = Field(default_factory=dict)
     fields: LabFields = LabFields()
     modes: LabModes = LabModes()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _policies_are_like_the_policy(cls, said: Any) -> Any:
+        policy, policies = (said.get(key) for key in ("policy", "policies")) if isinstance(said, dict) else (None, None)
+        if not (isinstance(policy, dict) and isinstance(policies, dict)):
+            return said
+        return {**said, "policies": {name: _like(policy, own) for name, own in policies.items()}}
+
+    @model_validator(mode="after")
+    def _policies_can_be_told_apart(self) -> Self:
+        for name, each in self.policies.items():
+            if name == REFERENCE:
+                raise ValueError(f"policies.{name} is what the one under policy is called; choose another name")
+            if each == self.policy:
+                raise ValueError(f"policies.{name} is the same as policy; give it another file, url, gain or settings")
+        for each in (self.policy, *self.policies.values()):
+            if unknown := sorted(set(each.settings) - set(self.environment.action_names)):
+                raise ValueError(f"settings has {unknown[0]}, which is not among environment.action_names")
+        return self
 
     @model_validator(mode="after")
     def _not_measured_already(self) -> Self:
@@ -184,6 +220,15 @@ class LabDescription(DescribedTask):
                 raise ValueError(f"hints.{name} is about {unknown[0]}, which is not among its signals")
         return self
 
+    def policy_named(self, name: str) -> LabPolicy:
+        """One of ``policies``; the empty name is the frozen policy's."""
+        return self.policies[name] if name else self.policy
+
+    @property
+    def most_behaviours(self) -> int | None:
+        """Policies to choose from; filters have no end of ways."""
+        return len(self.policies) + 1 if self.policies else None
+
     @property
     def policy_is_looked_into(self) -> bool:
         """Never: whatever it is, a lab's policy is only asked what it does."""
@@ -192,7 +237,7 @@ class LabDescription(DescribedTask):
     @property
     def policy_is_a_server(self) -> bool:
         """Whether it answers over a websocket."""
-        return self.policy.url is not None
+        return any(each.url is not None for each in (self.policy, *self.policies.values()))
 
     @property
     def signal_names(self) -> tuple[str, ...]:
@@ -222,10 +267,16 @@ def read(file: Path) -> InstalledTask:
     if not file.is_file():
         raise TaskRefused(f"There is no file {file}.")
     description = parsed(LabDescription, file)
-    if description.policy.file is not None:
-        policy = file.parent / description.policy.file
+    for key, said in {"policy": description.policy, **_by_key(description.policies)}.items():
+        if said.file is None:
+            continue
+        policy = file.parent / said.file
         if not policy.is_file():
-            raise TaskRefused(f"{file}: policy.file names {policy}, which does not exist.")
+            raise TaskRefused(f"{file}: {key}.file names {policy}, which does not exist.")
         if policy.suffix not in {".onnx", ".zip", ".safetensors"}:
-            raise TaskRefused(f"{file}: policy.file must end in .onnx, .zip (Stable-Baselines3) or .safetensors.")
+            raise TaskRefused(f"{file}: {key}.file must end in .onnx, .zip (Stable-Baselines3) or .safetensors.")
     return InstalledTask(description.name, NO_PACKAGE, file.parent.resolve(), description, picture="")
+
+
+def _by_key(policies: dict[str, LabPolicy]) -> dict[str, LabPolicy]:
+    return {f"policies.{name}": each for name, each in policies.items()}

@@ -54,10 +54,10 @@ def main() -> None:
 
 def cell(name: str, share: float, scenarios: int) -> tuple[object, ...]:
     """One task with its modes shortened to a share: how much people disagree, and what that is worth."""
-    task, policy = registry.task(name), simulation.reference_policy(name)
+    task = registry.task(name)
     found = disagreement.measured(
         task,
-        policy.mean,
+        lambda policy: simulation.reference_policy(name, policy).mean,
         lambda act, scenario: simulation.run_episode(name, act, scenario),
         registry.installed_task(name).description.usual_clip_steps,
         scenarios,

@@ -2,6 +2,7 @@
 
 import zipfile
 from collections.abc import Callable
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from tests.lab.conftest import way_to_goal
 from worker.__main__ import main
-from worker.experiments.check_lab import Checked, checked
+from worker.experiments.check_lab import Checked, checked, replaced_packages
 from worker.ml.policies import lab_policy
 from worker.ml.policies.onnx_policy import mlp_to_onnx
 from worker.sim.lab.references import named_object
@@ -195,3 +196,25 @@ def test_a_policys_actions_are_mapped_to_the_studios_range_and_multiplied(plane:
     whole, half = (lab_policy.load(plane / "policy.onnx", 4, 7, bounds, gain).mean(far) for gain in (1.0, 0.5))
     np.testing.assert_allclose(whole, np.tanh(4.0) * np.array([1, -1]), rtol=1e-5)
     np.testing.assert_allclose(half, whole / 2, rtol=1e-6)
+
+
+def test_packages_of_the_studio_that_an_installation_has_replaced_are_named() -> None:
+    lock = f"numpy==0.1 \\\n    --hash=sha256:00\nonnx=={version('onnx')} \\\nnot-installed-here==1.0\n"
+    assert replaced_packages([lock]) == [f"numpy==0.1 was replaced by {version('numpy')}"]
+    assert replaced_packages([lock, f"numpy=={version('numpy')}\n"]) == [], "of development"
+
+
+def test_a_repetition_that_differs_in_the_last_digits_is_the_same_episode(plane: Path) -> None:
+    noisy = "np.concatenate([self.place + np.random.uniform(0.0, 1e-7),"
+    change(plane, "np.concatenate([self.place,", noisy, "plane.py")
+    assert said(plane) == ""
+    change(plane, "1e-7", "1e-2", "plane.py")
+    (plane / "plane.py").rename(plane / "anew.py")
+    change(plane, "plane:", "anew:")
+    assert "the same seed and policy gave another episode" in said(plane)
+
+
+def test_check_tells_of_replaced_packages(plane: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "requirements.lock").write_text("numpy==0.1\n")
+    monkeypatch.setattr("worker.experiments.check_lab.LOCKS", [tmp_path / "requirements.lock"])
+    assert "has replaced packages of the studio: numpy==0.1 was replaced" in " ".join(found(plane).remarks)

@@ -70,7 +70,7 @@ def test_check_says_it_of_an_explored_task_and_what_to_do_where_nobody_could_tel
     assert "too alike" not in remarks
     task, policy = registry.task("plane"), simulation.reference_policy("plane")
     environment = simulation.lab_environment("plane")
-    alike = disagreement.measured(task, policy.mean, environment.episode, 40, scenarios=4, share=0.005)
+    alike = disagreement.measured(task, lambda _: policy.mean, environment.episode, 40, scenarios=4, share=0.005)
     words = " ".join(disagreement.in_words(alike, task))
     assert "do not invite people yet" in words
     (explored / "checkpoint" / "found.json").unlink()

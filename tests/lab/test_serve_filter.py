@@ -229,6 +229,26 @@ def test_a_bundle_of_ours_says_units_frame_and_rate_and_takes_its_fields_by_name
     loop.close()
 
 
+def test_an_environment_with_goals_has_a_field_called_observation_and_is_asked_by_fields_or_whole() -> None:
+    policy = invented.small_policy()
+    interface = interface_of(invented.TASK, policy)
+    (first, place), *others = invented.TASK.observation.slices()
+    fields = [interface["observation"][0] | {"name": "observation"}, *interface["observation"][1:]]
+    inputs = {
+        "observation": list(range(place.stop)),
+        **{other.name: list(range(at.start, at.stop)) for other, at in others},
+    }
+    interface |= {"observation": fields, "policy": interface["policy"] | {"inputs": inputs}}
+    loop = FilterLoop(interface, lambda seen, mean: mean, policy.mean, 5.0, 60.0)
+    seen = np.zeros(invented.TASK.observation.size, np.float32) + 0.1
+    parts = {"observation": seen[place], **{other.name: seen[at] for other, at in others}}
+    whole, by_fields = (loop.answer(packed(each))["actions"] for each in ({"observation": seen}, parts))
+    np.testing.assert_array_equal(whole, by_fields)
+    with pytest.raises(Refused, match=rf"observation has the shape .* needs \({first.size},\)"):
+        loop.answer(packed(parts | {"observation": np.zeros(first.size + 1)}))
+    loop.close()
+
+
 # The bundle's own files, as somebody without this project runs them
 
 

@@ -13,6 +13,7 @@ from starlette.testclient import TestClient
 from app import __main__ as studio
 from app.db import Database
 from app.domain.choices import Method
+from app.domain.models import ModelKind
 from app.domain.protocol import Language
 from app.domain.study_settings import StudySettings
 from app.installed_tasks import catalogue
@@ -144,3 +145,23 @@ def test_several_files_are_named_as_in_path(plane: Path, monkeypatch: pytest.Mon
     (broken,) = catalogue.installed().broken
     assert "There is no file" in broken.why
     forget()
+
+
+def test_a_participants_page_has_the_labs_own_costs_and_says_which_policy_was_chosen(
+    plane: Path, use: Callable[[Path], None], database: Database, experimenter: TestClient
+) -> None:
+    use(plane)
+    effort = {"reference": 2.5, "filter": 1.5, "delta": -1.0, "low": -1.2, "high": -0.8}
+    measured = factories.filter_metrics()
+    measured["evaluation"] |= {"costs": {"effort": effort}}
+    choice = {"policy": "careful_one", "chances": {"reference": 0.3, "careful_one": 0.7}, "sure": False}
+    with database.writing() as session:
+        study = studies.create_study(session, "Points", StudySettings(clip_steps=40), task="plane")
+        person, _ = factories.make_participant(session, study)
+        factories.make_model(session, study, person, ModelKind.FILTER, measured | {"choice": choice})
+        address = f"/studies/{study.slug}/participants/{person.code}"
+    page = " ".join(experimenter.get(address).text.split())
+    assert "effort (m)" in page
+    assert "<strong>careful one</strong> was chosen" in page
+    assert "<dt>careful one</dt><dd>70 %</dd></div><div><dt>reference</dt><dd>30 %</dd>" in page
+    assert "Gate" not in page, "nothing is weakened where a policy is chosen"

@@ -34,10 +34,10 @@ from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import Float32Array
 from worker.experiments import fit_response_surface
 from worker.jobs.clips.pool_clips import build_clips
-from worker.jobs.learning import dataset
+from worker.jobs.learning import dataset, shared_filters
 from worker.jobs.learning.filters import train_filter
 from worker.jobs.learning.reward_models import train_reward
-from worker.jobs.runtime import records
+from worker.jobs.runtime import due_lending, records
 from worker.jobs.runtime.context import Step, WorkerContext
 from worker.jobs.runtime.records import Job
 from worker.ml.export import bundle
@@ -102,6 +102,16 @@ def do(context: WorkerContext, act: Act, key: RunKey, study_id: int) -> None:
     with context.database.writing() as session:
         run_id = records.begin_run(session, job, seed=1)
     act(context, job, run_id, at_once)
+
+
+def lend(context: WorkerContext, study_id: int) -> None:
+    """Draw whose robots everybody is shown, and fit what is fitted for several."""
+    with context.database.writing() as session:
+        due_lending.settle(session, study_id)
+        jobs = due_lending.due(session, session.get_one(Study, study_id))
+        runs = [records.begin_run(session, job, seed=1) for job in jobs]
+    for job, run_id in zip(jobs, runs, strict=True):
+        shared_filters.fit(context, job, run_id, at_once)
 
 
 def film(context: WorkerContext, study_id: int) -> None:

@@ -20,7 +20,7 @@ from app.services.evaluation import evaluation_plan
 from app.storage import ArtefactStore
 from tests.lab.conftest import write_plane
 from tests.lab.policy_server import serving
-from tests.lab.test_whole_loop import LABELS, SLOW, answer, do, film, make_study
+from tests.lab.test_whole_loop import LABELS, SLOW, answer, do, film, lend, make_study
 from tests.worker.at_hand import AtHand
 from worker.experiments import fit_response_surface
 from worker.jobs.clips.evaluation_films import make_films
@@ -56,8 +56,9 @@ def test_from_a_policy_server_to_a_bundle(
         with database.reading() as session:
             last = f"answer-{session.scalar(select(func.max(LabelEvent.id)))}"
         known = RunKey(RunKind.REWARD, participant_id=person_id, labels=LABELS, answers=last)
+        do(context, train_reward, known, study_id)
+        lend(context, study_id)
         for act, kind, subject in (
-            (train_reward, RunKind.REWARD, ""),
             (train_filter, RunKind.FILTER, ""),
             (train_method, RunKind.METHOD, EvaluatedMethod.SOMEBODY_ELSE),
             (make_films, RunKind.FILMS, TRIALS),

@@ -11,6 +11,7 @@ import numpy as np
 from app.db import Database
 from app.domain.choices import ClipQuality, Strategy
 from app.domain.protocol import EvaluationSettings
+from app.domain.studies import usual_behaviours
 from app.domain.study_settings import PAPER_PROTOCOL, StudySettings
 from app.services.archives import demo_archive
 from app.storage import ArtefactStore
@@ -159,7 +160,9 @@ def settings_of(said: argparse.Namespace) -> StudySettings:
     chosen = {name: value for name in OF_SETTINGS if (value := getattr(said, name)) is not None}
     chosen["clip_quality"] = ClipQuality.QUICK  # nobody looks at them
     labels = chosen.get("labels_per_participant", usual.labels_per_participant)
-    chosen["pool_scenarios"] = said.clip_scenarios or -(-labels // usual.pairs_per_scenario)
+    ways = usual_behaviours(said.task, usual.behaviours_per_scenario)
+    chosen["behaviours_per_scenario"] = ways
+    chosen["pool_scenarios"] = said.clip_scenarios or -(-labels // (ways * (ways - 1) // 2))
     if registry.lab(said.task) is not None:
         chosen["clip_steps"] = registry.installed_task(said.task).description.usual_clip_steps
     if said.paper:

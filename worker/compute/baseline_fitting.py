@@ -7,6 +7,7 @@ observations to actions, so what is evaluated, filmed and run on a robot is one 
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -83,8 +84,8 @@ def controller_of_reference(task: str) -> bytes:
 
 def controller_of_filter(task: str, weights: bytes) -> bytes:
     """The frozen policy with somebody's filter behind it as a controller."""
-    policy, family = simulation.reference_policy(task), tasks.task(task).modes
-    act = filter_problem.act_of(family, policy, FilterWeights.from_bytes(weights))
+    personal = FilterWeights.from_bytes(weights)
+    act = filter_problem.act_of(tasks.task(task).modes, simulation.policy_in(task, personal.mode), personal)
     return controller.of_act(act, observations(task))
 
 
@@ -95,7 +96,7 @@ def packed(task: str, study: str, participant: str, letter: str, model: bytes) -
 
 def drive(task: str, model: bytes, scenarios: Sequence[int]) -> list[Trajectory]:
     """One rollout per scenario."""
-    act = controller.act_of_stored(model, simulation.reference_policy(task))
+    act = controller.act_of_stored(model, partial(simulation.reference_policy, task))
     return learning.run_scenarios(task, act, scenarios, 0.0, 0)
 
 

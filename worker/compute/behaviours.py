@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from worker.domain.lab_modes import PolicyChoice
 from worker.domain.spaces import CONTROL_STEP_S
 from worker.domain.task import Task
 
@@ -49,8 +50,13 @@ def draw_behaviours(
     task: Task, scenario: int, count: int, checkpoints: Sequence[str] = (), sampled: bool = True
 ) -> list[Behaviour]:
     """Random behaviours of one scenario, no two of them alike. ``checkpoints``: the early policies there are;
-    ``sampled``: whether the policy can draw actions at random."""
+    ``sampled``: whether the policy can draw actions at random. Where one of several policies is chosen, behaviours are
+    those policies and nothing else; raises ValueError for more than there are."""
     rng = np.random.default_rng([scenario, 1])
+    if isinstance(task.modes, PolicyChoice):
+        if count > len(task.modes.axes) + 1:
+            raise ValueError(f"{task.name} has {len(task.modes.axes) + 1} policies, not {count}.")
+        return [Behaviour(task.modes.named(mode)) for mode in _different_modes(task, count, rng)]
     modes = _different_modes(task, count, rng)
     return [_dressed(task, mode, (scenario, index), checkpoints, rng, sampled) for index, mode in enumerate(modes)]
 

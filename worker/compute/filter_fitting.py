@@ -12,18 +12,21 @@ from typing import Any
 
 import numpy as np
 
+from app.installed_tasks.lab import REFERENCE
 from worker.analysis.filters.evaluation import evaluate
 from worker.analysis.filters.promise import Outcome, Promise, sentence
 from worker.analysis.filters.proof import case_against
 from worker.compute import harm_tests, learning, simulation
 from worker.compute.pools import Computing, Lane
 from worker.compute.simulation import surface_file
+from worker.domain.lab_modes import PolicyChoice
 from worker.domain.scenarios import EVALUATION, RESIDUAL, first_of, of_promise
+from worker.domain.task import Task
 from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import Act
 from worker.ml.export import bundle
 from worker.ml.export.bundle import BundleContents, Provenance, RecordedSteps
-from worker.ml.filters import filter_problem, mode_search, printed_filter, residual
+from worker.ml.filters import filter_problem, mode_search, policy_choice, printed_filter, residual
 from worker.ml.filters.filter_module import FilterWeights
 from worker.ml.filters.filter_onnx import SHIELD
 from worker.ml.filters.filter_problem import (
@@ -34,7 +37,9 @@ from worker.ml.filters.filter_problem import (
     GateTrial,
     ReportProgress,
 )
+from worker.ml.filters.policy_choice import SURE
 from worker.ml.filters.response_surface import ResponseSurface
+from worker.ml.policies.reference import ReferencePolicy
 from worker.ml.rewards.loading import load_reward_model
 from worker.tasks import registry
 
@@ -98,10 +103,21 @@ class FilterFit:
         return FilterProblem(task, policy, load_reward_model(self.reward), self.seed, config)
 
     def find_mode(self, pool: Sequence[Trajectory]) -> FilterDraft:
-        """The person's execution mode, as far as held-out scenarios allow it."""
+        """The person's execution mode, as far as held-out scenarios allow it; or their policy among several."""
+        if isinstance(self.problem.task.modes, PolicyChoice):
+            return self._choose(self.problem.task.modes)
         surface = ResponseSurface.load(surface_file(self.task), self.problem.task.modes, self.problem.task.signals)
         reference = self._gate_reference()
         return mode_search.find_mode(self.problem, surface, pool, reference, self.collect, self.progress)
+
+    def _choose(self, family: PolicyChoice) -> FilterDraft:
+        """What every policy does in the gate's scenarios is the same for everybody, and made once per worker."""
+        scenarios = self.problem.config.gate_block(self.problem.task)
+        others = {}
+        for number, name in enumerate(family.names):
+            self.progress(f"driving the policy {name} through held-out scenarios", 0.6 * number / len(family.names))
+            others[name] = self.reference(scenarios, name)
+        return policy_choice.choose(self.problem, self.reference(scenarios), others)
 
     def train_residual(self, draft: FilterDraft) -> FilterDraft:
         """The residual action encoder around the mode."""
@@ -118,11 +134,12 @@ class FilterFit:
         if moves_nothing(draft.weights):
             return harm_tests.untested(draft, self.promise, self.version)
         started = time.perf_counter()
-        strengths, scenarios = (1.0, *self.config.gates), of_promise(self.study_seed)
+        chooses = isinstance(self.problem.task.modes, PolicyChoice)  # there is no half of another policy
+        strengths, scenarios = (1.0, *(() if chooses else self.config.gates)), of_promise(self.study_seed)
 
         def drive(weights: FilterWeights, some: range) -> Sequence[Outcome]:
             self.progress("testing what the filter may do to people", 0.86)
-            return self._outcomes(filter_problem.act_of(self.problem.task.modes, self.problem.policy, weights), some)
+            return self._outcomes(self._act_of(weights), some)
 
         kept = harm_tests.weakened_until_promised(
             draft, self.promise, self.version, strengths, scenarios, drive, self._reference_outcomes
@@ -178,18 +195,34 @@ class FilterFit:
             "seconds": {**draft.seconds, "evaluation": round(time.perf_counter() - started, 1)},
             "weights": learned.get("weights"),
             "costs": learned.get("costs"),
+            "choice": _choice(self.problem.task, draft),
         }
         contents = BundleContents(
-            task=self.problem.task,
+            task=self._bundled_task(draft.weights),
             filter_onnx=proven.act.exported.stored,
             weights=draft.weights,
             reward=self.problem.reward,
-            policy=self.problem.policy,
-            recording=RecordedSteps.of(proven.driven[:RECORDED_EPISODES]),
+            policy=self._policy_of(draft.weights),
+            recording=self._recording(proven),
             metrics=metrics,
             provenance=provenance,
         )
         return Finished(draft.weights.to_bytes(), bundle.write(contents), metrics)
+
+    def _bundled_task(self, weights: FilterWeights) -> Task:
+        """The task with what runs beside the robot has to know of the policy that was chosen."""
+        task, described = self.problem.task, registry.lab(self.task)
+        if described is None or not (policy := task.modes.policy(task.modes.vector(weights.mode))):
+            return task
+        return replace(task, interface=registry.found_out(self.task).interface(described, policy))
+
+    def _recording(self, proven: Proven) -> RecordedSteps:
+        """What goes into the bundle; the policy's own actions are those of the one that was chosen."""
+        recorded = RecordedSteps.of(proven.driven[:RECORDED_EPISODES])
+        if not proven.draft.choice:
+            return recorded
+        policy = self._policy_of(proven.draft.weights)
+        return replace(recorded, policy_means=policy.mean(recorded.observations))
 
     def _promised(self, draft: FilterDraft, unchanged: bool) -> dict[str, Any]:
         """The promise with its sentence; empty for a filter of which none is made."""
@@ -203,14 +236,14 @@ class FilterFit:
         (worker.analysis.filters.proof) is replaced by the reference.
         """
         self.progress("driving the filter through unseen scenarios", 0.88)
-        act = filter_problem.act_of(self.problem.task.modes, self.problem.policy, draft.weights)
+        act = self._act_of(draft.weights)
         evaluation, driven = self._evaluate(act)
         against = case_against(evaluation) if draft.weights.method == "studio" else ()
         if not against:
             return Proven(draft, act, evaluation, driven, {})
         rejected = {"evaluation": evaluation, "mode": dict(draft.weights.mode), **_strengths(draft.weights)}
         draft = as_reference(draft, evaluation["preference"], against)
-        act = filter_problem.act_of(self.problem.task.modes, self.problem.policy, draft.weights)
+        act = self._act_of(draft.weights)
         return Proven(draft, act, *self._evaluate_reference(), rejected)
 
     def _evaluate(self, act: FilterAct) -> tuple[dict[str, Any], list[Trajectory]]:
@@ -240,12 +273,29 @@ class FilterFit:
     def _gate_reference(self) -> Sequence[Trajectory]:
         return self.reference(self.problem.config.gate_block(self.problem.task))
 
-    def reference(self, scenarios: range) -> Sequence[Trajectory]:
-        """The frozen policy's rollouts: the same for everybody, so they are made once per worker."""
-        key = (self.task, scenarios)
+    def _act_of(self, weights: FilterWeights) -> FilterAct:
+        return filter_problem.act_of(self.problem.task.modes, self._policy_of(weights), weights)
+
+    def _policy_of(self, weights: FilterWeights) -> ReferencePolicy:
+        """The frozen policy, or the one that was chosen."""
+        return simulation.policy_in(self.task, weights.mode)
+
+    def reference(self, scenarios: range, policy: str = "") -> Sequence[Trajectory]:
+        """The frozen policy's rollouts, or those of another one: the same for everybody, so they are made once per
+        worker."""
+        key = (f"{self.task} {policy}".strip(), scenarios)
         if key not in self.references:
-            self.references[key] = self.collect(simulation.reference_policy(self.task).mean, scenarios, 0.0, 0)
+            act = simulation.reference_policy(self.task, policy).mean
+            self.references[key] = self.collect(act, scenarios, 0.0, 0)
         return self.references[key]
+
+
+def _choice(task: Task, draft: FilterDraft) -> dict[str, Any] | None:
+    """Which of several policies it is in the end, and whether the answers clearly say so; None: a filter."""
+    if not draft.choice:
+        return None
+    policy = task.modes.policy(task.modes.vector(draft.weights.mode)) or REFERENCE
+    return {"policy": policy, "chances": dict(draft.choice), "sure": draft.choice[policy] >= SURE}
 
 
 def moves_nothing(weights: FilterWeights) -> bool:
@@ -296,6 +346,7 @@ def draft_to_bytes(draft: FilterDraft) -> bytes:
         "notes": draft.notes,
         "seconds": dict(draft.seconds),
         "promise": dict(draft.promise),
+        "choice": dict(draft.choice),
     }
     arrays: dict[str, Any] = {f"value/{name}": array for name, array in draft.value.items()}
     arrays |= {f"tested/{name}": array for name, array in draft.tested.items()}
@@ -317,5 +368,12 @@ def draft_from_bytes(stored: bytes) -> FilterDraft:
         weights = FilterWeights.from_bytes(arrays["weights"].tobytes())
     trials = tuple(GateTrial(**each) for each in record["trials"])
     return FilterDraft(
-        weights, value, trials, tuple(record["notes"]), record["seconds"], tested, record.get("promise", {})
+        weights,
+        value,
+        trials,
+        tuple(record["notes"]),
+        record["seconds"],
+        tested,
+        record.get("promise", {}),
+        record.get("choice", {}),
     )

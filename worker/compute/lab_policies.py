@@ -11,20 +11,28 @@ from worker.ml.policies.remote_policy import Asking, RemotePolicy
 from worker.sim.lab.found import Found, inputs_of
 
 
-def policy_of(described: LabDescription, folder: Path, found: Found) -> OnnxPolicy | RemotePolicy:
-    """The policy that a lab.toml in a folder names. Raises NotAPolicy, and LabTaskBroken for policy.inputs."""
-    said, size = described.policy, sum(each.size for each in found.observation)
+def policy_of(described: LabDescription, folder: Path, found: Found, name: str = "") -> OnnxPolicy | RemotePolicy:
+    """The policy that a lab.toml in a folder names, or another of its policies, by name.
+
+    Raises NotAPolicy, and LabTaskBroken for its inputs.
+    """
+    said, size = described.policy_named(name), sum(each.size for each in found.observation)
     if said.file is not None:
         low, high = (np.array(each) for each in found.bounds)
-        return lab_policy.load(folder / said.file, found.own_size, size, (low, high), said.gain, said.activation)
+        kept = {each.name: place for place, each in enumerate(found.action)}
+        settings = {kept[action]: value for action, value in said.settings.items()}
+        return lab_policy.load(
+            folder / said.file, found.own_size, size, (low, high), said.gain, said.activation, settings
+        )
     asking = Asking(
         url=str(said.url),
         answer_s=said.answer_s,
-        inputs=inputs_of(described, found.observation),
+        inputs=inputs_of(described, found.observation, name),
         prompt=said.prompt,
         execution_horizon=said.execution_horizon,
         episode_steps=described.episode_steps,
         bounds=found.bounds,
         gain=said.gain,
+        name=name,
     )
-    return RemotePolicy(asking, size, found.answered)
+    return RemotePolicy(asking, size, found.answered_others.get(name) if name else found.answered)

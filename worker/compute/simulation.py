@@ -6,8 +6,9 @@ loads torch, so that the processes that film start quickly and stay small. Tasks
 """
 
 import io
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import cache, lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -109,22 +110,28 @@ def signal_predictor(name: str) -> SignalPredictor:
 
 @cache
 def reference_policy(name: str, early: str = "") -> ReferencePolicy:
-    """The frozen policy that lies in a task's folder, or one from an early stage of its training. Raises NoPolicy, and
-    NotAPolicy for a laboratory's."""
+    """The frozen policy that lies in a task's folder, or one from an early stage of its training, or another of those
+    among which a laboratory chooses, by name. Raises NoPolicy, and NotAPolicy for a laboratory's."""
     if registry.lab(name) is not None:
-        return _lab_policy(name)
+        return _lab_policy(name, early)
     file = checkpoint(name) / (f"early/{early}.safetensors" if early else "policy.safetensors")
     if not file.exists():
         raise NoPolicy(f"The task {name} has no policy {file}: run python -m worker pretrain --task {name}.")
     return GaussianPolicy.load(file)
 
 
-def _lab_policy(name: str) -> ReferencePolicy:
+def policy_in(name: str, mode: Mapping[str, float]) -> ReferencePolicy:
+    """The policy that a mode, by the names of its axes, is executed by: the frozen one but where one is chosen."""
+    family = task(name).modes
+    return reference_policy(name, family.policy(family.vector(mode)))
+
+
+def _lab_policy(name: str, other: str) -> ReferencePolicy:
     from worker.compute import lab_policies  # torch, which processes that film our tasks do without
 
     described = registry.lab(name)
     assert described is not None  # noqa: S101 -- callers do this for laboratories' tasks only
-    return lab_policies.policy_of(described, registry.installed_task(name).folder, registry.found_out(name))
+    return lab_policies.policy_of(described, registry.installed_task(name).folder, registry.found_out(name), other)
 
 
 def early_policies(name: str) -> list[str]:
@@ -140,12 +147,13 @@ def behaviours(name: str, scenario: int, count: int) -> list[Behaviour]:
 
 def act_in_mode(name: str, mode: npt.ArrayLike) -> Act:
     """The frozen policy executed in a mode (A,)."""
-    return _in_mode(task(name), reference_policy(name).mean, np.asarray(mode, np.float32))
+    policy = reference_policy(name, task(name).modes.policy(mode))
+    return _in_mode(task(name), policy.mean, np.asarray(mode, np.float32))
 
 
 def act_as(name: str, behaviour: Behaviour) -> Act:
     """The behaviour as a policy for one episode."""
-    policy = reference_policy(name, behaviour.checkpoint)
+    policy = reference_policy(name, behaviour.checkpoint) if behaviour.checkpoint else policy_in(name, behaviour.mode)
     rng = np.random.default_rng(behaviour.seed)
     base: Act = policy.mean
     if behaviour.temperature and isinstance(policy, GaussianPolicy):
@@ -180,7 +188,7 @@ def film(name: str, quality: str, controller: bytes, scenario: int) -> RecordedC
     """Run a whole episode as a controller (see worker.ml.export.blinded_controller) acts, and render all of it."""
     from worker.ml.export import blinded_controller  # processes that never film controllers do without its runtime
 
-    act = blinded_controller.act_of_stored(controller, reference_policy(name))
+    act = blinded_controller.act_of_stored(controller, partial(reference_policy, name))
     return _recorded(name, quality, act, scenario, 0, task(name).episode_steps)
 
 

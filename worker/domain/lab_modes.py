@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from worker.domain.modes import Axis, ModeFamily
 
@@ -94,3 +95,28 @@ class LabModes(ModeFamily):
 
     def _unit(self, index: int, action: Any, xp: Any) -> Any:
         return xp.asarray([float(place == index) for place in range(len(self.actions))], dtype=action.dtype)
+
+
+@dataclass(frozen=True)
+class PolicyChoice(ModeFamily):
+    """One of several policies instead of a filter: an axis for each but the frozen one, one of them 1 or all 0."""
+
+    def sample(self, count: int, rng: np.random.Generator) -> npt.NDArray[np.float64]:
+        """Random policies, (count, A), each equally often."""
+        every = np.concatenate([np.zeros((1, len(self.axes))), np.eye(len(self.axes))])
+        chosen: npt.NDArray[np.float64] = every[rng.integers(len(every), size=count)]
+        return chosen
+
+    def policy(self, mode: npt.ArrayLike) -> str:
+        """See ModeFamily."""
+        chosen = np.flatnonzero(np.asarray(mode) > 0.5)
+        return self.names[int(chosen[0])] if len(chosen) else ""
+
+    def perceived(self, observation: Any, mode: Any, xp: Any = np) -> Any:
+        """Every policy sees what is there."""
+        return observation
+
+
+def policy_axes(names: tuple[str, ...]) -> tuple[Axis, ...]:
+    """The axes of a PolicyChoice among the frozen policy and these."""
+    return tuple(Axis(name, 0.0, 1.0, f"1: the policy {name} instead of the frozen one") for name in names)

@@ -78,6 +78,10 @@ class ModeFamily(ABC):
         kept: npt.NDArray[np.float64] = modes * (rng.random(modes.shape) < 0.75)
         return kept
 
+    def policy(self, mode: npt.ArrayLike) -> str:
+        """Name of the policy that a mode (A,) is executed by; empty: the frozen one."""
+        return ""
+
     @abstractmethod
     def perceived(self, observation: Any, mode: Any, xp: Any = np) -> Any:
         """The observation (..., D) as the policy should see it in this mode."""

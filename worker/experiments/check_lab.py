@@ -1,7 +1,12 @@
 """Check a lab.toml: what is missing or wrong, in words; three episodes, and a contact sheet of them."""
 
+import contextlib
+import re
 import sys
 import time
+from collections.abc import Iterable, Mapping
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,6 +17,8 @@ from tqdm import tqdm
 from app.installed_tasks import lab
 from app.installed_tasks.description import InstalledTask, TaskRefused
 from app.installed_tasks.lab import LabDescription
+from app.paths import LOCKS
+from worker.compute.lab_clips import SAME_WITHIN
 from worker.compute.lab_policies import policy_of
 from worker.domain.scenarios import POLICY_TEST
 from worker.domain.trajectory import Trajectory
@@ -27,6 +34,8 @@ EPISODES, PICTURES = 3, 6
 SLOW_EPISODE_S = 5.0
 """Above this the exploration's five thousand episodes take more than three hours on two processes."""
 EXPLORED_EPISODES = 6000
+REPEATED_WITHIN = SAME_WITHIN / 10
+"""Largest difference of an episode repeated: MuJoCo's solver begins where it was, and differs in the last digits."""
 SHEET_WIDTH_PX = 1440
 
 
@@ -66,30 +75,41 @@ def checked(file: Path, sheet: Path) -> Checked:
         return Checked((str(error),), (), None)
     described = installed.description
     assert isinstance(described, LabDescription)  # noqa: S101 -- which lab.read() reads
-    environment = None
+    environment, key = None, _key(described, "")
     try:
         environment = LabEnvironment(described, installed.folder)
         found = lab_ranges.first_found(described, environment, installed.folder)
-        policy = policy_of(described, installed.folder, found)
-        lab_ranges.asked_first(policy, environment, POLICY_TEST[0])
-        ran = _run(described, environment, policy, sheet)
+        policies = {}
+        for name in ("", *described.policies):
+            key = _key(described, name)
+            policies[name] = policy_of(described, installed.folder, found, name)
+            lab_ranges.asked_first(policies[name], environment, POLICY_TEST[0])
+        ran = _run(described, environment, policies, sheet)
         return ran if ran.wrong else ran._replace(remarks=(*ran.remarks, *_disagree(installed, described, environment)))
     except LabTaskBroken as error:
         return Checked((f"{file}: {error}",), (), None)
     except NotAPolicy as error:
-        key = "policy.url" if described.policy.file is None else "policy.file"
         return Checked((f"{file}: {key}: {error}",), (), None)
     finally:
         if environment is not None:
             environment.close()
 
 
+def _key(described: LabDescription, name: str) -> str:
+    """Where lab.toml names a policy."""
+    of = "file" if described.policy_named(name).url is None else "url"
+    return f"policies.{name}.{of}" if name else f"policy.{of}"
+
+
 def _run(
-    described: LabDescription, environment: LabEnvironment, policy: OnnxPolicy | RemotePolicy, sheet: Path
+    described: LabDescription,
+    environment: LabEnvironment,
+    policies: Mapping[str, OnnxPolicy | RemotePolicy],
+    sheet: Path,
 ) -> Checked:
     shown = set(np.linspace(0, described.episode_steps - 1, PICTURES).round().astype(int).tolist())
     rows: list[list[Picture]] = []
-    trajectories, seconds = [], []
+    trajectories, seconds, policy = [], [], policies[""]
     for scenario in POLICY_TEST[:EPISODES]:
         started, row = time.perf_counter(), list[Picture]()
         trajectories.append(environment.episode(policy.mean, scenario))
@@ -100,8 +120,15 @@ def _run(
             take=lambda step, row=row: row.append if step in shown else None,  # type: ignore[misc]
         )
         rows.append(row)
-        if not np.array_equal(again.observations, trajectories[-1].observations):
+        if np.abs(again.observations - trajectories[-1].observations).max() > REPEATED_WITHIN:
             return Checked((_not_repeated(again, trajectories[-1], described),), (), None)
+    failed = []
+    for name in described.policies:
+        rows.append([])
+        done = environment.episode(
+            policies[name].mean, POLICY_TEST[0], take=lambda step: rows[-1].append if step in shown else None
+        )
+        failed += [] if done.success else [name]
     _write(sheet, rows)
     wrong = []
     if not any(each.success for each in trajectories):
@@ -115,7 +142,14 @@ def _run(
                 else ""
             )
         )
-    return Checked(tuple(wrong), _remarks(described, trajectories, seconds, sheet), sheet)
+    remarks = _remarks(described, trajectories, seconds, sheet)
+    if described.policies:
+        also = f" Not done by {', '.join(failed)}." if failed else ""
+        remarks = (
+            *remarks,
+            f"The last {len(described.policies)} rows of it are {', '.join(described.policies)}.{also}",
+        )
+    return Checked(tuple(wrong), remarks, sheet)
 
 
 def _disagree(installed: InstalledTask, described: LabDescription, environment: LabEnvironment) -> tuple[str, ...]:
@@ -125,14 +159,19 @@ def _disagree(installed: InstalledTask, described: LabDescription, environment: 
         return ("Whether behaviours differ enough for people to disagree is said here after `explore`.",)
     if why := lab_ranges.changed_since(found, described, installed.folder, environment):
         return (why,)
-    task, policy = found.task(described), policy_of(described, installed.folder, found)
-    with tqdm(total=disagreement.SCENARIOS * (1 + disagreement.PER_SCENARIO) + 1, desc="do people disagree") as bar:
+    task = found.task(described)
+    with tqdm(
+        total=disagreement.SCENARIOS * (1 + disagreement.per_scenario(task)) + 1, desc="do people disagree"
+    ) as bar:
 
         def episode(act: Act, scenario: int) -> Trajectory:
             bar.update()
             return environment.episode(act, scenario)
 
-        differences = disagreement.measured(task, policy.mean, episode, described.usual_clip_steps)
+        def policy_named(name: str) -> Act:
+            return policy_of(described, installed.folder, found, name).mean
+
+        differences = disagreement.measured(task, cache(policy_named), episode, described.usual_clip_steps)
     return disagreement.in_words(differences, task)
 
 
@@ -176,10 +215,30 @@ def _remarks(
             f"This is a slow environment: exploring it takes about {hours:.0f} hours on two processes. Lower "
             "episode_steps, use a quicker simulation, or explore fewer scenarios (--scenarios)."
         )
+    if changed := replaced_packages(each.read_text() for each in LOCKS if each.is_file()):
+        ours = " ".join(each.partition(" ")[0] for each in changed)
+        remarks.append(
+            f"An installation has replaced packages of the studio: {'; '.join(changed)}. Put them back with python -m "
+            f"pip install {ours}; what needs others, such as a policy server, belongs into an environment of its own."
+        )
     missing = [language for language in ("en", "de") if language not in described.instructions]
     if missing:
         remarks.append(f"instructions.{missing[0]} is missing: participants of that language read neutral words.")
     return tuple(remarks)
+
+
+def replaced_packages(locks: Iterable[str]) -> list[str]:
+    """Packages that are installed in a version that no lock has, each with both."""
+    pinned: dict[str, list[str]] = {}
+    for lock in locks:
+        for name, wanted in re.findall(r"^([a-z0-9._-]+)==([^\s;\\]+)", lock, re.MULTILINE):
+            pinned.setdefault(name, []).append(wanted)
+    found = []
+    for name, wanted in pinned.items():
+        with contextlib.suppress(PackageNotFoundError):
+            if (there := version(name)) not in wanted:
+                found.append(f"{name}=={wanted[0]} was replaced by {there}")
+    return found
 
 
 def _write(sheet: Path, rows: list[list[Picture]]) -> None:

@@ -15,6 +15,7 @@ from statistics import NormalDist
 import numpy as np
 
 from worker.compute.behaviours import SlowWaves, draw_behaviours
+from worker.domain.lab_modes import PolicyChoice
 from worker.domain.scenarios import POOL
 from worker.domain.task import Task
 from worker.domain.trajectory import Trajectory
@@ -47,35 +48,47 @@ class Differences:
 
 
 def measured(
-    task: Task, mean: Act, episode: Episode, shown_steps: int, scenarios: int | None = None, share: float = 1.0
+    task: Task,
+    policy_named: Callable[[str], Act],
+    episode: Episode,
+    shown_steps: int,
+    scenarios: int | None = None,
+    share: float = 1.0,
 ) -> Differences:
     """Run the pool's modes, and one of each scenario with a tremor.
 
     Args:
         task: its modes and signals.
-        mean: the frozen policy.
+        policy_named: a policy among several; the empty name is the frozen one's.
         episode: runs a whole episode of a scenario.
         shown_steps: of a clip, from the start.
         scenarios: five episodes each.
         share: of every mode's way from the reference policy, for measuring what less difference does.
     """
     last = FIRST_SCENARIO + (SCENARIOS if scenarios is None else scenarios)
-    frozen = episode(mean, FIRST_SCENARIO)
+    frozen = episode(policy_named(""), FIRST_SCENARIO)
     tremor = TREMOR * sqrt(float(np.square(frozen.actions, dtype=np.float64).mean()))
     sums, of_scenario, noise = list[FloatArray](), list[int](), list[FloatArray]()
     for scenario in range(FIRST_SCENARIO, last):
-        for number, behaviour in enumerate(draw_behaviours(task, scenario, PER_SCENARIO, sampled=False)):
+        drawn = draw_behaviours(task, scenario, per_scenario(task), sampled=False)
+        for number, behaviour in enumerate(drawn):
             mode = (share * np.array(task.modes.vector(behaviour.mode))).astype(np.float32)
+            mean = policy_named(task.modes.policy(mode))
             done = episode(_in_mode(task, mean, mode), scenario)
             sums.append(_sums(done, shown_steps))
             of_scenario.append(scenario)
-            if number == scenario % PER_SCENARIO:
+            if number == scenario % len(drawn):
                 waves = SlowWaves(tremor, np.random.default_rng([scenario, 4]), done.actions.shape[1])
                 again = episode(_in_mode(task, mean, mode, waves), scenario)
                 noise.append(_sums(again, shown_steps) - sums[-1])
     rows = matched_pairs(of_scenario)
     clips = np.array(sums)
     return Differences(np.array(of_scenario)[rows[:, 0]], clips[rows[:, 1]] - clips[rows[:, 0]], np.array(noise))
+
+
+def per_scenario(task: Task) -> int:
+    """Behaviours of each scenario: where one of few policies is chosen there are no more."""
+    return min(PER_SCENARIO, len(task.modes.axes) + 1) if isinstance(task.modes, PolicyChoice) else PER_SCENARIO
 
 
 def people(task: Task, count: int, rng: np.random.Generator) -> FloatArray:
@@ -127,8 +140,9 @@ def in_words(found: Differences, task: Task) -> tuple[str, ...]:
     ]
     if share < ENOUGH:
         said.append(
-            "Behaviours are too alike, or everybody would want the same: do not invite people yet. Lower policy.gain, "
-            "show longer clips, or declare signals that some like and others do not (height, side, distance), then "
+            "Behaviours are too alike, or everybody would want the same: do not invite people yet. "
+            + ("Take policies that differ more, " if isinstance(task.modes, PolicyChoice) else "Lower policy.gain, ")
+            + "show longer clips, or declare signals that some like and others do not (height, side, distance), then "
             "explore again."
         )
     if lost:

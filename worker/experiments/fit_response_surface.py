@@ -93,6 +93,8 @@ def explore(task: str, work_directory: Path, processes: int, scenarios: int = SC
     work_directory.mkdir(parents=True, exist_ok=True)
     if registry.lab(task) is not None:
         find_ranges(task)
+        if registry.found_out(task).chooses:  # every policy is driven when one is chosen: nothing is to be foreseen
+            return {"policies": list(registry.task(task).modes.names)}
         found = registry.checkpoint(task) / FOUND_FILE
         work_directory /= hashlib.sha256(found.read_bytes()).hexdigest()[:16]  # blocks of another policy are no part
         work_directory.mkdir(exist_ok=True)

@@ -13,7 +13,7 @@ import numpy as np
 
 from app.installed_tasks.lab import LabDescription
 from worker.compute.lab_policies import policy_of
-from worker.domain.lab_modes import widest_axes
+from worker.domain.lab_modes import policy_axes, widest_axes
 from worker.domain.modes import Axis
 from worker.domain.scenarios import RESPONSE_SURFACE
 from worker.domain.task import Answered
@@ -37,6 +37,7 @@ USUALLY_AT_LIMIT = 0.2
 """Share of the actions that move the robot; above it nobody can be quicker."""
 WITNESS = RESPONSE_SURFACE[-1]
 """The scenario by which an environment is known again."""
+CHANGES_NOTHING = "changes nothing that is measured"
 _MAY_GROW = ("undelivered", "distance_m")
 """Being slower is no disaster: success says whether it is too slow."""
 
@@ -47,7 +48,8 @@ def first_found(described: LabDescription, environment: LabEnvironment, folder: 
     names = environment.action_names
     moving = described.environment.moving or tuple(range(len(names)))
     by_distance = bool(environment.tip and environment.goal)
-    axes = widest_axes(by_distance, tuple(names[index] for index in moving))
+    others = tuple(described.policies)
+    axes = policy_axes(others) if others else widest_axes(by_distance, tuple(names[index] for index in moving))
     unknown = sorted(set(described.modes.leave_out) - {axis.name for axis in axes})
     if unknown:
         known = ", ".join(axis.name for axis in axes)
@@ -66,6 +68,7 @@ def first_found(described: LabDescription, environment: LabEnvironment, folder: 
         dropped=dict.fromkeys(described.modes.leave_out, "left out by modes.leave_out"),
         notes=(),
         reference={},
+        chooses=bool(others),
     )
 
 
@@ -122,7 +125,10 @@ def find(
         )
     found = replace(found, start_distance_m=_start_distance_m(found, reference))
     kept, dropped = [], dict(found.dropped)
-    for number, axis in enumerate(found.axes):
+    if found.chooses:
+        found = _told_apart(found, described, folder, environment, reference, progress)
+        kept = list(found.axes)
+    for number, axis in enumerate(found.axes if not found.chooses else ()):
         progress(f"trying {axis.name}", number / len(found.axes))
         ends = []
         for end in (axis.low, axis.high):
@@ -141,10 +147,34 @@ def find(
         found,
         axes=tuple(kept),
         dropped=dropped,
-        notes=_notes(success, at_limit, described),
+        notes=(*found.notes, *_notes(success, at_limit, described)),
         witness=_witness(reference[-1]),
         reference={"episodes": float(scenarios), "success": success, "actions_at_limit": round(at_limit, 3)},
     )
+
+
+def _told_apart(
+    found: Found,
+    described: LabDescription,
+    folder: Path,
+    environment: LabEnvironment,
+    reference: Sequence[Trajectory],
+    progress: Callable[[str, float], None],
+) -> Found:
+    """What servers answer, and which policies lose success or do nothing else that is measured.
+
+    They stay, for studies count on them: the choice guards the task for every person anyway.
+    """
+    notes, answered = [], {}
+    for number, axis in enumerate(found.axes):
+        progress(f"trying the policy {axis.name}", number / len(found.axes))
+        policy = policy_of(described, folder, found, axis.name)
+        if said := asked_first(policy, environment, reference[0].scenario):
+            answered[axis.name] = said
+        changed = [environment.episode(policy.mean, each.scenario) for each in reference]
+        if why := _lost(reference, changed) or ("" if _seen(reference, changed) else CHANGES_NOTHING):
+            notes.append(f"The policy {axis.name}: {why}. Better take it out of policies.")
+    return replace(found, notes=tuple(notes), answered_others=answered)
 
 
 def _usable_end(
@@ -173,25 +203,26 @@ def _usable_end(
             return (
                 (value, f"narrowed to {value:g}: {why}" if why else "")
                 if _seen(reference, changed)
-                else (
-                    0.0,
-                    "changes nothing that is measured",
-                )
+                else (0.0, CHANGES_NOTHING)
             )
         why, value = wrong, value / 2.0
     return 0.0, why
 
 
 def _disaster(described: LabDescription, reference: Sequence[Trajectory], changed: Sequence[Trajectory]) -> str:
-    lost = np.mean([each.success for each in reference]) - np.mean([each.success for each in changed])
-    if lost > LOST_SUCCESS:
-        return f"success falls by {100 * lost:.0f} points"
+    if lost := _lost(reference, changed):
+        return lost
     before, after = _sums(reference), _sums(changed)
     for column, name in enumerate(described.signal_names):
         most = DISASTER * np.abs(before[:, column]).mean()
         if name not in _MAY_GROW and most > 1e-9 and np.abs(after[:, column]).mean() > most:
             return f"{name} grows more than {DISASTER:g} times"
     return ""
+
+
+def _lost(reference: Sequence[Trajectory], changed: Sequence[Trajectory]) -> str:
+    lost = np.mean([each.success for each in reference]) - np.mean([each.success for each in changed])
+    return f"success falls by {100 * lost:.0f} points" if lost > LOST_SUCCESS else ""
 
 
 def _seen(reference: Sequence[Trajectory], changed: Sequence[Trajectory]) -> bool:

@@ -2,7 +2,7 @@
 
 from sqlalchemy.orm import Session
 
-from app.domain.studies import usual_clip_steps
+from app.domain.studies import usual_behaviours, usual_clip_steps
 from app.domain.study_settings import StudySettings
 from app.errors import AppError
 from app.paths import DEMO_STUDY
@@ -37,6 +37,17 @@ def import_finished(session: Session, store: ArtefactStore) -> str:
 
 def make_empty(session: Session, task: str) -> str:
     """Make a study of the task, whose clips have yet to be made, with one participant, whose token is returned."""
-    usual = StudySettings(clip_steps=usual_clip_steps(task))
-    study = studies.create_study(session, f"Demo: {task}", usual, task=task)
+    study = studies.create_study(session, f"Demo: {task}", usual_settings(task), task=task)
     return enrolment.add_participant(session, study)[1]
+
+
+def usual_settings(task: str) -> StudySettings:
+    """What suits the task: the length of its clips, and as many ways and situations as it takes."""
+    usual = StudySettings()
+    ways = usual_behaviours(task, usual.behaviours_per_scenario)
+    situations = -(-usual.pool_scenarios * usual.pairs_per_scenario // (ways * (ways - 1) // 2))
+    return StudySettings(
+        clip_steps=usual_clip_steps(task),
+        behaviours_per_scenario=ways,
+        pool_scenarios=min(situations, 2 * usual.labels_per_participant),
+    )

@@ -86,9 +86,10 @@ def learned(session: Session, participant: Participant) -> Learned | None:
     if row is None:
         return None
     version = model_metrics.filter_version(*row)
-    if version.scenarios is None or not version.costs:
+    costs = [each for each in version.costs if each.symbol in model_metrics.COST_SYMBOLS]
+    if version.scenarios is None or not costs:
         return None
-    return Learned(version.scenarios, lessons_of(version.costs)[:MOST_LESSONS], version.uses_reference)
+    return Learned(version.scenarios, lessons_of(costs)[:MOST_LESSONS], version.uses_reference)
 
 
 def lessons_of(changes: Sequence[model_metrics.Change]) -> Sequence[Lesson]:

@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from app.domain.models import Bundle, Model
 
 COST_SYMBOLS = ("C_d", "C_v", "C_f", "C_hf", "C_fd", "C_fdv")
+"""Of the paper; a laboratory has costs of its own."""
 """The paper's six preference costs; what each is called depends on the task."""
 
 
@@ -73,6 +74,9 @@ class FilterVersion:
     method: str | None
     gate: float | None
     mode: Sequence[tuple[str, float]]
+    chances: Sequence[tuple[str, float]]
+    """of each of several policies to be the best for the person, the largest first; empty: it is a filter"""
+    chosen: str
     notes: Sequence[str]
     uses_reference: bool
     """It changes nothing: what was learned was not surely better, or not without a price."""
@@ -113,6 +117,11 @@ class _Promise(_Metrics):
     sentence: str = ""
 
 
+class _Choice(_Metrics):
+    policy: str = ""
+    chances: dict[str, float] = Field(default_factory=dict)
+
+
 class _Filter(_Metrics):
     evaluation: _Evaluation = Field(default_factory=_Evaluation)
     gate: float | None = None
@@ -121,6 +130,7 @@ class _Filter(_Metrics):
     notes: list[str] = Field(default_factory=list)
     uses_reference: bool = False
     promise: _Promise = Field(default_factory=_Promise)
+    choice: _Choice | None = None
 
 
 class _Weight(_Metrics):
@@ -143,13 +153,16 @@ def filter_version(model: Model, bundle: Bundle | None) -> FilterVersion:
     """What is known about one filter; unreadable numbers are left out."""
     metrics = _read(_Filter, model.metrics)
     evaluation = metrics.evaluation
-    costs = [_change("", symbol, evaluation.costs.get(symbol), more_is_better=False) for symbol in COST_SYMBOLS]
+    of_labs = [name for name in evaluation.costs if name not in COST_SYMBOLS]
+    costs = [_change("", name, evaluation.costs.get(name), more_is_better=False) for name in (*COST_SYMBOLS, *of_labs)]
     return FilterVersion(
         label_count=model.label_count,
         created_at=model.created_at,
         method=metrics.method,
         gate=metrics.gate,
-        mode=sorted(metrics.mode.items()),
+        mode=sorted(metrics.mode.items()) if metrics.choice is None else (),
+        chances=sorted(metrics.choice.chances.items(), key=lambda each: -each[1]) if metrics.choice else (),
+        chosen=metrics.choice.policy if metrics.choice else "",
         notes=metrics.notes,
         uses_reference=metrics.uses_reference,
         promise=metrics.promise.sentence,

@@ -101,7 +101,7 @@ def change(
         raise SettingsFixed(" ".join(sorted({f"{key.replace('_', ' ')}: {fixed[key]}" for key in refused})))
     if not changed:
         return []
-    task_limits.require(task, settings)
+    task_limits.require(task, settings, recorded=study.material is not None)
     if study.lock_hash is not None:
         _note_deviation(session, study, before, after, changed, actor, reason)
     study.name, study.task, study.seed = name, task, seed

@@ -34,13 +34,15 @@ def create_study(
     seed: int | None = None,
     actor: str = audit.SYSTEM,
     task: str | None = None,
+    like: Study | None = None,
 ) -> Study:
     """Open a study; the worker finds it and begins to fill its pool. Without a seed one is drawn and kept.
 
-    Without a task it is the usual one. Raises TaskCannot.
+    Without a task it is the usual one. ``like``: a study whose recordings it shows, too, if it has any.
+    Raises TaskCannot.
     """
     task = task or catalogue.usual()
-    task_limits.require(task, settings)
+    task_limits.require(task, settings, recorded=like is not None and like.material is not None)
     study = Study(
         slug=free_slug(session, name),
         name=name,
@@ -51,6 +53,8 @@ def create_study(
     session.add(study)
     session.flush()
     audit.record(session, actor, "study created", study.slug, study=study)
+    if like is not None:
+        copy_material(session, like, study)
     return study
 
 

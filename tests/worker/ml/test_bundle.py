@@ -178,6 +178,15 @@ def test_the_card_says_in_words_what_was_learned_from_the_labels(kind: str, unzi
     assert re.search(r"Reward model: (linear|an ensemble) ", card)
 
 
+def test_the_card_of_a_laboratorys_filter_says_nothing_of_our_robot_and_person(unzipped: Path) -> None:
+    manifest = json.loads((unzipped / "manifest.json").read_text())
+    ours = model_card(manifest)
+    theirs = model_card(manifest | {"interface": manifest["interface"] | {"adds_previous_action_and_share": True}})
+    for words in ("one seated person", "SI units in the robot's base frame"):
+        assert words in ours
+        assert words not in theirs
+
+
 def test_the_bundle_runs_on_its_own_and_confirms_itself(unzipped: Path) -> None:
     finished = run(unzipped)
     assert finished.returncode == 0, finished.stderr

@@ -12,14 +12,14 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from sqlalchemy.orm import Session
 
-from app.domain.choices import RewardKind, Strategy
+from app.domain.choices import Strategy
 from app.domain.clips import Clip, Rollout
 from app.domain.described import bounds_of
 from app.domain.studies import Study
 from app.domain.study_settings import StudySettings
 from app.errors import AppError
 from app.services import audit
-from app.services.studies import studies
+from app.services.studies import studies, task_limits
 from app.storage import ArtefactStore
 from worker.domain.trajectory import Recording
 from worker.jobs.clips.stored_video import video_columns
@@ -169,16 +169,7 @@ def settings_of(material: Material, ready: Sequence[Ready]) -> StudySettings:
         settings = StudySettings.model_validate({**usual, **material.settings})
     except ValidationError as error:
         raise ClipsInvalid(f"settings: {in_words(error)} The clips make {pairs} pairs.") from error
-    needs_a_simulator = {
-        "evaluation": settings.evaluation is not None,
-        "debrief": settings.debrief,
-        "catch_pairs": settings.catch_pairs > 0,
-        "reward_kind": settings.reward_kind is not RewardKind.STRUCTURED,
-        "pooled_prior": settings.pooled_prior,
-        "strategy": settings.strategy is Strategy.CONTESTED,
-        "following_share": settings.following_share > 0.0,
-    }
-    wrong = [name for name, needed in needs_a_simulator.items() if needed]
+    wrong = task_limits.needing_a_simulator(settings)
     if wrong:
         raise ClipsInvalid(f"settings: {', '.join(wrong)} need the simulator and cannot be had with own clips.")
     return settings

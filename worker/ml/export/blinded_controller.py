@@ -9,7 +9,7 @@ import hashlib
 import io
 import json
 import zipfile
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -36,6 +36,8 @@ LENGTH_BYTES = 1 << 20
 """Models are padded to a multiple of this: all methods so far need less than half of it."""
 _TIMESTAMP = (1980, 1, 1, 0, 0, 0)
 _POLICY_MEAN = "policy_mean"
+_ASKED = "asked"
+"""Which of several policy servers; such controllers are never given to an operator."""
 
 
 class NotExportable(TypeError):
@@ -71,9 +73,14 @@ def of_act(act: Act, observations: Float32Array) -> bytes:
     return stored
 
 
-def act_of_stored(stored: bytes, policy: ReferencePolicy) -> Act:
-    """What of_act() has written, as a rollout's callable. ``policy``: the frozen one, if need be to be asked."""
-    return FilterAct(policy, OnnxFilter(stored)) if isinstance(policy, RemotePolicy) else Controller(stored)
+def act_of_stored(stored: bytes, policy_named: Callable[[str], ReferencePolicy]) -> Act:
+    """What of_act() has written, as a rollout's callable. ``policy_named``: the one to be asked, where it answers from
+    a server; the empty name is the frozen one's."""
+    model = onnx.load_from_string(stored)
+    if _POLICY_MEAN not in {each.name for each in model.graph.input}:
+        return Controller(stored)
+    asked = {each.key: each.value for each in model.metadata_props}.get(_ASKED, "")
+    return FilterAct(policy_named(asked), OnnxFilter(stored))
 
 
 def write(blinded: Blinded) -> bytes:
@@ -196,6 +203,8 @@ def _blinded(
     opset, ir_version = versions
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", opset)], ir_version=ir_version)
     onnx.checker.check_model(model)
+    if isinstance(policy, RemotePolicy) and policy.asking.name:
+        model.metadata_props.add(key=_ASKED, value=policy.asking.name)
     return _padded(model)
 
 
@@ -212,7 +221,7 @@ def _padded(model: ModelProto) -> bytes:
 
 def _compare(stored: bytes, act: "PolicyAct | FilterAct", observations: Float32Array) -> None:
     expected = np.array([act(each) for each in observations]).clip(-1.0, 1.0)
-    written = act_of_stored(stored, act.policy)
+    written = act_of_stored(stored, lambda _: act.policy)
     said = np.array([written(each) for each in observations])
     difference = float(np.abs(said - expected).max())
     if not difference <= LARGEST_DIFFERENCE:

@@ -202,6 +202,7 @@ def _manifest(contents: BundleContents) -> dict[str, Any]:
         "learned_costs": contents.metrics.get("costs"),
         "evaluation": contents.metrics.get("evaluation"),
         "promise": contents.metrics.get("promise") or None,
+        "choice": contents.metrics.get("choice"),
         "notes": list(contents.metrics.get("notes", ())),
         "versions": {
             "python": platform.python_version(),

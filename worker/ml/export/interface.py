@@ -40,6 +40,7 @@ def interface_of(task: Task, policy: ReferencePolicy) -> dict[str, Any]:
             "inputs": {name: list(columns) for name, columns in lab.inputs},
             "prompt": lab.prompt,
             "execution_horizon": lab.execution_horizon,
+            **({"settings": dict(lab.settings)} if lab.settings else {}),
         },
     }
     written = json.dumps(found, sort_keys=True, separators=(",", ":")).encode()

@@ -35,11 +35,13 @@ The second command checks every file, runs the filter over `recorded/` and compa
 Your own recording: `python run_filter.py --observations o.npy --output a.npy`.
 In a control loop, at every control step: `policy.onnx` turns the observation into the reference policy's mean action,
 and `filter.onnx` turns both into the action to execute.
-`manifest.json` lists every number with its unit and range; all are SI units in the robot's base frame."""
+`manifest.json` lists every number with its unit and range; {units}."""
+_AS_OURS = "all are SI units in the robot's base frame"
+_AS_A_LABS = "units and frame are those of the laboratory's own environment (`interface` in the manifest)"
 
 _LIMITS = """## Limits
 
-* Measured in simulation, with a model of one arm and one seated person. Nothing here was run on a robot.
+* Measured in simulation{simulated}. Nothing here was run on a robot.
 * The intervals cover the choice of scenarios. They do not cover a second training, other labels, or other bodies.
 * "Preference" is the return of a model learned from this person's own labels, not their satisfaction.
 * The largest speeds and forces are what happened in these simulated scenarios. They are not guaranteed bounds: keep the
@@ -51,15 +53,16 @@ def model_card(manifest: Mapping[str, Any]) -> str:
     """Markdown, from the manifest."""
     sections = [
         _what(manifest),
+        _choice(manifest.get("choice")),
         _REFERENCE if manifest.get("uses_reference_policy") else _way(manifest),
         _promise(manifest),
         _shield(manifest),
         _matters(manifest),
         _measured(manifest.get("evaluation")),
         _notes(manifest),
-        _USE,
+        _USE.format(units=_AS_A_LABS if _is_a_labs(manifest) else _AS_OURS),
         _server(manifest),
-        _LIMITS,
+        _LIMITS.format(simulated="" if _is_a_labs(manifest) else ", with a model of one arm and one seated person"),
     ]
     return "\n\n".join(section for section in sections if section) + "\n"
 
@@ -69,6 +72,11 @@ _REFERENCE = """## This is the reference policy
 **The filter in this bundle changes nothing: every action is the reference policy's own.** Nothing that was learned from
 this person's comparisons was surely better for them without a price in success, force, speed or spills; the notes say
 what was tried."""
+
+
+def _is_a_labs(manifest: Mapping[str, Any]) -> bool:
+    interface = manifest.get("interface") or {}
+    return bool(interface.get("adds_previous_action_and_share"))
 
 
 def _server(manifest: Mapping[str, Any]) -> str:
@@ -94,9 +102,31 @@ def _what(manifest: Mapping[str, Any]) -> str:
     )
 
 
+def _choice(choice: Mapping[str, Any] | None) -> str:
+    """Which of several policies it is, and how surely."""
+    if not choice:
+        return ""
+    chances = sorted(choice["chances"].items(), key=lambda each: -each[1])
+    clear = "" if choice["sure"] else " **That is not clear: other policies may suit this person as well or better.**"
+    return "\n".join(
+        [
+            "## The choice",
+            "",
+            f"Of {len(chances)} policies **{choice['policy']}** was chosen for this person, and is the policy of this "
+            f"bundle; the filter leaves its actions as they are.{clear}",
+            "",
+            "| policy | chance of being the best |",
+            "|---|---|",
+            *(f"| {name} | {chance:.0%} |" for name, chance in chances),
+            "",
+            "Of those that keep the task; from the reward model's posterior, over held-out scenarios.",
+        ]
+    )
+
+
 def _way(manifest: Mapping[str, Any]) -> str:
     """The person's mode in words."""
-    if manifest["method"] != "studio":
+    if manifest["method"] != "studio" or manifest.get("choice"):
         return ""
     rows = [
         f"| {axis['name']} | {manifest['mode'].get(axis['name'], 0.0):+.2f} | {axis['low']:g} to {axis['high']:g} "

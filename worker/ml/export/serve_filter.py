@@ -184,12 +184,14 @@ class FilterLoop:
         size = sum(each["size"] for each in fields)
         found = np.full(size, np.nan, np.float32)
         there = np.zeros(size, bool)
-        places = [("observation", list(range(size)))] if len(fields) > 1 else []
-        first = 0
+        places, first = [*inputs.items()], 0
         for each in fields:
             places.append((each["name"], list(range(first, first + each["size"]))))
             first += each["size"]
-        for name, columns in [*inputs.items(), *places]:
+        if "observation" not in dict(places) or np.size(message.get("observation", ())) == size:
+            # environments with goals call one of their fields so: which is meant, its length says
+            places = [("observation", list(range(size))), *(place for place in places if place[0] != "observation")]
+        for name, columns in places:
             if name in message:
                 found[columns] = _numbers(name, message[name], len(columns))
                 there[columns] = True
@@ -276,6 +278,11 @@ def main(manifest: Mapping[str, Any], run: Run, means: Means | None, options: ar
     """Serve until a signal; the exit code."""
     interface = manifest["interface"]
     policy: PolicyServer | Means
+    if options.upstream and interface["policy"].get("settings"):
+        sys.stderr.write(
+            "FAILED: this bundle's policy has settings that a server does not know: leave --upstream out.\n"
+        )
+        return 1
     if options.upstream:
         policy = PolicyServer(options.upstream, answer_s=options.upstream_s)
         try:

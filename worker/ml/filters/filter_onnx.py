@@ -48,7 +48,8 @@ def to_onnx(module: AnyFilter, observations: Float32Array, policy_means: Float32
             _templates[structure] = _template(_trace(module, observations[:2], policy_means[:2]), list(state))
     model = onnx.ModelProto()
     model.CopyFrom(_templates[structure])
-    model.graph.initializer.extend(onnx.numpy_helper.from_array(state[name], name) for name in sorted(state))
+    used = {name for node in model.graph.node for name in node.input}  # not all, where a filter changes nothing
+    model.graph.initializer.extend(onnx.numpy_helper.from_array(state[name], name) for name in sorted(used & {*state}))
     stored: bytes = model.SerializeToString(deterministic=True)
     difference = largest_difference(stored, module, observations, policy_means)
     if not difference <= LARGEST_DIFFERENCE:

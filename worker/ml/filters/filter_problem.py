@@ -142,6 +142,8 @@ class FilterDraft:
     """what the filter stayed within when it was tried (shield.limits_of)"""
     promise: Mapping[str, Any] = field(default_factory=dict)
     """a Promise (worker.analysis.filters.promise) and the tests that earned it, as plain values; empty: none"""
+    choice: Mapping[str, float] = field(default_factory=dict)
+    """the chance of each of several policies to be the best; empty: it is a filter"""
 
     def timed(self, stage: str, started: float) -> "FilterDraft":
         """The same with the seconds since ``started`` added to a stage."""

@@ -20,11 +20,21 @@ def try_on(
     """What came of it in the scenarios of ``reference``, and the rollouts."""
     scenarios = [each.scenario for each in reference]
     filtered = collect(act, scenarios, 0.0, problem.seed)
+    return trial_of(problem, gate, residual_share, reference, filtered), filtered
+
+
+def trial_of(
+    problem: FilterProblem,
+    gate: float,
+    residual_share: float,
+    reference: Sequence[Trajectory],
+    filtered: Sequence[Trajectory],
+) -> GateTrial:
+    """What rollouts say, beside the reference policy's of the same scenarios."""
     before, after = problem.reward.returns(reference), problem.reward.returns(filtered)
     unit = max(float(before.std()), 1e-9)
     success = float((successes(filtered) - successes(reference)).mean())
-    trial = GateTrial(gate, residual_share, float((after - before).mean()) / unit, success, _p95_force_n(filtered))
-    return trial, filtered
+    return GateTrial(gate, residual_share, float((after - before).mean()) / unit, success, _p95_force_n(filtered))
 
 
 def signal_changes(reference: Sequence[Trajectory], filtered: Sequence[Trajectory]) -> FloatArray:

@@ -6,6 +6,7 @@ import re
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from safetensors import SafetensorError
 
 from worker.domain.type_aliases import Float32Array, FloatArray
 from worker.ml.policies.gaussian import GaussianPolicy
-from worker.ml.policies.onnx_policy import NotAPolicy, OnnxPolicy, adapted, mlp_to_onnx
+from worker.ml.policies.onnx_policy import NotAPolicy, OnnxPolicy, adapted, mlp_to_onnx, said_by_file
 from worker.ml.policies.policy_onnx import policy_to_onnx
 
 LARGEST_BYTES = 256 << 20
@@ -29,18 +30,22 @@ def load(
     bounds: tuple[FloatArray, FloatArray],
     gain: float = 1.0,
     activation: str | None = None,
+    settings: Mapping[int, float] = MappingProxyType({}),
 ) -> OnnxPolicy:
-    """The policy in a file; for sizes and bounds see onnx_policy.adapted(). Nothing is unpickled. Raises NotAPolicy."""
+    """The policy in a file; for sizes, bounds and settings see onnx_policy.adapted(). Nothing is unpickled.
+
+    Raises NotAPolicy.
+    """
     if file.stat().st_size > LARGEST_BYTES:
         raise NotAPolicy(f"{file.name} is larger than {LARGEST_BYTES >> 20} MB.")
     try:
         if file.suffix == ".onnx":
             stored = file.read_bytes()
         elif file.suffix == ".zip":
-            stored = _of_stable_baselines(file, activation, bounds)
+            stored = _of_stable_baselines(file, activation, bounds, settings)
         else:
             stored = _of_ours(file, bounds)
-        return adapted(stored, own_size, observation_size, bounds, gain)
+        return adapted(stored, own_size, observation_size, bounds, gain, settings)
     except NotAPolicy as error:
         raise NotAPolicy(f"{file.name}: {error}") from error
 
@@ -60,7 +65,9 @@ def _of_ours(file: Path, bounds: tuple[FloatArray, FloatArray]) -> bytes:
     return policy_to_onnx(policy)
 
 
-def _of_stable_baselines(file: Path, activation: str | None, bounds: tuple[FloatArray, FloatArray]) -> bytes:
+def _of_stable_baselines(
+    file: Path, activation: str | None, bounds: tuple[FloatArray, FloatArray], settings: Mapping[int, float]
+) -> bytes:
     """The actor of SAC, TD3, DDPG, PPO or A2C, told by the names of its weights."""
     state = _state(file)
     activation = activation or _told_activation(file)
@@ -78,7 +85,10 @@ def _of_stable_baselines(file: Path, activation: str | None, bounds: tuple[Float
     if any("features_extractor" in name and "mlp" not in name for name in state):
         raise NotAPolicy("it looks at pictures or has features of its own; export it as ONNX.")
     stored = mlp_to_onnx(found, _OPERATIONS[activation or usual], squash)
-    return _stretched(stored, bounds) if squash else stored
+    if not squash:
+        return stored
+    own = said_by_file(len(found[-1][1]), len(bounds[0]), settings)
+    return _stretched(stored, (bounds[0][own], bounds[1][own]))
 
 
 def _stretched(stored: bytes, bounds: tuple[FloatArray, FloatArray]) -> bytes:

@@ -1,7 +1,8 @@
 """A frozen policy of which only what it says is known: an ONNX graph, from observation to mean action in [-1, 1]."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -70,13 +71,31 @@ def session(stored: bytes) -> Any:
     return onnxruntime.InferenceSession(stored, options, providers=["CPUExecutionProvider"])
 
 
+def said_by_file(size: int, actions: int, settings: Mapping[int, float]) -> list[int]:
+    """Which actions a policy's output of this size is: all of them, or those that are no settings.
+
+    Raises NotAPolicy when it is neither.
+    """
+    free = [place for place in range(actions) if place not in settings]
+    if size not in (0, actions, len(free)):
+        without = f", or {len(free)} without its settings" if settings else ""
+        raise NotAPolicy(f"its output has {size} numbers, but its actions has {actions}{without}.")
+    return free if size == len(free) else list(range(actions))
+
+
 def adapted(
-    stored: bytes, own_size: int, observation_size: int, bounds: tuple[FloatArray, FloatArray], gain: float
+    stored: bytes,
+    own_size: int,
+    observation_size: int,
+    bounds: tuple[FloatArray, FloatArray],
+    gain: float,
+    settings: Mapping[int, float] = MappingProxyType({}),
 ) -> OnnxPolicy:
     """A laboratory's graph as a policy of the studio's.
 
     It is given the first ``own_size`` numbers of an observation; its actions, in the environment's own unit with these
-    bounds (A,), are mapped to [-1, 1] and multiplied by ``gain``. Raises NotAPolicy.
+    bounds (A,), are mapped to [-1, 1] and multiplied by ``gain``. ``settings``: actions that stay at a value in the
+    environment's own unit, whatever the graph says of them, if it says anything. Raises NotAPolicy.
     """
     try:
         model = onnx.load_from_string(stored)
@@ -94,15 +113,24 @@ def adapted(
             "observation as one vector, a Dict's parts in the order of their keys."
         )
     _require_shape("input", inputs[0], own_size, "the environment's observation")
-    _require_shape("output", model.graph.output[0], len(bounds[0]), "its actions")
     low, high = bounds
-    half = (high - low) / 2.0
+    count = len(low)
+    output = model.graph.output[0].type.tensor_type.shape.dim
+    own = said_by_file(output[1].dim_value if len(output) == 2 else 0, count, settings)
+    _require_shape("output", model.graph.output[0], len(own), "its actions")
+    middle, half = (high + low) / 2.0, (high - low) / 2.0
+    placed = np.eye(count)[own] * [place not in settings for place in range(count)]
+    constant = np.array(
+        [(settings[place] - middle[place]) / half[place] if place in settings else 0.0 for place in range(count)]
+    )
+    if np.abs(constant).max() > 1.0 + 1e-6:
+        raise NotAPolicy("one of its settings is outside of the environment's own bounds of that action.")
     ends: dict[str, npt.NDArray[Any]] = {
         "first": np.array([0], np.int64),
         "last": np.array([own_size], np.int64),
         "axis": np.array([1], np.int64),
-        "middle": ((high + low) / 2.0).astype(np.float32),
-        "half": half.astype(np.float32),
+        "middle": middle[own].astype(np.float32),
+        "half": half[own].astype(np.float32),
         "gain": np.array([gain], np.float32),
         "least": np.array(-1.0, np.float32),
         "most": np.array(1.0, np.float32),
@@ -114,8 +142,14 @@ def adapted(
         helper.make_node("Sub", ["lab/action", "middle"], ["centred"]),
         helper.make_node("Div", ["centred", "half"], ["unit"]),
         helper.make_node("Clip", ["unit", "least", "most"], ["bounded"]),
-        helper.make_node("Mul", ["bounded", "gain"], [OUTPUT]),
+        helper.make_node("Mul", ["bounded", "gain"], ["slowed" if settings else OUTPUT]),
     ]
+    if settings:
+        ends |= {"placed": placed.astype(np.float32), "settings": constant.astype(np.float32)}
+        nodes += [
+            helper.make_node("MatMul", ["slowed", "placed"], ["free"]),
+            helper.make_node("Add", ["free", "settings"], [OUTPUT]),
+        ]
     graph = helper.make_graph(
         nodes,
         "lab_policy",

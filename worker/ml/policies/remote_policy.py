@@ -40,6 +40,8 @@ class Asking:
     bounds: tuple[tuple[float, ...], tuple[float, ...]]
     """(A,), (A,) of the actions in the environment's own unit"""
     gain: float
+    name: str = ""
+    """among several policies; empty: the frozen one"""
 
 
 class RemotePolicy:

@@ -6,13 +6,13 @@ Kept in a file beside the lab.toml, so that whoever learns knows the task withou
 import hashlib
 import json
 import re
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Self
 
-from app.installed_tasks.lab import LabDescription
-from worker.domain.lab_modes import LabModes
-from worker.domain.modes import Axis
+from app.installed_tasks.lab import LabDescription, LabPolicy
+from worker.domain.lab_modes import LabModes, PolicyChoice
+from worker.domain.modes import Axis, ModeFamily
 from worker.domain.spaces import Field, Space
 from worker.domain.task import Answered, LabInterface, Task
 from worker.sim.lab.errors import LabTaskBroken
@@ -32,12 +32,24 @@ def mark_of(described: LabDescription, folder: Path) -> str:
     """
     kept = described.model_dump(mode="json", exclude=_WORDS)
     kept["environment"].pop("frame")
-    kept["policy"] = described.policy.model_dump(mode="json", include=_OF_FILES) | described.policy.model_dump(
-        mode="json", include=_OF_SERVERS, exclude_defaults=True
-    )
-    file = described.policy.file
-    policy = "of a server" if file is None else hashlib.sha256((folder / file).read_bytes()).hexdigest()
-    return hashlib.sha256(f"{json.dumps(kept, sort_keys=True)} {policy}".encode()).hexdigest()
+    kept["policy"] = _kept(described.policy)
+    others = kept.pop("policies")
+    for name, each in described.policies.items():
+        others[name] = {**_kept(each), "bytes": _hash_of(each, folder)}
+    if others:
+        kept["policies"] = others
+    return hashlib.sha256(
+        f"{json.dumps(kept, sort_keys=True)} {_hash_of(described.policy, folder)}".encode()
+    ).hexdigest()
+
+
+def _kept(policy: LabPolicy) -> dict[str, Any]:
+    of_files = policy.model_dump(mode="json", include=_OF_FILES)
+    return of_files | policy.model_dump(mode="json", include={*_OF_SERVERS, "settings"}, exclude_defaults=True)
+
+
+def _hash_of(policy: LabPolicy, folder: Path) -> str:
+    return "of a server" if policy.file is None else hashlib.sha256((folder / policy.file).read_bytes()).hexdigest()
 
 
 @dataclass(frozen=True)
@@ -68,8 +80,15 @@ class Found:
     """(S,) of the signals, summed over the frozen policy's episode of one scenario: by it the environment, the lab's
     own functions and installed packages are known again, of which the mark knows nothing"""
 
-    def modes(self, axes: tuple[Axis, ...] | None = None) -> LabModes:
+    chooses: bool = False
+    """whether the ways are policies of which one is chosen, and not a filter's"""
+    answered_others: dict[str, Answered] = field(default_factory=dict)
+    """as ``answered``, by the other policies' names"""
+
+    def modes(self, axes: tuple[Axis, ...] | None = None) -> ModeFamily:
         """The ways to do the task."""
+        if self.chooses:
+            return PolicyChoice(Space(self.observation), self.axes if axes is None else axes)
         return LabModes(
             Space(self.observation),
             self.axes if axes is None else axes,
@@ -97,10 +116,10 @@ class Found:
             interface=self.interface(described),
         )
 
-    def interface(self, described: LabDescription) -> LabInterface:
-        """What runs beside the robot has to know."""
+    def interface(self, described: LabDescription, policy: str = "") -> LabInterface:
+        """What runs beside the robot has to know; ``policy``: by its name among several."""
         low, high = self.bounds
-        said = described.policy
+        said = described.policy_named(policy)
         return LabInterface(
             frame=described.environment.frame,
             own_size=self.own_size,
@@ -108,9 +127,10 @@ class Found:
             high=high,
             moving=self.moving,
             gain=said.gain,
-            inputs=inputs_of(described, self.observation),
+            inputs=inputs_of(described, self.observation, policy),
             prompt=said.prompt,
             execution_horizon=said.execution_horizon,
+            settings=tuple(said.settings.items()),
         )
 
     def save(self, file: Path) -> None:
@@ -130,22 +150,27 @@ class Found:
             stored[name] = tuple(stored.get(name, ()))
         stored["bounds"] = tuple(map(tuple, stored["bounds"]))
         if stored.get("answered"):
-            said = stored["answered"]
-            stored["answered"] = Answered(tuple(said["observation"]), tuple(map(tuple, said["actions"])))
+            stored["answered"] = _answered(stored["answered"])
+        stored["answered_others"] = {name: _answered(each) for name, each in stored.get("answered_others", {}).items()}
         return cls(**stored)
 
 
-def inputs_of(described: LabDescription, observation: tuple[Field, ...]) -> tuple[tuple[str, tuple[int, ...]], ...]:
+def _answered(stored: dict[str, Any]) -> Answered:
+    return Answered(tuple(stored["observation"]), tuple(map(tuple, stored["actions"])))
+
+
+def inputs_of(
+    described: LabDescription, observation: tuple[Field, ...], policy: str = ""
+) -> tuple[tuple[str, tuple[int, ...]], ...]:
     """What a policy server is sent: names with columns of the observation; without policy.inputs its own parts.
 
     Raises LabTaskBroken.
     """
-    own = Space(observation[:-2])
-    if not described.policy.inputs:
+    own, inputs = Space(observation[:-2]), described.policy_named(policy).inputs
+    if not inputs:
         return tuple((field.name, tuple(range(own.size)[place])) for field, place in own.slices())
-    return tuple(
-        (name, columns_of(own, f'policy.inputs."{name}"', said)) for name, said in described.policy.inputs.items()
-    )
+    key = f"policies.{policy}" if policy else "policy"
+    return tuple((name, columns_of(own, f'{key}.inputs."{name}"', said)) for name, said in inputs.items())
 
 
 def columns_of(own: Space, key: str, said: str) -> tuple[int, ...]:

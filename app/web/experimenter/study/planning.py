@@ -18,7 +18,7 @@ from app.services.paper import osf
 from app.services.participants import enrolment
 from app.services.studies import locking, membership, preregistration, studies
 from app.web.experimenter.study.study_form import study_form
-from app.web.experimenter.study.study_form.form_fields import FIELDS, SECTIONS
+from app.web.experimenter.study.study_form.form_fields import FIELDS, OF_RECORDINGS, SECTIONS, SIMULATED
 from app.web.experimenter.study.study_form.study_form import FormInvalid, Preset, StudyForm, TypedStudy
 from app.web.http.authorized_route import AuthorizedRoute
 from app.web.http.deps import (
@@ -64,20 +64,20 @@ def create_study(
     """Open the study, or show the form again: with what is wrong with it, or started from another preset."""
     source = _source(session, experimenter, form.like) if form.like else None
     own_task = _own_task(source) if source else None
+    if source is not None:
+        form = _with_unasked(source, form)
     if form.switch_to in set(Preset):
         started = study_form.with_preset(form, Preset(form.switch_to))
         return _form_page(request, experimenter, started, own_task=own_task)
     try:
-        typed = study_form.typed_study(form, own_task)
+        typed = study_form.typed_study(form, own_task, recorded=own_task is not None)
         _check_name(session, experimenter, form, typed.name)
     except FormInvalid as invalid:
         return _form_page(request, experimenter, form, errors=invalid.errors, own_task=own_task)
     study = studies.create_study(
-        session, typed.name, typed.settings, seed=typed.seed, actor=experimenter.name, task=typed.task
+        session, typed.name, typed.settings, seed=typed.seed, actor=experimenter.name, task=typed.task, like=source
     )
     membership.begin(session, study, experimenter)
-    if source is not None:
-        studies.copy_material(session, source, study)
     return _see(request, "show_study", slug=study.slug)
 
 
@@ -107,9 +107,9 @@ def change_settings(
 ) -> Response:
     """Store the changes, or show the form again; a locked study asks for a reason."""
     study = studies.find_study(session, slug)
-    form = _with_fixed(session, study, form)
+    form = _with_unasked(study, _with_fixed(session, study, form))
     try:
-        typed = study_form.typed_study(form, study.task)
+        typed = study_form.typed_study(form, study.task, recorded=study.material is not None)
         _check_name(session, experimenter, form, typed.name, study)
         locking.change(
             session,
@@ -242,6 +242,14 @@ def _with_fixed(session: Session, study: Study, form: StudyForm) -> StudyForm:
     return form.model_copy(update=_stored(study, locking.fixed_settings(session, study)))
 
 
+def _with_unasked(study: Study, form: StudyForm) -> StudyForm:
+    """What the form of a study of recordings does not ask stays as it is; whoever sends it nevertheless is answered."""
+    if study.material is None:
+        return form
+    stored, unasked = _form_of(study), SIMULATED - form.model_fields_set
+    return form.model_copy(update=stored.model_dump(include=set(unasked)))
+
+
 def _stored(study: Study, names: Collection[str]) -> dict[str, Any]:
     stored = _form_of(study).model_dump()
     return {each.name: stored[each.name] for each in FIELDS if each.fixed_with in names}
@@ -259,14 +267,19 @@ def _form_page(
 ) -> Response:
     """``own_task``: may stay although it is not installed here, as that of a ``study`` may."""
     own_task = study.task if study is not None else own_task
-    offered = [*catalogue.names(), *([own_task] if own_task and catalogue.find(own_task) is None else [])]
+    recorded = study.material is not None if study is not None else own_task is not None
+    if errors and recorded:
+        errors = _at_the_top(errors)
+    elsewhere = [own_task] if own_task and (recorded or catalogue.find(own_task) is None) else []
+    offered = elsewhere if recorded else [*catalogue.names(), *elsewhere]
     fixed = locking.fixed_settings(session, study) if study is not None and session is not None else {}
     context = {
         "experimenter": experimenter,
         "form": form,
         "errors": errors or {},
         "first_wrong": next((each for each in StudyForm.model_fields if each in (errors or {})), None),
-        "sections": SECTIONS,
+        "sections": OF_RECORDINGS if recorded else SECTIONS,
+        "recorded": recorded,
         "tasks": [(name, task_words.words_of(name)) for name in offered],
         "broken_tasks": catalogue.installed().broken,
         "presets": list(Preset),
@@ -276,6 +289,13 @@ def _form_page(
     return page(
         request, "experimenter/new_study.html", context, HTTPStatus.UNPROCESSABLE_ENTITY if errors else HTTPStatus.OK
     )
+
+
+def _at_the_top(errors: Mapping[str, str]) -> Mapping[str, str]:
+    """What is wrong with settings for which the form of recordings has no field."""
+    hidden = [said for name, said in errors.items() if name in {"", *SIMULATED}]
+    shown = {name: said for name, said in errors.items() if name not in {"", *SIMULATED}}
+    return {**shown, "": " ".join(hidden)} if hidden else shown
 
 
 def _see(request: Request, name: str, **parameters: str) -> RedirectResponse:

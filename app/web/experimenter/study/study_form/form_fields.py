@@ -1,13 +1,13 @@
 """The fields of a study's form: derived from the settings they fill, in the order of the page."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Any, get_args
 
 from pydantic import BaseModel
 
-from app.domain.choices import Choice
+from app.domain.choices import Choice, Strategy
 from app.domain.described import Section, Shown, settings_of
 from app.domain.designs import Arm, Screen
 from app.domain.protocol import EvaluationSettings, FormItem
@@ -143,20 +143,30 @@ FIELDS: Sequence[FormField] = tuple(_fields(StudySettings))
 BY_NAME: Mapping[str, FormField] = {each.name: each for each in FIELDS}
 
 
+SIMULATED = frozenset(each.name for each in FIELDS if each.shown.simulated or each.part)
+"""What a study of recordings has none of."""
+_NOT_OFFERED = SIMULATED | {Strategy.CONTESTED.value}
+
+
 Run = tuple[bool, list[FormField]]
 """Whether these fields are wide, and else stand side by side."""
 
 
-def _runs(section: Section) -> list[Run]:
+def _runs(section: Section, without: Collection[str] = ()) -> list[Run]:
     runs: list[Run] = []
     for each in FIELDS:
-        if each.shown.section is not section:
+        if each.shown.section is not section or each.name in without:
             continue
         wide = each.kind in WIDE
         if not runs or each.shown.new_row or runs[-1][0] is not wide:
             runs.append((wide, []))
-        runs[-1][1].append(each)
+        offered = [option for option in each.options if option[0] not in without]
+        runs[-1][1].append(replace(each, options=offered))
     return runs
 
 
 SECTIONS: Sequence[tuple[Section, Sequence[Run]]] = [(section, _runs(section)) for section in Section]
+OF_RECORDINGS: Sequence[tuple[Section, Sequence[Run]]] = [
+    (section, runs) for section in Section if (runs := _runs(section, without=_NOT_OFFERED))
+]
+"""The same for a study of recordings."""

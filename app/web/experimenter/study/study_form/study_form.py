@@ -155,13 +155,14 @@ def _as_typed(kind: Kind, value: Any) -> str | list[str]:
     return str(value)
 
 
-def typed_study(form: StudyForm, own_task: str | None = None) -> Typed:
+def typed_study(form: StudyForm, own_task: str | None = None, *, recorded: bool = False) -> Typed:
     """What was typed, checked; clips without a length get the task's usual one. Raises FormInvalid.
 
     ``own_task``: the task of a study which is changed or copied; it may stay although it is not installed here.
+    ``recorded``: the study shows recordings.
     """
     errors: dict[str, str] = {}
-    task = _task(errors, form.task, own_task)
+    task = own_task if recorded and own_task else _task(errors, form.task, own_task)
     values = {each.setting: _value(errors, each, form) for each in FIELDS if each.setting and each.part is None}
     values["clip_steps"] = _clip_steps(errors, form, task, values["clip_steps"])
     values["wording"] = _wording(errors, form)
@@ -175,7 +176,7 @@ def typed_study(form: StudyForm, own_task: str | None = None) -> Typed:
         errors["seed"] = f"Enter a number below {SEED_LIMIT}."
     settings = _settings(errors, values)
     if settings is not None:
-        errors |= task_limits.complaints(task, settings)
+        errors |= task_limits.complaints(task, settings, recorded=recorded)
     if errors or settings is None:
         if len(errors) > 1:
             errors.pop("", None)  # a rule about several fields is premature while one of them is wrong
