@@ -70,6 +70,14 @@ def test_somebody_who_cares_about_nothing_keeps_the_reference_policy(surface: Re
     assert best_mode(surface, likes(), seed=0).tolist() == FAMILY.reference.tolist()
 
 
+def test_with_caution_what_the_members_disagree_about_is_not_gambled_on(surface: ResponseSurface) -> None:
+    """Sure about the height, undecided about the speed."""
+    members = np.array([likes(height_above_target_m=-1.0, speed_m_s=speed) for speed in (-3.0, 3.2)])
+    chosen, bold = (best_mode(surface, members, seed=0, caution=caution) for caution in (1.0, 0.0))
+    assert chosen[2] > 0.4
+    assert abs(surface.predict(chosen)[0][SPEED]) < 0.1 < 0.4 < surface.predict(bold)[0][SPEED]
+
+
 def test_of_members_that_disagree_the_mean_decides(surface: ResponseSurface) -> None:
     members = np.array([likes(height_above_target_m=-1.0, speed_m_s=speed) for speed in (-1.0, 3.0)])
     np.testing.assert_array_equal(

@@ -21,6 +21,7 @@ from worker.ml.filters.filter_problem import (
 from worker.ml.filters.gate import acceptable, signal_changes, successes, try_on
 from worker.ml.filters.response_surface import CAUTION, ResponseSurface, best_mode
 from worker.ml.filters.shield import limits_of
+from worker.ml.rewards.reward_models import StructuredReward
 
 
 def find_mode(
@@ -48,7 +49,8 @@ def find_mode(
             break
         progress("searching the person's way of doing the task", 0.1 * attempt)
         rejected = len(tried) - len(accepted)
-        mode = best_mode(surface, wishes, problem.seed, success_caution=CAUTION * (1 + rejected))
+        careful = CAUTION * (1 + rejected)
+        mode = best_mode(surface, wishes, problem.seed, caution=_caution(problem), success_caution=careful)
         if not mode.any() or any(np.array_equal(mode, earlier) for _, earlier in tried):
             break
         progress(f"checking mode {attempt + 1} on held-out scenarios", 0.03 + 0.1 * attempt)
@@ -76,6 +78,12 @@ def find_mode(
     ordered = (*(trial for trial in trials if trial is not chosen), chosen)
     tested = limits_of(problem.task.observation, problem.task.action, driven, reference)
     return FilterDraft(weights, trials=ordered, tested=tested).timed("mode", started)
+
+
+def _caution(problem: FilterProblem) -> float:
+    """About what members disagree on: only where the reward model's prior has nobody whom the person may be like."""
+    knows_people = isinstance(problem.reward, StructuredReward) and not problem.task.is_a_labs
+    return 0.0 if knows_people else CAUTION
 
 
 def _act_in(problem: FilterProblem, mode: FloatArray) -> FilterAct:

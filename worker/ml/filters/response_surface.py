@@ -28,8 +28,8 @@ SUCCESS_PENALTY = 20.0
 """Standard deviations of predicted return per unit of success lost beyond the tolerance."""
 DRAWS = 20_000
 CAUTION = 1.0
-"""Standard deviations that are subtracted from a mode's predicted log odds of success: the best of many is the one that
-is most likely overestimated."""
+"""Standard deviations that are subtracted from a mode's predicted log odds of success, and where nothing is expected of
+a person (see best_mode) from its predicted return: the best of many is the one that is most likely overestimated."""
 REFERENCE_PRECISION = 0.1
 """Of the prior of the reference policy's log odds of success: it is known from data alone."""
 NEWTON_STEPS = 15
@@ -173,26 +173,28 @@ def best_mode(
     *,
     tolerance: float = SUCCESS_TOLERANCE,
     penalty: float = SUCCESS_PENALTY,
+    caution: float = 0.0,
     success_caution: float = CAUTION,
 ) -> FloatArray:
     """(A,) the mode with the best predicted return for these weights on the signals, (S,) or (E, S) for E members.
 
-    Of members the mean counts: caution about what they disagree on costs more than it saves, however few the labels
-    (docs/results/few_answers.md). The chance of success is taken ``success_caution`` of its standard deviations lower.
-    Random search with two local refinements; the mode 0 is always among the candidates and wins ties, so that somebody
+    The return counts as the members' mean less ``caution`` of their standard deviations. With a prior that expects
+    something of people caution costs more than it saves, however few the labels (docs/results/few_answers.md). The
+    chance of success is taken ``success_caution`` of its standard deviations lower. Random search with two local refinements; the mode 0 is always among the candidates and wins ties, so that somebody
     for whom nothing is better keeps the reference policy.
     """
     rng = np.random.default_rng(seed)
     width = surface.high - surface.low
-    wanted = np.atleast_2d(weights).mean(axis=0)
+    members = np.atleast_2d(weights)
     reference = np.zeros((1, len(width)))
     candidates = np.concatenate([reference, rng.uniform(surface.low, surface.high, (DRAWS, len(width)))])
     signals, success = surface.predict(candidates, success_caution)
-    unit = max(float((signals @ wanted).std()), 1e-9)
+    unit = max(float((signals @ members.mean(axis=0)).std()), 1e-9)
 
     def value(signals: FloatArray, success: FloatArray) -> FloatArray:
-        worth: FloatArray = signals @ wanted / unit - penalty * np.maximum(-success - tolerance, 0.0)
-        return worth
+        returns = signals @ members.T / unit
+        worth: FloatArray = returns.mean(axis=-1) - caution * returns.std(axis=-1)
+        return worth - penalty * np.maximum(-success - tolerance, 0.0)
 
     for spread in (0.2, 0.05):
         best = candidates[np.argsort(value(signals, success))[-40:]]
