@@ -86,7 +86,7 @@ class AnsweredPool:
     ) -> acquisition.Choice:
         if not len(rows):
             return acquisition.choose(count, len(free), rng)
-        mean, covariance = posterior(self.sums[rows], said)
-        members = np.random.default_rng(seed).multivariate_normal(mean, covariance, MEMBERS)
+        known = posterior(self.sums[rows], said)
+        members = np.random.default_rng(seed).multivariate_normal(known.mean, known.covariance, MEMBERS)
         scores = acquisition.entropy(probability_right(members @ self.sums[free].T))
         return acquisition.choose(count, len(free), rng, rule="entropy", scores=scores)

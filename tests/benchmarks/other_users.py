@@ -35,7 +35,7 @@ from worker.experiments.rollout_cache import BEHAVIOURS_PER_SCENARIO, RolloutCac
 from worker.jobs.learning import following
 from worker.ml.filters.response_surface import RIDGE, ResponseSurface, best_mode, monomials
 from worker.ml.rewards import misfit
-from worker.ml.rewards.prior import DEVIATION, Prior
+from worker.ml.rewards.prior import DEVIATION, Population, Prior
 from worker.ml.rewards.reward_training import fit, posterior
 from worker.ml.rewards.segments import SegmentPairs
 from worker.ml.teachers import User
@@ -119,10 +119,10 @@ class Bench:
             raw = self.pool.further[explained_by][answered.rows]
             more, used = misfit.by_spread(raw), np.sqrt((raw**2).mean(axis=0))
         deviations = np.append(np.full(sums.shape[1], DEVIATION), np.full(more.shape[1], misfit.RICHER_DEVIATION))
-        prior = Prior(np.zeros(len(deviations)), np.diag(deviations**2))
-        mean, covariance = posterior(np.concatenate([sums, more], axis=1), answered.answers, prior)
-        half = np.random.default_rng(seed).multivariate_normal(mean, covariance, MEMBERS // 2)
-        members = np.concatenate([half, 2 * mean - half])
+        prior = Prior((Population("anybody", np.zeros(len(deviations)), np.diag(deviations**2)),))
+        known = posterior(np.concatenate([sums, more], axis=1), answered.answers, prior)
+        half = np.random.default_rng(seed).multivariate_normal(known.mean, known.covariance, MEMBERS // 2)
+        members = np.concatenate([half, 2 * known.mean - half])
         of_sums, further = members[:, : len(spread)] / spread, members[:, len(spread) :]
         if explained_by == misfit.CHANGING:
             last = np.sqrt(3.0)  # the last answer's number in deviations from the middle one
