@@ -112,6 +112,8 @@ RUN: dict[str, str | Elsewhere | OnlyParsed] = {
     "following_pairs": ROLLOUTS,
     "hints": ROLLOUTS,
     "mattered": ROLLOUTS,
+    "misfit": ROLLOUTS,
+    "other_users": ROLLOUTS,
     "comparison_report": "results/paper_form",
     "contact_sheet": "sheets feeding --films 1 --steps 5 --no-people",
     "disagreement": "feeding --file cells.csv --shares 1 --scenarios 12",

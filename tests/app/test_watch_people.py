@@ -181,6 +181,23 @@ def test_the_advice_is_shown_only_where_the_study_wants_it(
     assert ("more answers could gain" in experimenter.get("/studies/advised/participants/P01").text) is shown
 
 
+@pytest.mark.parametrize(("evidence", "flagged"), [([25.0], True), ([19.0], False), ([25.0, 3.0], False)])
+def test_a_model_that_does_not_fit_is_a_flag_until_a_newer_one_does(
+    experimenter: TestClient,
+    study: Study,
+    participant: Participant,
+    database: Database,
+    evidence: list[float],
+    flagged: bool,
+) -> None:
+    with database.writing() as session:
+        for labels, each in enumerate(evidence, 10):
+            metrics = factories.reward_metrics() | {"misfit": {"evidence": each, "explanation": "arrival"}}
+            factories.make_model(session, study, participant, ModelKind.REWARD, metrics, labels=labels)
+    assert ('class="flag">model does not fit' in experimenter.get("/studies/pilot").text) is flagged
+    assert ("when the robot arrives" in experimenter.get("/studies/pilot/participants/P01").text) is flagged
+
+
 def test_what_was_learned_is_said_in_words_about_the_six_costs_whatever_the_model(
     experimenter: TestClient, study: Study, participant: Participant, database: Database
 ) -> None:

@@ -16,7 +16,7 @@ from worker.compute.simulation import reference_rollouts, run_episode, signal_pr
 from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import Act, Float32Array, FloatArray
 from worker.ml.rewards.loading import load_reward_model
-from worker.ml.rewards.reward_models import NEVER_WANTED, RewardModel
+from worker.ml.rewards.reward_models import NEVER_WANTED, RewardModel, StructuredReward
 from worker.ml.rewards.segments import SegmentPairs
 from worker.ml.rewards.signal_scale import SignalScale
 from worker.tasks import registry
@@ -72,11 +72,12 @@ def fit_reward(
     ``hints``: (H, S) which way the person wishes the signals, as in reward_training.fit().
     Raises ValueError for a kind there is not, and simulation.NoPredictor where the task's signals cannot be foreseen.
     """
-    from worker.ml.rewards import reward_training
+    from worker.ml.rewards import misfit, reward_training
 
     if kind not in get_args(reward_training.RewardKind):
         raise ValueError(f"There is no reward model of the kind {kind!r}.")
     simulated = None if recorded_signals is not None else registry.task(task)
+    names = recorded_signals or () if simulated is None else simulated.signals
     prior = prior_of(task if recorded_signals is None else None, scale.spread, [_model(each) for each in earlier])
     fitted = reward_training.fit(
         pairs,
@@ -86,13 +87,17 @@ def fit_reward(
         scale=scale,
         reference=reference_rollouts(task) if recorded_signals is None else (),
         prior=prior,
-        signal_names=recorded_signals or () if simulated is None else simulated.signals,
+        signal_names=names,
         costs=NEVER_WANTED if simulated is None else (*NEVER_WANTED, *simulated.costs),
         predictor=signal_predictor(task) if kind == "predicted" else None,
         mattered=mattered,
         hints=hints,
     )
-    return fitted.model.to_bytes(), {**fitted.metrics, "pooled_from": len(earlier)}
+    metrics = {**fitted.metrics, "pooled_from": len(earlier)}
+    if isinstance(fitted.model, StructuredReward):
+        scene = [] if simulated is None else misfit.scene_of(simulated.observation)
+        metrics["misfit"] = misfit.look(pairs, np.asarray(targets, np.float64), scale, names, scene)
+    return fitted.model.to_bytes(), metrics
 
 
 def probability_right(stored_model: bytes, pairs: SegmentPairs) -> list[float]:

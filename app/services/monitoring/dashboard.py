@@ -87,7 +87,8 @@ class ParticipantRow:
     @property
     def flags(self) -> Sequence[str]:
         """What deserves a look: of the model first, then of the answers. A program never runs the page's script."""
-        of_model = ["guessing"] if self.curve.foresight is accuracy.Foresight.GUESSING else []
+        guessing, misfit = self.curve.foresight is accuracy.Foresight.GUESSING, self.watched.misfit is not None
+        of_model = [name for name, raised in (("guessing", guessing), ("misfit", misfit)) if raised]
         expected = {"without_script"} if self.participant.scripted_as else set()
         return [*of_model, *(flag for flag in self.watched.consistency.flags if flag not in expected)]
 

@@ -25,6 +25,7 @@ from app.domain.protocol import Stage
 from app.domain.studies import Participant, Study
 from app.domain.study_settings import StudySettings
 from app.services.answers.consistency import Consistency, JudgedAnswer, consistency, seen
+from app.services.answers.misfit import Misfit
 from app.services.answers.stopping_advice import Advice
 from app.services.participants import stages
 
@@ -56,6 +57,7 @@ class Watched:
     pace_s: float | None
     """Median time from one answer to the next."""
     advice: Advice | None
+    misfit: Misfit | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,7 +151,7 @@ def reward_models(session: Session, participant_ids: Sequence[int]) -> dict[int,
     return models
 
 
-def judged(given: Sequence[GivenAnswer], advice: Advice | None) -> Watched:
+def judged(given: Sequence[GivenAnswer], advice: Advice | None, misfit: Misfit | None = None) -> Watched:
     """Everything that is said about the answers of one participant."""
     moments = sorted(each.moment for each in given if each.answer.purpose is not Purpose.PRACTICE)
     gaps = [(later - earlier).total_seconds() for earlier, later in pairwise(moments)]
@@ -158,6 +160,7 @@ def judged(given: Sequence[GivenAnswer], advice: Advice | None) -> Watched:
         consistency=consistency([each.answer for each in given if not each.excluded]),
         pace_s=median(working) if len(working) >= 3 else None,
         advice=advice,
+        misfit=misfit,
     )
 
 

@@ -20,6 +20,7 @@ from app.domain.models import Bundle, Model, ModelKind
 from app.domain.preferences import LEARNED_FROM, Exclusion, LabelEvent, Query, Response
 from app.services.answers import accuracy, stopping_advice
 from app.services.answers.accuracy import Predicted
+from app.services.answers.misfit import Misfit, misfit_of
 from app.services.answers.stopping_advice import Advice
 from app.services.monitoring import participant_status
 from app.services.monitoring.participant_status import GivenAnswer
@@ -64,6 +65,7 @@ class _Known:
     given: Mapping[int, GivenAnswer] | None
     """By the query's id, in the order of the queries; None: forgotten"""
     advice: Advice | None
+    misfit: Misfit | None
     tally: Tally
 
 
@@ -128,6 +130,7 @@ def _count(session: Session, marks: Mapping[int, Watermark], known: Mapping[int,
     trained = [each for each in marks if each not in known or known[each].mark.models != marks[each].models]
     models = participant_status.reward_models(session, trained)
     advice = {each: stopping_advice.advice_of(models[each]) if each in models else known[each].advice for each in marks}
+    misfit = {each: misfit_of(models[each]) if each in models else known[each].misfit for each in marks}
     published = {each for each in marks if each in models or known[each].mark.bundles != marks[each].bundles}
     filters = _newest_filters(session, list(published))
     return {
@@ -135,9 +138,11 @@ def _count(session: Session, marks: Mapping[int, Watermark], known: Mapping[int,
             mark,
             given[each],
             advice[each],
+            misfit[each],
             _tally(
                 list(given[each].values()),
                 advice[each],
+                misfit[each],
                 filters.get(each) if each in published else known[each].tally.newest_filter,
             ),
         )
@@ -186,7 +191,10 @@ def _ordinal(given: GivenAnswer) -> int:
 
 
 def _tally(
-    given: Sequence[GivenAnswer], advice: Advice | None, newest_filter: model_metrics.FilterVersion | None
+    given: Sequence[GivenAnswer],
+    advice: Advice | None,
+    misfit: Misfit | None,
+    newest_filter: model_metrics.FilterVersion | None,
 ) -> Tally:
     labels = [each for each in given if each.answer.purpose in LEARNED_FROM]
     counting = [each for each in labels if not each.excluded]
@@ -202,7 +210,7 @@ def _tally(
             )
         ),
         newest_filter=newest_filter,
-        watched=participant_status.judged(given, advice),
+        watched=participant_status.judged(given, advice, misfit),
     )
 
 

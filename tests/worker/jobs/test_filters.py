@@ -12,10 +12,11 @@ from app.domain.preferences import LabelEvent, Query, Response
 from app.domain.run_keys import RunKey
 from app.domain.studies import Participant, Study
 from app.services.answers import accuracy
+from app.services.answers.misfit import Misfit
 from app.storage import ArtefactStore
 from tests.worker.at_hand import at_once
 from worker.compute.pools import Compute
-from worker.jobs.learning.filters import NothingToLearnFrom, notes_on_foresight, train_filter
+from worker.jobs.learning.filters import NothingToLearnFrom, notes_on_foresight, notes_on_misfit, train_filter
 from worker.jobs.runtime import records
 from worker.jobs.runtime.context import WorkerContext
 from worker.jobs.runtime.due_work import answers_known, is_outdated
@@ -117,6 +118,13 @@ def test_the_card_of_a_filter_says_that_its_model_may_be_guessing(hits: list[flo
     (note,) = notes_on_foresight(accuracy.curve(hits))
     assert "not been shown to be better than guessing" in note
     assert said in note
+
+
+def test_the_card_of_a_filter_says_that_its_model_does_not_fit_and_what_would() -> None:
+    (note,) = notes_on_misfit(Misfit("arrival", 30.0))
+    assert "does not fit this person" in note
+    assert "explained better by when the robot arrives" in note
+    assert notes_on_misfit(None) == []
 
 
 def test_a_model_that_foresees_answers_needs_no_note() -> None:

@@ -10,6 +10,7 @@ from app.domain.studies import Participant, Study
 from app.domain.study_settings import StudySettings
 from app.errors import AppError
 from app.services.answers import accuracy
+from app.services.answers.misfit import Misfit, misfit_of
 from app.services.exports.export_formats import provenance_of
 from app.services.monitoring import dashboard
 from worker.analysis.filters.promise import Promise
@@ -128,7 +129,11 @@ def _publish(context: WorkerContext, run_id: int, job: Job, reward: str, draft: 
         version = records.next_version(session, job.participant)
         run = records.seen_labels(session, run_id)
         export = provenance_of(session, study)
-        notes = [*notes_on_script(participant), *notes_on_foresight(dashboard.curve_of(session, job.participant))]
+        notes = [
+            *notes_on_script(participant),
+            *notes_on_foresight(dashboard.curve_of(session, job.participant)),
+            *notes_on_misfit(misfit_of([model] if model else [])),
+        ]
     provenance = Provenance(
         study=study.name,
         participant=participant.code,
@@ -167,6 +172,16 @@ def notes_on_foresight(curve: accuracy.Curve) -> Sequence[str]:
         "The reward model behind this filter has not been shown to be better than guessing: before they were given it"
         f" foresaw {foreseen} of this person's preferences on pairs drawn at random. What it says about the person, the"
         " learned preference included, may mean nothing."
+    ]
+
+
+def notes_on_misfit(misfit: Misfit | None) -> Sequence[str]:
+    """What the model card has to say about a reward model that does not fit the person."""
+    if misfit is None:
+        return []
+    return [
+        "The reward model behind this filter adds up weighted signals, and that does not fit this person: their answers"
+        f" are explained better by {misfit.words}. The filter may suit them less than it could."
     ]
 
 

@@ -1,0 +1,43 @@
+"""Whether the reward model does not fit a person: a flag for people to look at, from what the worker has measured."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from app.domain.models import Model
+from app.services.answers.accuracy import ENOUGH_EVIDENCE
+
+IN_WORDS: Mapping[str, str] = {
+    "worst_moments": "the worst moment, such as the highest speed or the hardest touch",
+    "arrival": "when the robot arrives",
+    "phases": "weights that differ between far away and close up",
+    "poses": "weights that depend on how person and robot are placed at the start",
+    "changing": "weights that change from the first answer to the last",
+}
+"""What explains answers, by the names of worker.ml.rewards.misfit."""
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """Something richer explains somebody's answers better than weighted sums of signals."""
+
+    explanation: str
+    """What explains most, one of IN_WORDS."""
+    evidence: float
+    """How many times as probable richer models make the answers."""
+
+    @property
+    def words(self) -> str:
+        """What explains most, in words."""
+        return IN_WORDS[self.explanation]
+
+
+def misfit_of(models: Sequence[Model]) -> Misfit | None:
+    """From a participant's reward models in the order of their labels, the newest of which counts.
+
+    None while it has not been shown that the model does not fit. How often that is said wrongly, however often one
+    looks: docs/results/misfit.md.
+    """
+    found = models[-1].metrics.get("misfit") if models else None
+    if not isinstance(found, dict) or not found.get("evidence", 0.0) >= ENOUGH_EVIDENCE:
+        return None
+    return Misfit(str(found["explanation"]), float(found["evidence"]))

@@ -1,0 +1,153 @@
+"""Whether weighted sums of signals explain somebody's answers, or something richer does so much better that it is said.
+
+The linear model is compared with richer ones by how probable each makes the answers before it knows its weights (their
+marginal likelihoods, by Laplace's approximation). The mean of these ratios is a bet against the linear model: while
+that model is right it is expected not to grow from one answer to the next, so that it ever exceeds x with a chance of
+at most 1 / x, however often one looks (Ville). That is true over people as the prior takes them to be; how often it
+errs for scripted people, and whom it finds: docs/results/misfit.md. Both models allow for as many answers at random as
+the reward does; people who err much more often than that are flagged more often than one in twenty.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from worker.domain.spaces import Space
+from worker.domain.type_aliases import FloatArray
+from worker.ml.rewards import richer_features
+from worker.ml.rewards.bradley_terry import probability_of_answer, probability_right, slope_of_answer
+from worker.ml.rewards.calibration import cross_entropy
+from worker.ml.rewards.prior import DEVIATION
+from worker.ml.rewards.segments import SegmentPairs
+from worker.ml.rewards.signal_scale import SignalScale
+
+FEWEST_ANSWERS = 60
+"""Fewer are not looked at: with fewer answers than weights Laplace's approximation is too rough to bet on, and somebody
+linear is now and then taken for one whose weights depend on the pose (docs/results/misfit.md)."""
+RICHER_DEVIATION = 1.0
+"""Of the prior of a richer model's further weights, in log odds per usual difference of a pair. A wider one finds more
+of what is very clear, and errs more often (docs/results/misfit.md)."""
+CHANGING = "changing"
+"""The richer model whose weights move along with the number of the answer."""
+MOST_STEPS = 100
+SMALLEST_GAIN = 1e-6
+"""Of log probability, that is still a step worth making."""
+_SPEED, _NEAR_SPEED = "speed_squared_m2_s2", "near_speed_squared_m2_s2"
+_SCENE = ("target_outward", "tool_to_target_m")
+_SMALLEST_SPREAD = 1e-6
+
+
+def look(
+    pairs: SegmentPairs, answers: FloatArray, scale: SignalScale, signal_names: Sequence[str], scene: Sequence[int] = ()
+) -> dict[str, Any]:
+    """For a model's metrics: ``evidence`` against the linear model, and the richer one that explains most.
+
+    pairs and answers (N,) in {0, 1/2, 1} in the order in which they were given; ``scene``: columns of the observation
+    that say how a scene begins. Nothing for fewer than FEWEST_ANSWERS.
+    """
+    if len(answers) < FEWEST_ANSWERS:
+        return {}
+    sums = linear_features(pairs.signal_differences(), scale, signal_names)
+    richer = {name: by_spread(each) for name, each in further_differences(pairs, signal_names, scene).items()}
+    ratios = log_ratios(sums, {**richer, CHANGING: changing(sums)}, answers)
+    return {"evidence": evidence(ratios), "explanation": max(ratios, key=lambda name: ratios[name])}
+
+
+def linear_features(differences: FloatArray, scale: SignalScale, signal_names: Sequence[str]) -> FloatArray:
+    """(N, S) differences of summed signals, standardised, and that of the speed far away where there are both speeds.
+
+    That one is a difference of two signals, and linear. Without its own column the prior keeps it small where the robot
+    moves much more near than far, and people who mind it would look as if they minded something
+    else (docs/results/misfit.md).
+    """
+    usual = differences / scale.spread
+    if not {_SPEED, _NEAR_SPEED} <= {*signal_names}:
+        return usual
+    whole, near = (differences[:, [*signal_names].index(name)] for name in (_SPEED, _NEAR_SPEED))
+    return np.concatenate([usual, by_spread((whole - near)[:, None])], axis=1)
+
+
+def evidence(ratios: Mapping[str, float]) -> float:
+    """The mean ratio of the richer models' likelihoods to the linear one's."""
+    return float(np.exp(np.minimum([*ratios.values()], 700.0)).mean())
+
+
+def log_ratios(sums: FloatArray, further: Mapping[str, FloatArray], answers: FloatArray) -> dict[str, float]:
+    """Natural logarithms of the richer models' likelihoods over the linear one's. sums (N, S), further (N, F) each."""
+    usual = np.full(sums.shape[1], DEVIATION)
+    linear = log_likelihood(sums, answers, usual)
+    return {
+        name: log_likelihood(
+            np.concatenate([sums, each], axis=1), answers, np.append(usual, np.full(each.shape[1], RICHER_DEVIATION))
+        )
+        - linear
+        for name, each in further.items()
+    }
+
+
+def log_likelihood(features: FloatArray, answers: FloatArray, deviations: FloatArray) -> float:
+    """log p(answers) under weights of N(0, deviations^2), by Laplace's approximation at their most probable values.
+
+    Found by Fisher scoring with halved steps: a tenth of the time of reward_training.posterior(), which also holds
+    weights of costs at 0, and is made once an answer where this is made six times.
+    """
+    precision = deviations**-2.0
+    weights = np.zeros(len(precision))
+    loss, gradient, curvature = _loss(features, answers, weights, precision)
+    for _ in range(MOST_STEPS):
+        step = np.linalg.solve(curvature, gradient)
+        if step @ gradient < SMALLEST_GAIN:
+            break
+        while (found := _loss(features, answers, weights - step, precision))[0] > loss:
+            step = step / 2
+        weights, (loss, gradient, curvature) = weights - step, found
+    room = np.log(precision).sum() - np.linalg.slogdet(curvature)[1]
+    return float(0.5 * room - loss)
+
+
+def _loss(
+    features: FloatArray, answers: FloatArray, weights: FloatArray, precision: FloatArray
+) -> tuple[float, FloatArray, FloatArray]:
+    """Minus the log of the answers' and the weights' probability up to a constant, its gradient, Fisher's matrix."""
+    preferred = probability_right(features @ weights)
+    said, slope = probability_of_answer(preferred), slope_of_answer(preferred)
+    variance = said * (1.0 - said)
+    surprise = cross_entropy(said, answers) * len(answers) + 0.5 * float(precision @ weights**2)
+    gradient = features.T @ ((said - answers) * slope / variance) + precision * weights
+    return surprise, gradient, features.T @ (features * (slope**2 / variance)[:, None]) + np.diag(precision)
+
+
+def scene_of(observation: Space) -> list[int]:
+    """The columns of an observation that say how a scene begins; of spaces that are not a task of ours none."""
+    names = {field.name for field in observation.fields} & set(_SCENE)
+    return [column for name in sorted(names) for column in range(*observation.slice_of(name).indices(observation.size))]
+
+
+def further_differences(
+    pairs: SegmentPairs, signal_names: Sequence[str], scene: Sequence[int] = ()
+) -> dict[str, FloatArray]:
+    """What each richer model reads beside the signals' sums: right minus left, (N, F) each."""
+    return {name: each[:, 1] - each[:, 0] for name, each in further_sums(pairs, signal_names, scene).items()}
+
+
+def further_sums(pairs: SegmentPairs, signal_names: Sequence[str], scene: Sequence[int] = ()) -> dict[str, FloatArray]:
+    """The richer models' features of both sides, (N, 2, F) each."""
+    columns = {name: pairs.signals[..., place].astype(np.float64) for place, name in enumerate(signal_names)}
+    begins = pairs.observations[:, :, 0, list(scene)].astype(np.float64)
+    held = (begins - begins.mean(axis=(0, 1))) / np.maximum(begins.std(axis=(0, 1)), _SMALLEST_SPREAD)
+    return {name: each.sum(axis=-2) for name, each in richer_features.measured(columns, held).items()}
+
+
+def by_spread(differences: FloatArray) -> FloatArray:
+    """(N, F) in units of the usual difference of each column; one that never differs stays 0."""
+    spread = np.sqrt((differences**2).mean(axis=0))
+    standard: FloatArray = np.asarray(differences / np.where(spread > _SMALLEST_SPREAD, spread, 1.0), np.float64)
+    return standard
+
+
+def changing(sums: FloatArray) -> FloatArray:
+    """(N, S) the sums times the answer's number, in deviations from the middle one."""
+    order = np.arange(len(sums)) - (len(sums) - 1) / 2
+    moved: FloatArray = sums * (order / order.std())[:, None]
+    return moved
