@@ -101,6 +101,14 @@ def test_the_index_names_every_page() -> None:
     assert {each.name for each in DOCS.glob("*.md")} - {"README.md"} <= named
 
 
+def test_the_index_of_decisions_names_each_once_and_as_it_is_called() -> None:
+    text = (DOCS / "decisions.md").read_text()
+    named, written = (
+        re.findall(start, text, re.MULTILINE) for start in (r"^\* \*\*(\d+)\*\* (.*)$", r"^## (\d+)\. (.*)$")
+    )
+    assert sorted(named) == sorted(written)
+
+
 @pytest.mark.parametrize("name", Settings.model_fields)
 def test_the_table_of_settings_has_all_of_them_with_their_defaults(name: str) -> None:
     rows = re.findall(r"^\| `(\w+)` \| (.+?) \|", (DOCS / "operating.md").read_text(), re.MULTILINE)

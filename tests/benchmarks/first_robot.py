@@ -13,9 +13,10 @@ import re
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from sqlalchemy import select
@@ -107,14 +108,9 @@ def _answer(database: Database, study: Study, people: Sequence[Answering], optio
     last = [each for each in people if not _go_on(database, study, each, options.labels - 1, options.pace)]
     if options.unhurried:
         for each in last:
-            wait_until(PATIENCE_S, "not all is made ahead", lambda each=each: _is_made_ahead(database, each) or None)
-    before_last_answers()
+            _until("not all is made ahead", partial(_is_made_ahead, database, each))
     for each in last:
         _go_on(database, study, each, sys.maxsize, POLL_S)
-
-
-def before_last_answers() -> None:
-    """What is to happen then, such as making the machine quiet."""
 
 
 def _go_on(database: Database, study: Study, each: Answering, count: int, pace_s: float) -> bool:
@@ -128,6 +124,10 @@ def _go_on(database: Database, study: Study, each: Answering, count: int, pace_s
         time.sleep(pace_s if each.visitor.query_id() else POLL_S)
         each.answers()
     return True
+
+
+def _until(missing: str, seen: Callable[[], bool]) -> None:
+    wait_until(PATIENCE_S, missing, lambda: seen() or None)
 
 
 def _is_made_ahead(database: Database, each: Answering) -> bool:
@@ -168,16 +168,11 @@ def _wait(database: Database, people: Sequence[Answering]) -> None:
             at_s, left_s = late[0]
             _say(f"  told at {at_s:4.0f} s: {left_s / 60:.0f} min to go, in truth {(first_s - at_s) / 60:.1f}")
     for each in people:
-        wait_until(PATIENCE_S, "not all robots", lambda each=each: _all_films(database, each.participant.id) or None)
+        _until("not all robots", partial(_all_films, database, each.participant.id))
         _say(f"{each.participant.code}: every robot after {time.monotonic() - began:6.0f} s")
-    after_all_films()
     for each in people:
-        wait_until(PATIENCE_S, "no debrief", lambda each=each: _debriefed(database, each.participant.id) or None)
+        _until("no debrief", partial(_debriefed, database, each.participant.id))
         _say(f"{each.participant.code}: before and after after {time.monotonic() - began:6.0f} s")
-
-
-def after_all_films() -> None:
-    """What is to happen then."""
 
 
 def _all_films(database: Database, participant_id: int) -> bool:

@@ -116,7 +116,7 @@ async def _race(
     pids: Sequence[int],
     options: argparse.Namespace,
 ) -> None:
-    postgresql = on_postgresql.process_of(settings.database_url) if options.postgresql else None
+    postgresql = on_postgresql.process_of(settings.database_url) if settings.database_url else None
     phases = {key: Phase(*key) for key in product(("no worker", "worker busy"), options.thought)}
     current = Phase("between phases", options.thought[0])
     door = asyncio.Semaphore(AT_THE_DOOR)

@@ -82,11 +82,13 @@ def tolerant(task: Task, episode: Trajectory) -> FloatArray:
     beyond = [
         price * np.maximum(np.cumsum(_column(episode, name)) - most, 0.0) for name, (most, price) in amounts.items()
     ]
-    return as_type(User.NEUTRAL, 0.1)(task, episode) - np.diff(np.sum(beyond, axis=0), prepend=0.0)
+    excess: FloatArray = np.diff(np.sum(beyond, axis=0), prepend=0.0)
+    return as_type(User.NEUTRAL, 0.1)(task, episode) - excess
 
 
 def _column(episode: Trajectory, name: str) -> FloatArray:
-    return episode.signals[:, SIGNALS.index(name)].astype(np.float64)
+    found: FloatArray = episode.signals[:, SIGNALS.index(name)].astype(np.float64)
+    return found
 
 
 @dataclass(frozen=True)

@@ -48,7 +48,8 @@ def looked(pairs: SegmentPairs, answers: FloatArray) -> tuple[bool, str]:
 
 
 def total(pairs: SegmentPairs, column: int) -> FloatArray:
-    return pairs.signals[..., column].sum(axis=-1, dtype=np.float64)
+    summed: FloatArray = pairs.signals[..., column].sum(axis=-1, dtype=np.float64)
+    return summed
 
 
 def test_whoever_wants_less_of_some_signals_is_not_flagged(pairs: SegmentPairs) -> None:

@@ -180,8 +180,9 @@ def best_mode(
 
     The return counts as the members' mean less ``caution`` of their standard deviations. With a prior that expects
     something of people caution costs more than it saves, however few the labels (docs/results/few_answers.md). The
-    chance of success is taken ``success_caution`` of its standard deviations lower. Random search with two local refinements; the mode 0 is always among the candidates and wins ties, so that somebody
-    for whom nothing is better keeps the reference policy.
+    chance of success is taken ``success_caution`` of its standard deviations lower. Random search with two local
+    refinements; the mode 0 is always among the candidates and wins ties, so that somebody for whom nothing is better
+    keeps the reference policy.
     """
     rng = np.random.default_rng(seed)
     width = surface.high - surface.low
