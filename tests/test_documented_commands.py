@@ -109,6 +109,7 @@ RUN: dict[str, str | Elsewhere | OnlyParsed] = {
     "api_pages": "--people 1 --answers 20",
     "changed_physics": ROLLOUTS,
     "chosen_modes": ROLLOUTS,
+    "few_answers": ROLLOUTS,
     "following_pairs": ROLLOUTS,
     "hints": ROLLOUTS,
     "mattered": ROLLOUTS,

@@ -61,7 +61,7 @@ def far_out(column: int, value: float) -> np.ndarray:
 def test_where_everything_was_tested_nothing_is_changed() -> None:
     usual = SEEN[:, FORCE] <= limits()["observation_high"][FORCE]
     action, activity = said(shielded())
-    np.testing.assert_array_equal(activity[usual], 0.0)
+    np.testing.assert_allclose(activity[usual], 0.0, atol=1e-9)  # on the limit, one row is rounded otherwise than many
     np.testing.assert_allclose(action[usual], said(BARE)[0][usual], atol=1e-6)
 
 

@@ -698,7 +698,7 @@ def strengths(study):
     centre = (np.eye(len(groups)) - 1 / len(groups))[:, 1:]
     found, spread = centre @ fit.params, centre @ fit.cov_params() @ centre.T * len(who) / (len(who) - 1)
     t = stats.t.ppf(0.975, len(who) - 1)
-    margins = t * np.sqrt(np.diag(spread))
+    margins = t * np.sqrt(np.maximum(np.diag(spread), 0.0))
     result = [
         {"group": group, "strength": found[i], "low": found[i] - margins[i], "high": found[i] + margins[i]}
         for i, group in enumerate(groups)

@@ -101,7 +101,7 @@ def _estimated(wins: FloatArray, groups: Sequence[str]) -> dict[str, Any]:
     found = strengths(wins.sum(axis=0))
     spread = covariance(wins, found)
     t = float(stats.t.ppf(0.975, len(wins) - 1))
-    margins = t * np.sqrt(np.diag(spread))
+    margins = t * np.sqrt(np.maximum(np.diag(spread), 0.0))  # which rounding can leave below a variance of 0
     comparisons = []
     for first, second in combinations(range(len(groups)), 2):
         difference = float(found[second] - found[first])
