@@ -90,7 +90,7 @@ def _is_learned_again(context: WorkerContext, user: str) -> None:
     assert again.id != recorded.id
     assert again.label_hash == recorded.label_hash, user
     weights, before = weights_of(context, again), weights_of(context, recorded)
-    np.testing.assert_allclose(weights, before, rtol=1e-5, atol=1e-5, err_msg=user)
+    np.testing.assert_allclose(weights, before, rtol=1e-5, atol=1e-6, err_msg=user)
 
 
 def test_recorded_filters_are_exported_to_the_same_functions_and_drive_the_robot_as_they_did(

@@ -77,7 +77,7 @@ def _returns(reward: RewardModel, trajectories: Sequence[Trajectory]) -> FloatAr
     """(E, N) as answers are explained by them: neither normalised nor cut step by step.
 
     Limits on what a step or a signal may earn keep an optimiser from what nobody has seen; of these policies everybody
-    has seen all, and the cuts would make short and fierce ones look as good as calm ones.
+    has seen all, and with the limits a quick one came out level with a slow one for somebody who minds speed.
     """
     return np.array(
         [
