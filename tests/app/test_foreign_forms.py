@@ -1,10 +1,13 @@
 """Requests that other websites make in a visitor's name are refused; our own go through, with HTTPS or without."""
 
+import socket
+from urllib.parse import urlsplit
 from uuid import uuid4
 
 import pytest
 
 from tests.app.conftest import TakingPart
+from tests.waiting import PATIENCE_S
 
 OURS = "http://testserver"
 
@@ -68,3 +71,16 @@ def test_every_answer_carries_the_headers(taking_part: TakingPart, path: str) ->
     assert "script-src 'self'" in headers["content-security-policy"]
     assert "unsafe" not in headers["content-security-policy"]
     assert headers["x-content-type-options"] == "nosniff"
+
+
+def test_what_follows_a_request_of_two_lengths_is_not_taken_for_another(address: str) -> None:
+    """A proxy that went by the length would have taken all of it for one."""
+    hidden = b"GET /health/live HTTP/1.1\r\nHost: studio\r\n\r\n"
+    body = b"0\r\n\r\n" + hidden
+    head = f"POST /login HTTP/1.1\r\nHost: studio\r\nContent-Length: {len(body)}\r\nTransfer-Encoding: chunked\r\n\r\n"
+    server = urlsplit(address)
+    with socket.create_connection((server.hostname or "", server.port or 0), PATIENCE_S) as connection:
+        connection.sendall(head.encode() + body)
+        answers = b"".join(iter(lambda: connection.recv(65536), b""))
+    assert answers.startswith(b"HTTP/1.1 400")
+    assert answers.count(b"HTTP/1.1") == 1

@@ -17,7 +17,7 @@ from fastapi.testclient import TestClient
 from sqlalchemy import func, select
 
 from app.db import Base, Database
-from app.domain.studies import Study
+from app.domain.studies import Deviation, Study
 from app.services.archives import archive, archive_reading, study_import, unpacking
 from app.services.archives.archive import ArchiveInvalid
 from app.services.studies import locking
@@ -51,6 +51,9 @@ def _fill(there: Database, folder: Path) -> None:
         study = make_finished_study(session, store, people=2, labels=3)
         locking.lock(session, study, study.slug, "experimenter")
         study.join_token = "somebody"
+        session.add(
+            Deviation(study_id=study.id, actor="Ada", reason="More time", before={"seed": 1}, after={"seed": 7})
+        )
         session.flush()
         archive.write(session, store, study, folder / "study.zip")
 
@@ -70,7 +73,7 @@ def forged(packed: Path, change: Change, manifest: Callable[[dict[str, Any]], An
         change(rows)
         with zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as copy:
             for name, each in rows.items():
-                content = b"".join(json.dumps(row).encode() + b"\n" for row in each)
+                content = b"".join(_line(row) for row in each)
                 copy.writestr(f"rows/{name}.jsonl", content)
                 said["tables"][name] = {"rows": len(each), "sha256": hashlib.sha256(content).hexdigest()}
             said["lock_hash"] = rows["study"][0].get("lock_hash")
@@ -78,6 +81,13 @@ def forged(packed: Path, change: Change, manifest: Callable[[dict[str, Any]], An
                 copy.writestr(f"files/{sha256}", source.read(f"files/{sha256}"))
             copy.writestr("manifest.json", json.dumps(manifest(said)))
     return target
+
+
+BEYOND = "a number beyond all numbers"
+
+
+def _line(row: Row) -> bytes:
+    return json.dumps(row).replace(f'"{BEYOND}"', "1e999").encode() + b"\n"
 
 
 def _rows(content: bytes) -> list[Row]:
@@ -146,6 +156,10 @@ def _repeated(rows: dict[str, list[Row]]) -> None:
     last["repeats_query_id"] = first["id"]
 
 
+def _nested(depth: int) -> Row:
+    return {"in": _nested(depth - 1)} if depth else {}
+
+
 def _twice(table: str) -> Change:
     return lambda rows: rows[table].append(dict(rows[table][0]))
 
@@ -183,6 +197,13 @@ FORGERIES: dict[str, Change] = {
     "no number": _set("query", "propensity", float("nan")),
     "half a character": _set("form_answer", "value", "\ud800"),
     "a text that is too long": _set("study", "name", "x" * 121),
+    "half a character in an object": _set("participant_event", "detail", {"note": [{"text": "\ud800"}]}),
+    "half a character as a name": _set("model", "metrics", {"\ud800": 1}),
+    "a number beyond all numbers": _set("allocation", "considered", {"arms": [BEYOND]}),
+    "a number that is none to others": _set("model", "metrics", {"accuracy": 10**400}),
+    "a way that is no number": _set("self_setting", "mode", {"speed": 10**400}),
+    "an object in an object and so on": _set("participant_event", "detail", _nested(200)),
+    "a change of something else": _set("deviation", "after", {"name": "x"}),
     "a list for an object": _set("participant_event", "detail", [1]),
     "a time without its zone": _set("participant", "created_at", "2026-01-31T12:00:00"),
     "no time": _set("participant", "created_at", "yesterday"),
@@ -239,6 +260,35 @@ def _another_document(rows: dict[str, list[Row]]) -> None:
 
 def _another_hash(rows: dict[str, list[Row]]) -> None:
     rows["study"][0]["lock_hash"] = "0" * 64
+
+
+def _documented(document: Row | None = None, **changes: Any) -> Change:
+    """What was locked, with its hash, which anybody can compute."""
+
+    def change(rows: dict[str, list[Row]]) -> None:
+        (study,) = rows["study"]
+        study["lock_document"] = changed = (study["lock_document"] if document is None else document) | changes
+        study["lock_hash"] = locking.hash_of(changed)
+
+    return change
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        _documented({"a": 1}),
+        _documented(stop_rule=[1]),
+        _documented(study={"name": "x"}),
+        _documented(settings={"labels_per_participant": "many"}),
+        _documented(planned_tests="all"),
+        _documented(plan_of_pairs=None),
+    ],
+)
+def test_a_locked_document_that_no_page_could_show_is_refused(
+    database: Database, store: ArtefactStore, packed: Path, change: Change
+) -> None:
+    with pytest.raises(ArchiveInvalid, match="what was locked"):
+        bring(database, store, forged(packed, change))
 
 
 def _no_document(rows: dict[str, list[Row]]) -> None:

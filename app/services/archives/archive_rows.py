@@ -4,8 +4,8 @@ Nothing comes in that an export would not have written, and nothing that belongs
 """
 
 import json
-import math
 import re
+import sys
 from collections.abc import Callable, Mapping
 from datetime import datetime
 from enum import StrEnum
@@ -23,7 +23,7 @@ from app.domain.models import ModelKind, RunKind, RunStatus
 from app.domain.preferences import Purpose, Response, SkipReason
 from app.domain.protocol import EvaluatedMethod, Stage
 from app.domain.self_setting import PreviewFilm, SelfSetting
-from app.domain.studies import PREVIEW_NUMBERS, Participant, Study
+from app.domain.studies import PREVIEW_NUMBERS, Deviation, Participant, Study
 from app.domain.study_settings import StudySettings
 from app.services.archives.archive import LARGEST_ROW_BYTES, REMADE, SECRETS, ArchiveInvalid, Manifest, artefacts
 from app.services.studies import locking
@@ -31,6 +31,9 @@ from app.services.studies import locking
 MOST_ROWS = 3_000_000
 """Of all tables together that others refer to: their ids are held in memory."""
 _SMALLEST_ID, _LARGEST_ID = 1, 2**63 - 1
+_LARGEST_NUMBER = sys.float_info.max
+_DEEPEST = 30
+"""Objects and lists within each other in one column; settings have three."""
 _WORDS: Mapping[tuple[str, str], type[StrEnum]] = {
     ("query", "purpose"): Purpose,
     ("label_event", "response"): Response,
@@ -117,6 +120,8 @@ class RowCheck:
             self._check_study(row)
         if table.name == DonorDraw.__tablename__:
             _check_donors(row)
+        if table.name == Deviation.__tablename__ and {*(row.get("before") or ())} != {*(row.get("after") or ())}:
+            raise _Wrong("what was changed is not what it was changed to")
         if table.name in (SelfSetting.__tablename__, PreviewFilm.__tablename__) and not _is_mode(row.get("mode")):
             raise _Wrong("mode has a value that it cannot have")
         _check_left_out(table.name, row)
@@ -197,17 +202,25 @@ def _fits(column: Column[Any], value: Any) -> bool:
     if isinstance(kind, UtcDateTime):
         return isinstance(value, str) and _is_moment(value)
     if isinstance(kind, JSON):
-        return isinstance(value, dict)
+        return isinstance(value, dict) and _is_plain(value, _DEEPEST)
     if isinstance(kind, Boolean):
         return isinstance(value, bool)
     if isinstance(kind, Integer):
         smallest = _SMALLEST_ID if column.primary_key or column.foreign_keys else -_LARGEST_ID
         return isinstance(value, int) and not isinstance(value, bool) and smallest <= value <= _LARGEST_ID
     if isinstance(kind, Float):
-        return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+        return _is_number(value)
     if isinstance(kind, String):
         return isinstance(value, str) and (kind.length is None or len(value) <= kind.length) and _is_text(value)
     return False
+
+
+def _is_plain(value: Any, depth: int) -> bool:
+    """Whether every page and every file can show it."""
+    if isinstance(value, dict | list):
+        inside = [*value, *value.values()] if isinstance(value, dict) else value
+        return depth > 0 and all(_is_plain(each, depth - 1) for each in inside)
+    return _is_text(value) if isinstance(value, str) else value is None or isinstance(value, bool) or _is_number(value)
 
 
 def _is_moment(value: str) -> bool:
@@ -267,7 +280,10 @@ def _is_axis(name: str) -> bool:
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    """One that every reader of JSON can hold."""
+    return (
+        isinstance(value, int | float) and not isinstance(value, bool) and -_LARGEST_NUMBER <= value <= _LARGEST_NUMBER
+    )
 
 
 def _describes_recordings(material: Mapping[str, Any]) -> bool:
@@ -289,6 +305,13 @@ def _check_lock(study: Mapping[str, Any], in_manifest: str | None) -> None:
             "The lock hash in this archive is not the hash of what it says was locked, so it proves nothing. "
             "Ask whoever sent it for the archive as it was written. Nothing was imported."
         )
+    try:
+        locking.Locked.model_validate(document)
+        locking.planned_settings(document)
+    except ValidationError as error:
+        raise ArchiveInvalid(
+            "This version cannot read what was locked in this archive. Nothing was imported."
+        ) from error
 
 
 def _no_number(name: str) -> float:

@@ -53,10 +53,7 @@ paste each part into the form at osf.io, and attach the locked document."""
 
 
 def _planned(study: Study) -> StudySettings:
-    if study.lock_document is None:
-        return study.settings
-    locked = study.lock_document["settings"]  # by an earlier version perhaps, which had settings that are no more
-    return StudySettings.model_validate({name: locked[name] for name in StudySettings.model_fields if name in locked})
+    return study.settings if study.lock_document is None else locking.planned_settings(study.lock_document)
 
 
 def _evaluation(study: Study, settings: StudySettings) -> EvaluationSettings | None:

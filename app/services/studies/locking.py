@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from http import HTTPStatus
 from typing import Any
 
+from pydantic import BaseModel
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
@@ -133,6 +134,29 @@ def document(study: Study) -> dict[str, Any]:
         "planned_tests": [test.value for test in settings.planned_tests],
         "software_version": export_formats.software_version(),
     }
+
+
+class LockedStudy(BaseModel):
+    """What is read of the study in a locked document."""
+
+    seed: int
+
+
+class Locked(BaseModel):
+    """What is read of a locked document, by whichever version it was written."""
+
+    study: LockedStudy
+    settings: dict[str, Any]
+    plan_of_pairs: dict[str, Any]
+    stop_rule: str
+    planned_tests: list[str]
+    software_version: str
+
+
+def planned_settings(contents: Mapping[str, Any]) -> StudySettings:
+    """The settings in a locked document; an earlier version perhaps had some that are no more."""
+    locked = contents["settings"]
+    return StudySettings.model_validate({name: locked[name] for name in StudySettings.model_fields if name in locked})
 
 
 def canonical(contents: Mapping[str, Any]) -> bytes:

@@ -50,8 +50,17 @@ class ForeignForm(AppError):
     status = HTTPStatus.FORBIDDEN
 
 
+class TwoLengths(AppError):
+    """This request says in two ways where it ends, and was refused."""
+
+    status = HTTPStatus.BAD_REQUEST
+
+
 class Guard:
     """ASGI middleware: our headers on every response; unsafe methods only from our own pages.
+
+    A request with a length and in chunks is refused and its connection closed: a proxy may have read another end of it
+    than we do, and take what follows for somebody else's request (RFC 9112, 6.1).
 
     Browsers say where a request comes from: Sec-Fetch-Site (HTTPS and localhost), else Origin (plain HTTP).
     A client that sends neither is no browser, so it holds no victim's cookie.
@@ -76,9 +85,16 @@ class Guard:
             await send(message)
 
         app = self._app
-        if scope["method"] not in SAFE_METHODS and _is_foreign(scope["headers"]):
+        if _has_two_lengths(scope["headers"]):
+            app = refusal = self._refuse(Request(scope), TwoLengths())
+            refusal.headers["connection"] = "close"
+        elif scope["method"] not in SAFE_METHODS and _is_foreign(scope["headers"]):
             app = self._refuse(Request(scope), ForeignForm())
         await app(scope, receive, send_guarded)
+
+
+def _has_two_lengths(headers: Iterable[tuple[bytes, bytes]]) -> bool:
+    return {b"content-length", b"transfer-encoding"} <= {name for name, _ in headers}
 
 
 def _is_foreign(headers: Iterable[tuple[bytes, bytes]]) -> bool:
