@@ -3,7 +3,7 @@
 Workers are processes with a core and a data directory of their own, on one PostgreSQL server and one S3-compatible one,
 as two machines with a core each would be. Clips, learning and simulation are the real ones; one and two take turns.
 
-    python -m tests.benchmarks.second_worker --rounds 2
+    python -m tests.benchmarks.second_worker --scenarios 5 --people 2 --rounds 2
 """
 
 import argparse
@@ -33,7 +33,8 @@ def main() -> int:
     """Take turns."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenarios", type=int, default=10, help="of the pool, with six behaviours each")
-    parser.add_argument("--people", type=int, default=4, help="who give all their answers at once")
+    parser.add_argument("--people", type=int, default=4, help="who give all their answers at once; 0: clips only")
+    parser.add_argument("--workers", type=int, nargs="+", default=[1, 2], help="numbers of them, one after the other")
     parser.add_argument("--rounds", type=int, default=2)
     options = parser.parse_args()
     programs = on_postgresql.find_programs()
@@ -41,12 +42,12 @@ def main() -> int:
         sys.stderr.write("This needs PostgreSQL: install your system's package 'postgresql'.\n")
         return 1
     for _ in range(options.rounds):
-        for workers in (1, 2):
+        for workers in options.workers:
             with ExitStack() as stack:
                 url = stack.enter_context(on_postgresql.serving(programs))
                 os.environ.update(stack.enter_context(on_s3.serving()))
                 folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="cluster-")))
-                cluster = Cluster(folder, url, web_servers=1, worker_count=workers, pinned=True)
+                cluster = Cluster(folder, url, web_servers=0, worker_count=workers, pinned=True)
                 stack.callback(cluster.stop)
                 cluster.start()
                 database = Database(cluster.settings.sqlalchemy_url)
@@ -58,21 +59,36 @@ def main() -> int:
 def _measure(database: Database, workers: int, options: argparse.Namespace) -> None:
     with database.writing() as session:
         study = factories.make_study(
-            session, pool_scenarios=options.scenarios, behaviours_per_scenario=6, labels_per_participant=LABELS
+            session,
+            pool_scenarios=options.scenarios,
+            behaviours_per_scenario=6,
+            labels_per_participant=LABELS,
+            evaluation_scenarios=10,
+            filter_milestones=(),
         )
         people = [factories.make_participant(session, study)[0].id for _ in range(options.people)]
-    began = time.monotonic()
-    wait_until(PATIENCE_S, "clips are missing", lambda: _count(database, Clip) >= 6 * options.scenarios or None)
-    filmed = time.monotonic()
+    clips = 6 * options.scenarios
+    filmed_s = _until(database, Clip, clips)
     for person in people:
         wait_until(PATIENCE_S, "pairs are missing", partial(_answer, database, study, person))
-    answered = time.monotonic()
-    wait_until(PATIENCE_S, "bundles are missing", lambda: _count(database, Bundle) >= len(people) or None)
-    learned = time.monotonic()
+    learned_s = _until(database, Bundle, len(people))
     _say(
-        f"{workers} worker(s): {6 * options.scenarios} clips after {filmed - began:.0f} s, "
-        f"{len(people)} filters {learned - answered:.0f} s after the last answer"
+        f"{workers} worker(s): {clips} clips after {filmed_s:.0f} s, "
+        f"{len(people)} filters {learned_s:.0f} s after the last answer"
     )
+
+
+def _until(database: Database, table: type[Clip] | type[Bundle], wanted: int) -> float:
+    """Say of each how many there are; returns the seconds until all are."""
+    began, seen = time.monotonic(), 0
+    while seen < wanted:
+        count = _count(database, table)
+        if count == seen:
+            time.sleep(0.2)
+            continue
+        seen = count
+        _say(f"  {seen} of {wanted} {table.__tablename__}s after {time.monotonic() - began:.1f} s")
+    return time.monotonic() - began
 
 
 def _answer(database: Database, study: Study, person: int) -> bool | None:
