@@ -54,6 +54,11 @@ class DamagedDatabase(AppError):
     """The database is damaged and was left as it is. Restore it from a backup."""
 
 
+class LogDoesNotFit(AppError):
+    """The database and its log (studio.sqlite3-wal) do not fit together; both were left as they are. If the log was put
+    there from elsewhere, move it away and start again. Otherwise restore the database from a backup."""
+
+
 class DatabaseLost(AppError):
     """The database is gone, and stored files of it are there. Restore it from a backup. To begin anew, choose another
     DATA_DIR, or move this one away."""
@@ -66,8 +71,10 @@ def upgrade(settings: Settings) -> None:
     config = _config(settings)
     newest = _scripts(config).get_current_head() or ""
     with _one_at_a_time(settings):
-        present = _revision(settings, config)
         path = sqlite.file_of(settings.sqlalchemy_url)
+        if path is not None and path.exists() and not sqlite.fits_its_log(path):
+            raise LogDoesNotFit
+        present = _revision(settings, config)
         if present == newest:
             return
         if present is None:

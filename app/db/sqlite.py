@@ -49,6 +49,23 @@ def engine(url: str, patience_s: float, *, writes: bool, log_pages: int) -> Engi
     return connections
 
 
+def fits_its_log(path: Path) -> bool:
+    """Whether database and log, if it has left one, make a whole. Writes nothing, whatever the log holds.
+
+    SQLite takes in any log whose own sums are right, another database's as well.
+    """
+    log = path.with_name(f"{path.name}-wal")
+    if not log.exists() or log.stat().st_size == 0:
+        return True
+    try:
+        with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as connection:
+            return connection.execute("PRAGMA integrity_check(1)").fetchone() == ("ok",)
+    except sqlite3.DatabaseError as error:
+        if isinstance(error, sqlite3.OperationalError):  # away, locked or forbidden, which others say in words
+            return True
+        return False
+
+
 def _take_the_lock(connection: Connection, patience_s: float) -> None:
     """Begin to write, as soon as whoever writes has finished.
 

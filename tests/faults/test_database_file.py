@@ -17,7 +17,7 @@ from app.db import Database
 from app.domain.preferences import LabelEvent
 from app.settings import Settings
 from app.storage import ArtefactStore
-from app.upgrading import DatabaseLost
+from app.upgrading import DatabaseLost, LogDoesNotFit
 from tests import factories
 from tests.app.conftest import TakingPart
 from tests.databases import make_tables
@@ -179,3 +179,18 @@ def test_a_log_without_its_database_is_kept(crashed: Settings) -> None:
     with pytest.raises(DatabaseLost):
         migrate(crashed)
     assert log.read_bytes() == before
+
+
+def test_a_log_of_another_database_is_not_taken_in(crashed: Settings, tmp_path: Path) -> None:
+    """SQLite would: the sums in it are right."""
+    file, other = crashed.data_dir / "studio.sqlite3", tmp_path / "another.sqlite3"
+    with closing(sqlite3.connect(other, isolation_level=None)) as connection:
+        connection.execute("CREATE TABLE theirs (text TEXT)")
+        connection.executemany("INSERT INTO theirs VALUES (?)", [("x" * 400,)] * 500)
+        connection.execute("PRAGMA journal_mode=WAL")
+        connection.execute("UPDATE theirs SET text = upper(text)")
+        shutil.copy(f"{other}-wal", f"{file}-wal")
+    before = file.read_bytes(), Path(f"{file}-wal").read_bytes()
+    with pytest.raises(LogDoesNotFit, match="move it away"):
+        migrate(crashed)
+    assert (file.read_bytes(), Path(f"{file}-wal").read_bytes()) == before
