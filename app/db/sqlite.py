@@ -61,9 +61,7 @@ def fits_its_log(path: Path) -> bool:
         with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as connection:
             return connection.execute("PRAGMA integrity_check(1)").fetchone() == ("ok",)
     except sqlite3.DatabaseError as error:
-        if isinstance(error, sqlite3.OperationalError):  # away, locked or forbidden, which others say in words
-            return True
-        return False
+        return isinstance(error, sqlite3.OperationalError)  # away, locked or forbidden, which others say in words
 
 
 def _take_the_lock(connection: Connection, patience_s: float) -> None:

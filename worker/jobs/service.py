@@ -20,6 +20,7 @@ from app.db import Database, Watch, complaints, now
 from app.domain.study_settings import StudySettings
 from app.errors import AppError, OncePerMinute
 from app.files.interface import StorageUnavailable
+from app.services.monitoring import health
 from app.settings import Settings
 from app.storage import ArtefactMissing, ArtefactStore, keep_private
 from worker.compute import learning, simulation
@@ -69,6 +70,8 @@ def run(settings: Settings) -> int:
     with data_directory.shared(settings.data_dir), ExitStack() as stack:
         database = Database(settings.sqlalchemy_url)
         stack.callback(database.dispose)
+        with database.reading() as session:
+            health.require_own_schema(session)
         settings = _named(settings, database, stack)
         stack.enter_context(_only_one(settings))
         stop = Stop()
@@ -168,6 +171,7 @@ class _Rounds:
             if not self._bond.promise(moment):
                 return
             with self._context.database.writing() as session:
+                health.require_own_schema(session)  # another machine may have brought a newer version
                 records.sign_presence(session, self._worker_name, moment)
                 records.beat_all(session, list(self._runner.in_hand))
             self._bond.signed(moment)

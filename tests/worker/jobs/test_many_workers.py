@@ -1,18 +1,19 @@
 """Workers on machines of their own: names, signs of life, and what is left when another one has erased somebody."""
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from datetime import timedelta
 
 import pytest
 from dbos import DBOS, SetWorkflowID
-from sqlalchemy import select
+from sqlalchemy import select, text
 
 from app.db import Database, now
 from app.domain.models import Run, RunKind, RunStatus
 from app.domain.studies import Participant, Study
 from app.files.interface import StorageUnavailable
+from app.services.monitoring import health
 from app.services.participants import withdrawal
 from app.settings import Settings
 from app.storage import ArtefactStore
@@ -121,3 +122,32 @@ def test_workers_without_a_name_take_the_first_that_is_free(database: Database, 
                 service._named(named, database, first)
         with ExitStack() as third:
             assert service._named(settings, database, third).worker_name == "worker-1", "it is free again"
+
+
+class TestAnotherVersion:
+    """Its code would compute by other rules, and write rows that this one does not know."""
+
+    @pytest.fixture
+    def upgraded(self, database: Database) -> Callable[[], None]:
+        def upgrade() -> None:
+            with database.writing() as session:
+                session.execute(text("UPDATE alembic_version SET version_num = 'newer'"))
+
+        return upgrade
+
+    def test_a_worker_does_not_begin_on_a_database_of_another_version(
+        self, settings: Settings, upgraded: Callable[[], None]
+    ) -> None:
+        upgraded()
+        with pytest.raises(health.OtherSchema, match="same version on every machine"):
+            service.run(settings)
+
+    def test_a_worker_under_which_the_database_is_upgraded_stops_with_a_sentence(
+        self, runner: JobRunner, settings: Settings, upgraded: Callable[[], None], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(service, "PRESENCE_S", 0.0)
+        rounds = service._Rounds(settings, runner, engine.Bond(None, settings.worker_name, None))
+        rounds._sign()
+        upgraded()
+        with pytest.raises(health.OtherSchema):
+            rounds.until(threading.Event())
