@@ -135,14 +135,12 @@ class TestAnotherVersion:
 
         return upgrade
 
-    def test_a_worker_does_not_begin_on_a_database_of_another_version(
-        self, settings: Settings, upgraded: Callable[[], None]
-    ) -> None:
+    def test_a_worker_does_not_begin_on_another_schema(self, settings: Settings, upgraded: Callable[[], None]) -> None:
         upgraded()
         with pytest.raises(health.OtherSchema, match="same version on every machine"):
             service.run(settings)
 
-    def test_a_worker_under_which_the_database_is_upgraded_stops_with_a_sentence(
+    def test_an_upgrade_ends_the_workers_of_before(
         self, runner: JobRunner, settings: Settings, upgraded: Callable[[], None], monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr(service, "PRESENCE_S", 0.0)
