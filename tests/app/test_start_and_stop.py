@@ -4,22 +4,32 @@ import fcntl
 import os
 import re
 import signal
+import socket
+import sqlite3
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing
 from pathlib import Path
 from urllib.request import urlopen
+from uuid import uuid4
 
 import pytest
 
 from app.falls import noted
+from app.settings import Settings
 from tests import databases
+from tests.app.conftest import TakingPart
 from tests.waiting import PATIENCE_S, free_port, gone, until
 
 pytestmark = pytest.mark.slow
 
 Start = Callable[[], "Studio"]
+
+SOON_S = 10.0
+"""As promised; whoever has not ended by then is killed after nine seconds, or ends a thread's patience."""
 
 
 class Studio:
@@ -183,7 +193,45 @@ def test_a_port_in_use_is_explained(running: Studio, tmp_path: Path) -> None:
 def test_ctrl_c_stops_both_programs(running: Studio) -> None:
     """The last of those that share it."""
     programs = [running.child("app\0web"), running.child("worker")]
+    began = time.monotonic()
     assert running.stop() == 0
+    assert time.monotonic() - began < SOON_S
     assert "Stopped." in running.said
     assert "Traceback" not in running.said
     assert all(gone(pid) for pid in programs)
+
+
+@pytest.mark.long
+@pytest.mark.sqlite("locks its file")
+def test_the_web_server_ends_soon_whatever_it_is_asked_meanwhile(
+    taking_part: TakingPart, experimenter_cookie: str, settings: Settings
+) -> None:
+    """An open dashboard, an answer that waits for the database, and an upload that does not go on."""
+    taking_part.turn()
+    address = ("127.0.0.1", free_port())
+    environment = databases.environment(settings.data_dir, PORT=str(address[1]))
+    server = subprocess.Popen([sys.executable, "-m", "app", "web"], env=environment)
+    assert until(lambda: answers(f"http://127.0.0.1:{address[1]}"))
+
+    def ask(line: str, cookie: str, body: bytes = b"", length: int = 0) -> socket.socket:
+        head = f"{line} HTTP/1.1\r\nHost: studio\r\nCookie: {cookie}\r\nContent-Length: {length or len(body)}\r\n"
+        kind = "Content-Type: application/x-www-form-urlencoded\r\n\r\n"
+        connection = socket.create_connection(address, PATIENCE_S)
+        connection.sendall(f"{head}{kind}".encode() + body)
+        return connection
+
+    person = f"studio_participant={taking_part.browser.cookies['studio_participant']}"
+    ours = f"studio_experimenter={experimenter_cookie}"
+    answer = f"response=left&client_uuid={uuid4()}".encode()
+    with (
+        ExitStack() as last,
+        closing(sqlite3.connect(settings.data_dir / "studio.sqlite3", isolation_level=None)) as locking,
+        ask("GET /studies/live", ours) as dashboard,
+        ask("POST /import", ours, b"begun", 1000),
+    ):
+        last.callback(server.kill)
+        assert dashboard.recv(12) == b"HTTP/1.1 200"
+        locking.execute("BEGIN IMMEDIATE")
+        with ask(f"POST /p/queries/{taking_part.queries[0].id}/label", person, answer):
+            server.terminate()
+            server.wait(SOON_S)
