@@ -59,7 +59,8 @@ def fits_its_log(path: Path) -> bool:
         return True
     try:
         with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as connection:
-            return connection.execute("PRAGMA integrity_check(1)").fetchone() == ("ok",)
+            found: tuple[str] = connection.execute("PRAGMA integrity_check(1)").fetchone()
+            return found == ("ok",)
     except sqlite3.DatabaseError as error:
         return isinstance(error, sqlite3.OperationalError)  # away, locked or forbidden, which others say in words
 
