@@ -57,7 +57,8 @@ def complaint(database: Database, data_dir: Path) -> str | None:
 
 
 def _revision(session: Session) -> str | None:
-    return session.scalar(text("SELECT version_num FROM alembic_version"))
+    found: str | None = session.scalar(text("SELECT version_num FROM alembic_version"))
+    return found
 
 
 @cache
