@@ -261,6 +261,27 @@ class StudySettings(BaseModel):
         "By questions at the start, one per line: age | 18 to 75. Of a choice: hand | left; right. Others are thanked "
         "and sent back. No answer: they may.",
     )
+    goes_on_from: str = setting(
+        "",
+        Section.DESIGN,
+        "Return visit: goes on from the study",
+        "Its short name, the end of its address. Whoever has finished it comes back by the same link, and the model goes "
+        "on from all that they have answered. Same task. Empty: nobody comes back.",
+        complaint="Enter the short name of a study, such as feeding-at-home, or leave it empty.",
+        fixed_by=Use.PAIRS,
+        pattern=r"^[a-z0-9-]{0,80}$",
+        simulated=True,
+    )
+    days_between_visits: int = setting(
+        7,
+        Section.DESIGN,
+        "Days since the visit before",
+        "Nobody comes back sooner. 0: at once.",
+        unit="days",
+        ge=0,
+        le=365,
+        simulated=True,
+    )
     end_after_misses: int = setting(
         0,
         Section.DESIGN,

@@ -57,6 +57,10 @@ TABLES: Sequence[Table] = (
             ),
             Column("arm", T, "Between subjects: the arm; empty until the study is unblinded."),
             Column("ended_as", T, "Why they were sent back before the end.", allowed=_words(Ending)),
+            Column("visit", I, "Which visit of theirs this study is.", allowed="from 1"),
+            Column(
+                "earlier_participant", T, "Their code at the visit before, in the study that this one goes on from."
+            ),
         ),
         export_rows.participants,
         (Participant,),
