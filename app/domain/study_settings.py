@@ -265,8 +265,8 @@ class StudySettings(BaseModel):
         "",
         Section.DESIGN,
         "Return visit: goes on from the study",
-        "Its short name, the end of its address. Whoever has finished it comes back by the same link, and the model goes "
-        "on from all that they have answered. Same task. Empty: nobody comes back.",
+        "Its short name, the end of its address. Whoever has finished it comes back by the same link, and the model "
+        "goes on from all that they have answered. Same task. Empty: nobody comes back.",
         complaint="Enter the short name of a study, such as feeding-at-home, or leave it empty.",
         fixed_by=Use.PAIRS,
         pattern=r"^[a-z0-9-]{0,80}$",

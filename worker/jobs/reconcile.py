@@ -210,6 +210,7 @@ def _stale_models(session: Session, study: Study, succeeded: Collection[str], tr
         arm, shown = rating[participant_id], participant_id in begun
         if count < settings.labels_per_participant:
             jobs += due_evaluation.due_ahead(study, participant_id, arm)
+            jobs += due_lending.films_ahead(session, study, participant_id, arm)
         else:
             has_set = participant_id in have_set
             jobs += due_evaluation.due(study, reward, succeeded, trained, shown, arm, has_set=has_set)

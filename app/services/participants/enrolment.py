@@ -45,7 +45,7 @@ def add_participant(
 
 
 def add_returning(session: Session, study: Study, earlier: Participant) -> Participant:
-    """Add somebody to a later visit of theirs, under the number that they had, if it is free. Their old link leads on."""
+    """Add somebody to a later visit of theirs, under the number that they had, if it is free; their link leads on."""
     participant, _ = _add(session, study, audit.PARTICIPANT, preview=False, wished=earlier.number)
     participant.earlier_id, participant.visit = earlier.id, earlier.visit + 1
     participant.language, participant.scripted_as = earlier.language, earlier.scripted_as
