@@ -414,7 +414,7 @@ TABLES: Sequence[Table] = (
             Column("people", T, "Codes of those whose filter, or whose wishes, these are; separated by spaces."),
             Column("types", T, "The paper's types of users whose wishes these are; separated by spaces."),
             Column("candidates", T, "Codes of those who could have been drawn, without who has withdrawn since."),
-            Column("drawn_at", W, "When it was drawn: after the participant's last answer."),
+            Column("drawn_at", W, "When it was drawn: in the second half of the participant's answers, or later."),
         ),
         export_rows.donors,
         (DonorDraw,),
