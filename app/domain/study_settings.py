@@ -267,7 +267,7 @@ class StudySettings(BaseModel):
         "Return visit: goes on from the study",
         "Its short name, the end of its address. Whoever has finished it comes back by the same link, and the model "
         "goes on from all that they have answered. Same task. Empty: nobody comes back.",
-        complaint="Enter the short name of a study, such as feeding-at-home, or leave it empty.",
+        complaint="Enter the short name of a study, such as first-visit, or leave it empty.",
         fixed_by=Use.PAIRS,
         pattern=r"^[a-z0-9-]{0,80}$",
         simulated=True,

@@ -64,7 +64,7 @@ def participants(session: Session, study: Study, window: Window = EVERYTHING) ->
 
 def _participant(study: Study, each: Participant, earlier: Participant | None) -> Sequence[Any]:
     if each.withdrawn_at is not None:
-        return (each.code, "withdrawn", *[None] * 9, each.withdrawn_at, each.scripted_as, None, None, each.visit, None)
+        return (each.code, "withdrawn", *[None] * 9, each.withdrawn_at, each.scripted_as, *[None] * 4)
     status = "completed" if each.completed_at else "consented" if each.consented_at else "invited"
     return (
         each.code,
