@@ -194,7 +194,8 @@ def _stale_models(session: Session, study: Study, succeeded: Collection[str], tr
     answers, exclusions = last_answers(session, present_ids(study)), last_exclusions(session, present_ids(study))
     begun, rating = evaluation_plan.begun(session, study), _rating(session, study)
     have_set = self_setting.who_have_set(session, study) if self_setting.is_set(study) else set()
-    returned = set(session.scalars(present_ids(study).where(Participant.earlier_id.is_not(None))))
+    given_pairs = select(Query.id).where(Query.participant_id == Participant.id).exists()
+    returned = set(session.scalars(present_ids(study).where(Participant.earlier_id.is_not(None), given_pairs)))
     counts = dict.fromkeys(returned, 0) | count_labels(session, present_ids(study))
     for participant_id, count in sorted(counts.items()):
         known = answers_known(settings, count, answers.get(participant_id, 0), exclusions.get(participant_id))
