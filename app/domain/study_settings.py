@@ -261,6 +261,16 @@ class StudySettings(BaseModel):
         "By questions at the start, one per line: age | 18 to 75. Of a choice: hand | left; right. Others are thanked "
         "and sent back. No answer: they may.",
     )
+    end_after_misses: int = setting(
+        0,
+        Section.DESIGN,
+        "Missed catch pairs that end it",
+        "At so many wrong answers somebody is thanked and sent back. 0: never.",
+        unit="pairs",
+        ge=0,
+        le=20,
+        simulated=True,
+    )
     goes_on_from: str = setting(
         "",
         Section.DESIGN,
@@ -280,16 +290,6 @@ class StudySettings(BaseModel):
         unit="days",
         ge=0,
         le=365,
-        simulated=True,
-    )
-    end_after_misses: int = setting(
-        0,
-        Section.DESIGN,
-        "Missed catch pairs that end it",
-        "At so many wrong answers somebody is thanked and sent back. 0: never.",
-        unit="pairs",
-        ge=0,
-        le=20,
         simulated=True,
     )
     panel_parameter: str = setting(
