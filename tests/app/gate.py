@@ -113,7 +113,7 @@ MATRIX: dict[str, Rule] = {
         ("show_demographics", "save_demographics", "show_questionnaire", "save_questionnaire"), PARTICIPANT
     ),
     **dict.fromkeys(("end_break", "note_event", "show_evaluation", "show_evaluation_done"), PARTICIPANT),
-    **dict.fromkeys(("show_finished", "leave_evaluation", "show_debrief", "finish_debrief"), PARTICIPANT),
+    **dict.fromkeys(("show_finished", "leave_evaluation", "show_debrief", "finish_debrief", "begin_visit"), PARTICIPANT),
     **dict.fromkeys(
         ("show_withdraw", "withdraw", "show_next", "show_instructions", "finish_instructions"), PARTICIPANT
     ),
