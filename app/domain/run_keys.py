@@ -12,6 +12,7 @@ method/participant-3/prefft/labels-200/answer-345
 films/participant-3/trials/labels-200/answer-345
 films/participant-3/others/labels-200/answer-345    of the trials, while their own filter is still fitted
 films/participant-3/ahead                       of the reference, while they still answer
+films/participant-3/lent-4-19ab0c3d4e5      of what donor draw 4 of that moment lends them, while they still answer
 films/participant-3/again-8-1763811000          lost files of film 8
 shared/study-1/filter-7-19ab0c3d4e5             what shared filter 7 asks for, which was asked for at that moment
 report/study-1/basis-0123456789abcdef           the report of what there was then
@@ -31,11 +32,13 @@ ROWS = {
     "clips/again": "rollout",
     "clips/setting": "self_setting",
     "films/again": "film",
+    "films/lent": "donor_draw",
 }
 """Tables whose ids stand in keys, by what they stand behind."""
 SCENARIO, WHOLE, AGAIN = "scenario", "whole", "again"
 PREVIEW, SETTING = "preview", "setting"
-BEFORE_AFTER, TRIALS, CONTROLLERS, OTHERS, AHEAD = "before-after", "trials", "controllers", "others", "ahead"
+BEFORE_AFTER, TRIALS, CONTROLLERS, OTHERS = "before-after", "trials", "controllers", "others"
+AHEAD, LENT = "ahead", "lent"
 SHARED_FILTER = "filter"
 BASIS, PLAN = "basis", "plan"
 

@@ -138,6 +138,7 @@ class Participant(Base):
     __table_args__ = (
         UniqueConstraint("study_id", "number"),
         UniqueConstraint("study_id", "panel_id", name="uq_participant_panel_id"),
+        UniqueConstraint("earlier_id", name="uq_participant_earlier_id"),
     )
 
     id: Mapped[int] = mapped_column(primary_key=True)
@@ -162,6 +163,10 @@ class Participant(Base):
     panel_parameters: Mapped[dict[str, Any] | None]
     is_preview: Mapped[bool] = mapped_column(default=False, server_default=false())
     """An experimenter looking at the study as a participant would: counted, exported and learned from nowhere."""
+    visit: Mapped[int] = mapped_column(default=1, server_default="1")
+    """1 for whoever is new, one more with every study that goes on from another one."""
+    earlier_id: Mapped[int | None] = mapped_column(ForeignKey("participant.id"))
+    """Who this person was at the visit before, in another study: what they answered there is learned from as well."""
     scripted_as: Mapped[str | None] = mapped_column(String(120))
     """The user a program plays here, such as "cautious"; None: a person."""
     completed_at: Mapped[datetime | None]

@@ -58,7 +58,7 @@ class StudySettings(BaseModel):
         100,
         Section.START,
         "Answers per participant",
-        "The paper used 200. In simulations the second hundred adds 2 to 4 % to what people gain.",
+        "The paper used 200. Of 180 scripted people 3 gain much by a second hundred, and 20 by going on from 50.",
         unit="pairs",
         fixed_by=Use.PAIRS,
         ge=10,
@@ -269,6 +269,27 @@ class StudySettings(BaseModel):
         unit="pairs",
         ge=0,
         le=20,
+        simulated=True,
+    )
+    goes_on_from: str = setting(
+        "",
+        Section.DESIGN,
+        "Return visit: goes on from the study",
+        "Its short name, the end of its address. Whoever has finished it comes back by the same link, and the model "
+        "goes on from all that they have answered. Same task. Empty: nobody comes back.",
+        complaint="Enter the short name of a study, such as first-visit, or leave it empty.",
+        fixed_by=Use.PAIRS,
+        pattern=r"^[a-z0-9-]{0,80}$",
+        simulated=True,
+    )
+    days_between_visits: int = setting(
+        7,
+        Section.DESIGN,
+        "Days since the visit before",
+        "Nobody comes back sooner. 0: at once.",
+        unit="days",
+        ge=0,
+        le=365,
         simulated=True,
     )
     panel_parameter: str = setting(

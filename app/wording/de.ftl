@@ -22,6 +22,7 @@ consent-body =
     - Sie vergleichen { $count } Paare. Machen Sie so viele Pausen, wie Sie möchten, auch tagelange: Ihr Link bringt Sie dorthin zurück, wo Sie waren.
     - Gespeichert werden Ihre Antworten, wann Sie sie gegeben haben und wie lange Sie dafür gebraucht haben, unter dem Kürzel { $code }. Wir fragen nicht nach Ihrem Namen und benutzen weder Kamera noch Mikrofon. Wenn Sie über ein Teilnahmeportal kommen, speichern wir auch die Kennung, unter der Sie dort geführt werden.
     - Die Teilnahme ist freiwillig. Sie können jederzeit ohne Angabe von Gründen aufhören: Schließen Sie einfach die Seite. Wenn Sie unten auf einer Seite „Teilnahme widerrufen“ wählen, wird alles über Sie gelöscht.
+consent-visit = Sie haben schon einmal teilgenommen. Was Sie damals geantwortet haben, zählt weiter: Ihr Roboter lernt von dort aus weiter. Wenn Sie Ihre Teilnahme widerrufen, werden die Antworten aller Termine gelöscht.
 consent-setting = Nach dem Vergleichen stellen Sie selbst einen Roboter mit Reglern ein. Wir speichern, was Sie einstellen, und daraus entsteht dieser Roboter.
 consent-others = Zum Schluss bewerten Sie mehrere Roboter. Darunter können Roboter sein, die von anderen Menschen gelernt haben, und der Roboter, der von Ihnen gelernt hat, kann anderen gezeigt werden. Von wem ein Roboter gelernt hat, erfährt niemand, der ihn bewertet. Wenn Sie Ihre Teilnahme widerrufen, bekommt niemand Ihren Roboter neu zu sehen; wer schon angefangen hat, ihn zu bewerten, sieht ihn weiterhin. Auf Sie zurückführen lässt er sich dann nicht mehr.
 consent-duration = Dauer: { $duration }
@@ -166,6 +167,10 @@ finished-robot-ready-text = Er hat aus Ihren Antworten gelernt. Die Person, von 
 finished-robot-making = Ihr Roboter wird vorbereitet
 finished-robot-making-text = Er lernt aus Ihren Antworten. Sie brauchen nicht darauf zu warten.
 finished-robot-progress = Wie weit Ihr Roboter ist
+finished-visit-title = Ihr nächster Termin
+finished-visit-open = Sobald Sie möchten, kann es weitergehen. Ihr Roboter lernt von dort aus weiter, wo er jetzt steht.
+finished-visit-begin = Nächsten Termin beginnen
+finished-visit-later = Ab { $date } können Sie wiederkommen. Bitte bewahren Sie Ihren Link auf: Er führt Sie dann dorthin.
 finished-undo = Meine letzte Antwort zurücknehmen
 ended-title = Vielen Dank für Ihr Interesse
 ended-screened-out = Diese Studie richtet sich im Moment an andere Personen und endet deshalb hier für Sie. Sie haben nichts falsch gemacht.

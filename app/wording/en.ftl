@@ -24,6 +24,7 @@ consent-body =
     - You compare { $count } pairs. Take as many breaks as you like, even for days: your link brings you back to where you were.
     - We store your answers, when you gave them and how long you took, under the code { $code }. We do not ask for your name, and we use neither camera nor microphone. If a recruitment panel sent you here, we also keep the ID it uses for you.
     - Taking part is voluntary. You may stop at any time without giving a reason: just close the page. If you choose “Withdraw from the study” at the foot of a page, everything about you is erased.
+consent-visit = You have taken part before. What you answered then still counts: your robot goes on learning from there. If you withdraw, the answers of all your visits are erased.
 consent-setting = After comparing you set a robot yourself with sliders. We store what you set, and the robot is made from it.
 consent-others = At the end you rate several robots. Some of them may have learned from other people, and other people may be shown the robot that learned from you. Nobody who rates a robot is told whom it learned from. If you withdraw, nobody new is shown yours; whoever has begun to rate it goes on seeing it, and it can no longer be traced back to you.
 consent-duration = Duration: { $duration }
@@ -171,6 +172,10 @@ finished-robot-ready-text = It has learned from your answers. The person who sen
 finished-robot-making = Your robot is being prepared
 finished-robot-making-text = It is learning from your answers. You do not need to wait for it.
 finished-robot-progress = How far your robot is
+finished-visit-title = Your next visit
+finished-visit-open = Whenever you are ready, you can go on. Your robot goes on learning from where it is now.
+finished-visit-begin = Begin the next visit
+finished-visit-later = You can come back from { $date } on. Please keep your link: it will lead you there.
 finished-undo = Take back my last answer
 ended-title = Thank you for your interest
 ended-screened-out = This study needs other people just now, so it ends here for you. You have done nothing wrong.

@@ -106,6 +106,7 @@ MATRIX: dict[str, Rule] = {
     "forget_seal_key": ANYBODY,  # leads to show_exports, which asks
     **dict.fromkeys(("show_video", "show_poster"), CLIP),
     "show_metrics": OPERATOR,
+    "begin_visit": PARTICIPANT,
     **dict.fromkeys(("join_study", "join_study_now", "open_link"), ANYBODY),  # the address is the key
     **dict.fromkeys(("choose_language", "show_withdrawn"), ANYBODY),
     **dict.fromkeys(("show_consent", "give_consent", "show_consent_copy", "save_consent_copy"), PARTICIPANT),

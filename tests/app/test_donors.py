@@ -100,6 +100,25 @@ def test_while_there_is_nobody_types_of_users_are_lent_in_turn(database: Databas
     assert (averages.rule, averages.donors.types) == (DonorRule.MEAN_OF_TYPES, TYPES)
 
 
+def test_types_of_users_only_stand_in_until_enough_people_have_finished(
+    database: Database, store: ArtefactStore, study: Study
+) -> None:
+    with database.writing() as session:
+        person, _ = factories.make_participant(session, study)
+        stood_in = [draw(session, study, person, method) for method in (SOMEBODY_ELSE, AVERAGE)]
+        factories.make_film(session, store, person, SOMEBODY_ELSE)
+        assert [each.rule for each in stood_in] == [DonorRule.TYPE_OF_USER, DonorRule.MEAN_OF_TYPES]
+        first = arrive(session, study)
+        drawn = draw(session, study, person)
+        assert (drawn.rule, drawn.donors.people) == (DonorRule.BY_LOT, (first.number,))
+        assert session.scalars(select(Film)).all() == [], "what was filmed was another robot"
+        assert draw(session, study, person, AVERAGE) is stood_in[1]
+        for _ in range(2):
+            arrive(session, study)
+        assert draw(session, study, person, AVERAGE).rule == DonorRule.MEAN_OF_PEOPLE
+        assert draw(session, study, person) is drawn, "people stay drawn, whoever comes after them"
+
+
 def test_an_average_is_of_three_others_at_least(database: Database, study: Study) -> None:
     with database.writing() as session:
         people = [arrive(session, study) for _ in range(4)]

@@ -198,6 +198,18 @@ def test_a_model_that_does_not_fit_is_a_flag_until_a_newer_one_does(
     assert ("when the robot arrives" in experimenter.get("/studies/pilot/participants/P01").text) is flagged
 
 
+@pytest.mark.parametrize(
+    ("evidence", "said"), [(783.3, "783 times as probable"), (3.8e9, "over 1000 times as probable")]
+)
+def test_evidence_that_a_model_does_not_fit_is_a_number_that_can_be_read(
+    experimenter: TestClient, study: Study, participant: Participant, database: Database, evidence: float, said: str
+) -> None:
+    with database.writing() as session:
+        metrics = factories.reward_metrics() | {"misfit": {"evidence": evidence, "explanation": "poses"}}
+        factories.make_model(session, study, participant, ModelKind.REWARD, metrics)
+    assert said in experimenter.get("/studies/pilot/participants/P01").text
+
+
 def test_what_was_learned_is_said_in_words_about_the_six_costs_whatever_the_model(
     experimenter: TestClient, study: Study, participant: Participant, database: Database
 ) -> None:

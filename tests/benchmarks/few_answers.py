@@ -280,7 +280,11 @@ def main() -> None:
     rows = [row for chain in whole for row in done[chain]]
     page.write_text(
         result_pages.page(
-            page, TITLE, "\n\n".join([table_of_gains(rows), table_of_pooling(benches, rows), table_of_advice(rows)])
+            page,
+            TITLE,
+            "\n\n".join(
+                [table_of_gains(rows), table_of_pooling(benches, rows), table_of_advice(rows), table_of_lengths(rows)]
+            ),
         )
     )
 
@@ -373,6 +377,21 @@ def table_of_advice(rows: Sequence[Row]) -> str:
         low, high = wilson_interval(int((lost > 3.0).sum()), len(told)) if told else (0.0, 1.0)
         wrong = f"{(lost > 3.0).sum()} of {len(told)} [{100 * max(low, 0.0):.0f}, {100 * high:.0f} %]"
         lines.append(f"| {task.capitalize()} | {group} | {len(told)} of {len(last)} | {after} | {wrong} | {mean} |")
+    return "\n".join(lines)
+
+
+def table_of_lengths(rows: Sequence[Row]) -> str:
+    """Of everybody, told or not: who would gain more than 3 points by going on to 200 answers."""
+    lines = ["| task | answers | would gain more than 3 points by going on | still to gain, mean |", "|" + "---|" * 4]
+    for task, count in product(catalogue.names(), COUNTS[:-1]):
+        now, last = (
+            np.concatenate([_by_user(rows, task, group, "now", each) for group in GROUPS])
+            for each in (count, COUNTS[-1])
+        )
+        lost = last - now
+        low, high = wilson_interval(int((lost > 3.0).sum()), len(lost))
+        wrong = f"{(lost > 3.0).sum()} of {len(lost)} [{100 * max(low, 0.0):.0f}, {100 * high:.0f} %]"
+        lines.append(f"| {task.capitalize()} | {count} | {wrong} | {lost.mean():.1f} |")
     return "\n".join(lines)
 
 

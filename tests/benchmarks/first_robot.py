@@ -22,14 +22,14 @@ from pathlib import Path
 from sqlalchemy import select
 
 from app.db import Database
-from app.domain.evaluation import Film, SharedFilter, Trial
+from app.domain.evaluation import DonorDraw, Film, SharedFilter, Trial
 from app.domain.models import Run, RunKind, RunStatus
 from app.domain.preferences import count_labels
-from app.domain.protocol import EvaluatedMethod, EvaluationSettings
+from app.domain.protocol import FROM_OTHERS, EvaluatedMethod, EvaluationSettings
 from app.domain.run_keys import AHEAD, RunKey
 from app.domain.studies import Participant, Study
 from app.domain.study_settings import PAPER_PROTOCOL, StudySettings
-from app.services.evaluation import evaluation_plan
+from app.services.evaluation import donors, evaluation_plan
 from app.services.participants import enrolment
 from app.services.studies import studies
 from app.storage import ArtefactStore
@@ -78,6 +78,7 @@ def main() -> None:
                         participant,
                         ScriptedPerson(database, store, study, TASTES["cautious"], Manner(), participant.number),
                         browsers.enter_context(FormBrowser(studio.settings.base_url, f"/p/{token}")),
+                        evaluation.methods,
                     )
                     for participant, token in invited
                 ]
@@ -95,6 +96,7 @@ class Answering:
     participant: Participant
     person: ScriptedPerson
     visitor: FormBrowser
+    methods: Sequence[EvaluatedMethod]
     first_s: float | None = None
     """from the last answer to the first robot"""
 
@@ -131,15 +133,19 @@ def _until(missing: str, seen: Callable[[], bool]) -> None:
 
 
 def _is_made_ahead(database: Database, each: Answering) -> bool:
-    """Filters of others, and films of the reference."""
+    """Filters of others, and films of all that is not their own robot."""
     ahead = RunKey(RunKind.FILMS, participant_id=each.participant.id, subject=AHEAD)
     filters = select(Run.id).where(Run.kind == RunKind.FILTER, Run.status == RunStatus.RUNNING)
     with database.reading() as session:
         asked = session.scalars(select(SharedFilter)).all()
         fitted = [shared.artefact_sha256 for shared in asked]
         running = session.scalar(filters.where(Run.participant_id == each.participant.id).limit(1))
-        filmed = session.scalar(select(Run.status).where(Run.workflow_id == str(ahead)))
-    return bool(fitted) and None not in fitted and filmed == RunStatus.SUCCEEDED and running is None
+        drawn = session.scalars(select(DonorDraw).where(DonorDraw.participant_id == each.participant.id)).all()
+        keys = [str(ahead), *(str(donors.key_of_films(loan)) for loan in drawn)]
+        filmed = session.scalars(select(Run.status).where(Run.workflow_id.in_(keys))).all()
+    lent = sum(method in FROM_OTHERS for method in each.methods)
+    all_filmed = filmed == [RunStatus.SUCCEEDED] * (1 + lent)
+    return bool(fitted) and None not in fitted and all_filmed and running is None
 
 
 def _wait(database: Database, people: Sequence[Answering]) -> None:

@@ -194,11 +194,14 @@ def _stale_models(session: Session, study: Study, succeeded: Collection[str], tr
     answers, exclusions = last_answers(session, present_ids(study)), last_exclusions(session, present_ids(study))
     begun, rating = evaluation_plan.begun(session, study), _rating(session, study)
     have_set = self_setting.who_have_set(session, study) if self_setting.is_set(study) else set()
-    for participant_id, count in sorted(count_labels(session, present_ids(study)).items()):
-        known = answers_known(settings, count, answers[participant_id], exclusions.get(participant_id))
+    given_pairs = select(Query.id).where(Query.participant_id == Participant.id).exists()
+    returned = set(session.scalars(present_ids(study).where(Participant.earlier_id.is_not(None), given_pairs)))
+    counts = dict.fromkeys(returned, 0) | count_labels(session, present_ids(study))
+    for participant_id, count in sorted(counts.items()):
+        known = answers_known(settings, count, answers.get(participant_id, 0), exclusions.get(participant_id))
         labels = reward_due(settings, count)
         reward = RunKey(RunKind.REWARD, participant_id=participant_id, labels=labels, answers=known)
-        if labels:
+        if labels or participant_id in returned:  # who comes back is known before the first answer
             jobs.append(Job(reward, study.id))
             milestone = filter_due(settings, count)
             if milestone and str(reward) in succeeded and study.material is None:  # no simulator, no filter
@@ -208,6 +211,7 @@ def _stale_models(session: Session, study: Study, succeeded: Collection[str], tr
         arm, shown = rating[participant_id], participant_id in begun
         if count < settings.labels_per_participant:
             jobs += due_evaluation.due_ahead(study, participant_id, arm)
+            jobs += due_lending.films_ahead(session, study, participant_id, arm)
         else:
             has_set = participant_id in have_set
             jobs += due_evaluation.due(study, reward, succeeded, trained, shown, arm, has_set=has_set)

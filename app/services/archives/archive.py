@@ -49,8 +49,9 @@ LEFT_OUT = {
     each.__tablename__ for each in (BrowserSession, StudyMember, ApiToken, Report, Export, PowerPlan, SharedFilter)
 }
 """Who may come in is a matter of each installation; reports and files are made again."""
-SECRETS = {"study": {"join_token"}, "participant": {"token_sha256", "link_revoked_at"}}
-"""Columns that never leave: with them somebody could answer in somebody else's name; and links are new elsewhere."""
+SECRETS = {"study": {"join_token"}, "participant": {"token_sha256", "link_revoked_at", "earlier_id"}}
+"""Columns that never leave: with them somebody could answer in somebody else's name, and links are new elsewhere; or
+they lead to another study, which an archive does not hold."""
 REMADE = (RunKind.SHARED, RunKind.REPORT, RunKind.EXPORT, RunKind.POWER)
 _ROWS_AT_ONCE = 500
 _SHA256 = r"^[0-9a-f]{64}$"

@@ -14,7 +14,7 @@ from sqlalchemy.orm import Session
 from app.domain.evaluation import Controller, DonorDraw, DonorRule, Donors, Film, SharedFilter, Trial
 from app.domain.models import Model, ModelKind, Run, RunKind, RunStatus
 from app.domain.protocol import EvaluatedMethod
-from app.domain.run_keys import CONTROLLERS, OTHERS, SHARED_FILTER, TRIALS, RunKey, read
+from app.domain.run_keys import CONTROLLERS, LENT, OTHERS, SHARED_FILTER, TRIALS, RunKey, read
 from app.domain.studies import Participant, Study
 from app.services.evaluation import evaluation_plan, unblinding
 
@@ -28,11 +28,18 @@ Name = TypeVar("Name", int, str)
 def draw(
     session: Session, study: Study, participant: Participant, method: EvaluatedMethod, types: Sequence[str]
 ) -> DonorDraw:
-    """Draw whose filter the participant is shown, or give what was drawn before. ``types``: of users, by name."""
+    """Draw whose filter the participant is shown, or give what was drawn before. ``types``: of users, by name.
+
+    What only stood in is drawn again, if it is_superseded().
+    """
     session.scalar(select(Study.id).where(Study.id == study.id).with_for_update())  # one at a time: loans are counted
     known = find(session, participant.id, method)
-    if known is not None:
+    if known is not None and not is_superseded(session, study, participant, known):
         return known
+    if known is not None:
+        _take_back(session, participant.id, method, Counter())
+        session.delete(known)
+        session.flush()
     rule, donors = foresee(session, study, participant, method, types)
     drawn = DonorDraw(
         participant_id=participant.id, method=method, rule=rule, stored_donors=donors.model_dump(mode="json")
@@ -52,6 +59,14 @@ def foresee(
     if len(people) >= FEWEST_PEOPLE:
         return DonorRule.MEAN_OF_PEOPLE, Donors(people=tuple(people), candidates=tuple(people))
     return DonorRule.MEAN_OF_TYPES, Donors(types=tuple(types), candidates=tuple(people))
+
+
+def is_superseded(session: Session, study: Study, participant: Participant, drawn: DonorDraw) -> bool:
+    """Whether types of users were drawn, before enough people had finished, and by now they have."""
+    if drawn.rule not in (DonorRule.TYPE_OF_USER, DonorRule.MEAN_OF_TYPES):
+        return False
+    enough = 1 if drawn.method == EvaluatedMethod.SOMEBODY_ELSE else FEWEST_PEOPLE
+    return len(candidates(session, study, participant)) >= enough
 
 
 def find(session: Session, participant_id: int, method: str) -> DonorDraw | None:
@@ -140,6 +155,12 @@ def key_of(shared: SharedFilter) -> RunKey:
     """The key of the run that fits it; with the moment, for ids may be given again."""
     moment = f"{round(shared.asked_at.timestamp() * 1000):x}"
     return RunKey(RunKind.SHARED, study_id=shared.study_id, subject=SHARED_FILTER, number=shared.id, mark=moment)
+
+
+def key_of_films(drawn: DonorDraw) -> RunKey:
+    """The key of the run that films what was drawn while its borrower still answers."""
+    moment = f"{round(drawn.created_at.timestamp() * 1000):x}"
+    return RunKey(RunKind.FILMS, participant_id=drawn.participant_id, subject=LENT, number=drawn.id, mark=moment)
 
 
 def counts(session: Session, study: Study) -> dict[str, Counter[str]]:

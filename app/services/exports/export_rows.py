@@ -58,12 +58,13 @@ def _theirs(
 def participants(session: Session, study: Study, window: Window = EVERYTHING) -> KeyedRows:
     for each in everybody(session, study, window):
         if (each.number,) > window.after:
-            yield (each.number,), _participant(study, each)
+            earlier = None if each.earlier_id is None else session.get_one(Participant, each.earlier_id)
+            yield (each.number,), _participant(study, each, earlier)
 
 
-def _participant(study: Study, each: Participant) -> Sequence[Any]:
+def _participant(study: Study, each: Participant, earlier: Participant | None) -> Sequence[Any]:
     if each.withdrawn_at is not None:
-        return (each.code, "withdrawn", *[None] * 9, each.withdrawn_at, each.scripted_as, None, None)
+        return (each.code, "withdrawn", *[None] * 9, each.withdrawn_at, each.scripted_as, *[None] * 4)
     status = "completed" if each.completed_at else "consented" if each.consented_at else "invited"
     return (
         each.code,
@@ -81,6 +82,8 @@ def _participant(study: Study, each: Participant) -> Sequence[Any]:
         each.scripted_as,
         None if unblinding.is_blinded(study) else each.arm,
         each.ended_as,
+        each.visit,
+        None if earlier is None else earlier.code,
     )
 
 

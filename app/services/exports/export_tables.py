@@ -57,6 +57,10 @@ TABLES: Sequence[Table] = (
             ),
             Column("arm", T, "Between subjects: the arm; empty until the study is unblinded."),
             Column("ended_as", T, "Why they were sent back before the end.", allowed=_words(Ending)),
+            Column("visit", I, "Which visit of theirs this study is.", allowed="from 1"),
+            Column(
+                "earlier_participant", T, "Their code at the visit before, in the study that this one goes on from."
+            ),
         ),
         export_rows.participants,
         (Participant,),
@@ -410,7 +414,7 @@ TABLES: Sequence[Table] = (
             Column("people", T, "Codes of those whose filter, or whose wishes, these are; separated by spaces."),
             Column("types", T, "The paper's types of users whose wishes these are; separated by spaces."),
             Column("candidates", T, "Codes of those who could have been drawn, without who has withdrawn since."),
-            Column("drawn_at", W, "When it was drawn: after the participant's last answer."),
+            Column("drawn_at", W, "When it was drawn: in the second half of the participant's answers, or later."),
         ),
         export_rows.donors,
         (DonorDraw,),

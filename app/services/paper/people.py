@@ -43,6 +43,8 @@ def participants(session: Session, study: Study) -> Iterator[str]:
         if flow.scripted
         else "",
     )
+    if settings.goes_on_from:
+        yield _visit(session, study)
     by_arm = recruitment.flow_by_arm(session, study)
     if by_arm:
         rows = [_row_of_arm(study, name, flow) for name, flow in by_arm.items()]
@@ -57,6 +59,16 @@ def participants(session: Session, study: Study) -> Iterator[str]:
         f"How people were recruited and paid beyond that: {NOT_RECORDED}.",
     )
     yield from _demographics(session, study)
+
+
+def _visit(session: Session, study: Study) -> str:
+    people = [each for each in export_rows.everybody(session, study) if each.withdrawn_at is None]
+    returned = [each for each in people if each.earlier_id is not None]
+    return (
+        f"This was a return visit: {len(returned)} of these {len(people)} had completed the study "
+        f"{study.settings.goes_on_from} at least {count(study.settings.days_between_visits, 'day')} before, and models "
+        "went on from all that they had answered there."
+    )
 
 
 def sample_size(session: Session, study: Study) -> str:

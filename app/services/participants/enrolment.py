@@ -44,6 +44,16 @@ def add_participant(
     return participant, token
 
 
+def add_returning(session: Session, study: Study, earlier: Participant) -> Participant:
+    """Add somebody to a later visit of theirs, under the number that they had, if it is free; their link leads on."""
+    participant, _ = _add(session, study, audit.PARTICIPANT, preview=False, wished=earlier.number)
+    participant.earlier_id, participant.visit = earlier.id, earlier.visit + 1
+    participant.language, participant.scripted_as = earlier.language, earlier.scripted_as
+    participant.panel_id, participant.panel_parameters = earlier.panel_id, earlier.panel_parameters
+    session.flush()
+    return participant
+
+
 def count_scripted(session: Session, study: Study) -> int:
     """How many participants a program plays."""
     present = select(func.count(Participant.id)).where(
@@ -57,11 +67,15 @@ def add_preview(session: Session, study: Study, actor: str) -> tuple[Participant
     return _add(session, study, actor, preview=True)
 
 
-def _add(session: Session, study: Study, actor: str, *, preview: bool) -> tuple[Participant, str]:
+def _add(
+    session: Session, study: Study, actor: str, *, preview: bool, wished: int | None = None
+) -> tuple[Participant, str]:
     session.scalar(select(Study.id).where(Study.id == study.id).with_for_update())  # numbers are given one at a time
     like_this = Participant.study_id == study.id, Participant.is_preview.is_(preview)
     newest = session.scalar(select(func.max(Participant.number)).where(*like_this))
     number, token = (newest or (PREVIEW_NUMBERS if preview else 0)) + 1, _new_token()
+    if wished and session.scalar(select(Participant.id).where(*like_this, Participant.number == wished)) is None:
+        number = wished
     participant = Participant(
         study_id=study.id,
         number=number,

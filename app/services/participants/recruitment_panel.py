@@ -12,7 +12,7 @@ from sqlalchemy.orm import Session, joinedload
 from app.domain.studies import Participant, Study
 from app.errors import AppError
 from app.services import audit
-from app.services.participants import enrolment
+from app.services.participants import enrolment, visits
 from app.services.participants.enrolment import LinkRevoked
 
 LONGEST_PANEL_ID = 120
@@ -75,7 +75,7 @@ def panel_id_in(study: Study, parameters: Mapping[str, str]) -> str | None:
 def join(session: Session, study: Study, parameters: Mapping[str, str]) -> Joined:
     """The participant for these parameters of the panel: whoever has this id already, else somebody new.
 
-    Without a panel parameter in the settings everybody is new. Raises PanelIdMissing and LinkRevoked.
+    Without a panel parameter in the settings everybody is new. Raises PanelIdMissing, LinkRevoked and NoVisitYet.
     """
     panel_id = panel_id_in(study, parameters)
     if panel_id is None:
@@ -101,7 +101,11 @@ def _known(session: Session, study: Study, panel_id: str) -> Participant | None:
 
 
 def _add(session: Session, study: Study, panel_id: str | None, parameters: Mapping[str, str]) -> Joined:
-    participant, token = enrolment.add_participant(session, study)
+    earlier = visits.known_to_panel(session, study, panel_id) if panel_id else None
+    if earlier is not None:
+        participant, token = visits.begin(session, earlier), None
+    else:
+        participant, token = enrolment.add_participant(session, study)
     participant.panel_id = panel_id
     kept = list(parameters.items())[:MOST_PARAMETERS]
     participant.panel_parameters = {key[:LONGEST_PARAMETER]: value[:LONGEST_PARAMETER] for key, value in kept} or None

@@ -22,6 +22,7 @@ from app.services import audit
 from app.services.auditing import receipts
 from app.services.auditing.receipts import ROWS_AND_FILES, Erased
 from app.services.evaluation import donors
+from app.services.participants import visits
 from app.storage import ArtefactStore
 
 ARTEFACT_COLUMNS: tuple[InstrumentedAttribute[Any], ...] = (
@@ -42,7 +43,7 @@ ARTEFACT_COLUMNS: tuple[InstrumentedAttribute[Any], ...] = (
 """Every column that names a file of the artefact store. Report.figures does so too, inside its JSON."""
 
 KEPT_COLUMNS = frozenset(
-    {"id", "study_id", "number", "token_sha256", "seed", "created_at", "is_preview", "scripted_as"}
+    {"id", "study_id", "number", "token_sha256", "seed", "created_at", "is_preview", "scripted_as", "visit"}
     | {"withdrawn_at", "erased_at"}
 )
 """Of the tombstone: what makes the code, and what lets the old link end at a page that says what happened."""
@@ -52,13 +53,15 @@ _NOT_EMPTIED = frozenset({"created_at", "deleted_at", "erased_at"})
 def withdraw(session: Session, store: ArtefactStore, participant: Participant, actor: str) -> None:
     """Erase everything about the participant, now and for good. ``actor``: the person, or who erases at their request.
 
-    Files go before the transaction ends: should it fail, the person is asked to do it again, and nothing is left over.
+    Every visit of theirs, for what they said at one of them was learned from at the next. Files go before the
+    transaction ends: should it fail, the person is asked to do it again, and nothing is left over.
     """
-    study = session.get_one(Study, participant.study_id)
-    if participant.withdrawn_at is None:
-        participant.withdrawn_at = now()
-        audit.record(session, actor, "participant withdrew", study.slug, study=study)
-    erase(session, store, participant)
+    for each in visits.everyone_they_were(session, participant):
+        study = session.get_one(Study, each.study_id)
+        if each.withdrawn_at is None:
+            each.withdrawn_at = now()
+            audit.record(session, actor, "participant withdrew", study.slug, study=study)
+        erase(session, store, each)
 
 
 def erase(session: Session, store: ArtefactStore, participant: Participant) -> None:

@@ -13,7 +13,7 @@ from app.domain.protocol import Stage
 from app.domain.studies import Participant
 from app.services.accounts import browser_sessions
 from app.services.answers import next_query
-from app.services.participants import admission, completion, enrolment, stages
+from app.services.participants import admission, completion, enrolment, stages, visits
 from app.services.studies.retirement import StudyDeleted, StudyPutAway
 from app.web.error_pages import wants_json
 from app.web.http.authorized_route import AuthorizedRoute
@@ -91,7 +91,7 @@ def _closed(request: Request, participant: Participant) -> Response:
 @router.get("/{token}", name="open_link")
 def open_link(request: Request, token: Token, session: WritingSession, studio: StudioDep) -> Response:
     """Exchange the personal link for a cookie and leave its address, so that the token stays in no history."""
-    participant = enrolment.find_by_token(session, token)
+    participant = visits.newest(session, enrolment.find_by_token(session, token))
     if participant.study.deleted_at is not None:
         raise StudyDeleted
     if participant.withdrawn_at is not None:

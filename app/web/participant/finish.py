@@ -1,5 +1,6 @@
 """The end of the way: the person's own robot, thanks, and the way back to a recruitment panel."""
 
+from datetime import timedelta
 from typing import Annotated
 from uuid import uuid4
 
@@ -8,12 +9,20 @@ from fastapi.responses import Response
 
 from app.domain.protocol import Stage
 from app.domain.studies import Awaited, Participant
+from app.services.accounts import browser_sessions
 from app.services.answers import next_query
 from app.services.evaluation import robot_preparation
 from app.services.monitoring import dashboard
-from app.services.participants import completion, debrief, stages
+from app.services.participants import completion, debrief, stages, visits
 from app.web.http.authorized_route import AuthorizedRoute
-from app.web.http.deps import CurrentParticipant, NotYet, StudioDep, WritingSession
+from app.web.http.deps import (
+    PARTICIPANT_COOKIE,
+    CurrentParticipant,
+    NotYet,
+    StudioDep,
+    WritingSession,
+    set_cookie,
+)
 from app.web.participant.pages import back_from, go, has_reached, participant_page
 
 router = APIRouter(prefix="/p", route_class=AuthorizedRoute)
@@ -62,5 +71,19 @@ def show_finished(
         "return_address": completion.return_address(participant),
         "first_time": first_time,
         "undo_uuid": uuid4(),
+        "next_visit": visits.next_visit(session, participant),
     }
     return participant_page(request, "participant/finished.html", participant, context)
+
+
+@router.post("/visit", name="begin_visit")
+def begin_visit(
+    request: Request, participant: CurrentParticipant, session: WritingSession, studio: StudioDep
+) -> Response:
+    """Come back for the next visit; from here on the personal link leads there."""
+    lifetime = timedelta(days=studio.settings.session_days)
+    returned = visits.begin(session, participant)
+    cookie = browser_sessions.open_for_participant(session, returned, lifetime)
+    response = go(request, "show_next")
+    set_cookie(response, studio.settings, PARTICIPANT_COOKIE, cookie, lifetime)
+    return response

@@ -31,16 +31,17 @@ def consent_text(wording: Wording, participant: Participant) -> ConsentText:
     return ConsentText(
         title=wording("consent-title"),
         welcome=wording("consent-welcome"),
-        body=_with_list(body, [*_set_and_shown(wording, settings), *_facts_in_words(wording, facts)]),
+        body=_with_list(body, [*_what_happens(wording, participant), *_facts_in_words(wording, facts)]),
         version=wording("consent-version", version=settings.consent_version),
     )
 
 
-def _set_and_shown(wording: Wording, settings: StudySettings) -> list[str]:
-    """That people set a robot themselves, and are shown others': in every study where it happens, whatever its own text
-    says."""
-    evaluation = settings.evaluation
+def _what_happens(wording: Wording, participant: Participant) -> list[str]:
+    """That earlier answers count on, that people set a robot themselves, and are shown others': wherever it happens,
+    whatever the study's own text says."""
+    evaluation = participant.study.settings.evaluation
     happens = {
+        "consent-visit": participant.visit > 1,
         "consent-setting": evaluation is not None and evaluation.has_sliders,
         "consent-others": evaluation is not None and evaluation.shows_others,
     }

@@ -9,19 +9,20 @@ from sqlalchemy import select
 
 from app.db import Database, now
 from app.domain.clips import Clip
-from app.domain.evaluation import DonorRule, Donors
+from app.domain.evaluation import DonorRule, Donors, Film
 from app.domain.models import Model, ModelKind, RunKind
 from app.domain.preferences import Query, Response
 from app.domain.protocol import EvaluatedMethod
 from app.domain.run_keys import RunKey
 from app.domain.studies import Participant, Study
-from app.services.evaluation import donors
+from app.services.evaluation import donors, evaluation_plan
 from app.services.participants import withdrawal
 from app.storage import ArtefactStore
 from tests import factories
 from tests.worker.at_hand import AtHand, at_once
-from tests.worker.jobs.test_evaluation_films import LABELS, done, due, learn, names, settle
+from tests.worker.jobs.test_evaluation_films import LABELS, answers_wanted, done, due, learn, names, settle
 from worker.compute import baseline_fitting
+from worker.jobs.clips import evaluation_films
 from worker.jobs.clips.evaluation_films import make_films
 from worker.jobs.learning import filters, lent_filters, shared_filters
 from worker.jobs.learning.baselines import train_method
@@ -134,12 +135,12 @@ class TestAhead:
 
     @pytest.fixture
     def answering(self, context: WorkerContext, study: Study, participant: Participant) -> Participant:
-        """Somebody who is here, has given half of the answers, and is going to be shown both robots of others."""
+        """Somebody who is here, has given some of the answers, and is going to be shown both robots of others."""
         settle(context.database, study, trials=1, methods=("pbarl", "somebody_else", "average"))
         with context.database.writing() as session:
             person = session.get_one(Participant, participant.id)
             person.last_seen_at = now()
-            factories.make_model(session, study, person, ModelKind.REWARD, {}, LABELS // 2)
+            factories.make_model(session, study, person, ModelKind.REWARD, {}, LABELS // 2 - 1)
         return person
 
     def asked(self, context: WorkerContext, study: Study) -> list[Donors]:
@@ -154,7 +155,7 @@ class TestAhead:
         assert everybody == Donors(types=("neutral", "cautious", "impatient"))
         assert len(due(context.database, RunKind.SHARED)) == 2
         with context.database.reading() as session:
-            assert donors.find(session, 1, "average") is None, "drawn is after the last answer"
+            assert donors.find(session, 1, "average") is None, "drawn is after half of the answers"
 
     def test_nothing_for_whoever_has_left(self, context: WorkerContext, study: Study, answering: Participant) -> None:
         with context.database.writing() as session:
@@ -191,6 +192,64 @@ class TestAhead:
         assert not context.store.has(artefact)
         (few,) = self.asked(context, study)
         assert len(few.types) == 3, "an average of two would tell too much about each of them"
+
+
+class TestFilmedAhead:
+    """In the second half of the answers it is drawn and filmed, for what is lent depends on no answer."""
+
+    @pytest.fixture
+    def filming(self, context: WorkerContext, study: Study, participant: Participant, donor: Participant) -> Job:
+        """The films of the donor's filter, for somebody with one answer to go."""
+        settle(context.database, study, trials=1, methods=("pbarl", "somebody_else"))
+        answers_wanted(context.database, study, LABELS + 1)
+        with context.database.writing() as session:
+            person = session.get_one(Participant, participant.id)
+            person.last_seen_at = now()
+            factories.make_model(session, study, person, ModelKind.REWARD, {}, LABELS)
+            session.scalars(select(Model).where(Model.participant_id == donor.id)).one().label_count = LABELS + 1
+        (job,) = due(context.database, RunKind.FILMS)
+        return job
+
+    @pytest.mark.usefixtures("all_said")
+    def test_the_films_become_those_of_the_method_and_are_not_made_twice(
+        self, context: WorkerContext, study: Study, filming: Job, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        assert names([filming])[0].startswith("films/participant-1/lent-")
+        done(context, filming, make_films)
+        assert due(context.database, RunKind.FILMS) == []
+        answers_wanted(context.database, study, LABELS)
+        learn(context)
+        monkeypatch.setattr("worker.jobs.learning.baselines._driven", lambda *_: [])
+        monkeypatch.setattr("worker.jobs.learning.baselines.evaluate", lambda *_: {})
+        (method,) = due(context.database, RunKind.METHOD)
+        done(context, method, train_method)
+        for rest in due(context.database, RunKind.FILMS):
+            done(context, rest, make_films)
+        with context.database.reading() as session:
+            model = session.scalars(select(Model).where(Model.kind == ModelKind.METHOD)).one()
+            lent = session.scalars(select(Film).where(Film.method == "somebody_else")).all()
+            assert [(film.id, film.model_id) for film in lent] == [(1, model.id)]
+            assert all(trial.film_id is not None for trial in evaluation_plan.trials_of(session, 1))
+
+    @pytest.mark.usefixtures("all_said")
+    def test_nothing_is_left_of_a_donor_who_withdraws_meanwhile(
+        self, context: WorkerContext, donor: Participant, filming: Job, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        kept, made = evaluation_films._stored, dict[str, Any]()
+
+        def stored(*arguments: Any) -> dict[str, Any]:
+            made.update(kept(*arguments))
+            with context.database.writing() as session:
+                person = session.get_one(Participant, donor.id)
+                withdrawal.withdraw(session, context.store, person, person.code)
+            return made
+
+        monkeypatch.setattr(evaluation_films, "_stored", stored)
+        with pytest.raises(LoanEnded):
+            done(context, filming, make_films)
+        assert not any(context.store.has(made[name]) for name in made if name.endswith("sha256"))
+        with context.database.reading() as session:
+            assert session.scalars(select(Film)).all() == []
 
 
 @pytest.mark.usefixtures("all_said")

@@ -1,9 +1,9 @@
 """What an evaluation shows: films of the robots in scenarios that nothing else uses, or controllers for a real one.
 
-Five kinds of runs: ``before-after`` (the participant's robot beside the reference, for debriefing and experimenters),
+Six kinds of runs: ``before-after`` (the participant's robot beside the reference, for debriefing and experimenters),
 ``trials`` (everything that is rated in video mode), ``others`` (what of it is not their own robot, while that is still
-learning), ``ahead`` (what of both is the reference, while they still answer), ``controllers`` (one file per letter in
-physical mode).
+learning), ``ahead`` (what of both is the reference, while they still answer), ``lent`` (what of the trials is one robot
+of others, while they still answer), ``controllers`` (one file per letter in physical mode).
 """
 
 from collections.abc import Sequence
@@ -13,17 +13,18 @@ from typing import Any
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from app.domain.evaluation import Controller, Film, Trial
+from app.domain.evaluation import Controller, DonorDraw, Film, Trial
 from app.domain.models import Model, ModelKind, RunKind
 from app.domain.protocol import EvaluatedMethod
-from app.domain.run_keys import AHEAD, BEFORE_AFTER, CONTROLLERS, OTHERS, TRIALS
+from app.domain.run_keys import AHEAD, BEFORE_AFTER, CONTROLLERS, LENT, OTHERS, TRIALS
 from app.domain.studies import Participant, Study
-from app.services.evaluation import evaluation_plan
+from app.services.evaluation import donors, evaluation_plan
 from worker.compute import baseline_fitting, simulation
 from worker.compute.pools import Lane
 from worker.compute.simulation import RecordedClip
 from worker.jobs.clips import repairs
 from worker.jobs.clips.stored_video import video_columns
+from worker.jobs.learning import lent_filters
 from worker.jobs.learning.filters import NothingToLearnFrom
 from worker.jobs.learning.lent_filters import LoanEnded
 from worker.jobs.runtime import due_work, records
@@ -34,6 +35,7 @@ SHOWN = (TRIALS, BEFORE_AFTER)
 """Runs whose films are given to the trials they fit; all of somebody's robots are shown, or none."""
 AT_A_TIME = 2
 """Films between two marks of progress."""
+_FILES = ("trajectory_sha256", "video_sha256", "poster_sha256")
 
 
 @dataclass(frozen=True)
@@ -80,6 +82,7 @@ _DOING = {
     TRIALS: "filming robot",
     OTHERS: "filming robot",
     AHEAD: "filming the reference,",
+    LENT: "filming robot",
     CONTROLLERS: "packing robot",
 }
 
@@ -125,6 +128,9 @@ def _plan(context: WorkerContext, job: Job, what: str) -> list[list[Any]]:
             ]
         if what == AHEAD:
             return [[EvaluatedMethod.REFERENCE.value, None, each] for each in _scenarios(study, participant)]
+        if what == LENT:
+            drawn = _loan(session, job)
+            return [[drawn.method, None, each] for each in _rated(study, participant)] if drawn else []
         evaluation_plan.draw(session, study, participant)
         letters = {each.letter: each.method for each in evaluation_plan.assignments_of(session, participant.id)}
         if what == OTHERS:
@@ -141,10 +147,20 @@ def _plan(context: WorkerContext, job: Job, what: str) -> list[list[Any]]:
 
 def _scenarios(study: Study, participant: Participant) -> list[int]:
     """Of the trials, then of before and after."""
+    return [*_rated(study, participant), *evaluation_plan.comparison_scenarios(participant)]
+
+
+def _rated(study: Study, participant: Participant) -> list[int]:
+    """The scenarios of the trials."""
     settings = evaluation_plan.settings_for(study, participant.arm)
     repetitions = range(1, settings.trials + 1) if settings else ()
-    rated = [evaluation_plan.trial_scenario(participant, repetition) for repetition in repetitions]
-    return [*rated, *evaluation_plan.comparison_scenarios(participant)]
+    return [evaluation_plan.trial_scenario(participant, repetition) for repetition in repetitions]
+
+
+def _loan(session: Session, job: Job) -> DonorDraw | None:
+    """What was drawn that the job films; None when it is drawn no more."""
+    drawn = session.get(DonorDraw, job.number)
+    return drawn if drawn is not None and donors.key_of_films(drawn) == job.about else None
 
 
 def _newest_model(session: Session, participant_id: int, method: str) -> int | None:
@@ -168,12 +184,19 @@ def _film(context: WorkerContext, run_id: int, job: Job, shots: list[list[Any]])
         quality = session.get_one(Study, job.study_id).settings.clip_quality.value
         unfilmed = [each for each in shots if _film_of(session, job, each) is None]
     wanted = dict.fromkeys((method, model_id) for method, model_id, _ in unfilmed)
-    robots = {method: _robot(context, run_id, task, method, model_id) for method, model_id in wanted}
+    is_lent = job.about.subject == LENT
+    robots = {
+        method: _lent_robot(context, run_id, job) if is_lent else _robot(context, run_id, task, method, model_id)
+        for method, model_id in wanted
+    }
     missing = [(robots[method], scenario) for method, _, scenario in unfilmed]
     arguments = [(task, quality, robot.controller, scenario) for robot, scenario in missing]
     recorded = context.compute.run_all(Lane.CLIPS, context.beat(run_id), simulation.film, arguments)
     files = [_stored(context, each) for each in recorded]
     with context.database.writing() as session:
+        if is_lent and _loan(session, job) is None:
+            lent_filters.forget(context, session, [each[name] for each in files for name in _FILES])
+            raise LoanEnded
         for (robot, scenario), columns in zip(missing, files, strict=True):
             _save(session, job.participant, robot, scenario, columns)
         for method, model_id, scenario in shots if job.about.subject in SHOWN else ():
@@ -234,6 +257,16 @@ def _keep_controller(session: Session, participant_id: int, robot: ShownRobot, a
     elif session.scalar(begun) is not None:
         return
     known.model_id, known.artefact_sha256, known.byte_count = robot.model_id, artefact, byte_count
+
+
+def _lent_robot(context: WorkerContext, run_id: int, job: Job) -> ShownRobot:
+    """What was drawn, which is no model of the borrower's yet. Raises LoanEnded."""
+    with context.database.reading() as session:
+        drawn = _loan(session, job)
+    if drawn is None:
+        raise LoanEnded
+    controller, _ = lent_filters.controller_of(context, job, run_id, drawn)
+    return ShownRobot(drawn.method, None, controller)
 
 
 def _robot(context: WorkerContext, run_id: int, task: str, method: str, model_id: int | None) -> ShownRobot:

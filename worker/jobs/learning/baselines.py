@@ -18,7 +18,6 @@ from app.domain.protocol import FROM_OTHERS, EvaluatedMethod
 from app.domain.studies import Participant, Study
 from app.errors import AppError
 from app.services.evaluation import evaluation_plan, self_setting
-from app.services.participants import withdrawal
 from worker.analysis.filters.evaluation import evaluate
 from worker.compute import baseline_fitting, learning
 from worker.compute.baseline_fitting import Baseline
@@ -206,10 +205,11 @@ def _keep(context: WorkerContext, run_id: int, job: Job, method: str, trained: d
             if method in FROM_OTHERS:
                 lent_filters.check(session, job, method, trained["draw"])
         except LoanEnded:
-            for sha256 in {artefact} - withdrawal.in_use(session, [artefact]):
-                context.store.delete(sha256)
+            lent_filters.forget(context, session, [artefact])
             raise
-        records.save_model(session, run_id, ModelKind.METHOD, artefact, metrics)
+        model = records.save_model(session, run_id, ModelKind.METHOD, artefact, metrics)
+        if method in FROM_OTHERS:
+            lent_filters.take_over_films(session, model)
     context.store.unfinished.forget(_folder(context, job, run_id))
 
 

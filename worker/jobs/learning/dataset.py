@@ -19,6 +19,7 @@ from app.domain.studies import Participant, Study
 from app.errors import AppError
 from app.files.interface import Files
 from app.installed_tasks import hints, qualities
+from app.services.participants import visits
 from app.storage import ArtefactStore
 from worker.domain.responses import TARGETS
 from worker.domain.trajectory import OutdatedTrajectory, Recorded, Recording, Trajectory
@@ -56,7 +57,7 @@ class Preferences:
     hints: FloatArray
     """(H, S) which way this person wishes the signals, see worker.ml.rewards.hint_directions"""
     label_count: int
-    """How many labels were given, those without a target and those that were excluded included."""
+    """How many labels were given at this visit, those without a target and those that were excluded included."""
     label_hash: str
 
 
@@ -80,12 +81,16 @@ def labels_with_clips(session: Session, participant_id: int) -> Sequence[Label]:
 
 
 def load_preferences(session: Session, store: ArtefactStore, participant_id: int) -> Preferences:
-    """The participant's labels as arrays; pairs without a target, and excluded ones, are left out."""
+    """The participant's labels as arrays; pairs without a target, and excluded ones, are left out.
+
+    Those of the visits before come first; hints are the newest that were given.
+    """
     given = count_labels(session, select(Participant.id).where(Participant.id == participant_id))
-    labels = labels_with_clips(session, participant_id)
+    people = [*visits.before(session, participant_id), participant_id]
+    labels = [label for each in people for label in labels_with_clips(session, each)]
     said = [(label, target) for label in labels if (target := TARGETS[label.response]) is not None]
     study = session.get_one(Study, session.get_one(Participant, participant_id).study_id)
-    hinted = hints_of(session, participant_id)
+    hinted = next(filter(None, (hints_of(session, each) for each in reversed(people))), ())
     return Preferences(
         pairs=segment_pairs(store, [(each.query.left_clip, each.query.right_clip) for each, _ in said])
         if said

@@ -2,10 +2,12 @@
 
 from collections.abc import Sequence
 
+from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from app.domain.choices import Method, RewardKind
 from app.domain.models import Model, ModelKind
+from app.domain.preferences import count_labels
 from app.domain.studies import Participant, Study
 from app.domain.study_settings import StudySettings
 from app.errors import AppError
@@ -13,6 +15,7 @@ from app.services.answers import accuracy
 from app.services.answers.misfit import Misfit, misfit_of
 from app.services.exports.export_formats import provenance_of
 from app.services.monitoring import dashboard
+from app.services.participants import visits
 from worker.analysis.filters.promise import Promise
 from worker.compute import filter_fitting, learning
 from worker.compute.filter_fitting import FilterFit
@@ -133,6 +136,7 @@ def _publish(context: WorkerContext, run_id: int, job: Job, reward: str, draft: 
             *notes_on_script(participant),
             *notes_on_foresight(dashboard.curve_of(session, job.participant)),
             *notes_on_misfit(misfit_of([model] if model else [])),
+            *notes_on_visits(session, participant),
         ]
     provenance = Provenance(
         study=study.name,
@@ -183,6 +187,15 @@ def notes_on_misfit(misfit: Misfit | None) -> Sequence[str]:
         "The reward model behind this filter adds up weighted signals, and that does not fit this person: their answers"
         f" are explained better by {misfit.words}. The filter may suit them less than it could."
     ]
+
+
+def notes_on_visits(session: Session, participant: Participant) -> Sequence[str]:
+    """What the model card has to say about answers that are not counted in it."""
+    before = visits.before(session, participant.id)
+    if not before:
+        return []
+    earlier = sum(count_labels(session, select(Participant.id).where(Participant.id.in_(before))).values())
+    return [f"This is visit {participant.visit}: {earlier} answers of the visits before were learned from as well."]
 
 
 def load_draft(context: WorkerContext, artefact: str) -> FilterDraft:

@@ -5,16 +5,18 @@ people or types of users was fitted before (worker.jobs.learning.shared_filters)
 """
 
 import time
+from collections.abc import Collection
 
-from sqlalchemy import select
+from sqlalchemy import select, update
 from sqlalchemy.orm import Session
 
-from app.domain.evaluation import DonorDraw
-from app.domain.models import ModelKind
+from app.domain.evaluation import DonorDraw, Film
+from app.domain.models import Model, ModelKind
 from app.domain.protocol import EvaluatedMethod
 from app.domain.studies import Participant, Study
 from app.errors import AppError
 from app.services.evaluation import donors
+from app.services.participants import withdrawal
 from worker.compute import baseline_fitting
 from worker.compute.pools import Lane
 from worker.jobs.runtime import records
@@ -45,6 +47,12 @@ def check(session: Session, job: Job, method: str, mark: object) -> DonorDraw:
     return drawn
 
 
+def take_over_films(session: Session, model: Model) -> None:
+    """Films that were made ahead, of the same loan, are films of the model that it has become."""
+    ahead = update(Film).where(Film.participant_id == model.participant_id, Film.model_id.is_(None))
+    session.execute(ahead.where(Film.method == model.metrics["method"]).values(model_id=model.id))
+
+
 def _mark(drawn: DonorDraw) -> str:
     """Ids may be given again."""
     return f"{drawn.id} {drawn.created_at.isoformat()}"
@@ -62,16 +70,31 @@ def _lent(context: WorkerContext, job: Job, run_id: int, method: EvaluatedMethod
     """The controller of whose filter it is, with its notes."""
     with context.database.reading() as session:
         drawn = check(session, job, method, mark)
+    controller, notes = controller_of(context, job, run_id, drawn)
+    return context.store.put(controller), notes
+
+
+def controller_of(context: WorkerContext, job: Job, run_id: int, drawn: DonorDraw) -> tuple[bytes, list[str]]:
+    """The controller of what was drawn, with its notes; not stored, so that it goes when its donor does.
+
+    Raises LoanEnded.
+    """
+    with context.database.reading() as session:
         study = session.get_one(Study, job.study_id)
         if drawn.donors.share_a_filter:
             shared = donors.shared_filter(session, study, drawn.donors)
             if shared is None or shared.artefact_sha256 is None or shared.metrics is None:
                 raise LoanEnded
-            return shared.artefact_sha256, list(shared.metrics["notes"])
+            return context.store.read(shared.artefact_sha256), list(shared.metrics["notes"])
         weights = context.store.read(_filter_of(session, study, drawn))
     beat = context.beat(run_id)
-    controller = context.compute.run(Lane.LEARNING, beat, baseline_fitting.controller_of_filter, study.task, weights)
-    return context.store.put(controller), []
+    return context.compute.run(Lane.LEARNING, beat, baseline_fitting.controller_of_filter, study.task, weights), []
+
+
+def forget(context: WorkerContext, session: Session, files: Collection[str]) -> None:
+    """Delete what was made of a loan that has ended."""
+    for sha256 in set(files) - withdrawal.in_use(session, files):
+        context.store.delete(sha256)
 
 
 def _filter_of(session: Session, study: Study, drawn: DonorDraw) -> str:

@@ -1,7 +1,8 @@
 """Filters that are lent: whose turn it is to draw, and which filters for several donors are to be fitted for that.
 
-Those do not depend on what their borrower answers, so they are fitted while people answer, for what would be drawn for
-them now. What is drawn in the end is another matter: by then somebody else may have finished, whose filter comes first.
+None of it depends on what the borrower answers, so filters are fitted while people answer, for what would be drawn for
+them now, and in the second half of their answers it is drawn, to be filmed ahead. Types of users only stand in: once
+people have finished it is drawn again.
 """
 
 from collections.abc import Iterator, Sequence
@@ -12,9 +13,9 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from app.db import now
-from app.domain.evaluation import Donors, SharedFilter
+from app.domain.evaluation import DonorDraw, Donors, SharedFilter
 from app.domain.models import Model, ModelKind, RunKind
-from app.domain.protocol import FROM_OTHERS, EvaluatedMethod
+from app.domain.protocol import FROM_OTHERS, EvaluatedMethod, EvaluationMode
 from app.domain.studies import Participant, Study
 from app.errors import AppError
 from app.services.evaluation import donors, evaluation_plan
@@ -23,6 +24,8 @@ from worker.jobs.runtime.records import Job, models_of, newest_model
 
 SEEN_WITHIN = timedelta(minutes=30)
 """Whoever was here so recently may give the last answer soon."""
+DRAWN_FROM = 0.5
+"""Share of the answers from which on it is drawn: the films take a minute or two, and few leave after so many."""
 
 
 @dataclass(frozen=True)
@@ -70,17 +73,31 @@ def find(session: Session, job: Job) -> SharedFilter | None:
     return shared if shared is not None and donors.key_of(shared) == job.about else None
 
 
+def films_ahead(session: Session, study: Study, participant_id: int, arm: str | None) -> list[Job]:
+    """Films of what was drawn for somebody who still answers, as far as it is fitted."""
+    settings = evaluation_plan.settings_for(study, arm)
+    if settings is None or settings.mode is not EvaluationMode.VIDEO:
+        return []
+    lent = [method for method in settings.methods if method in FROM_OTHERS]
+    drawn = [found for method in lent if (found := donors.find(session, participant_id, method))]
+    return [Job(donors.key_of_films(each), study.id) for each in drawn if _is_fitted(session, study, each)]
+
+
 def is_missing(session: Session, job: Job) -> bool:
     """Whether the method that the job makes is still to be drawn, or to be fitted to the donors that were."""
     if job.kind != RunKind.METHOD or job.about.subject not in FROM_OTHERS:
         return False
     drawn = donors.find(session, job.participant, job.about.subject)
-    if drawn is None:
+    study, borrower = session.get_one(Study, job.study_id), session.get_one(Participant, job.participant)
+    if drawn is None or donors.is_superseded(session, study, borrower, drawn):
         return True
-    if not drawn.donors.share_a_filter:
-        return False
-    shared = donors.shared_filter(session, session.get_one(Study, job.study_id), drawn.donors)
-    return shared is None or shared.artefact_sha256 is None
+    return not _is_fitted(session, study, drawn)
+
+
+def _is_fitted(session: Session, study: Study, drawn: DonorDraw) -> bool:
+    """Whether what was drawn can be lent: a person's own filter is there already."""
+    shared = donors.shared_filter(session, study, drawn.donors) if drawn.donors.share_a_filter else None
+    return not drawn.donors.share_a_filter or (shared is not None and shared.artefact_sha256 is not None)
 
 
 def _has_needs(session: Session, study: Study) -> bool:
@@ -93,9 +110,10 @@ def _has_needs(session: Session, study: Study) -> bool:
 def _needs(session: Session, study: Study) -> _Needs:
     draws: list[tuple[Participant, EvaluatedMethod]] = []
     wanted: list[Donors] = []
-    for participant, method, all_said in _borrowers(session, study):
+    for participant, method, said in _borrowers(session, study):
         drawn = donors.find(session, participant.id, method)
-        if drawn is None and all_said:
+        again = drawn is not None and donors.is_superseded(session, study, participant, drawn)
+        if again or (drawn is None and said >= DRAWN_FROM):
             draws.append((participant, method))
         types = shared_reward.types_of(study.task)
         whose = donors.foresee(session, study, participant, method, types)[1] if drawn is None else drawn.donors
@@ -110,8 +128,8 @@ def _needs(session: Session, study: Study) -> _Needs:
     )
 
 
-def _borrowers(session: Session, study: Study) -> Iterator[tuple[Participant, EvaluatedMethod, bool]]:
-    """Who is to be shown a robot of others that is not made yet, which one, and whether they have given all answers."""
+def _borrowers(session: Session, study: Study) -> Iterator[tuple[Participant, EvaluatedMethod, float]]:
+    """Who is to be shown a robot of others that is not made yet, which one, and what share of the answers they gave."""
     if study.settings.evaluation is None or study.material is not None:
         return
     begun = evaluation_plan.begun(session, study)
@@ -122,11 +140,11 @@ def _borrowers(session: Session, study: Study) -> Iterator[tuple[Participant, Ev
         reward = newest_model(session, participant.id, ModelKind.REWARD) if lent else None
         if reward is None or participant.id in begun:
             continue
-        all_said = reward.label_count >= study.settings.labels_per_participant
+        said = reward.label_count / study.settings.labels_per_participant
         made = _made(session, participant.id, reward)
         for method in lent:
-            if method not in made and (all_said or _is_here(participant)):
-                yield participant, method, all_said
+            if method not in made and (said >= 1 or _is_here(participant)):
+                yield participant, method, said
 
 
 def _made(session: Session, participant_id: int, reward: Model) -> set[str]:

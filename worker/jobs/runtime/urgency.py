@@ -17,7 +17,7 @@ from sqlalchemy.orm import Session
 from app.db import now
 from app.domain.models import Model, Run, RunKind, RunStatus
 from app.domain.protocol import FROM_OTHERS
-from app.domain.run_keys import AHEAD, BEFORE_AFTER
+from app.domain.run_keys import AHEAD, BEFORE_AFTER, LENT
 from app.domain.studies import Awaited, Participant, Study
 from app.services.evaluation import donors
 from worker.jobs.runtime.records import Job
@@ -119,7 +119,7 @@ class WhoWaits:
         if job.kind == RunKind.SHARED:
             since = self.shared_awaited.get(job.key)
             return Urgency(Level.WAITING if since else Level.POOL, since or _BEGINNING, _STEPS[RunKind.SHARED])
-        if job.about.subject == AHEAD:
+        if job.about.subject in (AHEAD, LENT):
             return Urgency(Level.POOL, _BEGINNING, _LAST_STEP)
         person = None if job.participant_id is None else self.people.get(job.participant_id)
         if person is None:

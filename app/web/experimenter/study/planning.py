@@ -12,14 +12,15 @@ from sqlalchemy.orm import Session
 from app.domain.people import Experimenter, StudyRole
 from app.domain.protocol import Language
 from app.domain.studies import NAME_LENGTH, Study
+from app.errors import AppError
 from app.installed_tasks import catalogue
 from app.services.accounts import browser_sessions
 from app.services.paper import osf
-from app.services.participants import enrolment
+from app.services.participants import enrolment, visits
 from app.services.studies import locking, membership, preregistration, studies
 from app.web.experimenter.study.study_form import study_form
 from app.web.experimenter.study.study_form.form_fields import FIELDS, OF_RECORDINGS, SECTIONS, SIMULATED
-from app.web.experimenter.study.study_form.study_form import FormInvalid, Preset, StudyForm, TypedStudy
+from app.web.experimenter.study.study_form.study_form import FormInvalid, Preset, StudyForm, Typed, TypedStudy
 from app.web.http.authorized_route import AuthorizedRoute
 from app.web.http.deps import (
     PARTICIPANT_COOKIE,
@@ -72,6 +73,7 @@ def create_study(
     try:
         typed = study_form.typed_study(form, own_task, recorded=own_task is not None)
         _check_name(session, experimenter, form, typed.name)
+        _check_visit(session, experimenter, typed)
     except FormInvalid as invalid:
         return _form_page(request, experimenter, form, errors=invalid.errors, own_task=own_task)
     study = studies.create_study(
@@ -111,6 +113,7 @@ def change_settings(
     try:
         typed = study_form.typed_study(form, study.task, recorded=study.material is not None)
         _check_name(session, experimenter, form, typed.name, study)
+        _check_visit(session, experimenter, typed, study)
         locking.change(
             session,
             studio.store,
@@ -235,6 +238,20 @@ def _check_name(
     theirs = membership.visible_to(experimenter)
     if not unchanged and form.same_name != "yes" and studies.others_named(session, name, theirs, study):
         raise FormInvalid({"name": "Another study has this name. Change it, or say below that it is meant."})
+
+
+def _check_visit(session: Session, experimenter: Experimenter, typed: Typed, study: Study | None = None) -> None:
+    """A study can go on from an older one of the same task that the experimenter may change. Raises FormInvalid."""
+    slug = typed.settings.goes_on_from
+    if not slug or (study is not None and study.settings.goes_on_from == slug):
+        return
+    try:
+        membership.enter(session, experimenter, slug, StudyRole.EDITOR)
+    except AppError as error:
+        raise FormInvalid({"goes_on_from": f"You may change no study of the short name {slug}."}) from error
+    earlier = studies.find_study(session, slug)
+    if not visits.fits(earlier, typed.task) or (study is not None and earlier.id >= study.id):
+        raise FormInvalid({"goes_on_from": f"{slug} has to be an older study of the same task, with simulated clips."})
 
 
 def _with_fixed(session: Session, study: Study, form: StudyForm) -> StudyForm:
