@@ -26,7 +26,7 @@ def to_array(found: dict[Any, Any]) -> Any:
     kind = np.dtype(found[b"dtype"])
     if kind.kind not in "biuf":
         raise ValueError("only arrays of numbers are read")
-    return np.frombuffer(found[b"data"], kind).reshape(found[b"shape"])
+    return np.frombuffer(found[b"data"], kind).reshape(found[b"shape"]).copy()  # which may be written to
 
 
 def to_bytes(array: np.ndarray) -> dict[bytes, Any]:

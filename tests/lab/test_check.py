@@ -35,11 +35,18 @@ def change(folder: Path, before: str, after: str, name: str = "lab.toml") -> Non
     (folder / name).write_text(text.replace(before, after))
 
 
+def renamed(folder: Path) -> None:
+    """A module is imported once: what has changed in it needs another name."""
+    (folder / "plane.py").rename(folder / "anew.py")
+    change(folder, "plane:", "anew:")
+
+
 def test_a_whole_lab_can_be_used_and_three_episodes_are_shown(plane: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["check", str(plane)]) == 0
     printed = capsys.readouterr().out
     assert "3 of 3 episodes succeeded" in printed
     assert "python -m worker explore --task plane" in printed
+    assert "rehearse --task plane --labels 30 --users less=effort:1 more=effort:-1" in printed
     with Image.open(plane / "contact_sheet.png") as sheet:
         assert sheet.size == (1440, 720), "six pictures of each of three episodes"
         assert (np.asarray(sheet) != 255).any()
@@ -135,6 +142,21 @@ def test_what_the_environment_says_too_little_of_is_a_remark(plane: Path) -> Non
     assert "instructions.de is missing" in remarks
 
 
+def test_scenarios_that_are_all_alike_are_told_of(plane: Path) -> None:
+    assert "same situation" not in " ".join(found(plane).remarks)
+    change(plane, "self.np_random.uniform(-1.0, 1.0, 2)", "np.array([0.5, 0.5])", "plane.py")
+    renamed(plane)
+    assert "Every scenario is the same situation" in " ".join(found(plane).remarks)
+
+
+def test_a_success_that_is_lost_before_the_end_is_told_of(plane: Path) -> None:
+    assert "no longer" not in said(plane) + " ".join(found(plane).remarks)
+    change(plane, "near = bool", "self.steps += 1\n        near = self.steps == 20 and bool", "plane.py")
+    change(plane, "self.place, self.goal =", "self.steps = 0\n        self.place, self.goal =", "plane.py")
+    renamed(plane)
+    assert "In 3 of 3 episodes it had succeeded at some step, and no longer at the last" in said(plane)
+
+
 def test_a_slow_environment_is_a_remark_with_what_it_will_cost(plane: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("worker.experiments.check_lab.SLOW_EPISODE_S", 0.0)
     assert "This is a slow environment" in " ".join(found(plane).remarks)
@@ -202,6 +224,7 @@ def test_packages_of_the_studio_that_an_installation_has_replaced_are_named() ->
     lock = f"numpy==0.1 \\\n    --hash=sha256:00\nonnx=={version('onnx')} \\\nnot-installed-here==1.0\n"
     assert replaced_packages([lock]) == [f"numpy==0.1 was replaced by {version('numpy')}"]
     assert replaced_packages([lock, f"numpy=={version('numpy')}\n"]) == [], "of development"
+    assert replaced_packages(["", "numpy==0.1\n"]) == [], "the studio runs without what only development needs"
 
 
 def test_a_repetition_that_differs_in_the_last_digits_is_the_same_episode(plane: Path) -> None:
@@ -209,8 +232,7 @@ def test_a_repetition_that_differs_in_the_last_digits_is_the_same_episode(plane:
     change(plane, "np.concatenate([self.place,", noisy, "plane.py")
     assert said(plane) == ""
     change(plane, "1e-7", "1e-2", "plane.py")
-    (plane / "plane.py").rename(plane / "anew.py")
-    change(plane, "plane:", "anew:")
+    renamed(plane)
     assert "the same seed and policy gave another episode" in said(plane)
 
 

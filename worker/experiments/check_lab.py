@@ -4,7 +4,7 @@ import contextlib
 import re
 import sys
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -58,11 +58,13 @@ def check(file: Path, sheet: Path | None = None) -> int:
     if found.wrong:
         sys.stderr.write("What each key means: docs/lab_toml.md\n")
     if not found.wrong:
-        name = lab.read(file).name
-        explore = "" if _explored(lab.read(file)) else f"  python -m worker explore --task {name}\n"
+        installed = lab.read(file)
+        name, judged = installed.name, installed.description.signal_names[-1]
+        explore = "" if _explored(installed) else f"  python -m worker explore --task {name}\n"
         sys.stdout.write(
             f"{file} can be used. Next:\n  export LAB_TASKS={file}\n{explore}"
-            f"  python -m worker rehearse --task {name} --labels 30\n  python -m app demo --task {name}\n"
+            f"  python -m worker rehearse --task {name} --labels 30 --users less={judged}:1 more={judged}:-1\n"
+            f"  python -m app demo --task {name}\n"
         )
     return 1 if found.wrong else 0
 
@@ -135,6 +137,7 @@ def _run(
         wrong.append(
             f"success: none of {EPISODES} episodes succeeded. Check what success says at the last step, episode_steps, "
             "policy.gain and the policy itself."
+            + _lost_again(trajectories)
             + (
                 " A zip of Stable-Baselines3 lacks VecNormalize's statistics; export such a policy as ONNX, with them "
                 "inside."
@@ -194,17 +197,35 @@ def _not_repeated(again: Trajectory, before: Trajectory, described: LabDescripti
     return f"environment: the same seed and policy gave another episode ({differ}). {advice}"
 
 
+def _lost_again(trajectories: Sequence[Trajectory]) -> str:
+    """In how many episodes success came and went, in words."""
+    lost = sum(not each.success and not each.signals[:, 0].all() for each in trajectories)
+    return (
+        f" In {lost} of {len(trajectories)} episodes it had succeeded at some step, and no longer at the last, which counts: lower "
+        "episode_steps, or name a success that stays."
+        if lost
+        else ""
+    )
+
+
 def _remarks(
     described: LabDescription, trajectories: list[Trajectory], seconds: list[float], sheet: Path
 ) -> tuple[str, ...]:
     usual = float(np.median(seconds))
     successes = sum(each.success for each in trajectories)
     remarks = [
-        f"{successes} of {len(trajectories)} episodes succeeded; an episode takes {usual:.2f} s, so exploring "
+        f"{successes} of {len(trajectories)} episodes succeeded.{_lost_again(trajectories)}",
+        f"An episode takes {usual:.2f} s, so exploring "
         f"takes about {EXPLORED_EPISODES * usual / 120:.0f} minutes on two processes, a quarter of it with "
         "--scenarios 50.",
         f"Contact sheet: {sheet}",
     ]
+    first = trajectories[0].observations
+    if all(np.abs(each.observations - first).max() <= REPEATED_WITHIN for each in trajectories[1:]):
+        remarks.append(
+            "Every scenario is the same situation, so nothing is shown of any other: let reset(seed=...) draw what "
+            "differs (docs/lab_toml.md, The same scenario again)."
+        )
     sums = np.array([each.signals.sum(axis=0) for each in trajectories])
     silent = [name for name, column in zip(described.signal_names, sums.T, strict=True) if not column.any()]
     if silent:
@@ -228,16 +249,14 @@ def _remarks(
 
 
 def replaced_packages(locks: Iterable[str]) -> list[str]:
-    """Packages that are installed in a version that no lock has, each with both."""
-    pinned: dict[str, list[str]] = {}
-    for lock in locks:
-        for name, wanted in re.findall(r"^([a-z0-9._-]+)==([^\s;\\]+)", lock, re.MULTILINE):
-            pinned.setdefault(name, []).append(wanted)
+    """Packages of the first lock, with which the studio runs, in a version that no lock has, each with both."""
+    running, *others = (dict(re.findall(r"^([a-z0-9._-]+)==([^\s;\\]+)", lock, re.MULTILINE)) for lock in locks)
+    pinned = {name: {wanted, *(other[name] for other in others if name in other)} for name, wanted in running.items()}
     found = []
     for name, wanted in pinned.items():
         with contextlib.suppress(PackageNotFoundError):
             if (there := version(name)) not in wanted:
-                found.append(f"{name}=={wanted[0]} was replaced by {there}")
+                found.append(f"{name}=={running[name]} was replaced by {there}")
     return found
 
 
