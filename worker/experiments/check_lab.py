@@ -201,8 +201,8 @@ def _lost_again(trajectories: Sequence[Trajectory]) -> str:
     """In how many episodes success came and went, in words."""
     lost = sum(not each.success and not each.signals[:, 0].all() for each in trajectories)
     return (
-        f" In {lost} of {len(trajectories)} episodes it had succeeded at some step, and no longer at the last, which counts: lower "
-        "episode_steps, or name a success that stays."
+        f" In {lost} of {len(trajectories)} episodes it had succeeded at some step, and no longer at the last, which "
+        "counts: lower episode_steps, or name a success that stays."
         if lost
         else ""
     )
