@@ -4,6 +4,7 @@ import argparse
 import sys
 from pathlib import Path
 
+from app import upgrading
 from app.db import Database
 from app.settings import Settings
 from app.storage import ArtefactStore, keep_private
@@ -40,6 +41,7 @@ def _listed(text: str) -> tuple[str, ...]:
 def _import_clips(said: argparse.Namespace) -> int:
     settings = Settings()
     keep_private(settings)
+    upgrading.upgrade(settings)
     database = Database(settings.sqlalchemy_url)
     choices = Choices(said.name, said.camera, said.episodes, said.signals, said.rate)
     try:

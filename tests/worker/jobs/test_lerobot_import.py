@@ -219,14 +219,14 @@ def test_which_camera_must_be_said(camera: str | None, folder: Path) -> None:
         read(folder, Choices(camera=camera))
 
 
-def test_the_command_says_what_is_wrong(
+def test_the_command_needs_no_studio_that_has_run_before_and_says_what_is_wrong(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from app.__main__ import main as app
     from worker.__main__ import main
 
     monkeypatch.setenv("DATA_DIR", str(tmp_path / "data"))
-    app(["migrate"])
+    assert main(["import-clips", str(folder), "--camera", "front", "--episodes", "0:4"]) == 0
+    assert "Imported: " in capsys.readouterr().out
     shutil.rmtree(folder / "meta/episodes")
     assert main(["import-clips", str(folder), "--camera", "front", "--episodes", "0:9"]) == 1
     assert "meta/episodes has 0 Parquet files" in capsys.readouterr().err
