@@ -225,7 +225,7 @@ def test_the_command_needs_no_studio_that_has_run_before_and_says_what_is_wrong(
     from worker.__main__ import main
 
     monkeypatch.setenv("DATA_DIR", str(tmp_path / "data"))
-    assert main(["import-clips", str(folder), "--camera", "front", "--episodes", "0:4"]) == 0
+    assert main(["import-clips", str(folder), "--camera", "front", "--episodes", "0:9"]) == 0
     assert "Imported: " in capsys.readouterr().out
     shutil.rmtree(folder / "meta/episodes")
     assert main(["import-clips", str(folder), "--camera", "front", "--episodes", "0:9"]) == 1
