@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from app.installed_tasks.description import (
     DescribedTask,
@@ -38,6 +38,15 @@ class _Table(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
+def _scales(said: Any) -> Any:
+    if said not in ("delta", "velocity"):
+        raise ValueError(
+            "must be 'delta' or 'velocity': half of a torque or of a position is no slower way. Wrap the environment "
+            "(examples/reacher does), and let the policy say changes or speeds"
+        )
+    return said
+
+
 class LabEnvironment(_Table):
     """Which environment it is and how it is used."""
 
@@ -49,7 +58,7 @@ class LabEnvironment(_Table):
     """given to either, sizes and cameras of pictures among them"""
     rate_hz: float = Field(gt=0.0, le=LARGEST_RATE_HZ)
     """control steps per second"""
-    actions: Literal["delta", "velocity"]
+    actions: Annotated[Literal["delta", "velocity"], BeforeValidator(_scales)]
     """what an action is: a change of position or a speed. Only of these is a part also a slower way."""
     action_names: tuple[Annotated[str, Field(pattern="^[a-z][a-z0-9_]{0,19}$")], ...] = ()
     """one for each action; empty: numbers"""

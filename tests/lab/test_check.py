@@ -4,8 +4,11 @@ import zipfile
 from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import onnx.numpy_helper
+import onnx.parser
 import pytest
 import torch
 from PIL import Image
@@ -33,6 +36,15 @@ def change(folder: Path, before: str, after: str, name: str = "lab.toml") -> Non
     text = (folder / name).read_text()
     assert before in text
     (folder / name).write_text(text.replace(before, after))
+
+
+def graph(body: str, opset: int = 18, weight: type[np.floating[Any]] = np.float32) -> bytes:
+    """A policy in ONNX's own words, with a weight w (4, 2) of ones."""
+    model = onnx.parser.parse_model(f'<ir_version: 10, opset_import: ["" : {opset}]> policy {body}')
+    if "w)" in body:
+        model.graph.initializer.append(onnx.numpy_helper.from_array(np.ones((4, 2), weight), "w"))
+    stored: bytes = model.SerializeToString(deterministic=True)
+    return stored
 
 
 def renamed(folder: Path) -> None:
@@ -66,7 +78,12 @@ def test_what_is_wrong_is_an_exit_code_too(plane: Path, capsys: pytest.CaptureFi
         ("episode_steps = 40", "episode_steps = 5", "episode_steps: Input should be greater than or equal to 20"),
         ('title = "Plane"', "title = Plane", "is not valid TOML"),
         ("rate_hz = 10", "rate_hz = 10\nspeed = 3", "environment.speed is not known here"),
-        ('actions = "delta"', 'actions = "torque"', "environment.actions: Input should be 'delta' or 'velocity'"),
+        (
+            'actions = "delta"',
+            'actions = "torque"',
+            "environment.actions must be 'delta' or 'velocity': half of a torque",
+        ),
+        ('actions = "delta"', 'actions = "position"', "Wrap the environment (examples/reacher does)"),
         ('factory = "plane:Plane"', "", "environment needs either id (a Gymnasium id) or factory"),
         ('info = "height"', "", "signals.height needs either info"),
         ("[signals.height]", "[signals.undelivered]", "signals.undelivered is measured by the studio already"),
@@ -157,6 +174,21 @@ def test_a_success_that_is_lost_before_the_end_is_told_of(plane: Path) -> None:
     assert "In 3 of 3 episodes it had succeeded at some step, and no longer at the last" in said(plane)
 
 
+def test_a_success_that_is_told_at_the_end_alone_counts_and_a_misspelt_one_is_told_of(plane: Path) -> None:
+    change(plane, '{"is_success": near, "height": float(self.place[1])}', "info", "plane.py")
+    change(
+        plane,
+        "return self._seen(), 0.0",
+        'self.steps += 1\n        info = {"height": float(self.place[1])}\n'
+        '        info |= {"is_success": near} if self.steps == 40 else {}\n        return self._seen(), 0.0',
+        "plane.py",
+    )
+    change(plane, "self.place, self.goal =", "self.steps = 0\n        self.place, self.goal =", "plane.py")
+    assert said(plane) == ""
+    change(plane, "is_success", "is_sucess")
+    assert "success.info: the environment's info has no 'is_sucess'; it has height, is_success" in said(plane)
+
+
 def test_a_slow_environment_is_a_remark_with_what_it_will_cost(plane: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("worker.experiments.check_lab.SLOW_EPISODE_S", 0.0)
     assert "This is a slow environment" in " ".join(found(plane).remarks)
@@ -171,6 +203,15 @@ def test_a_slow_environment_is_a_remark_with_what_it_will_cost(plane: Path, monk
         (
             mlp_to_onnx([(np.full((2, 4), np.nan, np.float32), np.zeros(2, np.float32))], "Relu", ""),
             "not two rows of 2",
+        ),
+        (graph("(float[N, 4] seen, float[N, 2] memory) => (float[N, 2] said) { said = Identity(memory) }"), "2 inputs"),
+        (
+            graph("(double[N, 4] seen) => (double[N, 2] said) { said = MatMul(seen, w) }", weight=np.float64),
+            "must be float32 of shape (batch, 4)",
+        ),
+        (
+            graph("(float[N, 4] seen) => (float[N, 2] said) { said = MatMul(seen, w) }", opset=12),
+            "its opset is older than 13",
         ),
     ],
 )
@@ -189,6 +230,34 @@ def test_a_stable_baselines_zip_says_what_the_library_says(plane: Path, algorith
     seen = np.random.default_rng(0).uniform(-1, 1, (20, 7)).astype(np.float32)
     said_by_library, _ = model.predict(seen[:, :4], deterministic=True)
     np.testing.assert_allclose(low + (policy.mean(seen) + 1) / 2 * (high - low), said_by_library, atol=1e-6)
+
+
+def test_a_graph_with_branches_says_what_it_says_alone(plane: Path) -> None:
+    branches = graph(
+        "(float[N, 4] seen) => (float[N, 2] said) { half = Constant <value = float {0.05}> () "
+        "all = MatMul(seen, w) sum = ReduceSum <keepdims = 0> (all) least = Constant <value = float {0.0}> () "
+        "over = Greater(sum, least) said = If (over) <"
+        "then_branch = a () => (float[N, 2] x) { x = Mul(all, half) }, "
+        "else_branch = b () => (float[N, 2] y) { y = Neg(all) }> }"
+    )
+    (plane / "policy.onnx").write_bytes(branches)
+    policy = lab_policy.load(plane / "policy.onnx", 4, 7, (np.full(2, -1.0), np.full(2, 1.0)))
+    seen = np.full((1, 7), 0.1, np.float32)
+    np.testing.assert_allclose(policy.mean(seen), [[0.02, 0.02]], rtol=1e-6)
+    np.testing.assert_allclose(policy.mean(-seen), [[0.4, 0.4]], rtol=1e-6)
+
+
+def test_a_recurrent_zip_is_refused_before_anything_else_is_said_of_it(plane: Path) -> None:
+    state = {
+        "mlp_extractor.policy_net.0.weight": torch.zeros(16, 256),
+        "action_net.weight": torch.zeros(2, 16),
+        "lstm_actor.weight_ih_l0": torch.zeros(1024, 4),
+    }
+    torch.save(state, plane / "policy.pth")
+    with zipfile.ZipFile(plane / "policy.zip", "w") as archive:
+        archive.write(plane / "policy.pth", "policy.pth")
+    change(plane, "policy.onnx", "policy.zip")
+    assert "it is recurrent, and the studio asks for a function of what is seen" in said(plane)
 
 
 def test_a_zip_whose_weights_want_to_run_code_is_refused(plane: Path) -> None:

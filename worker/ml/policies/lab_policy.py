@@ -68,8 +68,14 @@ def _of_ours(file: Path, bounds: tuple[FloatArray, FloatArray]) -> bytes:
 def _of_stable_baselines(
     file: Path, activation: str | None, bounds: tuple[FloatArray, FloatArray], settings: Mapping[int, float]
 ) -> bytes:
-    """The actor of SAC, TD3, DDPG, PPO or A2C, told by the names of its weights."""
+    """The actor of SAC, TQC, TD3, DDPG, PPO, TRPO or A2C, told by the names of its weights."""
     state = _state(file)
+    if any("lstm" in name for name in state):
+        raise NotAPolicy(
+            "it is recurrent, and the studio asks for a function of what is seen. Train one without memory, or let the "
+            "environment's observation hold what it has to remember (gymnasium.wrappers.FrameStackObservation and "
+            "FlattenObservation)."
+        )
     activation = activation or _told_activation(file)
     if any(name.startswith("actor.latent_pi") for name in state) and "actor.mu.weight" not in state:
         raise NotAPolicy("its noise depends on the state (use_sde=True), whose mean is bounded; export it as ONNX.")
@@ -81,7 +87,10 @@ def _of_stable_baselines(
     elif "action_net.weight" in state:  # PPO and A2C: a mean in the environment's own unit, clipped
         found, squash, usual = [*_layers(state, "mlp_extractor.policy_net"), _layer(state, "action_net")], "", "tanh"
     else:
-        raise NotAPolicy(f"its weights ({', '.join(sorted(state)[:4])}, ...) are none of SAC, TD3, DDPG, PPO or A2C.")
+        raise NotAPolicy(
+            f"its weights ({', '.join(sorted(state)[:4])}, ...) are none of SAC, TQC, TD3, DDPG, "
+            "PPO, TRPO or A2C; export it as ONNX."
+        )
     if any("features_extractor" in name and "mlp" not in name for name in state):
         raise NotAPolicy("it looks at pictures or has features of its own; export it as ONNX.")
     stored = mlp_to_onnx(found, _OPERATIONS[activation or usual], squash)
@@ -170,7 +179,8 @@ def _layers(state: Mapping[str, Any], prefix: str) -> list[tuple[Float32Array, F
 
 
 def _layer(state: Mapping[str, Any], name: str) -> tuple[Float32Array, Float32Array]:
-    weight, bias = state[f"{name}.weight"], state[f"{name}.bias"]
+    weight, bias = state[f"{name}.weight"], state.get(f"{name}.bias")
     if weight.ndim != 2:
-        raise NotAPolicy("it looks at pictures; export it as ONNX.")
-    return weight.numpy().astype(np.float32), bias.numpy().astype(np.float32)
+        raise NotAPolicy(f"its layer {name} is not a plain one (pictures, normalisation); export it as ONNX.")
+    shift = np.zeros(len(weight), np.float32) if bias is None else bias.numpy().astype(np.float32)
+    return weight.numpy().astype(np.float32), shift

@@ -135,10 +135,10 @@ def adapted(
         "least": np.array(-1.0, np.float32),
         "most": np.array(1.0, np.float32),
     }
-    inner = {inputs[0].name: "lab/own", model.graph.output[0].name: "lab/action"}
+    _rename(model.graph, {inputs[0].name: "lab/own", model.graph.output[0].name: "lab/action"})
     nodes = [
         helper.make_node("Slice", [INPUT, "first", "last", "axis"], ["lab/own"]),
-        *_renamed(model, inner),
+        *model.graph.node,
         helper.make_node("Sub", ["lab/action", "middle"], ["centred"]),
         helper.make_node("Div", ["centred", "half"], ["unit"]),
         helper.make_node("Clip", ["unit", "least", "most"], ["bounded"]),
@@ -161,7 +161,9 @@ def adapted(
     version = max([OPSET, *(each.version for each in model.opset_import if each.domain in ("", "ai.onnx"))])
     if any(each.version < 13 for each in model.opset_import if each.domain in ("", "ai.onnx")):
         raise NotAPolicy("its opset is older than 13. Export it again with opset_version=18.")
-    joined = helper.make_model(graph, opset_imports=[helper.make_opsetid("", version), *opsets])
+    joined = helper.make_model(
+        graph, functions=model.functions, opset_imports=[helper.make_opsetid("", version), *opsets]
+    )
     joined.ir_version = max(IR_VERSION, model.ir_version)
     written: bytes = joined.SerializeToString(deterministic=True)
     policy = OnnxPolicy(written, observation_size)
@@ -207,19 +209,21 @@ def mlp_to_onnx(layers: Sequence[tuple[Float32Array, Float32Array]], activation:
     return stored
 
 
-def _renamed(model: onnx.ModelProto, inner: dict[str, str]) -> list[onnx.NodeProto]:
-    """The nodes with every name (and those of the initializers) behind a prefix, so that none meets one of ours."""
+def _rename(graph: onnx.GraphProto, inner: Mapping[str, str]) -> None:
+    """Every name, those in branches too, behind a prefix, so that none meets one of ours. Changes the graph."""
 
     def new(name: str) -> str:
         return name and inner.get(name, f"lab/{name}")
 
-    for constant in model.graph.initializer:
-        constant.name = new(constant.name)
-    for node in model.graph.node:
+    for named in (*graph.initializer, *graph.input, *graph.output):
+        named.name = new(named.name)
+    for node in graph.node:
         node.name = ""
         for names in (node.input, node.output):
             names[:] = [new(name) for name in names]
-    return list(model.graph.node)
+        for attribute in node.attribute:
+            for branch in (attribute.g, *attribute.graphs):
+                _rename(branch, inner)
 
 
 def _require_shape(which: str, value: onnx.ValueInfoProto, size: int, what: str) -> None:
