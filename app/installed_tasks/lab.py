@@ -100,7 +100,7 @@ class LabPolicy(_Table):
     execution_horizon: int = Field(default=1, ge=1, le=1000)
     """of every chunk of actions so many are executed before the next is asked for"""
     gain: float = Field(default=1.0, gt=0.0, le=1.0)
-    """its actions are multiplied by this, so that somebody may also want it quicker"""
+    """its actions that move the robot are multiplied by this, so that somebody may also want it quicker"""
     activation: Literal["relu", "tanh", "elu"] | None = None
     """of a Stable-Baselines3 network; None: what its algorithm uses unless told otherwise"""
     settings: dict[str, float] = {}

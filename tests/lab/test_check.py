@@ -15,11 +15,17 @@ from PIL import Image
 from stable_baselines3 import PPO, SAC, TD3
 from stable_baselines3.common.base_class import BaseAlgorithm
 
+from app.installed_tasks import lab
+from app.installed_tasks.lab import LabDescription
 from tests.lab.conftest import way_to_goal
 from worker.__main__ import main
+from worker.compute.lab_policies import policy_of
+from worker.experiments import lab_ranges
 from worker.experiments.check_lab import Checked, checked, replaced_packages
 from worker.ml.policies import lab_policy
-from worker.ml.policies.onnx_policy import mlp_to_onnx
+from worker.ml.policies.onnx_policy import OnnxPolicy, mlp_to_onnx
+from worker.ml.policies.remote_policy import in_unit
+from worker.sim.lab.environment import LabEnvironment
 from worker.sim.lab.references import named_object
 
 
@@ -127,6 +133,11 @@ def test_a_mistake_in_the_file_is_said_with_its_key_and_what_to_do(
             "Without a screen MuJoCo draws by EGL: install libegl1",
         ),
         ("spaces.Box(-0.1, 0.1, (2,))", "spaces.Discrete(4)", "one vector of continuous numbers"),
+        (
+            "spaces.Box(-0.1, 0.1, (2,))",
+            "spaces.Box(0.0, 0.1, (2,))",
+            "action x goes from 0 to 0.1, so its middle is no standstill",
+        ),
         ("spaces.Box(-0.1, 0.1, (2,))", "spaces.Box(-np.inf, np.inf, (2,))", "its actions have no bounds"),
         ("spaces.Box(-2.0, 2.0, (4,))", "spaces.Box(-2.0, 2.0, (2, 2))", "only vectors are known"),
         ("spaces.Box(-2.0, 2.0, (4,))", "spaces.Discrete(3)", "must be a Box or a Dict"),
@@ -258,6 +269,24 @@ def test_a_recurrent_zip_is_refused_before_anything_else_is_said_of_it(plane: Pa
         archive.write(plane / "policy.pth", "policy.pth")
     change(plane, "policy.onnx", "policy.zip")
     assert "it is recurrent, and the studio asks for a function of what is seen" in said(plane)
+
+
+@pytest.mark.parametrize("url", ["", "ws://localhost:1"])
+def test_actions_that_do_not_move_the_robot_are_as_the_policy_says_them_whatever_the_gain(
+    plane: Path, url: str
+) -> None:
+    change(plane, "rate_hz = 10", "rate_hz = 10\nmoving = [0]")
+    if url:
+        change(plane, 'file = "policy.onnx"', f'url = "{url}"')
+    described = lab.read(plane / "lab.toml").description
+    assert isinstance(described, LabDescription)
+    environment = LabEnvironment(described, plane)
+    policy = policy_of(described, plane, lab_ranges.first_found(described, environment, plane))
+    if isinstance(policy, OnnxPolicy):
+        said = policy.mean(np.array([[0, 0, 1, -1, 0, 0, 0]], np.float32))
+    else:
+        said = in_unit(np.array([[0.1, -0.1]]), *map(np.array, policy.asking.bounds), policy.asking.gain)
+    np.testing.assert_allclose(said, [[0.5, -1.0]], atol=1e-3)
 
 
 def test_a_zip_whose_weights_want_to_run_code_is_refused(plane: Path) -> None:

@@ -17,13 +17,12 @@ def policy_of(described: LabDescription, folder: Path, found: Found, name: str =
     Raises NotAPolicy, and LabTaskBroken for its inputs.
     """
     said, size = described.policy_named(name), sum(each.size for each in found.observation)
+    gain = np.where(np.isin(np.arange(len(found.action)), found.moving), said.gain, 1.0)
     if said.file is not None:
         low, high = (np.array(each) for each in found.bounds)
         kept = {each.name: place for place, each in enumerate(found.action)}
         settings = {kept[action]: value for action, value in said.settings.items()}
-        return lab_policy.load(
-            folder / said.file, found.own_size, size, (low, high), said.gain, said.activation, settings
-        )
+        return lab_policy.load(folder / said.file, found.own_size, size, (low, high), gain, said.activation, settings)
     asking = Asking(
         url=str(said.url),
         answer_s=said.answer_s,
@@ -32,7 +31,7 @@ def policy_of(described: LabDescription, folder: Path, found: Found, name: str =
         execution_horizon=said.execution_horizon,
         episode_steps=described.episode_steps,
         bounds=found.bounds,
-        gain=said.gain,
+        gain=tuple(gain.tolist()),
         name=name,
     )
     return RemotePolicy(asking, size, found.answered_others.get(name) if name else found.answered)

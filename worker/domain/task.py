@@ -33,7 +33,7 @@ class LabInterface:
     moving: tuple[int, ...]
     """the actions that are speeds or changes of position, from 0"""
     gain: float
-    """by which the policy's actions are multiplied"""
+    """by which the policy's actions that move the robot are multiplied"""
     inputs: tuple[tuple[str, tuple[int, ...]], ...]
     """what a policy is sent: names with columns of the observation"""
     prompt: str | None

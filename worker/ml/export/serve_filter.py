@@ -230,7 +230,7 @@ class FilterLoop:
         others.update({name: said for name, said in answer.items() if name not in ("actions", "filter")})
         said = self.interface["policy"]
         chunk = chunk_of(answer, len(self._low))[: said["execution_horizon"]]
-        return (said["gain"] * self._in_unit(chunk)).astype(np.float32)
+        return (np.where(self._moving, said["gain"], 1.0) * self._in_unit(chunk)).astype(np.float32)
 
     def _passed_on(self, observation: Any, stored: bytes) -> bytes:
         """A client's message as it came, without what is said to the filter alone and with what the policy needs."""

@@ -28,7 +28,7 @@ def load(
     own_size: int,
     observation_size: int,
     bounds: tuple[FloatArray, FloatArray],
-    gain: float = 1.0,
+    gain: float | FloatArray = 1.0,
     activation: str | None = None,
     settings: Mapping[int, float] = MappingProxyType({}),
 ) -> OnnxPolicy:

@@ -88,14 +88,14 @@ def adapted(
     own_size: int,
     observation_size: int,
     bounds: tuple[FloatArray, FloatArray],
-    gain: float,
+    gain: float | FloatArray,
     settings: Mapping[int, float] = MappingProxyType({}),
 ) -> OnnxPolicy:
     """A laboratory's graph as a policy of the studio's.
 
     It is given the first ``own_size`` numbers of an observation; its actions, in the environment's own unit with these
-    bounds (A,), are mapped to [-1, 1] and multiplied by ``gain``. ``settings``: actions that stay at a value in the
-    environment's own unit, whatever the graph says of them, if it says anything. Raises NotAPolicy.
+    bounds (A,), are mapped to [-1, 1] and multiplied by ``gain``, one number or (A,). ``settings``: actions that stay
+    at a value in the environment's own unit, whatever the graph says of them, if it says anything. Raises NotAPolicy.
     """
     try:
         model = onnx.load_from_string(stored)
@@ -131,7 +131,7 @@ def adapted(
         "axis": np.array([1], np.int64),
         "middle": middle[own].astype(np.float32),
         "half": half[own].astype(np.float32),
-        "gain": np.array([gain], np.float32),
+        "gain": np.unique(gain).astype(np.float32) if np.ptp(gain) == 0.0 else np.asarray(gain, np.float32)[own],
         "least": np.array(-1.0, np.float32),
         "most": np.array(1.0, np.float32),
     }

@@ -39,7 +39,8 @@ class Asking:
     episode_steps: int
     bounds: tuple[tuple[float, ...], tuple[float, ...]]
     """(A,), (A,) of the actions in the environment's own unit"""
-    gain: float
+    gain: tuple[float, ...]
+    """(A,) by which actions in [-1, 1] are multiplied"""
     name: str = ""
     """among several policies; empty: the frozen one"""
 
@@ -176,10 +177,10 @@ def message(inputs: Sequence[tuple[str, Sequence[int]]], prompt: str | None, obs
     return parts if prompt is None else {**parts, "prompt": prompt}
 
 
-def in_unit(actions: FloatArray, low: FloatArray, high: FloatArray, gain: float) -> Float32Array:
+def in_unit(actions: FloatArray, low: FloatArray, high: FloatArray, gain: Sequence[float]) -> Float32Array:
     """(..., A) in the environment's own unit -> in [-1, 1], as onnx_policy.adapted() has it."""
     unit = np.clip((actions - (high + low) / 2.0) / ((high - low) / 2.0), -1.0, 1.0)
-    return (gain * unit).astype(np.float32)
+    return (np.array(gain) * unit).astype(np.float32)
 
 
 def _row(chunk: Float32Array) -> list[float]:

@@ -83,6 +83,14 @@ class LabEnvironment:
             )
         if any(index >= len(names) for index in self.description.environment.moving):
             raise LabTaskBroken("environment.moving", f"actions are numbered from 0 to {len(names) - 1}.")
+        for index in self.description.environment.moving or range(len(names)):
+            if not np.isclose(self._low[index], -self._high[index]):
+                raise LabTaskBroken(
+                    "environment.moving",
+                    f"action {names[index]} goes from {self._low[index]:g} to {self._high[index]:g}, so its middle is "
+                    "no standstill and a part of it no slower way. Name the other actions there, if it does not move the "
+                    "robot, or wrap the environment so that it goes as far below 0 as above.",
+                )
         self.action_names = names
         self.observation = self._described_observation()
         self.own_size = gymnasium.spaces.flatdim(self._made.observation_space)
