@@ -88,8 +88,8 @@ class LabEnvironment:
                 raise LabTaskBroken(
                     "environment.moving",
                     f"action {names[index]} goes from {self._low[index]:g} to {self._high[index]:g}, so its middle is "
-                    "no standstill and a part of it no slower way. Name the other actions there, if it does not move the "
-                    "robot, or wrap the environment so that it goes as far below 0 as above.",
+                    "no standstill and a part of it no slower way. Name the other actions there, if it does not move "
+                    "the robot, or wrap the environment so that it goes as far below 0 as above.",
                 )
         self.action_names = names
         self.observation = self._described_observation()
