@@ -53,6 +53,13 @@ def graph(body: str, opset: int = 18, weight: type[np.floating[Any]] = np.float3
     return stored
 
 
+def write_zip(folder: Path, state: dict[str, torch.Tensor]) -> None:
+    """As Stable-Baselines3 stores weights."""
+    torch.save(state, folder / "policy.pth")
+    with zipfile.ZipFile(folder / "policy.zip", "w") as archive:
+        archive.write(folder / "policy.pth", "policy.pth")
+
+
 def renamed(folder: Path) -> None:
     """A module is imported once: what has changed in it needs another name."""
     (folder / "plane.py").rename(folder / "anew.py")
@@ -258,15 +265,24 @@ def test_a_graph_with_branches_says_what_it_says_alone(plane: Path) -> None:
     np.testing.assert_allclose(policy.mean(-seen), [[0.4, 0.4]], rtol=1e-6)
 
 
+def test_a_zip_with_layers_that_are_not_plain_is_refused(plane: Path) -> None:
+    layers = {"actor.latent_pi.0": (16, 4), "actor.mu": (2, 16)}
+    state = {f"{name}.weight": torch.zeros(shape) for name, shape in layers.items()}
+    state |= {f"{name}.bias": torch.zeros(shape[0]) for name, shape in layers.items()}
+    write_zip(plane, state)
+    assert lab_policy.load(plane / "policy.zip", 4, 7, (np.full(2, -1.0), np.full(2, 1.0)))
+    write_zip(plane, state | {"actor.latent_pi.1.running_mean": torch.zeros(16)})  # as CrossQ's
+    change(plane, "policy.onnx", "policy.zip")
+    assert "its layer actor.latent_pi.1.running_mean is not a plain one" in said(plane)
+
+
 def test_a_recurrent_zip_is_refused_before_anything_else_is_said_of_it(plane: Path) -> None:
     state = {
         "mlp_extractor.policy_net.0.weight": torch.zeros(16, 256),
         "action_net.weight": torch.zeros(2, 16),
         "lstm_actor.weight_ih_l0": torch.zeros(1024, 4),
     }
-    torch.save(state, plane / "policy.pth")
-    with zipfile.ZipFile(plane / "policy.zip", "w") as archive:
-        archive.write(plane / "policy.pth", "policy.pth")
+    write_zip(plane, state)
     change(plane, "policy.onnx", "policy.zip")
     assert "it is recurrent, and the studio asks for a function of what is seen" in said(plane)
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from stable_baselines3 import PPO, SAC
+from stable_baselines3.common.base_class import BaseAlgorithm
 from starlette.testclient import TestClient
 from websockets.sync.server import ServerConnection, serve
 
@@ -111,15 +112,18 @@ def test_a_policy_that_was_trained_with_other_activations_says_what_the_library_
 
 
 @pytest.mark.parametrize(
-    ("how", "complaint"),
+    ("algorithm", "how", "complaint"),
     [
-        ({"use_sde": True}, "whose mean is bounded; export it as ONNX"),
-        ({"policy_kwargs": {"activation_fn": torch.nn.SiLU}}, "its activation function is SiLU"),
+        (SAC, {"use_sde": True}, "whose mean is bounded; export it as ONNX"),
+        (PPO, {"use_sde": True, "policy_kwargs": {"squash_output": True}}, "its actions are squashed"),
+        (SAC, {"policy_kwargs": {"activation_fn": torch.nn.SiLU}}, "its activation function is SiLU"),
     ],
 )
-def test_a_network_that_is_not_known_is_refused(plane: Path, how: dict[str, object], complaint: str) -> None:
+def test_a_network_that_is_not_known_is_refused(
+    plane: Path, algorithm: type[BaseAlgorithm], how: dict[str, object], complaint: str
+) -> None:
     env = named_object(plane, "environment.factory", "plane:Plane")()
-    SAC("MlpPolicy", env, device="cpu", buffer_size=1, **how).save(plane / "policy.zip")  # type: ignore[arg-type]
+    algorithm("MlpPolicy", env, device="cpu", **how).save(plane / "policy.zip")  # type: ignore[arg-type]
     with pytest.raises(NotAPolicy, match=complaint):
         lab_policy.load(plane / "policy.zip", 4, 7, BOUNDS)
 

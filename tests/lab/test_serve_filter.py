@@ -18,6 +18,7 @@ import pytest
 from app.installed_tasks import lab
 from app.installed_tasks.lab import LabDescription
 from tests.lab.policy_server import Answer, serving, to_goal
+from tests.lab.test_check import change
 from tests.worker import invented
 from worker.compute.lab_policies import policy_of
 from worker.domain.task import Task
@@ -86,7 +87,11 @@ def of(answer: dict[str, Any]) -> tuple[str, list[float]]:
     return answer["filter"]["state"], np.round(answer["actions"][0], 6).tolist()
 
 
-def test_the_loop_acts_as_the_studio_did_when_the_filter_was_fitted(plane_of: Callable[..., Plane]) -> None:
+@pytest.mark.parametrize("moving", ["[0, 1]", "[1]"])
+def test_the_loop_acts_as_the_studio_did_when_the_filter_was_fitted(
+    plane: Path, plane_of: Callable[..., Plane], moving: str
+) -> None:
+    change(plane, "rate_hz = 10", f"rate_hz = 10\nmoving = {moving}")
     made = plane_of()
     trajectory = made.environment.episode(made.filter, 3)
     loop = made.loop()

@@ -19,6 +19,7 @@ from worker.ml.policies.onnx_policy import NotAPolicy, OnnxPolicy, adapted, mlp_
 from worker.ml.policies.policy_onnx import policy_to_onnx
 
 LARGEST_BYTES = 256 << 20
+NOT_PLAIN = "its layer {} is not a plain one (pictures, normalisation); export it as ONNX."
 _WEIGHTS, _DATA = "policy.pth", "data"
 _OPERATIONS = {"relu": "Relu", "tanh": "Tanh", "elu": "Elu"}
 
@@ -76,7 +77,8 @@ def _of_stable_baselines(
             "environment's observation hold what it has to remember (gymnasium.wrappers.FrameStackObservation and "
             "FlattenObservation)."
         )
-    activation = activation or _told_activation(file)
+    arguments = _arguments(file)
+    activation = activation or _told_activation(arguments)
     if any(name.startswith("actor.latent_pi") for name in state) and "actor.mu.weight" not in state:
         raise NotAPolicy("its noise depends on the state (use_sde=True), whose mean is bounded; export it as ONNX.")
     found: list[tuple[Float32Array, Float32Array]]
@@ -85,6 +87,8 @@ def _of_stable_baselines(
     elif any(name.startswith("actor.mu.") for name in state):  # TD3 and DDPG
         found, squash, usual = _layers(state, "actor.mu"), "Tanh", "relu"
     elif "action_net.weight" in state:  # PPO and A2C: a mean in the environment's own unit, clipped
+        if arguments.get("squash_output"):
+            raise NotAPolicy("its actions are squashed (squash_output=True); export it as ONNX.")
         found, squash, usual = [*_layers(state, "mlp_extractor.policy_net"), _layer(state, "action_net")], "", "tanh"
     else:
         raise NotAPolicy(
@@ -147,21 +151,26 @@ def _state(file: Path) -> Mapping[str, Any]:
     return state
 
 
-def _told_activation(file: Path) -> str | None:
-    """The activation function that the file's readable part names; None: it says none, so its algorithm's usual one.
+def _arguments(file: Path) -> Mapping[str, Any]:
+    """What the file's readable part says of how its networks were made; empty: nothing."""
+    with zipfile.ZipFile(file) as archive:
+        if _DATA not in archive.namelist() or archive.getinfo(_DATA).file_size > LARGEST_BYTES:
+            return {}
+        try:
+            data = json.loads(archive.read(_DATA))
+        except ValueError:
+            return {}
+    arguments = data.get("policy_kwargs") if isinstance(data, dict) else None
+    return arguments if isinstance(arguments, dict) else {}
+
+
+def _told_activation(arguments: Mapping[str, Any]) -> str | None:
+    """The activation function's name; None: the file says none, so it is its algorithm's usual one.
 
     What is stored of a class is its name beside its pickle; the name alone is read. Raises NotAPolicy for a function
     that is not known here.
     """
-    with zipfile.ZipFile(file) as archive:
-        if _DATA not in archive.namelist() or archive.getinfo(_DATA).file_size > LARGEST_BYTES:
-            return None
-        try:
-            data = json.loads(archive.read(_DATA))
-        except ValueError:
-            return None
-    arguments = data.get("policy_kwargs") if isinstance(data, dict) else None
-    said = str(arguments.get("activation_fn", "")) if isinstance(arguments, dict) else ""
+    said = str(arguments.get("activation_fn", ""))
     if not (named := re.search(r"activation\.(\w+)'", said)):
         return None
     if named[1].lower() not in _OPERATIONS:
@@ -172,15 +181,17 @@ def _told_activation(file: Path) -> str | None:
 
 
 def _layers(state: Mapping[str, Any], prefix: str) -> list[tuple[Float32Array, Float32Array]]:
-    numbers = sorted(
-        int(found[1]) for name in state if (found := re.fullmatch(rf"{re.escape(prefix)}\.(\d+)\.weight", name))
-    )
+    inside = [name for name in state if name.startswith(f"{prefix}.")]
+    for name in inside:
+        if not re.fullmatch(rf"{re.escape(prefix)}\.\d+\.(weight|bias)", name):
+            raise NotAPolicy(NOT_PLAIN.format(name))
+    numbers = sorted({int(name.split(".")[-2]) for name in inside})
     return [_layer(state, f"{prefix}.{number}") for number in numbers]
 
 
 def _layer(state: Mapping[str, Any], name: str) -> tuple[Float32Array, Float32Array]:
     weight, bias = state[f"{name}.weight"], state.get(f"{name}.bias")
     if weight.ndim != 2:
-        raise NotAPolicy(f"its layer {name} is not a plain one (pictures, normalisation); export it as ONNX.")
+        raise NotAPolicy(NOT_PLAIN.format(name))
     shift = np.zeros(len(weight), np.float32) if bias is None else bias.numpy().astype(np.float32)
     return weight.numpy().astype(np.float32), shift
