@@ -19,7 +19,7 @@ from app.commands import audit_commands, deploy_check
 from app.db import Database, now
 from app.domain.studies import Study
 from app.errors import EXPLAINED, AppError, in_words
-from app.installed_tasks import catalogue
+from app.installed_tasks import catalogue, lab
 from app.installed_tasks.lab import LabDescription
 from app.logs import LogFormat
 from app.paths import DOCS
@@ -235,7 +235,7 @@ def demo_study(settings: Settings, task: str) -> int:
         token = demo.make_empty(session, task)
     say(f"{settings.base_url}/p/{token}")
     installed = catalogue.find(task)
-    if installed and isinstance(installed.description, LabDescription) and not installed.checkpoint.exists():
+    if installed and isinstance(installed.description, LabDescription) and not lab.whole(installed):
         say(f"Nothing is known yet of the ways to do {task}, so its clips wait: python -m worker explore --task {task}")
     return 0
 

@@ -26,6 +26,9 @@ NO_PACKAGE = ""
 NAME = r"[a-z][a-z0-9_]{0,39}"
 LARGEST_RATE_HZ = 100.0
 
+FOUND_FILE, SURFACE_FILE = "found.json", "response_surface.safetensors"
+"""In a task's checkpoint/: the ways that were found; how they do, which is written last."""
+
 ANY_FRAME = "the environment's own"
 REFERENCE = "reference"
 """What the frozen policy is called among those of which one is chosen."""
@@ -285,6 +288,12 @@ def read(file: Path) -> InstalledTask:
         if policy.suffix not in {".onnx", ".zip", ".safetensors"}:
             raise TaskRefused(f"{file}: {key}.file must end in .onnx, .zip (Stable-Baselines3) or .safetensors.")
     return InstalledTask(description.name, NO_PACKAGE, file.parent.resolve(), description, picture="")
+
+
+def whole(installed: InstalledTask) -> bool:
+    """Whether the exploration came to its end: what is written last is there."""
+    of_policies = isinstance(installed.description, LabDescription) and installed.description.policies
+    return (installed.checkpoint / (FOUND_FILE if of_policies else SURFACE_FILE)).exists()
 
 
 def _by_key(policies: dict[str, LabPolicy]) -> dict[str, LabPolicy]:

@@ -71,7 +71,6 @@ def test_a_whole_lab_can_be_used_and_three_episodes_are_shown(plane: Path, capsy
     printed = capsys.readouterr().out
     assert "3 of 3 episodes succeeded" in printed
     assert "python -m worker explore --task plane" in printed
-    assert "rehearse --task plane --labels 30 --users less=effort:1 more=effort:-1" in printed
     with Image.open(plane / "contact_sheet.png") as sheet:
         assert sheet.size == (1440, 720), "six pictures of each of three episodes"
         assert (np.asarray(sheet) != 255).any()

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from app.installed_tasks import lab
-from app.installed_tasks.lab import LabDescription
+from app.installed_tasks.lab import FOUND_FILE, LabDescription
 from worker.compute import simulation
 from worker.domain.task import Task
 from worker.domain.type_aliases import FloatArray
@@ -15,7 +15,6 @@ from worker.experiments import disagreement, lab_ranges
 from worker.experiments.check_lab import checked
 from worker.experiments.disagreement import ENOUGH, Differences
 from worker.sim.lab.environment import LabEnvironment
-from worker.sim.lab.found import FOUND_FILE
 from worker.tasks import registry
 
 

@@ -166,6 +166,8 @@ def test_scripted_people_mind_a_labs_own_signals(
     ):
         assert main(["rehearse", "--task", "plane", "--users", users]) == 1
         assert complaint in capsys.readouterr().err
+    assert main(["rehearse", "--task", "plane", "--users", "high=height:-1"]) == 1, "its ranges alone are found"
+    assert "half explored: python -m worker explore --task plane goes on" in capsys.readouterr().err
     gentle = taste("gentle=height:-2,effort:1")
     names = registry.task("plane").signals
     rewards = gentle.step_rewards(np.eye(len(names)), names)  # type: ignore[attr-defined]

@@ -13,6 +13,7 @@ from app.domain.choices import ClipQuality, Strategy
 from app.domain.protocol import EvaluationSettings
 from app.domain.studies import usual_behaviours
 from app.domain.study_settings import PAPER_PROTOCOL, StudySettings
+from app.installed_tasks import lab
 from app.services.archives import demo_archive
 from app.storage import ArtefactStore
 from worker.commands import options
@@ -146,6 +147,10 @@ def _require_fitting(tastes: Sequence[Taste], name: str) -> None:
             )
         if isinstance(taste, LabTaste):
             taste.step_rewards(np.zeros(len(task.signals)), task.signals)
+    if task.is_a_labs and not lab.whole(registry.installed_task(name)):
+        raise registry.NotExplored(
+            f"The ways to do {name} are half explored: python -m worker explore --task {name} goes on where it was."
+        )
 
 
 def _manner(said: argparse.Namespace) -> Manner:

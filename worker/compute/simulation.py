@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from app.installed_tasks import catalogue
+from app.installed_tasks.lab import SURFACE_FILE
 from worker.compute import lab_clips
 from worker.compute.behaviours import Behaviour, SlowWaves, draw_behaviours
 from worker.domain.scenarios import NORMALISATION
@@ -92,7 +93,7 @@ def _scene() -> Scene:
 
 def surface_file(name: str) -> Path:
     """Where a task's response surface is kept; its record lies beside it."""
-    return checkpoint(name) / "response_surface.safetensors"
+    return checkpoint(name) / SURFACE_FILE
 
 
 def predictor_file(name: str) -> Path:

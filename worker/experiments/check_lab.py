@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 from app.installed_tasks import lab
 from app.installed_tasks.description import InstalledTask, TaskRefused
-from app.installed_tasks.lab import LabDescription
+from app.installed_tasks.lab import FOUND_FILE, LabDescription, whole
 from app.paths import LOCKS
 from worker.compute.lab_clips import SAME_WITHIN
 from worker.compute.lab_policies import policy_of
@@ -28,7 +28,7 @@ from worker.ml.policies.onnx_policy import NotAPolicy, OnnxPolicy
 from worker.ml.policies.remote_policy import RemotePolicy
 from worker.sim.lab.environment import LabEnvironment, Picture
 from worker.sim.lab.errors import LabTaskBroken
-from worker.sim.lab.found import FOUND_FILE, Found, mark_of
+from worker.sim.lab.found import Found, mark_of
 
 EPISODES, PICTURES = 3, 6
 SLOW_EPISODE_S = 5.0
@@ -59,12 +59,11 @@ def check(file: Path, sheet: Path | None = None) -> int:
         sys.stderr.write("What each key means: docs/lab_toml.md\n")
     if not found.wrong:
         installed = lab.read(file)
-        name, judged = installed.name, installed.description.signal_names[-1]
-        explore = "" if _explored(installed) else f"  python -m worker explore --task {name}\n"
+        name = installed.name
+        explore = "" if _explored(installed) and whole(installed) else f"  python -m worker explore --task {name}\n"
         sys.stdout.write(
             f"{file} can be used. Next:\n  export LAB_TASKS={file}\n{explore}"
-            f"  python -m worker rehearse --task {name} --labels 30 --users less={judged}:1 more={judged}:-1\n"
-            f"  python -m app demo --task {name}\n"
+            f"  python -m worker rehearse --task {name} --labels 30\n  python -m app demo --task {name}\n"
         )
     return 1 if found.wrong else 0
 

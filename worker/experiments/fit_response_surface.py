@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from app.installed_tasks.lab import LabDescription
+from app.installed_tasks.lab import FOUND_FILE, LabDescription
 from worker.compute import simulation
 from worker.compute.pools import Compute, Lane
 from worker.domain.scenarios import RESPONSE_SURFACE, RESPONSE_SURFACE_SOUGHT, first_of
@@ -32,7 +32,6 @@ from worker.ml.rewards.reward_models import NEVER_WANTED
 from worker.ml.teachers import random_taste
 from worker.sim.costs import signal_weights
 from worker.sim.lab.environment import LabEnvironment
-from worker.sim.lab.found import FOUND_FILE
 from worker.tasks import registry
 from worker.whole_files import written_whole
 

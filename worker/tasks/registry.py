@@ -7,11 +7,11 @@ from typing import Any
 
 from app.installed_tasks import catalogue
 from app.installed_tasks.description import InstalledTask, TaskDescription
-from app.installed_tasks.lab import LabDescription
+from app.installed_tasks.lab import FOUND_FILE, LabDescription
 from worker.domain.task import Task
 from worker.sim.assistive import AssistiveEnv
 from worker.sim.lab.environment import LabEnvironment
-from worker.sim.lab.found import FOUND_FILE, Found, mark_of
+from worker.sim.lab.found import Found, mark_of
 from worker.sim.render.clip import FilmedTask
 from worker.sim.render.task_look import TaskLook
 

@@ -18,7 +18,6 @@ from worker.domain.task import Answered, LabInterface, Task
 from worker.sim.lab.errors import LabTaskBroken
 from worker.whole_files import written_whole
 
-FOUND_FILE = "found.json"
 _OF_FILES = {"file", "gain", "activation"}
 _WORDS = {"title", "summary", "words", "instructions", "sliders", "hints", "usual_clip_steps"}
 """Nothing that was found depends on these."""
