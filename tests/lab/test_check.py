@@ -300,7 +300,8 @@ def test_actions_that_do_not_move_the_robot_are_as_the_policy_says_them_whatever
     if isinstance(policy, OnnxPolicy):
         said = policy.mean(np.array([[0, 0, 1, -1, 0, 0, 0]], np.float32))
     else:
-        said = in_unit(np.array([[0.1, -0.1]]), *map(np.array, policy.asking.bounds), policy.asking.gain)
+        low, high = (np.array(each) for each in policy.asking.bounds)
+        said = in_unit(np.array([[0.1, -0.1]]), low, high, policy.asking.gain)
     np.testing.assert_allclose(said, [[0.5, -1.0]], atol=1e-3)
 
 
