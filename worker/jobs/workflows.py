@@ -131,11 +131,12 @@ class JobRunner(DBOSConfiguredInstance):
         """The run's id; None when there is nothing to be done, because an earlier life of this job has finished it."""
         job = from_arguments(arguments)
         with self.context.database.writing() as session:
-            if _has_withdrawn(session, job):
-                raise ParticipantWithdrew
-            if records.has_succeeded(session, job.key):
-                return None
-            return records.begin_run(session, job, _seed(session, job))
+            if not _has_withdrawn(session, job):
+                if records.has_succeeded(session, job.key):
+                    return None
+                return records.begin_run(session, job, _seed(session, job))
+            _have_erased_again(session, job)
+        raise ParticipantWithdrew
 
     def _finish(self, run_id: int) -> None:
         with self.context.database.writing() as session:
@@ -170,6 +171,13 @@ def _has_withdrawn(session: Session, job: Job) -> bool:
     return job.participant_id is not None and (
         session.get_one(Participant, job.participant_id).withdrawn_at is not None
     )
+
+
+def _have_erased_again(session: Session, job: Job) -> None:
+    """Work may begin just when the last traces are erased, and then the engine keeps it anew."""
+    session.get_one(Study, job.study_id).erased_at = None
+    if job.participant_id is not None:
+        session.get_one(Participant, job.participant_id).erased_at = None
 
 
 def _is_erased(session: Session, about: RunKey) -> bool:

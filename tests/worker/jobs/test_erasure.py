@@ -87,6 +87,11 @@ def withdraw(database: Database, store: ArtefactStore, participant_id: int) -> N
         withdrawal.withdraw(session, store, session.get_one(Participant, participant_id), actor="P01")
 
 
+def has_ended() -> bool:
+    """Whether the engine has taken up all work, and is done with it."""
+    return not DBOS.list_workflows(status=["ENQUEUED", "PENDING"])
+
+
 def erase(runner: JobRunner, settings: Settings, participant_id: int) -> bool:
     context, file = runner.context, engine.file_of(settings)
     return erasure.erase_traces(context, participant_id, runner.in_hand, runner.stored, file).finished
@@ -174,6 +179,22 @@ def test_work_that_begins_after_the_withdrawal_does_nothing(
     context = runner.context
     withdraw(context.database, context.store, participant.id)
     start(runner, job)
+    assert until(has_ended)
+    assert until(lambda: erase(runner, settings, participant.id))
+    assert not work.waits.is_set()
+    assert traces(settings) == []
+
+
+def test_what_the_engine_keeps_of_work_that_begins_after_the_last_traces_are_erased_goes_as_well(
+    runner: JobRunner, work: Work, job: Job, participant: Participant, settings: Settings
+) -> None:
+    context = runner.context
+    withdraw(context.database, context.store, participant.id)
+    assert until(lambda: erase(runner, settings, participant.id))
+    start(runner, job)
+    assert until(has_ended)
+    with context.database.reading() as session:
+        assert erasure.unfinished(session) == [participant.id]
     assert until(lambda: erase(runner, settings, participant.id))
     assert not work.waits.is_set()
     assert traces(settings) == []
