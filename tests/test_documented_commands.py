@@ -139,6 +139,7 @@ RUN: dict[str, str | Elsewhere | OnlyParsed] = {
     "cluster": REAL_TIME,
     "second_worker": REAL_TIME,
     "point_in_time": REAL_TIME,
+    "replica": REAL_TIME,
     "onlookers": "--people 1 --labels 40 --labellers 1 --dashboards 1 --seconds 1 --thought 0.1",
     "page_times": "--people 1 --labels 20 --times 2",
     "pages": OnlyParsed("photographs a real studio, which takes minutes, and writes to docs/pictures"),

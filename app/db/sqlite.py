@@ -11,6 +11,8 @@ from sqlalchemy import Connection, Engine, create_engine, event, make_url
 from sqlalchemy.exc import OperationalError
 
 BUSY_TIMEOUT_S = 15
+READING_S = 1.0
+"""Whoever reads for longer is no page, but a backup or a program that copies the log."""
 LOOK_AGAIN_S = 0.003
 TAKE_THE_LOCK = "BEGIN IMMEDIATE"
 USUAL_LOG_PAGES, LONGEST_LOG_PAGES = 1000, 20_000
@@ -124,14 +126,25 @@ def rewrite(path: Path) -> bool:
     """Write a SQLite database anew, without what freed pages and the write-ahead log remember. False while it is busy.
 
     Deleting alone leaves the bytes where they were; VACUUM copies only what is alive, and the log is cut to nothing.
+    Where somebody reads all the time, nothing is copied: nobody could save anything meanwhile.
     """
     with closing(sqlite3.connect(path, timeout=BUSY_TIMEOUT_S, isolation_level=None)) as connection:
         try:
             connection.execute("PRAGMA secure_delete=ON")
+            if not _cut_log(connection, READING_S):
+                return False
             connection.execute("VACUUM")
-            busy, *_ = connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchone()
+            return _cut_log(connection, BUSY_TIMEOUT_S)
         except sqlite3.OperationalError:
             return False
+
+
+def _cut_log(connection: sqlite3.Connection, patience_s: float) -> bool:
+    """Copy the write-ahead log into the database and cut it to nothing. False when somebody reads for longer than that;
+    meanwhile nobody can write."""
+    connection.execute(f"PRAGMA busy_timeout={round(1000 * patience_s)}")
+    busy, *_ = connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchone()
+    connection.execute(f"PRAGMA busy_timeout={round(1000 * BUSY_TIMEOUT_S)}")
     return not busy
 
 

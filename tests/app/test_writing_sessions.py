@@ -78,3 +78,22 @@ def test_no_commit_copies_the_log_while_somebody_else_keeps_it_short(database: D
     path.unlink()
     served.keep_log_short()
     assert not path.exists(), "a lost database is to be noticed"
+
+
+@pytest.mark.sqlite("about its write-ahead log")
+def test_nothing_is_rewritten_while_a_program_reads_all_the_time(database: Database) -> None:
+    def free_pages() -> int:
+        with database.reading() as session:
+            return int(session.scalar(text("PRAGMA freelist_count")) or 0)
+
+    for statement in ("CREATE TABLE filler (content BLOB)", "INSERT INTO filler VALUES (zeroblob(400000))"):
+        with database.writing() as session:
+            session.execute(text(statement))
+    with database.reading() as copying:
+        copying.scalar(text("SELECT count(*) FROM filler"))
+        with database.writing() as session:
+            session.execute(text("DROP TABLE filler"))
+        assert not database.forget_erased()
+        assert free_pages() > 0, "whoever wants to save an answer would have waited for that"
+    assert database.forget_erased()
+    assert free_pages() == 0
