@@ -123,6 +123,7 @@ def test_a_network_that_is_not_known_is_refused(
     plane: Path, algorithm: type[BaseAlgorithm], how: dict[str, object], complaint: str
 ) -> None:
     env = named_object(plane, "environment.factory", "plane:Plane")()
+    # The base class wants what each of its algorithms has a default for.
     algorithm("MlpPolicy", env, device="cpu", **how).save(plane / "policy.zip")  # type: ignore[arg-type]
     with pytest.raises(NotAPolicy, match=complaint):
         lab_policy.load(plane / "policy.zip", 4, 7, BOUNDS)

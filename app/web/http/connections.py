@@ -42,6 +42,7 @@ class Connection(H11Protocol):
 
     _patience: asyncio.TimerHandle | None = None
 
+    # uvicorn narrows the argument's type as well: a server's connections are always transports that can be written.
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Begin to wait for a request, unless there are too many who do."""
         super().connection_made(transport)
