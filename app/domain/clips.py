@@ -1,4 +1,4 @@
-"""Rollouts of a study's pool and the videos made of them."""
+"""Rollouts that are compared, of a study's pool or made for one person, and the videos made of them."""
 
 from datetime import datetime
 from typing import Any
@@ -17,6 +17,8 @@ class Rollout(Base):
 
     id: Mapped[int] = mapped_column(primary_key=True)
     study_id: Mapped[int] = mapped_column(ForeignKey("study.id"), index=True)
+    participant_id: Mapped[int | None] = mapped_column(ForeignKey("participant.id"), index=True)
+    """For whom alone it was made, after their answers; None: it is of the pool."""
     scenario: Mapped[int]
     behaviour: Mapped[int]
     mode: Mapped[dict[str, Any]]

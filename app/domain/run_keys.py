@@ -4,6 +4,7 @@ clips/study-1/scenario-17                       the clips of a scenario of the p
 clips/study-1/whole-17                          its whole episodes, for the introduction
 clips/study-1/preview-2                         films ahead for people who set a robot themselves, the third batch
 clips/participant-3/setting-17                  a film of somebody's setting 17
+clips/participant-3/made/labels-20              pairs that follow somebody, after a model of 20 labels
 clips/study-1/again-5-1763811000                lost files of rollout 5, lost at that moment
 reward/participant-3/labels-20                  a reward model of 20 labels
 reward/participant-3/labels-200/answer-345      of all labels, the last of them answer 345
@@ -36,7 +37,7 @@ ROWS = {
 }
 """Tables whose ids stand in keys, by what they stand behind."""
 SCENARIO, WHOLE, AGAIN = "scenario", "whole", "again"
-PREVIEW, SETTING = "preview", "setting"
+PREVIEW, SETTING, MADE = "preview", "setting", "made"
 BEFORE_AFTER, TRIALS, CONTROLLERS, OTHERS = "before-after", "trials", "controllers", "others"
 AHEAD, LENT = "ahead", "lent"
 SHARED_FILTER = "filter"

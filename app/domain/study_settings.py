@@ -402,8 +402,8 @@ class StudySettings(BaseModel):
         0.0,
         Section.LEARNING,
         "Pairs that follow the person",
-        "From the tenth answer on: their robot as it would be now, beside a variation of it, as near as the pool has "
-        "them. With scripted people it did not save answers. 0: none.",
+        "From the tenth answer on: their robot as it would be now, beside a variation of it, filmed for them while "
+        "they answer. With scripted people it did not save answers. 0: none.",
         unit="%",
         ge=0.0,
         le=0.9,

@@ -50,7 +50,10 @@ _PREVIEW = (
     )
     .limit(1)
 )
-_CLIP_OF_STUDY = _CLIP.where(Rollout.study_id == bindparam("study_id"))
+_CLIP_OF_STUDY = _CLIP.where(
+    Rollout.study_id == bindparam("study_id"),
+    or_(Rollout.participant_id.is_(None), Rollout.participant_id == bindparam("participant_id")),
+)
 _FILM_OF_PARTICIPANT = _FILM.where(Film.participant_id == bindparam("participant_id"))
 
 
@@ -67,8 +70,8 @@ async def show_poster(request: Request, sha256: Sha256, studio: StudioDep) -> Re
 
 
 def _require_may_watch(request: Request, session: Session, sha256: str) -> None:
-    """A participant may watch clips and previews of their own study and their own films, an experimenter clips and
-    films of theirs.
+    """A participant may watch clips and previews of their own study, unless they were made for somebody else, and their
+    own films, an experimenter clips and films of theirs.
 
     Raises ClipNotFound.
     """

@@ -4,8 +4,9 @@ import argparse
 import csv
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from itertools import product
+from math import ceil
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +21,16 @@ from app.installed_tasks import catalogue, hints, qualities
 from tests.benchmarks.chosen_modes import stake
 from worker.analysis.comparison import result_pages
 from worker.compute import simulation
+from worker.compute.behaviours import DIFFERENT_ENOUGH
 from worker.compute.population import prior_of
 from worker.domain.responses import TARGETS
+from worker.domain.scenarios import MADE_FROM
 from worker.domain.type_aliases import Float32Array, FloatArray
 from worker.experiments.benchmark_cell import CHOOSE_EVERY
-from worker.jobs.learning import following
+from worker.jobs.clips import made_pairs
 from worker.ml import acquisition
 from worker.ml.filters.response_surface import ResponseSurface, best_mode
+from worker.ml.filters.variations import variation
 from worker.ml.rewards import reward_training
 from worker.ml.rewards.hint_directions import direction
 from worker.ml.rewards.reward_models import RewardModel
@@ -51,7 +55,7 @@ class Variant:
     """What is done otherwise while somebody answers."""
 
     following_share: float = 0.0
-    """of the pairs, from the tenth answer on"""
+    """of the pairs, from the tenth answer on: each is simulated for this user"""
     names: float | None = None
     """How often the quality that speaks most for the chosen clip is what is named; else any is. None: nobody asks."""
     hints: float | None = None
@@ -82,8 +86,6 @@ class Pool:
     costs: Float32Array
     means: FloatArray
     """(C, S) signals of the whole episodes"""
-    modes: FloatArray
-    """(C, A); nan: something else than the mode was different, too"""
     scenarios: acquisition.Indices
 
 
@@ -104,8 +106,8 @@ class Bench:
     def __init__(self, name: str, directory: Path, variants: Mapping[str, Variant]) -> None:
         self.task, self.variants, self.qualities = registry.task(name), variants, qualities.of_task(name)
         self.surface = ResponseSurface.load(simulation.surface_file(name), self.task.modes)
-        self.pool = _pool(name, directory)
-        self.pairs = acquisition.matched_pairs(self.pool.scenarios)
+        self.pool = self._usual_pool = _pool(name, directory)
+        self.pairs = self._usual_pairs = acquisition.matched_pairs(self.pool.scenarios)
         self.scale = SignalScale.of(self.segments(self.pairs), self.pool.means)
         self.prior = prior_of(name, self.scale.spread)
         self._of_users = dict[str, tuple[FloatArray, float, float]]()
@@ -126,15 +128,13 @@ class Bench:
         variant, taste, rng = self.variants[chain.variant], taste_of(chain.user), np.random.default_rng([chain.seed, 7])
         hinted = self._hinted(variant, taste, chain)
         saying = np.random.default_rng([chain.seed, 11])
-        rewards = preference_rewards(
-            self.task, self.pool.costs, self.pool.signals, taste.omega, "calibrated", taste.per_signal
-        )[self.pairs]
-        teacher = ScriptedTeacher.calibrated(Manner(), rewards)
+        self.pool, self.pairs = self._usual_pool, self._usual_pairs
+        teacher = ScriptedTeacher.calibrated(Manner(), self._rewards(taste))
         rows, answers, model = np.zeros(0, np.int64), np.zeros(0), None
         named = np.zeros((0, len(self.task.signals)), bool)
         for count in counts:
             added = self._choose(chain, variant.following_share, count - len(rows), rows, model, rng)
-            said = [TARGETS[teacher.answer(left, right, rng)] for left, right in rewards[added]]
+            said = [TARGETS[teacher.answer(left, right, rng)] for left, right in self._rewards(taste)[added]]
             rows, answers = np.concatenate([rows, added]), np.concatenate([answers, said])
             named = np.concatenate([named, self._named(variant, taste, added, said, saying)])
             asked = self.segments(self.pairs[rows])
@@ -149,6 +149,12 @@ class Bench:
                 hints=hinted,
             ).model
             yield Fitted(rows, answers, model)
+
+    def _rewards(self, taste: Taste) -> FloatArray:
+        """(N, 2, T) of every pair."""
+        return preference_rewards(
+            self.task, self.pool.costs, self.pool.signals, taste.omega, "calibrated", taste.per_signal
+        )[self.pairs]
 
     def _named(
         self,
@@ -196,23 +202,43 @@ class Bench:
         model: Any,
         rng: np.random.Generator,
     ) -> acquisition.Indices:
-        free = np.setdiff1d(np.arange(len(self.pairs)), used)
+        free = np.setdiff1d(np.arange(len(self._usual_pairs)), used)
         if model is None:
             return free[acquisition.choose(count, len(free), rng).indices]
-        near = None
-        if following_share and len(used) >= following.FROM_ANSWER:
-            wanted = best_mode(self.surface, model.signal_weights(()), chain.seed)
-            near = acquisition.nearness(self.pool.modes, self.pairs[free], wanted, self.surface.high - self.surface.low)
         choice = acquisition.choose(
             count,
             len(free),
             rng,
             rule="entropy",
             scores=acquisition.entropy(model.member_probabilities(self.segments(self.pairs[free]))),
-            following_scores=near,
+            made=ceil(following_share * count) if len(used) >= made_pairs.FROM_ANSWER else 0,
             following_share=following_share,
         )
-        return free[choice.indices]
+        usual = free[choice.indices[~choice.following]]
+        return np.append(usual, self._made(chain, model, int(choice.following.sum())))
+
+    def _made(self, chain: Chain, model: Any, count: int) -> acquisition.Indices:
+        """Rows of pairs that are made now: what the user's filter would do, and a variation of it."""
+        wanted = best_mode(self.surface, model.signal_weights(()), chain.seed)
+        return np.array([self._made_of(wanted, chain, model) for _ in range(count)], np.int64)
+
+    def _made_of(self, wanted: FloatArray, chain: Chain, model: Any) -> int:
+        name, rng = self.task.name, np.random.default_rng([chain.seed, 17, len(self.pairs)])
+        shown = self._steps / self.task.episode_steps
+        other = variation(self.surface, model, wanted, shown, DIFFERENT_ENOUGH, rng)
+        scenario = POOL_FIRST + MADE_FROM + len(self.pairs) - len(self._usual_pairs)
+        environment = simulation.environment(name)
+        made = [rollout(environment, simulation.act_in_mode(name, mode), scenario) for mode in (wanted, other)]
+        arrays = ("signals", "observations", "actions", "costs")
+        more = {each: np.array([getattr(side, each)[: self._steps] for side in made]) for each in arrays}
+        grown = {each: np.concatenate([getattr(self.pool, each), more[each]]) for each in arrays}
+        self.pairs = np.append(self.pairs, [[len(self.pool.signals), len(self.pool.signals) + 1]], axis=0)
+        self.pool = replace(self.pool, **grown)
+        return len(self.pairs) - 1
+
+    @property
+    def _steps(self) -> int:
+        return int(self._usual_pool.signals.shape[1])
 
     def gained(self, user: str, mode: FloatArray) -> Row:
         """What the response surface says the mode is worth to them."""
@@ -246,7 +272,7 @@ def _pool(name: str, directory: Path) -> Pool:
         np.savez(unfinished, allow_pickle=False, **vars(_rolled(name)))
         unfinished.rename(path)
     with np.load(path, allow_pickle=False) as stored:
-        return Pool(**{part: stored[part] for part in stored.files})
+        return Pool(**{part.name: stored[part.name] for part in fields(Pool)})
 
 
 def _rolled(name: str) -> Pool:
@@ -260,14 +286,13 @@ def _rolled(name: str) -> Pool:
         rollout(simulation.environment(name), simulation.act_as(name, each), scenario)
         for scenario, each in tqdm(shown, desc=f"{name} pool", unit="rollout", mininterval=5)
     ]
-    steps, family = slice(registry.installed_task(name).description.usual_clip_steps), registry.task(name).modes
+    steps = slice(registry.installed_task(name).description.usual_clip_steps)
     return Pool(
         np.stack([each.signals[steps] for each in made]),
         np.stack([each.observations[steps] for each in made]),
         np.stack([each.actions[steps] for each in made]),
         np.stack([each.costs[steps] for each in made]),
         np.array([each.signals.mean(axis=0, dtype=np.float64) for each in made]),
-        np.array([following.mode_of(family, each.described()) for _, each in shown]),
         np.array([scenario for scenario, _ in shown]),
     )
 

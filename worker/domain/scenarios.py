@@ -33,6 +33,9 @@ NORMALISATION = range(2_000_000_000, 2_000_001_000)
 """Over which reward models have mean 0 and deviation 1."""
 
 _POOL_OF_A_STUDY = 1_000
+MADE_FROM = 500
+"""Of a study's thousand: from here on what is made for one person; a pool has at most as many scenarios."""
+MOST_MADE = _POOL_OF_A_STUDY - MADE_FROM
 _PROMISE_OF_A_STUDY = 4_000
 
 
@@ -47,6 +50,16 @@ def of_pool(study_seed: int, index: int) -> int:
     """The scenario at one place of a study's pool."""
     pools = len(POOL) // _POOL_OF_A_STUDY
     return POOL.start + study_seed % pools * _POOL_OF_A_STUDY + index
+
+
+def of_made(study_seed: int, number: int) -> int:
+    """The scenario of the pair with this number that is made for somebody: the same for everybody in the study.
+
+    Raises ValueError from MOST_MADE on.
+    """
+    if not 0 <= number < MOST_MADE:
+        raise ValueError(f"At most {MOST_MADE} pairs are made for one person.")
+    return of_pool(study_seed, MADE_FROM + number)
 
 
 def of_preview(study_seed: int) -> int:

@@ -21,7 +21,7 @@ from app.domain.run_keys import SCENARIO, WHOLE, RunKey
 from app.domain.studies import Participant, Study
 from app.services.evaluation import evaluation_plan, self_setting
 from worker.domain import scenarios
-from worker.jobs.clips import preview_films, repairs
+from worker.jobs.clips import made_pairs, preview_films, repairs
 from worker.jobs.publishing import export_files, power_plans, report_files
 from worker.jobs.runtime import due_evaluation, due_lending
 from worker.jobs.runtime.due_work import (
@@ -183,7 +183,7 @@ def _clips_by_scenario(session: Session, study: Study, step_count: int | None) -
     counted = (
         select(Rollout.scenario, func.count(Clip.id))
         .join(Clip)
-        .where(Rollout.study_id == study.id, Clip.step_count == step_count)
+        .where(Rollout.study_id == study.id, Rollout.participant_id.is_(None), Clip.step_count == step_count)
         .group_by(Rollout.scenario)
     )
     return dict(session.execute(counted).all())
@@ -212,6 +212,7 @@ def _stale_models(session: Session, study: Study, succeeded: Collection[str], tr
         if count < settings.labels_per_participant:
             jobs += due_evaluation.due_ahead(study, participant_id, arm)
             jobs += due_lending.films_ahead(session, study, participant_id, arm)
+            jobs += made_pairs.due(session, study, reward) if str(reward) in succeeded else []
         else:
             has_set = participant_id in have_set
             jobs += due_evaluation.due(study, reward, succeeded, trained, shown, arm, has_set=has_set)

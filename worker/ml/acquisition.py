@@ -9,7 +9,6 @@ Every rule but the uniform one is a score of each candidate, made here from pred
 score into chances.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -44,7 +43,7 @@ class Choice:
     at_random: npt.NDArray[np.bool_]
     """(K,) True: drawn uniformly, whatever the rule: answers to these measure a model without bias"""
     following: npt.NDArray[np.bool_]
-    """(K,) True: drawn by ``following_scores``"""
+    """(K,) True: made for the person; its index is ``candidates`` at least"""
 
 
 def matched_pairs(scenarios: npt.ArrayLike, behaviours: npt.ArrayLike | None = None) -> Indices:
@@ -100,18 +99,6 @@ def contested(others_probabilities: FloatArray, member_probabilities: FloatArray
     return apart if member_probabilities is None else apart * entropy(member_probabilities) / np.log(2.0)
 
 
-def nearness(modes: FloatArray, pairs: Indices, wanted: FloatArray, width: FloatArray) -> FloatArray:
-    """(C, A) modes of clips, (M, 2) rows of the pairs' clips, (A,) the mode that is wanted -> (M,) at most 0.
-
-    Minus the sum of both clips' distances (root mean square over the axes, each in units of its ``width`` (A,)): the
-    pair is of the wanted mode and a variation of it, as far as there are such clips. A clip whose mode is nan is of no
-    mode alone; its pairs are worth -inf.
-    """
-    distance = np.sqrt((((modes - wanted) / width) ** 2).mean(axis=-1))
-    near: FloatArray = -distance[pairs].sum(axis=-1)
-    return np.where(np.isnan(near), -np.inf, near)
-
-
 def expected_answers(return_differences: FloatArray) -> FloatArray:
     """(U, M) right minus left return of U stand-ins with known tastes -> (U, M) P(right), each in their own unit."""
     unit = np.maximum(np.sqrt((return_differences**2).mean(axis=1, keepdims=True)), 1e-9)
@@ -133,13 +120,14 @@ def choose(
     rule: Strategy = "uniform",
     scores: FloatArray | None = None,
     random_share: float = RANDOM_SHARE,
-    following_scores: FloatArray | None = None,
+    made: int = 0,
     following_share: float = 0.0,
 ) -> Choice:
     """Draw up to ``count`` of ``candidates`` pairs without replacement and put them on sides.
 
-    ``scores`` (candidates,): needed by rules other than uniform; higher is more worth asking. ``following_scores``
-    (candidates,): of the share that follows the person, whatever the rule; -inf is never drawn by it.
+    ``scores`` (candidates,): needed by rules other than uniform; higher is more worth asking. ``made``: so many pairs
+    that were made for the person stand after the candidates; as long as there are some, ``following_share`` of what is
+    drawn is one of them, whatever the rule, and nothing else is.
     Raises ValueError when scores are missing, random_share is not in (0, 1], or the two shares exceed 1.
     """
     if not 0.0 < random_share <= 1.0:
@@ -148,20 +136,22 @@ def choose(
         raise ValueError("following_share must lie in [0, 1 - random_share].")
     if rule != "uniform" and (scores is None or np.shape(scores) != (candidates,)):
         raise ValueError(f"The rule {rule!r} needs one score per candidate.")
-    by_rule = np.zeros(candidates) if scores is None or rule == "uniform" else _standardised(scores)
-    near = np.full(candidates, -np.inf) if following_scores is None else _standardised(following_scores)
+    alike, of_rule = np.zeros(candidates + made), np.zeros(candidates + made)
+    if scores is not None and rule != "uniform":
+        of_rule[:candidates] = _standardised(scores)
     count = min(count, candidates)
-    remaining = np.ones(candidates, bool)
+    remaining, is_made = np.ones(candidates + made, bool), np.arange(candidates + made) >= candidates
     indices, propensities = np.zeros(count, np.int64), np.zeros(count)
     kinds = np.zeros(count, np.int64)
     lots = rng.random(count) if rule != "uniform" or following_share > 0.0 else np.zeros(count)
     for turn in range(count):
-        share = following_share if np.isfinite(near[remaining]).any() else 0.0
+        usual, own = remaining & ~is_made, remaining & is_made
+        share = following_share if own.any() else 0.0
         drawn_at_random = 1.0 - share if rule == "uniform" else random_share
         shares = np.array([drawn_at_random, max(0.0, 1.0 - drawn_at_random - share), share])
-        chances = _chances((by_rule, near), remaining)
+        chances = np.stack([_chances(alike, usual), _chances(of_rule, usual), _chances(alike, own)])
         kinds[turn] = int(lots[turn] >= drawn_at_random) + int(lots[turn] >= 1.0 - share)
-        indices[turn] = rng.choice(candidates, p=chances[kinds[turn]])
+        indices[turn] = rng.choice(len(remaining), p=chances[kinds[turn]])
         propensities[turn] = shares @ chances[:, indices[turn]]
         remaining[indices[turn]] = False
     return Choice(indices, propensities, balanced_sides(count, rng), kinds == AT_RANDOM, kinds == FOLLOWING)
@@ -175,19 +165,15 @@ def balanced_sides(count: int, rng: np.random.Generator) -> npt.NDArray[np.bool_
 
 
 def _standardised(scores: FloatArray) -> FloatArray:
-    """Mean 0 and deviation 1 of what is finite."""
-    finite = scores[np.isfinite(scores)]
-    spread = float(np.std(finite)) if len(finite) else 0.0
-    standardised: FloatArray = (scores - (np.mean(finite) if len(finite) else 0.0)) / (spread if spread > 0.0 else 1.0)
+    """Mean 0 and deviation 1."""
+    spread = float(np.std(scores))
+    standardised: FloatArray = (scores - np.mean(scores)) / (spread if spread > 0.0 else 1.0)
     return standardised
 
 
-def _chances(preferences: Sequence[FloatArray], remaining: npt.NDArray[np.bool_]) -> FloatArray:
-    """(1 + P, M) of a uniform draw and of one by each preference; uniform where it prefers nothing that is left."""
-    uniform = remaining / remaining.sum()
-    chances = [uniform]
-    for preference in preferences:
-        pull = np.where(remaining, SHARPNESS * preference, -np.inf)
-        sharp = np.exp(pull - pull.max()) if np.isfinite(pull.max()) else uniform
-        chances.append(sharp / sharp.sum())
-    return np.stack(chances)
+def _chances(preference: FloatArray, among: npt.NDArray[np.bool_]) -> FloatArray:
+    """(M,) of a draw among some, the preferred ones more often; all 0 where there are none."""
+    pull = np.where(among, SHARPNESS * preference, -np.inf)
+    sharp = np.exp(pull - pull.max()) if among.any() else np.zeros(len(pull))
+    chances: FloatArray = sharp / max(sharp.sum(), 1.0)
+    return chances

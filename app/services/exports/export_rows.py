@@ -467,14 +467,15 @@ def clips(session: Session, study: Study, window: Window = EVERYTHING) -> KeyedR
     rollout = aliased(Rollout)
     place = (rollout.scenario, rollout.behaviour, Clip.first_step, Clip.step_count, Clip.id)
     wanted = (
-        select(Clip, rollout)
+        select(Clip, rollout, Participant)
         .join(rollout, Clip.rollout_id == rollout.id)
+        .outerjoin(Participant, Participant.id == rollout.participant_id)
         .where(rollout.study_id == study.id, window.beyond(*place), window.known(Clip))
         .order_by(*place)
         .execution_options(yield_per=AT_ONCE)
     )
     with session.execute(wanted) as rows:  # whoever wants a page only stops in the middle
-        for clip, run in rows:
+        for clip, run, person in rows:
             yield (
                 (run.scenario, run.behaviour, clip.first_step, clip.step_count, clip.id),
                 (
@@ -488,6 +489,7 @@ def clips(session: Session, study: Study, window: Window = EVERYTHING) -> KeyedR
                     clip.duration_ms,
                     clip.fps,
                     run.trajectory_sha256,
+                    None if person is None else person.code,
                 ),
             )
 

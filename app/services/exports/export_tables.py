@@ -129,7 +129,8 @@ TABLES: Sequence[Table] = (
                 "strategy",
                 T,
                 "How the pair was chosen: at random (uniform), by a rule, or following the person: their robot as it "
-                "would have been then, beside a variation of it. The last four are no pairs for labels.",
+                "would have been then, beside a variation of it, made for them alone. The last four are no pairs for "
+                "labels.",
                 allowed=", ".join((*Strategy, FOLLOWING, *NO_LABELS)),
             ),
             Column(
@@ -488,6 +489,7 @@ TABLES: Sequence[Table] = (
             Column("duration_ms", I, "Length of the video.", "ms"),
             Column("fps", I, "Frames per second.", "1/s"),
             Column("trajectory_sha256", T, "The stored trajectory.", allowed=SHA256),
+            Column("made_for", T, "Participant for whom alone it was made; empty: it is of the study's pool."),
         ),
         export_rows.clips,
         (Clip,),

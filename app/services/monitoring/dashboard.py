@@ -185,8 +185,8 @@ def fingerprint(session: Session) -> str:
 
 def study_lines(session: Session, theirs: ColumnElement[bool], *, put_away: bool = False) -> Sequence[StudySummary]:
     """Of these studies those that are at work, or those that are put away; the newest first."""
-    counted = session.execute(select(Rollout.study_id, func.count(Clip.id)).join(Clip).group_by(Rollout.study_id))
-    clips = dict(counted.all())
+    pools = select(Rollout.study_id, func.count(Clip.id)).join(Clip).where(Rollout.participant_id.is_(None))
+    clips = dict(session.execute(pools.group_by(Rollout.study_id)).all())
     everybody = select(Participant).where(Participant.is_preview.is_(False))
     people: dict[int, list[Participant]] = defaultdict(list)
     for participant in session.scalars(everybody):
@@ -307,7 +307,7 @@ def _versions(session: Session, participant: Participant) -> Sequence[model_metr
 
 
 def _pool(session: Session, study: Study) -> Pool:
-    clips = select(Clip).join(Rollout).where(Rollout.study_id == study.id)
+    clips = select(Clip).join(Rollout).where(Rollout.study_id == study.id, Rollout.participant_id.is_(None))
     runs = session.scalars(
         select(Run).where(Run.study_id == study.id, Run.kind == RunKind.CLIPS).order_by(Run.id)
     ).all()

@@ -152,9 +152,10 @@ def _procedure(session: Session, study: Study) -> Iterator[str]:
             if settings.strategy is not Strategy.UNIFORM
             else "."
         ),
-        f"From the tenth answer on {percent(settings.following_share, 0)} of the pairs followed the participant "
-        "instead, whatever the rule: of the clips that there were they showed those nearest to the execution that "
-        "their filter would have had by then, side by side. Each pair's probability was stored."
+        f"From the tenth answer on {percent(settings.following_share, 0)} of the pairs, as far as they were ready in "
+        "time, followed the participant instead, whatever the rule: they showed the execution that the participant's "
+        "filter would have had by then, beside a variation of it about which the newest model expected an answer to "
+        "say much, both filmed for this participant alone. Each pair's probability was stored."
         if settings.following_share and study.material is None
         else "",
         f"The reward model was “{settings.reward_kind.label}”, trained anew every "

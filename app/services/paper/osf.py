@@ -119,8 +119,9 @@ def _randomisation(study: Study, settings: StudySettings, evaluation: Evaluation
         "in it.",
         f"Pairs: {settings.strategy.label.lower()}; at least {percent(settings.random_share, 0)} are drawn at random. "
         + (
-            f"From the tenth answer on {percent(settings.following_share, 0)} follow the person: clips nearest to what "
-            "their filter would do by then. "
+            f"From the tenth answer on {percent(settings.following_share, 0)} follow the person: what their filter "
+            "would do by then beside a variation of it, filmed for them alone; until such a pair is ready, the rule "
+            "chooses. "
             if settings.following_share and study.material is None
             else ""
         )

@@ -61,6 +61,8 @@ def complaints(task: str, settings: StudySettings, *, recorded: bool = False) ->
     most = installed.description.most_behaviours
     if most is not None and settings.behaviours_per_scenario > most:
         found["behaviours_per_scenario"] = f"This task has {most} policies to choose from. Enter at most {most}."
+    if most is not None and settings.following_share:
+        found["following_share"] = "One of several policies is chosen in this task: nothing can be varied. Enter 0."
     if not installed.description.policy_is_looked_into:
         if settings.method is Method.PRINTED:
             found["method"] = f"PbARL as printed {_NEEDS_WEIGHTS}"

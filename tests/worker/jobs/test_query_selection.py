@@ -13,22 +13,19 @@ from app.db import Database
 from app.domain.choices import Strategy
 from app.domain.clips import Clip
 from app.domain.models import ModelKind, Run
-from app.domain.preferences import FOLLOWING, Query, Response
+from app.domain.preferences import Query, Response
 from app.domain.studies import Participant, Study
 from app.storage import ArtefactDamaged, ArtefactStore
 from tests import stored_files
 from tests.waiting import until
 from worker.compute.pools import Compute
-from worker.compute.simulation import surface_file
 from worker.domain.trajectory import SIGNALS
 from worker.jobs.learning import dataset, query_selection, reward_models
 from worker.jobs.runtime import records
 from worker.jobs.runtime.context import WorkerContext
 from worker.ml import acquisition
-from worker.ml.filters.response_surface import ResponseSurface, best_mode
 from worker.ml.rewards import reward_training
 from worker.ml.rewards.reward_models import StructuredReward
-from worker.tasks import registry
 
 AddClips = Callable[..., list[Clip]]
 Answer = Callable[[Clip, Clip, Response], Query]
@@ -214,52 +211,6 @@ def test_a_pooled_prior_is_of_those_who_joined_before_and_have_answered_everythi
         newcomers = [session.get_one(Participant, each) for each in (participant.id, finished, last)]
         earlier = [reward_models.earlier_models(session, each, study) for each in newcomers]
     assert [[model.participant_id for model in each] for each in earlier] == [[], [], [finished]]
-
-
-def test_from_the_tenth_answer_on_a_share_of_the_pairs_shows_robots_like_the_one_that_the_person_would_have_now(
-    context: WorkerContext, participant: Participant, add_clips: AddClips
-) -> None:
-    settle_on(context, Strategy.UNIFORM, following_share=0.6, random_share=0.3)
-    for scenario in range(1, 5):
-        add_clips(scenario)
-    modes = spread_over_modes(context, participant)
-    save_model_of(context, participant.study_id, participant.id, FIRST_SIGNAL, labels=9)
-    query_selection.refill_queries(context, participant.id)
-    assert {query.strategy for query in queries_of(context.database, participant)} == {"uniform"}
-    save_model_of(context, participant.study_id, participant.id, FIRST_SIGNAL, labels=10)
-    with context.database.writing() as session:
-        records.drop_unseen_queries(session, participant.id, keep=0)
-    query_selection.refill_queries(context, participant.id)
-    chosen = queries_of(context.database, participant)
-    assert {query.strategy for query in chosen} == {FOLLOWING, "uniform"}
-    surface = ResponseSurface.load(surface_file("feeding"), registry.task("feeding").modes)
-    stored = StructuredReward(np.tile(FIRST_SIGNAL, (8, 1)))
-    wanted = best_mode(surface, stored.signal_weights(), participant.seed)
-    width = surface.high - surface.low
-
-    def distance(query: Query) -> float:
-        sides = [(modes[side] - wanted) / width for side in (query.left_clip_id, query.right_clip_id)]
-        return float(sum(np.sqrt((side**2).mean()) for side in sides))
-
-    following = [distance(query) for query in chosen if query.strategy == FOLLOWING]
-    others = [distance(query) for query in chosen if query.strategy == "uniform"]
-    assert np.mean(following) < np.mean(others)
-    assert all(np.isfinite(following)), "a disturbed behaviour is no mode of anybody's robot"
-
-
-def spread_over_modes(context: WorkerContext, participant: Participant) -> dict[int, npt.NDArray[np.float64]]:
-    """Modes of all clips of the pool; of none (nan) are one with a disturbance and one with an axis that is no more."""
-    family, found = registry.task("feeding").modes, {}
-    with context.database.writing() as session:
-        clips = dataset.pool_clips(session, participant.study_id)
-        for clip, mode in zip(clips, family.sample(len(clips), np.random.default_rng(1)), strict=True):
-            clip.rollout.mode = {"mode": family.named(mode)}
-            found[clip.id] = mode
-        clips[0].rollout.mode = {**clips[0].rollout.mode, "disturbance": 0.1}
-        clips[1].rollout.mode = {"mode": {"speed_of_before": 1.0}}
-        for clip in clips[:2]:
-            found[clip.id] = np.full(len(family.axes), np.nan)
-    return found
 
 
 def two_who_disagree_about_the_first_signal(context: WorkerContext, participant: Participant) -> None:

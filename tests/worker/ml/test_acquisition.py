@@ -14,7 +14,6 @@ from worker.ml.acquisition import (
     expected_answers,
     information_gain,
     matched_pairs,
-    nearness,
     score,
 )
 
@@ -156,56 +155,45 @@ def test_sides_are_in_no_fixed_order_and_repeatable() -> None:
     assert first == again != other
 
 
-NEAR = np.array([-np.inf, *np.linspace(-1.0, 0.0, 19)])
-"""The first pair is of no mode; the last is the one that is wanted."""
+MADE = 3
+"""So many pairs were made for the person; they stand after the twenty of the pool."""
 
 
 @pytest.mark.parametrize("rule", ["uniform", "entropy"])
 def test_with_a_share_that_follows_the_propensity_is_still_how_often_a_pair_is_drawn(rule: Strategy) -> None:
     def draw(seed: int) -> Choice:
         rng = np.random.default_rng(seed)
-        return choose(
-            1,
-            20,
-            rng,
-            rule=rule,
-            scores=SCORES[::-1],
-            random_share=0.3,
-            following_scores=NEAR,
-            following_share=0.4,
-        )
+        return choose(1, 20, rng, rule=rule, scores=SCORES[::-1], random_share=0.3, made=MADE, following_share=0.4)
 
     draws = [draw(seed) for seed in range(3000)]
     first = np.array([each.indices[0] for each in draws])
     following, at_random = (np.array([getattr(each, name)[0] for each in draws]) for name in ("following", "at_random"))
     assert following.mean() == pytest.approx(0.4, abs=0.03)
     assert at_random.mean() == pytest.approx(0.6 if rule == "uniform" else 0.3, abs=0.03)
-    assert not (following & at_random).any()
-    assert not following[first == 0].any(), "what is of no mode is drawn by the others alone"
-    assert first[following].mean() > 15 > first[at_random].mean()
+    np.testing.assert_array_equal(following, first >= 20, "what was made for the person is drawn as such, and only so")
     propensity = {int(each.indices[0]): float(each.propensities[0]) for each in draws}
     assert sum(propensity.values()) == pytest.approx(1.0)
-    for pair in (0, 10, 19):
+    for pair in (0, 10, 19, 20, 22):
         assert np.mean(first == pair) == pytest.approx(propensity[pair], abs=0.03)
 
 
-def test_where_nothing_can_follow_the_rule_chooses_all_the_same() -> None:
-    nothing = np.full(4, -np.inf)
-    choice = choose(4, 4, np.random.default_rng(0), random_share=0.5, following_scores=nothing, following_share=0.5)
+def test_as_long_as_nothing_was_made_the_rule_chooses_all_the_same() -> None:
+    choice = choose(4, 4, np.random.default_rng(0), random_share=0.5, following_share=0.5)
     assert choice.at_random.all()
     np.testing.assert_allclose(choice.propensities, [1 / 4, 1 / 3, 1 / 2, 1])
 
 
+def test_when_all_that_was_made_is_given_the_rule_chooses_the_rest() -> None:
+    choice = choose(20, 20, np.random.default_rng(0), random_share=0.3, made=2, following_share=0.7)
+    assert choice.following.sum() == 2
+    assert len(set(choice.indices)) == 20
+    before, last = np.flatnonzero(choice.following)
+    left = 20 - (last - 1)  # of the pool, once the second one is drawn
+    assert choice.propensities[before] == pytest.approx(0.7 / 2)
+    assert choice.propensities[last] == pytest.approx(0.7)
+    np.testing.assert_allclose(choice.propensities[last + 1 :], 1 / np.arange(left, left - (19 - last), -1))
+
+
 def test_a_share_that_follows_leaves_the_random_one_alone() -> None:
     with pytest.raises(ValueError, match="following_share"):
-        choose(1, 20, np.random.default_rng(0), random_share=0.3, following_share=0.8, following_scores=NEAR)
-
-
-def test_the_nearest_pair_is_of_the_wanted_mode_and_its_neighbour() -> None:
-    modes = np.array([[0.0, 0.0], [0.1, 0.0], [0.0, 1.0], [np.nan, np.nan]])
-    pairs = np.array([[0, 1], [0, 2], [1, 2], [0, 3]])
-    near = nearness(modes, pairs, np.zeros(2), np.array([1.0, 1.0]))
-    assert near.argmax() == 0
-    assert near[3] == -np.inf
-    wide = nearness(modes, pairs, np.zeros(2), np.array([1.0, 100.0]))
-    assert wide[0] < wide[1], "an axis counts in units of its range"
+        choose(1, 20, np.random.default_rng(0), random_share=0.3, following_share=0.8, made=MADE)

@@ -1,26 +1,26 @@
 """Clips: every behaviour of one scenario of a study's pool, rolled out and filmed."""
 
-from typing import Any
-
 from app.domain.run_keys import WHOLE
 from app.domain.studies import Study
 from worker.compute import simulation
 from worker.compute.pools import Lane
-from worker.jobs.clips import preview_films, repairs
-from worker.jobs.clips.stored_video import video_columns
+from worker.jobs.clips import made_pairs, preview_films, repairs
+from worker.jobs.clips.stored_video import rows_of_clip, video_columns
 from worker.jobs.runtime import records
 from worker.jobs.runtime.context import Step, WorkerContext
 from worker.jobs.runtime.records import Job
-from worker.sim.render.clip import RenderedClip
 
 AT_A_TIME = 2
 """Two clips already make a pair that can be labelled."""
 
 
 def build_clips(context: WorkerContext, job: Job, run_id: int, step: Step) -> None:
-    """Film what is still missing of the scenario that the job names: clips, or whole episodes; or previews."""
+    """Film what is still missing of the scenario that the job names: clips, or whole episodes; or something else."""
     if repairs.is_about(job):
         repairs.make_again(context, job, run_id, step)
+        return
+    if made_pairs.is_about(job):
+        made_pairs.make(context, job, run_id, step)
         return
     if preview_films.is_about(job):
         preview_films.make(context, job, run_id, step)
@@ -44,14 +44,7 @@ def _film(context: WorkerContext, run_id: int, study_id: int, scenario: int, whi
     shots = [(task, quality, scenario, behaviours[index], 0, settings.clip_steps) for index in which]
     recorded = context.compute.run_all(Lane.CLIPS, context.beat(run_id), simulation.record_clip, shots)
     for index, each in zip(which, recorded, strict=True):
-        rollout = {
-            "scenario": scenario,
-            "behaviour": index,
-            "mode": behaviours[index].described(),
-            "trajectory_sha256": context.store.put(each.trajectory),
-            "success": each.success,
-        }
-        clip = _columns(context, each.clip, settings.clip_steps)
+        rollout, clip = rows_of_clip(context.store, each, scenario, index, behaviours[index], settings.clip_steps)
         with context.database.writing() as session:
             records.save_clip(session, study_id, rollout, clip)
 
@@ -65,10 +58,6 @@ def _film_whole(context: WorkerContext, run_id: int, study_id: int, scenario: in
     shots = [(quality, context.store.read(rollout.trajectory_sha256), 0, steps) for rollout in rollouts]
     filmed = context.compute.run_all(Lane.CLIPS, context.beat(run_id), simulation.film_again, shots)
     for rollout, each in zip(rollouts, filmed, strict=True):
-        clip = _columns(context, each, steps)
+        clip = {"first_step": 0, "step_count": steps, **video_columns(context.store, each)}
         with context.database.writing() as session:
             records.save_clip(session, study_id, {"scenario": scenario, "behaviour": rollout.behaviour}, clip)
-
-
-def _columns(context: WorkerContext, clip: RenderedClip, steps: int) -> dict[str, Any]:
-    return {"first_step": 0, "step_count": steps, **video_columns(context.store, clip)}

@@ -20,6 +20,7 @@ from app.domain.run_keys import AGAIN, RunKey
 from app.domain.studies import Participant, Study
 from app.errors import AppError
 from worker.compute import simulation
+from worker.compute.behaviours import Behaviour
 from worker.compute.pools import Lane
 from worker.domain.trajectory import Trajectory
 from worker.jobs.clips.stored_video import video_columns
@@ -42,19 +43,20 @@ def due(session: Session, study: Study, lost: Mapping[str, int]) -> list[Job]:
     if study.material is not None or not lost:
         return []  # videos of other robots come from outside
     recorded, filmed = Rollout.trajectory_sha256, (Clip.video_sha256, Clip.poster_sha256)
-    pool = select(Rollout.id, recorded, *filmed).outerjoin(Clip, Clip.rollout_id == Rollout.id)
+    pool = select(Rollout.id, Rollout.participant_id, recorded, *filmed).outerjoin(Clip, Clip.rollout_id == Rollout.id)
     pool = pool.where(Rollout.study_id == study.id, or_(*(each.in_(lost) for each in (recorded, *filmed))))
     rendered = (Film.video_sha256, Film.poster_sha256)
     films = select(Film.id, Film.participant_id, *rendered).join(Participant, Participant.id == Film.participant_id)
     films = films.where(Participant.study_id == study.id, Participant.withdrawn_at.is_(None))
     films = films.where(or_(*(each.in_(lost) for each in rendered)))
-    stamps: dict[int, int] = {}  # the same file may be lost twice, and work of one name is done once
-    for rollout, *hashes in session.execute(pool):
-        stamps[rollout] = max(stamps.get(rollout, 0), *(lost.get(sha256, 0) for sha256 in hashes))
-    jobs = [
-        Job(RunKey(RunKind.CLIPS, study.id, subject=AGAIN, number=rollout, mark=str(stamp)), study.id)
-        for rollout, stamp in stamps.items()
-    ]
+    stamps: dict[tuple[int, int | None], int] = {}  # the same file may be lost twice; work of one name is done once
+    for rollout, person, *hashes in session.execute(pool):
+        stamp = stamps.get((rollout, person), 0)
+        stamps[rollout, person] = max(stamp, *(lost.get(sha256, 0) for sha256 in hashes))
+    jobs = []
+    for (rollout, person), stamp in stamps.items():
+        key = RunKey(RunKind.CLIPS, None if person else study.id, person, AGAIN, rollout, str(stamp))
+        jobs.append(Job(key, study.id))
     for film, person, *hashes in session.execute(films):
         stamp = max(lost.get(sha256, 0) for sha256 in hashes)
         key = RunKey(RunKind.FILMS, participant_id=person, subject=AGAIN, number=film, mark=str(stamp))
@@ -84,7 +86,10 @@ def _clips_again(context: WorkerContext, run_id: int, rollout_id: int) -> None:
     if whole:
         trajectory = context.store.read(rollout.trajectory_sha256)
     else:
-        drawn = simulation.behaviours(task, rollout.scenario, settings.behaviours_per_scenario)[rollout.behaviour]
+        if rollout.participant_id is None:
+            drawn = simulation.behaviours(task, rollout.scenario, settings.behaviours_per_scenario)[rollout.behaviour]
+        else:
+            drawn = Behaviour(**rollout.mode)
         shot = (task, quality, rollout.scenario, drawn, 0, settings.clip_steps)
         trajectory = context.compute.run(Lane.CLIPS, context.beat(run_id), simulation.record_clip, *shot).trajectory
     sha256 = hashlib.sha256(trajectory).hexdigest()

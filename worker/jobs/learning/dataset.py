@@ -4,6 +4,7 @@ import hashlib
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from functools import lru_cache
 from pathlib import Path
 
@@ -128,7 +129,8 @@ def stretch(store: ArtefactStore, clip: Clip) -> Stretch:
 
 
 def pool_clips(session: Session, study_id: int) -> Sequence[Clip]:
-    """Every clip of the study's pool with its rollout; of imported clips all, whatever their length."""
+    """Every clip of the study's pool with its rollout; of imported clips all, whatever their length. What was made for
+    one person is not among them."""
     study = session.get_one(Study, study_id)
     return _clips(session, study, study.settings.clip_steps)
 
@@ -139,8 +141,14 @@ def whole_clips(session: Session, study_id: int) -> Sequence[Clip]:
     return _clips(session, study, study.whole_clip_steps)
 
 
+def made_clips(session: Session, participant_id: int, since: datetime) -> Sequence[Clip]:
+    """Clips that were made for one person since a moment, with their rollouts; two of each scenario, a pair."""
+    theirs = select(Clip).join(Rollout).where(Rollout.participant_id == participant_id, Rollout.created_at >= since)
+    return session.scalars(theirs.order_by(Clip.id).options(contains_eager(Clip.rollout))).all()
+
+
 def _clips(session: Session, study: Study, step_count: int | None) -> Sequence[Clip]:
-    of_study = select(Clip).join(Rollout).where(Rollout.study_id == study.id)
+    of_study = select(Clip).join(Rollout).where(Rollout.study_id == study.id, Rollout.participant_id.is_(None))
     if study.material is None:
         of_study = of_study.where(Clip.step_count == step_count)
     return session.scalars(of_study.order_by(Clip.id).options(contains_eager(Clip.rollout))).all()

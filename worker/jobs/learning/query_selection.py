@@ -27,7 +27,7 @@ from app.storage import ArtefactStore
 from worker.compute import learning
 from worker.domain.task import Task
 from worker.domain.type_aliases import FloatArray
-from worker.jobs.learning import dataset, following, query_plan
+from worker.jobs.learning import dataset, query_plan
 from worker.jobs.learning.query_plan import Slot
 from worker.jobs.runtime import records
 from worker.jobs.runtime.context import WorkerContext
@@ -39,6 +39,8 @@ from worker.tasks import registry
 
 log = logging.getLogger("worker.jobs.learning.query_selection")
 
+KEPT_QUERIES = 3
+"""Queries ahead that stay when others are chosen: the page may already be loading them."""
 _CHOSEN_LATER = (Purpose.PREFERENCE, Purpose.REPEAT)
 OTHERS_LABELS = 20
 """So many answers a participant has given before their model speaks for them to others."""
@@ -66,6 +68,14 @@ def refill_queries(context: WorkerContext, participant_id: int) -> None:
     with context.database.writing() as session:
         records.save_queries(session, participant_id, rows)
     predict_waiting(context, participant_id)
+
+
+def choose_anew(context: WorkerContext, participant_id: int) -> None:
+    """Choose the pairs that nobody has seen once more, now that there is a newer model, or a pair made for the person;
+    the next few stay."""
+    with context.database.writing() as session:
+        records.drop_unseen_queries(session, participant_id, keep=KEPT_QUERIES)
+    refill_queries(context, participant_id)
 
 
 def predict_waiting(context: WorkerContext, participant_id: int) -> None:
@@ -99,6 +109,8 @@ class _Known:
     """The clips on the left and right of every pair that has been chosen, by its place."""
     clips: Sequence[Clip]
     """Of the pool, as far as they can be shown."""
+    made: Sequence[Clip]
+    """For this person, after their newest model; two of each scenario."""
     whole_clips: Sequence[Clip]
     """Of whole trajectories."""
     model: Model | None
@@ -125,14 +137,16 @@ def _load(session: Session, participant_id: int, lost: Collection[str]) -> _Know
     follows = Purpose.PREFERENCE in wanted and settings.following_share > 0.0
     contested = scored and settings.strategy is Strategy.CONTESTED
     asked = select(Query).where(Query.participant_id == participant_id)
+    model = _newest_whole(session, participant_id, lost) if scored or follows else None
     return _Known(
         participant,
         study,
         free,
         {query.ordinal: (query.left_clip_id, query.right_clip_id) for query in session.scalars(asked)},
         shown(dataset.pool_clips(session, study.id)) if free else [],
+        shown(dataset.made_clips(session, participant_id, model.created_at)) if follows and model else [],
         shown(dataset.whole_clips(session, study.id)) if Purpose.INTRODUCTION in wanted else [],
-        _newest_whole(session, participant_id, lost) if scored or follows else None,
+        model,
         [
             model
             for model in records.models_of_others(session, participant_id, ModelKind.REWARD, OTHERS_LABELS, MOST_OTHERS)
@@ -240,6 +254,7 @@ class _Choosing:
         if not pairs:
             return []
         settings = self._settings
+        made = self._unused(self._known.made)
         scores = _scores(self._context, self._known, pairs, settings.strategy)
         choice = acquisition.choose(
             len(ordinals),
@@ -248,21 +263,15 @@ class _Choosing:
             rule="uniform" if scores is None else cast(acquisition.Strategy, settings.strategy.value),
             scores=scores,
             random_share=settings.random_share,
-            following_scores=self._following(pairs),
+            made=len(made),
             following_share=settings.following_share,
         )
         how = np.select([choice.following, choice.at_random], [FOLLOWING, Strategy.UNIFORM.value], settings.strategy)
         drawn = zip(choice.indices, choice.swapped, choice.propensities, how, strict=True)
         return [
-            _columns(pairs[index], bool(swapped), str(strategy), float(propensity))
+            _columns((*pairs, *made)[index], bool(swapped), str(strategy), float(propensity))
             for index, swapped, propensity, strategy in drawn
         ]
-
-    def _following(self, pairs: Sequence[tuple[Clip, Clip]]) -> FloatArray | None:
-        if not self._settings.following_share:
-            return None
-        known = self._known
-        return following.scores(self._context.store, known.study, known.model, self._participant.seed, pairs)
 
     def _introduction(self, rng: np.random.Generator) -> dict[str, Any] | None:
         """A pair of whole trajectories."""

@@ -15,8 +15,6 @@ from worker.jobs.runtime import records
 from worker.jobs.runtime.context import Step, WorkerContext
 from worker.jobs.runtime.records import Job
 
-KEPT_QUERIES = 3
-"""Queries ahead that stay when a new model chooses: the page may already be loading them."""
 MOST_EARLIER = 100
 """Participants whose weights make up a pooled prior."""
 
@@ -84,10 +82,9 @@ def earlier_models(session: Session, participant: Participant, study: Study) -> 
 
 
 def _look_ahead(context: WorkerContext, participant_id: int) -> None:
-    with context.database.writing() as session:
+    with context.database.reading() as session:
         participant = session.get_one(Participant, participant_id)
         settings = session.get_one(Study, participant.study_id).settings
-        if settings.strategy is not Strategy.UNIFORM or settings.following_share:
-            records.drop_unseen_queries(session, participant_id, keep=KEPT_QUERIES)
-    query_selection.refill_queries(context, participant_id)
+    if settings.strategy is not Strategy.UNIFORM or settings.following_share:
+        query_selection.choose_anew(context, participant_id)
     query_selection.predict_waiting(context, participant_id)

@@ -17,7 +17,7 @@ from sqlalchemy.orm import Session
 from app.db import now
 from app.domain.models import Model, Run, RunKind, RunStatus
 from app.domain.protocol import FROM_OTHERS
-from app.domain.run_keys import AHEAD, BEFORE_AFTER, LENT
+from app.domain.run_keys import AHEAD, BEFORE_AFTER, LENT, MADE
 from app.domain.studies import Awaited, Participant, Study
 from app.services.evaluation import donors
 from worker.jobs.runtime.records import Job
@@ -124,6 +124,8 @@ class WhoWaits:
         person = None if job.participant_id is None else self.people.get(job.participant_id)
         if person is None:
             return self._of_study(job.study_id)
+        if job.about.subject == MADE:  # nobody waits for it: as long as there is none, the study's rule chooses
+            return Urgency(Level.ANSWERING if person.present and not person.awaited else Level.POOL, _BEGINNING, 0)
         found = _of_person(person, job)
         return found._replace(level=max(found.level, Level.DUE)) if job.key in self.measuring else found
 
