@@ -60,11 +60,12 @@ def make_participant(session: Session, study: Study, *, ready: bool = True) -> t
     return participant, token
 
 
-def make_clip(session: Session, store: ArtefactStore, study: Study) -> Clip:
-    """A clip with real files, different from every other of its study."""
+def make_clip(session: Session, store: ArtefactStore, study: Study, made_for: Participant | None = None) -> Clip:
+    """A clip with real files, different from every other of its study; of the pool, or made for one person."""
     number = session.scalar(select(func.count(Clip.id))) or 0
     rollout = Rollout(
         study_id=study.id,
+        participant_id=made_for.id if made_for else None,
         scenario=number // 2,
         behaviour=number % 2,
         mode={},

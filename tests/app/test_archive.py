@@ -1,10 +1,12 @@
 """A study moves to another installation: everything arrives, or nothing does."""
 
 import base64
+import csv
 import hashlib
 import json
 import zipfile
 import zlib
+from collections import Counter
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
@@ -17,6 +19,7 @@ from sqlalchemy import func, select
 from app.__main__ import import_study
 from app.db import Base, Database
 from app.domain import run_keys
+from app.domain.clips import Rollout
 from app.domain.models import Run, RunStatus
 from app.domain.participation import ConsentRecord, FormAnswer, ParticipantEvent
 from app.domain.preferences import Query
@@ -41,6 +44,7 @@ def study(database: Database, store: ArtefactStore) -> Study:
         name = "reward/participant-1/labels-10/answer-2"
         factories.make_run(session, study, session.get_one(Participant, 1)).workflow_id = name
         factories.make_run(session, study, status=RunStatus.RUNNING).workflow_id = "clips/study-1/scenario-7"
+        factories.make_clip(session, store, study, made_for=session.get_one(Participant, 2))
         session.flush()
         gone = session.scalars(select(Participant).where(Participant.number == 3)).one()
         withdrawal.withdraw(session, store, gone, gone.code)
@@ -110,6 +114,16 @@ def test_rows_refer_to_each_other_as_before(elsewhere: FastAPI, study: Study, pa
         for repeat in repeats:
             first = session.get_one(Query, repeat.repeats_query_id)
             assert (first.participant_id, first.left_clip_id) == (repeat.participant_id, repeat.right_clip_id)
+
+
+def test_what_was_made_for_somebody_is_theirs_there_too(elsewhere: FastAPI, packed: Path) -> None:
+    imported = bring(elsewhere, packed)
+    with elsewhere.state.studio.database.reading() as session:
+        theirs = select(Participant).join(Rollout, Rollout.participant_id == Participant.id)
+        made_for = session.scalars(theirs.where(Participant.study_id == imported.study.id)).one()
+    assert made_for.number == 2
+    clips = exports(elsewhere.state.studio.database, imported.study.slug)["clips"]
+    assert Counter(row["made_for"] for row in csv.DictReader(clips.splitlines())) == {"": 6, "P02": 1}
 
 
 def test_what_was_done_is_not_done_again_and_what_was_at_work_is(

@@ -92,6 +92,19 @@ def test_a_clip_of_another_study_does_not_exist(
     assert forbidden.text == unknown.text
 
 
+def test_a_clip_that_was_made_for_somebody_exists_for_nobody_else_who_takes_part(
+    taking_part: TakingPart, store: ArtefactStore, new_browser: Callable[[], TestClient], experimenter: TestClient
+) -> None:
+    with taking_part.database.writing() as session:
+        made = factories.make_clip(session, store, taking_part.study, made_for=taking_part.participant)
+        _, token = factories.make_participant(session, taking_part.study)
+    other = new_browser()
+    other.get(f"/p/{token}")
+    for name in (f"{made.video_sha256}.mp4", f"{made.poster_sha256}.jpg"):
+        watching = [each.get(f"/media/{name}").status_code for each in (taking_part.browser, experimenter, other)]
+        assert watching == [200, 200, 404]
+
+
 def test_without_a_cookie_no_clip_exists(taking_part: TakingPart, clip: Clip, client: TestClient) -> None:
     assert client.get(f"/media/{clip.video_sha256}.mp4").status_code == 404
 

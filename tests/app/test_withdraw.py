@@ -9,7 +9,7 @@ from fastapi.testclient import TestClient
 from sqlalchemy import func, select
 
 from app.db import Base, Database, now
-from app.domain.clips import Clip
+from app.domain.clips import Clip, Rollout
 from app.domain.evaluation import (
     Assignment,
     Controller,
@@ -106,6 +106,9 @@ def leave_traces(database: Database, store: ArtefactStore, participant_id: int) 
         hinted = {"hints": marked("hint"), "offered": marked("offered"), "client_uuid": marked("hinting")[:36]}
         session.add(HintEvent(participant_id=person.id, revision=1, answered=3, **hinted))
         factories.make_previews(session, store, study, [{}])
+        made = factories.make_clip(session, store, study, made_for=person)
+        made.video_sha256 = store.put(marked("made").encode())
+        session.get_one(Rollout, made.rollout_id).mode = {marked("axis"): 0.2}
         chosen = SelfSetting(
             participant_id=person.id,
             revision=1,

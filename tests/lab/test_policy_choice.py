@@ -119,7 +119,7 @@ def test_exploring_tells_of_policies_that_lose_the_task_or_do_nothing_else(
     assert alike == "The policy alike: changes nothing that is measured. Better take it out of policies."
 
 
-def test_a_study_asks_for_no_more_ways_than_there_are_policies_and_for_no_sliders(
+def test_a_study_asks_for_no_more_ways_than_there_are_policies_and_for_nothing_in_between(
     several: Path, use: Callable[[Path], None]
 ) -> None:
     use(several)
@@ -130,7 +130,12 @@ def test_a_study_asks_for_no_more_ways_than_there_are_policies_and_for_no_slider
     assert said == {
         "evaluation_methods": "One of several policies is chosen in this task: nothing can be set by sliders."
     }
-    assert task_limits.complaints("plane", usual_settings("plane")) == {}
+    usual = usual_settings("plane")
+    assert task_limits.complaints("plane", usual) == {}
+    said = task_limits.complaints("plane", usual.model_copy(update={"following_share": 0.2}))
+    assert said == {
+        "following_share": "One of several policies is chosen in this task: nothing can be varied. Enter 0."
+    }
 
 
 def test_settings_stay_whatever_the_file_says_of_them_if_it_says_anything() -> None:
