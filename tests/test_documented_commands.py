@@ -125,6 +125,7 @@ RUN: dict[str, str | Elsewhere | OnlyParsed] = {
     "feedback_efficiency": OnlyParsed("begins with 240 rollouts of unseen scenarios, and draws all its figures"),
     "feedback_report": "results",
     "first_robot": REAL_TIME,
+    "made_pairs": REAL_TIME,
     "fuzz_api": "--requests 20",
     "likert": Elsewhere("tests/worker/analysis/test_likert.py::test_the_command_writes_page_and_table"),
     "head_to_head": OnlyParsed("computes each truth from 200 000 people; what it measures has tests of its own"),

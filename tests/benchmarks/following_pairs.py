@@ -1,12 +1,13 @@
-"""Whether pairs that follow the person pay: the true preference that their mode gains, with and without such pairs.
+"""Whether pairs made for the person pay: the true preference that their mode gains, with and without such pairs.
 
     python -m tests.benchmarks.following_pairs
 
 Scripted users (5 % mistakes, 10 % "equal") answer pairs of a pool as large as a study's, chosen by entropy with the
-usual random share. Beside it the same with 30 % of the pairs following, from the tenth answer on. After 25, 50 and 100
-answers the search of modes picks the user's mode; its gain of the true preference, in % of what the user minds and
-likes under the reference policy, is what the response surface predicts. The pool is kept under data/, every finished
-chain in --output: repeat the command to go on.
+usual random share. Beside it the same with 30 % of the pairs made for them, from the tenth answer on: the newest
+model's mode and a variation of it, each really simulated. After 25, 50 and 100 answers the search of modes picks the
+user's mode; its gain of the true preference, in % of what the user minds and likes under the reference policy, is what
+the response surface predicts. The pool is kept under data/, every finished chain in --output: repeat the command to go
+on.
 """
 
 from tests.benchmarks import answering
