@@ -361,6 +361,25 @@ def test_nothing_scrolls_and_everything_is_in_reach(
     assert all(clip is not None and clip["width"] >= 150 for clip in clips)
 
 
+@pytest.mark.parametrize(
+    "invited",
+    [{"asks_for_hints": True, "introduction_pairs": 0, "language": language} for language in ("en", "de")],
+    indirect=True,
+)
+def test_whatever_can_be_done_below_a_pair_fits_in_one_row_of_a_narrow_phone(
+    invited: Invited, new_page: NewPage
+) -> None:
+    page = new_page(viewport={"width": 360, "height": 640}, has_touch=True, is_mobile=True)
+    page.goto(invited.link)
+    expect(page.locator("[data-phase=ready]")).to_be_visible()
+    page.keyboard.press(KEYS["left"])
+    foot = page.locator(".stage-foot > :is(button, form, a):visible")
+    expect(foot).to_have_count(4)
+    boxes = [box for each in foot.all() if (box := each.bounding_box())]
+    assert len({round(box["y"] + box["height"] / 2) for box in boxes}) == 1
+    assert max(box["height"] for box in boxes) <= 44, "two lines of words at most"
+
+
 def test_a_phone_answers_by_touch_and_names_the_clips_by_where_they_are(invited: Invited, new_page: NewPage) -> None:
     page = new_page(viewport={"width": 390, "height": 844}, has_touch=True, is_mobile=True)
     page.goto(invited.link)

@@ -104,6 +104,19 @@ def test_films_that_somebody_may_be_shown_later_come_after_the_clips_that_they_c
     assert (level(database, clips(study)), level(database, ahead)) == (Level.ANSWERING, Level.POOL)
 
 
+def test_pairs_that_follow_somebody_are_made_while_they_answer_and_never_before_what_anybody_waits_for(
+    database: Database, study: Study
+) -> None:
+    with database.writing() as session:
+        answering, gone = add_person(session, study, seen=1), add_person(session, study, seen=3600)
+        waiting = add_person(session, study, Awaited.ROBOTS, seen=1, waiting=1)
+    made = [job_of(f"clips/participant-{each.id}/made/labels-10", study.id) for each in (answering, gone, waiting)]
+    assert [level(database, each) for each in made] == [Level.ANSWERING, Level.POOL, Level.POOL]
+    with database.reading() as session:
+        waits = WhoWaits.look(session)
+    assert min([*made, films(waiting)], key=waits.urgency) == films(waiting)
+
+
 def test_nobody_waits_for_the_numbers_of_a_method_that_can_be_shown(database: Database, study: Study) -> None:
     with database.writing() as session:
         person = add_person(session, study, Awaited.ROBOTS, seen=1, waiting=60)
