@@ -19,7 +19,7 @@ SHARES = {"0.0": Variant(), "0.3": Variant(following_share=0.3)}
 
 def main() -> None:
     """See the module."""
-    options = answering.parser(__doc__, "following_pairs").parse_args()
+    options = answering.parser(__doc__, "following_pairs", seeds=1).parse_args()
     answering.run(options, TITLE, "share", SHARES)
 
 
