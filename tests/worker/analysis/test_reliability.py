@@ -88,6 +88,13 @@ def test_scores_about_robots_are_compared_within_people_and_not_while_letters_hi
     assert blinded["comparisons"] == []
 
 
+def test_omega_is_that_of_the_best_fit_and_not_of_the_nearest_one() -> None:
+    """R 4.2: factanal(items, 1, control = list(nstart = 200)); from its one usual start it comes to 0.590."""
+    people = ("23454", "34354", "43444", "23344", "34332", "33434", "24253", "43434", "23344", "33322", "34322", "23343")
+    items = np.array([[float(point) for point in person] for person in people])
+    assert omega(np.cov(items, rowvar=False), len(people)) == pytest.approx(0.3133654, abs=1e-6)
+
+
 def test_omega_is_the_same_every_time_also_where_a_unique_variance_would_vanish() -> None:
     answers = np.array([[1.0, 1, 1], [2, 2, 1], [3, 3, 4], [4, 4, 2], [5, 5, 3], [4, 5, 1]])
     covariance = np.cov(answers, rowvar=False)

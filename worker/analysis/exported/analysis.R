@@ -374,7 +374,8 @@ reliability <- function(items) {
 }
 
 # Of one factor, by maximum likelihood over the unique variances, at least 0.005 of each item (as factanal() does, which
-# gives up where its optimiser has done what it can). NA where it cannot be fitted.
+# gives up where its optimiser has done what it can). With few people there are several maxima: the best is sought from
+# factanal's start and from one for every item. NA where it cannot be fitted.
 omega <- function(covariance, people) {
   correlation <- cov2cor(covariance)
   if (people <= nrow(covariance) || min(eigen(correlation, TRUE, TRUE)$values) < 1e-8) return(NA_real_)
@@ -389,9 +390,14 @@ omega <- function(covariance, people) {
     sum(rest - log(rest) - 1)
   }
   gradient <- function(unique) diag(outer(loadings(unique), loadings(unique)) + diag(unique) - correlation) / unique^2
-  start <- (1 - 0.5 / k) / diag(solve(correlation))
-  exact <- list(factr = 1, pgtol = 1e-10, maxit = 10000, parscale = rep(0.01, k))
-  unique <- optim(start, misfit, gradient, method = "L-BFGS-B", lower = 0.005, upper = 1, control = exact)$par
+  fitted <- function(start, ...) {
+    optim(start, misfit, gradient, method = "L-BFGS-B", lower = 0.005, upper = 1, control = list(...))
+  }
+  usual <- (1 - 0.5 / k) / diag(solve(correlation))
+  starts <- c(list(usual), lapply(seq_len(k), function(item) replace(rep(0.9, k), item, 0.1)))
+  roughly <- lapply(starts, fitted)
+  best <- roughly[[which.min(sapply(roughly, function(each) each$value))]]$par
+  unique <- fitted(best, factr = 1, pgtol = 1e-10, maxit = 10000, parscale = rep(0.01, k))$par
   scale <- sqrt(diag(covariance))
   common <- sum(loadings(unique) * scale)^2
   common / (common + sum(unique * scale^2))

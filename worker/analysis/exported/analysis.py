@@ -494,6 +494,7 @@ def reliability(items):
 def omega(covariance, people):
     """Of one factor, by maximum likelihood over the unique variances, at least 0.005 of each item (as R's factanal).
 
+    With few people there are several maxima: the best is sought from factanal's start and from one for every item.
     None where it cannot be fitted: too few people, or items that determine each other.
     """
     scale = np.sqrt(np.diag(covariance))
@@ -513,15 +514,14 @@ def omega(covariance, people):
         gradient = np.diag(np.outer(found, found) + np.diag(unique) - correlation) / unique**2
         return (rest - np.log(rest) - 1).sum(), gradient
 
-    start = (1 - 0.5 / len(covariance)) / np.diag(np.linalg.inv(correlation))
-    unique = optimize.minimize(
-        misfit,
-        start,
-        jac=True,
-        method="L-BFGS-B",
-        bounds=[(0.005, 1.0)] * len(start),
-        options={"ftol": 1e-15, "gtol": 1e-10, "maxiter": 10_000, "maxfun": 100_000},
-    ).x
+    def fitted(start, **options):
+        ends = [(0.005, 1.0)] * len(start)
+        return optimize.minimize(misfit, start, jac=True, method="L-BFGS-B", bounds=ends, options=options)
+
+    usual = (1 - 0.5 / len(covariance)) / np.diag(np.linalg.inv(correlation))
+    roughly = [fitted(start, ftol=1e-7) for start in (usual, *(0.9 - 0.8 * np.eye(len(usual))))]
+    best = min(roughly, key=lambda each: each.fun).x
+    unique = fitted(best, ftol=1e-15, gtol=1e-10, maxiter=10_000, maxfun=100_000).x
     common = (loadings(unique) * scale).sum() ** 2
     return common / (common + (unique * scale**2).sum())
 

@@ -66,22 +66,29 @@ def omega(covariance: FloatArray, people: int) -> float | None:
     """McDonald's omega of items with this covariance, one factor; None where it cannot be fitted. (K, K)
 
     Fewer people than items, or items that determine each other, leave no likelihood to maximise. It is maximised over
-    the unique variances (Lawley and Maxwell 1971, ch. 4), from the start and within the bounds of R's factanal: at
-    least LEAST_UNIQUE of an item is its own, or the likelihood may have no maximum (Heywood).
+    the unique variances (Lawley and Maxwell 1971, ch. 4), within the bounds of R's factanal: at least LEAST_UNIQUE of
+    an item is its own, or the likelihood may have no maximum (Heywood). With few people it has several, so the best is
+    sought from factanal's start, and from one for every item in which the factor is that item.
     """
     scale = np.sqrt(np.diag(covariance))
     correlation = covariance / np.outer(scale, scale)
     if people <= len(covariance) or np.linalg.eigvalsh(correlation)[0] < 1e-8:
         return None
-    start = (1 - 0.5 / len(covariance)) / np.diag(np.linalg.inv(correlation))
-    bounds = [(LEAST_UNIQUE, 1.0)] * len(covariance)
-    exact = {"ftol": 1e-15, "gtol": 1e-10, "maxiter": 10_000, "maxfun": 100_000}
-    found = optimize.minimize(
-        _misfit, start, args=(correlation,), method="L-BFGS-B", jac=True, bounds=bounds, options=exact
-    )
-    unique = found.x * scale**2
-    common = float((_loadings(found.x, correlation) * scale).sum() ** 2)
+    usual = (1 - 0.5 / len(covariance)) / np.diag(np.linalg.inv(correlation))
+    roughly = [_fitted(correlation, start, ftol=1e-7) for start in (usual, *(0.9 - 0.8 * np.eye(len(covariance))))]
+    best = min(roughly, key=lambda found: float(found.fun)).x
+    exactly = _fitted(correlation, best, ftol=1e-15, gtol=1e-10, maxiter=10_000, maxfun=100_000).x
+    unique = exactly * scale**2
+    common = float((_loadings(exactly, correlation) * scale).sum() ** 2)
     return common / (common + float(unique.sum()))
+
+
+def _fitted(correlation: FloatArray, start: FloatArray, **options: float) -> Any:
+    """What scipy finds from here: unique variances x, their misfit fun."""
+    bounds = [(LEAST_UNIQUE, 1.0)] * len(start)
+    return optimize.minimize(
+        _misfit, start, args=(correlation,), method="L-BFGS-B", jac=True, bounds=bounds, options=options
+    )
 
 
 def _loadings(unique: FloatArray, correlation: FloatArray) -> FloatArray:
