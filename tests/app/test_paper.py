@@ -13,6 +13,7 @@ from sqlalchemy.orm import Session
 from app.db import Database, now
 from app.domain.designs import Arm, Ending
 from app.domain.models import ModelKind, Report
+from app.domain.participation import FormAnswer
 from app.domain.power_plan import PowerInputs
 from app.domain.preferences import LabelEvent, Query
 from app.domain.protocol import EvaluatedMethod, EvaluationSettings
@@ -109,6 +110,48 @@ def test_who_came_and_who_stayed_is_counted(
     assert "and 3 completed the study. 1 of those invited had not consented." in said
     assert "1 person withdrew and had all their data erased" in said
     assert "1 of the participants was played by a program" in said
+
+
+def test_who_was_screened_out_is_in_no_demographics_and_what_was_asked_at_the_end_is_told(
+    experimenter: TestClient, finished: Finished, database: Database
+) -> None:
+    study = finished()
+    with database.writing() as session:
+        session.get_one(Study, study.id).stored_settings = study.stored_settings | {
+            "demographics": [{"name": "age", "kind": "number"}],
+            "questionnaire": [{"name": "felt_safe", "kind": "likert"}],
+        }
+        for person, points in zip(_people(session), "43", strict=False):
+            session.add(FormAnswer(participant_id=person.id, form="questionnaire", item="felt_safe", value=points))
+        _people(session)[5].ended_as = Ending.SCREENED_OUT
+    said = text_of(experimenter, study)
+    assert "of 5 people who did not withdraw and were not screened out: age: mean 23" in said, "26 is screened out"
+    assert "felt safe: mean 3.50, SD 0.71, range 3 to 4 (n = 2)" in said
+    assert "consent on 2" in said, "one day is not between two"
+
+
+def test_analyses_are_told_as_they_are_made(experimenter: TestClient, database: Database) -> None:
+    with database.writing() as session:
+        evaluation = EvaluationSettings(ask_which_is_theirs=True, ask_reasons=True, instruments=("sus", "nasa_tlx"))
+        study = factories.make_study(
+            session, languages=("en",), evaluation=evaluation, planned_tests=("paired_t", "equivalence")
+        )
+        arms = ({"name": "own", "methods": ("pbarl",)}, {"name": "usual", "methods": ("reference",)})
+        apart = EvaluationSettings(methods=("reference", "pbarl"), instruments=("nasa_tlx",))
+        between = factories.make_study(session, "Between", languages=("en",), arms=arms, evaluation=apart)
+        locking.lock(session, study, study.slug, "Ada")
+    said, planned = text_of(experimenter, study), text_of(experimenter, study, "preregistration.md")
+    assert "Planned tests: Paired t; Equivalence, two one-sided paired t. Every other" in said
+    assert "at a level of 5 %" in said
+    assert "from all ratings, a linear mixed model" in said
+    assert "exact two-sided binomial test" in said
+    for text in (said, planned):
+        assert "reason" in text
+    assert "both one-sided p values below .05" in planned
+    assert "learn_a_lot (reversed), stretched to 0 to 100." in planned, "items of 1 to 5 have no such mean"
+    assert "Effort, 0 to 100: effort." in planned
+    assert "Between arms scores are compared by Welch's t" in text_of(experimenter, between)
+    assert "Tests between arms leave out" in text_of(experimenter, between, "preregistration.md")
 
 
 def test_every_number_of_the_report_is_in_the_text(

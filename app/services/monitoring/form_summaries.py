@@ -9,9 +9,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from statistics import mean, median, stdev
 
-from sqlalchemy import select
+from sqlalchemy import select, true
 from sqlalchemy.orm import Session
 
+from app.domain.designs import Ending
 from app.domain.participation import FormAnswer
 from app.domain.protocol import LIKERT_POINTS, FormItem, Stage
 from app.domain.studies import Participant, Study
@@ -83,12 +84,17 @@ def sheets_of(session: Session, study: Study, participant: Participant) -> Seque
     return sheets
 
 
-def summaries_of(session: Session, study: Study) -> Sequence[FormSummary]:
-    """What everybody said who has not withdrawn, by form; a form that nobody has come to is left out."""
+def summaries_of(session: Session, study: Study, *, screened_out: bool = True) -> Sequence[FormSummary]:
+    """What everybody said who has not withdrawn, by form; a form that nobody has come to is left out.
+
+    ``screened_out``: with those who were sent back by what they said at the start.
+    """
+    kept = true() if screened_out else Participant.ended_as.is_distinct_from(Ending.SCREENED_OUT)
     rows = session.execute(
         select(FormAnswer, Participant)
         .join(Participant, Participant.id == FormAnswer.participant_id)
         .where(Participant.study_id == study.id, Participant.is_preview.is_(False), Participant.withdrawn_at.is_(None))
+        .where(kept)
         .order_by(Participant.number, FormAnswer.id)
     )
     newest: dict[str, dict[str, dict[str, str | None]]] = {form: {} for form in FORMS}

@@ -198,6 +198,7 @@ def _measures(study: Study) -> Iterator[str]:
             + (" or that both were equal." if evaluation.head_to_head_ties else ".")
             if evaluation.head_to_heads
             else "",
+            "Beside each of these answers they could give a reason in words." if evaluation.ask_reasons else "",
             "At the end they named the robot that they thought was made for them."
             if evaluation.ask_which_is_theirs
             else "",
@@ -214,6 +215,9 @@ def _measures(study: Study) -> Iterator[str]:
             codebook.MISSING[known.missing],
             f"Words in {listed(own)} were the study's own, which nobody had validated." if own else "",
         )
+    if settings.questionnaire:
+        own = "; ".join(quoted(each.question or each.name.replace("_", " ")) for each in settings.questionnaire)
+        yield f"Questions of the study's own at the end: {own}."
     yield paragraph(
         "Each answer to a pair that was drawn at random was predicted by the newest reward model before it was given; "
         "the share predicted correctly is the model's accuracy on data that it had not seen.",
@@ -246,18 +250,18 @@ def _analysis(study: Study, plan: Plan) -> Iterator[str]:
     if evaluation is None:
         yield "No tests were planned: nothing was compared."
         return
-    planned = listed(TEST_NAMES[test] for test in plan.planned)
+    planned = "; ".join(TEST_NAMES[test] for test in plan.planned)
     yield paragraph(
         f"Planned tests: {planned}. Every other test is exploratory."
         if plan.planned
         else "No test was planned; all are exploratory.",
-        "Tests compared every two methods on each scale, two-sided; p values were corrected by Holm's method over the "
-        "comparisons of one scale and one test, those included that could not be computed. The two-sample t-test, "
+        "Tests compared every two methods on each scale, two-sided and at a level of 5 %; p values were corrected by "
+        "Holm's method over the comparisons of one scale and one test, those included that could not be computed. The two-sample t-test, "
         "which counts every rating as if a different person had given it, was computed as in the paper on PbARL and "
         "not corrected.",
-        "The other tests within people used each person's mean rating of a method: Student's paired t-test (Cohen's "
-        "d_z with its exact interval), Wilcoxon's signed-rank test (exact given ties; matched-pairs rank-biserial "
-        "correlation with an approximate interval), and a linear mixed model with random intercepts and slopes for "
+        "Within people, from each person's mean rating of a method: Student's paired t-test (Cohen's d_z with its "
+        "exact interval) and Wilcoxon's signed-rank test (exact given ties; matched-pairs rank-biserial correlation "
+        "with an approximate interval); from all ratings, a linear mixed model with random intercepts and slopes for "
         "people, estimated in two stages (Paule-Mandel, Hartung-Knapp).",
         "Beside it, ratings as ordered categories: a cumulative link mixed model (proportional odds, random intercept "
         "for people, maximum likelihood) with a sandwich covariance over people and t with people less "
@@ -275,9 +279,15 @@ def _analysis(study: Study, plan: Plan) -> Iterator[str]:
         "over people, and Holm's method over their comparisons."
         if evaluation.head_to_heads
         else "",
-        "Questionnaires: scores as published, with Cronbach's alpha and McDonald's omega, and paired tests between "
-        "methods."
+        "Which robot was made for them: exact two-sided binomial test against chance."
+        if evaluation.ask_which_is_theirs
+        else "",
+        "Questionnaires: scores as published, with Cronbach's alpha and McDonald's omega, and of those about robots "
+        "paired t-tests and Wilcoxon's test between methods."
         if study.settings.all_instruments
+        else "",
+        "Between arms scores are compared by Welch's t and the permutation test; questionnaires at the end are not."
+        if study.settings.all_instruments and study.settings.arms
         else "",
         "Intervals are 95 % intervals.",
     )

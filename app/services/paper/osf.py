@@ -206,6 +206,7 @@ def _variables(study: Study, settings: StudySettings) -> Mapping[str, str]:
             if evaluation and evaluation.head_to_heads
             else []
         ),
+        *(["Reasons in words, beside ratings and head-to-heads."] if evaluation and evaluation.ask_reasons else []),
         *(["Which robot was made for them."] if evaluation and evaluation.ask_which_is_theirs else []),
         *(f"{library.every()[name].title}, {_when(name, settings, evaluation)}." for name in settings.all_instruments),
         "Answers to pairs (left, right, equal, can't tell), with response times.",
@@ -241,7 +242,10 @@ def _indices(settings: StudySettings, evaluation: EvaluationSettings | None) -> 
         for score in known.scores:
             low, high = known.range_of(score)
             items = listed(f"{item} (reversed)" if item in known.reversed_items else item for item in score.items)
-            lines.append(f"* {known.title}, {score.title}, {low} to {high}: mean of {items}.")
+            made = items if len(score.items) == 1 else f"mean of {items}"
+            if (low, high) != (known.answers.lowest, known.answers.highest):
+                made += f", stretched to {low} to {high}"
+            lines.append(f"* {known.title}, {score.title}, {low} to {high}: {made}.")
     return "\n".join(lines) or NOTHING
 
 
@@ -276,7 +280,8 @@ def _analysis(study: Study, settings: StudySettings) -> Mapping[str, str]:
         "Statistical models": models if evaluation else "No test is planned: nothing is compared.",
         "Transformations": "None. Reversed items of questionnaires are mirrored within the range of answers.",
         "Inference criteria": "Two-sided p values below .05 after Holm's correction over the comparisons of one scale "
-        "and one test, and 95 % intervals; the two-sample t-test as in the paper on PbARL, p < .01, is not corrected."
+        "and one test, and 95 % intervals; equivalence: both one-sided p values below .05 after the same correction. "
+        "The two-sample t-test as in the paper on PbARL, p < .01, is not corrected."
         if evaluation
         else NOTHING,
         "Data exclusion": paragraph(
@@ -289,7 +294,9 @@ def _analysis(study: Study, settings: StudySettings) -> Mapping[str, str]:
             f"Further rules: {YOURS}",
         ),
         "Missing data": paragraph(
-            "Tests within people use who has rated both methods of a comparison; nothing is imputed.", *missing
+            "Tests within people use who has rated both methods of a comparison; nothing is imputed.",
+            "Tests between arms leave out who has rated both." if settings.arms else "",
+            *missing,
         ),
         "Exploratory analysis": "Every test that is not named above: order and carryover, reliability of scales, "
         "changes of success, costs and learned preference in simulation, and differences between methods on "

@@ -8,13 +8,14 @@ from sqlalchemy.orm import Session, joinedload
 from app.domain.designs import Ending, Screen
 from app.domain.power_plan import PowerTest
 from app.domain.preferences import Label, Query, current_answers
+from app.domain.protocol import MADE_FOR_YOU, Stage
 from app.domain.studies import Participant, Study
 from app.services.answers import consistency, exclusions
 from app.services.answers.accuracy import Share
 from app.services.evaluation import unblinding
 from app.services.exports import export_rows
 from app.services.monitoring import form_summaries
-from app.services.monitoring.form_summaries import Summary
+from app.services.monitoring.form_summaries import FormSummary, Summary
 from app.services.paper import recruitment
 from app.services.paper.prose import NOT_RECORDED, count, day, listed, number, paragraph, percent, quoted, table
 from app.services.paper.recruitment import Flow
@@ -32,7 +33,7 @@ def participants(session: Session, study: Study) -> Iterator[str]:
         f"{count(flow.invited, 'person was', 'people were')} invited or joined"
         + (f", {flow.from_panel} of them through a recruitment panel" if flow.from_panel else "")
         + f"; {flow.consented} gave informed consent"
-        + (f" between {day(flow.first_consent)} and {day(flow.last_completion)}" if flow.last_completion else "")
+        + _when(flow)
         + f". Of these, {_ended(flow)}{flow.unfinished} had not finished when this text was made (dropped out or still "
         f"on their way), and {flow.completed} completed the study.",
         f"{flow.not_consented} of those invited had not consented.",
@@ -59,6 +60,13 @@ def participants(session: Session, study: Study) -> Iterator[str]:
         f"How people were recruited and paid beyond that: {NOT_RECORDED}.",
     )
     yield from _demographics(session, study)
+
+
+def _when(flow: Flow) -> str:
+    if flow.last_completion is None:
+        return ""
+    first, last = day(flow.first_consent), day(flow.last_completion)
+    return f" on {first}" if first == last else f" between {first} and {last}"
 
 
 def _visit(session: Session, study: Study) -> str:
@@ -112,7 +120,7 @@ def _row_of_arm(study: Study, name: str, flow: Flow) -> Sequence[str]:
 
 
 def _demographics(session: Session, study: Study) -> Iterator[str]:
-    found = [each for each in form_summaries.summaries_of(session, study) if each.form == "demographics"]
+    found = _forms(session, study, Stage.DEMOGRAPHICS)
     if not found:
         yield (
             "Demographics were not asked for."
@@ -121,7 +129,24 @@ def _demographics(session: Session, study: Study) -> Iterator[str]:
         )
     for form in found:
         said = "; ".join(_question(each) for each in form.questions)
-        yield f"Answers at the start, of {count(form.people, 'person', 'people')} who did not withdraw: {said}."
+        yield (
+            f"Answers at the start, of {count(form.people, 'person', 'people')} who did not withdraw and were not "
+            f"screened out: {said}."
+        )
+
+
+def closing_answers(session: Session, study: Study) -> Iterator[str]:
+    """What people said to the study's own questions at the end; which robot was made for them has a test."""
+    for form in _forms(session, study, Stage.QUESTIONNAIRE):
+        said = [_question(each) for each in form.questions if each.item.name != MADE_FOR_YOU]
+        if said:
+            yield "## Questions at the end"
+            yield f"Answers of {count(form.people, 'person', 'people')} who did not withdraw: {'; '.join(said)}."
+
+
+def _forms(session: Session, study: Study, stage: Stage) -> Sequence[FormSummary]:
+    found = form_summaries.summaries_of(session, study, screened_out=False)
+    return [each for each in found if each.form == stage]
 
 
 def _question(each: Summary) -> str:

@@ -7,6 +7,7 @@ from sqlalchemy.orm import Session
 from app.domain.studies import Study
 from app.services.evaluation import unblinding
 from app.services.paper.methods import methods_part
+from app.services.paper.people import closing_answers
 from app.services.paper.prose import quoted
 from app.services.paper.results import results_part
 from app.services.runs import reports
@@ -33,4 +34,5 @@ def _paragraphs(session: Session, study: Study) -> Iterator[str]:
         yield "> There are no results yet: no report has been made."
     else:
         yield from results_part(report.contents, preregistration.plan_of(session, study))
+        yield from closing_answers(session, study)
         yield f"> Statistics: report of {report.created_at:%Y-%m-%d %H:%M} UTC."

@@ -10,6 +10,7 @@ from scipy import stats
 from statsmodels.stats.power import TTestIndPower, TTestPower
 
 from app.domain.power_plan import PowerTest
+from worker.analysis.study.between import BETWEEN_TESTS
 from worker.analysis.study.effect_sizes import holm
 from worker.analysis.study.power import Truth, _is_found, _ratings_find, enough, power_at, ratings_p
 from worker.analysis.study.statistics import scale_report
@@ -62,7 +63,7 @@ def test_an_invented_study_is_tested_and_corrected_as_the_page_of_results_does(t
     )
     rows = [(person, groups[method], said) for person, method in np.argwhere(meets) for said in ratings[person, method]]
     table = pd.DataFrame(rows, columns=["participant", "method", "satisfaction"])
-    report = scale_report(table, "satisfaction", "method", groups, compare=True, between=True, bound=0.4)
+    report = scale_report(table, "satisfaction", "method", groups, compare=True, between=BETWEEN_TESTS, bound=0.4)
     paired = any({truth.better, truth.compared} <= set(arm) for arm in truth.arms)
     name = PowerTest(test).planned(paired=paired).value
     expected = [comparison[name].get("p_holm") for comparison in report["comparisons"]]

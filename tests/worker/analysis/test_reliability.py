@@ -95,6 +95,22 @@ def test_omega_is_that_of_the_best_fit_and_not_of_the_nearest_one() -> None:
     assert omega(np.cov(items, rowvar=False), len(people)) == pytest.approx(0.3133654, abs=1e-6)
 
 
+def test_scores_about_robots_are_compared_between_people_where_arms_met_different_ones() -> None:
+    """Welch's t of 3, 4, 5 against 6, 7, 9, by hand: difference 10/3, error root of 1/3 + 7/9."""
+    score = {"name": "effort", "title": "Effort", "lowest": 0, "highest": 100, "items": ["effort"]}
+    values = {"P1": ("a", 3.0), "P2": ("a", 4.0), "P3": ("a", 5.0), "P4": ("b", 6.0), "P5": ("b", 7.0), "P6": ("b", 9.0)}
+    rows = [
+        {"participant": person, "group": group, "scores": {"effort": value}, "items": {"effort": value}}
+        for person, (group, value) in values.items()
+    ]
+    instrument = {"name": "x", "title": "X", "measures": "effort", "scores": [score], "filled_in": rows}
+    (part,) = scale_reports([instrument], ["a", "b"], compare=True, between=True)[0]["parts"]
+    (compared,) = part["scores"][0]["comparisons"]
+    assert compared["welch_t"]["statistic"] == pytest.approx(10 / 3 / (1 / 3 + 7 / 9) ** 0.5)
+    assert compared["permutation"]["p"] == pytest.approx(2 / 20), "of twenty ways these and their mirror image"
+    assert "equivalence_between" not in compared, "the study's bound is in points of its ratings"
+
+
 def test_omega_is_the_same_every_time_also_where_a_unique_variance_would_vanish() -> None:
     answers = np.array([[1.0, 1, 1], [2, 2, 1], [3, 3, 4], [4, 4, 2], [5, 5, 3], [4, 5, 1]])
     covariance = np.cov(answers, rowvar=False)

@@ -647,7 +647,8 @@ scale_means <- function(study) {
 
 scale_comparisons <- function(study) {
   if (study$blinded) return(NULL)
-  of_questionnaires(study, function(part) comparisons_of(part$rows, "value", part$groups, c("paired_t", "wilcoxon")))
+  tests <- c("paired_t", "wilcoxon", if (study$between) c("welch_t", "permutation"))
+  of_questionnaires(study, function(part) comparisons_of(part$rows, "value", part$groups, tests))
 }
 
 scale_reliability <- function(study) {

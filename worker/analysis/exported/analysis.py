@@ -777,11 +777,12 @@ def scale_means(study):
 def scale_comparisons(study):
     if study.blinded:
         return []
+    tests = ("paired_t", "wilcoxon", *(("welch_t", "permutation") if study.between else ()))
     return [
         {"instrument": instrument, "score": score, **each}
         for instrument, score, rows, groups, _ in questionnaires(study)
         if groups != [""]
-        for each in comparisons_of(rows.assign(method=rows["group"]), "value", groups, ("paired_t", "wilcoxon"))
+        for each in comparisons_of(rows.assign(method=rows["group"]), "value", groups, tests)
     ]
 
 

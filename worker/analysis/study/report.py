@@ -78,7 +78,9 @@ def contents_of(tables: Tables) -> dict[str, Any]:
         ),
         "guesses": None if tables.guesses is None else guess_report(tables.guesses, len(tables.groups)),
         "head_to_heads": None if tables.head_to_heads is None else _head_to_heads(tables),
-        "instruments": scale_reports(tables.instruments, tables.groups, compare=not tables.blinded),
+        "instruments": scale_reports(
+            tables.instruments, tables.groups, compare=not tables.blinded, between=tables.between
+        ),
         "answers": answers.answer_report(tables.answers, tables.window),
         "change": answers.change_report(_frame(tables, "evaluations"), tables.participants),
     }

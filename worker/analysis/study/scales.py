@@ -20,31 +20,42 @@ from worker.analysis.study.statistics import scale_report
 
 TESTS = ("paired_t", "wilcoxon")
 """Shown of the differences between robots; one score per person and robot leaves the others nothing to add."""
+BETWEEN_TESTS = ("welch_t", "permutation")
+"""Likewise, of people who met one of the two; the study's bound of equivalence is in points of its ratings."""
 NO_ROBOT = ""
 """The group of questionnaires that are about none."""
 
 
 def scale_reports(
-    instruments: Sequence[Mapping[str, Any]], groups: Sequence[str], *, compare: bool
+    instruments: Sequence[Mapping[str, Any]], groups: Sequence[str], *, compare: bool, between: bool = False
 ) -> list[dict[str, Any]]:
-    """``groups``: robots in their order. ``compare``: False while a letter is another method for every participant."""
-    return [_of_instrument(each, groups, compare) for each in instruments]
+    """``groups``: robots in their order. ``compare``: False while a letter is another method for every participant.
+
+    ``between``: with the tests of people who met different robots.
+    """
+    return [_of_instrument(each, groups, compare, BETWEEN_TESTS if between else ()) for each in instruments]
 
 
-def _of_instrument(instrument: Mapping[str, Any], groups: Sequence[str], compare: bool) -> dict[str, Any]:
+def _of_instrument(
+    instrument: Mapping[str, Any], groups: Sequence[str], compare: bool, between: Sequence[str]
+) -> dict[str, Any]:
     rows = instrument["filled_in"]
     about_none = [each for each in rows if each["group"] is None]
     about_robots = [each for each in rows if each["group"] in groups]
     parts = []
     if about_none:
-        parts.append(_part(instrument, [{**each, "group": NO_ROBOT} for each in about_none], [NO_ROBOT], False))
+        parts.append(_part(instrument, [{**each, "group": NO_ROBOT} for each in about_none], [NO_ROBOT], False, ()))
     if about_robots:
-        parts.append(_part(instrument, about_robots, groups, compare))
+        parts.append(_part(instrument, about_robots, groups, compare, between))
     return {name: instrument[name] for name in ("name", "title", "measures")} | {"parts": parts}
 
 
 def _part(
-    instrument: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], groups: Sequence[str], compare: bool
+    instrument: Mapping[str, Any],
+    rows: Sequence[Mapping[str, Any]],
+    groups: Sequence[str],
+    compare: bool,
+    between: Sequence[str],
 ) -> dict[str, Any]:
     scores = []
     for score in instrument["scores"]:
@@ -52,7 +63,7 @@ def _part(
         values = [(each["participant"], each["group"], each["scores"][score["name"]]) for each in scored]
         frame = pd.DataFrame(values, columns=["participant", "group", "score"])
         possible = float(score["lowest"]), float(score["highest"])
-        found = scale_report(frame, "score", "group", groups, compare, possible, tests=TESTS)
+        found = scale_report(frame, "score", "group", groups, compare, possible, between, TESTS)
         answered = {
             group: [[each["items"][name] for name in score["items"]] for each in scored if each["group"] == group]
             for group in groups

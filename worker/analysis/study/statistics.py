@@ -132,7 +132,10 @@ def rating_report(
         "error_bars": ERROR_BARS,
         "star_below": STAR_BELOW,
         "scales": {
-            scale: scale_report(rows, scale, by, groups, compare, between=between, bound=bound) for scale in SCALES
+            scale: scale_report(
+                rows, scale, by, groups, compare, between=BETWEEN_TESTS if between else (), bound=bound
+            )
+            for scale in SCALES
         },
     }
 
@@ -144,21 +147,21 @@ def scale_report(
     groups: Sequence[str],
     compare: bool,
     possible: tuple[float, float] = POINTS,
-    between: bool = False,
+    between: Sequence[str] = (),
     tests: Sequence[str] = TESTS,
     bound: float = BOUND,
 ) -> Result:
     """Means, people and comparisons of one scale, a column of ``rows``; ``possible``: its lowest and highest value.
 
-    ``bound``: of equivalence, in points of the scale.
+    ``between``: tests of people who met different groups. ``bound``: of equivalence, in points of the scale.
     """
     comparisons: list[Result] = [
         {"first": first, "second": second, **_tests(rows, scale, by, first, second, tests, bound)}
         for first, second in (combinations(groups, 2) if compare else ())
     ]
     for comparison in comparisons if between else ():
-        comparison |= _between(_cells(rows, scale, by), comparison["first"], comparison["second"], bound)
-    for test in (*(each for each in tests if each != UNCORRECTED), *(BETWEEN_TESTS if between else ())):
+        comparison |= _between(_cells(rows, scale, by), comparison["first"], comparison["second"], between, bound)
+    for test in (*(each for each in tests if each != UNCORRECTED), *between):
         _correct([comparison[test] for comparison in comparisons])
     return {
         "means": [_mean_of(rows[rows[by] == group], scale, group, possible) for group in groups],
@@ -168,18 +171,22 @@ def scale_report(
     }
 
 
-def _between(cells: Mapping[tuple[str, str], FloatArray], first: str, second: str, bound: float) -> dict[str, Result]:
+def _between(
+    cells: Mapping[tuple[str, str], FloatArray], first: str, second: str, tests: Sequence[str], bound: float
+) -> dict[str, Result]:
     ratings = only_one_of(cells, first, second)
     means = means_of(ratings[0]), means_of(ratings[1])
-    results = {
-        "welch_t": welch_t(*means),
-        "permutation": permutation(*means),
-        "cumulative_link_between": cumulative_link_between(*ratings),
-        "equivalence_between": equivalence_between(*means, bound),
+    computed: dict[str, Callable[[], Result]] = {
+        "welch_t": lambda: _hedges_g(welch_t(*means), *means),
+        "permutation": lambda: permutation(*means),
+        "cumulative_link_between": lambda: cumulative_link_between(*ratings),
+        "equivalence_between": lambda: equivalence_between(*means, bound),
     }
-    if "p" in results["welch_t"]:
-        results["welch_t"] |= hedges_g(*means)
-    return results
+    return {test: computed[test]() for test in tests}
+
+
+def _hedges_g(test: Result, first: FloatArray, second: FloatArray) -> Result:
+    return test | hedges_g(first, second) if "p" in test else test
 
 
 def _cells(rows: pd.DataFrame, scale: str, by: str) -> dict[tuple[str, str], FloatArray]:
