@@ -130,6 +130,7 @@ RUN: dict[str, str | Elsewhere | OnlyParsed] = {
     "likert": Elsewhere("tests/worker/analysis/test_likert.py::test_the_command_writes_page_and_table"),
     "head_to_head": OnlyParsed("computes each truth from 200 000 people; what it measures has tests of its own"),
     "reliability": OnlyParsed("computes each truth from 400 000 people; what it measures has tests of its own"),
+    "in_r": OnlyParsed("needs R with two packages; tests/worker/analysis/test_exported_scripts.py runs it where it is"),
     "in_lerobot": OnlyParsed("needs the library lerobot, in an environment of its own"),
     "in_imitation": OnlyParsed("needs the library imitation, in an environment of its own"),
     "in_stable_baselines3": ROLLOUTS,

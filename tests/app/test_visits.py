@@ -224,3 +224,12 @@ class TestTheForm:
         answer = experimenter.post("/studies/new", data=form)
         assert answer.status_code == 422
         assert said in answer.text
+
+
+def test_the_page_of_an_archive_says_that_earlier_visits_are_not_in_it(
+    experimenter: TestClient, database: Database
+) -> None:
+    with database.writing() as session:
+        first = factories.make_study(session, "First visit")
+        pages = [f"/studies/{each.slug}/export" for each in (first, later(session, days_between_visits=0))]
+    assert ["earlier visits is not in it" in experimenter.get(page).text for page in pages] == [False, True]

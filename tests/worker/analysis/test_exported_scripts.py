@@ -8,6 +8,7 @@ import subprocess
 import sys
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from app.domain.clips import Clip
 from app.domain.preferences import Exclusion, LabelEvent, Purpose, Query, Response
 from app.domain.protocol import EvaluatedMethod
 from app.domain.studies import Participant, Study
-from app.paths import ANALYSIS
+from app.paths import ANALYSIS, DOCS
 from app.services.exports import export_tables
 from app.storage import ArtefactStore
 from tests import factories
@@ -61,7 +62,7 @@ def tables_of(contents: Mapping[str, Any]) -> Tables:
         ],
         "change_pooled": [{"measure": name, **each} for name, each in change["pooled"].items()],
         "guesses": [contents["guesses"]] if contents["guesses"] else [],
-        **_scales(contents["instruments"]),
+        **scales_tables(contents["instruments"]),
     }
 
 
@@ -125,7 +126,7 @@ def _answers_of(each: Mapping[str, Any]) -> Mapping[str, Any]:
     return flat
 
 
-def _scales(instruments: Rows) -> Tables:
+def scales_tables(instruments: Rows) -> Tables:
     means, comparisons, agreement = [], [], []
     for instrument in instruments:
         for score in (score for part in instrument["parts"] for score in part["scores"]):
@@ -138,8 +139,8 @@ def _scales(instruments: Rows) -> Tables:
 
 def assert_same(reported: Rows, computed: Rows, name: str, within: float = SAME) -> None:
     """The same rows, by their words, with the same numbers; what one has not, the other has not either."""
-    found = {_words(each): _numbers(each) for each in computed}
-    wanted = {_words(each): _numbers(each) for each in reported}
+    found = {words_of(each): numbers_of(each) for each in computed}
+    wanted = {words_of(each): numbers_of(each) for each in reported}
     assert found.keys() == wanted.keys(), name
     for words, numbers in wanted.items():
         assert found[words].keys() == numbers.keys(), (name, words)
@@ -162,14 +163,14 @@ KEYS = {
 }
 
 
-def _words(row: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
+def words_of(row: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
     kept = {name: value for name, value in row.items() if name in {*KEYS, "foresight"} and not _missing(value)}
     if {"participant", "scored"} == row.keys() - {"accuracy"}:  # a point of a curve
         kept["scored"] = row["scored"]
     return tuple(sorted((name, str(value)) for name, value in kept.items() if value != ""))
 
 
-def _numbers(row: Mapping[str, Any]) -> dict[str, float]:
+def numbers_of(row: Mapping[str, Any]) -> dict[str, float]:
     words = {*KEYS, "foresight", "not_computable"}
     return {name: float(value) for name, value in row.items() if name not in words and not _missing(value)}
 
@@ -255,6 +256,14 @@ def test_the_r_script_computes_every_number_of_the_report(exported: Exported) ->
     run("Rscript", folder / "analysis.R")
     for name, reported in tables_of(contents).items():
         assert_same(reported, read(folder / "analysis", name), name)
+
+
+@pytest.mark.parametrize("script", ["analysis.R", "analysis.py"])
+def test_the_scripts_are_those_that_real_r_was_last_seen_to_agree_on(script: str) -> None:
+    """Where there is no R, the two tests that run it are skipped; the page says of which scripts they held."""
+    found = sha256((ANALYSIS / script).read_bytes()).hexdigest()
+    page = (DOCS / "results/in_r.md").read_text()
+    assert found in page, "Run python -m tests.benchmarks.in_r where R is, and commit what it writes."
 
 
 def _drawn(contents: Mapping[str, Any]) -> Iterator[str]:

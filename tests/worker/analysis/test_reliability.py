@@ -90,7 +90,20 @@ def test_scores_about_robots_are_compared_within_people_and_not_while_letters_hi
 
 def test_omega_is_that_of_the_best_fit_and_not_of_the_nearest_one() -> None:
     """R 4.2: factanal(items, 1, control = list(nstart = 200)); from its one usual start it comes to 0.590."""
-    people = ("23454", "34354", "43444", "23344", "34332", "33434", "24253", "43434", "23344", "33322", "34322", "23343")
+    people = (
+        "23454",
+        "34354",
+        "43444",
+        "23344",
+        "34332",
+        "33434",
+        "24253",
+        "43434",
+        "23344",
+        "33322",
+        "34322",
+        "23343",
+    )
     items = np.array([[float(point) for point in person] for person in people])
     assert omega(np.cov(items, rowvar=False), len(people)) == pytest.approx(0.3133654, abs=1e-6)
 
@@ -98,7 +111,14 @@ def test_omega_is_that_of_the_best_fit_and_not_of_the_nearest_one() -> None:
 def test_scores_about_robots_are_compared_between_people_where_arms_met_different_ones() -> None:
     """Welch's t of 3, 4, 5 against 6, 7, 9, by hand: difference 10/3, error root of 1/3 + 7/9."""
     score = {"name": "effort", "title": "Effort", "lowest": 0, "highest": 100, "items": ["effort"]}
-    values = {"P1": ("a", 3.0), "P2": ("a", 4.0), "P3": ("a", 5.0), "P4": ("b", 6.0), "P5": ("b", 7.0), "P6": ("b", 9.0)}
+    values = {
+        "P1": ("a", 3.0),
+        "P2": ("a", 4.0),
+        "P3": ("a", 5.0),
+        "P4": ("b", 6.0),
+        "P5": ("b", 7.0),
+        "P6": ("b", 9.0),
+    }
     rows = [
         {"participant": person, "group": group, "scores": {"effort": value}, "items": {"effort": value}}
         for person, (group, value) in values.items()

@@ -132,9 +132,7 @@ def rating_report(
         "error_bars": ERROR_BARS,
         "star_below": STAR_BELOW,
         "scales": {
-            scale: scale_report(
-                rows, scale, by, groups, compare, between=BETWEEN_TESTS if between else (), bound=bound
-            )
+            scale: scale_report(rows, scale, by, groups, compare, between=BETWEEN_TESTS if between else (), bound=bound)
             for scale in SCALES
         },
     }
