@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from scipy import stats
 
 from app.paths import ANALYSIS
 from app.services.exports import export_tables
@@ -175,27 +176,30 @@ SAME = {
     "welch_t": ("welch_t", "statistic", "p"),
     "oneway.test": ("welch_t", "p"),
     "equivalence_between": ("equivalence_between", "p"),
-    "clmm": ("cumulative_link", "difference", "sd_between_people"),
-    "clmm between": ("cumulative_link_between", "difference", "sd_between_people"),
+    "clmm": ("cumulative_link", "difference", "sd_between_people", "standard_error", "p"),
+    "clmm between": ("cumulative_link_between", "difference", "sd_between_people", "standard_error", "p"),
     "lmer": ("mixed_model", "difference", "standard_error", "p"),
 }
 """By what R calls it: the test of the report, and quantities that mean the same."""
 
 
-def by_hand(study: Invented, tables: Tables, rows: Rows) -> Iterator[dict[str, Any]]:
-    """Every number of by_hand.R with the report's."""
+def by_hand(study: Invented, tables: Tables, rows: Rows, compared_by: int) -> Iterator[dict[str, Any]]:
+    """Every number of by_hand.R with the report's; ``compared_by``: people who answered head-to-heads."""
     tests = {(each["scale"], each["first"], each["second"], each["test"]): each for each in tables["comparisons"]}
     orders = {(each["scale"], each["effect"]): each for each in tables["order_effects"]}
     strengths = {each["group"]: each for each in tables["strengths"] if "group" in each}
     for row in rows:
         kind, quantity = row["analysis"], row["quantity"]
-        mine = None
+        mine: float | None = None
         if kind in SAME and quantity in SAME[kind][1:]:
             mine = tests[row["scale"], row["first"], row["second"], SAME[kind][0]].get(quantity)
         elif kind in ("period", "carryover"):
             mine = orders[row["scale"], kind].get(quantity)
         elif kind == "Bradley-Terry":
             mine = strengths[row["first"]]["strength"]
+        elif kind == "jackknife":
+            found = strengths[row["first"]]
+            mine = (found["high"] - found["strength"]) / stats.t.ppf(0.975, compared_by - 1)
         if mine is not None:
             yield {"study": study.name, "analysis": kind, "quantity": quantity, "r": row["value"], "report": mine}
 
@@ -224,7 +228,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             scripted += against_script(study, contents, folder / "analysis")
             _run(BY_HAND, folder / "csv", folder / "by_hand.csv")
             hand = pd.read_csv(folder / "by_hand.csv", keep_default_na=False, na_values=["NA"])
-            compared += by_hand(study, contents, hand.to_dict("records"))
+            answered = tables["headtoheads"]["participant"].nunique()
+            compared += by_hand(study, contents, hand.to_dict("records"), answered)
         sys.stdout.write(f"{study.name}\n")
     save(said.to, scripted, compared)
     return 0
