@@ -110,9 +110,9 @@ def _said(
             given = {"form": "scale", "item": f"item_{n}", "superseded": False}
             yield "forms", {**who, "letter": about["letter"], **given, "value": 6 - points if n == ITEMS else points}
     for left, right in ((a, b) for place, a in enumerate(met) for b in met[place + 1 :] for _ in range(2)):
-        felt = worth[left] - worth[right] + 0.2 + rng.logistic(0, 0.9)
-        said = "equal" if abs(felt) < 0.3 else "left" if felt > 0 else "right"
-        yield "headtoheads", {**who, "left_method": left, "right_method": right, "response": said, "counts": True}
+        better = worth[left] - worth[right] + 0.2 + rng.logistic(0, 0.9)
+        answer = "equal" if abs(better) < 0.3 else "left" if better > 0 else "right"
+        yield "headtoheads", {**who, "left_method": left, "right_method": right, "response": answer, "counts": True}
 
 
 def write(tables: Mapping[str, pd.DataFrame], folder: Path) -> None:

@@ -216,8 +216,8 @@ def _measures(study: Study) -> Iterator[str]:
             f"Words in {listed(own)} were the study's own, which nobody had validated." if own else "",
         )
     if settings.questionnaire:
-        own = "; ".join(quoted(each.question or each.name.replace("_", " ")) for each in settings.questionnaire)
-        yield f"Questions of the study's own at the end: {own}."
+        asked = "; ".join(quoted(each.question or each.name.replace("_", " ")) for each in settings.questionnaire)
+        yield f"Questions of the study's own at the end: {asked}."
     yield paragraph(
         "Each answer to a pair that was drawn at random was predicted by the newest reward model before it was given; "
         "the share predicted correctly is the model's accuracy on data that it had not seen.",
@@ -256,7 +256,8 @@ def _analysis(study: Study, plan: Plan) -> Iterator[str]:
         if plan.planned
         else "No test was planned; all are exploratory.",
         "Tests compared every two methods on each scale, two-sided and at a level of 5 %; p values were corrected by "
-        "Holm's method over the comparisons of one scale and one test, those included that could not be computed. The two-sample t-test, "
+        "Holm's method over the comparisons of one scale and one test, those included that could not be computed. "
+        "The two-sample t-test, "
         "which counts every rating as if a different person had given it, was computed as in the paper on PbARL and "
         "not corrected.",
         "Within people, from each person's mean rating of a method: Student's paired t-test (Cohen's d_z with its "
