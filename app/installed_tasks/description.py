@@ -131,9 +131,9 @@ class DescribedTask(BaseModel):
         return True
 
     @property
-    def policy_is_a_server(self) -> bool:
-        """Whether the policy answers from elsewhere."""
-        return False
+    def policy_is_packed(self) -> bool:
+        """Whether bundles hold the policy itself."""
+        return True
 
     @property
     def most_behaviours(self) -> int | None:

@@ -87,6 +87,10 @@ def _address(url: str) -> str:
     return url
 
 
+WHERE = ("file", "url", "function")
+"""Where a policy is."""
+
+
 class LabPolicy(_Table):
     """The frozen policy."""
 
@@ -94,6 +98,8 @@ class LabPolicy(_Table):
     """.onnx, .zip (Stable-Baselines3) or .safetensors (ours), beside the lab.toml"""
     url: Annotated[str, AfterValidator(_address)] | None = None
     """ws://host:port of a policy server, as openpi's"""
+    function: Reference | None = None
+    """module:function, which is given what a server would be sent and returns an action or a chunk of them"""
     answer_s: float = Field(default=10.0, gt=0.0, le=600.0)
     """how long the server may take for an answer"""
     inputs: dict[Annotated[str, Field(min_length=1, max_length=80)], _Columns] = {}
@@ -111,13 +117,17 @@ class LabPolicy(_Table):
 
     @model_validator(mode="after")
     def _one_of_both(self) -> Self:
-        if (self.file is None) == (self.url is None):
-            raise ValueError("needs either file or url (ws://host:port of a policy server)")
-        of_servers = {"answer_s", "inputs", "prompt", "execution_horizon"} & self.model_fields_set
-        if self.file and of_servers:
-            raise ValueError(f"{min(of_servers)} is for policy servers (url), and this policy is a file")
-        if self.url and self.settings:
-            raise ValueError("settings are for policies in files; a server answers with every action itself")
+        if sum(getattr(self, where) is not None for where in WHERE) != 1:
+            raise ValueError(
+                "needs either file, url (ws://host:port of a policy server) or function (module:function), and one of "
+                "them alone"
+            )
+        if self.file and (asked := {"inputs", "prompt", "execution_horizon"} & self.model_fields_set):
+            raise ValueError(f"{min(asked)} is for policy servers (url) and functions, and this policy is a file")
+        if not self.url and "answer_s" in self.model_fields_set:
+            raise ValueError("answer_s is for policy servers (url)")
+        if not self.file and self.settings:
+            raise ValueError("settings are for policies in files; a server or function says every action itself")
         return self
 
 
@@ -173,7 +183,7 @@ def _like(policy: dict[str, Any], own: Any) -> Any:
     """What an entry of ``policies`` says, and for the rest what ``policy`` says."""
     if not isinstance(own, dict):
         return own
-    elsewhere = {"file", "url"} if {"file", "url"} & own.keys() else set()
+    elsewhere = WHERE if own.keys() & {*WHERE} else ()
     return {**{key: value for key, value in policy.items() if key not in elsewhere}, **own}
 
 
@@ -247,9 +257,9 @@ class LabDescription(DescribedTask):
         return False
 
     @property
-    def policy_is_a_server(self) -> bool:
-        """Whether it answers over a websocket."""
-        return any(each.url is not None for each in (self.policy, *self.policies.values()))
+    def policy_is_packed(self) -> bool:
+        """Not what answers over a websocket, nor a function."""
+        return all(each.file is not None for each in (self.policy, *self.policies.values()))
 
     @property
     def signal_names(self) -> tuple[str, ...]:

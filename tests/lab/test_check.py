@@ -23,8 +23,8 @@ from worker.compute.lab_policies import policy_of
 from worker.experiments import lab_ranges
 from worker.experiments.check_lab import Checked, checked, replaced_packages
 from worker.ml.policies import lab_policy
+from worker.ml.policies.asked_policy import in_unit
 from worker.ml.policies.onnx_policy import OnnxPolicy, mlp_to_onnx
-from worker.ml.policies.remote_policy import in_unit
 from worker.sim.lab.environment import LabEnvironment
 from worker.sim.lab.references import named_object
 

@@ -191,7 +191,7 @@ def test_a_policy_server_is_told_that_nobody_asks_any_more() -> None:
         thread = threading.Thread(target=server.serve_forever)
         thread.start()
         url = f"ws://127.0.0.1:{server.socket.getsockname()[1]}"
-        program = f"from worker.ml.policies.remote_policy import _connection; _connection({url!r}, 5.0).ask({{}})"
+        program = f"from worker.ml.policies.asked_policy import _connection; _connection({url!r}, 5.0).ask({{}})"
         subprocess.run([sys.executable, "-c", program], check=True, cwd=ROOT)
         server.shutdown()
         thread.join()

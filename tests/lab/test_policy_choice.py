@@ -39,7 +39,7 @@ from worker.jobs.learning.reward_models import train_reward
 from worker.jobs.runtime.context import WorkerContext
 from worker.ml.export import bundle
 from worker.ml.filters import policy_choice
-from worker.ml.policies import remote_policy
+from worker.ml.policies import asked_policy
 from worker.ml.policies.onnx_policy import NotAPolicy, adapted
 from worker.tasks import registry
 
@@ -241,7 +241,7 @@ def test_each_of_several_policies_may_answer_from_a_server_of_its_own(
         fit_response_surface.find_ranges("plane", scenarios=4)
         context = WorkerContext(database, store, AtHand())
         found = learned(context, SLOW, *EVALUATED)
-    remote_policy.forget()
+    asked_policy.forget()
     manifest = bundle.verify(found["bundle"])
     assert manifest["choice"]["policy"] in {"slow", "slower"}
     assert manifest["policy"]["file"] is None

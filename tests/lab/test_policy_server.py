@@ -17,7 +17,7 @@ from worker.experiments import fit_response_surface
 from worker.experiments.check_lab import Checked, checked
 from worker.ml.filters.filter_module import FilterWeights
 from worker.ml.filters.filter_problem import act_of
-from worker.ml.policies import remote_policy
+from worker.ml.policies import asked_policy
 from worker.ml.policies.onnx_policy import NotAPolicy
 from worker.ml.policies.policy_client import packed, unpacked
 from worker.tasks import registry
@@ -26,7 +26,7 @@ from worker.tasks import registry
 @pytest.fixture(autouse=True)
 def _as_a_new_process() -> Iterator[None]:
     yield
-    remote_policy.forget()
+    asked_policy.forget()
 
 
 def behind(folder: Path, url: str, more: str = "") -> Path:
@@ -67,7 +67,7 @@ def test_a_chunk_is_executed_as_far_as_it_is_said_before_the_next_is_asked_for(p
 
     with serving(answer, asked=asked) as url:
         assert found(behind(plane, url, more)).wrong == ()
-    assert len(asked) == 2 + 3 * 40 / 4, "twice the first, then every fourth step of three episodes, once each"
+    assert len(asked) == 2 + 3 * 40 / 4 + 2 * 5, "first twice, every fourth step of three episodes, five once more"
 
 
 def never(_: dict[str, Any]) -> Any:
@@ -126,7 +126,7 @@ def test_a_dead_server_and_one_of_something_else_are_told_apart(plane: Path, tmp
 @pytest.mark.parametrize(
     ("more", "complaint"),
     [
-        ('file = "policy.onnx"', "policy needs either file or url"),
+        ('file = "policy.onnx"', "policy needs either file, url"),
         ("execution_horizon = 9", "answers with 4 actions, and policy.execution_horizon wants 9"),
         ('inputs = { state = "tip" }', "policy.inputs.\"state\": No field 'tip'"),
     ],
@@ -181,14 +181,14 @@ def test_another_policy_at_the_same_address_is_not_taken_for_the_one_that_was_ex
         assert registry.task("plane").interface is not None
         assert simulation.run_episode("plane", simulation.reference_policy("plane").mean, 1).success
         port = int(url.rpartition(":")[2])
-    remote_policy.forget()
+    asked_policy.forget()
     use(folder)
     with (
         serving(lambda message: {"actions": -to_goal(message)["actions"]}, port=port),
         pytest.raises(NotAPolicy, match="is not the one with which the task was explored"),
     ):
         simulation.run_episode("plane", simulation.reference_policy("plane").mean, 1)
-    remote_policy.forget()
+    asked_policy.forget()
     with serving() as elsewhere:
         (folder / "lab.toml").write_text((folder / "lab.toml").read_text().replace(url, elsewhere))
         use(folder)

@@ -15,7 +15,7 @@ import pytest
 from worker.compute import simulation
 from worker.experiments.check_lab import checked
 from worker.ml.filters.response_surface import ResponseSurface
-from worker.ml.policies import remote_policy
+from worker.ml.policies import asked_policy
 from worker.sim.lab.errors import LabTaskBroken
 from worker.tasks import registry
 
@@ -37,7 +37,7 @@ def reacher(tmp_path: Path) -> Iterator[Path]:
             yield folder
         finally:
             server.kill()
-            remote_policy.forget()
+            asked_policy.forget()
 
 
 def test_it_passes_its_own_check(reacher: Path) -> None:

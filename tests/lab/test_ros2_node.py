@@ -16,7 +16,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from tests.lab.policy_server import serving, to_goal
 from tests.lab.test_serve_filter import Plane, written
-from worker.ml.policies import remote_policy
+from worker.ml.policies import asked_policy
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "ros2" / "filter_node.py"
 ROS = get_typestore(Stores.ROS2_JAZZY)
@@ -85,7 +85,7 @@ def made(plane: Path) -> Iterator[Plane]:
         lab = Plane(plane, url)
         yield lab
         lab.environment.close()
-    remote_policy.forget()
+    asked_policy.forget()
 
 
 def test_a_robot_behind_the_node_moves_as_it_did_when_the_filter_was_fitted_and_stops_when_nobody_sees(

@@ -30,7 +30,7 @@ from worker.ml.export.interface import interface_of
 from worker.ml.export.serve_filter import FilterLoop, Refused, require_same
 from worker.ml.filters.filter_module import FilterWeights
 from worker.ml.filters.filter_problem import FilterAct, act_of
-from worker.ml.policies import remote_policy
+from worker.ml.policies import asked_policy
 from worker.ml.policies.policy_client import PolicyServer, PolicyServerFailed, packed
 from worker.ml.policies.reference import ReferencePolicy
 from worker.ml.rewards.reward_models import StructuredReward
@@ -80,7 +80,7 @@ def plane_of(plane: Path) -> Iterator[Callable[..., Plane]]:
             return made
 
         yield make
-    remote_policy.forget()
+    asked_policy.forget()
 
 
 def of(answer: dict[str, Any]) -> tuple[str, list[float]]:
@@ -339,7 +339,9 @@ def test_what_is_missing_is_said_before_anybody_connects(plane_of: Callable[...,
     folder = written(
         made.task, made.policy, made.environment.episode(made.filter, 3, made.policy.mean), made.filter, tmp_path
     )
-    assert "say where with --upstream" in ended(folder, "run_filter.py", "--serve", "0")
+    assert "say where it is with --upstream ws://host:port or --upstream module:function" in ended(
+        folder, "run_filter.py", "--serve", "0"
+    )
     nobody = ("run_filter.py", "--serve", "0", "--upstream", "ws://127.0.0.1:9")
     assert "no policy server answers at ws://127.0.0.1:9" in ended(folder, *nobody)
     code = "import sys, runpy; sys.modules['websockets'] = None; sys.argv = ['run_filter.py', '--serve', '0']\n"

@@ -29,7 +29,7 @@ from worker.jobs.learning.filters import train_filter
 from worker.jobs.learning.reward_models import train_reward
 from worker.jobs.runtime.context import WorkerContext
 from worker.ml.export import bundle
-from worker.ml.policies import remote_policy
+from worker.ml.policies import asked_policy
 
 METHODS = (EvaluatedMethod.REFERENCE, EvaluatedMethod.SOMEBODY_ELSE, EvaluatedMethod.PBARL)
 
@@ -71,7 +71,7 @@ def test_from_a_policy_server_to_a_bundle(
             stored = store.read(
                 session.scalars(select(Bundle).where(Bundle.model_id == model.id)).one().artefact_sha256
             )
-    remote_policy.forget()
+    asked_policy.forget()
     assert set(shown) == set(METHODS), "somebody else's is that of a type of user, while there is nobody else"
     assert len(set(shown.values())) == len(METHODS), "every robot acts differently"
     manifest = bundle.verify(stored)

@@ -38,6 +38,8 @@ class LabInterface:
     """what a policy is sent: names with columns of the observation"""
     prompt: str | None
     execution_horizon: int
+    function: str = ""
+    """module:name of a policy that is a function; empty: it is none"""
     settings: tuple[tuple[str, float], ...] = ()
     """actions that stay at a value, in the environment's own unit: the policy's file says the others"""
 

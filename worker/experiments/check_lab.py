@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 from app.installed_tasks import lab
 from app.installed_tasks.description import InstalledTask, TaskRefused
-from app.installed_tasks.lab import FOUND_FILE, LabDescription, whole
+from app.installed_tasks.lab import FOUND_FILE, WHERE, LabDescription, whole
 from app.paths import LOCKS
 from worker.compute.lab_clips import SAME_WITHIN
 from worker.compute.lab_policies import policy_of
@@ -24,8 +24,8 @@ from worker.domain.scenarios import POLICY_TEST
 from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import Act
 from worker.experiments import disagreement, lab_ranges
+from worker.ml.policies.asked_policy import AskedPolicy
 from worker.ml.policies.onnx_policy import NotAPolicy, OnnxPolicy
-from worker.ml.policies.remote_policy import RemotePolicy
 from worker.sim.lab.environment import LabEnvironment, Picture
 from worker.sim.lab.errors import LabTaskBroken
 from worker.sim.lab.found import Found, mark_of
@@ -98,14 +98,15 @@ def checked(file: Path, sheet: Path) -> Checked:
 
 def _key(described: LabDescription, name: str) -> str:
     """Where lab.toml names a policy."""
-    of = "file" if described.policy_named(name).url is None else "url"
+    said = described.policy_named(name)
+    of = next(where for where in WHERE if getattr(said, where) is not None)
     return f"policies.{name}.{of}" if name else f"policy.{of}"
 
 
 def _run(
     described: LabDescription,
     environment: LabEnvironment,
-    policies: Mapping[str, OnnxPolicy | RemotePolicy],
+    policies: Mapping[str, OnnxPolicy | AskedPolicy],
     sheet: Path,
 ) -> Checked:
     shown = set(np.linspace(0, described.episode_steps - 1, PICTURES).round().astype(int).tolist())
@@ -123,15 +124,14 @@ def _run(
         rows.append(row)
         if np.abs(again.observations - trajectories[-1].observations).max() > REPEATED_WITHIN:
             return Checked((_not_repeated(again, trajectories[-1], described),), (), None)
-    failed = []
+    done = {"": trajectories[0]}
     for name in described.policies:
         rows.append([])
-        done = environment.episode(
+        done[name] = environment.episode(
             policies[name].mean, POLICY_TEST[0], take=lambda step: rows[-1].append if step in shown else None
         )
-        failed += [] if done.success else [name]
     _write(sheet, rows)
-    wrong = []
+    wrong = _remember(described, policies, done)
     if not any(each.success for each in trajectories):
         wrong.append(
             f"success: none of {EPISODES} episodes succeeded. Check what success says at the last step, episode_steps, "
@@ -146,12 +146,27 @@ def _run(
         )
     remarks = _remarks(described, trajectories, seconds, sheet)
     if described.policies:
+        failed = [name for name in described.policies if not done[name].success]
         also = f" Not done by {', '.join(failed)}." if failed else ""
         remarks = (
             *remarks,
             f"The last {len(described.policies)} rows of it are {', '.join(described.policies)}.{also}",
         )
     return Checked(tuple(wrong), remarks, sheet)
+
+
+def _remember(
+    described: LabDescription, policies: Mapping[str, OnnxPolicy | AskedPolicy], done: Mapping[str, Trajectory]
+) -> list[str]:
+    """Which servers and functions answer otherwise when they are asked in another order, in words."""
+    wrong = []
+    for name, policy in policies.items():
+        try:
+            if isinstance(policy, AskedPolicy):
+                policy.require_no_memory(done[name].observations[:-1])
+        except NotAPolicy as error:
+            wrong.append(f"{_key(described, name)}: {error}")
+    return wrong
 
 
 def _disagree(installed: InstalledTask, described: LabDescription, environment: LabEnvironment) -> tuple[str, ...]:

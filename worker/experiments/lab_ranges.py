@@ -19,8 +19,8 @@ from worker.domain.scenarios import RESPONSE_SURFACE
 from worker.domain.task import Answered
 from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import Float32Array, FloatArray
+from worker.ml.policies.asked_policy import AskedPolicy
 from worker.ml.policies.onnx_policy import OnnxPolicy
-from worker.ml.policies.remote_policy import RemotePolicy
 from worker.sim.lab.environment import LabEnvironment
 from worker.sim.lab.errors import LabTaskBroken
 from worker.sim.lab.found import Found, mark_of
@@ -72,9 +72,9 @@ def first_found(described: LabDescription, environment: LabEnvironment, folder: 
     )
 
 
-def asked_first(policy: OnnxPolicy | RemotePolicy, environment: LabEnvironment, scenario: int) -> Answered | None:
+def asked_first(policy: OnnxPolicy | AskedPolicy, environment: LabEnvironment, scenario: int) -> Answered | None:
     """What a policy server says at the beginning of a scenario; None of a policy in a file. Raises NotAPolicy."""
-    return policy.first_answer(environment.first_observation(scenario)) if isinstance(policy, RemotePolicy) else None
+    return policy.first_answer(environment.first_observation(scenario)) if isinstance(policy, AskedPolicy) else None
 
 
 def changed_since(found: Found, described: LabDescription, folder: Path, environment: LabEnvironment) -> str:
@@ -183,7 +183,7 @@ def _usable_end(
     end: float,
     described: LabDescription,
     environment: LabEnvironment,
-    policy: OnnxPolicy | RemotePolicy,
+    policy: OnnxPolicy | AskedPolicy,
     reference: Sequence[Trajectory],
 ) -> tuple[float, str]:
     """The end of an axis that can be used, 0.0 for none; and why it is not all of it."""
@@ -243,7 +243,7 @@ def _start_distance_m(found: Found, reference: Sequence[Trajectory]) -> float:
     return max(float(np.median(np.linalg.norm(starts[:, found.goal] - starts[:, found.tip], axis=1))), 1e-3)
 
 
-def _share_at_limit(found: Found, policy: OnnxPolicy | RemotePolicy, reference: Sequence[Trajectory]) -> float:
+def _share_at_limit(found: Found, policy: OnnxPolicy | AskedPolicy, reference: Sequence[Trajectory]) -> float:
     actions = np.concatenate([each.actions for each in reference])[:, found.moving]
     return float((np.abs(actions).max(axis=1) >= AT_LIMIT).mean())
 

@@ -76,8 +76,8 @@ def complaints(task: str, settings: StudySettings, *, recorded: bool = False) ->
         found["evaluation_methods"] = f"{' and '.join(in_need)} {_NEEDS_WEIGHTS}"
     if most is not None and EvaluatedMethod.SELF_SET in asked:
         found["evaluation_methods"] = "One of several policies is chosen in this task: nothing can be set by sliders."
-    if installed.description.policy_is_a_server and settings.evaluation.mode is EvaluationMode.PHYSICAL:
+    if not installed.description.policy_is_packed and settings.evaluation.mode is EvaluationMode.PHYSICAL:
         found["evaluation_mode"] = (
-            "This task's policy answers from a server, so a robot cannot be packed for its operator. Show videos."
+            "This task's policy is no file, so a robot cannot be packed for its operator. Show videos."
         )
     return found

@@ -82,7 +82,7 @@ def _of_lab(described: LabDescription) -> TaskWords:
         {**axes, **words.axes},
         {name: own.get(name) or shared[name] for name in described.signal_names},
         words.silent_signals,
-        OF_A_SERVER if described.policy.url else "",
+        OF_A_SERVER if any(each.url for each in (described.policy, *described.policies.values())) else "",
     )
 
 

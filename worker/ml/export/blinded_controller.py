@@ -26,9 +26,9 @@ from worker.ml.export.run_controller import INPUT, OUTPUT, Controller
 from worker.ml.filters.filter_onnx import LARGEST_DIFFERENCE, ExportDiffers, OnnxFilter
 from worker.ml.filters.filter_problem import FilterAct
 from worker.ml.methods.preference_rl import PolicyAct
+from worker.ml.policies.asked_policy import AskedPolicy
 from worker.ml.policies.policy_onnx import IR_VERSION, OPSET
 from worker.ml.policies.reference import ReferencePolicy
-from worker.ml.policies.remote_policy import RemotePolicy
 from worker.ml.policies.stored_policy import stored_policy
 
 SCHEMA_VERSION = 1
@@ -125,7 +125,7 @@ def _manifest(blinded: Blinded) -> dict[str, Any]:
 
 def _of_policy(policy: ReferencePolicy) -> bytes:
     """The policy's graph; of a server nothing but what it says."""
-    if isinstance(policy, RemotePolicy):
+    if isinstance(policy, AskedPolicy):
         said = helper.make_node("Identity", [_POLICY_MEAN], [OUTPUT])
         return _blinded([said], [], _SAID, (OPSET, IR_VERSION), policy)
     graph = onnx.load_from_string(stored_policy(policy))
@@ -134,7 +134,7 @@ def _of_policy(policy: ReferencePolicy) -> bytes:
 
 def _of_filter(act: FilterAct) -> bytes:
     """The policy's graph, and the filter's behind it."""
-    if isinstance(act.policy, RemotePolicy):
+    if isinstance(act.policy, AskedPolicy):
         alone = onnx.load_from_string(act.exported.stored)
         return _blinded([*alone.graph.node], alone.graph.initializer, _SAID, _versions(alone), act.policy)
     policy = onnx.load_from_string(stored_policy(act.policy))
@@ -198,12 +198,12 @@ def _blinded(
     ends = {
         name: helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", size]) for name, size in sizes.items()
     }
-    inputs = [ends[INPUT], *([ends[_POLICY_MEAN]] if isinstance(policy, RemotePolicy) else [])]
+    inputs = [ends[INPUT], *([ends[_POLICY_MEAN]] if isinstance(policy, AskedPolicy) else [])]
     graph = helper.make_graph(plain, "controller", inputs, [ends[OUTPUT]], tensors)
     opset, ir_version = versions
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", opset)], ir_version=ir_version)
     onnx.checker.check_model(model)
-    if isinstance(policy, RemotePolicy) and policy.asking.name:
+    if isinstance(policy, AskedPolicy) and policy.asking.name:
         model.metadata_props.add(key=_ASKED, value=policy.asking.name)
     return _padded(model)
 

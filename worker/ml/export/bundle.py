@@ -28,8 +28,8 @@ from worker.ml.filters import shield
 from worker.ml.filters.filter_module import FilterWeights
 from worker.ml.filters.filter_onnx import INPUTS, OUTPUT, SHIELD, OnnxFilter
 from worker.ml.policies import policy_client
+from worker.ml.policies.asked_policy import AskedPolicy
 from worker.ml.policies.reference import ReferencePolicy
-from worker.ml.policies.remote_policy import RemotePolicy
 from worker.ml.policies.stored_policy import stored_policy
 from worker.ml.rewards.reward_models import CLIP, RewardModel
 
@@ -153,8 +153,8 @@ def verify(stored: bytes) -> dict[str, Any]:
 
 
 def _policy_files(policy: ReferencePolicy) -> dict[str, bytes]:
-    """None of a policy that answers from a server."""
-    return {} if isinstance(policy, RemotePolicy) else {"policy.onnx": stored_policy(policy)}
+    """None of a policy that answers from a server or is a function."""
+    return {} if isinstance(policy, AskedPolicy) else {"policy.onnx": stored_policy(policy)}
 
 
 def _manifest(contents: BundleContents) -> dict[str, Any]:
@@ -185,7 +185,7 @@ def _manifest(contents: BundleContents) -> dict[str, Any]:
             "reward_clip": CLIP,
         },
         "policy": {
-            "file": None if isinstance(contents.policy, RemotePolicy) else "policy.onnx",
+            "file": None if isinstance(contents.policy, AskedPolicy) else "policy.onnx",
             "weights_sha256": _sha256(save(contents.policy.weights)),
             "action_limit": contents.policy.action_limit,
         },

@@ -6,8 +6,8 @@ from typing import Any
 
 from worker.domain.spaces import Space
 from worker.domain.task import LabInterface, Task
+from worker.ml.policies.asked_policy import AskedPolicy
 from worker.ml.policies.reference import ReferencePolicy
-from worker.ml.policies.remote_policy import RemotePolicy
 
 ROBOT_FRAME = "robot base"
 """Of the studio's own tasks; see worker.domain.spaces."""
@@ -35,11 +35,12 @@ def interface_of(task: Task, policy: ReferencePolicy) -> dict[str, Any]:
             "moving": list(lab.moving),
         },
         "policy": {
-            "answers_from_a_server": isinstance(policy, RemotePolicy),
+            "answers_from_a_server": isinstance(policy, AskedPolicy) and not lab.function,
             "gain": lab.gain,
             "inputs": {name: list(columns) for name, columns in lab.inputs},
             "prompt": lab.prompt,
             "execution_horizon": lab.execution_horizon,
+            **({"function": lab.function} if lab.function else {}),
             **({"settings": dict(lab.settings)} if lab.settings else {}),
         },
     }

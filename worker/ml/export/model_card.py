@@ -61,7 +61,7 @@ def model_card(manifest: Mapping[str, Any]) -> str:
         _measured(manifest.get("evaluation")),
         _notes(manifest),
         _USE.format(units=_AS_A_LABS if _is_a_labs(manifest) else _AS_OURS),
-        _server(manifest),
+        _elsewhere(manifest),
         _LIMITS.format(simulated="" if _is_a_labs(manifest) else ", with a model of one arm and one seated person"),
     ]
     return "\n\n".join(section for section in sections if section) + "\n"
@@ -79,13 +79,16 @@ def _is_a_labs(manifest: Mapping[str, Any]) -> bool:
     return bool(interface.get("adds_previous_action_and_share"))
 
 
-def _server(manifest: Mapping[str, Any]) -> str:
+def _elsewhere(manifest: Mapping[str, Any]) -> str:
     """Where the policy is, if it is not in the bundle."""
     if manifest["policy"]["file"]:
         return ""
+    function = manifest["interface"]["policy"].get("function")
+    where = f"is the function `{function}`" if function else "answers from a server"
     return (
-        "The policy of this bundle answers from a server, so `policy.onnx` is not part of it:\n\n"
-        "```\npython -m pip install websockets msgpack\npython run_filter.py --serve 8001 --upstream ws://HOST:PORT\n```"
+        f"The policy of this bundle {where}, so `policy.onnx` is not part of it:\n\n"
+        "```\npython -m pip install websockets msgpack\n"
+        f"python run_filter.py --serve 8001 --upstream {function or 'ws://HOST:PORT'}\n```"
     )
 
 

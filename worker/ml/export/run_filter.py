@@ -12,8 +12,9 @@
         policy.onnx, or from an (N, A) file of your own with --policy-means policy_means.npy.
 
     python run_filter.py --serve 8001 --upstream ws://localhost:8000
-        Stand between a policy server and a client, both in the websocket protocol of openpi; without --upstream the
-        policy is the bundle's own. serve_filter.py says how. Needs also: python -m pip install websockets msgpack
+        Stand between a policy server and a client, both in the websocket protocol of openpi. With --upstream
+        module:function the policy is called in this process, and without --upstream it is the bundle's own.
+        serve_filter.py says how. Needs also: python -m pip install websockets msgpack
 
 In a control loop, load the filter once and call it at every step:
 
@@ -67,7 +68,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--key", metavar="FINGERPRINT", help="refuse what this key has not signed")
     parser.add_argument("--output", type=Path, help="where to write the (N, A) filtered actions, as .npy")
     parser.add_argument("--serve", type=int, metavar="PORT", help="filter in a loop over websockets (0: any free port)")
-    parser.add_argument("--upstream", metavar="URL", help="with --serve: the policy server, ws://host:port")
+    parser.add_argument(
+        "--upstream", metavar="WHERE", help="with --serve: the policy, ws://host:port or module:function"
+    )
     parser.add_argument(
         "--host", default="127.0.0.1", help="with --serve: where to listen; nobody is asked who they are"
     )
@@ -87,7 +90,7 @@ def main(arguments: list[str] | None = None) -> int:
         if options.output:
             means = options.policy_means or policy
             if means is None:
-                raise Problem("this bundle's policy answers from a server; give what it said with --policy-means.")
+                raise Problem("this bundle holds no policy; give what it said with --policy-means.")
             filter_files(manifest, session, options.observations, means, options.output)
         else:
             compare_with_recording(manifest, session, policy, directory / "recorded")
@@ -171,7 +174,7 @@ def load(path: Path) -> Any:
 
 
 def policy_of(manifest: dict[str, Any], directory: Path) -> Any:
-    """The policy's session; None where it answers from a server and is not in the bundle."""
+    """The policy's session; None where it is a server or a function, and not in the bundle."""
     return load(directory / "policy.onnx") if "policy.onnx" in manifest["files"] else None
 
 

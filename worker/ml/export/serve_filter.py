@@ -1,9 +1,10 @@
-"""Runs a bundle's filter as a loop, between any policy server and any client: ``run_filter.py --serve PORT``.
+"""Runs a bundle's filter as a loop, between any policy and any client: ``run_filter.py --serve PORT``.
 
 Both sides speak openpi's websocket protocol (policy_client.py). A client's message goes to the policy server as it
-came. Of the chunk that comes back, the actions are filtered one at a time, each with a fresh observation, and the
-client gets one action (1, A) in the policy's own units, with ``filter``: in which state the loop is, and why. The first
-message of a connection begins an episode, and so does one that says ``"reset": true``.
+came; a policy that is a function (``--upstream module:function``) is called in this process instead. Of the chunk that
+comes back, the actions are filtered one at a time, each with a fresh observation, and the client gets one action (1, A)
+in the policy's own units, with ``filter``: in which state the loop is, and why. The first message of a connection
+begins an episode, and so does one that says ``"reset": true``.
 
 A watchdog stands between them. An answer later than the deadline: the last action at half, a quarter, an eighth of it
 ("slow"), then zero ("stop"), until the policy is in time again; actions that do not move the robot, a gripper's, stay
@@ -15,6 +16,7 @@ own watchdog must stop it when this loop says nothing at all.
 import argparse
 import contextlib
 import http
+import importlib
 import logging
 import signal
 import sys
@@ -24,6 +26,7 @@ from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures import TimeoutError as Late
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -32,9 +35,17 @@ from websockets.http11 import Request, Response
 from websockets.sync.server import ServerConnection, serve
 
 if __package__:
-    from worker.ml.policies.policy_client import PolicyServer, PolicyServerFailed, chunk_of, packed, unpacked
+    from worker.ml.policies.policy_client import (
+        PolicyFunction,
+        PolicyServer,
+        PolicyServerFailed,
+        chunk_of,
+        packed,
+        unpacked,
+    )
 else:  # in a bundle it lies beside this file
     from policy_client import (  # type: ignore[import-not-found, no-redef]  # in bundles
+        PolicyFunction,
         PolicyServer,
         PolicyServerFailed,
         chunk_of,
@@ -51,6 +62,8 @@ FAR_OUTSIDE = 10.0
 SLOW_STEPS = 3
 """Late answers in a row for which the robot is slowed down before it is stopped."""
 TOLERATED_RATE = 0.2
+SAME_WITHIN = 1e-4
+"""Largest difference of a policy's action in [-1, 1] from the recorded one: another computer rounds otherwise."""
 ASKED_FOR_RATE = 20
 """Steps after which the client's rate is known."""
 OURS = {"reset", "interface"}
@@ -94,7 +107,12 @@ class FilterLoop:
     """One robot's filter: what is between two messages is kept here. Raises Refused for messages of others."""
 
     def __init__(
-        self, interface: Mapping[str, Any], run: Run, policy: PolicyServer | Means, deadline_s: float, pause_s: float
+        self,
+        interface: Mapping[str, Any],
+        run: Run,
+        policy: PolicyServer | PolicyFunction | Means,
+        deadline_s: float,
+        pause_s: float,
     ) -> None:
         self.interface, self._run, self._policy = interface, run, policy
         self._deadline_s, self._pause_s = deadline_s, pause_s
@@ -147,6 +165,10 @@ class FilterLoop:
         self.counted.whole_ms.append(1000 * (time.perf_counter() - now))
         said = {"state": state, "why": why or self._rate_note()}
         return {**others, "actions": self._outside(action)[None], "filter": said}
+
+    def first_said(self, observation: Any) -> Any:
+        """(own size,) -> (A,): the policy's action in [-1, 1] at the beginning of an episode, asked alone."""
+        return self._next_chunk(observation, packed({}), {})[0]
 
     def close(self) -> None:
         """Let go of the policy server."""
@@ -218,7 +240,7 @@ class FilterLoop:
         return mean
 
     def _next_chunk(self, observation: Any, stored: bytes, others: dict[str, Any]) -> Any:
-        if not isinstance(self._policy, PolicyServer):
+        if not isinstance(self._policy, PolicyServer | PolicyFunction):
             return np.asarray(self._policy(self._whole(observation)), np.float32)
         until = time.perf_counter() + self._deadline_s
         if self._asked is not None:  # an answer that was late: what it says is of the past
@@ -277,31 +299,35 @@ def require_same(who: str, said: Mapping[str, Any], own: Mapping[str, Any]) -> N
 def main(manifest: Mapping[str, Any], run: Run, means: Means | None, options: argparse.Namespace) -> int:
     """Serve until a signal; the exit code."""
     interface = manifest["interface"]
-    policy: PolicyServer | Means
+    policy: PolicyServer | PolicyFunction | Means
     if options.upstream and interface["policy"].get("settings"):
         sys.stderr.write(
             "FAILED: this bundle's policy has settings that a server does not know: leave --upstream out.\n"
         )
         return 1
     if options.upstream:
-        policy = PolicyServer(options.upstream, answer_s=options.upstream_s)
         try:
-            policy.connect()
-            if isinstance(policy.metadata.get("interface"), dict):
-                require_same("the policy server", policy.metadata["interface"], interface)
+            policy = _upstream(options, interface)
         except (PolicyServerFailed, Refused) as error:
-            policy.close()
             sys.stderr.write(f"FAILED: {error}\n")
             return 1
     elif means is not None:
         policy = means
     else:
         sys.stderr.write(
-            "FAILED: this bundle's policy answers from a server: say where with --upstream ws://host:port.\n"
+            "FAILED: this bundle holds no policy: say where it is with --upstream ws://host:port or --upstream "
+            "module:function.\n"
         )
         return 1
     deadline_s = options.deadline_ms / 1000.0 if options.deadline_ms else 1.0 / interface["control_rate_hz"]
     loop = FilterLoop(interface, run, policy, deadline_s, options.pause_s)
+    if isinstance(policy, PolicyFunction):
+        try:
+            _require_the_policy(loop, Path(__file__).with_name("recorded"))
+        except (PolicyServerFailed, Refused) as error:
+            loop.close()
+            sys.stderr.write(f"FAILED: {error}\n")
+            return 1
     about = {
         "interface": dict(interface),
         "bundle": {name: manifest[name] for name in ("study", "participant", "version")},
@@ -323,6 +349,39 @@ def main(manifest: Mapping[str, Any], run: Run, means: Means | None, options: ar
         loop.close()
     sys.stdout.write("Ended.\n")
     return 0
+
+
+def _upstream(options: argparse.Namespace, interface: Mapping[str, Any]) -> PolicyServer | PolicyFunction:
+    """Raises PolicyServerFailed, and Refused for a server of something else."""
+    if "://" not in options.upstream:
+        module, _, name = options.upstream.partition(":")
+        try:
+            return PolicyFunction(options.upstream, getattr(importlib.import_module(module), name))
+        except Exception as error:  # whatever code from elsewhere may do when it is imported
+            raise Refused(
+                f"{options.upstream!r} is no address of a websocket, and as module:function it cannot be imported "
+                f"({type(error).__name__}: {error}). Put the file beside run_filter.py, or install its package."
+            ) from error
+    server = PolicyServer(options.upstream, answer_s=options.upstream_s)
+    try:
+        server.connect()
+        if isinstance(server.metadata.get("interface"), dict):
+            require_same("the policy server", server.metadata["interface"], interface)
+    except (PolicyServerFailed, Refused):
+        server.close()
+        raise
+    return server
+
+
+def _require_the_policy(loop: FilterLoop, recorded: Path) -> None:
+    """Refuse a function that says something else of what was recorded than the policy that the filter was made for."""
+    seen, mean = (np.load(recorded / f"{name}.npy", allow_pickle=False)[0] for name in ("observations", "policy_means"))
+    said = loop.first_said(seen[: sum(field["size"] for field in loop.interface["observation"])])
+    if float(np.abs(said - mean).max()) > SAME_WITHIN:
+        raise Refused(
+            f"this is another policy than the one of this bundle: it says {np.round(said, 4).tolist()} where that said "
+            f"{np.round(mean, 4).tolist()}."
+        )
 
 
 @contextlib.contextmanager

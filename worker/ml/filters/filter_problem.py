@@ -27,9 +27,9 @@ from worker.ml.filters.action_encoder import ResidualAdapter
 from worker.ml.filters.filter_module import FilterWeights, build, state_of
 from worker.ml.filters.filter_onnx import OnnxFilter, to_onnx
 from worker.ml.filters.shield import widest
+from worker.ml.policies.asked_policy import AskedPolicy
 from worker.ml.policies.gaussian import GaussianPolicy
 from worker.ml.policies.reference import ReferencePolicy
-from worker.ml.policies.remote_policy import RemotePolicy
 from worker.ml.rewards.reward_models import RewardModel
 
 ReportProgress = Callable[[str, float], None]
@@ -191,7 +191,7 @@ def act_of(family: ModeFamily, policy: ReferencePolicy, weights: FilterWeights) 
     rng = np.random.default_rng(0)
     spread = 0.3 * rng.standard_normal((64, len(policy.offset)))
     observations = (policy.offset + spread).astype(np.float32)
-    if isinstance(policy, RemotePolicy):  # a server is asked about nothing that was invented
+    if isinstance(policy, AskedPolicy):  # a server is asked about nothing that was invented
         means = rng.uniform(-1.0, 1.0, (len(observations), policy.action_size)).astype(np.float32)
     else:
         means = policy.mean(observations)

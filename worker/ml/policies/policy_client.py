@@ -1,11 +1,11 @@
-"""Asks a policy server over a websocket, in the protocol of openpi's server: MessagePack with NumPy arrays.
+"""Asks a policy: a server over a websocket, in the protocol of openpi's (MessagePack with NumPy arrays), or a function.
 
 The server sends its metadata first; then it answers each message, a dictionary of arrays, with a dictionary that has
 ``actions`` (H, A), a chunk of H actions. An answer that is text is an error. What comes from a server is hostile until
 it is checked. This file needs no other of the project: bundles contain it, for ``run_filter.py --serve``.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from typing import Any
 
@@ -23,7 +23,7 @@ _KINDS = "biuf"
 
 
 class PolicyServerFailed(Exception):
-    """A policy server did not do what it must; the message says what happened and what to do."""
+    """A policy server or function did not do what it must; the message says what happened and what to do."""
 
 
 def packed(message: Mapping[str, Any]) -> bytes:
@@ -130,6 +130,27 @@ class PolicyServer:
             raise
 
 
+class PolicyFunction:
+    """A function in this process in the place of a server: a message in, an action (A,) or a chunk (H, A) out."""
+
+    def __init__(self, name: str, function: Callable[[dict[str, Any]], Any]) -> None:
+        self.name, self._function = name, function
+
+    def ask(self, message: Mapping[str, Any]) -> dict[str, Any]:
+        """What it returns, as a server would say it. Raises PolicyServerFailed."""
+        try:
+            return {"actions": np.asarray(self._function(dict(message)))}
+        except Exception as error:  # whatever code from elsewhere may do
+            raise PolicyServerFailed(
+                f"the function {self.name} failed with {type(error).__name__}: {_short(str(error))}. It is given a "
+                f"dictionary of vectors ({', '.join(message)}) and must return an action."
+            ) from error
+
+    def ask_packed(self, message: bytes) -> dict[str, Any]:
+        """The same with a message as a server would get it."""
+        return self.ask(unpacked(message))
+
+
 def chunk_of(answer: Mapping[str, Any], size: int) -> "np.ndarray[Any, np.dtype[np.float64]]":
     """The chunk of actions in an answer, (H, size), finite; a single action (size,) is a chunk of one.
 
@@ -139,20 +160,18 @@ def chunk_of(answer: Mapping[str, Any], size: int) -> "np.ndarray[Any, np.dtype[
         raise PolicyServerFailed(f"the policy server's answer has no 'actions', only {_short(', '.join(answer))!r}.")
     actions = answer["actions"]
     if not isinstance(actions, np.ndarray | list):
-        raise PolicyServerFailed(
-            f"the policy server's actions are a {type(actions).__name__}; send an array (H, {size})."
-        )
+        raise PolicyServerFailed(f"the policy's actions are a {type(actions).__name__}; send an array (H, {size}).")
     try:
         chunk = np.atleast_2d(np.asarray(actions, np.float64))
     except (TypeError, ValueError):
-        raise PolicyServerFailed(f"the policy server's actions are no numbers; send an array (H, {size}).") from None
+        raise PolicyServerFailed(f"the policy's actions are no numbers; send an array (H, {size}).") from None
     if chunk.ndim != 2 or chunk.shape[1] != size or not 0 < chunk.size <= MOST_ACTIONS:
         raise PolicyServerFailed(
-            f"the policy server's actions have the shape {np.shape(actions)}, and (H, {size}) is needed: H actions of "
-            f"{size} numbers each. Check that the server's robot is this one."
+            f"the policy's actions have the shape {np.shape(actions)}, and (H, {size}) is needed: H actions of "
+            f"{size} numbers each. Check that the policy's robot is this one."
         )
     if not np.isfinite(chunk).all():
-        raise PolicyServerFailed("the policy server's actions hold a NaN or an infinity. Look at what it was asked.")
+        raise PolicyServerFailed("the policy's actions hold a NaN or an infinity. Look at what it was asked.")
     return chunk
 
 

@@ -5,10 +5,10 @@ from typing import TYPE_CHECKING, TypeAlias
 from worker.ml.policies.gaussian import GaussianPolicy
 
 if TYPE_CHECKING:  # its runtime is loaded by whoever needs it
+    from worker.ml.policies.asked_policy import AskedPolicy
     from worker.ml.policies.onnx_policy import OnnxPolicy
-    from worker.ml.policies.remote_policy import RemotePolicy
 
-ReferencePolicy: TypeAlias = "GaussianPolicy | OnnxPolicy | RemotePolicy"
+ReferencePolicy: TypeAlias = "GaussianPolicy | OnnxPolicy | AskedPolicy"
 
 
 class NotLookedInto(ValueError):

@@ -1,14 +1,14 @@
 """Any frozen policy as the bytes of policy.onnx."""
 
+from worker.ml.policies.asked_policy import AskedPolicy
 from worker.ml.policies.onnx_policy import OnnxPolicy
 from worker.ml.policies.policy_onnx import policy_to_onnx
 from worker.ml.policies.reference import ReferencePolicy
-from worker.ml.policies.remote_policy import RemotePolicy
 
 
 class NotStored(ValueError):
-    """The task's policy answers from a server: there is no file of it that a blinded controller could be made of. Leave
-    evaluations out, or name the policy as a file in lab.toml."""
+    """The task's policy is no file of which a blinded controller could be made: it answers from a server or function.
+    Leave evaluations out, or name the policy as a file in lab.toml."""
 
 
 def stored_policy(policy: ReferencePolicy) -> bytes:
@@ -16,6 +16,6 @@ def stored_policy(policy: ReferencePolicy) -> bytes:
 
     Raises NotStored.
     """
-    if isinstance(policy, RemotePolicy):
+    if isinstance(policy, AskedPolicy):
         raise NotStored(" ".join(str(NotStored.__doc__).split()))
     return policy.stored if isinstance(policy, OnnxPolicy) else policy_to_onnx(policy)

@@ -21,7 +21,7 @@ from worker.whole_files import written_whole
 _OF_FILES = {"file", "gain", "activation"}
 _WORDS = {"title", "summary", "words", "instructions", "sliders", "hints", "usual_clip_steps"}
 """Nothing that was found depends on these."""
-_OF_SERVERS = {"inputs", "prompt", "execution_horizon"}
+_OF_ASKED = {"function", "inputs", "prompt", "execution_horizon"}
 
 
 def mark_of(described: LabDescription, folder: Path) -> str:
@@ -44,11 +44,15 @@ def mark_of(described: LabDescription, folder: Path) -> str:
 
 def _kept(policy: LabPolicy) -> dict[str, Any]:
     of_files = policy.model_dump(mode="json", include=_OF_FILES)
-    return of_files | policy.model_dump(mode="json", include={*_OF_SERVERS, "settings"}, exclude_defaults=True)
+    return of_files | policy.model_dump(mode="json", include={*_OF_ASKED, "settings"}, exclude_defaults=True)
 
 
 def _hash_of(policy: LabPolicy, folder: Path) -> str:
-    return "of a server" if policy.file is None else hashlib.sha256((folder / policy.file).read_bytes()).hexdigest()
+    """Of the file that it is, or that its function is in, if that lies beside lab.toml."""
+    if policy.url is not None:
+        return "of a server"
+    file = folder / (policy.file or f"{str(policy.function).partition(':')[0]}.py")
+    return hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else "of a package"
 
 
 @dataclass(frozen=True)
@@ -129,6 +133,7 @@ class Found:
             inputs=inputs_of(described, self.observation, policy),
             prompt=said.prompt,
             execution_horizon=said.execution_horizon,
+            function=said.function or "",
             settings=tuple(said.settings.items()),
         )
 

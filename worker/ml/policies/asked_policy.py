@@ -1,8 +1,8 @@
-"""A frozen policy that answers over a websocket (see policy_client): from observation to mean action in [-1, 1].
+"""A frozen policy that is only asked: a server (see policy_client), or a function of the laboratory's.
 
-It must be a function of what it is asked: the same observation, the same answer, whatever was asked before. Otherwise
-two ways of doing one scenario could not be compared. The server is asked twice at first, and later whether it still
-answers as when the task was explored.
+From observation to mean action in [-1, 1]. It must be a function of what it is asked: the same observation, the same
+answer, whatever was asked before. Otherwise two ways of doing one scenario could not be compared. It is asked twice at
+first, and later whether it still answers as when the task was explored.
 """
 
 import atexit
@@ -10,27 +10,57 @@ from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from worker.domain.task import Answered
 from worker.domain.type_aliases import Float32Array, FloatArray
 from worker.ml.policies.onnx_policy import NotAPolicy
-from worker.ml.policies.policy_client import PolicyServer, PolicyServerFailed, chunk_of, packed
+from worker.ml.policies.policy_client import PolicyFunction, PolicyServer, PolicyServerFailed, chunk_of, packed
 
 REMEMBERED = 2000
 """Answers that are kept: a pool asks about each state twice, for the action and for the reference policy's."""
 SAME_WITHIN = 1e-4
 """Largest change of an answer in [-1, 1] since the task was explored: another computer rounds otherwise."""
+ASKED_AGAIN = 5
+"""Observations of an episode, last first, by which a policy's memory is found."""
+
+
+class Where(Protocol):
+    """Where a policy answers. Plain values; nothing is connected to or imported before it is asked."""
+
+    @property
+    def who(self) -> str:
+        """In words."""
+
+    def connected(self) -> PolicyServer | PolicyFunction:
+        """To be asked in this process. Raises NotAPolicy."""
+
+
+@dataclass(frozen=True)
+class AtAddress:
+    """Behind a websocket."""
+
+    url: str
+    answer_s: float
+    """how long it may take for an answer"""
+
+    @property
+    def who(self) -> str:
+        """See Where."""
+        return f"the policy server at {self.url}"
+
+    def connected(self) -> PolicyServer:
+        """See Where; one connection for each process."""
+        return _connection(self.url, self.answer_s)
 
 
 @dataclass(frozen=True)
 class Asking:
-    """How a policy server is asked. Plain values."""
+    """How a policy is asked. Plain values."""
 
-    url: str
-    answer_s: float
+    at: Where
     inputs: tuple[tuple[str, tuple[int, ...]], ...]
     """what each part of a message is called, and its columns of the observation"""
     prompt: str | None
@@ -45,7 +75,7 @@ class Asking:
     """among several policies; empty: the frozen one"""
 
 
-class RemotePolicy:
+class AskedPolicy:
     """observation (..., D) -> mean action (..., A). Travels between processes as how it is asked."""
 
     action_limit = 1.0
@@ -89,14 +119,23 @@ class RemotePolicy:
 
     def first_answer(self, observation: Float32Array) -> Answered:
         """What it says of this (D,), by which it will be known again. Raises NotAPolicy when it says two things."""
-        first, second = (_ask(self.asking, observation) for _ in range(2))
-        if not np.array_equal(first, second):
-            raise NotAPolicy(
-                f"the policy server at {self.asking.url} answered the same observation in two ways, {_row(first)} and "
-                f"{_row(second)}. It must be a function of the observation: switch sampling off, or begin its noise "
-                "from the same seed at every question, and let it remember nothing."
-            )
+        first = _ask(self.asking, observation)
+        self._require_again(observation, first)
         return Answered(tuple(observation.tolist()), tuple(map(tuple, first.tolist())))
+
+    def require_no_memory(self, observations: Float32Array) -> None:
+        """Asks about some of an episode (N, D) again, last first. Raises NotAPolicy when it says something else."""
+        for observation in observations[:: -max(1, len(observations) // ASKED_AGAIN)]:
+            self._require_again(observation, self._asked(observation))
+
+    def _require_again(self, observation: Float32Array, before: Float32Array) -> None:
+        now = _ask(self.asking, observation)
+        if not np.array_equal(before, now):
+            raise NotAPolicy(
+                f"{self.asking.at.who} answered the same observation in two ways, {_row(before)} and {_row(now)}. It "
+                "must be a function of the observation: switch sampling off, or begin its noise from the same seed at "
+                "every question, and let it remember nothing."
+            )
 
     def _one(self, observation: Float32Array) -> Float32Array:
         """One step: from the chunk that is being executed, or from a new one."""
@@ -109,8 +148,8 @@ class RemotePolicy:
         self._at = step
         if offset >= len(self._chunk):
             raise NotAPolicy(
-                f"the policy server at {self.asking.url} answers with {len(self._chunk)} actions, and "
-                f"policy.execution_horizon wants {self.asking.execution_horizon} of them executed. Lower it."
+                f"{self.asking.at.who} answers with {len(self._chunk)} actions, and policy.execution_horizon "
+                f"wants {self.asking.execution_horizon} of them executed. Lower it."
             )
         action: Float32Array = self._chunk[offset]
         return action
@@ -141,8 +180,8 @@ def _of_process(asking: Asking, known: Answered | None) -> "OrderedDict[bytes, F
         now = _ask(asking, np.array(known.observation, np.float32))
         if now.shape != before.shape or float(np.abs(now - before).max()) > SAME_WITHIN:
             raise NotAPolicy(
-                f"the policy server at {asking.url} is not the one with which the task was explored: it answers "
-                f"{_row(now)} where it answered {_row(before)}. Start that one again, or explore the task anew."
+                f"{asking.at.who} is not the one with which the task was explored: it answers "
+                f"{_row(now)} where it answered {_row(before)}. Take that one again, or explore the task anew."
             )
     return OrderedDict()
 
@@ -155,7 +194,7 @@ def forget() -> None:
 
 def _ask(asking: Asking, observation: Float32Array) -> Float32Array:
     """(H, A) in [-1, 1]. A connection that was lost is made anew once, for an answer depends on its question alone."""
-    server = _connection(asking.url, asking.answer_s)
+    server = asking.at.connected()
     asked = message(asking.inputs, asking.prompt, observation)
     try:
         try:
