@@ -37,6 +37,12 @@ _Columns = Annotated[str, Field(pattern=r"^([A-Za-z_]\w*)?(\[\d+:\d+\])?$", min_
 """Columns of an observation: a key of a Dict, a range of columns as in [0:3], or both."""
 
 
+def _name(name: str) -> str:
+    if not re.fullmatch(NAME, name):
+        raise ValueError("must be at most 40 small letters, digits and underscores, and begin with a letter")
+    return name
+
+
 class _Table(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -171,12 +177,8 @@ class LabModes(_Table):
     """Which ways to do it differently are tried."""
 
     leave_out: tuple[str, ...] = ()
-
-
-def _name(name: str) -> str:
-    if not re.fullmatch(NAME, name):
-        raise ValueError("must be at most 40 small letters, digits and underscores, and begin with a letter")
-    return name
+    groups: dict[Annotated[str, AfterValidator(_name)], tuple[str, ...]] = Field(default_factory=dict, max_length=4)
+    """actions that are quicker or slower together, apart from all others: by names that lab.toml gives, their names"""
 
 
 def _like(policy: dict[str, Any], own: Any) -> Any:

@@ -488,6 +488,7 @@ setting-press = Druck
 setting-press-low = sanfter
 setting-press-high = fester
 setting-push = Unterwegs in Richtung { $name } gedrückt
+setting-gain = Tempo von { $name } allein
 setting-shift = Am Ziel in Richtung { $name } daneben
 
 ## Vorschau

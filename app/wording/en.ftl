@@ -493,6 +493,7 @@ setting-press = Pressure
 setting-press-low = more gently
 setting-press-high = more firmly
 setting-push = Pushed along { $name } on the way
+setting-gain = Speed of { $name } alone
 setting-shift = Beside the goal along { $name } at the end
 
 ## Preview by an experimenter

@@ -165,6 +165,7 @@ def test_participants_read_words_of_their_language_for_every_axis(task: str, lan
 def test_axes_of_a_laboratory_and_unknown_ones_have_words(monkeypatch: pytest.MonkeyPatch) -> None:
     german = Wording(Language.GERMAN)
     assert slider_words.words_of(german, "reach", "push_x").label == "Unterwegs in Richtung x gedrückt"
+    assert slider_words.words_of(german, "reach", "gain_turning").label == "Tempo von turning allein"
     assert slider_words.words_of(german, "reach", "smooth").high == "gleichmäßiger"
     assert slider_words.words_of(german, "not_installed", "wrist_turn").label == "Wrist turn"
 

@@ -119,6 +119,9 @@ def test_what_is_wrong_is_an_exit_code_too(plane: Path, capsys: pytest.CaptureFi
             '[modes]\nleave_out = ["wave"]\n[instructions]',
             "there is no way 'wave'; this task has speed_far",
         ),
+        ("[fields]", '[modes.groups]\nup = ["z"]\n[fields]', "modes.groups.up: z is no action that moves the robot"),
+        ("[fields]", '[modes.groups]\nup = ["x", "y"]\n[fields]', "modes.groups.up: a group is some of the actions"),
+        ("[fields]", '[modes.groups]\nUp = ["y"]\n[fields]', "must be at most 40 small letters"),
     ],
 )
 def test_a_mistake_in_the_file_is_said_with_its_key_and_what_to_do(

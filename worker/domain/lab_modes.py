@@ -20,14 +20,16 @@ HALFWAY, WIDTH = 0.5, 0.5
 HESITATES_AT, HESITATES_WITHIN = 0.35, 0.15
 """Share of the way that is left where hesitate slows the robot, and how far around it."""
 SPEED, SMOOTH, HESITATE, PUSH, SHIFT = (-1.4, 0.9), (0.0, 0.9), (0.0, 2.0), (-0.6, 0.6), (-0.6, 0.6)
+GAIN = SPEED
 """Widest ranges; the program narrows them (worker.experiments.lab_ranges)."""
 MOST_PUSHES, MOST_SHIFTS = 6, 3
 PUSHES_UNTIL = 0.5
 """Share of the episode after which nothing is pushed, so that every way arrives."""
 
 
-def widest_axes(by_distance: bool, moving: tuple[str, ...]) -> tuple[Axis, ...]:
-    """Every way there is, in its widest range. ``moving``: the names of the actions that move the robot."""
+def widest_axes(by_distance: bool, moving: tuple[str, ...], groups: tuple[str, ...] = ()) -> tuple[Axis, ...]:
+    """Every way there is, in its widest range. ``moving``: names of the actions that move the robot; ``groups``: of
+    groups of them."""
     early, late = BY_DISTANCE if by_distance else BY_TIME
     where = {"far": "far from the goal", "near": "near the goal", "early": "early", "late": "late in the episode"}
     shifted = moving[:MOST_SHIFTS] if by_distance else ()
@@ -35,6 +37,7 @@ def widest_axes(by_distance: bool, moving: tuple[str, ...]) -> tuple[Axis, ...]:
         Axis(f"speed_{early}", *SPEED, f"log of the speed factor {where[early]}"),
         Axis(f"speed_{late}", *SPEED, f"log of the speed factor {where[late]}"),
         Axis("smooth", *SMOOTH, "share of the action before that is kept: a low-pass filter"),
+        *(Axis(f"gain_{name}", *GAIN, f"log of the gain of the actions {name} alone") for name in groups),
         Axis("hesitate", *HESITATE, "slows down before the end of the way"),
         *(Axis(f"push_{name}", *PUSH, f"added to the action {name} on the way") for name in moving[:MOST_PUSHES]),
         *(Axis(f"shift_{name}", *SHIFT, f"added to the action {name} near the goal") for name in shifted),
@@ -43,7 +46,8 @@ def widest_axes(by_distance: bool, moving: tuple[str, ...]) -> tuple[Axis, ...]:
 
 @dataclass(frozen=True)
 class LabModes(ModeFamily):
-    """Speed early and late, smoothing, hesitation, a push per action that fades on the way, and a shifted goal.
+    """Speed early and late and of groups of actions, smoothing, hesitation, a push per action that fades on the way,
+    and a shifted goal.
 
     The goal is shifted without asking the policy again: where it settles at the goal, a constant added to an action
     there lets it settle beside the goal, as far as the constant over the policy's own gain.
@@ -58,6 +62,8 @@ class LabModes(ModeFamily):
     goal: tuple[int, ...] = ()
     start_distance_m: float = 1.0
     """how far the goal usually is at the start"""
+    groups: tuple[tuple[str, tuple[int, ...]], ...] = ()
+    """names of groups of actions, each with its actions, from 0"""
 
     def perceived(self, observation: Any, mode: Any, xp: Any = np) -> Any:
         """The policy sees what is there."""
@@ -69,22 +75,23 @@ class LabModes(ModeFamily):
         early = xp.clip((left - HALFWAY + WIDTH / 2) / WIDTH, 0.0, 1.0)
         names = BY_DISTANCE if self.tip and self.goal else BY_TIME
         band = xp.clip(1.0 - ((left - HESITATES_AT) / HESITATES_WITHIN) ** 2, 0.0, 1.0)
-        factor = xp.exp(
+        quicker = (
             self._of(mode, f"speed_{names[0]}") * early
             + self._of(mode, f"speed_{names[1]}") * (1.0 - early)
             - self._of(mode, "hesitate") * band
         )
-        scaled = action * factor
+        for name, members in self.groups:
+            quicker = quicker + self._of(mode, f"gain_{name}") * self._are(members, action, xp)
+        scaled = action * xp.exp(quicker)
         pushed = early * xp.clip(1.0 - self._field(observation, EPISODE_SHARE) / PUSHES_UNTIL, 0.0, 1.0)
         for index in self.moving:
             push, shift = (self._of(mode, f"{way}_{self.actions[index]}") for way in ("push", "shift"))
-            scaled = scaled + (pushed * push + (1.0 - early) * shift) * self._unit(index, action, xp)
+            scaled = scaled + (pushed * push + (1.0 - early) * shift) * self._are((index,), action, xp)
         kept = self._of(mode, "smooth")
         smoothed = (1.0 - kept) * scaled + kept * self._field(observation, PREVIOUS_ACTION)
         if len(self.moving) == len(self.actions):
             return smoothed
-        moved = sum(self._unit(index, action, xp) for index in self.moving)
-        return action + moved * (smoothed - action)
+        return action + self._are(self.moving, action, xp) * (smoothed - action)
 
     def _left(self, observation: Any, xp: Any) -> Any:
         """Share of the way (or of the time) that is left, (..., 1)."""
@@ -93,8 +100,9 @@ class LabModes(ModeFamily):
         way = observation[..., list(self.goal)] - observation[..., list(self.tip)]
         return xp.sqrt((way * way).sum(-1) + 1e-12)[..., None] / self.start_distance_m
 
-    def _unit(self, index: int, action: Any, xp: Any) -> Any:
-        return xp.asarray([float(place == index) for place in range(len(self.actions))], dtype=action.dtype)
+    def _are(self, which: tuple[int, ...], action: Any, xp: Any) -> Any:
+        """(A,) 1 for these actions and 0 for the others."""
+        return xp.asarray([float(place in which) for place in range(len(self.actions))], dtype=action.dtype)
 
 
 @dataclass(frozen=True)

@@ -49,7 +49,12 @@ def first_found(described: LabDescription, environment: LabEnvironment, folder: 
     moving = described.environment.moving or tuple(range(len(names)))
     by_distance = bool(environment.tip and environment.goal)
     others = tuple(described.policies)
-    axes = policy_axes(others) if others else widest_axes(by_distance, tuple(names[index] for index in moving))
+    groups = _groups(described, names, moving)
+    axes = (
+        policy_axes(others)
+        if others
+        else widest_axes(by_distance, tuple(names[index] for index in moving), tuple(name for name, _ in groups))
+    )
     unknown = sorted(set(described.modes.leave_out) - {axis.name for axis in axes})
     if unknown:
         known = ", ".join(axis.name for axis in axes)
@@ -69,7 +74,24 @@ def first_found(described: LabDescription, environment: LabEnvironment, folder: 
         notes=(),
         reference={},
         chooses=bool(others),
+        groups=groups,
     )
+
+
+def _groups(
+    described: LabDescription, names: Sequence[str], moving: Sequence[int]
+) -> tuple[tuple[str, tuple[int, ...]], ...]:
+    """The groups of actions that lab.toml names, by place. Raises LabTaskBroken."""
+    places = {names[index]: index for index in moving}
+    for name, members in described.modes.groups.items():
+        key = f"modes.groups.{name}"
+        if unknown := [each for each in members if each not in places]:
+            raise LabTaskBroken(key, f"{unknown[0]} is no action that moves the robot; there are {', '.join(places)}.")
+        if not 0 < len(set(members)) < len(places):
+            raise LabTaskBroken(
+                key, "a group is some of the actions, not all and not none: all are quicker and slower together anyway."
+            )
+    return tuple((name, tuple(places[each] for each in members)) for name, members in described.modes.groups.items())
 
 
 def asked_first(policy: OnnxPolicy | AskedPolicy, environment: LabEnvironment, scenario: int) -> Answered | None:

@@ -5,8 +5,8 @@ from app.installed_tasks.description import SliderWords
 from app.web.texts import task_words
 from app.web.texts.wording import Wording
 
-_OF_ACTIONS = ("push", "shift")
-"""Ways that there are for each action; its name follows."""
+_OF_ACTIONS = ("push", "shift", "gain")
+"""Ways that there are for each action or group of them; its name follows."""
 
 
 def words_of(wording: Wording, task: str, axis: str) -> SliderWords:

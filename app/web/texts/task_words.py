@@ -69,6 +69,10 @@ def _of_lab(described: LabDescription) -> TaskWords:
         "speed_near": f"near the {target}: slower ({minus}), quicker (+)",
         "speed_early": f"at first: slower ({minus}), quicker (+)",
         "speed_late": f"later: slower ({minus}), quicker (+)",
+        **{
+            f"gain_{name}": f"{name.replace('_', ' ')} alone: slower ({minus}), quicker (+)"
+            for name in described.modes.groups
+        },
         "smooth": "smoother (+)",
         "hesitate": f"slows down before the {target} (+)",
         **{f"push_{name}": f"on the way pushed along {name}" for name in described.environment.action_names},

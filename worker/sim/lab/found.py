@@ -32,6 +32,8 @@ def mark_of(described: LabDescription, folder: Path) -> str:
     kept = described.model_dump(mode="json", exclude=_WORDS)
     kept["environment"].pop("frame")
     kept["policy"] = _kept(described.policy)
+    if not described.modes.groups:
+        kept["modes"].pop("groups")
     others = kept.pop("policies")
     for name, each in described.policies.items():
         others[name] = {**_kept(each), "bytes": _hash_of(each, folder)}
@@ -87,6 +89,8 @@ class Found:
     """whether the ways are policies of which one is chosen, and not a filter's"""
     answered_others: dict[str, Answered] = field(default_factory=dict)
     """as ``answered``, by the other policies' names"""
+    groups: tuple[tuple[str, tuple[int, ...]], ...] = ()
+    """names of groups of actions that have a gain of their own, each with its actions, from 0"""
 
     def modes(self, axes: tuple[Axis, ...] | None = None) -> ModeFamily:
         """The ways to do the task."""
@@ -100,6 +104,7 @@ class Found:
             self.tip,
             self.goal,
             self.start_distance_m,
+            self.groups,
         )
 
     def task(self, described: LabDescription) -> Task:
@@ -152,6 +157,7 @@ class Found:
             stored[name] = tuple(kind(**each) for each in stored[name])
         for name in ("moving", "tip", "goal", "notes", "witness"):
             stored[name] = tuple(stored.get(name, ()))
+        stored["groups"] = tuple((name, tuple(members)) for name, members in stored.get("groups", ()))
         stored["bounds"] = tuple(map(tuple, stored["bounds"]))
         if stored.get("answered"):
             stored["answered"] = _answered(stored["answered"])
