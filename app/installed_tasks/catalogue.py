@@ -21,7 +21,7 @@ from typing import NamedTuple
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from app.installed_tasks import lab
-from app.installed_tasks.description import InstalledTask, TaskRefused, read
+from app.installed_tasks.description import NAME, InstalledTask, TaskRefused, read
 
 GROUP = "pbarl_studio.tasks"
 OURS, OUR_ENTRY_POINTS = "pbarl-studio", Path(__file__).with_name("entry_points.txt")
@@ -128,7 +128,7 @@ def _declared() -> Iterator[Declared]:
 
 
 def _read(declared: Declared) -> InstalledTask:
-    if not re.fullmatch(lab.NAME, declared.name):
+    if not re.fullmatch(NAME, declared.name):
         raise TaskRefused("Its name must be at most 40 small letters, digits and underscores, and begin with a letter.")
     if declared.name in _RESERVED:
         raise TaskRefused("This name is not free.")

@@ -13,7 +13,7 @@ from pydantic_core import ErrorDetails
 DESCRIPTION, PICTURE, CHECKPOINT = "task.toml", "picture.svg", "checkpoint"
 SHORTEST_CLIP_STEPS, LONGEST_CLIP_STEPS = 20, 600
 """Control steps of 0.1 s."""
-NAME = r"^[a-z][a-z0-9_]{0,39}$"
+NAME = "[a-z][a-z0-9_]{0,39}"
 PICTURE_FRAME = "0 0 240 150"
 _SHAPES = {"g", "path", "circle", "ellipse", "rect", "line", "polyline", "polygon"}
 _PLACES = {"cx", "cy", "x", "y", "x1", "y1", "x2", "y2"}
@@ -36,13 +36,27 @@ def _code(language: str) -> str:
 _EXPLAINED = {
     "missing": "is missing",
     "extra_forbidden": "is not known here",
-    "string_pattern_mismatch": "must be like module:name, a name in a module of the package",
 }
 
+
+def like(pattern: str, words: str) -> AfterValidator:
+    """Text has to look so; else ``words`` say what it must be."""
+
+    def matching(said: str) -> str:
+        if not re.fullmatch(pattern, said):
+            raise ValueError(f"must be {words}")
+        return said
+
+    return AfterValidator(matching)
+
+
+NAMED = like(NAME, "at most 40 small letters, digits and underscores, and begin with a letter")
 Word = Annotated[str, Field(min_length=1, max_length=200)]
 Text = Annotated[str, Field(min_length=1, max_length=4000), AfterValidator(_flowing)]
 LanguageCode = Annotated[str, AfterValidator(_code)]
-Reference = Annotated[str, Field(pattern=r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*$")]
+Reference = Annotated[
+    str, like(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*", "like module:name, a name in a module of the package")
+]
 """An object of the task's package: ``module:name``."""
 
 
@@ -122,7 +136,7 @@ class DescribedTask(BaseModel):
     sliders: dict[str, dict[LanguageCode, SliderWords]] = {}
     """What participants who set a robot themselves read beside the slider of an axis, by axis and language; where it is
     missing, the words that all tasks share."""
-    hints: dict[Annotated[str, Field(pattern=NAME)], HintedAt] = {}
+    hints: dict[Annotated[str, NAMED], HintedAt] = {}
     """What participants may wish for in general, where a study asks; their order is that of the file."""
 
     @property

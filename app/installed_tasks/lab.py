@@ -3,13 +3,13 @@
 Only the file is read here. What it names (modules, policies) is loaded in the worker's processes.
 """
 
-import re
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from app.installed_tasks.description import (
+    NAMED,
     DescribedTask,
     InstalledTask,
     LanguageCode,
@@ -18,12 +18,12 @@ from app.installed_tasks.description import (
     Text,
     Word,
     Words,
+    like,
     parsed,
 )
 
 NO_PACKAGE = ""
 """Of an installed task that a lab.toml describes."""
-NAME = r"[a-z][a-z0-9_]{0,39}"
 LARGEST_RATE_HZ = 100.0
 
 FOUND_FILE, SURFACE_FILE = "found.json", "response_surface.safetensors"
@@ -33,14 +33,16 @@ ANY_FRAME = "the environment's own"
 REFERENCE = "reference"
 """What the frozen policy is called among those of which one is chosen."""
 
-_Columns = Annotated[str, Field(pattern=r"^([A-Za-z_]\w*)?(\[\d+:\d+\])?$", min_length=1)]
+_Columns = Annotated[
+    str, like(r"(?=.)([^\[\]]+)?(\[\d+:\d+\])?", 'a key of the observation, columns as in "[0:3]", or both, "key[0:3]"')
+]
 """Columns of an observation: a key of a Dict, a range of columns as in [0:3], or both."""
 
 
-def _name(name: str) -> str:
-    if not re.fullmatch(NAME, name):
-        raise ValueError("must be at most 40 small letters, digits and underscores, and begin with a letter")
-    return name
+_ActionName = Annotated[
+    str,
+    like("[a-z][a-z0-9_]{0,19}", "at most 20 small letters, digits and underscores, and begin with a letter"),
+]
 
 
 class _Table(BaseModel):
@@ -69,7 +71,7 @@ class LabEnvironment(_Table):
     """control steps per second"""
     actions: Annotated[Literal["delta", "velocity"], BeforeValidator(_scales)]
     """what an action is: a change of position or a speed. Only of these is a part also a slower way."""
-    action_names: tuple[Annotated[str, Field(pattern="^[a-z][a-z0-9_]{0,19}$")], ...] = ()
+    action_names: tuple[_ActionName, ...] = ()
     """one for each action; empty: numbers"""
     moving: tuple[int, ...] = ()
     """the actions that move the robot, from 0; empty: all. The others, a gripper's, are left as they are."""
@@ -87,12 +89,6 @@ class LabEnvironment(_Table):
         return self
 
 
-def _address(url: str) -> str:
-    if not re.match(r"wss?://[^\s/]+", url):
-        raise ValueError("must be the address of a websocket, such as ws://localhost:8000")
-    return url
-
-
 WHERE = ("file", "url", "function")
 """Where a policy is."""
 
@@ -102,7 +98,9 @@ class LabPolicy(_Table):
 
     file: str | None = Field(default=None, min_length=1)
     """.onnx, .zip (Stable-Baselines3) or .safetensors (ours), beside the lab.toml"""
-    url: Annotated[str, AfterValidator(_address)] | None = None
+    url: Annotated[str, like(r"wss?://[^\s/]+.*", "the address of a websocket, such as ws://localhost:8000")] | None = (
+        None
+    )
     """ws://host:port of a policy server, as openpi's"""
     function: Reference | None = None
     """module:function, which is given what a server would be sent and returns an action or a chunk of them"""
@@ -177,7 +175,7 @@ class LabModes(_Table):
     """Which ways to do it differently are tried."""
 
     leave_out: tuple[str, ...] = ()
-    groups: dict[Annotated[str, AfterValidator(_name)], tuple[str, ...]] = Field(default_factory=dict, max_length=4)
+    groups: dict[Annotated[str, NAMED], tuple[str, ...]] = Field(default_factory=dict, max_length=4)
     """actions that are quicker or slower together, apart from all others: by names that lab.toml gives, their names"""
 
 
@@ -192,18 +190,18 @@ def _like(policy: dict[str, Any], own: Any) -> Any:
 class LabDescription(DescribedTask):
     """What ``lab.toml`` says."""
 
-    name: Annotated[str, AfterValidator(_name)]
+    name: Annotated[str, NAMED]
     """as stored in studies, trajectories and bundles"""
     words: Words = Words(tool="robot", target="goal")
     instructions: dict[LanguageCode, Text] = Field(default_factory=dict)
     """as in DescribedTask; a language without them reads neutral words"""
     environment: LabEnvironment
     policy: LabPolicy
-    policies: dict[Annotated[str, AfterValidator(_name)], LabPolicy] = Field(default_factory=dict, max_length=7)
+    policies: dict[Annotated[str, NAMED], LabPolicy] = Field(default_factory=dict, max_length=7)
     """Others among which one is chosen for a person, instead of a filter; what is not said is as in ``policy``."""
     success: Measured
     """Whether the task has succeeded so far; what it says at the last step counts."""
-    signals: dict[Annotated[str, AfterValidator(_name)], LabSignal] = Field(default_factory=dict)
+    signals: dict[Annotated[str, NAMED], LabSignal] = Field(default_factory=dict)
     fields: LabFields = LabFields()
     modes: LabModes = LabModes()
 

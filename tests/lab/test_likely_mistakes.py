@@ -196,3 +196,16 @@ def test_a_policy_server_is_told_that_nobody_asks_any_more() -> None:
         server.shutdown()
         thread.join()
     assert closed == [1000], "a goodbye, and no traceback in the server's log"
+
+
+def test_an_observation_of_tables_under_any_name_is_flattened(plane: Path) -> None:
+    """As dm_control's are: one row, and slashes in the names."""
+    change(plane, "spaces.Box(-2.0, 2.0, (4,))", 'spaces.Dict({"arm/at": TABLE, "to": TABLE})', "plane.py")
+    change(plane, "class Plane", "TABLE = gymnasium.spaces.Box(-2.0, 2.0, (1, 2))\n\n\nclass Plane", "plane.py")
+    seen = '{"arm/at": self.place[None].astype(np.float32), "to": self.goal[None].astype(np.float32)}'
+    change(plane, "np.concatenate([self.place, self.goal]).astype(np.float32)", seen, "plane.py")
+    change(plane, 'tip = "[0:2]"', 'tip = "arm/at"')
+    change(plane, 'goal = "[2:4]"', 'goal = "to[0:2]"')
+    checked = found(plane)
+    assert checked.wrong == ()
+    assert checked.remarks[0].startswith("3 of 3 episodes succeeded")

@@ -27,6 +27,8 @@ from worker.sim.lab.references import named_object
 Picture = npt.NDArray[np.uint8]
 UNBOUNDED = 1e6
 """Stands for the bound of an observation whose space has none."""
+LARGEST_TABLE = 1000
+"""Numbers of an observation that are no vector and are flattened; pictures have more."""
 SMALLEST_PICTURE_PX = 64
 NO_SCREEN = (
     "Without a screen MuJoCo draws by EGL: install libegl1 and libegl-mesa0 (Debian's names), or libosmesa6 and set "
@@ -265,13 +267,13 @@ class LabEnvironment:
                     f"its observation {name!r} is {part}. Observations must be a Box or a Dict of them; wrap the "
                     "environment with gymnasium.wrappers.FlattenObservation or your own.",
                 )
-            if len(part.shape) > 1:
+            size = gymnasium.spaces.flatdim(part)
+            if len(part.shape) > 1 and (part.dtype == np.uint8 or size > LARGEST_TABLE):
                 raise LabTaskBroken(
                     "environment",
-                    f"its observation {name!r} is a picture or table {part.shape}; only vectors are known.",
+                    f"its observation {name!r} is a picture {part.shape}; only numbers are known. Leave it out.",
                 )
             low, high = float(np.min(part.low)), float(np.max(part.high))
-            size = gymnasium.spaces.flatdim(part)
             fields.append(Field(name, size, "as the environment has it", _finite(low), _finite(high), "of the lab"))
         count = len(self._low)
         return Space(
