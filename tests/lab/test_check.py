@@ -106,6 +106,7 @@ def test_what_is_wrong_is_an_exit_code_too(plane: Path, capsys: pytest.CaptureFi
         ('factory = "plane:Plane"', 'id = "no_such_package:Reach-v3"', "Install its package"),
         ('factory = "plane:Plane"', 'factory = "plane:Plane"\nkwargs = { colour = 1 }', "Check environment.kwargs"),
         ('factory = "plane:Plane"', 'factory = "plane:Plane"\nkwargs = { size = 16 }', "pixels are too small"),
+        ('factory = "plane:Plane"', 'factory = "gymnasium:logger"', "'gymnasium:logger' is no function"),
         ('action_names = ["x", "y"]', 'action_names = ["x"]', "1 names for 2 actions"),
         ("rate_hz = 10", "rate_hz = 10\nmoving = [2]", "actions are numbered from 0 to 1"),
         ('tip = "[0:2]"', 'tip = "tip[0:2]"', "No field 'tip'"),

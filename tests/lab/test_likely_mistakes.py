@@ -209,3 +209,13 @@ def test_an_observation_of_tables_under_any_name_is_flattened(plane: Path) -> No
     checked = found(plane)
     assert checked.wrong == ()
     assert checked.remarks[0].startswith("3 of 3 episodes succeeded")
+
+
+def test_a_package_that_does_not_fit_another_is_told_of_as_such(plane: Path) -> None:
+    change(
+        plane,
+        "self.render_mode, self.size =",
+        "gymnasium.flex_vertedge\n        self.render_mode, self.size =",
+        "plane.py",
+    )
+    assert "has no attribute 'flex_vertedge'). Make it without the studio first" in said(plane)

@@ -359,4 +359,9 @@ def _not_made(error: Exception, what: str) -> str:
         return f"{said} Name the module that registers it before a colon, as in panda_gym:PandaReach-v3."
     if "egl" in str(error).lower():
         return f"{said} {NO_SCREEN}"
-    return f"{said} Check environment.kwargs; it must take render_mode='rgb_array'."
+    if isinstance(error, TypeError):
+        return f"{said} Check environment.kwargs; it must take render_mode='rgb_array'."
+    return (
+        f"{said} Make it without the studio first, in .venv/bin/python, with the same kwargs and "
+        "render_mode='rgb_array': a package may not fit another that is installed."
+    )
