@@ -114,6 +114,7 @@ RUN: dict[str, str | Elsewhere | OnlyParsed] = {
     "hints": ROLLOUTS,
     "mattered": ROLLOUTS,
     "misfit": ROLLOUTS,
+    "more_ways": ROLLOUTS,
     "other_users": ROLLOUTS,
     "comparison_report": "results/paper_form",
     "contact_sheet": "sheets feeding --films 1 --steps 5 --no-people",
