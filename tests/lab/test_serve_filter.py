@@ -227,7 +227,8 @@ def test_a_bundle_of_ours_says_units_frame_and_rate_and_takes_its_fields_by_name
     loop = FilterLoop(interface, act.exported.batch, policy.mean, 5.0, 60.0)
     seen = np.zeros(invented.TASK.observation.size, np.float32) + 0.1
     parts = {field.name: seen[place] for field, place in invented.TASK.observation.slices()}
-    for message in ({"observation": seen}, parts):
+    tables = {name: part.reshape(1, -1, 1) for name, part in parts.items()}
+    for message in ({"observation": seen}, parts, tables):
         np.testing.assert_allclose(loop.answer(packed(message))["actions"][0], act(seen), atol=1e-6)
     with pytest.raises(Refused, match=r"tool_position_m is .* look at units and frame"):
         loop.answer(packed(parts | {"tool_position_m": np.full(3, 500.0)}))

@@ -452,7 +452,7 @@ def _numbers(name: str, value: Any, size: int) -> Any:
         array = np.asarray(value, np.float32)
     except (TypeError, ValueError):
         raise Refused(f"{name} is no array of numbers.") from None
-    if array.shape not in ((size,), (1, size)):
+    if array.size != size:  # a table is flattened, as the studio has it
         raise Refused(f"{name} has the shape {array.shape}; this filter needs ({size},).")
     if not np.isfinite(array).all():
         raise Refused(f"{name} holds a NaN or an infinity.")
