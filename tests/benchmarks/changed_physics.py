@@ -124,7 +124,7 @@ def _filter(bench: BenchmarkUser, kept: Path) -> FilterAct:
     problem = setting.problem
     if not kept.exists():
         gate = setting.reference(problem.config.gate_block(bench.task))
-        draft = pbarl.fit_studio(problem, setting.surface(), setting.pool, gate, setting.collect)
+        draft = pbarl.fit_studio(problem, setting.surface(), setting.pool, gate, setting.collect).shielded()
         kept.parent.mkdir(parents=True, exist_ok=True)
         with written_whole(kept) as path:
             path.write_bytes(filter_fitting.draft_to_bytes(draft))

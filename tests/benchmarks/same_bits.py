@@ -107,7 +107,7 @@ def learned(bench: BenchmarkUser) -> Iterator[tuple[str, Iterable[bytes]]]:
     """What is learned with rollouts."""
     setting = bench.setting()
     gate = setting.reference(FILTER.gate_block(bench.task))
-    draft = pbarl.fit_studio(setting.problem, setting.surface(), setting.pool, gate, setting.collect)
+    draft = pbarl.fit_studio(setting.problem, setting.surface(), setting.pool, gate, setting.collect).shielded()
     yield "filter", [draft.weights.to_bytes()]
     yield "filter.onnx", [act_of(bench.task.modes, setting.problem.policy, draft.weights).exported.stored]
     tuned = registry.fit("prefft", setting).act

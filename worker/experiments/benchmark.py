@@ -34,6 +34,7 @@ from worker.ml.methods.latent_people import Latent
 from worker.ml.methods.pbrl_hri import FromScratch
 from worker.ml.methods.prefft import FineTuning
 from worker.ml.methods.prefft_lagrangian import Constraint
+from worker.ml.methods.refinement import Refinement
 from worker.ml.methods.registry import METHODS, MethodConfig
 from worker.ml.methods.steered_rl import Steering
 from worker.ml.teachers import Manner, Taste, random_taste
@@ -72,6 +73,7 @@ PROFILES = {
             value_rollouts=12,
             value_steps=200,
             steering=Steering(steps=2_400, warm_up_steps=800, critic_first_updates=100, flow_steps=100),
+            refinement=Refinement(steps=2_400, warm_up_steps=800, imitation_steps=200, critic_first_updates=100),
             constraint=Constraint(scenarios=10, every_steps=1_000),
             others=4,
             others_labels=20,

@@ -25,6 +25,7 @@ from worker.ml.methods.latent_people import Latent
 from worker.ml.methods.pbrl_hri import FromScratch
 from worker.ml.methods.prefft import FineTuning
 from worker.ml.methods.prefft_lagrangian import Constraint
+from worker.ml.methods.refinement import Refinement
 from worker.ml.methods.registry import METHODS, MethodConfig, NobodyToAsk, Setting
 from worker.ml.methods.steered_rl import Steering
 from worker.ml.rewards.reward_models import MlpReward, StructuredReward
@@ -80,6 +81,9 @@ SMALL = MethodConfig(
     value_rollouts=4,
     value_steps=20,
     steering=Steering(steps=120, warm_up_steps=60, critic_first_updates=20, hidden=16, flow_steps=20),
+    refinement=Refinement(
+        steps=120, warm_up_steps=60, imitation_steps=20, critic_first_updates=20, hidden=16, environments=2
+    ),
     constraint=Constraint(scenarios=3, every_steps=80),
     others=4,
     others_labels=10,

@@ -26,7 +26,7 @@ from worker.ml.rewards.reward_models import stored_config
 Method = Literal["studio", "printed"]
 
 
-_SHIELD = "shield/"
+_SHIELD, _REFINED = "shield/", "refined/"
 
 
 @dataclass(frozen=True)
@@ -43,6 +43,8 @@ class FilterWeights:
     """state of ResidualAdapter or PrintedEncoder; empty: none was trained"""
     shield: Mapping[str, Float32Array] = field(default_factory=dict)
     """limits of the shield (shield.limits_of); empty: there is none"""
+    refined: Mapping[str, Float32Array] = field(default_factory=dict)
+    """weights of the person's refined policy, which acts in place of mode and residual; empty: it was not refined"""
 
     def changed(self, **values: Any) -> Self:
         """The same with some values replaced."""
@@ -58,7 +60,8 @@ class FilterWeights:
             "residual_share": self.residual_share,
         }
         limits = {f"{_SHIELD}{name}": array for name, array in self.shield.items()}
-        tensors = {name: np.ascontiguousarray(array) for name, array in {**self.encoder, **limits}.items()}
+        refined = {f"{_REFINED}{name}": array for name, array in self.refined.items()}
+        tensors = {name: np.ascontiguousarray(array) for name, array in {**self.encoder, **limits, **refined}.items()}
         return save(tensors, metadata={"config": json.dumps(config, sort_keys=True)})
 
     @classmethod
@@ -66,8 +69,11 @@ class FilterWeights:
         """Read what to_bytes() wrote."""
         config = stored_config(stored)
         tensors = load(stored)
-        limits = {name.removeprefix(_SHIELD): tensors.pop(name) for name in [*tensors] if name.startswith(_SHIELD)}
-        return cls(config["method"], config["mode"], config["gate"], config["residual_share"], tensors, limits)
+        limits, refined = (
+            {name.removeprefix(part): tensors.pop(name) for name in [*tensors] if name.startswith(part)}
+            for part in (_SHIELD, _REFINED)
+        )
+        return cls(config["method"], config["mode"], config["gate"], config["residual_share"], tensors, limits, refined)
 
 
 class ModeTransform(nn.Module):
@@ -135,6 +141,19 @@ class PrintedTransform(nn.Module):
         return action
 
 
+class RefinedTransform(nn.Module):
+    """The person's refined policy in place of mode and residual (worker.ml.methods.refinement)."""
+
+    def __init__(self, refined: FrozenPolicy) -> None:
+        super().__init__()
+        self.refined = refined
+
+    def forward(self, observation: Tensor, policy_mean: Tensor) -> Tensor:
+        """(B, D), (B, 7) -> (B, 7)"""
+        action: Tensor = self.refined(observation)[0]
+        return action
+
+
 class ActionFilter(nn.Module):
     """observation (B, D), policy_mean (B, 7) -> action (B, 7) in [-1, 1]. Deterministic."""
 
@@ -189,7 +208,7 @@ def build(family: ModeFamily, policy: ReferencePolicy, weights: FilterWeights) -
     """
     transform: nn.Module
     if not isinstance(policy, GaussianPolicy):
-        if weights.method != "studio" or weights.encoder:
+        if weights.method != "studio" or weights.encoder or weights.refined:
             raise ValueError("A policy that cannot be looked into has filters of modes alone.")
         return _finished(ActionModeTransform(family, weights.mode), family, weights)
     frozen = FrozenPolicy(policy.weights)
@@ -197,6 +216,8 @@ def build(family: ModeFamily, policy: ReferencePolicy, weights: FilterWeights) -
         encoder = PrintedEncoder(frozen.offset, frozen.scale)
         load_state(encoder, weights.encoder)
         transform = PrintedTransform(encoder)
+    elif weights.refined:
+        transform = RefinedTransform(FrozenPolicy(weights.refined))
     else:
         adapter = None
         if weights.encoder and weights.residual_share > 0.0:

@@ -125,6 +125,8 @@ class GateTrial:
     """share of episodes"""
     p95_force_n: float
     """95 % of the episodes stay below this force on the person"""
+    refined: bool = False
+    """whether it was the person's refined policy, in place of mode and residual"""
 
 
 @dataclass(frozen=True)
@@ -173,6 +175,11 @@ class FilterAct:
         """(D,) -> (7,)"""
         mean = self.policy.mean(observation)
         return mean + np.float32(self.gate) * (self.exported(observation, mean) - mean)
+
+    def batch(self, observations: Float32Array) -> Float32Array:
+        """(B, D) -> (B, 7)"""
+        means = self.policy.mean(observations)
+        return means + np.float32(self.gate) * (self.exported.batch(observations, means) - means)
 
 
 def trace(family: ModeFamily, policy: ReferencePolicy) -> None:

@@ -4,7 +4,7 @@ Environments report the measured ``signals`` of every step in their info; their 
 rewarded when it is over, as a whole, so that the reward model may be one that remembers what came before.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -14,7 +14,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from worker.domain.trajectory import SIGNALS
+from worker.domain.trajectory import SIGNALS, Trajectory
 from worker.domain.type_aliases import Float32Array
 from worker.ml.policies.checkpoint import Checkpoint, Paused
 from worker.ml.policies.reference import ReferencePolicy
@@ -61,23 +61,29 @@ class _Episode:
 class PreferenceRl:
     """Several environments, the replay, and a learner once there is one. Draws torch's global random numbers."""
 
-    def __init__(self, make_env: MakeEnv, reward: EpisodeReward, config: SacConfig) -> None:
+    def __init__(
+        self, make_env: MakeEnv, reward: EpisodeReward, config: SacConfig, known: Sequence[Trajectory] = ()
+    ) -> None:
+        """``known``: rollouts that the replay begins with; they count as no steps."""
         self.config, self.reward = config, reward
         self.rng = np.random.default_rng([config.seed, 6])
         self.envs = [make_env() for _ in range(config.environments)]
         self.actions = int(np.prod(self.envs[0].action_space.shape or ()))
         capacity = max(config.total_steps + config.environments, _LONGEST_EPISODE * config.environments)
+        capacity += sum(len(each) for each in known)
         self.replay = Replay(capacity, config.observation.size, self.actions)
+        for each in known:
+            self._remember(each.signals, each.observations, each.actions, terminated=False)
         self.states = np.stack([self._reset(env) for env in self.envs])
         self.episodes = [_Episode([state]) for state in self.states]
         self.steps = 0
 
     def warm_up(self, first: FirstActions) -> Float32Array:
-        """Make ``random_steps`` steps, or at least one episode, without learning; returns those states, (N, D)."""
-        while self.steps < self.config.random_steps or not self.replay.count:
+        """Make ``random_steps`` steps, or at least one episode, without learning; returns all states there are, (N, D)."""
+        before = self.replay.count
+        while self.steps < self.config.random_steps or self.replay.count == before:
             self._step(first(self.states))
-        finished: Float32Array = self.replay.rows[: self.replay.count, : self.config.observation.size].numpy()
-        return finished
+        return self.seen
 
     def learn(self, learner: Learner, checkpoint: Checkpoint | None = None, watch: "Watch | None" = None) -> None:
         """The rest of the steps: first the critics alone, on the warm-up's episodes, then everything.
@@ -146,12 +152,21 @@ class PreferenceRl:
         self.steps += len(self.envs)
 
     def _keep(self, episode: _Episode, terminated: bool) -> None:
-        """Reward a finished episode and put it into the replay."""
         states, actions = np.array(episode.states, np.float32), np.array(episode.actions, np.float32)
-        rewards = self.reward(np.array(episode.signals, np.float32), states[:-1], actions)
+        self._remember(np.array(episode.signals, np.float32), states, actions, terminated)
+
+    def _remember(self, signals: Float32Array, states: Float32Array, actions: Float32Array, terminated: bool) -> None:
+        """Reward a finished episode and put it into the replay: (T, S), (T + 1, D), (T, A)."""
+        rewards = self.reward(signals, states[:-1], actions)
         goes_on = np.ones(len(actions), np.float32)
         goes_on[-1] = not terminated  # a time limit is not an end: what would have followed still counts
         self.replay.add(states[:-1], actions, np.asarray(rewards, np.float32), goes_on, states[1:])
+
+    @property
+    def seen(self) -> Float32Array:
+        """The states in the replay, (N, D)."""
+        states: Float32Array = self.replay.rows[: self.replay.count, : self.config.observation.size].numpy()
+        return states
 
     def _reset(self, env: Env) -> Float32Array:
         state: Float32Array = env.reset(seed=int(self.rng.integers(TRAINING_SCENARIOS)))[0]

@@ -30,6 +30,7 @@ from worker.ml.methods import (
     pbrl_hri,
     prefft,
     prefft_lagrangian,
+    refinement,
     residual_rl,
     sliders,
 )
@@ -41,6 +42,7 @@ from worker.ml.methods.people import Person
 from worker.ml.methods.preference_rl import Env, MakeEnv, PolicyAct, learned
 from worker.ml.methods.prefft import TIED, FineTuning
 from worker.ml.methods.prefft_lagrangian import Constraint, Price
+from worker.ml.methods.refinement import Refinement
 from worker.ml.methods.steered_rl import Steering
 from worker.ml.policies.checkpoint import Checkpoint
 from worker.ml.policies.reference import looked_into
@@ -62,6 +64,7 @@ class MethodConfig:
     value_noise: float = 0.25
     value_steps: int = 3_000
     steering: Steering = field(default_factory=Steering)
+    refinement: Refinement = field(default_factory=Refinement)
     constraint: Constraint = field(default_factory=Constraint)
     others: int = 60
     """people whose answers clusters and latents are learned from; they count for nobody"""
@@ -138,14 +141,23 @@ def fit_reference(setting: Setting) -> tuple[Act, tuple[str, ...]]:
 
 
 def fit_pbarl(setting: Setting) -> tuple[Act, tuple[str, ...]]:
-    """The studio's default: mode, gate, residual encoder, gate."""
-    problem = setting.problem
-    gate = setting.reference(_gate(setting))
-    draft = pbarl.fit_studio(problem, setting.surface(), setting.pool, gate, setting.collect)
-    weights = draft.weights
-    mode = ", ".join(f"{axis} {value:+.2f}" for axis, value in weights.mode.items()) or "off"
-    share = weights.residual_share if weights.encoder else 0.0
-    return _exported(problem, draft), (*draft.notes, f"Mode: {mode}; gate {weights.gate:g}; residual {share:g}.")
+    """The studio's quick filter: mode, gate, residual encoder, gate."""
+    return _shipped(setting.problem, _mode_and_residual(setting))
+
+
+def fit_pbarl_refined(setting: Setting) -> tuple[Act, tuple[str, ...]]:
+    """The quick filter, and the refined policy that begins as it."""
+    problem, reference = setting.problem, setting.reference(_gate(setting))
+    draft = refinement.refine(
+        problem,
+        _mode_and_residual(setting),
+        setting.make_env,
+        setting.pool,
+        reference,
+        setting.config.refinement,
+        setting.checkpoint,
+    )
+    return _shipped(problem, refinement.gate_refined(problem, draft, reference, setting.collect))
 
 
 def fit_as_printed(setting: Setting, list_length: int) -> tuple[Act, tuple[str, ...]]:
@@ -267,6 +279,7 @@ def fit_latent(setting: Setting) -> tuple[Act, tuple[str, ...]]:
 METHODS: Mapping[str, FitMethod] = {
     "reference": fit_reference,
     "pbarl": fit_pbarl,
+    "pbarl_refined": fit_pbarl_refined,
     "pbarl_printed": partial(fit_as_printed, list_length=10),
     "pbarl_n1": partial(fit_as_printed, list_length=1),
     "pbarl_n20": partial(fit_as_printed, list_length=20),
@@ -296,6 +309,23 @@ WITHOUT_LABELS = ("reference", "average")
 
 def _gate(setting: Setting) -> range:
     return setting.problem.config.gate_block(setting.problem.task)
+
+
+def _mode_and_residual(setting: Setting) -> FilterDraft:
+    gate = setting.reference(_gate(setting))
+    return pbarl.fit_studio(setting.problem, setting.surface(), setting.pool, gate, setting.collect)
+
+
+def _shipped(problem: FilterProblem, draft: FilterDraft) -> tuple[Act, tuple[str, ...]]:
+    draft = draft.shielded()
+    weights = draft.weights
+    mode = ", ".join(f"{axis} {value:+.2f}" for axis, value in weights.mode.items()) or "off"
+    share = weights.residual_share if weights.encoder else 0.0
+    refined = " Refined." if weights.refined else ""
+    return _exported(problem, draft), (
+        *draft.notes,
+        f"Mode: {mode}; gate {weights.gate:g}; residual {share:g}.{refined}",
+    )
 
 
 def _exported(problem: FilterProblem, draft: FilterDraft) -> Act:

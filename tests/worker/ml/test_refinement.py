@@ -1,0 +1,111 @@
+"""A filter's refinement: what it begins as, where it goes, and that it only stays where it is better."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from tests.worker import invented
+from tests.worker.ml.test_methods import POLICY, REWARD, STEPS, World, collect
+from worker.domain.trajectory import Trajectory
+from worker.ml.filters.filter_module import FilterWeights
+from worker.ml.filters.filter_problem import FilterConfig, FilterDraft, FilterProblem, GateTrial, act_of
+from worker.ml.methods import refinement
+from worker.ml.methods.refinement import Refinement
+from worker.ml.policies.checkpoint import Checkpoint, Paused, ask_to_pause, begin_again
+from worker.ml.rewards.reward_models import StructuredReward
+
+SEEN = invented.observations(300, np.random.default_rng(9))
+SHORT = Refinement(
+    steps=400, warm_up_steps=120, imitation_steps=300, critic_first_updates=50, hidden=16, environments=2
+)
+LONGER = replace(SHORT, steps=1_500, critic_first_updates=150, learning_rate=5e-3)
+GATED = FilterWeights(mode={"speed_far": -0.3, "speed_near": -0.3}, gate=0.6)
+
+
+@pytest.fixture(scope="module")
+def reference() -> list[Trajectory]:
+    return collect(POLICY.mean, range(6), 0.0, 0)
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> None:
+    torch.set_num_threads(1)
+
+
+def problem(reward: StructuredReward = REWARD) -> FilterProblem:
+    """Of somebody who dislikes the first joint's action, by default."""
+    return FilterProblem(invented.TASK, POLICY, reward, 0, FilterConfig(success_tolerance=1.0))
+
+
+def refined(draft: FilterDraft, reference: list[Trajectory], config: Refinement = SHORT, **more: object) -> FilterDraft:
+    """After ``config``."""
+    return refinement.refine(problem(), draft, World, [], reference, config, **more)  # type: ignore[arg-type]
+
+
+def first_joint(weights: FilterWeights) -> float:
+    """Mean action of the disliked joint in unseen states."""
+    return float(act_of(invented.TASK.modes, POLICY, weights).batch(SEEN)[:, 0].mean())
+
+
+def test_it_begins_as_the_filter_and_goes_where_the_person_wants_it(reference: list[Trajectory]) -> None:
+    draft = FilterDraft(GATED)
+    only_imitated = refined(
+        draft, reference, replace(SHORT, steps=400, warm_up_steps=400, imitation_steps=1_000, hidden=64)
+    )
+    began = act_of(invented.TASK.modes, POLICY, GATED).batch(SEEN)
+    imitated = act_of(invented.TASK.modes, POLICY, only_imitated.weights.changed(gate=1.0)).batch(SEEN)
+    assert np.abs(imitated - began).mean() < 0.05
+    learned = refined(draft, reference, LONGER)
+    assert first_joint(learned.weights.changed(gate=1.0)) < first_joint(GATED) - 0.1
+
+
+def test_the_refined_policy_takes_the_place_of_a_weakened_filter_at_full_strength(reference: list[Trajectory]) -> None:
+    draft = FilterDraft(GATED, trials=(GateTrial(0.6, 0.0, 0.01, 0.0, 0.0),))
+    learned = refined(draft, reference, LONGER)
+    gated = refinement.gate_refined(problem(), learned, reference, collect)
+    assert gated.weights.refined
+    assert gated.weights.gate == 1.0
+    assert gated.trials[-1].refined
+    assert gated.trials[-1].preference > 0.01
+    assert gated.tested
+    assert first_joint(gated.weights) < first_joint(GATED)
+
+
+def test_a_refined_policy_that_is_no_better_leaves_the_filter_as_it_was(reference: list[Trajectory]) -> None:
+    draft = FilterDraft(GATED, trials=(GateTrial(0.6, 0.0, 99.0, 0.0, 0.0),))
+    gated = refinement.gate_refined(problem(), refined(draft, reference), reference, collect)
+    assert gated.weights == GATED
+    assert "refined" in gated.notes[-1]
+
+
+def test_a_refined_policy_that_loses_the_task_leaves_the_filter_as_it_was(reference: list[Trajectory]) -> None:
+    def failing(*arguments: object) -> list[Trajectory]:
+        return [replace(each, success=False) for each in collect(*arguments)]  # type: ignore[arg-type]
+
+    strict = replace(problem(), config=FilterConfig(success_tolerance=0.05))
+    succeeding = [replace(each, success=True) for each in reference]
+    gated = refinement.gate_refined(strict, refined(FilterDraft(GATED, trials=()), reference), succeeding, failing)
+    assert gated.weights == GATED
+
+
+def test_a_training_that_paused_goes_on_from_its_checkpoint(reference: list[Trajectory], tmp_path: Path) -> None:
+    draft = FilterDraft(GATED)
+    ask_to_pause(tmp_path)
+    with pytest.raises(Paused):
+        refined(draft, reference, checkpoint=Checkpoint(tmp_path))
+    begin_again(tmp_path)
+    kept = Checkpoint(tmp_path).read()
+    assert kept is not None
+    assert kept[1]["steps"] >= SHORT.warm_up_steps
+    assert refined(draft, reference, checkpoint=Checkpoint(tmp_path)).weights.refined
+
+
+def test_the_same_seed_gives_the_same_policy_and_it_survives_being_stored(reference: list[Trajectory]) -> None:
+    first, again = (refined(FilterDraft(GATED), reference).weights for _ in range(2))
+    assert first.to_bytes() == again.to_bytes()
+    read = FilterWeights.from_bytes(first.to_bytes())
+    assert first_joint(read) == first_joint(first)
+    assert len(reference[0]) == STEPS

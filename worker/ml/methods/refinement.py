@@ -1,0 +1,158 @@
+"""The last and longest stage of the studio's filter: a policy of the person's own, which begins as mode and residual.
+
+A network imitates the filter; soft actor-critic goes on from there, on R-hat and the sketchy reward of PbRL-HRI. Its
+replay begins with the rollouts that are there already (Ball et al. 2023, arXiv 2302.02948), and a tie to the imitation,
+as in prefft_anchored, fades while it learns: without the tie it forgets the task before it finds anything better
+(docs/method.md, section 7).
+"""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from worker.domain.trajectory import Trajectory
+from worker.domain.type_aliases import Float32Array
+from worker.ml.filters.filter_problem import (
+    Collect,
+    FilterAct,
+    FilterDraft,
+    FilterProblem,
+    GateTrial,
+    ReportProgress,
+    act_of,
+)
+from worker.ml.filters.gate import acceptable, try_on
+from worker.ml.filters.shield import limits_of
+from worker.ml.methods import pbrl_hri
+from worker.ml.methods.preference_rl import MakeEnv, PreferenceRl, learned
+from worker.ml.methods.prefft import TiedLearner
+from worker.ml.policies.checkpoint import Checkpoint
+from worker.ml.policies.demonstrations import Demonstrations
+from worker.ml.policies.imitation import imitate
+from worker.ml.policies.reference import looked_into
+from worker.ml.policies.sac import Learner, SacConfig
+
+OWN_SHARE = 3
+"""How often the imitation sees the filter's own states, beside those of the rollouts that were there."""
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """How much is learned."""
+
+    steps: int = 60_000
+    """of the environment"""
+    warm_up_steps: int = 4_000
+    """of these, made by the filter"""
+    warm_up_noise: float = 0.15
+    """standard deviation of what is added to its actions then"""
+    imitation_steps: int = 4_000
+    critic_first_updates: int = 6_000
+    hidden: int = 128
+    environments: int = 4
+    learning_rate: float = 5e-4
+    first_tie: float = 1.0
+    """weight of the KL divergence from the imitation, in units of the spread of Q; see prefft"""
+    last_tie: float = 0.1
+
+
+def refine(
+    problem: FilterProblem,
+    draft: FilterDraft,
+    make_env: MakeEnv,
+    known: Sequence[Trajectory],
+    reference: Sequence[Trajectory],
+    config: Refinement,
+    checkpoint: Checkpoint | None = None,
+) -> FilterDraft:
+    """Train the person's refined policy; gate_refined() decides whether it takes the filter's place.
+
+    ``known``: rollouts of many behaviours, for the replay; ``reference``: of the frozen policy, for the unit of the
+    sketchy reward. With a checkpoint, a training that was killed goes on where it was.
+    """
+    started = time.perf_counter()
+    settings = SacConfig(
+        problem.task.observation,
+        seed=problem.seed,
+        total_steps=config.steps,
+        random_steps=min(config.warm_up_steps, config.steps),
+        environments=config.environments,
+        hidden=config.hidden,
+        learning_rate=config.learning_rate,
+        critic_first_updates=config.critic_first_updates,
+    )
+    policy = looked_into(problem.policy)
+    offset, scale = torch.from_numpy(policy.offset), torch.from_numpy(policy.scale)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(problem.seed)
+        reward = pbrl_hri.sketchy(reference, learned(problem.reward))
+        training = PreferenceRl(make_env, reward, settings, [*known, *reference])
+        learner = TiedLearner(settings, offset, scale, training.actions, config.first_tie)
+        kept = checkpoint.read() if checkpoint else None
+        if kept is None:
+            _imitate(learner, training, act_of(problem.task.modes, problem.policy, draft.weights), config)
+        else:
+            training.restore(learner, *kept)
+
+        def loosen(training: PreferenceRl, _: Learner) -> None:
+            learner.weight = config.first_tie + training.steps / config.steps * (config.last_tie - config.first_tie)
+
+        training.learn(learner, checkpoint, loosen)
+        training.close()
+    weights = draft.weights.changed(refined=learner.average.policy().weights)
+    return replace(draft, weights=weights).timed("refinement", started)
+
+
+def _imitate(learner: TiedLearner, training: PreferenceRl, act: FilterAct, config: Refinement) -> None:
+    """Begin as the filter, which makes the warm-up's steps."""
+
+    def disturbed(states: Float32Array) -> Float32Array:
+        actions = act.batch(states)
+        noise = training.rng.normal(0.0, config.warm_up_noise, actions.shape)
+        return np.clip(actions + noise, -1.0, 1.0).astype(np.float32)
+
+    before = training.replay.count
+    states = training.warm_up(disturbed)
+    shown = np.concatenate([states, *[states[before:]] * OWN_SHARE])
+    demonstrations = Demonstrations(shown, act.batch(shown))
+    imitate(learner.actor, demonstrations, config.imitation_steps, early=-1, watch=lambda _: None)
+    learner.average.load_state_dict(learner.actor.state_dict())
+    learner.hold()
+
+
+def gate_refined(
+    problem: FilterProblem,
+    draft: FilterDraft,
+    reference: Sequence[Trajectory],
+    collect: Collect,
+    progress: ReportProgress = lambda stage, share: None,
+) -> FilterDraft:
+    """Keep the refined policy when it keeps the task and is better than what it began as; else mode and residual."""
+    if not draft.weights.refined:
+        return draft
+    started = time.perf_counter()
+    progress("checking the refined policy on held-out scenarios", 0.84)
+    weights = draft.weights.changed(gate=1.0)
+    act = act_of(problem.task.modes, problem.policy, weights)
+    trial, driven = try_on(problem, act, weights.gate, 0.0, reference, collect)
+    trial = replace(trial, refined=True)
+    if acceptable(problem, trial, reference) and trial.preference > _to_beat(draft):
+        tested = limits_of(problem.task.observation, problem.task.action, driven, reference)
+        draft = replace(draft, weights=weights, tested=tested)
+    else:
+        notes = (*draft.notes, "The refined policy was no better on held-out scenarios and is off.")
+        draft = replace(draft, weights=draft.weights.changed(refined={}), notes=notes)
+    return replace(draft, trials=(*draft.trials, trial)).timed("gate_refined", started)
+
+
+def _to_beat(draft: FilterDraft) -> float:
+    """What the filter that was refined has gained in the same scenarios; 0 if it changes nothing."""
+    weights = draft.weights
+    share = weights.residual_share if weights.encoder else 0.0
+    if not share and not any(weights.mode.values()):
+        return 0.0
+    setting = (weights.gate, share)
+    return next(each.preference for each in reversed(draft.trials) if (each.gate, each.residual_share) == setting)
