@@ -26,6 +26,8 @@ from app.installed_tasks.description import LONGEST_CLIP_STEPS, SHORTEST_CLIP_ST
 from app.questionnaires import library
 
 USUAL_CLIP_STEPS = 60
+SHORTEST_REFINEMENT = 8_000
+"""Environment steps; half of them are the filter's own, before anything is learned."""
 """Of a task that is not installed here."""
 
 
@@ -332,6 +334,17 @@ class StudySettings(BaseModel):
         unit="answers",
         simulated=True,
     )
+    refinement_steps: int = setting(
+        0,
+        Section.LEARNING,
+        "Refine the last filter for",
+        "By reinforcement learning, once all answers are there. 60,000 steps make most filters better by a half or "
+        "more, and take about five minutes longer, while the participant waits for the evaluation. 0: not at all.",
+        unit="steps",
+        ge=0,
+        le=1_000_000,
+        simulated=True,
+    )
     success_tolerance: float = setting(
         0.035,
         Section.LEARNING,
@@ -484,6 +497,14 @@ class StudySettings(BaseModel):
             )
         if self.following_share and not self.reward_kind.is_linear_in_signals:
             raise ValueError("Pairs follow the person with structured reward models only. Choose one, or enter 0 %.")
+        return self
+
+    @model_validator(mode="after")
+    def _can_refine(self) -> "StudySettings":
+        if 0 < self.refinement_steps < SHORTEST_REFINEMENT:
+            raise ValueError(f"A refinement has at least {SHORTEST_REFINEMENT:,} steps. Enter more, or 0 for none.")
+        if self.refinement_steps and self.method is not Method.STUDIO:
+            raise ValueError("Only the studio's own filters are refined. Choose its method, or enter 0 steps.")
         return self
 
     @model_validator(mode="after")

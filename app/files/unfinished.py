@@ -12,6 +12,10 @@ KEPT = "*.safetensors"
 """What a training goes on from; notes of how far it is are of use on this machine only."""
 
 
+WORKSPACES = ("export", "import", REFINEMENT := "refinement")
+"""How the names of folders begin that are of use to one process only."""
+
+
 class Unfinished:
     """Trainings work in folders of this machine, and others go on from what they keep."""
 
@@ -58,9 +62,9 @@ class Unfinished:
                 self._files.delete(f"{self._there(folder)}/{name}")
 
     def clear_workspaces(self, older_than_s: float) -> None:
-        """Remove folders in which a killed program was writing or reading an archive: they hold what everybody said."""
+        """Remove folders in which a killed program was at work on what several people said, an archive for example."""
         newest_s = time.time() - older_than_s
-        for folder in (*self.root.glob("export-*"), *self.root.glob("import-*")):
+        for folder in [each for name in WORKSPACES for each in self.root.glob(f"{name}-*")]:
             with suppress(FileNotFoundError):
                 if folder.stat().st_mtime < newest_s:
                     shutil.rmtree(folder, ignore_errors=True)

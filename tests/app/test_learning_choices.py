@@ -39,6 +39,29 @@ def test_a_share_of_the_pairs_can_follow_the_person_beside_the_random_ones(
     assert "20 % follow the person" in experimenter.get("/studies/pilot").text
 
 
+@pytest.mark.parametrize(
+    ("steps", "changed", "complaint"),
+    [
+        ("60000", {}, None),
+        ("500", {}, "at least 8,000 steps"),
+        ("60000", {"method": "printed"}, "Only the studio&#39;s own filters are refined"),
+    ],
+)
+def test_the_last_filter_can_be_refined(
+    experimenter: TestClient, database: Database, steps: str, changed: dict[str, str], complaint: str | None
+) -> None:
+    form = {**form_with_defaults().model_dump(), "name": "Pilot", "refinement_steps": steps, **changed}
+    answer = experimenter.post("/studies/new", data=form)
+    with database.reading() as session:
+        studies = session.scalars(select(Study)).all()
+    if complaint is not None:
+        assert complaint in answer.text
+        assert not studies
+        return
+    assert studies[0].settings.refinement_steps == 60_000
+    assert "the last one refined" in experimenter.get("/studies/pilot").text
+
+
 @pytest.mark.parametrize(("field", "value"), CHOICES)
 def test_a_choice_is_offered_and_stored(experimenter: TestClient, database: Database, field: str, value: str) -> None:
     assert f'name="{field}" value="{value}"' in experimenter.get("/studies/new").text

@@ -29,6 +29,7 @@ OF_SETTINGS: options.Table = {
     "labels_per_participant": ("--labels", "labels per participant"),
     "retrain_every_labels": ("--retrain-every", "labels between two reward models"),
     "filter_milestones": ("--milestones", "labels after which a filter is trained early"),
+    "refinement_steps": ("--refinement-steps", "by which the last filter is refined; 60000 or so, 0: not at all"),
     "method": ("--method", "how the filter is trained"),
     "reward_kind": ("--reward", "the model that is learned from the labels"),
     "strategy": ("--strategy", "which pairs are asked"),

@@ -8,6 +8,8 @@ import json
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +18,7 @@ from app.installed_tasks.lab import REFERENCE
 from worker.analysis.filters.evaluation import evaluate
 from worker.analysis.filters.promise import Outcome, Promise, sentence
 from worker.analysis.filters.proof import case_against
-from worker.compute import harm_tests, learning, simulation
+from worker.compute import harm_tests, learning, refining, simulation
 from worker.compute.pools import Computing, Lane
 from worker.compute.simulation import surface_file
 from worker.domain.lab_modes import PolicyChoice
@@ -39,6 +41,7 @@ from worker.ml.filters.filter_problem import (
 )
 from worker.ml.filters.policy_choice import SURE
 from worker.ml.filters.response_surface import ResponseSurface
+from worker.ml.methods.refinement import Refinement, gate_refined
 from worker.ml.policies.reference import ReferencePolicy
 from worker.ml.rewards.loading import load_reward_model
 from worker.tasks import registry
@@ -73,6 +76,9 @@ class Finished:
     filter_weights: bytes
     bundle: bytes
     metrics: dict[str, Any]
+
+
+TrainPatiently = Callable[[Callable[[Path], FilterDraft | None]], FilterDraft | None]
 
 
 @dataclass(frozen=True)
@@ -127,6 +133,19 @@ class FilterFit:
         """As much of the residual as held-out scenarios allow."""
         reference = self._gate_reference()
         return residual.gate_residual(self.problem, draft, reference, self.collect, self.progress)
+
+    def refine(
+        self, draft: FilterDraft, known: Sequence[Trajectory], steps: int, train: "TrainPatiently"
+    ) -> FilterDraft | None:
+        """The person's refined policy in place of mode and residual, if it is better; None: nobody needs it any more.
+
+        ``known``: the pool's rollouts; ``train``: calls what it is given with a folder for checkpoints, in a compute
+        process, until that gives a draft.
+        """
+        reference = self._gate_reference()
+        training = refining.Training(self.task, self.problem, draft, known, reference, Refinement(steps))
+        refined = train(partial(refining.train, training))
+        return refined and gate_refined(self.problem, refined, reference, self.collect, self.progress)
 
     def keep_promise(self, draft: FilterDraft) -> FilterDraft:
         """The filter behind its shield, as far as the promise about harm can be made of it."""
@@ -186,6 +205,7 @@ class FilterFit:
             **_strengths(draft.weights),
             "mode": dict(draft.weights.mode),
             "method": draft.weights.method,
+            "refined": bool(draft.weights.refined),
             "notes": [
                 *draft.notes,
                 *learned.get("foresight_notes", ()),
@@ -301,7 +321,7 @@ def _choice(task: Task, draft: FilterDraft) -> dict[str, Any] | None:
 def moves_nothing(weights: FilterWeights) -> bool:
     """Whether the filter leaves the reference policy as it is."""
     without_residual = not weights.encoder or weights.residual_share == 0.0
-    off = without_residual and not any(weights.mode.values())
+    off = without_residual and not any(weights.mode.values()) and not weights.refined
     return weights.gate == 0.0 or (weights.method == "studio" and off)
 
 
@@ -325,7 +345,8 @@ def _shield_active(proven: Proven) -> float | None:
 
 
 def _strengths(weights: FilterWeights) -> dict[str, float]:
-    return {"gate": weights.gate, "residual_share": weights.residual_share if weights.encoder else 0.0}
+    has_residual = weights.encoder and not weights.refined
+    return {"gate": weights.gate, "residual_share": weights.residual_share if has_residual else 0.0}
 
 
 def _warnings(evaluation: dict[str, Any], tolerance: float) -> list[str]:

@@ -167,6 +167,11 @@ def _procedure(session: Session, study: Study) -> Iterator[str]:
         f"{percent(settings.harm_share)} of scenarios with {percent(settings.harm_confidence, 0)} confidence."
         if study.material is None
         else "",
+        "The filter of all answers was then refined by soft actor-critic on the learned preference, for "
+        f"{settings.refinement_steps:,} environment steps from that filter on, and the refined policy kept where it "
+        "was better and no worse in these respects."
+        if settings.refinement_steps
+        else "",
     )
     languages = [LANGUAGES[each] for each in settings.offered_languages]
     yield f"Pages were in {listed(languages, 'or')}{', as participants chose' if len(languages) > 1 else ''}."

@@ -101,7 +101,7 @@ def _what_matters(kind: RunKind, settings: StudySettings) -> tuple[object, ...]:
         case RunKind.REWARD:
             return (settings.reward_kind,)
         case RunKind.FILTER | RunKind.SHARED:
-            return settings.method, settings.evaluation_scenarios
+            return settings.method, settings.evaluation_scenarios, settings.refinement_steps
         case RunKind.METHOD:
             return evaluation.fine_tuning_steps if evaluation else None, settings.evaluation_scenarios
         case RunKind.FILMS:

@@ -39,6 +39,7 @@ def needing_a_simulator(settings: StudySettings) -> Sequence[str]:
         "pooled_prior": settings.pooled_prior,
         "strategy": settings.strategy is Strategy.CONTESTED,
         "following_share": settings.following_share > 0.0,
+        "refinement_steps": settings.refinement_steps > 0,
     }
     return [name for name, is_asked in asked.items() if is_asked]
 
@@ -68,6 +69,8 @@ def complaints(task: str, settings: StudySettings, *, recorded: bool = False) ->
             found["method"] = f"PbARL as printed {_NEEDS_WEIGHTS}"
         if settings.reward_kind is RewardKind.PREDICTED:
             found["reward_kind"] = "The signals of this task cannot be foreseen. Choose another reward model."
+        if settings.refinement_steps:
+            found["refinement_steps"] = f"A refinement {_NEEDS_WEIGHTS.removesuffix('Choose something else.')}Enter 0."
     if settings.evaluation is None:
         return found
     asked = {*settings.evaluation.methods, *(method for arm in settings.arms for method in arm.methods)}

@@ -11,12 +11,19 @@ from app.domain.models import Model, ModelKind, RunKind
 from app.domain.preferences import LabelEvent, Query, Response
 from app.domain.run_keys import RunKey
 from app.domain.studies import Participant, Study
+from app.domain.study_settings import SHORTEST_REFINEMENT
 from app.services.answers import accuracy
 from app.services.answers.misfit import Misfit
 from app.storage import ArtefactStore
 from tests.worker.at_hand import at_once
 from worker.compute.pools import Compute
-from worker.jobs.learning.filters import NothingToLearnFrom, notes_on_foresight, notes_on_misfit, train_filter
+from worker.jobs.learning.filters import (
+    NothingToLearnFrom,
+    notes_on_foresight,
+    notes_on_misfit,
+    train_filter,
+)
+from worker.jobs.learning.refinement import is_refined
 from worker.jobs.runtime import records
 from worker.jobs.runtime.context import WorkerContext
 from worker.jobs.runtime.due_work import answers_known, is_outdated
@@ -101,6 +108,22 @@ def test_after_the_last_answer_an_earlier_filter_is_not_even_finished(
     answered(20)
     assert outdated_at(context, participant, 10, begun=True)
     assert not outdated_at(context, participant, 20, begun=True)
+
+
+def test_only_the_filter_of_all_answers_and_those_for_several_people_are_refined(
+    context: WorkerContext, participant: Participant
+) -> None:
+    with context.database.reading() as session:
+        settings = session.get_one(Study, participant.study_id).settings
+    wanted = settings.model_copy(update={"refinement_steps": SHORTEST_REFINEMENT})
+    early, last = (
+        Job(RunKey(RunKind.FILTER, participant_id=participant.id, labels=labels), participant.study_id)
+        for labels in (10, settings.labels_per_participant)
+    )
+    assert is_refined(wanted, last, shared=False)
+    assert is_refined(wanted, early, shared=True)
+    assert not is_refined(wanted, early, shared=False)
+    assert not is_refined(settings, last, shared=True)
 
 
 def test_without_a_reward_model_the_run_says_why_there_is_no_filter(

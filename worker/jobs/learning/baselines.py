@@ -8,6 +8,7 @@ participant's, so a killed worker goes on where it was; the folder is removed at
 
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from sqlalchemy import select
@@ -24,14 +25,13 @@ from worker.compute.baseline_fitting import Baseline
 from worker.compute.pools import Lane
 from worker.domain.scenarios import EVALUATION, first_of
 from worker.domain.trajectory import Trajectory
-from worker.jobs.learning import dataset, lent_filters
+from worker.jobs.learning import dataset, lent_filters, patience
 from worker.jobs.learning.filters import NothingToLearnFrom, reward_to_follow
 from worker.jobs.learning.lent_filters import LoanEnded
 from worker.jobs.runtime import due_work, records
 from worker.jobs.runtime.context import Step, WorkerContext
 from worker.jobs.runtime.records import Job
 from worker.ml.filters.filter_module import FilterWeights
-from worker.ml.policies.checkpoint import ask_to_pause, share_done
 from worker.ml.rewards.loading import load_reward_model
 from worker.tasks import registry
 
@@ -76,24 +76,23 @@ def _train(context: WorkerContext, run_id: int, job: Job, method: str, reward: s
     """
     folder = _folder(context, job, run_id)
     folder.mkdir(parents=True, exist_ok=True)
-    context.store.unfinished.bring(folder)
     baseline = _baseline(context, run_id, job, method, reward, folder)
 
-    def beat() -> None:
-        share = share_done(folder)
+    def report(share: float) -> None:
         context.report(run_id, f"training a method to be evaluated, {share:.0%} done", TRAINING_SHARE * share)
-        context.keep_unfinished(folder)
-        if context.compute.is_needed_elsewhere(Lane.PATIENT) or _is_outdated(context, job):
-            ask_to_pause(folder)
 
-    seconds = 0.0
-    while not _is_outdated(context, job):
-        fitted = context.compute.run(Lane.PATIENT, beat, baseline_fitting.fit, baseline, folder)
-        seconds += fitted.seconds
-        if fitted.controller is not None:
-            return {"artefact": context.store.put(fitted.controller), "notes": list(fitted.notes), "seconds": seconds}
-    context.store.unfinished.forget(folder)
-    return {}
+    parts = patience.train(
+        context,
+        folder,
+        report,
+        partial(_is_outdated, context, job),
+        partial(baseline_fitting.fit, baseline),
+        lambda fitted: fitted.controller is not None,
+    )
+    if not parts or parts[-1].controller is None:
+        return {}
+    artefact = context.store.put(parts[-1].controller)
+    return {"artefact": artefact, "notes": list(parts[-1].notes), "seconds": sum(each.seconds for each in parts)}
 
 
 def _as_set(context: WorkerContext, run_id: int, job: Job) -> dict[str, object]:

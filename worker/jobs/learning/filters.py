@@ -1,6 +1,7 @@
 """Filters: from the participant's reward model to an evaluated, published bundle."""
 
 from collections.abc import Sequence
+from functools import partial
 
 from sqlalchemy import select
 from sqlalchemy.orm import Session
@@ -20,7 +21,8 @@ from worker.analysis.filters.promise import Promise
 from worker.compute import filter_fitting, learning
 from worker.compute.filter_fitting import FilterFit
 from worker.compute.pools import Lane
-from worker.jobs.learning import dataset
+from worker.domain.trajectory import Trajectory
+from worker.jobs.learning import dataset, refinement
 from worker.jobs.runtime import due_work, records
 from worker.jobs.runtime.context import Step, WorkerContext
 from worker.jobs.runtime.records import Job
@@ -28,7 +30,7 @@ from worker.ml.export import bundle
 from worker.ml.export.bundle import Provenance
 from worker.ml.filters.filter_problem import FilterConfig, FilterDraft
 
-STAGES = {Method.STUDIO: ("mode", "residual", "gate", "promise"), Method.PRINTED: ("printed",)}
+STAGES = {Method.STUDIO: ("mode", "residual", "gate", "refinement", "promise"), Method.PRINTED: ("printed",)}
 
 
 class NothingToLearnFrom(AppError):
@@ -53,6 +55,8 @@ def train_filter(context: WorkerContext, job: Job, run_id: int, step: Step) -> N
         if step(f"is-outdated-before-{stage}", is_outdated, context, job, True):
             return
         draft = step(stage, fit_stage, context, run_id, job, reward, draft, stage)
+        if not draft:
+            return
     step("publish", _publish, context, run_id, job, reward, draft)
 
 
@@ -112,14 +116,37 @@ def fit_stage(
     """One stage of the fit: the artefact of a draft in, the artefact of a better one out. ``shared``: see fitting()."""
     fit = fitting(context, run_id, job, reward, shared=shared)
     if stage in {"mode", "printed"}:
-        with context.database.reading() as session:
-            clips = dataset.pool_clips(session, job.study_id)
-        pool = [dataset.shown(context.store, clip) for clip in clips]
+        pool = pool_rollouts(context, job)
         result = fit.find_mode(pool) if stage == "mode" else fit.fit_printed()
+    elif stage == "refinement":
+        return _refined(context, run_id, job, fit, draft, shared)
     else:
         stages = {"residual": fit.train_residual, "gate": fit.gate_residual, "promise": fit.keep_promise}
         result = stages[stage](load_draft(context, draft))
     return context.store.put(filter_fitting.draft_to_bytes(result))
+
+
+def pool_rollouts(context: WorkerContext, job: Job) -> list[Trajectory]:
+    """What the study's clips show, as whole episodes."""
+    with context.database.reading() as session:
+        clips = dataset.pool_clips(session, job.study_id)
+    return [dataset.shown(context.store, clip) for clip in clips]
+
+
+def _refined(context: WorkerContext, run_id: int, job: Job, fit: FilterFit, draft: str, shared: bool) -> str:
+    """The artefact of the refined filter, or of the same one where none is to be refined; empty: nobody needs it."""
+    with context.database.reading() as session:
+        settings = session.get_one(Study, job.study_id).settings
+    if not refinement.is_refined(settings, job, shared):
+        return draft
+    outdated = (lambda: False) if shared else partial(is_outdated, context, job, True)
+    with refinement.folder(context, run_id, job, shared) as folder:
+        train = refinement.trainer(context, run_id, folder, outdated)
+        known = pool_rollouts(context, job)
+        result = fit.refine(load_draft(context, draft), known, settings.refinement_steps, train)
+        artefact = context.store.put(filter_fitting.draft_to_bytes(result)) if result else ""
+        context.store.unfinished.forget(folder)
+    return artefact
 
 
 def _publish(context: WorkerContext, run_id: int, job: Job, reward: str, draft: str) -> None:
@@ -228,6 +255,7 @@ def fitting(context: WorkerContext, run_id: int, job: Job, reward: str, *, share
         study_seed = study.seed
         seed = study_seed if shared else session.get_one(Participant, job.participant).seed
         version = 1 if shared else records.next_version(session, job.participant)
+    quick = not refinement.is_refined(settings, job, shared)
     return FilterFit(
         task=task,
         compute=context.compute,
@@ -235,7 +263,7 @@ def fitting(context: WorkerContext, run_id: int, job: Job, reward: str, *, share
         reward=context.store.read(reward),
         seed=seed,
         config=filter_config(settings),
-        progress=lambda stage, share: context.report(run_id, stage, share),
+        progress=lambda stage, share: context.report(run_id, stage, share if quick else refinement.beside(share)),
         references=context.references,
         promise=promise_of(settings),
         study_seed=study_seed,

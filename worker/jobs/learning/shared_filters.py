@@ -16,7 +16,7 @@ from worker.jobs.runtime import due_lending, records
 from worker.jobs.runtime.context import Step, WorkerContext
 from worker.jobs.runtime.records import Job
 
-STAGES = ("mode", "residual", "gate", "promise")
+STAGES = ("mode", "residual", "gate", "refinement", "promise")
 
 
 def fit(context: WorkerContext, job: Job, run_id: int, step: Step) -> None:

@@ -20,7 +20,7 @@ def fit_studio(
     collect: Collect,
     progress: ReportProgress = lambda stage, share: None,
 ) -> FilterDraft:
-    """All stages in a row, without shield. ``reference``: rollouts of the reference policy on the problem's gate scenarios."""
+    """All stages in a row, without shield. ``reference``: of the reference policy on the problem's gate scenarios."""
     draft = find_mode(problem, surface, pool, reference, collect, progress)
     draft = train_residual(problem, draft, collect, progress)
     return gate_residual(problem, draft, reference, collect, progress)

@@ -79,7 +79,7 @@ class PreferenceRl:
         self.steps = 0
 
     def warm_up(self, first: FirstActions) -> Float32Array:
-        """Make ``random_steps`` steps, or at least one episode, without learning; returns all states there are, (N, D)."""
+        """Make ``random_steps`` steps, or at least one episode, without learning; returns all states seen, (N, D)."""
         before = self.replay.count
         while self.steps < self.config.random_steps or self.replay.count == before:
             self._step(first(self.states))

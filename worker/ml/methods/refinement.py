@@ -20,7 +20,6 @@ from worker.ml.filters.filter_problem import (
     FilterAct,
     FilterDraft,
     FilterProblem,
-    GateTrial,
     ReportProgress,
     act_of,
 )
