@@ -67,6 +67,7 @@ def test_the_refined_policy_takes_the_place_of_a_weakened_filter_at_full_strengt
     learned = refined(draft, reference, LONGER)
     gated = refinement.gate_refined(problem(), learned, reference, collect)
     assert gated.weights.refined
+    assert "refined by reinforcement learning" in gated.notes[-1]
     assert gated.weights.gate == 1.0
     assert gated.trials[-1].refined
     assert gated.trials[-1].preference > 0.01
@@ -78,7 +79,7 @@ def test_a_refined_policy_that_is_no_better_leaves_the_filter_as_it_was(referenc
     draft = FilterDraft(GATED, trials=(GateTrial(0.6, 0.0, 99.0, 0.0, 0.0),))
     gated = refinement.gate_refined(problem(), refined(draft, reference), reference, collect)
     assert gated.weights == GATED
-    assert "refined" in gated.notes[-1]
+    assert "no better" in gated.notes[-1]
 
 
 def test_a_refined_policy_that_loses_the_task_leaves_the_filter_as_it_was(reference: list[Trajectory]) -> None:

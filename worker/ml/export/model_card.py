@@ -137,11 +137,6 @@ def _way(manifest: Mapping[str, Any]) -> str:
         for axis in manifest["mode_axes"]
     ]
     heading = f"## This person's way\n\nGate {manifest['gate']:.0%}, residual {manifest['residual_share']:.0%}."
-    if manifest.get("refined"):
-        heading = (
-            f"## This person's way\n\nGate {manifest['gate']:.0%}. The filter was refined by reinforcement learning on"
-            " the learned preference; it began as the execution mode below, and may have gone elsewhere since."
-        )
     return "\n".join([heading, "", "| axis | value | range | meaning |", "|---|---|---|---|", *rows])
 
 

@@ -34,6 +34,10 @@ from worker.ml.policies.imitation import imitate
 from worker.ml.policies.reference import looked_into
 from worker.ml.policies.sac import Learner, SacConfig
 
+_REFINED = (
+    "The filter was refined by reinforcement learning on the learned preference. It began as the execution mode that is "
+    "shown, and may have gone elsewhere since."
+)
 OWN_SHARE = 3
 """How often the imitation sees the filter's own states, beside those of the rollouts that were there."""
 
@@ -140,7 +144,7 @@ def gate_refined(
     trial = replace(trial, refined=True)
     if acceptable(problem, trial, reference) and trial.preference > _to_beat(draft):
         tested = limits_of(problem.task.observation, problem.task.action, driven, reference)
-        draft = replace(draft, weights=weights, tested=tested)
+        draft = replace(draft, weights=weights, tested=tested, notes=(*draft.notes, _REFINED))
     else:
         notes = (*draft.notes, "The refined policy was no better on held-out scenarios and is off.")
         draft = replace(draft, weights=draft.weights.changed(refined={}), notes=notes)
