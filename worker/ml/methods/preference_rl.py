@@ -74,9 +74,9 @@ class PreferenceRl:
         self.replay = Replay(capacity, config.observation.size, self.actions)
         for each in known:
             self._remember(each.signals, each.observations, each.actions, terminated=False)
-        self.states = np.stack([self._reset(env) for env in self.envs])
-        self.episodes = [_Episode([state]) for state in self.states]
         self.steps = 0
+        self._goes_on = False
+        self._begin()
 
     def warm_up(self, first: FirstActions) -> Float32Array:
         """Make ``random_steps`` steps, or at least one episode, without learning; returns all states seen, (N, D)."""
@@ -91,7 +91,7 @@ class PreferenceRl:
         ``watch`` is called before every step of the environments.
         """
         config = self.config
-        for _ in range(0 if learner.updates else config.critic_first_updates):
+        for _ in range(0 if self._goes_on else config.critic_first_updates):
             learner.update(self.replay, actor=False)
         owed = 0.0
         while self.steps < config.total_steps:
@@ -113,23 +113,38 @@ class PreferenceRl:
         return actions
 
     def restore(self, learner: Learner, tensors: dict[str, Tensor], counts: dict[str, Any]) -> None:
-        """Go on from a checkpoint of learn(); the episodes that were in flight then begin anew."""
+        """Go on from a checkpoint of learn(), as if nothing had happened where episodes are equally long."""
         self.replay.count, self.steps = len(tensors["replay"]), counts["steps"]
         self.replay.rows[: self.replay.count] = tensors["replay"]
         learner.load_state(tensors, counts["updates"])
         torch.set_rng_state(tensors["torch_rng"])
         self.rng.bit_generator.state = counts["rng"]
+        self._goes_on = True
+        self._begin()
 
     def _keep_state(self, learner: Learner, checkpoint: Checkpoint) -> None:
         checkpoint.note(self.steps / self.config.total_steps)
+        if self._is_in_midst:
+            return
         if checkpoint.is_due or checkpoint.pause_is_asked:
             rows = self.replay.rows[: self.replay.count]
             tensors = {**learner.state(), "replay": rows, "torch_rng": torch.get_rng_state()}
-            rng = self.rng.bit_generator.state
-            counts = {"steps": self.steps, "updates": learner.updates, "rng": rng}
+            counts = {"steps": self.steps, "updates": learner.updates, "rng": self._rng_at_beginning}
             checkpoint.write(tensors, {**counts, "target_entropy": learner.config.target_entropy})
         if checkpoint.pause_is_asked:
             raise Paused(Paused.__doc__)
+
+    @property
+    def _is_in_midst(self) -> bool:
+        """Whether all episodes will soon be over at once; what went on from here would begin them anew."""
+        lengths = {len(each.states) for each in self.episodes}
+        return len(lengths) == 1 and lengths != {1}
+
+    def _begin(self) -> None:
+        """New episodes everywhere."""
+        self._rng_at_beginning = self.rng.bit_generator.state
+        self.states = np.stack([self._reset(env) for env in self.envs])
+        self.episodes = [_Episode([state.copy()]) for state in self.states]
 
     def close(self) -> None:
         """Free the environments."""
@@ -138,6 +153,7 @@ class PreferenceRl:
 
     def _step(self, actions: Float32Array) -> None:
         """One step in every environment."""
+        rng = self.rng.bit_generator.state
         for index, (env, action) in enumerate(zip(self.envs, actions, strict=True)):
             state, _, terminated, truncated, info = env.step(action)
             episode = self.episodes[index]
@@ -146,6 +162,7 @@ class PreferenceRl:
             episode.signals.append([info["signals"][name] for name in SIGNALS])
             if terminated or truncated:
                 self._keep(episode, terminated)
+                self._rng_at_beginning = rng
                 state = self._reset(env)
                 self.episodes[index] = _Episode([state])
             self.states[index] = state

@@ -60,8 +60,7 @@ def fine_tune(
 ) -> GaussianPolicy:
     """The policy after ``config.steps`` environment steps: the running average of the actor, as everywhere in sac.
 
-    With a checkpoint, a training that was killed goes on where it was; its result then is as good, but not the same
-    to the bit, because the episodes in flight begin anew.
+    With a checkpoint, a training that was killed goes on where it was, with the same result.
     """
     settings = _settings(policy, space, config, seed)
     with torch.random.fork_rng(devices=[]):

@@ -35,8 +35,8 @@ from worker.ml.policies.reference import looked_into
 from worker.ml.policies.sac import Learner, SacConfig
 
 _REFINED = (
-    "The filter was refined by reinforcement learning on the learned preference. It began as the execution mode that is "
-    "shown, and may have gone elsewhere since."
+    "The filter was refined by reinforcement learning on the learned preference. It began as the execution mode that "
+    "is shown, and may have gone elsewhere since."
 )
 OWN_SHARE = 3
 """How often the imitation sees the filter's own states, beside those of the rollouts that were there."""
@@ -74,7 +74,8 @@ def refine(
     """Train the person's refined policy; gate_refined() decides whether it takes the filter's place.
 
     ``known``: rollouts of many behaviours, for the replay; ``reference``: of the frozen policy, for the unit of the
-    sketchy reward. With a checkpoint, a training that was killed goes on where it was.
+    sketchy reward. With a checkpoint, a training that was killed goes on where it
+    was, with the same result.
     """
     started = time.perf_counter()
     settings = SacConfig(
