@@ -28,11 +28,11 @@ from tests.benchmarks.answered_pool import Answered, AnsweredPool
 from tests.benchmarks.nonlinear_people import ON_TIME_S, PEOPLE, Person, as_type
 from worker.analysis.comparison import result_pages
 from worker.compute import learning, simulation
+from worker.domain.modes import ModeFamily
 from worker.domain.scenarios import EVALUATION, first_of
 from worker.domain.trajectory import SIGNALS, Trajectory
 from worker.domain.type_aliases import FloatArray
 from worker.experiments.rollout_cache import BEHAVIOURS_PER_SCENARIO, RolloutCache
-from worker.jobs.learning import following
 from worker.ml.filters.response_surface import RIDGE, ResponseSurface, best_mode, monomials
 from worker.ml.rewards import misfit
 from worker.ml.rewards.prior import DEVIATION, Population, Prior
@@ -141,7 +141,7 @@ class Bench:
             for scenario in dict.fromkeys(scenarios.tolist())
             for each in simulation.behaviours(task.name, scenario, BEHAVIOURS_PER_SCENARIO)
         ]
-        modes = np.array([following.mode_of(task.modes, each.described()) for each in shown])
+        modes = np.array([_mode_of(task.modes, each.described()) for each in shown])
         plain = ~np.isnan(modes).any(axis=1)
         whole = SegmentPairs.cut([(each, each) for each in self.pool.clips])
         found = misfit.further_sums(whole, SIGNALS, misfit.scene_of(task.observation))
@@ -151,6 +151,13 @@ class Bench:
             name: np.asarray(np.linalg.solve(gram, within.T @ _centred(scenarios[plain], each[plain, 0])), np.float64)
             for name, each in found.items()
         }
+
+
+def _mode_of(family: ModeFamily, described: Mapping[str, Any]) -> FloatArray:
+    """(A,) of a behaviour as it is stored with a rollout; nan where something else than the mode was different, too."""
+    if described.keys() - {"mode"}:
+        return np.full(len(family.axes), np.nan)
+    return np.array(family.vector(described.get("mode", {})))
 
 
 def _centred(groups: npt.NDArray[np.int64], values: FloatArray) -> FloatArray:
