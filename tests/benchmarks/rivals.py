@@ -39,6 +39,7 @@ from worker.whole_files import written_whole
 
 CHEAP_FIRST = (
     "pbarl",
+    "pbarl_refined",
     "sliders",
     "preferential_bo",
     "clusters_3",
