@@ -362,6 +362,6 @@ def _not_made(error: Exception, what: str) -> str:
     if isinstance(error, TypeError):
         return f"{said} Check environment.kwargs; it must take render_mode='rgb_array'."
     return (
-        f"{said} Make it without the studio first, in .venv/bin/python, with the same kwargs and "
+        f"{said} Make it without the studio first, by the Python of .venv with the same kwargs and "
         "render_mode='rgb_array': a package may not fit another that is installed."
     )
