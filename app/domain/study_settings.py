@@ -364,7 +364,6 @@ class StudySettings(BaseModel):
         unit="%",
         ge=0.01,
         le=0.5,
-        new_row=True,
         simulated=True,
     )
     harm_confidence: float = setting(
