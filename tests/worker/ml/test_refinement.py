@@ -88,8 +88,10 @@ def test_a_refined_policy_that_loses_the_task_leaves_the_filter_as_it_was(refere
 
     strict = replace(problem(), config=FilterConfig(success_tolerance=0.05))
     succeeding = [replace(each, success=True) for each in reference]
-    gated = refinement.gate_refined(strict, refined(FilterDraft(GATED, trials=()), reference), succeeding, failing)
+    draft = FilterDraft(GATED, trials=(GateTrial(0.6, 0.0, 0.01, 0.0, 0.0),))
+    gated = refinement.gate_refined(strict, refined(draft, reference), succeeding, failing)
     assert gated.weights == GATED
+    assert [trial.gate for trial in gated.trials if trial.refined] == [1.0, 0.8, 0.6]
 
 
 def test_a_training_that_paused_goes_on_from_its_checkpoint_with_the_same_result(

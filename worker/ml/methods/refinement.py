@@ -38,6 +38,8 @@ _REFINED = (
     "The filter was refined by reinforcement learning on the learned preference. It began as the execution mode that "
     "is shown, and may have gone elsewhere since."
 )
+STRENGTHS = (1.0, 0.8, 0.6)
+"""Tried in this order, blended with the reference policy."""
 OWN_SHARE = 3
 """How often the imitation sees the filter's own states, beside those of the rollouts that were there."""
 
@@ -134,22 +136,23 @@ def gate_refined(
     collect: Collect,
     progress: ReportProgress = lambda stage, share: None,
 ) -> FilterDraft:
-    """Keep the refined policy when it keeps the task and is better than what it began as; else mode and residual."""
+    """As much of the refined policy as keeps the task and is better than what it began as; else mode and residual."""
     if not draft.weights.refined:
         return draft
-    started = time.perf_counter()
-    progress("checking the refined policy on held-out scenarios", 0.84)
-    weights = draft.weights.changed(gate=1.0)
-    act = act_of(problem.task.modes, problem.policy, weights)
-    trial, driven = try_on(problem, act, weights.gate, 0.0, reference, collect)
-    trial = replace(trial, refined=True)
-    if acceptable(problem, trial, reference) and trial.preference > _to_beat(draft):
-        tested = limits_of(problem.task.observation, problem.task.action, driven, reference)
-        draft = replace(draft, weights=weights, tested=tested, notes=(*draft.notes, _REFINED))
-    else:
-        notes = (*draft.notes, "The refined policy was no better on held-out scenarios and is off.")
-        draft = replace(draft, weights=draft.weights.changed(refined={}), notes=notes)
-    return replace(draft, trials=(*draft.trials, trial)).timed("gate_refined", started)
+    started, to_beat = time.perf_counter(), _to_beat(draft)
+    for gate in STRENGTHS:
+        progress(f"checking {gate:.0%} of the refined policy on held-out scenarios", 0.84)
+        weights = draft.weights.changed(gate=gate)
+        act = act_of(problem.task.modes, problem.policy, weights)
+        trial, driven = try_on(problem, act, gate, 0.0, reference, collect)
+        draft = replace(draft, trials=(*draft.trials, replace(trial, refined=True)))
+        if acceptable(problem, trial, reference) and trial.preference > to_beat:
+            tested = limits_of(problem.task.observation, problem.task.action, driven, reference)
+            draft = replace(draft, weights=weights, tested=tested, notes=(*draft.notes, _REFINED))
+            return draft.timed("gate_refined", started)
+    notes = (*draft.notes, "The refined policy was no better on held-out scenarios and is off.")
+    draft = replace(draft, weights=draft.weights.changed(refined={}), notes=notes)
+    return draft.timed("gate_refined", started)
 
 
 def _to_beat(draft: FilterDraft) -> float:
