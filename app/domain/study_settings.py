@@ -338,8 +338,8 @@ class StudySettings(BaseModel):
         0,
         Section.LEARNING,
         "Refine the last filter for",
-        "By reinforcement learning, once all answers are there. 60,000 steps made two of three filters better by more "
-        "than a half in our tests, and take some five minutes, in which the participant waits. 0: not at all.",
+        "By reinforcement learning, once all answers are there. In our tests 60,000 steps made what filters gain "
+        "half as much again or more, in some five minutes, in which the participant waits. 0: not at all.",
         unit="steps",
         ge=0,
         le=1_000_000,
