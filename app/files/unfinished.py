@@ -11,8 +11,8 @@ FOLDER = "unfinished"
 KEPT = "*.safetensors"
 """What a training goes on from; notes of how far it is are of use on this machine only."""
 
-
-WORKSPACES = ("export", "import", REFINEMENT := "refinement")
+REFINEMENT = "refinement"
+WORKSPACES = ("export", "import", REFINEMENT)
 """How the names of folders begin that are of use to one process only."""
 
 

@@ -7,6 +7,7 @@ from sqlalchemy import select
 from app.db import Database
 from app.domain.choices import RewardKind, Strategy
 from app.domain.studies import Study
+from app.domain.study_settings import StudySettings
 from app.web.experimenter.study.study_form.study_form import form_with_defaults
 
 CHOICES = [
@@ -14,6 +15,21 @@ CHOICES = [
     *(("reward_kind", each.value) for each in RewardKind),
     *(("pooled_prior", each) for each in ("yes", "no")),
 ]
+
+
+def created(
+    experimenter: TestClient, database: Database, changed: dict[str, str], complaint: str | None
+) -> StudySettings | None:
+    """The settings of the study that the form makes; None where it complains as it should, and makes none."""
+    form = {**form_with_defaults().model_dump(), "name": "Pilot", **changed}
+    answer = experimenter.post("/studies/new", data=form)
+    with database.reading() as session:
+        studies = session.scalars(select(Study)).all()
+    if complaint is None:
+        return studies[0].settings
+    assert complaint in answer.text
+    assert not studies
+    return None
 
 
 @pytest.mark.parametrize(
@@ -27,15 +43,10 @@ CHOICES = [
 def test_a_share_of_the_pairs_can_follow_the_person_beside_the_random_ones(
     experimenter: TestClient, database: Database, share: str, changed: dict[str, str], complaint: str | None
 ) -> None:
-    form = {**form_with_defaults().model_dump(), "name": "Pilot", "following_share": share, **changed}
-    answer = experimenter.post("/studies/new", data=form)
-    with database.reading() as session:
-        studies = session.scalars(select(Study)).all()
-    if complaint is not None:
-        assert complaint in answer.text
-        assert not studies
+    settings = created(experimenter, database, {"following_share": share, **changed}, complaint)
+    if settings is None:
         return
-    assert studies[0].settings.following_share == 0.2
+    assert settings.following_share == 0.2
     assert "20 % follow the person" in experimenter.get("/studies/pilot").text
 
 
@@ -50,15 +61,10 @@ def test_a_share_of_the_pairs_can_follow_the_person_beside_the_random_ones(
 def test_the_last_filter_can_be_refined(
     experimenter: TestClient, database: Database, steps: str, changed: dict[str, str], complaint: str | None
 ) -> None:
-    form = {**form_with_defaults().model_dump(), "name": "Pilot", "refinement_steps": steps, **changed}
-    answer = experimenter.post("/studies/new", data=form)
-    with database.reading() as session:
-        studies = session.scalars(select(Study)).all()
-    if complaint is not None:
-        assert complaint in answer.text
-        assert not studies
+    settings = created(experimenter, database, {"refinement_steps": steps, **changed}, complaint)
+    if settings is None:
         return
-    assert studies[0].settings.refinement_steps == 60_000
+    assert settings.refinement_steps == 60_000
     assert "the last one refined" in experimenter.get("/studies/pilot").text
 
 

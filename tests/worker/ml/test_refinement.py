@@ -1,5 +1,6 @@
 """A filter's refinement: what it begins as, where it goes, and that it only stays where it is better."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import torch
 from tests.worker import invented
 from tests.worker.ml.test_methods import POLICY, REWARD, STEPS, World, collect
 from worker.domain.trajectory import Trajectory
+from worker.domain.type_aliases import Act
 from worker.ml.filters.filter_module import FilterWeights
 from worker.ml.filters.filter_problem import FilterConfig, FilterDraft, FilterProblem, GateTrial, act_of
 from worker.ml.methods import refinement
@@ -40,9 +42,14 @@ def problem(reward: StructuredReward = REWARD) -> FilterProblem:
     return FilterProblem(invented.TASK, POLICY, reward, 0, FilterConfig(success_tolerance=1.0))
 
 
-def refined(draft: FilterDraft, reference: list[Trajectory], config: Refinement = SHORT, **more: object) -> FilterDraft:
+def refined(
+    draft: FilterDraft,
+    reference: list[Trajectory],
+    config: Refinement = SHORT,
+    checkpoint: Checkpoint | None = None,
+) -> FilterDraft:
     """After ``config``."""
-    return refinement.refine(problem(), draft, World, [], reference, config, **more)  # type: ignore[arg-type]
+    return refinement.refine(problem(), draft, World, [], reference, config, checkpoint)
 
 
 def first_joint(weights: FilterWeights) -> float:
@@ -83,8 +90,8 @@ def test_a_refined_policy_that_is_no_better_leaves_the_filter_as_it_was(referenc
 
 
 def test_a_refined_policy_that_loses_the_task_leaves_the_filter_as_it_was(reference: list[Trajectory]) -> None:
-    def failing(*arguments: object) -> list[Trajectory]:
-        return [replace(each, success=False) for each in collect(*arguments)]  # type: ignore[arg-type]
+    def failing(act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
+        return [replace(each, success=False) for each in collect(act, scenarios, noise, seed)]
 
     strict = replace(problem(), config=FilterConfig(success_tolerance=0.05))
     succeeding = [replace(each, success=True) for each in reference]
