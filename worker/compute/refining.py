@@ -8,7 +8,7 @@ import torch
 
 from worker.domain.trajectory import Trajectory
 from worker.ml.filters.filter_problem import FilterDraft, FilterProblem
-from worker.ml.methods.refinement import Refinement, refine
+from worker.ml.methods.refinement import Beginning, Refinement, refine
 from worker.ml.policies.checkpoint import Checkpoint, Paused, begin_again
 from worker.tasks import registry
 
@@ -31,14 +31,7 @@ def train(training: Training, folder: Path) -> FilterDraft | None:
     begin_again(folder)
     make_env, checkpoint = registry.environment_class(training.task), Checkpoint(folder)
     try:
-        return refine(
-            training.problem,
-            training.draft,
-            make_env,
-            training.known,
-            training.reference,
-            training.config,
-            checkpoint,
-        )
+        beginning = Beginning(make_env, training.known, training.reference)
+        return refine(training.problem, training.draft, beginning, training.config, checkpoint)
     except Paused:
         return None

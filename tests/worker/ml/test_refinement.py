@@ -15,7 +15,7 @@ from worker.domain.type_aliases import Act
 from worker.ml.filters.filter_module import FilterWeights
 from worker.ml.filters.filter_problem import FilterConfig, FilterDraft, FilterProblem, GateTrial, act_of
 from worker.ml.methods import refinement
-from worker.ml.methods.refinement import Refinement
+from worker.ml.methods.refinement import Beginning, Refinement
 from worker.ml.policies.checkpoint import Checkpoint, Paused, ask_to_pause, begin_again
 from worker.ml.rewards.reward_models import StructuredReward
 
@@ -49,7 +49,7 @@ def refined(
     checkpoint: Checkpoint | None = None,
 ) -> FilterDraft:
     """After ``config``."""
-    return refinement.refine(problem(), draft, World, [], reference, config, checkpoint)
+    return refinement.refine(problem(), draft, Beginning(World, [], reference), config, checkpoint)
 
 
 def first_joint(weights: FilterWeights) -> float:

@@ -6,6 +6,7 @@ rewarded when it is over, as a whole, so that the reward model may be one that r
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any
 
 import gymnasium
@@ -62,16 +63,26 @@ class PreferenceRl:
     """Several environments, the replay, and a learner once there is one. Draws torch's global random numbers."""
 
     def __init__(
-        self, make_env: MakeEnv, reward: EpisodeReward, config: SacConfig, known: Sequence[Trajectory] = ()
+        self,
+        make_env: MakeEnv,
+        reward: EpisodeReward,
+        config: SacConfig,
+        known: Sequence[Trajectory] = (),
+        reward_mark: str = "",
     ) -> None:
-        """``known``: rollouts that the replay begins with; they count as no steps."""
-        self.config, self.reward = config, reward
+        """``known``: rollouts that the replay begins with; they count as no steps. ``reward_mark``: differs where the
+        reward does, for checkpoints.
+        """
+        self.config, self.reward, self.reward_mark = config, reward, reward_mark
         self.rng = np.random.default_rng([config.seed, 6])
         self.envs = [make_env() for _ in range(config.environments)]
         self.actions = int(np.prod(self.envs[0].action_space.shape or ()))
         capacity = max(config.total_steps + config.environments, _LONGEST_EPISODE * config.environments)
         capacity += sum(len(each) for each in known)
         self.replay = Replay(capacity, config.observation.size, self.actions)
+        self.signals = np.zeros((capacity, len(SIGNALS)), np.float32)
+        self.ends: list[int] = []
+        """of the episodes in the replay"""
         for each in known:
             self._remember(each.signals, each.observations, each.actions, terminated=False)
         self.steps = 0
@@ -85,10 +96,17 @@ class PreferenceRl:
             self._step(first(self.states))
         return self.seen
 
-    def learn(self, learner: Learner, checkpoint: Checkpoint | None = None, watch: "Watch | None" = None) -> None:
+    def learn(
+        self,
+        learner: Learner,
+        checkpoint: Checkpoint | None = None,
+        watch: "Watch | None" = None,
+        until: int | None = None,
+    ) -> None:
         """The rest of the steps: first the critics alone, on the warm-up's episodes, then everything.
 
-        ``watch`` is called before every step of the environments.
+        ``watch`` is called before every step of the environments. ``until``: stop after so many steps, with all that
+        restore() needs in the checkpoint.
         """
         config = self.config
         for _ in range(0 if self._goes_on else config.critic_first_updates):
@@ -96,7 +114,10 @@ class PreferenceRl:
         owed = 0.0
         while self.steps < config.total_steps:
             if checkpoint:
-                self._keep_state(learner, checkpoint)
+                ends_here = until is not None and self.steps >= until
+                self._keep_state(learner, checkpoint, ends_here)
+                if ends_here and not self._is_in_midst:
+                    return
             if watch:
                 watch(self, learner)
             with torch.no_grad():
@@ -113,24 +134,37 @@ class PreferenceRl:
         return actions
 
     def restore(self, learner: Learner, tensors: dict[str, Tensor], counts: dict[str, Any]) -> None:
-        """Go on from a checkpoint of learn(), as if nothing had happened where episodes are equally long."""
-        self.replay.count, self.steps = len(tensors["replay"]), counts["steps"]
+        """Go on from a checkpoint of learn(), as if nothing had happened where episodes are equally long.
+
+        If the reward is another one by now, all episodes are rewarded anew, and learn() begins with the critics again.
+        """
+        self.replay.count, self.steps, self.ends = len(tensors["replay"]), counts["steps"], counts["ends"]
         self.replay.rows[: self.replay.count] = tensors["replay"]
+        self.signals[: self.replay.count] = tensors["signals"].numpy()
+        if is_new := counts["reward"] != self.reward_mark:
+            self._reward_anew()
         learner.load_state(tensors, counts["updates"])
         torch.set_rng_state(tensors["torch_rng"])
         self.rng.bit_generator.state = counts["rng"]
-        self._goes_on = True
+        self._goes_on = not is_new
         self._begin()
 
-    def _keep_state(self, learner: Learner, checkpoint: Checkpoint) -> None:
+    def _reward_anew(self) -> None:
+        for start, end in pairwise([0, *self.ends]):
+            states, actions, rewards, *_ = self.replay.split(self.replay.rows[start:end])
+            anew = self.reward(self.signals[start:end], states.numpy(), actions.numpy())
+            rewards[:, 0] = torch.from_numpy(np.asarray(anew, np.float32))
+
+    def _keep_state(self, learner: Learner, checkpoint: Checkpoint, at_once: bool) -> None:
         checkpoint.note(self.steps / self.config.total_steps)
         if self._is_in_midst:
             return
-        if checkpoint.is_due or checkpoint.pause_is_asked:
-            rows = self.replay.rows[: self.replay.count]
-            tensors = {**learner.state(), "replay": rows, "torch_rng": torch.get_rng_state()}
-            counts = {"steps": self.steps, "updates": learner.updates, "rng": self._rng_at_beginning}
-            checkpoint.write(tensors, {**counts, "target_entropy": learner.config.target_entropy})
+        if at_once or checkpoint.is_due or checkpoint.pause_is_asked:
+            rows, signals = self.replay.rows[: self.replay.count], torch.from_numpy(self.signals[: self.replay.count])
+            tensors = {**learner.state(), "replay": rows, "signals": signals, "torch_rng": torch.get_rng_state()}
+            counts = {"steps": self.steps, "updates": learner.updates, "rng": self._rng_at_beginning, "ends": self.ends}
+            kept = {"reward": self.reward_mark, "target_entropy": learner.config.target_entropy}
+            checkpoint.write(tensors, {**counts, **kept})
         if checkpoint.pause_is_asked:
             raise Paused(Paused.__doc__)
 
@@ -177,7 +211,9 @@ class PreferenceRl:
         rewards = self.reward(signals, states[:-1], actions)
         goes_on = np.ones(len(actions), np.float32)
         goes_on[-1] = not terminated  # a time limit is not an end: what would have followed still counts
+        self.signals[self.replay.count : self.replay.count + len(actions)] = signals
         self.replay.add(states[:-1], actions, np.asarray(rewards, np.float32), goes_on, states[1:])
+        self.ends.append(self.replay.count)
 
     @property
     def seen(self) -> Float32Array:

@@ -6,6 +6,7 @@ as in prefft_anchored, fades while it learns: without the tie it forgets the tas
 (docs/method.md, section 7).
 """
 
+import hashlib
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -38,6 +39,8 @@ _REFINED = (
     "The filter was refined by reinforcement learning on the learned preference. It began as the execution mode that "
     "is shown, and may have gone elsewhere since."
 )
+AHEAD = 0.75
+"""The share of the steps that is made while people still answer."""
 STRENGTHS = (1.0, 0.8, 0.6)
 """Tried in this order, blended with the reference policy."""
 OWN_SHARE = 3
@@ -64,22 +67,50 @@ class Refinement:
     last_tie: float = 0.1
 
 
+@dataclass(frozen=True)
+class Beginning:
+    """What a refinement goes on from."""
+
+    make_env: MakeEnv
+    known: Sequence[Trajectory]
+    """rollouts of many behaviours, for the replay"""
+    reference: Sequence[Trajectory]
+    """of the frozen policy, for the unit of the sketchy reward"""
+
+
+def refine_ahead(
+    problem: FilterProblem, draft: FilterDraft, beginning: Beginning, config: Refinement, checkpoint: Checkpoint
+) -> None:
+    """The larger part of a refinement, for a reward model of fewer answers; refine() goes on from the checkpoint."""
+    _train(problem, draft, beginning, config, checkpoint, round(AHEAD * config.steps))
+
+
 def refine(
     problem: FilterProblem,
     draft: FilterDraft,
-    make_env: MakeEnv,
-    known: Sequence[Trajectory],
-    reference: Sequence[Trajectory],
+    beginning: Beginning,
     config: Refinement,
     checkpoint: Checkpoint | None = None,
 ) -> FilterDraft:
     """Train the person's refined policy; gate_refined() decides whether it takes the filter's place.
 
-    ``known``: rollouts of many behaviours, for the replay; ``reference``: of the frozen policy, for the unit of the
-    sketchy reward. With a checkpoint, a training that was killed goes on where it
-    was, with the same result.
+    With a checkpoint, a training that was killed goes on where it was, with the same result, and one of
+    refine_ahead() goes on with this reward model.
     """
     started = time.perf_counter()
+    learner = _train(problem, draft, beginning, config, checkpoint)
+    weights = draft.weights.changed(refined=learner.average.policy().weights)
+    return replace(draft, weights=weights).timed("refinement", started)
+
+
+def _train(
+    problem: FilterProblem,
+    draft: FilterDraft,
+    beginning: Beginning,
+    config: Refinement,
+    checkpoint: Checkpoint | None,
+    until: int | None = None,
+) -> TiedLearner:
     settings = SacConfig(
         problem.task.observation,
         seed=problem.seed,
@@ -90,12 +121,13 @@ def refine(
         learning_rate=config.learning_rate,
         critic_first_updates=config.critic_first_updates,
     )
-    policy = looked_into(problem.policy)
+    policy, reference = looked_into(problem.policy), beginning.reference
     offset, scale = torch.from_numpy(policy.offset), torch.from_numpy(policy.scale)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(problem.seed)
         reward = pbrl_hri.sketchy(reference, learned(problem.reward))
-        training = PreferenceRl(make_env, reward, settings, [*known, *reference])
+        mark = hashlib.sha256(problem.reward.to_bytes()).hexdigest()
+        training = PreferenceRl(beginning.make_env, reward, settings, [*beginning.known, *reference], mark)
         learner = TiedLearner(settings, offset, scale, training.actions, config.first_tie)
         kept = checkpoint.read() if checkpoint else None
         if kept is None:
@@ -106,10 +138,9 @@ def refine(
         def loosen(training: PreferenceRl, _: Learner) -> None:
             learner.weight = config.first_tie + training.steps / config.steps * (config.last_tie - config.first_tie)
 
-        training.learn(learner, checkpoint, loosen)
+        training.learn(learner, checkpoint, loosen, until)
         training.close()
-    weights = draft.weights.changed(refined=learner.average.policy().weights)
-    return replace(draft, weights=weights).timed("refinement", started)
+    return learner
 
 
 def _imitate(learner: TiedLearner, training: PreferenceRl, act: FilterAct, config: Refinement) -> None:

@@ -148,14 +148,9 @@ def fit_pbarl(setting: Setting) -> tuple[Act, tuple[str, ...]]:
 def fit_pbarl_refined(setting: Setting) -> tuple[Act, tuple[str, ...]]:
     """The quick filter, and the refined policy that begins as it."""
     problem, reference = setting.problem, setting.reference(_gate(setting))
+    beginning = refinement.Beginning(setting.make_env, setting.pool, reference)
     draft = refinement.refine(
-        problem,
-        _mode_and_residual(setting),
-        setting.make_env,
-        setting.pool,
-        reference,
-        setting.config.refinement,
-        setting.checkpoint,
+        problem, _mode_and_residual(setting), beginning, setting.config.refinement, setting.checkpoint
     )
     return _shipped(problem, refinement.gate_refined(problem, draft, reference, setting.collect))
 
