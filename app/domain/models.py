@@ -16,6 +16,8 @@ class RunKind(StrEnum):
     CLIPS = "clips"
     REWARD = "reward"
     FILTER = "filter"
+    REFINEMENT = "refinement"
+    """What the last filter's refinement goes on from, made while the participant still answers."""
     METHOD = "method"
     """A method that is only evaluated, such as PrefFT."""
     SHARED = "shared"

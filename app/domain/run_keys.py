@@ -9,6 +9,7 @@ clips/study-1/again-5-1763811000                lost files of rollout 5, lost at
 reward/participant-3/labels-20                  a reward model of 20 labels
 reward/participant-3/labels-200/answer-345      of all labels, the last of them answer 345
 filter/participant-3/labels-200/answer-345-exclusion-6
+refinement/participant-3/ahead/labels-100      of half the answers, while they give the others
 method/participant-3/prefft/labels-200/answer-345
 films/participant-3/trials/labels-200/answer-345
 films/participant-3/others/labels-200/answer-345    of the trials, while their own filter is still fitted

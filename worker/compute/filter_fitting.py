@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -78,7 +78,9 @@ class Finished:
     metrics: dict[str, Any]
 
 
-TrainPatiently = Callable[[Callable[[Path], FilterDraft | None]], FilterDraft | None]
+T = TypeVar("T")
+TrainPatiently = Callable[[Callable[[Path], T]], T | None]
+"""Calls a part of a training with the folder of its checkpoint until it is whole; None: nobody needs it any more."""
 
 
 @dataclass(frozen=True)
@@ -135,17 +137,28 @@ class FilterFit:
         return residual.gate_residual(self.problem, draft, reference, self.collect, self.progress)
 
     def refine(
-        self, draft: FilterDraft, known: Sequence[Trajectory], steps: int, train: "TrainPatiently"
+        self,
+        draft: FilterDraft,
+        known: Sequence[Trajectory],
+        steps: int,
+        begun: Path | None,
+        train: TrainPatiently[FilterDraft | None],
     ) -> FilterDraft | None:
         """The person's refined policy in place of mode and residual, if it is better; None: nobody needs it any more.
 
-        ``known``: the pool's rollouts; ``train``: calls what it is given with a folder for checkpoints, in a compute
-        process, until that gives a draft.
+        ``known``: the pool's rollouts; ``begun``: the folder of refine_ahead(); ``train``: calls what it is given with
+        a folder for checkpoints, in a compute process, until that gives a draft.
         """
-        reference = self._gate_reference()
-        training = refining.Training(self.task, self.problem, draft, known, reference, Refinement(steps))
-        refined = train(partial(refining.train, training))
-        return refined and gate_refined(self.problem, refined, reference, self.collect, self.progress)
+        training = self._training(draft, known, steps)
+        refined = train(partial(refining.train, training, begun))
+        return refined and gate_refined(self.problem, refined, training.reference, self.collect, self.progress)
+
+    def refine_ahead(self, known: Sequence[Trajectory], steps: int, train: TrainPatiently[bool]) -> None:
+        """The larger part of a refinement, around this reward model's mode."""
+        train(partial(refining.train_ahead, self._training(self.find_mode(known), known, steps)))
+
+    def _training(self, draft: FilterDraft, known: Sequence[Trajectory], steps: int) -> refining.Training:
+        return refining.Training(self.task, self.problem, draft, known, self._gate_reference(), Refinement(steps))
 
     def keep_promise(self, draft: FilterDraft) -> FilterDraft:
         """The filter behind its shield, as far as the promise about harm can be made of it."""

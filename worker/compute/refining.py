@@ -8,8 +8,8 @@ import torch
 
 from worker.domain.trajectory import Trajectory
 from worker.ml.filters.filter_problem import FilterDraft, FilterProblem
-from worker.ml.methods.refinement import Beginning, Refinement, refine
-from worker.ml.policies.checkpoint import Checkpoint, Paused, begin_again
+from worker.ml.methods.refinement import Beginning, Refinement, refine, refine_ahead
+from worker.ml.policies.checkpoint import Checkpoint, Paused, begin_again, go_on_from
 from worker.tasks import registry
 
 
@@ -25,13 +25,39 @@ class Training:
     config: Refinement
 
 
-def train(training: Training, folder: Path) -> FilterDraft | None:
-    """The draft with its refined policy; None: it paused at a checkpoint in the folder."""
+def train(training: Training, begun: Path | None, folder: Path) -> FilterDraft | None:
+    """The draft with its refined policy; None: it paused at a checkpoint in the folder.
+
+    ``begun``: the folder of what train_ahead() made, which stays as it is.
+    """
     torch.set_num_threads(1)
     begin_again(folder)
-    make_env, checkpoint = registry.environment_class(training.task), Checkpoint(folder)
+    if begun and is_ahead(begun, training.config):
+        go_on_from(begun, folder)
     try:
-        beginning = Beginning(make_env, training.known, training.reference)
-        return refine(training.problem, training.draft, beginning, training.config, checkpoint)
+        return refine(training.problem, training.draft, _beginning(training), training.config, Checkpoint(folder))
     except Paused:
         return None
+
+
+def train_ahead(training: Training, folder: Path) -> bool:
+    """Whether all that is made ahead is in the folder; else it paused at a checkpoint there."""
+    torch.set_num_threads(1)
+    begin_again(folder)
+    if is_ahead(folder, training.config):
+        return True
+    try:
+        refine_ahead(training.problem, training.draft, _beginning(training), training.config, Checkpoint(folder))
+    except Paused:
+        return False
+    return True
+
+
+def is_ahead(folder: Path, config: Refinement) -> bool:
+    """Whether all that is made ahead is in the folder."""
+    counts = Checkpoint(folder).read_counts()
+    return counts is not None and counts["steps"] >= config.ahead_steps
+
+
+def _beginning(training: Training) -> Beginning:
+    return Beginning(registry.environment_class(training.task), training.known, training.reference)

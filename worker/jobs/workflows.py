@@ -49,6 +49,7 @@ BODIES: dict[RunKind, Callable[[WorkerContext, Job, int, Step], None]] = {
     RunKind.CLIPS: Imported("worker.jobs.clips.pool_clips:build_clips"),
     RunKind.REWARD: Imported("worker.jobs.learning.reward_models:train_reward"),
     RunKind.FILTER: Imported("worker.jobs.learning.filters:train_filter"),
+    RunKind.REFINEMENT: Imported("worker.jobs.learning.refinement:refine_ahead"),
     RunKind.METHOD: Imported("worker.jobs.learning.baselines:train_method"),
     RunKind.SHARED: Imported("worker.jobs.learning.shared_filters:fit"),
     RunKind.FILMS: Imported("worker.jobs.clips.evaluation_films:make_films"),

@@ -132,6 +132,21 @@ def test_an_excluded_answer_is_not_learned_from_and_was_still_given(
     assert after.label_hash != before.label_hash
 
 
+def test_of_the_first_answers_nothing_changes_when_others_follow(
+    database: Database, store: ArtefactStore, participant: Participant, add_clips: AddClips, answer: Answer
+) -> None:
+    first, second, third, _ = add_clips(7)
+    answer(first, second, Response.LEFT)
+    answer(first, third, Response.RIGHT)
+    with database.reading() as session:
+        whole = dataset.load_preferences(session, store, participant.id)
+    answer(second, third, Response.RIGHT)
+    with database.reading() as session:
+        begun = dataset.load_preferences(session, store, participant.id, first=2)
+    assert (begun.targets.tolist(), begun.label_count) == ([0.0, 1.0], 2)
+    assert begun.label_hash == whole.label_hash
+
+
 def test_the_fingerprint_depends_on_what_was_shown_and_said_and_on_nothing_else(
     database: Database, store: ArtefactStore, participant: Participant, add_clips: AddClips, answer: Answer
 ) -> None:

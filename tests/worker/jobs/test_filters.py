@@ -23,7 +23,7 @@ from worker.jobs.learning.filters import (
     notes_on_misfit,
     train_filter,
 )
-from worker.jobs.learning.refinement import is_refined
+from worker.jobs.learning.fits import is_refined
 from worker.jobs.runtime import records
 from worker.jobs.runtime.context import WorkerContext
 from worker.jobs.runtime.due_work import answers_known, is_outdated

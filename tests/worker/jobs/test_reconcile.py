@@ -13,7 +13,7 @@ from app.domain.models import Run, RunKind, RunStatus
 from app.domain.preferences import Exclusion, LabelEvent, Query, Response
 from app.domain.protocol import PAPER_METHODS, EvaluationSettings
 from app.domain.studies import Participant, Study
-from app.domain.study_settings import StudySettings
+from app.domain.study_settings import SHORTEST_REFINEMENT, StudySettings
 from tests.worker.invented import job_of
 from worker.domain import scenarios
 from worker.jobs import reconcile
@@ -88,6 +88,19 @@ def test_the_tenth_label_asks_for_a_reward_model_and_then_for_the_milestones_fil
     assert found() == {"filter/participant-1/labels-10": 1}
     succeed(database, "filter/participant-1/labels-10")
     assert found() == {}
+
+
+def test_a_refinement_is_begun_with_half_the_answers_while_the_others_are_given(
+    database: Database, labels: Callable[[int], list[Query]], found: Callable[[], dict[str, int]]
+) -> None:
+    with database.writing() as session:
+        study = session.get_one(Study, 1)
+        study.stored_settings = {**study.stored_settings, "refinement_steps": SHORTEST_REFINEMENT}
+        settings = study.settings
+    labels(11)
+    assert set(found()) == {"reward/participant-1/labels-10", "refinement/participant-1/ahead/labels-10"}
+    assert not due_work.is_refinement_due(settings, 10), "the tenth answer can still be undone"
+    assert not due_work.is_refinement_due(settings, 20), "the last filter goes on from there by itself"
 
 
 def test_a_last_answer_that_is_changed_makes_the_last_models_stale(

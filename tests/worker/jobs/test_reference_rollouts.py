@@ -16,7 +16,7 @@ from worker.compute import simulation
 from worker.compute.filter_fitting import FilterFit
 from worker.compute.pools import Compute
 from worker.domain.scenarios import of_promise
-from worker.jobs.learning.filters import filter_config
+from worker.jobs.learning.fits import filter_config
 from worker.jobs.learning.reference_rollouts import make_ready, promise_block, reference_blocks
 from worker.jobs.runtime.context import WorkerContext
 

@@ -16,7 +16,7 @@ from worker.ml.filters.filter_module import FilterWeights
 from worker.ml.filters.filter_problem import FilterConfig, FilterDraft, FilterProblem, GateTrial, act_of
 from worker.ml.methods import refinement
 from worker.ml.methods.refinement import Beginning, Refinement
-from worker.ml.policies.checkpoint import Checkpoint, Paused, ask_to_pause, begin_again
+from worker.ml.policies.checkpoint import Checkpoint, Paused, ask_to_pause, begin_again, go_on_from
 from worker.ml.rewards.reward_models import StructuredReward
 
 SEEN = invented.observations(300, np.random.default_rng(9))
@@ -114,6 +114,43 @@ def test_a_training_that_paused_goes_on_from_its_checkpoint_with_the_same_result
     assert kept[1]["steps"] >= SHORT.warm_up_steps
     went_on = refined(draft, reference, checkpoint=Checkpoint(tmp_path))
     assert went_on.weights.to_bytes() == refined(draft, reference).weights.to_bytes()
+
+
+def test_what_was_begun_on_half_the_answers_goes_where_all_of_them_say(
+    reference: list[Trajectory], tmp_path: Path
+) -> None:
+    likes = problem(StructuredReward(-REWARD.weights))
+    draft, beginning, config = FilterDraft(GATED), Beginning(World, [], reference), replace(LONGER, share_ahead=0.5)
+    refinement.refine_ahead(likes, draft, beginning, config, Checkpoint(tmp_path))
+    ahead = Checkpoint(tmp_path).read_counts()
+    assert ahead is not None
+    assert config.ahead_steps <= ahead["steps"] < config.steps
+    on_the_way = refinement.refine(likes, draft, beginning, config, Checkpoint(_copy(tmp_path, "liked")))
+    changed = refinement.refine(problem(), draft, beginning, config, Checkpoint(_copy(tmp_path, "disliked")))
+    assert first_joint(changed.weights) < first_joint(on_the_way.weights) - 0.1
+
+
+def test_a_training_that_changed_its_mind_and_paused_ends_with_the_same_policy(
+    reference: list[Trajectory], tmp_path: Path
+) -> None:
+    likes = problem(StructuredReward(-REWARD.weights))
+    draft, beginning = FilterDraft(GATED), Beginning(World, [], reference)
+    refinement.refine_ahead(likes, draft, beginning, SHORT, Checkpoint(tmp_path))
+    whole, paused = _copy(tmp_path, "whole"), _copy(tmp_path, "paused")
+    went_through = refined(draft, reference, checkpoint=Checkpoint(whole))
+    ask_to_pause(paused)
+    with pytest.raises(Paused):
+        refined(draft, reference, checkpoint=Checkpoint(paused, every_s=0.0))
+    begin_again(paused)
+    went_on = refined(draft, reference, checkpoint=Checkpoint(paused))
+    assert went_on.weights.to_bytes() == went_through.weights.to_bytes()
+
+
+def _copy(folder: Path, name: str) -> Path:
+    copied = folder.with_name(f"{folder.name}-{name}")
+    copied.mkdir()
+    go_on_from(folder, copied)
+    return copied
 
 
 def test_the_same_seed_gives_the_same_policy_and_it_survives_being_stored(reference: list[Trajectory]) -> None:

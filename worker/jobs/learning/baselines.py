@@ -86,10 +86,11 @@ def _train(context: WorkerContext, run_id: int, job: Job, method: str, reward: s
         folder,
         report,
         partial(_is_outdated, context, job),
-        partial(baseline_fitting.fit, baseline),
         lambda fitted: fitted.controller is not None,
+        partial(baseline_fitting.fit, baseline),
     )
     if not parts or parts[-1].controller is None:
+        context.store.unfinished.forget(folder)
         return {}
     artefact = context.store.put(parts[-1].controller)
     return {"artefact": artefact, "notes": list(parts[-1].notes), "seconds": sum(each.seconds for each in parts)}

@@ -2,6 +2,7 @@
 
 import hashlib
 import io
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
@@ -81,14 +82,18 @@ def labels_with_clips(session: Session, participant_id: int) -> Sequence[Label]:
     return current_labels(session, participant_id, *CLIPS_AND_ROLLOUTS)
 
 
-def load_preferences(session: Session, store: ArtefactStore, participant_id: int) -> Preferences:
+def load_preferences(
+    session: Session, store: ArtefactStore, participant_id: int, first: int | None = None
+) -> Preferences:
     """The participant's labels as arrays; pairs without a target, and excluded ones, are left out.
 
-    Those of the visits before come first; hints are the newest that were given.
+    Those of the visits before come first; hints are the newest that were given. ``first``: of this visit's, only so
+    many.
     """
     given = count_labels(session, select(Participant.id).where(Participant.id == participant_id))
     people = [*visits.before(session, participant_id), participant_id]
-    labels = [label for each in people for label in labels_with_clips(session, each)]
+    before = [label for each in people[:-1] for label in labels_with_clips(session, each)]
+    labels = [*before, *labels_with_clips(session, participant_id)[:first]]
     said = [(label, target) for label in labels if (target := TARGETS[label.response]) is not None]
     study = session.get_one(Study, session.get_one(Participant, participant_id).study_id)
     hinted = next(filter(None, (hints_of(session, each) for each in reversed(people))), ())
@@ -98,7 +103,7 @@ def load_preferences(session: Session, store: ArtefactStore, participant_id: int
         else None,
         targets=np.array([target for _, target in said], np.float32),
         mattered=named_signals(study, [label.event.mattered for label, _ in said]),
-        label_count=given.get(participant_id, 0),
+        label_count=min(given.get(participant_id, 0), sys.maxsize if first is None else first),
         hints=directions(study, hinted),
         label_hash=label_hash(labels, hinted),
     )

@@ -1,7 +1,6 @@
 """Filters: from the participant's reward model to an evaluated, published bundle."""
 
 from collections.abc import Sequence
-from functools import partial
 
 from sqlalchemy import select
 from sqlalchemy.orm import Session
@@ -10,25 +9,20 @@ from app.domain.choices import Method, RewardKind
 from app.domain.models import Model, ModelKind
 from app.domain.preferences import count_labels
 from app.domain.studies import Participant, Study
-from app.domain.study_settings import StudySettings
 from app.errors import AppError
 from app.services.answers import accuracy
 from app.services.answers.misfit import Misfit, misfit_of
 from app.services.exports.export_formats import provenance_of
 from app.services.monitoring import dashboard
 from app.services.participants import visits
-from worker.analysis.filters.promise import Promise
 from worker.compute import filter_fitting, learning
-from worker.compute.filter_fitting import FilterFit
 from worker.compute.pools import Lane
-from worker.domain.trajectory import Trajectory
-from worker.jobs.learning import dataset, refinement
+from worker.jobs.learning import dataset, fits, refinement
 from worker.jobs.runtime import due_work, records
 from worker.jobs.runtime.context import Step, WorkerContext
 from worker.jobs.runtime.records import Job
 from worker.ml.export import bundle
 from worker.ml.export.bundle import Provenance
-from worker.ml.filters.filter_problem import FilterConfig, FilterDraft
 
 STAGES = {Method.STUDIO: ("mode", "residual", "gate", "refinement", "promise"), Method.PRINTED: ("printed",)}
 
@@ -113,45 +107,22 @@ def _choose_reward(context: WorkerContext, run_id: int, job: Job) -> str:
 def fit_stage(
     context: WorkerContext, run_id: int, job: Job, reward: str, draft: str, stage: str, shared: bool = False
 ) -> str:
-    """One stage of the fit: the artefact of a draft in, the artefact of a better one out. ``shared``: see fitting()."""
-    fit = fitting(context, run_id, job, reward, shared=shared)
+    """One stage of the fit: the artefact of a draft in, that of a better one out. ``shared``: see fits.fitting()."""
+    if stage == "refinement":
+        return refinement.refine(context, run_id, job, reward, draft, shared)
+    fit = fits.fitting(context, run_id, job, context.store.read(reward), shared=shared)
     if stage in {"mode", "printed"}:
-        pool = pool_rollouts(context, job)
+        pool = fits.pool_rollouts(context, job)
         result = fit.find_mode(pool) if stage == "mode" else fit.fit_printed()
-    elif stage == "refinement":
-        return _refined(context, run_id, job, fit, draft, shared)
     else:
         stages = {"residual": fit.train_residual, "gate": fit.gate_residual, "promise": fit.keep_promise}
-        result = stages[stage](load_draft(context, draft))
+        result = stages[stage](fits.load_draft(context, draft))
     return context.store.put(filter_fitting.draft_to_bytes(result))
-
-
-def pool_rollouts(context: WorkerContext, job: Job) -> list[Trajectory]:
-    """What the study's clips show, as whole episodes."""
-    with context.database.reading() as session:
-        clips = dataset.pool_clips(session, job.study_id)
-    return [dataset.shown(context.store, clip) for clip in clips]
-
-
-def _refined(context: WorkerContext, run_id: int, job: Job, fit: FilterFit, draft: str, shared: bool) -> str:
-    """The artefact of the refined filter, or of the same one where none is to be refined; empty: nobody needs it."""
-    with context.database.reading() as session:
-        settings = session.get_one(Study, job.study_id).settings
-    if not refinement.is_refined(settings, job, shared):
-        return draft
-    outdated = (lambda: False) if shared else partial(is_outdated, context, job, True)
-    with refinement.folder(context, run_id, job, shared) as folder:
-        train = refinement.trainer(context, run_id, folder, outdated)
-        known = pool_rollouts(context, job)
-        result = fit.refine(load_draft(context, draft), known, settings.refinement_steps, train)
-        artefact = context.store.put(filter_fitting.draft_to_bytes(result)) if result else ""
-        context.store.unfinished.forget(folder)
-    return artefact
 
 
 def _publish(context: WorkerContext, run_id: int, job: Job, reward: str, draft: str) -> None:
     """Evaluate on unseen scenarios, write the bundle, and only then let anybody see it."""
-    fit = fitting(context, run_id, job, reward)
+    fit = fits.fitting(context, run_id, job, context.store.read(reward))
     with context.database.reading() as session:
         participant = session.get_one(Participant, job.participant)
         study = session.get_one(Study, job.study_id)
@@ -177,7 +148,7 @@ def _publish(context: WorkerContext, run_id: int, job: Job, reward: str, draft: 
         deviations=export.deviations,
     )
     learned = {**(model.metrics if model else {}), "foresight_notes": notes}
-    finished = fit.finish(load_draft(context, draft), provenance, learned)
+    finished = fit.finish(fits.load_draft(context, draft), provenance, learned)
     packed = finished.bundle if context.key is None else bundle.signed(finished.bundle, context.key.signed)
     model_artefact, bundle_artefact = context.store.put(finished.filter_weights), context.store.put(packed)
     with context.database.writing() as session:
@@ -223,50 +194,3 @@ def notes_on_visits(session: Session, participant: Participant) -> Sequence[str]
         return []
     earlier = sum(count_labels(session, select(Participant.id).where(Participant.id.in_(before))).values())
     return [f"This is visit {participant.visit}: {earlier} answers of the visits before were learned from as well."]
-
-
-def load_draft(context: WorkerContext, artefact: str) -> FilterDraft:
-    """A stored draft of a filter."""
-    return filter_fitting.draft_from_bytes(context.store.read(artefact))
-
-
-def filter_config(settings: StudySettings) -> FilterConfig:
-    """What a study says about the fitting of its filters."""
-    return FilterConfig(
-        success_tolerance=settings.success_tolerance, evaluation_scenarios=settings.evaluation_scenarios
-    )
-
-
-def promise_of(settings: StudySettings) -> Promise:
-    """What a study promises about the harm its filters may do."""
-    return Promise(
-        share=settings.harm_share,
-        confidence=settings.harm_confidence,
-        force_n=settings.harm_force_n,
-        spilled=settings.harm_spilled,
-    )
-
-
-def fitting(context: WorkerContext, run_id: int, job: Job, reward: str, *, shared: bool = False) -> FilterFit:
-    """What fits a filter to a stored reward model. ``shared``: not the person's own, so the study's seed is used."""
-    with context.database.reading() as session:
-        study = session.get_one(Study, job.study_id)
-        task, settings = study.task, study.settings
-        study_seed = study.seed
-        seed = study_seed if shared else session.get_one(Participant, job.participant).seed
-        version = 1 if shared else records.next_version(session, job.participant)
-    quick = not refinement.is_refined(settings, job, shared)
-    return FilterFit(
-        task=task,
-        compute=context.compute,
-        beat=context.beat(run_id),
-        reward=context.store.read(reward),
-        seed=seed,
-        config=filter_config(settings),
-        progress=lambda stage, share: context.report(run_id, stage, share if quick else refinement.beside(share)),
-        references=context.references,
-        promise=promise_of(settings),
-        study_seed=study_seed,
-        version=version,
-        outcomes=context.outcomes,
-    )

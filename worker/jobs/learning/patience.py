@@ -16,12 +16,12 @@ def train(
     folder: Path,
     report: Callable[[float], None],
     is_outdated: Callable[[], bool],
-    part: Callable[[Path], Part],
     is_whole: Callable[[Part], bool],
+    part: Callable[[Path], Part],
 ) -> list[Part]:
     """All parts of a training, the last one whole; none when nobody needs it any more.
 
-    ``folder``: of its checkpoint, which is kept for whoever has to train it again, and forgotten when nobody needs it.
+    ``folder``: of its checkpoint, which stays for whoever goes on from there.
     ``report``: told which share is done; ``part``: called in a compute process, trains until it is done or asked to
     pause.
     """
@@ -39,5 +39,4 @@ def train(
         parts.append(context.compute.run(Lane.PATIENT, beat, part, folder))
         if is_whole(parts[-1]):
             return parts
-    context.store.unfinished.forget(folder)
     return []

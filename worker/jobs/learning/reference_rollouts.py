@@ -8,7 +8,7 @@ from worker.compute.filter_fitting import CHUNK
 from worker.compute.pools import Computing, Lane
 from worker.domain.scenarios import EVALUATION, first_of, of_promise
 from worker.domain.trajectory import Trajectory
-from worker.jobs.learning.filters import filter_config, promise_of
+from worker.jobs.learning.fits import filter_config, promise_of
 from worker.ml.filters import filter_problem
 from worker.tasks import registry
 

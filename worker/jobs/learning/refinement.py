@@ -1,55 +1,118 @@
-"""The refinement of a filter, which takes minutes: whose it is, where its checkpoints lie, how far it is."""
+"""The refinement of a person's last filter, which takes minutes: most of it is done while they still answer.
+
+What is made ahead follows the first half of the answers, whenever it is made, so that the same answers give the same
+filter. It lies in a folder of the person's until their last filter goes on from there; if it is missing, it is made
+then.
+"""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from app.domain.study_settings import StudySettings
+from sqlalchemy import select
+
+from app.domain.preferences import count_labels
+from app.domain.run_keys import AHEAD
+from app.domain.studies import Participant, Study
 from app.files.unfinished import REFINEMENT
-from worker.compute.filter_fitting import TrainPatiently
-from worker.jobs.learning import patience
-from worker.jobs.runtime.context import WorkerContext
+from worker.compute import filter_fitting, refining
+from worker.compute.filter_fitting import T, TrainPatiently
+from worker.compute.pools import Lane
+from worker.jobs.learning import dataset, fits, patience, reward_models
+from worker.jobs.runtime import due_work
+from worker.jobs.runtime.context import Step, WorkerContext
 from worker.jobs.runtime.records import Job
 from worker.ml.filters.filter_problem import FilterDraft
-
-BEFORE, AFTER = 0.25, 0.9
-"""How far a fit is before its refinement and after it."""
-_GATED = 0.85
-"""How far a fit without one is before its promise."""
+from worker.ml.methods.refinement import Refinement
 
 
-def is_refined(settings: StudySettings, job: Job, shared: bool) -> bool:
-    """Filters of all answers are, and those for several people (``shared``), which others are compared with."""
-    return settings.refinement_steps > 0 and (shared or (job.about.labels or 0) >= settings.labels_per_participant)
+def refine_ahead(context: WorkerContext, job: Job, run_id: int, step: Step) -> None:
+    """Make what the last filter will go on from, or as much of it as there is time for."""
+    step("ahead", _make_ahead, context, run_id, job)
 
 
-def beside(share: float) -> float:
-    """What is done of a fit with a refinement, when this share of it would be done without one."""
-    if share <= _GATED:
-        return BEFORE * share / _GATED
-    return AFTER + (1.0 - AFTER) * (share - _GATED) / (1.0 - _GATED)
+def refine(context: WorkerContext, run_id: int, job: Job, reward: str, draft: str, shared: bool) -> str:
+    """The artefact of the refined filter, or of the same one where none is to be refined; empty: nobody needs it."""
+    with context.database.reading() as session:
+        settings = session.get_one(Study, job.study_id).settings
+    if not fits.is_refined(settings, job, shared):
+        return draft
+    is_outdated = (lambda: False) if shared else partial(_is_outdated, context, job)
+    begun = None if shared else _made_ahead(context, run_id, job, is_outdated)
+    fit = fits.fitting(context, run_id, job, context.store.read(reward), shared=shared)
+    with _folder(context, run_id, job, shared) as folder:
+        train: TrainPatiently[FilterDraft | None] = _trainer(context, run_id, folder, is_outdated, bool)
+        known = fits.pool_rollouts(context, job)
+        result = fit.refine(fits.load_draft(context, draft), known, settings.refinement_steps, begun, train)
+        artefact = context.store.put(filter_fitting.draft_to_bytes(result)) if result else ""
+        context.store.unfinished.forget(folder)
+    if artefact and begun:
+        context.store.unfinished.forget(begun)
+    return artefact
 
 
-def trainer(context: WorkerContext, run_id: int, folder: Path, is_outdated: Callable[[], bool]) -> TrainPatiently:
+def _make_ahead(context: WorkerContext, run_id: int, job: Job) -> None:
+    _made_ahead(context, run_id, job, partial(_has_answered_everything, context, job))
+
+
+def _made_ahead(context: WorkerContext, run_id: int, job: Job, is_outdated: Callable[[], bool]) -> Path | None:
+    """The folder of what is made ahead, as far as it is; None: the answers that it would follow say nothing."""
+    with context.database.reading() as session:
+        settings = session.get_one(Study, job.study_id).settings
+        first = due_work.first_half(settings)
+        followed = dataset.load_preferences(session, context.store, job.participant, first)
+    if followed.pairs is None:
+        return None
+    folder = context.store.unfinished.folder(job.participant) / f"{AHEAD}-{followed.label_hash[:16]}"
+    folder.mkdir(parents=True, exist_ok=True)
+    context.store.unfinished.bring(folder)
+    if refining.is_ahead(folder, Refinement(settings.refinement_steps)):
+        return folder
+    fitted = reward_models.fit(context, run_id, job.participant, Lane.LEARNING, first)
+    if fitted is None:
+        return None
+    known, fit = fits.pool_rollouts(context, job), fits.fitting(context, run_id, job, fitted.stored)
+    train: TrainPatiently[bool] = _trainer(context, run_id, folder, is_outdated, bool)
+    fit.refine_ahead(known, settings.refinement_steps, train)
+    return folder
+
+
+def _trainer(
+    context: WorkerContext, run_id: int, folder: Path, is_outdated: Callable[[], bool], is_whole: Callable[[T], bool]
+) -> TrainPatiently[T]:
     """What trains part by part, and makes room for whoever waits."""
 
     def report(share: float) -> None:
-        context.report(run_id, f"refining the filter, {share:.0%} done", BEFORE + (AFTER - BEFORE) * share)
+        context.report(run_id, f"refining the filter, {share:.0%} done", fits.refining(share))
 
-    def train(part: Callable[[Path], FilterDraft | None]) -> FilterDraft | None:
-        parts = patience.train(context, folder, report, is_outdated, part, lambda draft: draft is not None)
+    def train(part: Callable[[Path], T]) -> T | None:
+        parts = patience.train(context, folder, report, is_outdated, is_whole, part)
         return parts[-1] if parts else None
 
     return train
 
 
+def _is_outdated(context: WorkerContext, job: Job) -> bool:
+    with context.database.reading() as session:
+        return due_work.is_outdated(session, job, begun=True)
+
+
+def _has_answered_everything(context: WorkerContext, job: Job) -> bool:
+    """Then their last filter goes on from here."""
+    with context.database.reading() as session:
+        answered = count_labels(session, select(Participant.id).where(Participant.id == job.participant))
+        wanted = session.get_one(Study, job.study_id).settings.labels_per_participant
+    return answered.get(job.participant, 0) >= wanted
+
+
 @contextmanager
-def folder(context: WorkerContext, run_id: int, job: Job, shared: bool) -> Iterator[Path]:
+def _folder(context: WorkerContext, run_id: int, job: Job, shared: bool) -> Iterator[Path]:
     """For checkpoints: the participant's own; of what several people said nothing is kept for another process."""
     unfinished = context.store.unfinished
     if not shared:
-        yield unfinished.folder(job.participant) / f"refinement-{run_id}"
+        yield unfinished.folder(job.participant) / f"{REFINEMENT}-{run_id}"
         return
     unfinished.root.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(dir=unfinished.root, prefix=f"{REFINEMENT}-", ignore_cleanup_errors=True) as name:

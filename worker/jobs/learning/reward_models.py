@@ -1,5 +1,7 @@
 """Reward models: learn from everything one participant has said, then choose and predict what comes next."""
 
+from typing import Any, NamedTuple
+
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
@@ -11,6 +13,7 @@ from app.services.answers import stopping_advice
 from worker.compute import learning
 from worker.compute.pools import Lane
 from worker.jobs.learning import dataset, query_selection, reward_metrics
+from worker.jobs.learning.dataset import Preferences
 from worker.jobs.runtime import records
 from worker.jobs.runtime.context import Step, WorkerContext
 from worker.jobs.runtime.records import Job
@@ -26,20 +29,45 @@ def train_reward(context: WorkerContext, job: Job, run_id: int, step: Step) -> N
 
 
 def _fit(context: WorkerContext, run_id: int, participant_id: int) -> None:
+    fitted = fit(context, run_id, participant_id, Lane.REWARDS)
+    if fitted is None:
+        return
+    artefact = context.store.put(fitted.stored)
+    with context.database.reading() as session:
+        notes = notes_on_pairs(session, participant_id)
+    metrics = fitted.metrics | {"notes": notes, **reward_metrics.insight(context, participant_id, fitted.stored)}
+    with context.database.writing() as session:
+        records.set_labels(session, run_id, fitted.labels.label_count, fitted.labels.label_hash)
+        records.save_model(session, run_id, ModelKind.REWARD, artefact, metrics)
+        participant = session.get_one(Participant, participant_id)
+        stopping_advice.note(session, session.get_one(Study, participant.study_id), participant)
+
+
+class Fitted(NamedTuple):
+    """A reward model."""
+
+    stored: bytes
+    metrics: dict[str, Any]
+    labels: Preferences
+
+
+def fit(
+    context: WorkerContext, run_id: int, participant_id: int, lane: Lane, first: int | None = None
+) -> Fitted | None:
+    """The reward model of a participant's labels, or of their ``first`` ones; None: nothing but "can't tell" so far."""
     with context.database.reading() as session:
         participant = session.get_one(Participant, participant_id)
         study = session.get_one(Study, participant.study_id)
         task, kind = study.task, study.settings.reward_kind
         earlier = earlier_models(session, participant, study) if study.settings.pooled_prior else []
-        preferences = dataset.load_preferences(session, context.store, participant_id)
+        preferences = dataset.load_preferences(session, context.store, participant_id, first)
         scale = dataset.signal_scale(session, context.store, participant.study_id)
-        notes = notes_on_pairs(session, participant_id)
         recorded_signals = None if study.material is None else dataset.signal_names(study)
     if preferences.pairs is None:
-        return  # nothing but "can't tell" so far: there is nothing to learn from
+        return None
     context.report(run_id, f"learning from {preferences.label_count} labels", 0.2)
     stored, metrics = context.compute.run(
-        Lane.REWARDS,
+        lane,
         context.beat(run_id),
         learning.fit_reward,
         task,
@@ -53,12 +81,7 @@ def _fit(context: WorkerContext, run_id: int, participant_id: int) -> None:
         preferences.mattered,
         preferences.hints,
     )
-    artefact = context.store.put(stored)
-    metrics |= {"notes": notes, **reward_metrics.insight(context, participant_id, stored)}
-    with context.database.writing() as session:
-        records.set_labels(session, run_id, preferences.label_count, preferences.label_hash)
-        records.save_model(session, run_id, ModelKind.REWARD, artefact, metrics)
-        stopping_advice.note(session, session.get_one(Study, participant.study_id), participant)
+    return Fitted(stored, metrics, preferences)
 
 
 def notes_on_pairs(session: Session, participant_id: int) -> list[str]:

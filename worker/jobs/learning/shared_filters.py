@@ -11,7 +11,7 @@ from app.domain.studies import Participant, Study
 from app.services.participants import withdrawal
 from worker.compute import baseline_fitting, shared_reward
 from worker.compute.pools import Lane
-from worker.jobs.learning import dataset, filters
+from worker.jobs.learning import dataset, filters, fits
 from worker.jobs.runtime import due_lending, records
 from worker.jobs.runtime.context import Step, WorkerContext
 from worker.jobs.runtime.records import Job
@@ -60,8 +60,8 @@ def _rewards(session: Session, job: Job, shared: SharedFilter) -> list[str]:
 
 def _prove(context: WorkerContext, job: Job, run_id: int, reward: str, draft: str, started: float) -> None:
     """The same burden of proof as of a personal filter, for the wishes it was fitted to."""
-    fitting = filters.fitting(context, run_id, job, reward, shared=True)
-    proven = fitting.prove(filters.load_draft(context, draft))
+    fitting = fits.fitting(context, run_id, job, context.store.read(reward), shared=True)
+    proven = fitting.prove(fits.load_draft(context, draft))
     weights, beat = proven.draft.weights.to_bytes(), context.beat(run_id)
     controller = context.compute.run(Lane.LEARNING, beat, baseline_fitting.controller_of_filter, fitting.task, weights)
     artefact = context.store.put(controller)

@@ -34,6 +34,16 @@ def filter_due(settings: StudySettings, answered: int) -> int:
     return max((milestone for milestone in settings.milestones if milestone <= answered), default=0)
 
 
+def first_half(settings: StudySettings) -> int:
+    """How many answers a refinement follows as far as it is made ahead."""
+    return settings.labels_per_participant // 2
+
+
+def is_refinement_due(settings: StudySettings, answered: int) -> bool:
+    """Whether it can be made ahead: none of the answers that it follows can be undone any more."""
+    return settings.refinement_steps > 0 and first_half(settings) < answered < settings.labels_per_participant
+
+
 def last_exclusions(session: Session, people: Select[int]) -> dict[int, int]:
     """The number of the last word about an answer that is learned from, of everybody about whom there is one."""
     words = select(Query.participant_id, func.max(Exclusion.id)).join(LabelEvent, LabelEvent.query_id == Query.id)

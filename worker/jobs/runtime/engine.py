@@ -31,6 +31,7 @@ QUEUES = {
     RunKind.CLIPS: 2,
     RunKind.REWARD: 1,
     RunKind.FILTER: 1,
+    RunKind.REFINEMENT: 1,
     RunKind.METHOD: 4,  # those that are only measured keep their place while they give way to whoever waits
     RunKind.SHARED: 1,
     RunKind.FILMS: 1,

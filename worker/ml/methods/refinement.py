@@ -39,8 +39,6 @@ _REFINED = (
     "The filter was refined by reinforcement learning on the learned preference. It began as the execution mode that "
     "is shown, and may have gone elsewhere since."
 )
-AHEAD = 0.75
-"""The share of the steps that is made while people still answer."""
 STRENGTHS = (1.0, 0.8, 0.6)
 """Tried in this order, blended with the reference policy."""
 OWN_SHARE = 3
@@ -65,6 +63,13 @@ class Refinement:
     first_tie: float = 1.0
     """weight of the KL divergence from the imitation, in units of the spread of Q; see prefft"""
     last_tie: float = 0.1
+    share_ahead: float = 0.75
+    """of the steps, for a reward model of fewer answers"""
+
+    @property
+    def ahead_steps(self) -> int:
+        """After so many, the reward model of all answers is needed."""
+        return round(self.share_ahead * self.steps)
 
 
 @dataclass(frozen=True)
@@ -82,7 +87,7 @@ def refine_ahead(
     problem: FilterProblem, draft: FilterDraft, beginning: Beginning, config: Refinement, checkpoint: Checkpoint
 ) -> None:
     """The larger part of a refinement, for a reward model of fewer answers; refine() goes on from the checkpoint."""
-    _train(problem, draft, beginning, config, checkpoint, round(AHEAD * config.steps))
+    _train(problem, draft, beginning, config, checkpoint, config.ahead_steps)
 
 
 def refine(

@@ -5,6 +5,7 @@ whoever waits for it in another process. When the folder is gone, nobody wants t
 """
 
 import json
+import shutil
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from safetensors import safe_open
-from safetensors.torch import save_file
+from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from worker.whole_files import written_whole
@@ -67,13 +68,19 @@ class Checkpoint:
 
     def read(self) -> tuple[dict[str, Tensor], dict[str, Any]] | None:
         """What was written last; None at the beginning."""
+        counts = self.read_counts()
+        if counts is None:
+            return None
+        return load_file(self.folder / STATE_FILE), counts
+
+    def read_counts(self) -> dict[str, Any] | None:
+        """The plain values of read(), without its arrays."""
         path = self.folder / STATE_FILE
         if not path.exists():
             return None
         with safe_open(path, "pt") as stored:
-            tensors = {name: stored.get_tensor(name) for name in stored.keys()}  # noqa: SIM118  (no mapping)
             counts: dict[str, Any] = json.loads(stored.metadata()["counts"])
-        return tensors, counts
+        return counts
 
     @contextmanager
     def _writing(self, name: str) -> Iterator[Path]:
@@ -93,6 +100,13 @@ def ask_to_pause(folder: Path) -> None:
 def begin_again(folder: Path) -> None:
     """Forget that anybody asked for a pause."""
     (folder / PAUSE_FILE).unlink(missing_ok=True)
+
+
+def go_on_from(begun: Path, folder: Path) -> None:
+    """Have the training in this folder go on from another one's checkpoint, if it has none of its own."""
+    if not (folder / STATE_FILE).exists():
+        with written_whole(folder / STATE_FILE) as draft:
+            shutil.copyfile(begun / STATE_FILE, draft)
 
 
 def share_done(folder: Path) -> float:

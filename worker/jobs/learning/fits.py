@@ -1,0 +1,89 @@
+"""What fits filters, as a study and a person have it: settings, seeds, the pool; and how far a fit is."""
+
+from app.domain.studies import Participant, Study
+from app.domain.study_settings import StudySettings
+from worker.analysis.filters.promise import Promise
+from worker.compute import filter_fitting
+from worker.compute.filter_fitting import FilterFit
+from worker.domain.trajectory import Trajectory
+from worker.jobs.learning import dataset
+from worker.jobs.runtime import records
+from worker.jobs.runtime.context import WorkerContext
+from worker.jobs.runtime.records import Job
+from worker.ml.filters.filter_problem import FilterConfig, FilterDraft
+
+_BEFORE, _AFTER = 0.25, 0.9
+"""How far a fit is before its refinement and after it."""
+_GATED = 0.85
+"""How far a fit without one is before its promise."""
+
+
+def is_refined(settings: StudySettings, job: Job, shared: bool) -> bool:
+    """Filters of all answers are, and those for several people (``shared``), which others are compared with."""
+    return settings.refinement_steps > 0 and (shared or (job.about.labels or 0) >= settings.labels_per_participant)
+
+
+def refining(share: float) -> float:
+    """What is done of a fit when this share of its refinement is."""
+    return _BEFORE + (_AFTER - _BEFORE) * share
+
+
+def _beside(share: float) -> float:
+    """What is done of a fit with a refinement, when this share of it would be done without one."""
+    if share <= _GATED:
+        return _BEFORE * share / _GATED
+    return _AFTER + (1.0 - _AFTER) * (share - _GATED) / (1.0 - _GATED)
+
+
+def pool_rollouts(context: WorkerContext, job: Job) -> list[Trajectory]:
+    """What the study's clips show, as whole episodes."""
+    with context.database.reading() as session:
+        clips = dataset.pool_clips(session, job.study_id)
+    return [dataset.shown(context.store, clip) for clip in clips]
+
+
+def load_draft(context: WorkerContext, artefact: str) -> FilterDraft:
+    """A stored draft of a filter."""
+    return filter_fitting.draft_from_bytes(context.store.read(artefact))
+
+
+def filter_config(settings: StudySettings) -> FilterConfig:
+    """What a study says about the fitting of its filters."""
+    return FilterConfig(
+        success_tolerance=settings.success_tolerance, evaluation_scenarios=settings.evaluation_scenarios
+    )
+
+
+def promise_of(settings: StudySettings) -> Promise:
+    """What a study promises about the harm its filters may do."""
+    return Promise(
+        share=settings.harm_share,
+        confidence=settings.harm_confidence,
+        force_n=settings.harm_force_n,
+        spilled=settings.harm_spilled,
+    )
+
+
+def fitting(context: WorkerContext, run_id: int, job: Job, reward: bytes, *, shared: bool = False) -> FilterFit:
+    """What fits a filter to a reward model. ``shared``: not the person's own, so the study's seed is used."""
+    with context.database.reading() as session:
+        study = session.get_one(Study, job.study_id)
+        task, settings = study.task, study.settings
+        study_seed = study.seed
+        seed = study_seed if shared else session.get_one(Participant, job.participant).seed
+        version = 1 if shared else records.next_version(session, job.participant)
+    quick = not is_refined(settings, job, shared)
+    return FilterFit(
+        task=task,
+        compute=context.compute,
+        beat=context.beat(run_id),
+        reward=reward,
+        seed=seed,
+        config=filter_config(settings),
+        progress=lambda stage, share: context.report(run_id, stage, share if quick else _beside(share)),
+        references=context.references,
+        promise=promise_of(settings),
+        study_seed=study_seed,
+        version=version,
+        outcomes=context.outcomes,
+    )
