@@ -167,9 +167,10 @@ def _procedure(session: Session, study: Study) -> Iterator[str]:
         f"{percent(settings.harm_share)} of scenarios with {percent(settings.harm_confidence, 0)} confidence."
         if study.material is None
         else "",
-        "The filter of all answers was then refined by soft actor-critic on the learned preference, for "
-        f"{settings.refinement_steps:,} environment steps from that filter on, and the refined policy kept where it "
-        "was better and no worse in these respects."
+        "The filter of all answers was then refined by soft actor-critic for "
+        f"{settings.refinement_steps:,} environment steps, three quarters of them on the preference learned from the "
+        "first half of the answers and from its execution mode on; the refined policy was kept where it was better and "
+        "no worse in these respects."
         if settings.refinement_steps
         else "",
     )

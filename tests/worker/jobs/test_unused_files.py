@@ -17,12 +17,12 @@ from worker.compute.pools import Compute
 from worker.jobs.runtime.context import WorkerContext
 from worker.jobs.upkeep import unused_files
 
-TWO_DAYS_S = 2 * 24 * 3600
+DAY_S = 24 * 3600
 
 
-def age(path: Path | None) -> None:
+def age(path: Path | None, days: int = 2) -> None:
     assert path is not None, "on this machine"
-    long_ago = time.time() - TWO_DAYS_S
+    long_ago = time.time() - days * DAY_S
     os.utime(path, (long_ago, long_ago))
 
 
@@ -66,3 +66,14 @@ def test_what_was_never_written_to_its_end_goes_as_well(context: WorkerContext) 
     age(old)
     unused_files.clear_away(context, ())
     assert (old.exists(), young.exists()) == (False, True)
+
+
+def test_what_was_made_ahead_for_somebody_who_does_not_come_back_goes_after_two_weeks(context: WorkerContext) -> None:
+    unfinished = context.store.unfinished
+    left, present = unfinished.folder(1) / "ahead-0123", unfinished.folder(2) / "ahead-4567"
+    for folder, days in ((left, 15), (present, 2)):
+        folder.mkdir(parents=True)
+        (folder / "state.safetensors").write_bytes(b"half way")
+        age(folder, days)
+    unused_files.clear_away(context, ())
+    assert (left.exists(), present.exists()) == (False, True)

@@ -120,7 +120,8 @@ def test_what_was_begun_on_half_the_answers_goes_where_all_of_them_say(
     reference: list[Trajectory], tmp_path: Path
 ) -> None:
     likes = problem(StructuredReward(-REWARD.weights))
-    draft, beginning, config = FilterDraft(GATED), Beginning(World, [], reference), replace(LONGER, share_ahead=0.5)
+    draft, beginning = FilterDraft(GATED), Beginning(World, [], reference)
+    config = replace(LONGER, steps=900, share_ahead=0.5)
     refinement.refine_ahead(likes, draft, beginning, config, Checkpoint(tmp_path))
     ahead = Checkpoint(tmp_path).read_counts()
     assert ahead is not None
