@@ -25,6 +25,10 @@ class Labels:
         if self.targets.shape != (len(self.pairs),):
             raise ValueError(f"{len(self.pairs)} pairs need as many answers, got shape {self.targets.shape}.")
 
+    def first(self, count: int) -> "Labels":
+        """So many of them, in the order in which they were given."""
+        return Labels(self.pairs.take(np.arange(count)), self.targets[:count])
+
 
 class Person(Protocol):
     """Somebody who can be asked and shown more; only scripted users can (worker.experiments.benchmark_person)."""

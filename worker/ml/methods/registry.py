@@ -9,6 +9,8 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import gymnasium
@@ -16,7 +18,7 @@ import gymnasium
 from worker.domain.scenarios import RESIDUAL, first_of
 from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import Act
-from worker.ml.filters import filter_problem, pbarl
+from worker.ml.filters import filter_problem, mode_search, pbarl
 from worker.ml.filters.filter_problem import Collect, FilterDraft, FilterProblem
 from worker.ml.filters.pbarl_printed import PrintedConfig
 from worker.ml.filters.printed_filter import fit_printed
@@ -146,12 +148,15 @@ def fit_pbarl(setting: Setting) -> tuple[Act, tuple[str, ...]]:
 
 
 def fit_pbarl_refined(setting: Setting) -> tuple[Act, tuple[str, ...]]:
-    """The quick filter, and the refined policy that begins as it."""
-    problem, reference = setting.problem, setting.reference(_gate(setting))
+    """The quick filter, and the refined policy, most of which is made for the first half of the labels."""
+    problem, reference, config = setting.problem, setting.reference(_gate(setting)), setting.config.refinement
     beginning = refinement.Beginning(setting.make_env, setting.pool, reference)
-    draft = refinement.refine(
-        problem, _mode_and_residual(setting), beginning, setting.config.refinement, setting.checkpoint
-    )
+    half = replace(problem, reward=setting.asked().fit(setting.asked().labels.first(setting.labels // 2)))
+    mode = mode_search.find_mode(half, setting.surface(), setting.pool, reference, setting.collect)
+    with TemporaryDirectory() as folder:
+        checkpoint = Checkpoint(Path(folder))
+        refinement.refine_ahead(half, mode, beginning, config, checkpoint)
+        draft = refinement.refine(problem, _mode_and_residual(setting), beginning, config, checkpoint)
     return _shipped(problem, refinement.gate_refined(problem, draft, reference, setting.collect))
 
 
