@@ -1,5 +1,6 @@
 """Whether people will disagree about a pool is said before anybody is invited."""
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -67,6 +68,11 @@ def test_check_says_it_of_an_explored_task_and_what_to_do_where_nobody_could_tel
     remarks = " ".join(checked(explored / "lab.toml", explored / "sheet.png").remarks)
     assert "Of 100 pairs of clips" in remarks
     assert "too alike" not in remarks
+    assert "hardly foreseen" not in remarks
+    record = {"scenarios": [0, 9], "explained_share": {"height": 0.5}, "foreseen_share": {"height": 0.1}}
+    (explored / "checkpoint" / "response_surface.json").write_text(json.dumps(record))
+    remarks = " ".join(checked(explored / "lab.toml", explored / "sheet.png").remarks)
+    assert "How ways change height (10%) is hardly foreseen" in remarks
     task, policy = registry.task("plane"), simulation.reference_policy("plane")
     environment = simulation.lab_environment("plane")
     alike = disagreement.measured(task, lambda _: policy.mean, environment.episode, 40, scenarios=4, share=0.005)

@@ -219,3 +219,24 @@ def test_a_package_that_does_not_fit_another_is_told_of_as_such(plane: Path) -> 
         "plane.py",
     )
     assert "has no attribute 'flex_vertedge'). Make it without the studio first" in said(plane)
+
+
+def test_a_library_that_warns_at_every_reset_is_heard_a_few_times_and_its_errors_always(plane: Path) -> None:
+    change(
+        plane,
+        "import numpy as np\n",
+        'import logging\nimport numpy as np\nlog = logging.getLogger("a_lab")\n',
+        "plane.py",
+    )
+    said_each_time = 'log.warning("no convergence: error %g", self.goal[0])\n        log.error("no contact")\n'
+    change(
+        plane,
+        "        return self._seen(), {}",
+        f"        {said_each_time}        return self._seen(), {{}}",
+        "plane.py",
+    )
+    checking = [sys.executable, "-m", "worker", "check", str(plane)]
+    printed = subprocess.run(checking, cwd=ROOT, capture_output=True, text=True, check=True).stderr
+    assert printed.count("no convergence: error") == 3
+    assert printed.count("said again and again") == 1
+    assert printed.count("no contact") > 3

@@ -38,6 +38,15 @@ class Space:
             yield field, slice(start, start + field.size)
             start += field.size
 
+    @property
+    def column_names(self) -> list[str]:
+        """A name for every number of the vector; a field of several is numbered from 0."""
+        return [
+            field.name if field.size == 1 else f"{field.name}_{column}"
+            for field in self.fields
+            for column in range(field.size)
+        ]
+
     def slice_of(self, name: str) -> slice:
         """The place of one field in the vector. Raises KeyError for a name the space does not have."""
         for field, place in self.slices():

@@ -1,6 +1,7 @@
 """Check a lab.toml: what is missing or wrong, in words; three episodes, and a contact sheet of them."""
 
 import contextlib
+import json
 import re
 import sys
 import time
@@ -16,14 +17,15 @@ from tqdm import tqdm
 
 from app.installed_tasks import lab
 from app.installed_tasks.description import InstalledTask, TaskRefused
-from app.installed_tasks.lab import FOUND_FILE, WHERE, LabDescription, whole
+from app.installed_tasks.lab import FOUND_FILE, SURFACE_FILE, WHERE, LabDescription, whole
 from app.paths import LOCKS
 from worker.compute.lab_clips import SAME_WITHIN
 from worker.compute.lab_policies import policy_of
 from worker.domain.scenarios import POLICY_TEST
+from worker.domain.task import Task
 from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import Act
-from worker.experiments import disagreement, lab_ranges
+from worker.experiments import disagreement, fit_response_surface, lab_ranges
 from worker.ml.policies.asked_policy import AskedPolicy
 from worker.ml.policies.onnx_policy import NotAPolicy, OnnxPolicy
 from worker.sim.lab.environment import LabEnvironment, Picture
@@ -189,7 +191,14 @@ def _disagree(installed: InstalledTask, described: LabDescription, environment: 
             return policy_of(described, installed.folder, found, name).mean
 
         differences = disagreement.measured(task, cache(policy_named), episode, described.usual_clip_steps)
-    return disagreement.in_words(differences, task)
+    return (*disagreement.in_words(differences, task), *_little_foreseen(installed, task))
+
+
+def _little_foreseen(installed: InstalledTask, task: Task) -> tuple[str, ...]:
+    """What filters cannot serve, once the surface is there; where one of several policies is chosen there is none."""
+    record = (installed.checkpoint / SURFACE_FILE).with_suffix(".json")
+    said = fit_response_surface.little_foreseen(json.loads(record.read_text()), task) if record.exists() else ""
+    return (said,) if said else ()
 
 
 def _explored(installed: InstalledTask) -> Found | None:
@@ -229,9 +238,7 @@ def _remarks(
     successes = sum(each.success for each in trajectories)
     remarks = [
         f"{successes} of {len(trajectories)} episodes succeeded.{_lost_again(trajectories)}",
-        f"An episode takes {usual:.2f} s, so exploring "
-        f"takes about {EXPLORED_EPISODES * usual / 120:.0f} minutes on two processes, a quarter of it with "
-        "--scenarios 50.",
+        f"An episode takes {usual:.2f} s{'' if described.policies else _exploring(usual)}.",
         f"Contact sheet: {sheet}",
     ]
     first = trajectories[0].observations
@@ -244,7 +251,7 @@ def _remarks(
     silent = [name for name, column in zip(described.signal_names, sums.T, strict=True) if not column.any()]
     if silent:
         remarks.append(f"Always 0 in these episodes: {', '.join(silent)}. What never varies cannot be judged by.")
-    if usual > SLOW_EPISODE_S:
+    if usual > SLOW_EPISODE_S and not described.policies:
         hours = EXPLORED_EPISODES * usual / 2 / 3600
         remarks.append(
             f"This is a slow environment: exploring it takes about {hours:.0f} hours on two processes. Lower "
@@ -260,6 +267,11 @@ def _remarks(
     if missing:
         remarks.append(f"instructions.{missing[0]} is missing: participants of that language read neutral words.")
     return tuple(remarks)
+
+
+def _exploring(episode_s: float) -> str:
+    minutes = EXPLORED_EPISODES * episode_s / 120
+    return f", so exploring takes about {minutes:.0f} minutes on two processes, a quarter of it with --scenarios 50"
 
 
 def replaced_packages(locks: Iterable[str]) -> list[str]:

@@ -11,7 +11,7 @@ Finished blocks are kept, so an interrupted exploration goes on where it was.
 import hashlib
 import json
 import platform
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -42,6 +42,11 @@ SOUGHT_SCENARIOS = 60
 ROUNDS = 3
 MODES_PER_SCENARIO = 12
 BLOCK = 10
+FOLDS = 10
+"""Of the scenarios, by which it is measured what a surface foresees in others than it was fitted in."""
+LITTLE = 0.2
+"""Below this share of what a signal differs by, what is best for whoever judges by it is a guess."""
+FEW_SCENARIOS = 50
 JITTER = 0.08
 """Standard deviation around a mode that somebody wants, as a share of every axis' range."""
 
@@ -229,12 +234,56 @@ def _joined(blocks: Sequence[Block]) -> Differences:
     return Differences(*(np.concatenate([each[name] for each in loaded]).astype(np.float64) for name in names))
 
 
+def little_foreseen(record: Mapping[str, Any], task: Task) -> str:
+    """Which signals the surface with this record hardly foresees, and what to do, in words; empty: none.
+
+    Records of earlier versions have only what was explained in the scenarios themselves.
+    """
+    shares = record.get("foreseen_share", record["explained_share"])
+    little = [f"{name} ({max(share, 0.0):.0%})" for name, share in shares.items() if share < LITTLE]
+    if not little:
+        return ""
+    first, last = record["scenarios"]
+    count = last - first + 1
+    return (
+        f"How ways change {', '.join(little)} is hardly foreseen, so filters will be worth little to whoever judges by "
+        "it. "
+        + (
+            f"{count} scenarios are few: python -m worker explore --task {task.name} --scenarios {2 * FEW_SCENARIOS}."
+            if count < FEW_SCENARIOS
+            else "It depends on the situation, as where actions are speeds of joints: wrap the environment so that "
+            "actions move the tool, name policies to choose from, or leave such a signal out."
+        )
+    )
+
+
+def foreseen(task: Task, found: Differences) -> FloatArray:
+    """(N, S) What a surface fitted in the other scenarios says of each rollout."""
+    fold = np.arange(len(found.reference_success)).repeat(MODES_PER_SCENARIO) % FOLDS
+    predicted = np.empty_like(found.signals)
+    for each in range(FOLDS):
+        out = fold == each
+        surface = response_surface.fit(
+            task.modes, found.modes[~out], found.signals[~out], found.successes[~out], task.signals
+        )
+        predicted[out], _ = surface.predict(found.modes[out])
+    return predicted
+
+
+def share(task: Task, found: Differences, predicted: FloatArray) -> dict[str, float]:
+    """Of what each signal differs by; below 0: worse than to say that nothing changes."""
+    left = ((found.signals - predicted) ** 2).mean(axis=0)
+    spread = (found.signals**2).mean(axis=0)
+    return {
+        name: round(float(1 - left[column] / spread[column]), 3)
+        for column, name in enumerate(task.signals)
+        if spread[column] > 1e-9
+    }
+
+
 def _publish(task: Task, scenarios: int, found: Differences) -> dict[str, Any]:
     surface, successes = found.fit(task), found.successes
     surface.save(simulation.surface_file(task.name))
-    predicted, _ = surface.predict(found.modes)
-    residual = ((found.signals - predicted) ** 2).mean(axis=0)
-    spread = np.maximum((found.signals**2).mean(axis=0), 1e-12)
     record = {
         "command": f"python -m worker explore --task {task.name} --scenarios {scenarios}",
         "scenarios": [RESPONSE_SURFACE.start, RESPONSE_SURFACE[scenarios - 1]],
@@ -243,12 +292,11 @@ def _publish(task: Task, scenarios: int, found: Differences) -> dict[str, Any]:
         "axes": {axis.name: [axis.low, axis.high] for axis in task.modes.axes},
         "reference_success": float(found.reference_success.mean()),
         "mode_success": float(successes.mean()),
-        "explained_share": {
-            name: round(float(1 - residual[column] / spread[column]), 3)
-            for column, name in enumerate(task.signals)
-            if spread[column] > 1e-9
-        },
+        "explained_share": share(task, found, surface.predict(found.modes)[0]),
+        "foreseen_share": share(task, found, foreseen(task, found)),
         "versions": {"python": platform.python_version(), "numpy": np.__version__},
     }
     simulation.surface_file(task.name).with_suffix(".json").write_text(json.dumps(record, indent=2) + "\n")
+    if task.is_a_labs and (said := little_foreseen(record, task)):
+        tqdm.write(said)
     return record

@@ -1,7 +1,10 @@
-"""Keeps native libraries from writing to our terminal."""
+"""Keeps other people's libraries from flooding our terminal and log."""
 
+import logging
 import os
+import re
 import sys
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -19,3 +22,36 @@ def silenced_stderr() -> Iterator[None]:
         os.dup2(kept, 2)
         os.close(kept)
         os.close(nowhere)
+
+
+REPEATED = 3
+"""So often a library may say the same: dm_control's inverse kinematics warn at every second reset."""
+
+
+class FewRepetitions(logging.Filter):
+    """Lets the same warning through a few times, whatever numbers it names; errors always."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._seen = Counter[str]()
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """See logging.Filter."""
+        if record.levelno >= logging.ERROR:
+            return True
+        said = re.sub(r"[-+]?\d[\d.e+-]*", "", str(record.msg))
+        self._seen[said] += 1
+        if self._seen[said] == REPEATED:
+            record.msg = f"{record.msg} (said again and again: left out from here on)"
+        return self._seen[said] <= REPEATED
+
+
+@contextmanager
+def few_repetitions() -> Iterator[None]:
+    """For the loggers of everything that is imported inside."""
+    before = set(logging.root.manager.loggerDict)
+    try:
+        yield
+    finally:
+        for name in set(logging.root.manager.loggerDict) - before:
+            logging.getLogger(name).addFilter(FewRepetitions())

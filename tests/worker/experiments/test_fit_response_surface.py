@@ -7,7 +7,7 @@ import pytest
 
 from worker.compute import simulation
 from worker.experiments import fit_response_surface
-from worker.experiments.fit_response_surface import BLOCK, MODES_PER_SCENARIO, Block
+from worker.experiments.fit_response_surface import BLOCK, MODES_PER_SCENARIO, Block, Differences
 from worker.ml.filters.response_surface import ResponseSurface
 from worker.tasks import registry
 
@@ -48,3 +48,29 @@ def test_a_block_that_was_run_in_other_modes_is_run_again(tmp_path: Path) -> Non
     np.savez(block.file, modes=modes.reshape(-1, 5))
     assert block.is_there()
     assert not Block("feeding", 1, modes + 0.1, block.file).is_there()
+
+
+def test_what_is_foreseen_is_measured_in_scenarios_that_the_surface_has_not_seen() -> None:
+    scenarios, rng = 20, np.random.default_rng(0)
+    modes = FEEDING.modes.sample(scenarios * MODES_PER_SCENARIO, rng)
+    signals = rng.standard_normal((len(modes), len(FEEDING.signals)))
+    signals[:, 0] = modes[:, 0]
+    found = Differences(modes, signals, np.zeros(len(modes)), np.ones(scenarios))
+    learned, chance = FEEDING.signals[:2]
+    known = fit_response_surface.share(FEEDING, found, found.fit(FEEDING).predict(modes)[0])
+    unseen = fit_response_surface.share(FEEDING, found, fit_response_surface.foreseen(FEEDING, found))
+    assert unseen[learned] > 0.9
+    assert known[chance] > 0.05
+    assert unseen[chance] < 0.0
+
+
+def test_signals_that_are_hardly_foreseen_are_told_of_with_what_to_do() -> None:
+    record = {"scenarios": [100, 109], "explained_share": {"speed_m_s": 0.6, "distance_m": 0.5}}
+    assert not fit_response_surface.little_foreseen(record, FEEDING), "as records of earlier versions have it"
+    record["foreseen_share"] = {"speed_m_s": 0.5, "distance_m": -0.4}
+    few = fit_response_surface.little_foreseen(record, FEEDING)
+    assert "How ways change distance_m (0%) is hardly foreseen" in few
+    assert "explore --task feeding --scenarios 100" in few
+    many = fit_response_surface.little_foreseen({**record, "scenarios": [100, 149]}, FEEDING)
+    assert "--scenarios" not in many
+    assert "wrap the environment" in many

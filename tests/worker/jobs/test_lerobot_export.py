@@ -33,6 +33,7 @@ from worker.jobs.learning import dataset
 from worker.jobs.publishing import export_files
 from worker.jobs.runtime import records
 from worker.jobs.runtime.context import WorkerContext
+from worker.tasks import registry
 
 AddClips = Callable[..., list[Clip]]
 Answer = Callable[[Clip, Clip, Response], Query]
@@ -123,6 +124,18 @@ def test_minari_has_the_same_episodes_by_the_example_of_the_manual(
         np.testing.assert_array_equal(episode.observations, stretch.cut("observations"))
         np.testing.assert_array_equal(episode.actions, stretch.cut("actions")[:-1])
         np.testing.assert_array_equal(episode.infos["signals"], stretch.cut("signals"))
+
+
+def test_columns_are_called_as_the_task_calls_them(exported: Path, study: Study) -> None:
+    features = json.loads((exported / "meta/info.json").read_text())["features"]
+    task = registry.task(study.task)
+    assert features["observation.state"]["names"][:4] == [
+        *(f"tool_position_m_{axis}" for axis in range(3)),
+        "tool_forward_0",
+    ]
+    for name, space in {"observation.state": task.observation, "action": task.action}.items():
+        assert len(features[name]["names"]) == features[name]["shape"][0] == space.size
+    assert features["signals"]["names"] == list(task.signals)
 
 
 def test_a_film_has_one_picture_for_every_row(exported: Path, clips: list[Clip]) -> None:

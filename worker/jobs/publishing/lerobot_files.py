@@ -59,7 +59,8 @@ class _Writing:
     size: tuple[int, int]
     """width and height of all films"""
     task: str
-    signal_names: Sequence[str]
+    column_names: Mapping[str, Sequence[str]]
+    """of the features whose columns have names"""
     episodes: list[dict[str, Any]] = field(default_factory=list)
     place: dict[int, int] = field(default_factory=dict)
     """episode by the id of the clip"""
@@ -75,10 +76,9 @@ def write(session: Session, context: WorkerContext, study: Study, path: Path) ->
     if not clips:
         raise NothingToShow
     task = study.task.replace("_", " ")
-    names = dataset.signal_names(study)
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as target:
         size = (clips[0].width // 2 * 2, clips[0].height // 2 * 2)
-        writing = _Writing(target, _rate_hz(study), size, task, names)
+        writing = _Writing(target, _rate_hz(study), size, task, _column_names(study))
         with _unfinished(path.parent) as data:
             _write_episodes(context, writing, clips, data, lost)
             target.write(data, DATA_PATH.format(chunk_index=0, file_index=0))
@@ -100,6 +100,15 @@ def _rate_hz(study: Study) -> int:
     if abs(rate - round(rate)) > 1e-6:
         raise NoWholeRate
     return round(rate)
+
+
+def _column_names(study: Study) -> Mapping[str, Sequence[str]]:
+    """As the task or the laboratory calls them; of recordings only the signals are known by name."""
+    signals = {SIGNALS: dataset.signal_names(study)}
+    if study.material is not None:
+        return signals
+    task = registry.task(study.task)
+    return signals | {STATE: task.observation.column_names, ACTION: task.action.column_names}
 
 
 @contextmanager
@@ -243,12 +252,11 @@ def _write_metadata(writing: _Writing) -> None:
 
 def _features(writing: _Writing, widths: Mapping[str, int]) -> dict[str, Any]:
     width, height = writing.size
-    names: dict[str, Sequence[str]] = {SIGNALS: writing.signal_names}
     found: dict[str, Any] = {
         name: {
             "dtype": "float32",
             "shape": [columns],
-            "names": list(names.get(name, [f"{name.rpartition('.')[2]}_{column}" for column in range(columns)])),
+            "names": _names(writing.column_names.get(name, ()), name, columns),
         }
         for name, columns in widths.items()
     }
@@ -269,6 +277,11 @@ def _features(writing: _Writing, widths: Mapping[str, int]) -> dict[str, Any]:
     }
     plain = {"next.done": "bool", "next.success": "bool", "timestamp": "float32", **dict.fromkeys(COUNTERS, "int64")}
     return found | {name: {"dtype": kind, "shape": [1], "names": None} for name, kind in plain.items()}
+
+
+def _names(known: Sequence[str], feature: str, columns: int) -> list[str]:
+    """Those that are known, unless it was recorded when the task had others."""
+    return list(known) if len(known) == columns else [f"{feature.rpartition('.')[2]}_{each}" for each in range(columns)]
 
 
 _PREFERENCE = pa.schema(

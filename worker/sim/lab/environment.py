@@ -23,6 +23,7 @@ from worker.domain.type_aliases import Act, Float32Array, FloatArray
 from worker.sim.lab.errors import LabTaskBroken
 from worker.sim.lab.found import columns_of
 from worker.sim.lab.references import named_object
+from worker.sim.quiet import few_repetitions
 
 Picture = npt.NDArray[np.uint8]
 UNBOUNDED = 1e6
@@ -63,11 +64,12 @@ class LabEnvironment:
     def __post_init__(self) -> None:
         if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
             os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo reads it when it is imported, by what follows
-        self._signals = {
-            name: self._measure(f"signals.{name}", each) for name, each in self.description.signals.items()
-        }
-        self._success = self._measure("success", self.description.success)
-        self._build()
+        with few_repetitions():
+            self._signals = {
+                name: self._measure(f"signals.{name}", each) for name, each in self.description.signals.items()
+            }
+            self._success = self._measure("success", self.description.success)
+            self._build()
         space = self._made.action_space
         if not isinstance(space, gymnasium.spaces.Box) or len(space.shape) != 1:
             raise LabTaskBroken(
