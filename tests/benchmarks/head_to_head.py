@@ -1,6 +1,6 @@
-"""How often the strengths of head-to-heads err, in invented studies of people who differ and whose truth is known.
+"""How often strengths of head-to-heads err, in invented studies, with arms and without, whose truth is known.
 
-    OMP_NUM_THREADS=1 python -m tests.benchmarks.head_to_head --studies 2000
+    OMP_NUM_THREADS=1 python -m tests.benchmarks.head_to_head --studies 1000
 
 Writes docs/results/head_to_head.csv and .md. Everything is computed by the functions that the page of results uses.
 """
@@ -16,74 +16,92 @@ import numpy as np
 from scipy import stats
 
 from worker.analysis.comparison import result_pages
-from worker.analysis.study.bradley_terry import covariance, strengths, why_not
+from worker.analysis.study.bradley_terry import NO_SPREAD, error_of, strengths, why_not
 from worker.analysis.study.effect_sizes import holm
 from worker.domain.type_aliases import FloatArray
 
 RESULTS = Path("docs/results")
 METHODS, ROUNDS, TIE = 3, 3, 0.3
 PEOPLE, SPREADS, EFFECTS = (4, 8, 16, 24), (0.0, 1.0), (0.0, 1.0)
+Arms = tuple[tuple[int, ...], ...]
+ARMS: tuple[Arms, ...] = (((0, 1), (1, 2)), ((0, 1), (1, 2), (0, 2)), ((0, 1, 2), (1, 2)))
+IN_EACH_ARM, SPREADS_IN_ARMS = (4, 5, 8, 16), (0.0, 1.2)
 TRUTH_PEOPLE = 200_000
 ALPHA = 0.05
 
 
-def invented(people: int, spread: float, effect: float, rng: np.random.Generator) -> FloatArray:
-    """Wins (people, methods, methods). Latent: what each method is to a person, with logistic noise; ties if close."""
-    worth = rng.normal(0.0, spread, (people, METHODS)) + np.array([0.0, 0.0, effect])
-    wins = np.zeros((people, METHODS, METHODS))
+def invented(people: int, spread: float, effect: float, rng: np.random.Generator, arms: Arms) -> FloatArray:
+    """Wins (people of all arms, methods, methods). Latent: what each method is to a person, with logistic noise."""
+    worth = rng.normal(0.0, spread, (people * len(arms), METHODS)) + np.array([0.0, 0.0, effect])
+    wins = np.zeros((len(worth), METHODS, METHODS))
     for first, second in combinations(range(METHODS), 2):
-        felt = (worth[:, first] - worth[:, second])[:, None] + rng.logistic(size=(people, ROUNDS))
+        felt = (worth[:, first] - worth[:, second])[:, None] + rng.logistic(size=(len(worth), ROUNDS))
         share = np.where(np.abs(felt) < TIE, 0.5, felt > 0).sum(axis=1)
-        wins[:, first, second], wins[:, second, first] = share, ROUNDS - share
+        met = np.repeat([first in arm and second in arm for arm in arms], people)
+        wins[:, first, second], wins[:, second, first] = met * share, met * (ROUNDS - share)
     return wins
 
 
-def row(people: int, spread: float, effect: float, studies: int) -> dict[str, Any]:
-    """Misses and findings of one truth; what cannot be computed misses and finds nothing."""
-    rng = np.random.default_rng([people, int(10 * spread), int(10 * effect)])
-    truth = strengths(invented(TRUTH_PEOPLE, spread, effect, rng).sum(axis=0))
+def row(arms: Arms, people: int, spread: float, effect: float, studies: int) -> dict[str, Any]:
+    """Misses and findings of one truth; what is not computed finds nothing. ``people``: in each arm."""
+    design = ARMS.index(arms) + 1 if arms in ARMS else 0
+    rng = np.random.default_rng([people, int(10 * spread), int(10 * effect), design])
+    truth = strengths(invented(TRUTH_PEOPLE, spread, effect, rng, arms).sum(axis=0))
     pairs = list(combinations(range(METHODS), 2))
     same = [pair for pair in pairs if not effect or METHODS - 1 not in pair]
-    tally = dict.fromkeys(("computed", "missed", "naive_missed", "false", "family", "found"), 0)
+    offered, missed, naive_missed, hit = (dict.fromkeys(pairs, 0) for _ in range(4))
+    families = 0
     for _ in range(studies):
-        wins = invented(people, spread, effect, rng)
+        wins = invented(people, spread, effect, rng, arms)
         if why_not(wins):
             continue
-        tally["computed"] += 1
         found = strengths(wins.sum(axis=0))
-        spreads = covariance(wins, found)
-        chances = 1 / (1 + np.exp(found[None, :] - found[:, None]))
-        met = wins.sum(axis=0) + wins.sum(axis=0).T
-        weights = met * chances * (1 - chances)
-        naive = np.linalg.pinv(np.diag(weights.sum(axis=1)) - weights)
-        p_values = []
-        for first, second in pairs:
+        naive = naive_covariance(wins.sum(axis=0), found)
+        p_values: list[float | None] = []
+        for pair in pairs:
             contrast = np.zeros(METHODS)
-            contrast[[first, second]] = -1, 1
-            error, plain_error = (max(float(contrast @ each @ contrast), 1e-18) ** 0.5 for each in (spreads, naive))
-            off = contrast @ (found - truth)
-            tally["missed"] += abs(off) > stats.t.ppf(0.975, people - 1) * error
-            tally["naive_missed"] += abs(off) > 1.96 * plain_error
-            p_values.append(float(2 * stats.t.sf(abs(contrast @ found) / error, people - 1)))
-        hits = [p < ALPHA for p in p_values]
-        after = [p is not None and p < ALPHA for p in holm(p_values)]
-        tally["false"] += sum(hit for pair, hit in zip(pairs, hits, strict=True) if pair in same)
-        tally["family"] += any(hit for pair, hit in zip(pairs, after, strict=True) if pair in same)
-        tally["found"] += sum(hit for pair, hit in zip(pairs, hits, strict=True) if pair not in same)
-    shown = max(tally["computed"], 1)
-    differing = len(pairs) - len(same)
+            contrast[list(pair)] = -1, 1
+            error = error_of(wins, found, contrast)
+            if error is None or error[0] <= NO_SPREAD:
+                p_values.append(None)
+                continue
+            p = float(2 * stats.t.sf(abs(contrast @ found) / error[0], error[1]))
+            p_values.append(p)
+            off = abs(contrast @ (found - truth))
+            offered[pair] += 1
+            missed[pair] += int(off > stats.t.ppf(0.975, error[1]) * error[0])
+            naive_missed[pair] += int(off > 1.96 * float(contrast @ naive @ contrast) ** 0.5)
+            hit[pair] += p < ALPHA
+        after = dict(zip(pairs, holm(p_values), strict=True))
+        families += any(p is not None and p < ALPHA for pair, p in after.items() if pair in same)
+    alarms = [100 * hit[pair] / max(offered[pair], 1) for pair in same]
+    different = [pair for pair in pairs if pair not in same]
+    shown = max(sum(offered.values()), 1)
     return {
+        "arms": ", ".join("".join("ABC"[method] for method in arm) for arm in arms),
         "people": people,
         "spread": spread,
         "effect": effect,
         "studies": studies,
-        "computed_percent": round(100 * tally["computed"] / studies, 1),
-        "misses_percent": round(100 * tally["missed"] / shown / len(pairs), 1),
-        "misses_if_answers_counted_percent": round(100 * tally["naive_missed"] / shown / len(pairs), 1),
-        "false_alarms_percent": round(100 * tally["false"] / shown / len(same), 1),
-        "false_alarms_of_family_percent": round(100 * tally["family"] / shown, 1),
-        "power_percent": round(100 * tally["found"] / studies / differing, 1) if differing else "",
+        "offered_percent": round(100 * sum(offered.values()) / studies / len(pairs), 1),
+        "misses_percent": round(100 * sum(missed.values()) / shown, 1),
+        "misses_if_answers_counted_percent": round(100 * sum(naive_missed.values()) / shown, 1),
+        "false_alarms_percent": round(
+            100 * sum(hit[pair] for pair in same) / max(sum(offered[pair] for pair in same), 1), 1
+        ),
+        "false_alarms_of_worst_pair_percent": round(max(alarms), 1),
+        "false_alarms_of_family_percent": round(100 * families / studies, 1),
+        "power_percent": round(100 * sum(hit[pair] for pair in different) / studies / len(different), 1)
+        if different
+        else "",
     }
+
+
+def naive_covariance(wins: FloatArray, found: FloatArray) -> FloatArray:
+    """Of the strengths, as if each answer came from another person. ``wins`` (methods, methods)."""
+    chances = 1 / (1 + np.exp(found[None, :] - found[:, None]))
+    weights = (wins + wins.T) * chances * (1 - chances)
+    return np.asarray(np.linalg.pinv(np.diag(weights.sum(axis=1)) - weights), np.float64)
 
 
 TITLE = "# Error rates of head-to-heads"
@@ -92,11 +110,16 @@ TITLE = "# Error rates of head-to-heads"
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure everything and write both files."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--studies", type=int, default=2000, help="of each truth")
+    parser.add_argument("--studies", type=int, default=1000, help="of each truth")
     parser.add_argument("--to", type=Path, default=RESULTS, help="folder to write to")
     options = parser.parse_args(arguments)
+    everybody = ((0, 1, 2),)
     rows = [
-        row(people, spread, effect, options.studies) for effect in EFFECTS for spread in SPREADS for people in PEOPLE
+        row(arms, people, spread, effect, options.studies)
+        for arms, numbers, spreads in ((everybody, PEOPLE, SPREADS), *((a, IN_EACH_ARM, SPREADS_IN_ARMS) for a in ARMS))
+        for effect in EFFECTS
+        for spread in spreads
+        for people in numbers
     ]
     with (options.to / "head_to_head.csv").open("w", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")

@@ -183,8 +183,8 @@ SAME = {
 """By what R calls it: the test of the report, and quantities that mean the same."""
 
 
-def by_hand(study: Invented, tables: Tables, rows: Rows, compared_by: int) -> Iterator[dict[str, Any]]:
-    """Every number of by_hand.R with the report's; ``compared_by``: people who answered head-to-heads."""
+def by_hand(study: Invented, tables: Tables, rows: Rows) -> Iterator[dict[str, Any]]:
+    """Every number of by_hand.R with the report's."""
     tests = {(each["scale"], each["first"], each["second"], each["test"]): each for each in tables["comparisons"]}
     orders = {(each["scale"], each["effect"]): each for each in tables["order_effects"]}
     strengths = {each["group"]: each for each in tables["strengths"] if "group" in each}
@@ -199,7 +199,7 @@ def by_hand(study: Invented, tables: Tables, rows: Rows, compared_by: int) -> It
             mine = strengths[row["first"]]["strength"]
         elif kind == "jackknife":
             found = strengths[row["first"]]
-            mine = (found["high"] - found["strength"]) / stats.t.ppf(0.975, compared_by - 1)
+            mine = (found["high"] - found["strength"]) / stats.t.ppf(0.975, found["degrees_of_freedom"])
         if mine is not None:
             yield {"study": study.name, "analysis": kind, "quantity": quantity, "r": row["value"], "report": mine}
 
@@ -228,8 +228,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             scripted += against_script(study, contents, folder / "analysis")
             _run(BY_HAND, folder / "csv", folder / "by_hand.csv")
             hand = pd.read_csv(folder / "by_hand.csv", keep_default_na=False, na_values=["NA"])
-            answered = tables["headtoheads"]["participant"].nunique()
-            compared += by_hand(study, contents, hand.to_dict("records"), answered)
+            compared += by_hand(study, contents, hand.to_dict("records"))
         sys.stdout.write(f"{study.name}\n")
     save(said.to, scripted, compared)
     return 0

@@ -282,8 +282,9 @@ def _analysis(study: Study, plan: Plan) -> Iterator[str]:
         else "",
         "Order and carryover: F tests of the analysis of variance of a crossover (person, method, period; then the "
         "method before).",
-        "Head-to-heads: Bradley-Terry strengths, an equal answer as half a win for each, with a sandwich covariance "
-        "over people, and Holm's method over their comparisons."
+        "Head-to-heads: Bradley-Terry strengths, an equal answer as half a win for each, with a sandwich variance over "
+        "people corrected for the people whom a difference rests on (Bell and McCaffrey 2002), t with Satterthwaite's "
+        "degrees of freedom, and Holm's method over their comparisons."
         if evaluation.head_to_heads
         else "",
         "Which robot was made for them: exact two-sided binomial test against chance."

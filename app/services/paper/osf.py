@@ -262,7 +262,8 @@ def _analysis(study: Study, settings: StudySettings) -> Mapping[str, str]:
         )
         + (
             "\n\nHead-to-heads: Bradley-Terry strengths, an equal answer as half a win for each, with a sandwich "
-            "covariance over people and t with people less one degrees of freedom."
+            "variance over people corrected for the people whom a difference rests on (Bell and McCaffrey 2002), and t "
+            "with Satterthwaite's degrees of freedom: people less one where everybody compares all, fewer in arms."
             if evaluation and evaluation.head_to_heads
             else ""
         )

@@ -258,7 +258,8 @@ def _head_to_heads(found: Result) -> Iterator[str]:
         return
     yield (
         "Bradley-Terry strengths (log odds, their sum is zero; an equal answer is half a win for each), with intervals "
-        "and tests that count people (sandwich covariance, t with people less one degrees of freedom):"
+        "and tests that count people (sandwich variance corrected for the people whom a difference rests on, t with "
+        "Satterthwaite's degrees of freedom, which are people less one where everybody compared all):"
     )
     rows = [
         (name_of(each["group"]), f"{number(each['strength'])}{interval(each['low'], each['high'])}")

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from worker.analysis.study.bradley_terry import covariance, head_to_head_report, strengths
+from worker.analysis.study.bradley_terry import error_of, head_to_head_report, strengths
 
 
 def answers(person: str, left: str, right: str, *said: str) -> list[dict[str, Any]]:
@@ -38,10 +38,32 @@ def test_two_methods_by_hand() -> None:
     assert report["wins"] == [[0, 18], [6, 0]]
     wins = np.array([[[0, w], [4 - w, 0]] for w in (4, 4, 4, 2, 2, 2)], float)
     found = strengths(wins.sum(axis=0))
-    spread = covariance(wins, found)
     information, scores = 24 * 0.75 * 0.25, 6 * 1.0
-    difference = spread[0, 0] + spread[1, 1] - 2 * spread[0, 1]
-    assert difference == pytest.approx(6 / 5 * scores / information**2)
+    error, degrees_of_freedom = error_of(wins, found, np.array([-1.0, 1.0])) or (0.0, 0.0)
+    assert error**2 == pytest.approx(6 / 5 * scores / information**2)
+    assert degrees_of_freedom == pytest.approx(5)
+
+
+def test_in_arms_only_those_count_who_tell_about_the_two_methods() -> None:
+    """Arms of a with b and of b with c: a with b rests on four people, a with c on the four and the six."""
+    rows = [row for p in range(4) for row in answers(f"x{p}", "a", "b", "left", "left" if p else "right", "right")]
+    rows += [row for p in range(6) for row in answers(f"y{p}", "b", "c", "left", "left" if p % 2 else "right", "right")]
+    by_pair = {(e["first"], e["second"]): e for e in head_to_head_report(rows, ["a", "b", "c"])["comparisons"]}
+    alone = head_to_head_report([e for e in rows if e["participant"][0] == "x"], ["a", "b"])["comparisons"][0]
+    for name in ("difference", "low", "high", "p"):
+        assert by_pair["a", "b"][name] == pytest.approx(alone[name])
+    assert by_pair["a", "b"]["degrees_of_freedom"] == pytest.approx(3)
+    assert by_pair["b", "c"]["degrees_of_freedom"] == pytest.approx(5)
+    assert by_pair["a", "c"]["degrees_of_freedom"] > by_pair["a", "b"]["degrees_of_freedom"]
+
+
+@pytest.mark.parametrize("people", [1, 2])
+def test_a_comparison_that_too_few_people_made_has_no_p(people: int) -> None:
+    rows = [row for p in range(people) for row in answers(f"x{p}", "a", "b", "left", *["left"] * p, "right")]
+    rows += [row for p in range(8) for row in answers(f"y{p}", "b", "c", "left", "left" if p % 2 else "right", "right")]
+    by_pair = {(e["first"], e["second"]): e for e in head_to_head_report(rows, ["a", "b", "c"])["comparisons"]}
+    assert by_pair["a", "b"]["p"] is by_pair["a", "b"]["low"] is by_pair["a", "c"]["p"] is None
+    assert by_pair["b", "c"]["p"] is not None
 
 
 def test_an_equal_is_half_a_win_and_sides_do_not_matter() -> None:
@@ -50,6 +72,13 @@ def test_an_equal_is_half_a_win_and_sides_do_not_matter() -> None:
     first, second = (head_to_head_report(rows, ["a", "b"]) for rows in (one, other))
     assert first["wins"] == second["wins"] == [[0, 6], [2, 0]]
     assert first["comparisons"] == second["comparisons"]
+
+
+def test_where_all_answered_alike_no_strength_has_an_interval() -> None:
+    rows = [row for p in "vwxyz" for row in answers(p, "a", "b", "left", "left", "right")]
+    report = head_to_head_report(rows, ["a", "b"])
+    assert [each["low"] for each in report["strengths"]] == [None, None]
+    assert report["comparisons"][0]["p"] is None
 
 
 def test_the_same_answers_from_fewer_people_say_less() -> None:

@@ -389,6 +389,37 @@ def test_head_to_heads_with_equal_answers_are_computed_alike(
         assert_same(reported, script[name](study), name)
 
 
+@pytest.mark.parametrize("alone", [1, 2, 4])
+def test_head_to_heads_in_arms_are_computed_alike(script: dict[str, Any], tmp_path: Path, alone: int) -> None:
+    """``alone`` people compare the first two methods, where one or two are too few to tell."""
+    random, methods = np.random.default_rng(alone), ["reference", "prefft", "pbarl"]
+    rows = [
+        {"participant": f"P{number}", "left_method": left, "right_method": right, "counts": True}
+        | {"response": "left" if answer == 0 else "right" if answer == 1 else random.choice(["left", "equal", "right"])}
+        for number in range(alone + 6)
+        for left, right in [methods[:2] if number < alone else methods[1:]]
+        for answer in range(4 + number % 2)
+    ]
+    (tmp_path / "csv").mkdir()
+    study = invented(
+        script,
+        tmp_path / "csv",
+        headtoheads=pd.DataFrame(rows),
+        methods=pd.DataFrame({"method": methods}),
+    )
+    report = head_to_head_report(
+        [{**each, "left": each["left_method"], "right": each["right_method"]} for each in rows], methods
+    )
+    reported = head_to_head_tables(report)["strengths"]
+    assert_same(reported, script["strengths"](study), "strengths")
+    if shutil.which("Rscript"):
+        call = (
+            "source(commandArgs(TRUE)[1]); write.csv(strengths(read_study(commandArgs(TRUE)[2])), commandArgs(TRUE)[3])"
+        )
+        run("Rscript", "-e", call, ANALYSIS / "analysis.R", tmp_path / "csv", tmp_path / "strengths.csv")
+        assert_same(reported, pd.read_csv(tmp_path / "strengths.csv", index_col=0).to_dict("records"), "strengths")
+
+
 def test_guesses_are_computed_alike(script: dict[str, Any], tmp_path: Path) -> None:
     methods, said = ["reference", "somebody_else", "pbarl"], "CCCCABCB"
     ratings = pd.DataFrame(

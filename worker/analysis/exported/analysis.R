@@ -549,7 +549,7 @@ is_connected <- function(won) {
   all(reached)
 }
 
-# Bradley and Terry's model as a logistic regression, with a sandwich covariance over people.
+# Bradley and Terry's model as a logistic regression, with a sandwich variance over people.
 strengths <- function(study) {
   rows <- head_to_heads(study)
   groups <- study$groups
@@ -558,28 +558,53 @@ strengths <- function(study) {
   design <- sapply(groups, function(group) (rows$left_method == group) - (rows$right_method == group))[, -1, drop = FALSE]
   won <- unname(SHARE[rows$response])
   fit <- suppressWarnings(glm(won ~ design - 1, family = binomial, control = list(epsilon = 1e-14, maxit = 100)))
-  bread <- solve(t(design) %*% (design * fit$fitted.values * (1 - fit$fitted.values)))
-  scores <- rowsum(design * (won - fit$fitted.values), rows$participant)
-  centre <- (diag(length(groups)) - 1 / length(groups))[, -1]
+  centre <- (diag(length(groups)) - 1 / length(groups))[, -1, drop = FALSE]
   found <- as.numeric(centre %*% coef(fit))
-  spread <- centre %*% bread %*% crossprod(scores) %*% bread %*% t(centre) * length(who) / (length(who) - 1)
-  t <- qt(0.975, length(who) - 1)
-  margins <- t * sqrt(diag(spread))
+  error_of <- function(contrast) error_of_strengths(design, won, fit$fitted.values, rows$participant, contrast)
+  shown <- stack_rows(lapply(seq_along(groups), function(i) {
+    error <- error_of(centre[i, ])
+    if (is.na(error[1]) || error[1] <= 1e-9) error <- c(NA, NA)
+    margin <- if (is.na(error[2])) NA else qt(0.975, error[2]) * error[1]
+    row_of(group = groups[i], strength = found[i], low = found[i] - margin, high = found[i] + margin, degrees_of_freedom = error[2])
+  }))
   pairs <- stack_rows(combn(length(groups), 2, simplify = FALSE, FUN = function(pair) {
     difference <- found[pair[2]] - found[pair[1]]
-    error <- sqrt(max(spread[pair[1], pair[1]] + spread[pair[2], pair[2]] - 2 * spread[pair[1], pair[2]], 0))
+    error <- error_of(centre[pair[2], ] - centre[pair[1], ])
     result <- row_of(first = groups[pair[1]], second = groups[pair[2]], difference = difference, chance = plogis(difference), p = NA)
-    if (error > 1e-9) {
-      result$low <- difference - t * error
-      result$high <- difference + t * error
+    if (!is.na(error[1]) && error[1] > 1e-9) {
+      margin <- qt(0.975, error[2]) * error[1]
+      result$low <- difference - margin
+      result$high <- difference + margin
       result$chance_low <- plogis(result$low)
       result$chance_high <- plogis(result$high)
-      result$p <- 2 * pt(-abs(difference / error), length(who) - 1)
+      result$p <- 2 * pt(-abs(difference / error[1]), error[2])
+      result$degrees_of_freedom <- error[2]
     }
     result
   }))
   pairs$p_holm <- holm(pairs$p)
-  stack_rows(list(row_of(group = groups, strength = found, low = found - margins, high = found + margins), pairs))
+  stack_rows(list(shown, pairs))
+}
+
+# Standard error of a difference of strengths and its degrees of freedom; NA where too few people tell.
+# A sandwich over people, corrected for the people whom this difference rests on (Bell and McCaffrey 2002).
+error_of_strengths <- function(design, won, chances, participant, contrast) {
+  weights <- chances * (1 - chances)
+  bread <- solve(t(design) %*% (design * weights))
+  along <- bread %*% contrast
+  parts <- rowsum(design * weights * as.numeric(design %*% along), participant)
+  alone <- as.numeric(parts %*% along)
+  tells <- alone > 1e-9 * sum(alone)
+  seen <- as.numeric(rowsum(design * (won - chances), participant) %*% along)[tells]
+  parts <- parts[tells, , drop = FALSE]
+  alone <- alone[tells]
+  shared <- parts %*% bread %*% t(parts)
+  left <- alone - diag(shared)
+  if (any(left < 1e-9 * alone)) return(c(NA, NA))
+  scale <- sqrt(alone / left)
+  model <- outer(scale, scale) * (diag(alone, length(alone)) - shared)
+  freedom <- sum(diag(model))^2 / sum(model^2)
+  if (freedom < 2) c(NA, NA) else c(sqrt(sum((scale * seen)^2)), freedom)
 }
 
 # Whether people knew which robot was made for them, against chance.
@@ -857,7 +882,7 @@ head_to_heads_figure <- function(study) {
   found <- found[!is.na(found$strength), ]
   found <- found[order(found$strength), ]
   par(mar = c(5, 10, 2, 1))
-  ends <- range(0, found$low, found$high)
+  ends <- range(0, found$strength, found$low, found$high, na.rm = TRUE)
   plot(
     found$strength, seq_len(nrow(found)), pch = 18, col = BLUE, xlim = ends, yaxt = "n", ylab = "",
     xlab = "Strength (log odds against the average robot; right: preferred)"

@@ -675,7 +675,7 @@ def wins(study):
 
 
 def strengths(study):
-    """Bradley and Terry's model as a logistic regression, with a sandwich covariance over people.
+    """Bradley and Terry's model as a logistic regression, with a sandwich variance over people.
 
     Rows with a group: its strength; rows with first and second: the difference of strengths.
     """
@@ -692,30 +692,56 @@ def strengths(study):
     )
     won = answers["response"].map({"left": 1.0, "equal": 0.5, "right": 0.0}).to_numpy(float)
     clusters = pd.factorize(answers["participant"])[0]
-    fit = GLM(won, design[:, 1:], family=Binomial()).fit(
-        cov_type="cluster", cov_kwds={"groups": clusters, "use_correction": False}, tol=1e-12, maxiter=100
-    )
+    fit = GLM(won, design[:, 1:], family=Binomial()).fit(tol=1e-12, maxiter=100)
     centre = (np.eye(len(groups)) - 1 / len(groups))[:, 1:]
-    found, spread = centre @ fit.params, centre @ fit.cov_params() @ centre.T * len(who) / (len(who) - 1)
-    t = stats.t.ppf(0.975, len(who) - 1)
-    margins = t * np.sqrt(np.maximum(np.diag(spread), 0.0))
-    result = [
-        {"group": group, "strength": found[i], "low": found[i] - margins[i], "high": found[i] + margins[i]}
-        for i, group in enumerate(groups)
-    ]
+    found = centre @ fit.params
+    weights = fit.fittedvalues * (1 - fit.fittedvalues)
+    people = [design[clusters == i, 1:] for i in range(len(who))]
+    information = np.array([rows.T @ (weights[clusters == i, None] * rows) for i, rows in enumerate(people)])
+    scores = np.array([rows.T @ (won - fit.fittedvalues)[clusters == i] for i, rows in enumerate(people)])
+    result = []
+    for i, group in enumerate(groups):
+        error, freedom = error_of_strengths(scores, information, centre[i])
+        row = {"group": group, "strength": found[i]}
+        if error > 1e-9:
+            margin = stats.t.ppf(0.975, freedom) * error
+            row |= {"low": found[i] - margin, "high": found[i] + margin, "degrees_of_freedom": freedom}
+        result.append(row)
     pairs = []
     for i, j in combinations(range(len(groups)), 2):
         difference = found[j] - found[i]
-        error = math.sqrt(max(spread[i, i] + spread[j, j] - 2 * spread[i, j], 0.0))
+        error, freedom = error_of_strengths(scores, information, centre[j] - centre[i])
         pair = {"first": groups[i], "second": groups[j], "difference": difference, "chance": special.expit(difference)}
         if error > 1e-9:
-            pair["low"], pair["high"] = difference - t * error, difference + t * error
+            margin = stats.t.ppf(0.975, freedom) * error
+            pair["low"], pair["high"] = difference - margin, difference + margin
             pair["chance_low"], pair["chance_high"] = special.expit(pair["low"]), special.expit(pair["high"])
-            pair["p"] = 2 * stats.t.sf(abs(difference / error), len(who) - 1)
+            pair["p"] = 2 * stats.t.sf(abs(difference / error), freedom)
+            pair["degrees_of_freedom"] = freedom
         pairs.append(pair)
     for pair, p in zip(pairs, holm([each.get("p") for each in pairs]), strict=True):
         pair["p_holm"] = p
     return result + pairs
+
+
+def error_of_strengths(scores, information, contrast):
+    """Standard error of a difference of strengths and its degrees of freedom; nan where too few people tell.
+
+    A sandwich over people, corrected for the people whom this difference rests on (Bell and McCaffrey 2002).
+    """
+    bread = np.linalg.inv(information.sum(axis=0))
+    parts = information @ bread @ contrast
+    alone = parts @ bread @ contrast
+    tells = alone > 1e-9 * alone.sum()
+    seen, parts, alone = scores[tells] @ bread @ contrast, parts[tells], alone[tells]
+    shared = parts @ bread @ parts.T
+    left = alone - np.diag(shared)
+    if (left < 1e-9 * alone).any():
+        return np.nan, np.nan
+    scale = np.sqrt(alone / left)
+    model = scale[:, None] * (np.diag(alone) - shared) * scale
+    freedom = np.trace(model) ** 2 / (model**2).sum()
+    return (np.nan, np.nan) if freedom < 2 else (math.sqrt(((scale * seen) ** 2).sum()), freedom)
 
 
 def guesses(study):
@@ -1005,7 +1031,8 @@ def head_to_heads_figure(study):
     found = sorted((each for each in strengths(study) if "group" in each), key=lambda each: -each["strength"])
     figure, axes = plt.subplots(figsize=(5.6, 0.45 * len(found) + 1.2), layout="constrained")
     for row, each in enumerate(found):
-        axes.plot([each["low"], each["high"]], [row, row], color=GREY)
+        if "low" in each:
+            axes.plot([each["low"], each["high"]], [row, row], color=GREY)
         axes.plot(each["strength"], row, "D", color=BLUE)
     axes.axvline(0, color=INK, linewidth=0.8)
     axes.set_yticks(range(len(found)), [name_of(each["group"]) for each in found])

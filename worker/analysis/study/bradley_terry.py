@@ -1,9 +1,11 @@
 """Head-to-heads: Bradley-Terry strengths of the methods, with intervals and tests that count people and not answers.
 
 P(a preferred to b) = 1 / (1 + exp(strength_b - strength_a)); strengths sum to zero (Bradley and Terry 1952, Biometrika
-39, 324). An "equal" is half a win for each. The estimate is the maximum of that (quasi-)likelihood; its covariance is
-the sandwich over people (Liang and Zeger 1986), times G / (G - 1), with a t of people - 1 degrees of freedom, since
-answers of one person resemble each other. What is estimated is what holds for somebody drawn at random.
+39, 324). An "equal" is half a win for each. The estimate is the maximum of that (quasi-)likelihood; its variance is
+the sandwich over people (Liang and Zeger 1986), since answers of one person resemble each other, and for every
+difference it is corrected for the people whom that difference rests on, with Satterthwaite's degrees of freedom (Bell
+and McCaffrey 2002, Survey Methodology 28, 169): where everybody compares all, people - 1, and fewer in arms. What is
+estimated is what holds for somebody drawn at random.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,7 +21,9 @@ from worker.analysis.study.hypothesis_tests import not_computable, plain
 from worker.domain.type_aliases import FloatArray
 
 FEWEST_PEOPLE = 4
-"""Below, a covariance over people says nothing."""
+"""Below, a variance over people says nothing."""
+FEWEST_DEGREES = 2.0
+"""Degrees of freedom below which a difference rests on too few people, though others have compared other methods."""
 NO_SPREAD = 1e-9
 """Standard error up to which all people answered alike, so that nothing says how they scatter."""
 _STEPS = 100
@@ -29,9 +33,9 @@ def head_to_head_report(answers: Sequence[Mapping[str, Any]], groups: Sequence[s
     """``answers``: rows with participant, left, right (of ``groups``) and response, those that count.
 
     people, answers, equal, left (shares of the sides, ties apart); wins[row][column]: how often row was preferred to
-    column, an equal as one half; strengths[] (group, strength, low, high) and comparisons[] (first, second, difference
-    of strengths second minus first, low, high, p, p_holm, and the chance with its interval that second is preferred),
-    or ``not_computable``.
+    column, an equal as one half; strengths[] (group, strength, low, high, degrees_of_freedom) and comparisons[] (first,
+    second, difference of strengths second minus first, low, high, p, p_holm, degrees_of_freedom, and the chance with
+    its interval that second is preferred), or ``not_computable``. No interval and no p where too few people tell.
     """
     rows = [each for each in answers if each["left"] in groups and each["right"] in groups]
     people = list(dict.fromkeys(each["participant"] for each in rows))
@@ -80,12 +84,35 @@ def strengths(wins: FloatArray) -> FloatArray:
     return np.asarray(found - found.mean(), np.float64)
 
 
-def covariance(wins: FloatArray, found: FloatArray) -> FloatArray:
-    """Of the strengths, (methods, methods): the sandwich over people. ``wins`` (people, methods, methods)."""
-    met, expected, count = wins + wins.transpose(0, 2, 1), _chances(found), len(wins)
-    scores = (wins - met * expected).sum(axis=2)
-    bread = np.linalg.pinv(_information(met.sum(axis=0), expected))
-    return np.asarray(count / (count - 1) * bread @ (scores.T @ scores) @ bread, np.float64)
+def error_of(wins: FloatArray, found: FloatArray, contrast: FloatArray) -> tuple[float, float] | None:
+    """Standard error of ``contrast @ found`` and its degrees of freedom; None where too few people tell.
+
+    ``wins`` (people, methods, methods), ``contrast`` (methods,). By the model person g adds v_g to the variance, of
+    which h_g cannot be seen, since the estimate follows their answers: what is seen is divided by 1 - h_g / v_g.
+    """
+    met, expected = wins + wins.transpose(0, 2, 1), _chances(found)
+    information = np.stack([_information(each, expected) for each in met])
+    bread = np.linalg.pinv(information.sum(axis=0))
+    seen = (wins - met * expected).sum(axis=2) @ bread @ contrast
+    parts = information @ bread @ contrast  # (people, methods)
+    shared = parts @ bread @ parts.T
+    alone = parts @ bread @ contrast
+    tells = alone > NO_SPREAD * alone.sum()
+    seen, shared, alone = seen[tells], shared[np.ix_(tells, tells)], alone[tells]
+    left = alone - np.diag(shared)
+    if (left < NO_SPREAD * alone).any():
+        return None  # one person alone tells about it
+    scale = np.sqrt(alone / left)
+    model = scale[:, None] * (np.diag(alone) - shared) * scale
+    degrees = float(np.trace(model) ** 2 / (model**2).sum())
+    return None if degrees < FEWEST_DEGREES else (float(((scale * seen) ** 2).sum()) ** 0.5, degrees)
+
+
+def head_to_head_p(wins: FloatArray, found: FloatArray, first: int, second: int) -> float | None:
+    """Of two methods, by their numbers; None where too few people tell, or all answered alike."""
+    error = error_of(wins, found, np.eye(len(found))[second] - np.eye(len(found))[first])
+    p: float | None = _compared("", "", float(found[second] - found[first]), error)["p"]
+    return p
 
 
 def _chances(found: FloatArray) -> FloatArray:
@@ -98,41 +125,37 @@ def _information(met: FloatArray, expected: FloatArray) -> FloatArray:
 
 
 def _estimated(wins: FloatArray, groups: Sequence[str]) -> dict[str, Any]:
-    found = strengths(wins.sum(axis=0))
-    spread = covariance(wins, found)
-    t = float(stats.t.ppf(0.975, len(wins) - 1))
-    margins = t * np.sqrt(np.maximum(np.diag(spread), 0.0))  # which rounding can leave below a variance of 0
-    comparisons = []
-    for first, second in combinations(range(len(groups)), 2):
+    found, count = strengths(wins.sum(axis=0)), len(groups)
+    shown, comparisons = [], []
+    for i, group in enumerate(groups):
+        strength = _between(float(found[i]), error_of(wins, found, np.eye(count)[i] - 1 / count))
+        shown.append({"group": group, "strength": plain(found[i])} | strength)
+    for first, second in combinations(range(count), 2):
         difference = float(found[second] - found[first])
-        error = float(max(spread[first, first] + spread[second, second] - 2 * spread[first, second], 0.0)) ** 0.5
-        comparisons.append(_compared(groups[first], groups[second], difference, error, len(wins) - 1))
+        error = error_of(wins, found, np.eye(count)[second] - np.eye(count)[first])
+        comparisons.append(_compared(groups[first], groups[second], difference, error))
     for each, corrected in zip(comparisons, holm([each["p"] for each in comparisons]), strict=True):
         each["p_holm"] = corrected
-    return {
-        "strengths": [
-            {
-                "group": group,
-                "strength": plain(found[i]),
-                "low": plain(found[i] - margins[i]),
-                "high": plain(found[i] + margins[i]),
-            }
-            for i, group in enumerate(groups)
-        ],
-        "comparisons": comparisons,
-    }
+    return {"strengths": shown, "comparisons": comparisons}
 
 
-def _compared(first: str, second: str, difference: float, error: float, degrees_of_freedom: int) -> dict[str, Any]:
+def _between(estimate: float, error: tuple[float, float] | None) -> dict[str, Any]:
+    """The interval; none where too few people tell, or where there is no spread."""
+    if error is None or error[0] <= NO_SPREAD:
+        return {"low": None, "high": None, "degrees_of_freedom": None}
+    margin = float(stats.t.ppf(0.975, error[1])) * error[0]
+    return {"low": estimate - margin, "high": estimate + margin, "degrees_of_freedom": error[1]}
+
+
+def _compared(first: str, second: str, difference: float, error: tuple[float, float] | None) -> dict[str, Any]:
     """No p and no interval where there is no spread."""
+    if error is not None and error[0] <= NO_SPREAD:
+        error = None
     compared: dict[str, Any] = {"first": first, "second": second, "difference": difference}
-    compared["chance"] = float(1 / (1 + np.exp(-difference)))
-    compared |= dict.fromkeys(("low", "high", "chance_low", "chance_high", "p"))
-    if error > NO_SPREAD:
-        margin = float(stats.t.ppf(0.975, degrees_of_freedom)) * error
-        compared["low"], compared["high"] = difference - margin, difference + margin
-        compared["chance_low"], compared["chance_high"] = (
-            float(1 / (1 + np.exp(-end))) for end in (difference - margin, difference + margin)
-        )
-        compared["p"] = plain(2 * stats.t.sf(abs(difference / error), degrees_of_freedom))
+    compared |= _between(difference, error)
+    compared |= {
+        name: None if end is None else float(1 / (1 + np.exp(-end)))
+        for name, end in (("chance", difference), ("chance_low", compared["low"]), ("chance_high", compared["high"]))
+    }
+    compared["p"] = plain(2 * stats.t.sf(abs(difference / error[0]), error[1])) if error else None
     return compared

@@ -212,7 +212,8 @@ def head_to_head_strengths(contents: Mapping[str, Any]) -> Figure | None:
         axes = figure.subplots()
         axes.axvline(0, color=INK, linewidth=0.8)
         for row, each in enumerate(ordered):
-            axes.plot([each["low"], each["high"]], [row, row], color=GREY, linewidth=1.2, zorder=2)
+            if each["low"] is not None:
+                axes.plot([each["low"], each["high"]], [row, row], color=GREY, linewidth=1.2, zorder=2)
             axes.plot(each["strength"], row, "D", color=LINE_COLOURS[2], markersize=6.5, zorder=3)
         axes.set_yticks(range(len(ordered)), [name_of(each["group"]) for each in ordered])
         axes.set_ylim(len(ordered) - 0.4, -0.6)

@@ -15,10 +15,9 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
-from scipy import stats
 
 from worker.analysis.study.between import equivalence_between, means_of, welch_t
-from worker.analysis.study.bradley_terry import NO_SPREAD, covariance, strengths, why_not
+from worker.analysis.study.bradley_terry import head_to_head_p, strengths, why_not
 from worker.analysis.study.cumulative_link import cumulative_link, cumulative_link_between
 from worker.analysis.study.effect_sizes import holm
 from worker.analysis.study.hypothesis_tests import FEWEST_PAIRED, equivalence, paired_t
@@ -173,13 +172,7 @@ def _head_to_heads_p(truth: Truth, worth: FloatArray, meets: Any, rng: np.random
     if why_not(wins):
         return [None for _ in pairs]
     found = strengths(wins.sum(axis=0))
-    spread, people = covariance(wins, found), len(wins)
-    p_values: list[float | None] = []
-    for first, second in pairs:
-        error = max(spread[first, first] + spread[second, second] - 2 * spread[first, second], 0.0) ** 0.5
-        p = float(2 * stats.t.sf(abs(found[second] - found[first]) / max(error, NO_SPREAD), people - 1))
-        p_values.append(p if error > NO_SPREAD else None)
-    return p_values
+    return [head_to_head_p(wins, found, first, second) for first, second in pairs]
 
 
 def _is_found(truth: Truth, p_values: Sequence[float | None]) -> bool:
