@@ -8,7 +8,7 @@ included. An experimenter locks the study before they come, and unblinds it when
 import hashlib
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
@@ -36,7 +36,7 @@ from worker.rehearsal import experimenter_steps as conclusion
 from worker.rehearsal.browser import OVER, UP_TO_PAIRS, WAITING, Asked, FormBrowser
 from worker.rehearsal.experimenter_steps import Conclusion
 from worker.rehearsal.participant_steps import Insight, Rated, ScriptedPerson
-from worker.rehearsal.server import PATIENCE_S, wait_until
+from worker.rehearsal.server import PATIENCE_S, Answered, wait_until
 
 
 @dataclass
@@ -162,7 +162,7 @@ class Rehearsal:
             experimenter.log_in(accounts.FIRST_EXPERIMENTER, password or "")
             conclusion.lock(experimenter, study)
             if self.unhurried:
-                wait_until(PATIENCE_S, "no whole pool", lambda: self._pool_is_whole(study) or None)
+                self._wait_until("no whole pool", lambda: self._pool_is_whole(study) or None)
             began = time.monotonic()
             outcomes, persons = [], []
             for (participant, token), taste in zip(enrolled, tastes, strict=True):
@@ -193,7 +193,7 @@ class Rehearsal:
             return
         came = time.monotonic()
         while visitor.page not in OVER:
-            if wait_until(PATIENCE_S, "no page to go on with", partial(_act, visitor, person)) is Asked.RATING:
+            if self._wait_until("no page to go on with", partial(_act, visitor, person)) is Asked.RATING:
                 outcome.waited_for_robots_seconds = outcome.waited_for_robots_seconds or time.monotonic() - came
 
     def _answer_everything(
@@ -206,9 +206,9 @@ class Rehearsal:
             while visitor.page in UP_TO_PAIRS:
                 query_id = visitor.query_id()
                 if query_id is None:
-                    wait_until(PATIENCE_S, "no pair to label", partial(_act, visitor, person))
+                    self._wait_until("no pair to label", partial(_act, visitor, person))
                     continue
-                wait_until(PATIENCE_S, "no prediction", partial(self._was_predicted, outcome, query_id))
+                self._wait_until("no prediction", partial(self._was_predicted, outcome, query_id))
                 time.sleep(self.pace_s)
                 sent = time.perf_counter()
                 visitor.act(person)
@@ -218,8 +218,17 @@ class Rehearsal:
                     continue
                 outcome.labels += 1
                 if outcome.labels % settings.retrain_every_labels == 0 and visitor.page not in OVER:
-                    wait_until(PATIENCE_S, "no reward model", lambda: self._has_learned(outcome) or None)
+                    self._wait_until("no reward model", lambda: self._has_learned(outcome) or None)
         outcome.answering_seconds = time.monotonic() - came
+
+    def _wait_until(self, missing: str, look: Callable[[], Answered | None]) -> Answered:
+        """As wait_until(), for as long as the worker gets on."""
+        return wait_until(PATIENCE_S, missing, look, self._how_far)
+
+    def _how_far(self) -> Sequence[object]:
+        """Something else whenever the worker has got on."""
+        with self.database.reading() as session:
+            return session.execute(select(Run.workflow_id, Run.status, Run.stage, Run.progress)).all()
 
     def _is_label(self, query_id: int) -> bool:
         with self.database.reading() as session:
@@ -265,7 +274,7 @@ class Rehearsal:
                 ).first()
                 return None if row is None else (row[0], row[1])
 
-        model, bundle = wait_until(PATIENCE_S, "no bundle", finished)
+        model, bundle = self._wait_until("no bundle", finished)
         outcome.bundle_seconds = time.monotonic() - outcome.finished_at
         outcome.evaluation = model.metrics["evaluation"]
         outcome.gate = model.metrics["gate"]

@@ -107,10 +107,19 @@ class OwnStudio:
             ).result()
 
 
-def wait_until(patience_s: float, missing: str, look: Callable[[], Answered | None]) -> Answered:
-    """What ``look`` finds in the end. Raises StandsStill when it has found nothing for too long."""
-    deadline = time.monotonic() + patience_s
+def wait_until(
+    patience_s: float,
+    missing: str,
+    look: Callable[[], Answered | None],
+    how_far: Callable[[], object] = lambda: None,
+) -> Answered:
+    """What ``look`` finds in the end. Raises StandsStill when it finds nothing and ``how_far`` says the same for too
+    long.
+    """
+    deadline, known = time.monotonic() + patience_s, how_far()
     while (found := look()) is None:
+        if known != (known := how_far()):
+            deadline = time.monotonic() + patience_s
         if time.monotonic() > deadline:
             raise StandsStill(f"There was {missing} for {patience_s:.0f} s; rehearsal.log says what went on.")
         time.sleep(POLL_S)

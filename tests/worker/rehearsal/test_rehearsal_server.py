@@ -5,11 +5,14 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import partial
+from itertools import count
 from pathlib import Path
 
 import pytest
 
 from tests.waiting import PATIENCE_S, gone, hear_hangups, until
+from worker.rehearsal.server import StandsStill, wait_until
 
 PROGRAM = """
 import sys
@@ -82,3 +85,11 @@ def test_a_rehearsal_that_is_told_to_stop_takes_its_studio_along(
     command.terminate()
     assert command.wait(PATIENCE_S) == 130
     assert until(lambda: programs_in(tmp_path) == {})
+
+
+def test_whoever_waits_is_patient_for_as_long_as_something_moves() -> None:
+    looks = iter(range(8))
+    found = wait_until(1.2, "nothing", lambda: "there" if next(looks) == 7 else None, partial(next, count()))
+    assert found == "there", "after longer than the patience"
+    with pytest.raises(StandsStill, match="no bundle for 1 s"):
+        wait_until(1.0, "no bundle", lambda: None, lambda: "always the same")
