@@ -1,5 +1,6 @@
 """``python -m worker check lab.toml`` says in words what is missing or wrong, and what to do."""
 
+import re
 import zipfile
 from collections.abc import Callable
 from importlib.metadata import version
@@ -214,7 +215,9 @@ def test_a_success_that_is_told_at_the_end_alone_counts_and_a_misspelt_one_is_to
 
 def test_a_slow_environment_is_a_remark_with_what_it_will_cost(plane: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("worker.experiments.check_lab.SLOW_EPISODE_S", 0.0)
-    assert "This is a slow environment" in " ".join(found(plane).remarks)
+    remarks = " ".join(found(plane).remarks)
+    assert "This is a slow environment" in remarks
+    assert re.search(r"exploring takes about \d+ minutes on two processes, \d+ with --scenarios 50", remarks)
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import math
 import re
 import sys
 import time
@@ -34,8 +35,7 @@ from worker.sim.lab.found import Found, mark_of
 
 EPISODES, PICTURES = 3, 6
 SLOW_EPISODE_S = 5.0
-"""Above this the exploration's five thousand episodes take more than three hours on two processes."""
-EXPLORED_EPISODES = 6000
+"""Above this the exploration's six thousand episodes take more than four hours on two processes."""
 REPEATED_WITHIN = SAME_WITHIN / 10
 """Largest difference of an episode repeated: MuJoCo's solver begins where it was, and differs in the last digits."""
 SHEET_WIDTH_PX = 1440
@@ -87,7 +87,7 @@ def checked(file: Path, sheet: Path) -> Checked:
             key = _key(described, name)
             policies[name] = policy_of(described, installed.folder, found, name)
             lab_ranges.asked_first(policies[name], environment, POLICY_TEST[0])
-        ran = _run(described, environment, policies, sheet)
+        ran = _run(described, environment, policies, len(found.axes), sheet)
         return ran if ran.wrong else ran._replace(remarks=(*ran.remarks, *_disagree(installed, described, environment)))
     except LabTaskBroken as error:
         return Checked((f"{file}: {error}",), (), None)
@@ -109,6 +109,7 @@ def _run(
     described: LabDescription,
     environment: LabEnvironment,
     policies: Mapping[str, OnnxPolicy | AskedPolicy],
+    axes: int,
     sheet: Path,
 ) -> Checked:
     shown = set(np.linspace(0, described.episode_steps - 1, PICTURES).round().astype(int).tolist())
@@ -146,7 +147,7 @@ def _run(
                 else ""
             )
         )
-    remarks = _remarks(described, trajectories, seconds, sheet)
+    remarks = _remarks(described, trajectories, seconds, axes, sheet)
     if described.policies:
         failed = [name for name in described.policies if not done[name].success]
         also = f" Not done by {', '.join(failed)}." if failed else ""
@@ -232,13 +233,13 @@ def _lost_again(trajectories: Sequence[Trajectory]) -> str:
 
 
 def _remarks(
-    described: LabDescription, trajectories: list[Trajectory], seconds: list[float], sheet: Path
+    described: LabDescription, trajectories: list[Trajectory], seconds: list[float], axes: int, sheet: Path
 ) -> tuple[str, ...]:
     usual = float(np.median(seconds))
     successes = sum(each.success for each in trajectories)
     remarks = [
         f"{successes} of {len(trajectories)} episodes succeeded.{_lost_again(trajectories)}",
-        f"An episode takes {usual:.2f} s{'' if described.policies else _exploring(usual)}.",
+        f"An episode takes {usual:.2f} s{'' if described.policies else _exploring(usual, axes)}.",
         f"Contact sheet: {sheet}",
     ]
     first = trajectories[0].observations
@@ -252,10 +253,9 @@ def _remarks(
     if silent:
         remarks.append(f"Always 0 in these episodes: {', '.join(silent)}. What never varies cannot be judged by.")
     if usual > SLOW_EPISODE_S and not described.policies:
-        hours = EXPLORED_EPISODES * usual / 2 / 3600
         remarks.append(
-            f"This is a slow environment: exploring it takes about {hours:.0f} hours on two processes. Lower "
-            "episode_steps, use a quicker simulation, or explore fewer scenarios (--scenarios)."
+            "This is a slow environment. Lower episode_steps, use a quicker simulation, or explore fewer scenarios "
+            "(--scenarios)."
         )
     if changed := replaced_packages(each.read_text() for each in LOCKS if each.is_file()):
         ours = " ".join(each.partition(" ")[0] for each in changed)
@@ -269,9 +269,17 @@ def _remarks(
     return tuple(remarks)
 
 
-def _exploring(episode_s: float) -> str:
-    minutes = EXPLORED_EPISODES * episode_s / 120
-    return f", so exploring takes about {minutes:.0f} minutes on two processes, a quarter of it with --scenarios 50"
+def _exploring(episode_s: float, axes: int) -> str:
+    """Ranges are found by one process, then two drive the blocks."""
+
+    def minutes(scenarios: int) -> int:
+        episodes = lab_ranges.usual_episodes(axes) + fit_response_surface.block_episodes(scenarios) / 2
+        return math.ceil(episodes * episode_s / 60)
+
+    few, usual = fit_response_surface.FEW_SCENARIOS, fit_response_surface.SCENARIOS
+    return (
+        f", so exploring takes about {minutes(usual)} minutes on two processes, {minutes(few)} with --scenarios {few}"
+    )
 
 
 def replaced_packages(locks: Iterable[str]) -> list[str]:

@@ -188,6 +188,11 @@ def sought_scenarios(scenarios: int) -> int:
     return max(BLOCK, SOUGHT_SCENARIOS * scenarios // SCENARIOS // BLOCK * BLOCK)
 
 
+def block_episodes(scenarios: int) -> int:
+    """How many episodes all blocks together drive, the frozen policy's among them."""
+    return (scenarios + ROUNDS * sought_scenarios(scenarios)) * (MODES_PER_SCENARIO + 1)
+
+
 def sought_blocks(
     task: Task, surface: ResponseSurface, number: int, work_directory: Path, scenarios: int = SOUGHT_SCENARIOS
 ) -> list[Block]:

@@ -27,6 +27,8 @@ from worker.sim.lab.found import Found, mark_of
 
 SCENARIOS = 15
 HALVINGS = 3
+USUAL_TRIALS = 1.5
+"""How often an end of an axis is tried in the mean, of at most HALVINGS + 1."""
 LOST_SUCCESS = 0.10
 DISASTER = 3.0
 """Times the frozen policy's: a signal that grows so much would swamp labels and surface."""
@@ -40,6 +42,11 @@ WITNESS = RESPONSE_SURFACE[-1]
 CHANGES_NOTHING = "changes nothing that is measured"
 _MAY_GROW = ("undelivered", "distance_m")
 """Being slower is no disaster: success says whether it is too slow."""
+
+
+def usual_episodes(axes: int) -> int:
+    """About how many find() drives, one after the other, where there are so many axes to try."""
+    return round(SCENARIOS * (1 + 2 * USUAL_TRIALS * axes))
 
 
 def first_found(described: LabDescription, environment: LabEnvironment, folder: Path) -> Found:

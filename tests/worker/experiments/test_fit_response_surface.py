@@ -39,6 +39,9 @@ def test_every_round_seeks_anew_and_the_same_again_when_repeated(tmp_path: Path)
     first, again, second = sought(0, tmp_path), sought(0, tmp_path), sought(1, tmp_path)
     assert all(np.array_equal(one.modes, other.modes) for one, other in zip(first, again, strict=True))
     assert {block.first for block in first}.isdisjoint(block.first for block in second)
+    rounds = fit_response_surface.ROUNDS * sum(block.modes.shape[1] + 1 for block in first) * BLOCK
+    random = fit_response_surface.SCENARIOS * (MODES_PER_SCENARIO + 1)
+    assert fit_response_surface.block_episodes(fit_response_surface.SCENARIOS) == random + rounds
 
 
 def test_a_block_that_was_run_in_other_modes_is_run_again(tmp_path: Path) -> None:

@@ -65,7 +65,7 @@ class Refinement:
     learning_rate: float = 5e-4
     first_tie: float = 1.0
     """weight of the KL divergence from the imitation, in units of the spread of Q; see prefft"""
-    last_tie: float = 0.1
+    last_tie: float = 0.3
     share_ahead: float = 0.75
     """of the steps, for a reward model of fewer answers"""
 
