@@ -3,6 +3,8 @@
 // They outlive the pairs: `player()` gives the LockStep of the pair that is shown now, or null.
 
 const SCRUB_STEPS = 1000;
+const TENTHS = { minimumFractionDigits: 1, maximumFractionDigits: 1 };
+const SECONDS = new Intl.NumberFormat(document.documentElement.lang, TENTHS); // 2.5 or 2,5
 
 export class PlayerControls {
   // `on` holds: scrubbed(), used(name). `words` are the texts of the page, by name.
@@ -68,7 +70,7 @@ export class PlayerControls {
     this.scrub.style.setProperty("--at", `${(100 * now) / total}%`);
     this.scrub.setAttribute(
       "aria-valuetext",
-      this.words.position.replace("{seconds}", now.toFixed(1)).replace("{total}", total.toFixed(1)),
+      this.words.position.replace("{seconds}", SECONDS.format(now)).replace("{total}", SECONDS.format(total)),
     );
   }
 }

@@ -100,6 +100,14 @@ def test_changing_the_language_comes_back_to_the_same_page(taking_part: TakingPa
     assert language_of(taking_part.browser.get("/p/withdraw").text) == "de"
 
 
+def test_the_speeds_of_a_pair_are_said_as_the_language_writes_numbers(taking_part: TakingPart) -> None:
+    assert 'aria-label="0.25 times normal speed"' in taking_part.browser.get("/p/next").text
+    taking_part.browser.post("/p/language", data={"language": "de"})
+    page = taking_part.browser.get("/p/next").text
+    assert 'aria-label="0,25-faches Tempo"' in page
+    assert 'aria-label="1-faches Tempo"' in page
+
+
 @pytest.mark.parametrize("elsewhere", ["https://evil.example/p/", "//evil.example", "/studies", "/p/\r\nx: y", ""])
 def test_changing_the_language_leads_to_pages_of_participants_only(taking_part: TakingPart, elsewhere: str) -> None:
     answer = taking_part.browser.post("/p/language", data={"language": "de", "here": elsewhere})

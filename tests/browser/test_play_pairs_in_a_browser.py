@@ -1,5 +1,7 @@
 """Two clips as one: controls and their keys, what opens the answers, what is noted, practice and breaks."""
 
+import re
+
 import pytest
 from playwright.sync_api import Page, expect
 from sqlalchemy import select
@@ -265,6 +267,7 @@ def test_practice_fits_the_screen_in_the_longer_language_too(
     page = new_page(viewport={"width": width, "height": height}, has_touch=width < 900, is_mobile=width < 900)
     page.goto(invited.link)
     expect(page.locator("[data-phase=ready]")).to_be_visible()
+    expect(page.locator("[data-scrub]")).to_have_attribute("aria-valuetext", re.compile(r"^\d,\d von \d,\d Sekunden$"))
     root = "document.documentElement"
     assert page.evaluate(f"[{root}.scrollWidth - innerWidth, {root}.scrollHeight - innerHeight]") == [0, 0]
     for box in [each.bounding_box() for each in page.locator("video, button:visible, input:visible").all()]:
