@@ -217,7 +217,7 @@ def test_a_slow_environment_is_a_remark_with_what_it_will_cost(plane: Path, monk
     monkeypatch.setattr("worker.experiments.check_lab.SLOW_EPISODE_S", 0.0)
     remarks = " ".join(found(plane).remarks)
     assert "This is a slow environment" in remarks
-    assert re.search(r"exploring takes about \d+ minutes on two processes, \d+ with --scenarios 50", remarks)
+    assert re.search(r"exploring takes about \d+ min on two processes, \d+ min with --scenarios 50", remarks)
 
 
 @pytest.mark.parametrize(

@@ -272,14 +272,13 @@ def _remarks(
 def _exploring(episode_s: float, axes: int) -> str:
     """Ranges are found by one process, then two drive the blocks."""
 
-    def minutes(scenarios: int) -> int:
+    def lasts(scenarios: int) -> str:
         episodes = lab_ranges.usual_episodes(axes) + fit_response_surface.block_episodes(scenarios) / 2
-        return math.ceil(episodes * episode_s / 60)
+        minutes = math.ceil(episodes * episode_s / 60)
+        return f"{minutes} min" if minutes < 120 else f"{minutes / 60:.0f} hours"
 
     few, usual = fit_response_surface.FEW_SCENARIOS, fit_response_surface.SCENARIOS
-    return (
-        f", so exploring takes about {minutes(usual)} minutes on two processes, {minutes(few)} with --scenarios {few}"
-    )
+    return f", so exploring takes about {lasts(usual)} on two processes, {lasts(few)} with --scenarios {few}"
 
 
 def replaced_packages(locks: Iterable[str]) -> list[str]:
