@@ -6,6 +6,7 @@ short of clips. From the last answer on they look at the waiting page like a bro
     python -m tests.benchmarks.first_robot --steps 1000 --people 2
     python -m tests.benchmarks.first_robot --whole --labels 60 --methods reference pbarl somebody_else average
     python -m tests.benchmarks.first_robot --whole --unhurried --people 1 --at-once 2
+    python -m tests.benchmarks.first_robot --whole --unhurried --labels 40 --people 1 --refine 60000
 """
 
 import argparse
@@ -53,10 +54,12 @@ def main() -> None:
     parser.add_argument("--pace", type=float, default=PACE_S, help="seconds between two answers")
     parser.add_argument("--at-once", type=int, default=0, help="so many more, who give their last answers together")
     parser.add_argument("--unhurried", action="store_true", help="the last answer comes when all is made ahead")
+    parser.add_argument("--refine", type=int, default=0, help="steps of the last filter's refinement")
     parser.add_argument("--whole", action="store_true", help="filters, promise and trials as studies usually have them")
     options = parser.parse_args()
     evaluation = EvaluationSettings(fine_tuning_steps=options.steps, methods=tuple(options.methods))
     small = {"labels_per_participant": options.labels, "introduction_pairs": 2, "evaluation": evaluation}
+    small["refinement_steps"] = options.refine
     small["pool_scenarios"] = max(2, options.labels // 10)
     if not options.whole:
         small["evaluation"] = evaluation.model_copy(update={"trials": 1})
@@ -133,9 +136,9 @@ def _until(missing: str, seen: Callable[[], bool]) -> None:
 
 
 def _is_made_ahead(database: Database, each: Answering) -> bool:
-    """Filters of others, and films of all that is not their own robot."""
+    """Filters of others, films of all that is not their own robot, and the larger part of a refinement."""
     ahead = RunKey(RunKind.FILMS, participant_id=each.participant.id, subject=AHEAD)
-    filters = select(Run.id).where(Run.kind == RunKind.FILTER, Run.status == RunStatus.RUNNING)
+    filters = select(Run.id).where(Run.kind.in_((RunKind.FILTER, RunKind.REFINEMENT)), Run.status == RunStatus.RUNNING)
     with database.reading() as session:
         asked = session.scalars(select(SharedFilter)).all()
         fitted = [shared.artefact_sha256 for shared in asked]

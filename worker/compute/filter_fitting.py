@@ -144,7 +144,7 @@ class FilterFit:
         begun: Path | None,
         train: TrainPatiently[FilterDraft | None],
     ) -> FilterDraft | None:
-        """The person's refined policy in place of mode and residual, if it is better; None: nobody needs it any more.
+        """The person's refined policy in place of the mode, if it is better; None: nobody needs it any more.
 
         ``known``: the pool's rollouts; ``begun``: the folder of refine_ahead(); ``train``: calls what it is given with
         a folder for checkpoints, in a compute process, until that gives a draft.
@@ -358,8 +358,7 @@ def _shield_active(proven: Proven) -> float | None:
 
 
 def _strengths(weights: FilterWeights) -> dict[str, float]:
-    has_residual = weights.encoder and not weights.refined
-    return {"gate": weights.gate, "residual_share": weights.residual_share if has_residual else 0.0}
+    return {"gate": weights.gate, "residual_share": weights.residual_share if weights.encoder else 0.0}
 
 
 def _warnings(evaluation: dict[str, Any], tolerance: float) -> list[str]:

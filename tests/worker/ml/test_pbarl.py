@@ -15,7 +15,7 @@ from worker.domain.trajectory import SIGNALS, Trajectory
 from worker.domain.type_aliases import Act
 from worker.ml.filters import mode_search, pbarl, residual, response_surface
 from worker.ml.filters.filter_module import FilterWeights
-from worker.ml.filters.filter_problem import FilterConfig, FilterDraft, FilterProblem, act_of
+from worker.ml.filters.filter_problem import FilterConfig, FilterDraft, FilterProblem, GateTrial, act_of
 from worker.ml.filters.residual import learn_round
 from worker.ml.filters.response_surface import ResponseSurface
 from worker.ml.rewards.reward_models import StructuredReward
@@ -190,6 +190,33 @@ def test_a_residual_that_does_not_help_is_left_out_and_said_so(reference: list[T
     gated = residual.gate_residual(problem(-1.0, reference), wrong, reference, World().collect)
     assert gated.weights.residual_share == 0.0
     assert "residual" in gated.notes[0]
+
+
+def test_a_residual_has_to_be_better_than_the_mode_though_a_refinement_was_refused_since(
+    reference: list[Trajectory],
+) -> None:
+    speed = {"speed_far": -0.2}
+    learned = learn_round(
+        problem(-1.0, reference),
+        FilterDraft(FilterWeights(mode=speed)),
+        [World().collect(POLICY.mean, range(6), 0.3, 0)],
+    )
+    trials = (GateTrial(1.0, 0.0, 99.0, 0.0, 0.0), GateTrial(1.0, 0.0, -1.0, 0.0, 0.0, refined=True))
+    draft = replace(learned, trials=trials)
+    gated = residual.gate_residual(problem(-1.0, reference), draft, reference, World().collect)
+    assert gated.weights.residual_share == 0.0
+
+
+def test_what_was_refined_is_driven_no_further(reference: list[Trajectory], surface: ResponseSurface) -> None:
+    def refined(draft: FilterDraft) -> FilterDraft:
+        return replace(draft, weights=draft.weights.changed(refined=POLICY.weights))
+
+    world, searching = World(), World()
+    draft = pbarl.fit_studio(problem(-1.0, reference), surface, [], reference, world.collect, refined=refined)
+    mode_search.find_mode(problem(-1.0, reference), surface, [], reference, searching.collect)
+    assert draft.weights.refined
+    assert not draft.weights.encoder
+    assert world.asked == searching.asked
 
 
 def test_learning_is_repeatable_and_later_rounds_go_on_from_earlier_ones(reference: list[Trajectory]) -> None:

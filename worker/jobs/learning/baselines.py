@@ -84,6 +84,7 @@ def _train(context: WorkerContext, run_id: int, job: Job, method: str, reward: s
     parts = patience.train(
         context,
         folder,
+        Lane.PATIENT,
         report,
         partial(_is_outdated, context, job),
         lambda fitted: fitted.controller is not None,

@@ -24,7 +24,7 @@ from worker.jobs.runtime.records import Job
 from worker.ml.export import bundle
 from worker.ml.export.bundle import Provenance
 
-STAGES = {Method.STUDIO: ("mode", "residual", "gate", "refinement", "promise"), Method.PRINTED: ("printed",)}
+STAGES = {Method.STUDIO: ("mode", "refinement", "residual", "gate", "promise"), Method.PRINTED: ("printed",)}
 
 
 class NothingToLearnFrom(AppError):

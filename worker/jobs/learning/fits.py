@@ -12,10 +12,10 @@ from worker.jobs.runtime.context import WorkerContext
 from worker.jobs.runtime.records import Job
 from worker.ml.filters.filter_problem import FilterConfig, FilterDraft
 
-_BEFORE, _AFTER = 0.25, 0.9
+_BEFORE, _AFTER = 0.15, 0.7
 """How far a fit is before its refinement and after it."""
-_GATED = 0.85
-"""How far a fit without one is before its promise."""
+_MODE = 0.35
+"""How far a fit without one is when it has its mode."""
 
 
 def is_refined(settings: StudySettings, job: Job, shared: bool) -> bool:
@@ -30,9 +30,9 @@ def refining(share: float) -> float:
 
 def _beside(share: float) -> float:
     """What is done of a fit with a refinement, when this share of it would be done without one."""
-    if share <= _GATED:
-        return _BEFORE * share / _GATED
-    return _AFTER + (1.0 - _AFTER) * (share - _GATED) / (1.0 - _GATED)
+    if share < _MODE:
+        return _BEFORE * share / _MODE
+    return _AFTER + (1.0 - _AFTER) * (share - _MODE) / (1.0 - _MODE)
 
 
 def pool_rollouts(context: WorkerContext, job: Job) -> list[Trajectory]:

@@ -14,6 +14,7 @@ Part = TypeVar("Part")
 def train(
     context: WorkerContext,
     folder: Path,
+    lane: Lane,
     report: Callable[[float], None],
     is_outdated: Callable[[], bool],
     is_whole: Callable[[Part], bool],
@@ -31,12 +32,12 @@ def train(
     def beat() -> None:
         report(share_done(folder))
         context.keep_unfinished(folder)
-        if context.compute.is_needed_elsewhere(Lane.PATIENT) or is_outdated():
+        if context.compute.is_needed_elsewhere(lane) or is_outdated():
             ask_to_pause(folder)
 
     parts: list[Part] = []
     while not is_outdated():
-        parts.append(context.compute.run(Lane.PATIENT, beat, part, folder))
+        parts.append(context.compute.run(lane, beat, part, folder))
         if is_whole(parts[-1]):
             return parts
     return []

@@ -39,11 +39,12 @@ def refine(context: WorkerContext, run_id: int, job: Job, reward: str, draft: st
         settings = session.get_one(Study, job.study_id).settings
     if not fits.is_refined(settings, job, shared):
         return draft
+    lane = Lane.PATIENT if shared else Lane.LEARNING  # somebody waits for their last filter
     is_outdated = (lambda: False) if shared else partial(_is_outdated, context, job)
-    begun = None if shared else _made_ahead(context, run_id, job, is_outdated)
+    begun = None if shared else _made_ahead(context, run_id, job, lane, is_outdated)
     fit = fits.fitting(context, run_id, job, context.store.read(reward), shared=shared)
     with _folder(context, run_id, job, shared) as folder:
-        train: TrainPatiently[FilterDraft | None] = _trainer(context, run_id, folder, is_outdated, bool)
+        train: TrainPatiently[FilterDraft | None] = _trainer(context, run_id, folder, lane, is_outdated, bool)
         known = fits.pool_rollouts(context, job)
         result = fit.refine(fits.load_draft(context, draft), known, settings.refinement_steps, begun, train)
         artefact = context.store.put(filter_fitting.draft_to_bytes(result)) if result else ""
@@ -54,10 +55,12 @@ def refine(context: WorkerContext, run_id: int, job: Job, reward: str, draft: st
 
 
 def _make_ahead(context: WorkerContext, run_id: int, job: Job) -> None:
-    _made_ahead(context, run_id, job, partial(_has_answered_everything, context, job))
+    _made_ahead(context, run_id, job, Lane.PATIENT, partial(_has_answered_everything, context, job))
 
 
-def _made_ahead(context: WorkerContext, run_id: int, job: Job, is_outdated: Callable[[], bool]) -> Path | None:
+def _made_ahead(
+    context: WorkerContext, run_id: int, job: Job, lane: Lane, is_outdated: Callable[[], bool]
+) -> Path | None:
     """The folder of what is made ahead, as far as it is; None: the answers that it would follow say nothing."""
     with context.database.reading() as session:
         settings = session.get_one(Study, job.study_id).settings
@@ -74,21 +77,26 @@ def _made_ahead(context: WorkerContext, run_id: int, job: Job, is_outdated: Call
     if fitted is None:
         return None
     known, fit = fits.pool_rollouts(context, job), fits.fitting(context, run_id, job, fitted.stored)
-    train: TrainPatiently[bool] = _trainer(context, run_id, folder, is_outdated, bool)
+    train: TrainPatiently[bool] = _trainer(context, run_id, folder, lane, is_outdated, bool)
     fit.refine_ahead(known, settings.refinement_steps, train)
     return folder
 
 
 def _trainer(
-    context: WorkerContext, run_id: int, folder: Path, is_outdated: Callable[[], bool], is_whole: Callable[[T], bool]
+    context: WorkerContext,
+    run_id: int,
+    folder: Path,
+    lane: Lane,
+    is_outdated: Callable[[], bool],
+    is_whole: Callable[[T], bool],
 ) -> TrainPatiently[T]:
-    """What trains part by part, and makes room for whoever waits."""
+    """What trains part by part, and makes room for whoever waits longer."""
 
     def report(share: float) -> None:
         context.report(run_id, f"refining the filter, {share:.0%} done", fits.refining(share))
 
     def train(part: Callable[[Path], T]) -> T | None:
-        parts = patience.train(context, folder, report, is_outdated, is_whole, part)
+        parts = patience.train(context, folder, lane, report, is_outdated, is_whole, part)
         return parts[-1] if parts else None
 
     return train

@@ -5,6 +5,7 @@ import time
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
+from app.domain.choices import Method
 from app.domain.evaluation import SharedFilter
 from app.domain.models import ModelKind
 from app.domain.studies import Participant, Study
@@ -16,14 +17,12 @@ from worker.jobs.runtime import due_lending, records
 from worker.jobs.runtime.context import Step, WorkerContext
 from worker.jobs.runtime.records import Job
 
-STAGES = ("mode", "residual", "gate", "refinement", "promise")
-
 
 def fit(context: WorkerContext, job: Job, run_id: int, step: Step) -> None:
     """Fit the filter that a row asks for; every stage is a step. Nothing is left when it is no longer asked for."""
     started = time.time()
     reward, draft = step("wishes", _wishes, context, job, run_id), ""
-    for stage in STAGES:
+    for stage in filters.STAGES[Method.STUDIO]:
         if not reward or step(f"is-outdated-before-{stage}", _is_outdated, context, job):
             return
         draft = step(stage, filters.fit_stage, context, run_id, job, reward, draft, stage, True)

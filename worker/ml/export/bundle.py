@@ -193,7 +193,7 @@ def _manifest(contents: BundleContents) -> dict[str, Any]:
         "mode": dict(weights.mode),
         "mode_axes": [asdict(axis) for axis in contents.task.modes.axes],
         "gate": weights.gate,
-        "residual_share": weights.residual_share if weights.encoder and not weights.refined else 0.0,
+        "residual_share": weights.residual_share if weights.encoder else 0.0,
         "refined": bool(weights.refined),
         "shield": _shield(contents),
         "reward_kind": contents.reward.kind,

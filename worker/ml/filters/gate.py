@@ -6,7 +6,7 @@ import numpy as np
 
 from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import Act, FloatArray
-from worker.ml.filters.filter_problem import Collect, FilterProblem, GateTrial
+from worker.ml.filters.filter_problem import Collect, FilterDraft, FilterProblem, GateTrial
 
 
 def try_on(
@@ -60,6 +60,13 @@ def keeps_task(problem: FilterProblem, trial: GateTrial, reference: Sequence[Tra
     config = problem.config
     gentle = trial.p95_force_n <= max(config.force_limit_n, _p95_force_n(reference))
     return trial.success_change >= -config.success_tolerance and gentle
+
+
+def to_beat(problem: FilterProblem, draft: FilterDraft, reference: Sequence[Trajectory]) -> float:
+    """The change of the learned return that the draft's mode has made on its own; 0 where it is off."""
+    alone = (each for each in reversed(draft.trials) if not each.refined and each.residual_share == 0.0)
+    trial = next(alone, None)
+    return trial.preference if trial and acceptable(problem, trial, reference) else 0.0
 
 
 def _p95_force_n(trajectories: Sequence[Trajectory]) -> float:

@@ -1,9 +1,10 @@
 """The studio's filter, stage by stage: a person's execution mode, gated, and a residual adapter around it, gated again.
 
+A refined policy (worker.ml.methods.refinement) takes the residual's place where it is better than the mode.
 Every stage takes a draft and returns a better one.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from worker.domain.trajectory import Trajectory
 from worker.ml.filters.filter_problem import Collect, FilterDraft, FilterProblem, ReportProgress
@@ -19,8 +20,13 @@ def fit_studio(
     reference: Sequence[Trajectory],
     collect: Collect,
     progress: ReportProgress = lambda stage, share: None,
+    refined: Callable[[FilterDraft], FilterDraft] = lambda mode: mode,
 ) -> FilterDraft:
-    """All stages in a row, without shield. ``reference``: of the reference policy on the problem's gate scenarios."""
-    draft = find_mode(problem, surface, pool, reference, collect, progress)
+    """All stages in a row, without shield.
+
+    ``reference``: of the reference policy on the problem's gate scenarios; ``refined``: gives the draft a refined
+    policy, if that is better than the mode; no residual is needed then.
+    """
+    draft = refined(find_mode(problem, surface, pool, reference, collect, progress))
     draft = train_residual(problem, draft, collect, progress)
     return gate_residual(problem, draft, reference, collect, progress)

@@ -23,7 +23,7 @@ from worker.ml.filters.filter_problem import (
     act_of,
 )
 from worker.ml.filters.fitted_q import ActionValue, Transitions, evaluate_filter, spread_within_states
-from worker.ml.filters.gate import acceptable, try_on
+from worker.ml.filters.gate import acceptable, to_beat, try_on
 from worker.ml.filters.shield import limits_of
 from worker.ml.policies.torch_module import FrozenPolicy
 
@@ -41,9 +41,11 @@ def train_residual(
     """Rounds of: roll out the current filter with noise, learn its value, move its actions up that value.
 
     When a round has clearly made the learned return worse, its step is taken back, and from then on steps are half as
-    bold.
+    bold. A refined policy is left as it is.
     ``learn``: learn_round(), or something that calls it in another process.
     """
+    if draft.weights.refined:
+        return draft
     rounds: list[list[Trajectory]] = []
     kept = draft
     earned: FloatArray | None = None
@@ -112,8 +114,7 @@ def gate_residual(
     if not draft.weights.encoder:
         return draft
     started = time.perf_counter()
-    without = [trial for trial in draft.trials[-1:] if acceptable(problem, trial, reference)]
-    to_beat = without[0].preference if without else 0.0
+    alone = to_beat(problem, draft, reference)
     kept, trials, tested = 0.0, list[GateTrial](), draft.tested
     for share in problem.config.residual_shares:
         progress(f"checking {share:.0%} of the residual on held-out scenarios", 0.75 + 0.1 * len(trials))
@@ -121,7 +122,7 @@ def gate_residual(
         act = act_of(problem.task.modes, problem.policy, weights)
         trial, driven = try_on(problem, act, weights.gate, share, reference, collect)
         trials.append(trial)
-        if acceptable(problem, trial, reference) and trial.preference > to_beat:
+        if acceptable(problem, trial, reference) and trial.preference > alone:
             kept, tested = share, limits_of(problem.task.observation, problem.task.action, driven, reference)
             break
     weights = draft.weights.changed(residual_share=kept)

@@ -1,6 +1,6 @@
-"""The last and longest stage of the studio's filter: a policy of the person's own, which begins as mode and residual.
+"""The longest stage of the studio's filter: a policy of the person's own, which begins as the mode.
 
-A network imitates the filter; soft actor-critic goes on from there, on R-hat and the sketchy reward of PbRL-HRI. Its
+A network imitates the mode; soft actor-critic goes on from there, on R-hat and the sketchy reward of PbRL-HRI. Its
 replay begins with the rollouts that are there already (Ball et al. 2023, arXiv 2302.02948), and a tie to the imitation,
 as in prefft_anchored, fades while it learns: without the tie it forgets the task before it finds anything better
 (docs/method.md, section 7).
@@ -24,7 +24,7 @@ from worker.ml.filters.filter_problem import (
     ReportProgress,
     act_of,
 )
-from worker.ml.filters.gate import acceptable, try_on
+from worker.ml.filters.gate import acceptable, to_beat, try_on
 from worker.ml.filters.shield import limits_of
 from worker.ml.methods import pbrl_hri
 from worker.ml.methods.preference_rl import MakeEnv, PreferenceRl, learned
@@ -175,31 +175,21 @@ def gate_refined(
     collect: Collect,
     progress: ReportProgress = lambda stage, share: None,
 ) -> FilterDraft:
-    """As much of the refined policy as keeps the task and is better than what it began as; else mode and residual."""
+    """As much of the refined policy as keeps the task and is better than the mode; else the mode."""
     if not draft.weights.refined:
         return draft
-    started, to_beat = time.perf_counter(), _to_beat(draft)
+    started, alone = time.perf_counter(), to_beat(problem, draft, reference)
     for gate in STRENGTHS:
-        progress(f"checking {gate:.0%} of the refined policy on held-out scenarios", 0.84)
+        progress(f"checking {gate:.0%} of the refined policy on held-out scenarios", 0.35)
         weights = draft.weights.changed(gate=gate)
         act = act_of(problem.task.modes, problem.policy, weights)
         trial, driven = try_on(problem, act, gate, 0.0, reference, collect)
         draft = replace(draft, trials=(*draft.trials, replace(trial, refined=True)))
         keeps = acceptable(problem, trial, reference) and trial.success_change >= -LARGEST_LOSS
-        if keeps and trial.preference > to_beat:
+        if keeps and trial.preference > alone:
             tested = limits_of(problem.task.observation, problem.task.action, driven, reference)
             draft = replace(draft, weights=weights, tested=tested, notes=(*draft.notes, _REFINED))
             return draft.timed("gate_refined", started)
     notes = (*draft.notes, "The refined policy was no better on held-out scenarios and is off.")
     draft = replace(draft, weights=draft.weights.changed(refined={}), notes=notes)
     return draft.timed("gate_refined", started)
-
-
-def _to_beat(draft: FilterDraft) -> float:
-    """What the filter that was refined has gained in the same scenarios; 0 if it changes nothing."""
-    weights = draft.weights
-    share = weights.residual_share if weights.encoder else 0.0
-    if not share and not any(weights.mode.values()):
-        return 0.0
-    setting = (weights.gate, share)
-    return next(each.preference for each in reversed(draft.trials) if (each.gate, each.residual_share) == setting)

@@ -144,11 +144,11 @@ def fit_reference(setting: Setting) -> tuple[Act, tuple[str, ...]]:
 
 def fit_pbarl(setting: Setting) -> tuple[Act, tuple[str, ...]]:
     """The studio's quick filter: mode, gate, residual encoder, gate."""
-    return _shipped(setting.problem, _mode_and_residual(setting))
+    return _shipped(setting.problem, _fitted(setting))
 
 
 def fit_pbarl_refined(setting: Setting) -> tuple[Act, tuple[str, ...]]:
-    """The quick filter, and the refined policy, most of which is made for the first half of the labels."""
+    """The studio's filter with its refinement, most of which is made for the first half of the labels."""
     problem, reference, config = setting.problem, setting.reference(_gate(setting)), setting.config.refinement
     beginning = refinement.Beginning(setting.make_env, setting.pool, reference)
     half = replace(problem, reward=setting.asked().fit(setting.asked().labels.first(setting.labels // 2)))
@@ -156,8 +156,12 @@ def fit_pbarl_refined(setting: Setting) -> tuple[Act, tuple[str, ...]]:
     with TemporaryDirectory() as folder:
         checkpoint = Checkpoint(Path(folder))
         refinement.refine_ahead(half, mode, beginning, config, checkpoint)
-        draft = refinement.refine(problem, _mode_and_residual(setting), beginning, config, checkpoint)
-    return _shipped(problem, refinement.gate_refined(problem, draft, reference, setting.collect))
+
+        def refined(draft: FilterDraft) -> FilterDraft:
+            draft = refinement.refine(problem, draft, beginning, config, checkpoint)
+            return refinement.gate_refined(problem, draft, reference, setting.collect)
+
+        return _shipped(problem, _fitted(setting, refined))
 
 
 def fit_as_printed(setting: Setting, list_length: int) -> tuple[Act, tuple[str, ...]]:
@@ -311,9 +315,9 @@ def _gate(setting: Setting) -> range:
     return setting.problem.config.gate_block(setting.problem.task)
 
 
-def _mode_and_residual(setting: Setting) -> FilterDraft:
-    gate = setting.reference(_gate(setting))
-    return pbarl.fit_studio(setting.problem, setting.surface(), setting.pool, gate, setting.collect)
+def _fitted(setting: Setting, refined: Callable[[FilterDraft], FilterDraft] = lambda mode: mode) -> FilterDraft:
+    gate, surface = setting.reference(_gate(setting)), setting.surface()
+    return pbarl.fit_studio(setting.problem, surface, setting.pool, gate, setting.collect, refined=refined)
 
 
 def _shipped(problem: FilterProblem, draft: FilterDraft) -> tuple[Act, tuple[str, ...]]:
