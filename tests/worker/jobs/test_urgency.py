@@ -311,6 +311,25 @@ def test_a_training_of_many_minutes_does_not_stop_the_other_lanes(database: Data
         pass
 
 
+def test_clips_of_a_study_without_participants_leave_a_processor_to_a_training_for_somebody(
+    database: Database, study: Study
+) -> None:
+    with database.writing() as session:
+        present = add_person(session, study, None, seen=1)
+        unopened = add_study(session, "unopened", study)
+    lanes = Lanes(Compute(2))
+    with database.reading() as session:
+        lanes.who_waits = WhoWaits.look(session)
+    first = lanes.gate(Lane.CLIPS).passed(lambda: lanes.who_waits.urgency(clips(unopened)))
+    with lanes.working(Lane.PATIENT, films(present)):
+        assert not lanes._holds_back(Lane.CLIPS, Level.UNOPENED), "there are two processors"
+        with first:
+            assert lanes._holds_back(Lane.CLIPS, Level.UNOPENED)
+            assert not lanes._holds_back(Lane.CLIPS, Level.POOL), "whose study has participants"
+    with lanes.gate(Lane.CLIPS).passed(lambda: lanes.who_waits.urgency(clips(unopened))):
+        assert not lanes._holds_back(Lane.CLIPS, Level.UNOPENED), "nothing is trained"
+
+
 def test_what_goes_wrong_in_one_task_reaches_the_job(database: Database, study: Study) -> None:
     compute = Slowly()
     for _ in range(3):

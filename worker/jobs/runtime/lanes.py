@@ -2,7 +2,8 @@
 
 A job's tasks go in one by one, so work that began earlier gives way within one task (a few rollouts, a film); trainings
 of many minutes ask is_needed_elsewhere() and pause at a checkpoint. Lanes share the processors: while work that
-somebody waits for is in any lane but the patient one, no lane takes tasks that nobody is here for.
+somebody waits for is in any lane but the patient one, no lane takes tasks that nobody is here for. Clips of a study
+without participants leave a processor to the patient lane.
 """
 
 import time
@@ -51,9 +52,6 @@ class Lanes:
     @contextmanager
     def working(self, lane: Lane, job: Job) -> Iterator[None]:
         """Meanwhile the job has tasks for the lane."""
-        if lane == Lane.PATIENT:
-            yield
-            return
         self._in_hand.append((lane, job))
         try:
             yield
@@ -66,8 +64,21 @@ class Lanes:
     def _holds_back(self, lane: Lane, level: Level) -> bool:
         """In a lane whose work somebody waits for, everything else; in the others, what nobody is here for."""
         lately = [each for each, until in self._lately.items() if until > time.monotonic()]
-        awaited = {where for where, job in (*tuple(self._in_hand), *lately) if self._level(job) == Level.WAITING}
-        return (level > Level.WAITING and lane in awaited) or (level > Level.ASKED and bool(awaited))
+        awaited = {
+            where
+            for where, job in (*tuple(self._in_hand), *lately)
+            if where != Lane.PATIENT and self._level(job) == Level.WAITING
+        }
+        if (level > Level.WAITING and lane in awaited) or (level > Level.ASKED and awaited):
+            return True
+        return level >= Level.UNOPENED and self._takes_all_processors(lane)
+
+    def _takes_all_processors(self, lane: Lane) -> bool:
+        """Whether one task more in the lane would leave none to a training that is for somebody."""
+        is_trained = any(
+            where == Lane.PATIENT and self._level(job) < Level.UNOPENED for where, job in tuple(self._in_hand)
+        )
+        return is_trained and self._gates[lane].inside >= max(1, self.compute.size(lane) - 1)
 
     def _level(self, job: Job) -> Level:
         return self.who_waits.urgency(job).level

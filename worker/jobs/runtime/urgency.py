@@ -177,10 +177,16 @@ class Gate:
     LOOK_S = 1.0
 
     def __init__(self, places: int, holds_back: Callable[[Level], bool] = lambda _level: False) -> None:
-        self._free, self._holds_back = places, holds_back
+        self._places = self._free = places
+        self._holds_back = holds_back
         self._waiting: dict[int, Callable[[], Urgency]] = {}
         self._number = 0
         self._changed = threading.Condition()
+
+    @property
+    def inside(self) -> int:
+        """How many have been let in, and are still there."""
+        return self._places - self._free
 
     @contextmanager
     def passed(self, urgency: Callable[[], Urgency]) -> Iterator[None]:
