@@ -148,7 +148,7 @@ def _is_made_ahead(database: Database, each: Answering) -> bool:
         filmed = session.scalars(select(Run.status).where(Run.workflow_id.in_(keys))).all()
     lent = sum(method in FROM_OTHERS for method in each.methods)
     all_filmed = filmed == [RunStatus.SUCCEEDED] * (1 + lent)
-    return bool(fitted) and None not in fitted and all_filmed and running is None
+    return bool(fitted) == bool(lent) and None not in fitted and all_filmed and running is None
 
 
 def _wait(database: Database, people: Sequence[Answering]) -> None:
