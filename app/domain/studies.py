@@ -32,6 +32,12 @@ def usual_clip_steps(task: str) -> int:
     return installed.description.usual_clip_steps if installed else USUAL_CLIP_STEPS
 
 
+def usual_refinement_steps(task: str) -> int:
+    """How long the studio's last filters are refined, where that was measured to be worth it; else 0."""
+    installed = catalogue.find(task)
+    return installed.description.usual_refinement_steps if installed else 0
+
+
 def usual_behaviours(task: str, wanted: int) -> int:
     """So many ways of doing a scenario, or as many as there are."""
     installed = catalogue.find(task)

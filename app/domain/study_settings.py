@@ -338,9 +338,8 @@ class StudySettings(BaseModel):
         0,
         Section.LEARNING,
         "Refine the last filter for",
-        "By reinforcement learning. With 60,000 steps the filters gained 1.4 to 1.9 times as much in one of the tasks "
-        "(docs/results/rivals.md). Three quarters are done while people answer; the rest takes a minute or two, in "
-        "which the participant waits. 0: not at all.",
+        "By reinforcement learning, most of it while people answer; the rest takes a minute or two, in which the "
+        "participant waits. 0: not at all; empty: what suits the task (docs/results/rivals.md).",
         unit="steps",
         ge=0,
         le=1_000_000,

@@ -130,6 +130,8 @@ class DescribedTask(BaseModel):
     episode_steps: int = Field(ge=SHORTEST_CLIP_STEPS, le=LONGEST_CLIP_STEPS)
     usual_clip_steps: int = Field(ge=SHORTEST_CLIP_STEPS)
     """from the start, in which what matters has happened"""
+    usual_refinement_steps: int = Field(default=0, ge=0)
+    """of a person's last filter; 0 where nothing was measured that speaks for it"""
     words: Words
     instructions: dict[LanguageCode, Text]
     """What participants read of the task, by language; an empty line makes a paragraph."""

@@ -344,7 +344,7 @@ break-heading =
         [one] Eine Antwort ist geschafft
        *[other] { $answered } Antworten sind geschafft
     }
-break-lead = Alle sind sicher gespeichert. Schauen Sie aus dem Fenster, strecken Sie sich, trinken Sie ein Glas Wasser. Kommen Sie wieder, wann Sie möchten, auch an einem anderen Tag: Ihr Link führt hierher zurück.
+break-lead = Alles ist sicher gespeichert. Schauen Sie aus dem Fenster, strecken Sie sich, trinken Sie ein Glas Wasser. Kommen Sie wieder, wann Sie möchten, auch an einem anderen Tag: Ihr Link führt hierher zurück.
 break-left = Noch { $count }, { $time }.
 break-left-unknown = Noch { $count }.
 break-go-on = Weiter
@@ -437,7 +437,7 @@ head-to-head-done =
 
 setting-title = Stellen Sie selbst einen Roboter ein
 setting-lead = Verschieben Sie die Regler, bis der Roboter die Aufgabe so ausführt, wie es Ihnen am besten gefällt. Sobald Sie einen Regler loslassen, folgt der Film.
-setting-film = Der Roboter mit diesen Reglern
+setting-film = Der Roboter mit dieser Einstellung
 setting-exact = Der Film zeigt genau Ihre Einstellung.
 setting-near = Der Film zeigt von den gefilmten Einstellungen die, die Ihrer am nächsten kommt. Ihre wird gerade gefilmt und erscheint von selbst.
 setting-filmed = Im Film: { $place }

@@ -349,7 +349,7 @@ break-heading =
         [one] One answer done
        *[other] { $answered } answers done
     }
-break-lead = They are all safely stored. Look out of the window, stretch, have a glass of water. Come back whenever you like, even on another day: your link brings you back here.
+break-lead = Everything is safely stored. Look out of the window, stretch, have a glass of water. Come back whenever you like, even on another day: your link brings you back here.
 break-left = { $count } to go, { $time }.
 break-left-unknown = { $count } to go.
 break-go-on = Go on

@@ -73,7 +73,9 @@ PROFILES = {
             value_rollouts=12,
             value_steps=200,
             steering=Steering(steps=2_400, warm_up_steps=800, critic_first_updates=100, flow_steps=100),
-            refinement=Refinement(steps=2_400, warm_up_steps=800, imitation_steps=200, critic_first_updates=100),
+            refinement=Refinement(
+                steps=2_400, warm_up_steps=800, imitation_steps=200, critic_first_updates=100, critic_again_updates=100
+            ),
             constraint=Constraint(scenarios=10, every_steps=1_000),
             others=4,
             others_labels=20,

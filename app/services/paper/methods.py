@@ -168,7 +168,7 @@ def _procedure(session: Session, study: Study) -> Iterator[str]:
         if study.material is None
         else "",
         "The filter of all answers was then refined by soft actor-critic for "
-        f"{settings.refinement_steps:,} environment steps, three quarters of them on the preference learned from the "
+        f"{settings.refinement_steps:,} environment steps, 85 % of them on the preference learned from the "
         "first half of the answers and from its execution mode on; the refined policy was kept where it was better and "
         "no worse in these respects."
         if settings.refinement_steps

@@ -82,7 +82,13 @@ SMALL = MethodConfig(
     value_steps=20,
     steering=Steering(steps=120, warm_up_steps=60, critic_first_updates=20, hidden=16, flow_steps=20),
     refinement=Refinement(
-        steps=120, warm_up_steps=60, imitation_steps=20, critic_first_updates=20, hidden=16, environments=2
+        steps=120,
+        warm_up_steps=60,
+        imitation_steps=20,
+        critic_first_updates=20,
+        critic_again_updates=20,
+        hidden=16,
+        environments=2,
     ),
     constraint=Constraint(scenarios=3, every_steps=80),
     others=4,

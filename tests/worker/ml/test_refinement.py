@@ -21,9 +21,15 @@ from worker.ml.rewards.reward_models import StructuredReward
 
 SEEN = invented.observations(300, np.random.default_rng(9))
 SHORT = Refinement(
-    steps=400, warm_up_steps=120, imitation_steps=300, critic_first_updates=50, hidden=16, environments=2
+    steps=400,
+    warm_up_steps=120,
+    imitation_steps=300,
+    critic_first_updates=50,
+    critic_again_updates=50,
+    hidden=16,
+    environments=2,
 )
-LONGER = replace(SHORT, steps=1_500, critic_first_updates=150, learning_rate=5e-3)
+LONGER = replace(SHORT, steps=1_500, critic_first_updates=150, critic_again_updates=150, learning_rate=5e-3)
 GATED = FilterWeights(mode={"speed_far": -0.3, "speed_near": -0.3}, gate=0.6)
 
 

@@ -60,13 +60,15 @@ class Refinement:
     """standard deviation of what is added to its actions then"""
     imitation_steps: int = 4_000
     critic_first_updates: int = 6_000
+    critic_again_updates: int = 3_000
+    """of the critics alone, when the reward has changed"""
     hidden: int = 128
     environments: int = 4
     learning_rate: float = 5e-4
     first_tie: float = 1.0
     """weight of the KL divergence from the imitation, in units of the spread of Q; see prefft"""
     last_tie: float = 0.3
-    share_ahead: float = 0.75
+    share_ahead: float = 0.85
     """of the steps, for a reward model of fewer answers"""
 
     @property
@@ -119,6 +121,7 @@ def _train(
     checkpoint: Checkpoint | None,
     until: int | None = None,
 ) -> TiedLearner:
+    kept = checkpoint.read() if checkpoint else None
     settings = SacConfig(
         problem.task.observation,
         seed=problem.seed,
@@ -127,7 +130,7 @@ def _train(
         environments=config.environments,
         hidden=config.hidden,
         learning_rate=config.learning_rate,
-        critic_first_updates=config.critic_first_updates,
+        critic_first_updates=config.critic_first_updates if kept is None else config.critic_again_updates,
     )
     policy, reference = looked_into(problem.policy), beginning.reference
     offset, scale = torch.from_numpy(policy.offset), torch.from_numpy(policy.scale)
@@ -137,7 +140,6 @@ def _train(
         mark = hashlib.sha256(problem.reward.to_bytes()).hexdigest()
         training = PreferenceRl(beginning.make_env, reward, settings, [*beginning.known, *reference], mark)
         learner = TiedLearner(settings, offset, scale, training.actions, config.first_tie)
-        kept = checkpoint.read() if checkpoint else None
         if kept is None:
             _imitate(learner, training, act_of(problem.task.modes, problem.policy, draft.weights), config)
         else:
