@@ -11,6 +11,7 @@ from sqlalchemy.orm import Mapped, mapped_column, relationship
 from app.db import Base, now
 from app.domain.study_settings import USUAL_CLIP_STEPS, StudySettings
 from app.installed_tasks import catalogue
+from app.installed_tasks.description import TaskDescription
 from app.installed_tasks.lab import LabDescription
 
 NAME_LENGTH = 120
@@ -35,7 +36,8 @@ def usual_clip_steps(task: str) -> int:
 def usual_refinement_steps(task: str) -> int:
     """How long the studio's last filters are refined, where that was measured to be worth it; else 0."""
     installed = catalogue.find(task)
-    return installed.description.usual_refinement_steps if installed else 0
+    described = installed.description if installed else None
+    return described.usual_refinement_steps if isinstance(described, TaskDescription) else 0
 
 
 def usual_behaviours(task: str, wanted: int) -> int:

@@ -22,12 +22,10 @@ from app.domain.protocol import (
     PlannedTest,
     check_instruments,
 )
-from app.installed_tasks.description import LONGEST_CLIP_STEPS, SHORTEST_CLIP_STEPS
+from app.installed_tasks.description import LONGEST_CLIP_STEPS, SHORTEST_CLIP_STEPS, none_or_enough
 from app.questionnaires import library
 
 USUAL_CLIP_STEPS = 60
-SHORTEST_REFINEMENT = 8_000
-"""Environment steps; half of them are the filter's own, before anything is learned."""
 """Of a task that is not installed here."""
 
 
@@ -500,8 +498,6 @@ class StudySettings(BaseModel):
 
     @model_validator(mode="after")
     def _can_refine(self) -> "StudySettings":
-        if 0 < self.refinement_steps < SHORTEST_REFINEMENT:
-            raise ValueError(f"A refinement has at least {SHORTEST_REFINEMENT:,} steps. Enter more, or 0 for none.")
         if self.refinement_steps and self.method is not Method.STUDIO:
             raise ValueError("Only the studio's own filters are refined. Choose its method, or enter 0 steps.")
         return self
@@ -526,6 +522,7 @@ class StudySettings(BaseModel):
             raise ValueError(f"{twice} is asked by the evaluation already. Leave it out of the questions at the end.")
         return self
 
+    _check_refinement_steps = field_validator("refinement_steps")(none_or_enough)
     _check_instruments = field_validator("instruments")(check_instruments)
 
     @model_validator(mode="after")

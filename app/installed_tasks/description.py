@@ -13,6 +13,8 @@ from pydantic_core import ErrorDetails
 DESCRIPTION, PICTURE, CHECKPOINT = "task.toml", "picture.svg", "checkpoint"
 SHORTEST_CLIP_STEPS, LONGEST_CLIP_STEPS = 20, 600
 """Control steps of 0.1 s."""
+SHORTEST_REFINEMENT = 8_000
+"""Environment steps; half of them are the filter's own, before anything is learned."""
 NAME = "[a-z][a-z0-9_]{0,39}"
 PICTURE_FRAME = "0 0 240 150"
 _SHAPES = {"g", "path", "circle", "ellipse", "rect", "line", "polyline", "polygon"}
@@ -25,6 +27,13 @@ def _flowing(text: str) -> str:
     if "{" in text or "}" in text:
         raise ValueError("must not have braces, which mean a variable in the texts of pages")
     return "\n\n".join(" ".join(paragraph.split()) for paragraph in re.split(r"\n\s*\n", text.strip()))
+
+
+def none_or_enough(steps: int) -> int:
+    """Environment steps of a refinement. Raises ValueError for so few that nothing would be learned."""
+    if 0 < steps < SHORTEST_REFINEMENT:
+        raise ValueError(f"must be 0, for none, or at least {SHORTEST_REFINEMENT:,}")
+    return steps
 
 
 def _code(language: str) -> str:
@@ -130,8 +139,6 @@ class DescribedTask(BaseModel):
     episode_steps: int = Field(ge=SHORTEST_CLIP_STEPS, le=LONGEST_CLIP_STEPS)
     usual_clip_steps: int = Field(ge=SHORTEST_CLIP_STEPS)
     """from the start, in which what matters has happened"""
-    usual_refinement_steps: int = Field(default=0, ge=0)
-    """of a person's last filter; 0 where nothing was measured that speaks for it"""
     words: Words
     instructions: dict[LanguageCode, Text]
     """What participants read of the task, by language; an empty line makes a paragraph."""
@@ -172,6 +179,8 @@ class TaskDescription(DescribedTask):
     """a worker.sim.render.task_look.TaskLook; None: the usual one"""
     demonstrator: Reference | None = None
     """returns a scripted controller that the reference policy imitates first; None: trial and error alone"""
+    usual_refinement_steps: Annotated[int, Field(ge=0), AfterValidator(none_or_enough)] = 0
+    """of a person's last filter; 0 where nothing was measured that speaks for it"""
     training: dict[str, Any] = {}
     """What the reference policy's training does otherwise than worker.ml.policies.sac.SacConfig."""
 

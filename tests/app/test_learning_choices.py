@@ -54,7 +54,7 @@ def test_a_share_of_the_pairs_can_follow_the_person_beside_the_random_ones(
     ("steps", "changed", "complaint"),
     [
         ("60000", {}, None),
-        ("500", {}, "at least 8,000 steps"),
+        ("500", {}, "Must be 0, for none, or at least 8,000."),
         ("60000", {"method": "printed"}, "Only the studio&#39;s own filters are refined"),
         ("", {"task": "feeding"}, None),
     ],

@@ -27,6 +27,7 @@ from tests import factories
 from tests.finished_study import make_finished_study
 from worker.analysis.study.report import make_report
 from worker.jobs.publishing import report_files
+from worker.ml.methods.refinement import Refinement
 
 Finished = Callable[..., Study]
 OSF_QUESTIONS = (
@@ -277,6 +278,20 @@ def test_hints_are_told_where_they_are_asked_for(
         settings = StudySettings(asks_for_hints=asks)
         study = studies.create_study(session, "Hints", settings, seed=1)
     assert text_of(experimenter, study, path).count("up to 2 hints") == asks
+
+
+@pytest.mark.parametrize("steps", [0, 60_000])
+@pytest.mark.parametrize("path", ["results/methods_and_results.md", "preregistration.md"])
+def test_a_refinement_is_told_as_it_is_made(
+    experimenter: TestClient, database: Database, steps: int, path: str
+) -> None:
+    with database.writing() as session:
+        settings = PAPER_PROTOCOL.model_copy(update={"refinement_steps": steps})
+        study = studies.create_study(session, "Refined", settings, seed=1)
+    said = text_of(experimenter, study, path)
+    assert said.count("refined by soft actor-critic for 60,000 environment steps") == (steps > 0)
+    if path.startswith("results"):
+        assert (f"steps, {Refinement().share_ahead:.0%} of them".replace("%", " %") in said) == (steps > 0)
 
 
 def test_a_preregistration_answers_every_question_of_osf(

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from app.domain.studies import usual_refinement_steps
 from worker.analysis.comparison.aggregate import (
     Estimate,
     compare,
@@ -21,7 +22,6 @@ from worker.analysis.filters.evaluation import mean_change, success_change
 from worker.domain.type_aliases import FloatArray
 
 TITLE = "# Is the default better than rivals of today?"
-DEFAULT = "pbarl"
 TOLERANCE = 0.02
 """Largest loss of success, as a share of episodes, with which the task counts as kept."""
 GOAL_SEEDS = 5
@@ -30,6 +30,11 @@ _FINE = 1000.0
 
 Row = Mapping[str, Any]
 Name = tuple[str, str, str, int]
+
+
+def default_in(task: str) -> str:
+    """The method whose filters a study of this task gets, where its experimenter changes nothing."""
+    return "pbarl_refined" if usual_refinement_steps(task) else "pbarl"
 
 
 def read(table: Path) -> list[Row]:
@@ -67,8 +72,10 @@ def page(rows: Sequence[Row]) -> str:
     """All below the mark."""
     found = {name_of(row): row for row in rows}
     seeds = sorted({name[3] for name in found})
+    defaults = ", ".join(f"`{default_in(task)}` in {task}" for task in dict.fromkeys(name[0] for name in found))
     head = (
         f"{len(found)} cells of task, user, method and seed; seeds {', '.join(map(str, seeds))} of {GOAL_SEEDS} so far."
+        f" The default is {defaults}; every other method is called a rival."
     )
     return "\n\n".join([head, _ahead(found), _together(found), _cells(found), _budgets(found)]) + "\n"
 
@@ -76,15 +83,15 @@ def page(rows: Sequence[Row]) -> str:
 def _ahead(found: Mapping[Name, Row]) -> str:
     """Every cell in which a rival gains more, beyond the paired interval, kept task or not."""
     lines = [
-        f"## Where a rival is better than `{DEFAULT}`",
+        "## Where a rival is better than the default",
         "",
         "Difference of gains in points, paired by scenario, with its 95 % interval over scenarios.",
         "",
     ]
     ahead, behind, ties = [], 0, 0
     for (task, user, method, seed), row in found.items():
-        own = found.get((task, user, DEFAULT, seed))
-        if method == DEFAULT or own is None:
+        own = found.get((task, user, default_in(task), seed))
+        if own is None or own is row:
             continue
         change = mean_change(gains_of(own), gains_of(row))
         behind += change["high"] < 0
@@ -115,7 +122,7 @@ def _together(found: Mapping[Name, Row]) -> str:
         " stratified bootstrap (seeds, where there are several, and scenarios). P: the probability that a run of the"
         " method is better than one of the default. Last: share of the method's runs that gain more than so many %.",
         "",
-        f"| method | runs | gain | `{DEFAULT}` there | difference | P(better than `{DEFAULT}`) |"
+        "| method | runs | gain | default there | difference | P(better than the default) |"
         + "".join(f" > {100 * each:.0f} |" for each in THRESHOLDS),
         "|---" * (6 + len(THRESHOLDS)) + "|",
     ]
@@ -123,10 +130,11 @@ def _together(found: Mapping[Name, Row]) -> str:
         strata, others = _shared(found, method)
         if not strata:
             continue
+        is_default = all(method == default_in(name[0]) for name in found if name[2] == method)
         runs = sum(len(each) for each in strata)
         shares = " | ".join(f"{100 * each:.0f} %" for each in profile(strata, THRESHOLDS))
         own = _estimate(estimate(strata))
-        if method == DEFAULT:
+        if is_default:
             lines.append(f"| `{method}` | {runs} | {own} | - | - | - | {shares} |")
             continue
         better = compare(strata, others, probability_of_improvement)
@@ -145,11 +153,11 @@ def _shared(found: Mapping[Name, Row], method: str) -> tuple[list[FloatArray], l
         seeds = [
             seed
             for seed in sorted({name[3] for name in found})
-            if (task, user, method, seed) in found and (task, user, DEFAULT, seed) in found
+            if (task, user, method, seed) in found and (task, user, default_in(task), seed) in found
         ]
         if seeds:
             strata.append(np.array([gains_of(found[task, user, method, seed]) for seed in seeds]))
-            others.append(np.array([gains_of(found[task, user, DEFAULT, seed]) for seed in seeds]))
+            others.append(np.array([gains_of(found[task, user, default_in(task), seed]) for seed in seeds]))
     return strata, others
 
 

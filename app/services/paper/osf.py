@@ -103,6 +103,10 @@ def _design(study: Study, settings: StudySettings) -> Mapping[str, str]:
         + "\n".join(methods)
         + "\n\n"
         + paragraph(
+            f"Filters of all answers are refined by soft actor-critic for {settings.refinement_steps:,} environment "
+            "steps and kept so where that is better by the learned preference and no worse for the task."
+            if settings.refinement_steps
+            else "",
             f"Each method is met in one block of {count(evaluation.trials, 'trial')} "
             + ("on video." if evaluation.mode is EvaluationMode.VIDEO else "with a robot in the room."),
             f"Every two methods that a person has met then meet {count(evaluation.head_to_heads, 'time')} side by side."

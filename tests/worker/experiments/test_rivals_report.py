@@ -37,13 +37,14 @@ def test_a_better_rival_is_named_with_what_it_does_to_the_task() -> None:
     lossy = (np.arange(100) >= 10).astype(float)
     page = rivals_report.page(
         [
-            row("pbarl", 0.10 + noise, np.ones(100)),
+            row("pbarl_refined", 0.10 + noise, np.ones(100)),  # the default in Feeding
             row("sliders", 0.05 + noise, np.ones(100)),
             row("dsrl", 0.20 + noise, np.ones(100)),
             row("residual_rl", 0.30 + noise, lossy),
             row("prefft", 0.30 + noise, lossy, seed=1),  # the default has no such seed
         ]
     )
+    assert "The default is `pbarl_refined` in feeding;" in page
     assert "Of 3 comparisons the rival is behind in 1, within the interval in 0, and ahead in 2:" in page
     assert "`dsrl` by +10.0 [+10.0, +10.0]; success +0.0 points (keeps the task)." in page
     assert "`residual_rl` by +20.0 [+20.0, +20.0]; success -10.0 points (loses the task)." in page

@@ -13,7 +13,8 @@ from app.domain.models import Run, RunKind, RunStatus
 from app.domain.preferences import Exclusion, LabelEvent, Query, Response
 from app.domain.protocol import PAPER_METHODS, EvaluationSettings
 from app.domain.studies import Participant, Study
-from app.domain.study_settings import SHORTEST_REFINEMENT, StudySettings
+from app.domain.study_settings import StudySettings
+from app.installed_tasks.description import SHORTEST_REFINEMENT
 from tests.worker.invented import job_of
 from worker.domain import scenarios
 from worker.jobs import reconcile

@@ -19,16 +19,7 @@ from worker.sim.lab.errors import LabTaskBroken
 from worker.whole_files import written_whole
 
 _OF_FILES = {"file", "gain", "activation"}
-_WORDS = {
-    "title",
-    "summary",
-    "words",
-    "instructions",
-    "sliders",
-    "hints",
-    "usual_clip_steps",
-    "usual_refinement_steps",
-}
+_WORDS = {"title", "summary", "words", "instructions", "sliders", "hints", "usual_clip_steps"}
 """Nothing that was found depends on these."""
 _OF_ASKED = {"function", "inputs", "prompt", "execution_horizon"}
 
