@@ -46,7 +46,7 @@ class Lane(StrEnum):
     LEARNING = "learning"
     """Filters and reports: a minute or so."""
     PATIENT = "patient"
-    """Trainings of many minutes: one at a time on one core, and only with what the others leave."""
+    """Trainings of many minutes, one core each, and only with what the others leave."""
     EXPERIMENTS = "experiments"
     """What no study waits for."""
 
@@ -95,8 +95,7 @@ class Compute:
 
     def __init__(self, processes: int, closing: threading.Event | None = None) -> None:
         """``closing``: when this is set, nothing more is begun, and whoever waits is Interrupted."""
-        alone = dict.fromkeys((Lane.REWARDS, Lane.PATIENT), 1)
-        self._sizes = {**dict.fromkeys(Lane, processes), **alone}
+        self._sizes = {**dict.fromkeys(Lane, processes), Lane.REWARDS: 1}
         self._lanes: dict[Lane, ThreadPoolExecutor] = {}
         self._seats: list[_Seat] = []
         self._mine = threading.local()

@@ -117,6 +117,20 @@ def test_pairs_that_follow_somebody_are_made_while_they_answer_and_never_before_
     assert min([*made, films(waiting)], key=waits.urgency) == films(waiting)
 
 
+def test_a_refinement_for_whoever_answers_comes_before_those_that_are_lent(database: Database, study: Study) -> None:
+    with database.writing() as session:
+        answering, gone = add_person(session, study, seen=1), add_person(session, study, seen=3600)
+    ahead, of_gone = [
+        job_of(f"refinement/participant-{each.id}/ahead/labels-20", study.id) for each in (answering, gone)
+    ]
+    shared = job_of(f"shared/study-{study.id}/filter-1-0", study.id)
+    assert (level(database, ahead), level(database, shared)) == (Level.ANSWERING, Level.POOL)
+    with database.reading() as session:
+        waits = WhoWaits.look(session)
+    mixed = [of_gone, shared, ahead]
+    assert sorted(mixed, key=waits.urgency) == [ahead, shared, of_gone]
+
+
 def test_nobody_waits_for_the_numbers_of_a_method_that_can_be_shown(database: Database, study: Study) -> None:
     with database.writing() as session:
         person = add_person(session, study, Awaited.ROBOTS, seen=1, waiting=60)

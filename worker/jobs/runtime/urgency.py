@@ -119,13 +119,16 @@ class WhoWaits:
         if job.kind == RunKind.SHARED:
             since = self.shared_awaited.get(job.key)
             return Urgency(Level.WAITING if since else Level.POOL, since or _BEGINNING, _STEPS[RunKind.SHARED])
-        if job.about.subject in (AHEAD, LENT):
+        if job.about.subject in (AHEAD, LENT) and job.kind != RunKind.REFINEMENT:
             return Urgency(Level.POOL, _BEGINNING, _LAST_STEP)
         person = None if job.participant_id is None else self.people.get(job.participant_id)
         if person is None:
             return self._of_study(job.study_id)
+        is_here = Level.ANSWERING if person.present and not person.awaited else Level.POOL
         if job.about.subject == MADE:  # nobody waits for it: as long as there is none, the study's rule chooses
-            return Urgency(Level.ANSWERING if person.present and not person.awaited else Level.POOL, _BEGINNING, 0)
+            return Urgency(is_here, _BEGINNING, 0)
+        if job.kind == RunKind.REFINEMENT:  # ahead, of their own last filter: before those that are lent
+            return Urgency(is_here, person.seen_at or _BEGINNING, _LAST_STEP)
         found = _of_person(person, job)
         return found._replace(level=max(found.level, Level.DUE)) if job.key in self.measuring else found
 
