@@ -23,6 +23,7 @@ from app.services.evaluation import donors
 from app.services.monitoring import dashboard
 from app.services.studies import locking
 from app.storage import ArtefactStore
+from app.web.texts.templating import signed_points
 from tests import factories
 from tests.finished_study import make_finished_study
 from tests.made_once import made_once
@@ -176,6 +177,11 @@ def test_dashboard_and_results_have_the_same_figures_of_a_person(
         judged.repeats.agreement.correct,
         judged.repeats.agreement.scored,
     )
+
+
+@pytest.mark.parametrize(("change", "shown"), [(-0.0004, "+0.0"), (-0.0006, "\N{MINUS SIGN}0.1"), (0.05, "+5.0")])
+def test_what_is_rounded_to_nothing_has_no_minus(change: float, shown: str) -> None:
+    assert signed_points(change) == shown
 
 
 def test_tests_that_need_more_people_say_how_many(experimenter: TestClient, finished: Finished) -> None:

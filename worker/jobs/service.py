@@ -63,6 +63,7 @@ class KeepsFelling(AppError):
 def run(settings: Settings) -> int:
     """Keep studies supplied with clips, queries, models and bundles until told to stop."""
     logs.write_to_stderr(settings.log_format, logging.INFO)
+    logging.getLogger("alembic").setLevel(logging.WARNING)  # it tells of every plugin it loads
     engine_log = logging.getLogger("dbos")
     engine_log.setLevel(logging.ERROR)
     engine_log.addFilter(OncePerMinute())

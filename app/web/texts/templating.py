@@ -41,7 +41,7 @@ def percent(share: float) -> str:
 
 def signed_points(difference: float) -> str:
     """A difference of shares in percentage points, with its sign."""
-    return f"{_minus(f'{difference * 100:+.1f}')}"
+    return _minus(f"{difference * 100:+z.1f}")
 
 
 def quantity(value: float | None) -> str:
