@@ -9,49 +9,13 @@ from sqlalchemy import ForeignKey, String, Text, UniqueConstraint, false
 from sqlalchemy.orm import Mapped, mapped_column, relationship
 
 from app.db import Base, now
-from app.domain.study_settings import USUAL_CLIP_STEPS, StudySettings
+from app.domain.study_settings import StudySettings
 from app.installed_tasks import catalogue
-from app.installed_tasks.description import TaskDescription
-from app.installed_tasks.lab import LabDescription
+from app.installed_tasks.by_name import control_rate_hz, longest_clip_steps
 
 NAME_LENGTH = 120
 SEED_LIMIT = 2**31
 """Seeds of studies are smaller."""
-CONTROL_RATE_HZ = 10.0
-"""Of the studio's own tasks."""
-
-
-def longest_clip_steps(task: str) -> int | None:
-    """A whole episode of a task; None for one that is not installed here."""
-    installed = catalogue.find(task)
-    return installed.description.episode_steps if installed else None
-
-
-def usual_clip_steps(task: str) -> int:
-    """Control steps from the start in which what matters in a task has happened."""
-    installed = catalogue.find(task)
-    return installed.description.usual_clip_steps if installed else USUAL_CLIP_STEPS
-
-
-def usual_refinement_steps(task: str) -> int:
-    """How long the studio's last filters are refined, where that was measured to be worth it; else 0."""
-    installed = catalogue.find(task)
-    described = installed.description if installed else None
-    return described.usual_refinement_steps if isinstance(described, TaskDescription) else 0
-
-
-def usual_behaviours(task: str, wanted: int) -> int:
-    """So many ways of doing a scenario, or as many as there are."""
-    installed = catalogue.find(task)
-    most = installed.description.most_behaviours if installed else None
-    return wanted if most is None else min(wanted, most)
-
-
-def control_rate_hz(task: str) -> float:
-    """Control steps per second; a laboratory's task has its own."""
-    installed = catalogue.find(task)
-    described = installed.description if installed else None
-    return described.environment.rate_hz if isinstance(described, LabDescription) else CONTROL_RATE_HZ
 
 
 def new_key_secret() -> str:

@@ -22,11 +22,9 @@ from app.domain.protocol import (
     PlannedTest,
     check_instruments,
 )
+from app.installed_tasks.by_name import USUAL_CLIP_STEPS
 from app.installed_tasks.description import LONGEST_CLIP_STEPS, SHORTEST_CLIP_STEPS, none_or_enough
 from app.questionnaires import library
-
-USUAL_CLIP_STEPS = 60
-"""Of a task that is not installed here."""
 
 
 def _without_words(instrument: str, language: Language, missing: tuple[str, ...], usual: Language) -> str:

@@ -12,8 +12,9 @@ from sqlalchemy import select
 from app.__main__ import _first_start, main
 from app.db import Database
 from app.domain.clips import Clip
-from app.domain.studies import Participant, Study, usual_clip_steps
+from app.domain.studies import Participant, Study
 from app.installed_tasks import catalogue
+from app.installed_tasks.by_name import usual_clip_steps
 from app.services.archives import demo_archive
 from app.settings import Settings
 from app.storage import ArtefactStore

@@ -9,11 +9,11 @@ from typing import Any, get_args
 
 import pytest
 
-from app.domain import studies
 from app.domain.choices import ClipQuality, Method, RewardKind, Strategy
 from app.domain.preferences import Response
 from app.domain.protocol import FROM_OTHERS, LIKERT_POINTS, EvaluatedMethod, EvaluationSettings, Language, PlannedTest
 from app.domain.study_settings import PAPER_PROTOCOL, StudySettings
+from app.installed_tasks import by_name
 from app.paths import WORDING
 from app.services.evaluation import unblinding
 from app.services.studies import preregistration
@@ -59,7 +59,7 @@ def default(config: type, name: str) -> Any:
         (benchmark_cell.CHOOSE_EVERY, USUAL.retrain_every_labels),
         (rollout_cache.BEHAVIOURS_PER_SCENARIO, USUAL.behaviours_per_scenario),
         (statistics.POINTS, (1, LIKERT_POINTS)),
-        (CONTROL_STEP_S, 1 / studies.CONTROL_RATE_HZ),
+        (CONTROL_STEP_S, 1 / by_name.CONTROL_RATE_HZ),
     ],
 )
 def test_what_is_usual_without_a_study_is_what_is_usual_in_one(assumed: object, usual: object) -> None:

@@ -23,16 +23,16 @@ from tqdm import tqdm
 from app.installed_tasks import catalogue
 from worker.analysis.comparison import result_pages
 from worker.analysis.filters.promise import Promise, harms, outcome_of
-from worker.compute import filter_fitting, simulation
+from worker.compute import simulation
 from worker.domain.scenarios import PROMISE_TEST, first_of
 from worker.domain.spaces import Space
 from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import Act, Float32Array, FloatArray
-from worker.experiments.benchmark_cell import PAPER_USERS, BenchmarkConfig, BenchmarkUser, Cell
+from worker.experiments.benchmark_cell import PAPER_USERS, BenchmarkConfig, BenchmarkUser, Cell, default_method
 from worker.experiments.rollout_cache import RolloutCache
-from worker.ml.filters import filter_problem, pbarl
 from worker.ml.filters.filter_onnx import SHIELD
 from worker.ml.filters.filter_problem import FilterAct
+from worker.ml.methods import registry as methods
 from worker.sim.assistive import AssistiveEnv
 from worker.sim.bullet import Bullet
 from worker.sim.costs import preference_rewards, stakes
@@ -97,16 +97,19 @@ def main() -> None:
 
 def _measured(task: str, user: str, changes: Sequence[str], options: argparse.Namespace) -> Iterator[Mapping[str, Any]]:
     work = options.work_directory
-    cell = Cell(task, PAPER_USERS[user], "pbarl", 0)
+    method = default_method(task)
+    cell = Cell(task, PAPER_USERS[user], method, 0)
     bench = BenchmarkUser(cell, BenchmarkConfig(), RolloutCache(task, work / "rollouts"), work)
-    act = _filter(bench, work / "changed_physics" / f"{task}-{user}.npz")
+    act = methods.fit(method, bench.setting()).act
+    if not isinstance(act, FilterAct):
+        raise TypeError(f"{method} is no filter.")
     scenarios = first_of(PROMISE_TEST, options.scenarios, skip=SKIP)
     for name in changes:
         env = changed_environment(task, CHANGES[name])
         policy = simulation.reference_policy(task).mean
         reference, filtered = ([_driven(env, each, some) for some in scenarios] for each in (policy, act))
         env.close()
-        yield {"task": task, "user": user, "change": name, **_row(bench, act, reference, filtered)}
+        yield {"task": task, "user": user, "method": method, "change": name, **_row(bench, act, reference, filtered)}
 
 
 def _changes_of(task: str) -> Sequence[str]:
@@ -116,20 +119,6 @@ def _changes_of(task: str) -> Sequence[str]:
 
 def _driven(env: AssistiveEnv, act: Act, scenario: int) -> Trajectory:
     return rollout(env, act, scenario, simulation.reference_policy(env.task.name).mean)
-
-
-def _filter(bench: BenchmarkUser, kept: Path) -> FilterAct:
-    """The default filter with its shield, fitted once."""
-    setting = bench.setting()
-    problem = setting.problem
-    if not kept.exists():
-        gate = setting.reference(problem.config.gate_block(bench.task))
-        draft = pbarl.fit_studio(problem, setting.surface(), setting.pool, gate, setting.collect).shielded()
-        kept.parent.mkdir(parents=True, exist_ok=True)
-        with written_whole(kept) as path:
-            path.write_bytes(filter_fitting.draft_to_bytes(draft))
-    weights = filter_fitting.draft_from_bytes(kept.read_bytes()).weights
-    return filter_problem.act_of(bench.task.modes, problem.policy, weights)
 
 
 # -- another world -----------------------------------------------------------------------------------------------------
@@ -282,9 +271,7 @@ def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--tasks", nargs="+", choices=catalogue.names(), default=catalogue.names())
     parser.add_argument("--scenarios", type=int, default=40, help="per user and change")
-    parser.add_argument(
-        "--work-directory", type=Path, default=Path("data/benchmark"), help="of rollouts and finished filters"
-    )
+    parser.add_argument("--work-directory", type=Path, default=Path("data/benchmark"), help="of rollouts")
     parser.add_argument("--output", type=Path, required=True, help="path without ending of the page and the table")
     return parser.parse_args()
 

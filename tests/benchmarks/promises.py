@@ -15,6 +15,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from tqdm import tqdm
 
 from app.domain.study_settings import PAPER_PROTOCOL
 from app.installed_tasks import catalogue
+from app.installed_tasks.by_name import usual_refinement_steps
 from tests.worker.at_hand import AtHand
 from worker.analysis.comparison import result_pages
 from worker.analysis.filters.promise import HARMS, Promise, harms, outcome_of
@@ -102,7 +104,7 @@ def _draft(task: str, number: int, bench: BenchmarkUser, kept: Path) -> FilterDr
     )
     fit._gate_reference()  # of which a worker has made sure beforehand
     started = time.process_time()
-    draft = fit.gate_residual(fit.train_residual(fit.find_mode(bench.pool)))
+    draft = fit.gate_residual(fit.train_residual(_refined(fit, fit.find_mode(bench.pool), bench.pool)))
     fitted = time.process_time()
     bare = draft.weights
     draft = fit.keep_promise(draft)
@@ -112,6 +114,15 @@ def _draft(task: str, number: int, bench: BenchmarkUser, kept: Path) -> FilterDr
     with written_whole(kept) as path:
         path.write_bytes(filter_fitting.draft_to_bytes(draft))
     return filter_fitting.draft_from_bytes(kept.read_bytes())
+
+
+def _refined(fit: FilterFit, mode: FilterDraft, known: Sequence[Trajectory]) -> FilterDraft:
+    """The mode refined as is usual in the task; all of it for all answers, as if nothing had been made ahead."""
+    steps = usual_refinement_steps(fit.task)
+    if not steps:
+        return mode
+    with TemporaryDirectory() as folder:
+        return fit.refine(mode, known, steps, None, lambda part: part(Path(folder))) or mode
 
 
 def _variants(draft: FilterDraft) -> dict[str, FilterWeights]:

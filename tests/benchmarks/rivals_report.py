@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from app.domain.studies import usual_refinement_steps
 from worker.analysis.comparison.aggregate import (
     Estimate,
     compare,
@@ -20,6 +19,7 @@ from worker.analysis.comparison.aggregate import (
 )
 from worker.analysis.filters.evaluation import mean_change, success_change
 from worker.domain.type_aliases import FloatArray
+from worker.experiments.benchmark_cell import default_method
 
 TITLE = "# Is the default better than rivals of today?"
 TOLERANCE = 0.02
@@ -30,11 +30,6 @@ _FINE = 1000.0
 
 Row = Mapping[str, Any]
 Name = tuple[str, str, str, int]
-
-
-def default_in(task: str) -> str:
-    """The method whose filters a study of this task gets, where its experimenter changes nothing."""
-    return "pbarl_refined" if usual_refinement_steps(task) else "pbarl"
 
 
 def read(table: Path) -> list[Row]:
@@ -72,7 +67,7 @@ def page(rows: Sequence[Row]) -> str:
     """All below the mark."""
     found = {name_of(row): row for row in rows}
     seeds = sorted({name[3] for name in found})
-    defaults = ", ".join(f"`{default_in(task)}` in {task}" for task in dict.fromkeys(name[0] for name in found))
+    defaults = ", ".join(f"`{default_method(task)}` in {task}" for task in dict.fromkeys(name[0] for name in found))
     head = (
         f"{len(found)} cells of task, user, method and seed; seeds {', '.join(map(str, seeds))} of {GOAL_SEEDS} so far."
         f" The default is {defaults}; every other method is called a rival."
@@ -90,7 +85,7 @@ def _ahead(found: Mapping[Name, Row]) -> str:
     ]
     ahead, behind, ties = [], 0, 0
     for (task, user, method, seed), row in found.items():
-        own = found.get((task, user, default_in(task), seed))
+        own = found.get((task, user, default_method(task), seed))
         if own is None or own is row:
             continue
         change = mean_change(gains_of(own), gains_of(row))
@@ -130,7 +125,7 @@ def _together(found: Mapping[Name, Row]) -> str:
         strata, others = _shared(found, method)
         if not strata:
             continue
-        is_default = all(method == default_in(name[0]) for name in found if name[2] == method)
+        is_default = all(method == default_method(name[0]) for name in found if name[2] == method)
         runs = sum(len(each) for each in strata)
         shares = " | ".join(f"{100 * each:.0f} %" for each in profile(strata, THRESHOLDS))
         own = _estimate(estimate(strata))
@@ -153,11 +148,11 @@ def _shared(found: Mapping[Name, Row], method: str) -> tuple[list[FloatArray], l
         seeds = [
             seed
             for seed in sorted({name[3] for name in found})
-            if (task, user, method, seed) in found and (task, user, default_in(task), seed) in found
+            if (task, user, method, seed) in found and (task, user, default_method(task), seed) in found
         ]
         if seeds:
             strata.append(np.array([gains_of(found[task, user, method, seed]) for seed in seeds]))
-            others.append(np.array([gains_of(found[task, user, default_in(task), seed]) for seed in seeds]))
+            others.append(np.array([gains_of(found[task, user, default_method(task), seed]) for seed in seeds]))
     return strata, others
 
 

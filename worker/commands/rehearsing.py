@@ -11,9 +11,9 @@ import numpy as np
 from app.db import Database
 from app.domain.choices import ClipQuality, Method, Strategy
 from app.domain.protocol import EvaluationSettings
-from app.domain.studies import usual_behaviours, usual_refinement_steps
 from app.domain.study_settings import PAPER_PROTOCOL, StudySettings
 from app.installed_tasks import lab
+from app.installed_tasks.by_name import usual_behaviours, usual_refinement_steps
 from app.services.archives import demo_archive
 from app.storage import ArtefactStore
 from worker.commands import options

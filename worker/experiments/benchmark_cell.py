@@ -18,6 +18,7 @@ import numpy.typing as npt
 import torch
 
 import worker
+from app.installed_tasks.by_name import usual_refinement_steps
 from worker.compute import learning, simulation
 from worker.compute.population import prior_of
 from worker.compute.simulation import surface_file
@@ -54,6 +55,11 @@ PAIRS_PER_SCENARIO = BEHAVIOURS_PER_SCENARIO * (BEHAVIOURS_PER_SCENARIO - 1) // 
 PAPER_USERS: Mapping[str, Taste] = {user.value: TASTES[user.value] for user in User}
 OPPOSED_USERS: Mapping[str, Taste] = {taste.name: taste for pair in OPPOSED for taste in pair}
 INDIRECT_USERS: Mapping[str, Taste] = {taste.name: taste for taste in INDIRECT}
+
+
+def default_method(task: str) -> str:
+    """The method whose filters a study of this task gets where its experimenter changes nothing."""
+    return "pbarl_refined" if usual_refinement_steps(task) else "pbarl"
 
 
 @dataclass(frozen=True)

@@ -2,9 +2,9 @@
 
 from sqlalchemy.orm import Session
 
-from app.domain.studies import usual_behaviours, usual_clip_steps, usual_refinement_steps
 from app.domain.study_settings import StudySettings
 from app.errors import AppError
+from app.installed_tasks.by_name import usual_behaviours, usual_clip_steps, usual_refinement_steps
 from app.paths import DEMO_STUDY
 from app.services import audit
 from app.services.archives import study_import

@@ -14,8 +14,9 @@ from sqlalchemy.orm import Session
 
 from app.domain.participation import ParticipantEvent, StageRecord
 from app.domain.protocol import Stage
-from app.domain.studies import Participant, Study, control_rate_hz
+from app.domain.studies import Participant, Study
 from app.domain.study_settings import StudySettings
+from app.installed_tasks.by_name import control_rate_hz
 from app.services.answers.next_query import LONGEST_PAUSE, PairProgress
 from app.services.participant_events import EventKind
 from app.services.participants import stages

@@ -5,10 +5,10 @@ from http import HTTPStatus
 
 from app.domain.choices import Method, RewardKind, Strategy
 from app.domain.protocol import NEEDS_WEIGHTS, EvaluatedMethod, EvaluationMode
-from app.domain.studies import longest_clip_steps
 from app.domain.study_settings import StudySettings
 from app.errors import AppError
 from app.installed_tasks import catalogue
+from app.installed_tasks.by_name import longest_clip_steps
 
 _NEEDS_WEIGHTS = (
     "would need the policy's own weights, and this task's policy is only asked what it does. Choose something else."

@@ -12,7 +12,8 @@ from app.db import Database
 from app.domain.clips import Clip, Rollout
 from app.domain.models import RunKind
 from app.domain.preferences import NO_OBVIOUS_PAIR, LabelEvent, Purpose, Query, Response
-from app.domain.studies import Participant, Study, longest_clip_steps
+from app.domain.studies import Participant, Study
+from app.installed_tasks.by_name import longest_clip_steps
 from app.storage import ArtefactStore
 from tests.worker.conftest import STEPS, make_trajectory
 from tests.worker.invented import job_of

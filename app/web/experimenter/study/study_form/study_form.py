@@ -11,9 +11,10 @@ from pydantic import ConfigDict, Field, ValidationError, create_model
 from app.domain.choices import Method
 from app.domain.designs import Arm, Screen
 from app.domain.protocol import FormItem
-from app.domain.studies import NAME_LENGTH, SEED_LIMIT, usual_clip_steps, usual_refinement_steps
+from app.domain.studies import NAME_LENGTH, SEED_LIMIT
 from app.domain.study_settings import PAPER_PROTOCOL, StudySettings
 from app.installed_tasks import catalogue
+from app.installed_tasks.by_name import usual_clip_steps, usual_refinement_steps
 from app.services.studies import task_limits
 from app.web.experimenter.study.study_form import form_lines
 from app.web.experimenter.study.study_form.form_fields import BY_NAME, FIELDS, LINES, FormField, Kind
