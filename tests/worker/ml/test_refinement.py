@@ -10,7 +10,7 @@ import torch
 
 from tests.worker import invented
 from tests.worker.ml.test_methods import POLICY, REWARD, STEPS, World, collect
-from worker.domain.trajectory import Trajectory
+from worker.domain.trajectory import SIGNALS, Trajectory
 from worker.domain.type_aliases import Act
 from worker.ml.filters.filter_module import FilterWeights
 from worker.ml.filters.filter_problem import FilterConfig, FilterDraft, FilterProblem, GateTrial, act_of
@@ -30,6 +30,7 @@ SHORT = Refinement(
     environments=2,
 )
 LONGER = replace(SHORT, steps=1_500, critic_first_updates=150, critic_again_updates=150, learning_rate=5e-3)
+STROKES = SIGNALS.index("strokes")
 GATED = FilterWeights(mode={"speed_far": -0.3, "speed_near": -0.3}, gate=0.6)
 
 
@@ -75,10 +76,17 @@ def test_it_begins_as_the_filter_and_goes_where_the_person_wants_it(reference: l
     assert first_joint(learned.weights.changed(gate=1.0)) < first_joint(GATED) - 0.1
 
 
-def test_the_refined_policy_takes_the_place_of_a_weakened_filter_at_full_strength(reference: list[Trajectory]) -> None:
-    draft = FilterDraft(GATED, trials=(GateTrial(0.6, 0.0, 0.01, 0.0, 0.0),))
-    learned = refined(draft, reference, LONGER)
-    gated = refinement.gate_refined(problem(), learned, reference, collect)
+@pytest.fixture(scope="module")
+def learned(reference: list[Trajectory]) -> FilterDraft:
+    torch.set_num_threads(1)
+    return refined(FilterDraft(GATED), reference, LONGER)
+
+
+def test_the_refined_policy_takes_the_place_of_a_weakened_filter_at_full_strength(
+    reference: list[Trajectory], learned: FilterDraft
+) -> None:
+    weak = replace(learned, trials=(GateTrial(0.6, 0.0, 0.01, 0.0, 0.0),))
+    gated = refinement.gate_refined(problem(), weak, reference, collect)
     assert gated.weights.refined
     assert "refined by reinforcement learning" in gated.notes[-1]
     assert gated.weights.gate == 1.0
@@ -88,11 +96,15 @@ def test_the_refined_policy_takes_the_place_of_a_weakened_filter_at_full_strengt
     assert first_joint(gated.weights) < first_joint(GATED)
 
 
-def test_a_refined_policy_that_is_no_better_leaves_the_filter_as_it_was(reference: list[Trajectory]) -> None:
-    draft = FilterDraft(GATED, trials=(GateTrial(0.6, 0.0, 99.0, 0.0, 0.0),))
-    gated = refinement.gate_refined(problem(), refined(draft, reference), reference, collect)
-    assert gated.weights == GATED
-    assert "no better" in gated.notes[-1]
+@pytest.mark.parametrize(("share_of_its_gain", "is_kept"), [(0.85, True), (0.95, False), (99.0, False)])
+def test_a_refined_policy_that_is_hardly_better_than_the_mode_leaves_it_to_a_residual(
+    reference: list[Trajectory], learned: FilterDraft, share_of_its_gain: float, is_kept: bool
+) -> None:
+    best = max(each.preference for each in refinement.gate_refined(problem(), learned, reference, collect).trials)
+    mode = GateTrial(0.6, 0.0, share_of_its_gain * best, 0.0, 0.0)
+    gated = refinement.gate_refined(problem(), replace(learned, trials=(mode,)), reference, collect)
+    assert bool(gated.weights.refined) == is_kept
+    assert is_kept or (gated.weights == GATED and "no better" in gated.notes[-1])
 
 
 def test_a_refined_policy_that_loses_the_task_leaves_the_filter_as_it_was(reference: list[Trajectory]) -> None:
@@ -151,6 +163,23 @@ def test_a_training_that_changed_its_mind_and_paused_ends_with_the_same_policy(
     begin_again(paused)
     went_on = refined(draft, reference, checkpoint=Checkpoint(paused))
     assert went_on.weights.to_bytes() == went_through.weights.to_bytes()
+
+
+def test_strokes_count_where_the_task_is_done_by_strokes(reference: list[Trajectory]) -> None:
+    stroking = [replace(each, signals=each.signals.copy()) for each in reference]
+    for each in stroking:
+        each.signals[:, STROKES] = np.arange(len(each)) % 2
+    signals = np.zeros((2, len(SIGNALS)), np.float32)
+    signals[1, STROKES] = 1.0
+    without, counted = (
+        refinement.guided(some, lambda signals, observations, actions: np.zeros(len(signals)), 0.3)(
+            signals, signals, signals
+        )
+        for some in (reference, stroking)
+    )
+    spread = float(np.concatenate([each.signals[:, STROKES] for each in stroking]).std())
+    assert np.ptp(without) == 0.0
+    assert counted[1] - counted[0] == pytest.approx(0.3 / spread)
 
 
 def _copy(folder: Path, name: str) -> Path:

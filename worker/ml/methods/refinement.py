@@ -1,6 +1,6 @@
 """The longest stage of the studio's filter: a policy of the person's own, which begins as the mode.
 
-A network imitates the mode; soft actor-critic goes on from there, on R-hat and the sketchy reward of PbRL-HRI. Its
+A network imitates the mode; soft actor-critic goes on from there, on R-hat and a sketchy reward (guided()). Its
 replay begins with the rollouts that are there already (Ball et al. 2023, arXiv 2302.02948), and a tie to the imitation,
 as in prefft_anchored, fades while it learns: without the tie it forgets the task before it finds anything better
 (docs/method.md, section 7).
@@ -12,9 +12,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 import torch
 
-from worker.domain.trajectory import Trajectory
+from worker.domain.trajectory import SIGNALS, Trajectory
 from worker.domain.type_aliases import Float32Array
 from worker.ml.filters.filter_problem import (
     Collect,
@@ -27,7 +28,7 @@ from worker.ml.filters.filter_problem import (
 from worker.ml.filters.gate import acceptable, to_beat, try_on
 from worker.ml.filters.shield import limits_of
 from worker.ml.methods import pbrl_hri
-from worker.ml.methods.preference_rl import MakeEnv, PreferenceRl, learned
+from worker.ml.methods.preference_rl import EpisodeReward, MakeEnv, PreferenceRl, learned
 from worker.ml.methods.prefft import TiedLearner
 from worker.ml.policies.checkpoint import Checkpoint
 from worker.ml.policies.demonstrations import Demonstrations
@@ -44,6 +45,9 @@ STRENGTHS = (1.0, 0.8, 0.6)
 LARGEST_LOSS = 0.02
 """of success in the gate's scenarios. Less than a mode may lose: of what reinforcement learning finds, the loss in
 other scenarios was twice what these had shown (docs/results/rivals.md)."""
+LEAST_LIFT = 1.1
+"""So many times what the mode gains the refined policy has to gain: a residual, which follows otherwise, gains as much."""
+_STROKES = SIGNALS.index("strokes")
 OWN_SHARE = 3
 """How often the imitation sees the filter's own states, beside those of the rollouts that were there."""
 
@@ -68,6 +72,8 @@ class Refinement:
     first_tie: float = 1.0
     """weight of the KL divergence from the imitation, in units of the spread of Q; see prefft"""
     last_tie: float = 0.3
+    stroke_weight: float = 0.3
+    """of strokes in the sketchy reward, beside the distance"""
     share_ahead: float = 0.85
     """of the steps, for a reward model of fewer answers"""
 
@@ -136,7 +142,7 @@ def _train(
     offset, scale = torch.from_numpy(policy.offset), torch.from_numpy(policy.scale)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(problem.seed)
-        reward = pbrl_hri.sketchy(reference, learned(problem.reward))
+        reward = guided(reference, learned(problem.reward), config.stroke_weight)
         mark = hashlib.sha256(problem.reward.to_bytes()).hexdigest()
         training = PreferenceRl(beginning.make_env, reward, settings, [*beginning.known, *reference], mark)
         learner = TiedLearner(settings, offset, scale, training.actions, config.first_tie)
@@ -151,6 +157,24 @@ def _train(
         training.learn(learner, checkpoint, loosen, until)
         training.close()
     return learner
+
+
+def guided(reference: Sequence[Trajectory], learned: EpisodeReward, stroke_weight: float) -> EpisodeReward:
+    """The reward that is learned from: PbRL-HRI's, and where a task is done by strokes each of them counts, too.
+
+    Both in standard deviations over reference rollouts. A critic that is asked for a policy's value does not know that
+    episodes end: without it strokes that come too late cost nothing (docs/results/rivals.md).
+    """
+    approaching = pbrl_hri.sketchy(reference, learned)
+    unit = float(np.concatenate([each.signals[:, _STROKES] for each in reference]).std())
+    if unit == 0.0:
+        return approaching
+
+    def both(signals: Float32Array, observations: Float32Array, actions: Float32Array) -> npt.NDArray[np.floating]:
+        rewards: npt.NDArray[np.floating] = approaching(signals, observations, actions)
+        return rewards + stroke_weight / unit * signals[:, _STROKES]
+
+    return both
 
 
 def _imitate(learner: TiedLearner, training: PreferenceRl, act: FilterAct, config: Refinement) -> None:
@@ -177,7 +201,7 @@ def gate_refined(
     collect: Collect,
     progress: ReportProgress = lambda stage, share: None,
 ) -> FilterDraft:
-    """As much of the refined policy as keeps the task and is better than the mode; else the mode."""
+    """As much of the refined policy as keeps the task and is better enough than the mode; else the mode."""
     if not draft.weights.refined:
         return draft
     started, alone = time.perf_counter(), to_beat(problem, draft, reference)
@@ -188,7 +212,7 @@ def gate_refined(
         trial, driven = try_on(problem, act, gate, 0.0, reference, collect)
         draft = replace(draft, trials=(*draft.trials, replace(trial, refined=True)))
         keeps = acceptable(problem, trial, reference) and trial.success_change >= -LARGEST_LOSS
-        if keeps and trial.preference > alone:
+        if keeps and trial.preference > LEAST_LIFT * alone:
             tested = limits_of(problem.task.observation, problem.task.action, driven, reference)
             draft = replace(draft, weights=weights, tested=tested, notes=(*draft.notes, _REFINED))
             return draft.timed("gate_refined", started)
