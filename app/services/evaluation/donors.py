@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from typing import TypeVar
 
-from sqlalchemy import delete, select
+from sqlalchemy import Select, delete, select
 from sqlalchemy.orm import Session
 
 from app.domain.evaluation import Controller, DonorDraw, DonorRule, Donors, Film, SharedFilter, Trial
@@ -83,6 +83,20 @@ def candidates(session: Session, study: Study, participant: Participant) -> Sequ
     """
     if participant.is_preview:
         return []
+    scripted = Participant.scripted_as.is_not(None)
+    others = _finished(study).where(
+        Participant.id != participant.id, scripted if participant.scripted_as is not None else ~scripted
+    )
+    return session.scalars(others.order_by(Participant.number)).all()
+
+
+def has_finished(session: Session, study: Study) -> bool:
+    """Whether anybody's filter, be it a scripted participant's, may be lent."""
+    return session.scalar(_finished(study).limit(1)) is not None
+
+
+def _finished(study: Study) -> Select[int]:
+    """Numbers of those who have a filter of all their answers."""
     has_filter = (
         select(Model.id)
         .where(
@@ -92,17 +106,13 @@ def candidates(session: Session, study: Study, participant: Participant) -> Sequ
         )
         .exists()
     )
-    scripted = Participant.scripted_as.is_not(None)
-    others = select(Participant.number).where(
+    return select(Participant.number).where(
         Participant.study_id == study.id,
-        Participant.id != participant.id,
         Participant.withdrawn_at.is_(None),
         Participant.is_preview.is_(False),
         Participant.ended_as.is_(None),
-        scripted if participant.scripted_as is not None else ~scripted,
         has_filter,
     )
-    return session.scalars(others.order_by(Participant.number)).all()
 
 
 def _one(

@@ -157,6 +157,21 @@ class TestAhead:
         with context.database.reading() as session:
             assert donors.find(session, 1, "average") is None, "drawn is after half of the answers"
 
+    @pytest.mark.parametrize("pool_scenarios", [2, 3])
+    def test_before_anybody_comes_one_of_each_type_once_the_clips_are_there(
+        self, context: WorkerContext, study: Study, add_clips: Callable[[int], list[Clip]], pool_scenarios: int
+    ) -> None:
+        settle(context.database, study, trials=1, methods=("pbarl", "somebody_else", "average"))
+        clips = [clip for scenario in range(2) for clip in add_clips(scenario)]
+        with context.database.writing() as session:
+            changed = {"pool_scenarios": pool_scenarios, "behaviours_per_scenario": len(clips) // 2}
+            stored = session.get_one(Study, study.id)
+            stored.stored_settings = {**stored.stored_settings, **changed}
+        types = [each.types for each in self.asked(context, study)]
+        everybody = ("neutral", "cautious", "impatient")
+        assert types == ([] if pool_scenarios == 3 else [*((each,) for each in everybody), everybody])
+        assert self.asked(context, study) == self.asked(context, study)
+
     def test_nothing_for_whoever_has_left(self, context: WorkerContext, study: Study, answering: Participant) -> None:
         with context.database.writing() as session:
             session.get_one(Participant, answering.id).last_seen_at = now() - timedelta(hours=1)

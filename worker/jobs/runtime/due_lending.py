@@ -1,7 +1,8 @@
 """Filters that are lent: whose turn it is to draw, and which filters for several donors are to be fitted for that.
 
 None of it depends on what the borrower answers, so filters are fitted while people answer, for what would be drawn for
-them now, and in the second half of their answers it is drawn, to be filmed ahead. Types of users only stand in: once
+them now, and in the second half of their answers it is drawn, to be filmed ahead. Types of users only stand in, for
+the first people of a study: their filters are fitted before anybody comes, once the study's clips are there. When
 people have finished it is drawn again.
 """
 
@@ -9,10 +10,11 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import timedelta
 
-from sqlalchemy import select
+from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from app.db import now
+from app.domain.clips import Clip, Rollout
 from app.domain.evaluation import DonorDraw, Donors, SharedFilter
 from app.domain.models import Model, ModelKind, RunKind
 from app.domain.protocol import FROM_OTHERS, EvaluatedMethod, EvaluationMode
@@ -119,6 +121,7 @@ def _needs(session: Session, study: Study) -> _Needs:
         whose = donors.foresee(session, study, participant, method, types)[1] if drawn is None else drawn.donors
         if whose.share_a_filter:
             wanted.append(whose.without_candidates)
+    wanted += _of_types(session, study)
     there = donors.shared_filters(session, study)
     asked = [each.donors for each in there]
     return _Needs(
@@ -145,6 +148,27 @@ def _borrowers(session: Session, study: Study) -> Iterator[tuple[Participant, Ev
         for method in lent:
             if method not in made and (said >= 1 or _is_here(participant)):
                 yield participant, method, said
+
+
+def _of_types(session: Session, study: Study) -> list[Donors]:
+    """What the first people of a study may be lent: none once somebody has finished, or before its clips are there."""
+    settings = study.settings
+    if settings.evaluation is None or study.material is not None:
+        return []
+    in_arms = {method for arm in settings.arms for method in arm.methods}
+    methods = {*settings.evaluation.methods, *in_arms}.intersection(FROM_OTHERS)
+    if not methods or donors.has_finished(session, study) or not _has_all_clips(session, study):
+        return []
+    types = shared_reward.types_of(study.task)
+    each = [Donors(types=(name,)) for name in types] if EvaluatedMethod.SOMEBODY_ELSE in methods else []
+    return each + ([Donors(types=tuple(types))] if EvaluatedMethod.AVERAGE in methods else [])
+
+
+def _has_all_clips(session: Session, study: Study) -> bool:
+    settings = study.settings
+    of_pool = select(func.count(Clip.id)).join(Rollout).where(Rollout.study_id == study.id)
+    of_pool = of_pool.where(Rollout.participant_id.is_(None), Clip.step_count == settings.clip_steps)
+    return (session.scalar(of_pool) or 0) >= settings.pool_scenarios * settings.behaviours_per_scenario
 
 
 def _made(session: Session, participant_id: int, reward: Model) -> set[str]:

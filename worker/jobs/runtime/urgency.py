@@ -118,7 +118,8 @@ class WhoWaits:
             return Urgency(Level.UNREAD, _BEGINNING, 0)
         if job.kind == RunKind.SHARED:
             since = self.shared_awaited.get(job.key)
-            return Urgency(Level.WAITING if since else Level.POOL, since or _BEGINNING, _STEPS[RunKind.SHARED])
+            level = Level.WAITING if since else max(Level.POOL, self._of_study(job.study_id).level)
+            return Urgency(level, since or _BEGINNING, _STEPS[RunKind.SHARED])
         if job.about.subject in (AHEAD, LENT) and job.kind != RunKind.REFINEMENT:
             return Urgency(Level.POOL, _BEGINNING, _LAST_STEP)
         person = None if job.participant_id is None else self.people.get(job.participant_id)

@@ -46,7 +46,7 @@ LARGEST_LOSS = 0.02
 """of success in the gate's scenarios. Less than a mode may lose: of what reinforcement learning finds, the loss in
 other scenarios was twice what these had shown (docs/results/rivals.md)."""
 LEAST_LIFT = 1.1
-"""So many times what the mode gains the refined policy has to gain: a residual, which follows otherwise, gains as much."""
+"""times what the mode gains the refined policy has to gain: a residual, which follows otherwise, often gains as much"""
 _STROKES = SIGNALS.index("strokes")
 OWN_SHARE = 3
 """How often the imitation sees the filter's own states, beside those of the rollouts that were there."""
