@@ -41,7 +41,8 @@ from worker.ml.filters.filter_problem import (
 )
 from worker.ml.filters.policy_choice import SURE
 from worker.ml.filters.response_surface import ResponseSurface
-from worker.ml.methods.refinement import Refinement, gate_refined
+from worker.ml.methods.refinement import Refinement, gate_refined, given_up, is_promising
+from worker.ml.policies.checkpoint import Checkpoint
 from worker.ml.policies.reference import ReferencePolicy
 from worker.ml.rewards.loading import load_reward_model
 from worker.tasks import registry
@@ -150,8 +151,15 @@ class FilterFit:
         a folder for checkpoints, in a compute process, until that gives a draft.
         """
         training = self._training(draft, known, steps)
+        if begun and refining.is_ahead(begun, training.config) and not self._is_promising(training, begun):
+            return given_up(draft)
         refined = train(partial(refining.train, training, begun))
         return refined and gate_refined(self.problem, refined, training.reference, self.collect, self.progress)
+
+    def _is_promising(self, training: refining.Training, begun: Path) -> bool:
+        self.progress("checking what the refinement has come to", 0.34)
+        draft, reference, checkpoint = training.draft, training.reference, Checkpoint(begun)
+        return is_promising(self.problem, draft, reference, training.config, checkpoint, self.collect)
 
     def refine_ahead(self, known: Sequence[Trajectory], steps: int, train: TrainPatiently[bool]) -> None:
         """The larger part of a refinement, around this reward model's mode."""

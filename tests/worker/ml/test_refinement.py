@@ -149,6 +149,19 @@ def test_what_was_begun_on_half_the_answers_goes_where_all_of_them_say(
     assert first_joint(changed.weights) < first_joint(on_the_way.weights) - 0.1
 
 
+def test_what_was_made_ahead_is_promising_only_to_whoever_likes_it(reference: list[Trajectory], tmp_path: Path) -> None:
+    likes = problem(StructuredReward(-REWARD.weights))
+    draft, beginning = FilterDraft(GATED), Beginning(World, [], reference)
+    config, checkpoint = replace(LONGER, share_ahead=0.9), Checkpoint(tmp_path)
+    assert refinement.is_promising(problem(), draft, reference, config, checkpoint, collect), "nothing was made ahead"
+    refinement.refine_ahead(problem(), draft, beginning, config, checkpoint)
+    assert refinement.is_promising(problem(), draft, reference, config, checkpoint, collect)
+    assert not refinement.is_promising(likes, draft, reference, config, checkpoint, collect)
+    ambitious = replace(draft, trials=(GateTrial(0.6, 0.0, 99.0, 0.0, 0.0),))
+    assert not refinement.is_promising(problem(), ambitious, reference, config, checkpoint, collect)
+    assert "given up" in refinement.given_up(draft).notes[-1]
+
+
 def test_a_training_that_changed_its_mind_and_paused_ends_with_the_same_policy(
     reference: list[Trajectory], tmp_path: Path
 ) -> None:

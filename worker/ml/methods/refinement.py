@@ -34,7 +34,7 @@ from worker.ml.policies.checkpoint import Checkpoint
 from worker.ml.policies.demonstrations import Demonstrations
 from worker.ml.policies.imitation import imitate
 from worker.ml.policies.reference import looked_into
-from worker.ml.policies.sac import Learner, SacConfig
+from worker.ml.policies.sac import Actor, Learner, SacConfig
 
 _REFINED = (
     "The filter was refined by reinforcement learning on the learned preference. It began as the execution mode that "
@@ -47,6 +47,10 @@ LARGEST_LOSS = 0.02
 other scenarios was twice what these had shown (docs/results/rivals.md)."""
 LEAST_LIFT = 1.1
 """times what the mode gains the refined policy has to gain: a residual, which follows otherwise, often gains as much"""
+LOOKED_AT = 40
+"""of the gate's scenarios, to see whether a refinement is promising"""
+_AVERAGE = "average."
+"""So begin the names of what the policy is made of in a checkpoint."""
 _STROKES = SIGNALS.index("strokes")
 OWN_SHARE = 3
 """How often the imitation sees the filter's own states, beside those of the rollouts that were there."""
@@ -117,6 +121,35 @@ def refine(
     learner = _train(problem, draft, beginning, config, checkpoint)
     weights = draft.weights.changed(refined=learner.average.policy().weights)
     return replace(draft, weights=weights).timed("refinement", started)
+
+
+def is_promising(
+    problem: FilterProblem,
+    draft: FilterDraft,
+    reference: Sequence[Trajectory],
+    config: Refinement,
+    checkpoint: Checkpoint,
+    collect: Collect,
+) -> bool:
+    """Whether what refine_ahead() came to is better than the mode, by the reward model of all answers.
+
+    If not, the rest, for which somebody waits, is not worth their time: of what was worse by then nothing has become
+    better (docs/results/rivals.md).
+    """
+    kept = checkpoint.read()
+    if kept is None:
+        return True
+    policy = looked_into(problem.policy)
+    actor = Actor(torch.from_numpy(policy.offset), torch.from_numpy(policy.scale), policy.action_size, config.hidden)
+    actor.load_state_dict({name.removeprefix(_AVERAGE): kept[0][name] for name in kept[0] if name.startswith(_AVERAGE)})
+    so_far = act_of(problem.task.modes, problem.policy, draft.weights.changed(refined=actor.policy().weights, gate=1.0))
+    trial, _ = try_on(problem, so_far, 1.0, 0.0, reference[:LOOKED_AT], collect)
+    return trial.preference > to_beat(problem, draft, reference)
+
+
+def given_up(draft: FilterDraft) -> FilterDraft:
+    """Without a refinement, which is not promising."""
+    return replace(draft, notes=(*draft.notes, "The refinement had made nothing better on the way and was given up."))
 
 
 def _train(

@@ -158,6 +158,8 @@ def fit_pbarl_refined(setting: Setting) -> tuple[Act, tuple[str, ...]]:
         refinement.refine_ahead(half, mode, beginning, config, checkpoint)
 
         def refined(draft: FilterDraft) -> FilterDraft:
+            if not refinement.is_promising(problem, draft, reference, config, checkpoint, setting.collect):
+                return refinement.given_up(draft)
             draft = refinement.refine(problem, draft, beginning, config, checkpoint)
             return refinement.gate_refined(problem, draft, reference, setting.collect)
 
