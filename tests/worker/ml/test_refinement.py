@@ -149,6 +149,15 @@ def test_what_was_begun_on_half_the_answers_goes_where_all_of_them_say(
     assert first_joint(changed.weights) < first_joint(on_the_way.weights) - 0.1
 
 
+def test_a_tie_to_what_it_was_lately_lets_it_go_further_than_one_to_the_imitation(reference: list[Trajectory]) -> None:
+    tied = replace(LONGER, first_tie=5.0, last_tie=5.0)
+    stays, goes = (
+        first_joint(refined(FilterDraft(GATED), reference, replace(tied, hold_every_steps=every)).weights)
+        for every in (1_000_000, 150)
+    )
+    assert goes < stays - 0.05
+
+
 def test_what_was_made_ahead_is_promising_only_to_whoever_likes_it(reference: list[Trajectory], tmp_path: Path) -> None:
     likes = problem(StructuredReward(-REWARD.weights))
     draft, beginning = FilterDraft(GATED), Beginning(World, [], reference)

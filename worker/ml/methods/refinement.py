@@ -1,9 +1,9 @@
 """The longest stage of the studio's filter: a policy of the person's own, which begins as the mode.
 
 A network imitates the mode; soft actor-critic goes on from there, on R-hat and a sketchy reward (guided()). Its
-replay begins with the rollouts that are there already (Ball et al. 2023, arXiv 2302.02948), and a tie to the imitation,
-as in prefft_anchored, fades while it learns: without the tie it forgets the task before it finds anything better
-(docs/method.md, section 7).
+replay begins with the rollouts that are there already (Ball et al. 2023, arXiv 2302.02948). It is tied to what it was
+some time before, as prefft_anchored is to where it began, less and less while it learns: without a tie it forgets the
+task before it finds anything better (docs/method.md, section 5).
 """
 
 import hashlib
@@ -74,8 +74,11 @@ class Refinement:
     environments: int = 4
     learning_rate: float = 5e-4
     first_tie: float = 1.0
-    """weight of the KL divergence from the imitation, in units of the spread of Q; see prefft"""
+    """weight of the KL divergence from what it is tied to, the imitation at first, in units of the spread of Q; see
+    prefft"""
     last_tie: float = 0.3
+    hold_every_steps: int = 12_000
+    """the tie is to what the policy was then: it goes far, and never far at once"""
     stroke_weight: float = 0.3
     """of strokes in the sketchy reward, beside the distance"""
     share_ahead: float = 0.85
@@ -184,10 +187,12 @@ def _train(
         else:
             training.restore(learner, *kept)
 
-        def loosen(training: PreferenceRl, _: Learner) -> None:
+        def move_tie(training: PreferenceRl, _: Learner) -> None:
             learner.weight = config.first_tie + training.steps / config.steps * (config.last_tie - config.first_tie)
+            if (training.steps - settings.random_steps) % config.hold_every_steps < config.environments:
+                learner.hold()
 
-        training.learn(learner, checkpoint, loosen, until)
+        training.learn(learner, checkpoint, move_tie, until)
         training.close()
     return learner
 
