@@ -85,7 +85,7 @@ def main() -> None:
     torch.set_num_threads(1)
     table = options.output.with_suffix(".csv")
     rows: list[Mapping[str, Any]] = list(csv.DictReader(table.open())) if table.exists() else []
-    known = {(row["task"], row["user"], row["change"]) for row in rows}
+    known = {(row["task"], row["user"], row["change"]) for row in rows if row["method"] == default_method(row["task"])}
     people = [(task, user) for user in PAPER_USERS for task in options.tasks]
     for task, user in tqdm(people, unit="filter"):
         missing = [name for name in _changes_of(task) if (task, user, name) not in known]

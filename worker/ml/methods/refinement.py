@@ -136,8 +136,8 @@ def is_promising(
 ) -> bool:
     """Whether what refine_ahead() came to is better than the mode, by the reward model of all answers.
 
-    If not, the rest, for which somebody waits, is not worth their time: of what was worse by then nothing has become
-    better (docs/results/rivals.md).
+    If not, somebody would wait for the rest, which is hardly worth their time. How often that would have become better
+    after all was not measured.
     """
     kept = checkpoint.read()
     if kept is None:
