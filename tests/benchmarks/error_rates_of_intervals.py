@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from random import Random
+from statistics import NormalDist
 from typing import Any
 
 import numpy as np
@@ -38,7 +39,15 @@ def _intervals(trials: int) -> Iterator[Row]:
         held = _d_z(rng, people, truth)
         yield _row("Cohen's d_z (noncentral t)", f"{people} people, true {truth:g}", truth, trials // SLOW, held)
     for people in (8, 20):
-        yield _row("rank-biserial (Fisher's z)", f"{people} people, true {RANKS:g}", RANKS, trials, _ranks(rng, people))
+        for shift in RANKS:
+            true = 2 * NormalDist().cdf(shift * 2**0.5) - 1
+            yield _row(
+                "rank-biserial (after Wilson)",
+                f"{people} people, true {true:.2f}",
+                true,
+                trials,
+                _ranks(rng, people, shift),
+            )
     for pairs in (5, 8, 20):
         for rate in (0.5, 0.85, 1.0):
             yield _row("kappa (Wilson, carried through)", *_kappa(rng, pairs, rate, trials))
@@ -47,10 +56,10 @@ def _intervals(trials: int) -> Iterator[Row]:
     for scenarios in (20, 100, 500):
         about = f"{scenarios} scenarios, 95 % and 92 %"
         yield _row("change of success (Newcombe)", about, -0.03, trials, _success(rng, scenarios))
-        yield _row("change of a cost (normal)", f"{scenarios} scenarios, skewed", 0.0, trials, _cost(rng, scenarios))
+        yield _row("change of a cost (t)", f"{scenarios} scenarios, skewed", 0.0, trials, _cost(rng, scenarios))
     for count in (20, 200):
         about = f"{count} answers, no trend"
-        yield _row("time per 100 answers (normal)", about, 0.0, trials // SLOW, _slowing(rng, count))
+        yield _row("time per 100 answers (t)", about, 0.0, trials // SLOW, _slowing(rng, count))
 
 
 def _row(interval: str, about: str, truth: float | None, trials: int, draw: Callable[[], Bounds]) -> Row:
@@ -86,16 +95,12 @@ def _d_z(rng: np.random.Generator, people: int, truth: float) -> Callable[[], Bo
     return draw
 
 
-RANKS = 0.5
-"""Of differences that are positive with a chance of 3/4 whatever their size."""
+RANKS = (0.0, 0.4, 0.8, 1.3)
+"""Means of normal differences with a standard deviation of 1."""
 
 
-def _ranks(rng: np.random.Generator, people: int) -> Callable[[], Bounds]:
-    def draw() -> Bounds:
-        values = rng.exponential(1.0, people) * rng.choice([1, 1, 1, -1], people)
-        return rank_biserial_interval(rank_biserial(values), people)
-
-    return draw
+def _ranks(rng: np.random.Generator, people: int, shift: float) -> Callable[[], Bounds]:
+    return lambda: rank_biserial_interval(rank_biserial(rng.normal(shift, 1.0, people)), people)
 
 
 def _pairs(rng: np.random.Generator, pairs: int, rate: float, equal: float = 0.0) -> list[JudgedAnswer]:

@@ -2,13 +2,14 @@
 
 import numpy as np
 
-Z_95 = 1.959963984540054
+_Z_95 = 1.959963984540054
 
 
-def wilson_interval(correct: float, scored: int, z: float = Z_95) -> tuple[float, float]:
+def wilson_interval(correct: float, scored: float, z: float = _Z_95) -> tuple[float, float]:
     """95 % interval of a proportion; unlike the textbook one it stays inside [0, 1] and works for few trials.
 
-    Wilson (1927). ``correct`` may be a fraction where every trial is a mean over repetitions.
+    Wilson (1927). ``correct`` may be a fraction where every trial is a mean over repetitions, ``scored``
+    where it is what a variance is worth in trials.
     Raises ValueError when nothing was scored.
     """
     if scored < 1 or not 0 <= correct <= scored:

@@ -99,7 +99,7 @@ class Trend:
     """A change from the first to the last answer."""
 
     per_hundred: Estimate
-    """Change in percent per hundred answers (normal interval)."""
+    """Change in percent per hundred answers (t interval)."""
 
 
 @dataclass(frozen=True)
@@ -304,7 +304,7 @@ def longest_run(answers: Sequence[JudgedAnswer]) -> int:
 
 
 def slowing(answers: Sequence[JudgedAnswer]) -> Trend | None:
-    """The trend of log response time beyond the clip's length over the answers: least squares (normal interval)."""
+    """The trend of log response time beyond the clip's length over the answers: least squares (t interval)."""
     timed = [
         (place, _log_ratio(answer.response_time_ms, answer.clip_ms))
         for place, answer in enumerate(answers)
@@ -319,8 +319,19 @@ def slowing(answers: Sequence[JudgedAnswer]) -> Trend | None:
     slope = sum((place - middle) * (value - level) for place, value in timed) / spread
     residual = sum((value - level - slope * (place - middle)) ** 2 for place, value in timed)
     error = sqrt(residual / (count - 2) / spread)
-    low, value, high = (_percent(slope + step * error) for step in (-_Z, 0.0, _Z))
+    margin = _t_quantile(count - 2) * error
+    low, value, high = (_percent(slope + step) for step in (-margin, 0.0, margin))
     return Trend(Estimate(value, low, high))
+
+
+def _t_quantile(degrees_of_freedom: int) -> float:
+    """The 97.5 % quantile of Student's t, right to three digits from 18 degrees of freedom on.
+
+    Abramowitz and Stegun (1964), 26.7.5; the web server has no scipy.
+    """
+    first = (_Z**3 + _Z) / 4
+    second = (5 * _Z**5 + 16 * _Z**3 + 3 * _Z) / 96
+    return _Z + first / degrees_of_freedom + second / degrees_of_freedom**2
 
 
 def _told(pairs: Sequence[tuple[JudgedAnswer, JudgedAnswer]]) -> list[tuple[JudgedAnswer, JudgedAnswer]]:

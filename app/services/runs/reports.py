@@ -11,7 +11,7 @@ from app.domain.studies import Participant, Study
 from app.errors import AppError
 from app.storage import ArtefactStore
 
-VERSION = 10
+VERSION = 11
 """Of the contents of a report. An older one is not shown but made again: numbers in it were computed otherwise."""
 
 FORMATS = {"svg": "image/svg+xml", "png": "image/png"}

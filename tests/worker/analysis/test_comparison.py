@@ -10,6 +10,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from worker.analysis.comparison import comparison_page, comparison_rows, result_pages
 from worker.analysis.comparison.comparison_rows import EvaluatedCell, pooled, table_rows
@@ -98,7 +99,8 @@ def test_every_episode_of_another_seed_narrows_the_interval() -> None:
         row = next(row for row in table_rows(pooled(runs)) if (row["user"], row["method"]) == ("neutral", "pbarl"))
         return float(row["true_preference_high"] - row["true_preference_low"])
 
-    assert width([*RUNS, *second]) == pytest.approx(width(RUNS) / 2**0.5, rel=0.02)
+    quantiles = stats.t.ppf(0.975, 2 * N - 1) / stats.t.ppf(0.975, N - 1)
+    assert width([*RUNS, *second]) == pytest.approx(width(RUNS) * quantiles / 2**0.5, rel=0.02)
 
 
 def test_methods_and_users_are_compared_in_the_seeds_they_share() -> None:

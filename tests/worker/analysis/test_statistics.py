@@ -167,9 +167,31 @@ def test_the_interval_of_an_effect_size_is_where_the_noncentral_t_says(t: float,
     assert stats.nct.sf(t, n - 1, low * n**0.5) == pytest.approx(0.025, abs=1e-6)
 
 
-def test_people_who_all_agree_give_no_interval_of_certainty() -> None:
+def test_few_people_who_all_agree_give_no_interval_of_certainty() -> None:
     assert rank_biserial(np.array([1.0, 2.0, 1.0])) == 1
-    assert rank_biserial_interval(1.0, 3) == (None, None)
+    low, high = rank_biserial_interval(1.0, 3)
+    assert low < 0
+    assert high == 1
+
+
+@pytest.mark.parametrize("n", [8, 16, 30])
+def test_the_interval_of_ranks_leaves_out_zero_where_the_exact_test_does(n: int) -> None:
+    """For whoever the two disagree about, it is close: p is between 3 and 8 %."""
+    rng = np.random.default_rng(n)
+    for shift in np.linspace(0, 2, 60):
+        differences = rng.normal(shift, 1, n)
+        low, high = rank_biserial_interval(rank_biserial(differences), n)
+        p = wilcoxon(differences)["p"]
+        assert (low > 0 or high < 0) == (p < 0.05) or 0.03 < p < 0.08
+
+
+@pytest.mark.parametrize(("shift", "true"), [(0.0, 0.0), (0.8, 0.742), (1.3, 0.934)])
+def test_the_interval_of_ranks_holds_the_true_one_as_often_as_it_says(shift: float, true: float) -> None:
+    """Of normal differences: 2 P(D + D' > 0) - 1."""
+    assert true == pytest.approx(2 * stats.norm.cdf(shift * 2**0.5) - 1, abs=1e-3)
+    samples = np.random.default_rng(0).normal(shift, 1, (1000, 12))
+    ends = [rank_biserial_interval(rank_biserial(sample), 12) for sample in samples]
+    assert 0.93 <= np.mean([low <= true <= high for low, high in ends]) <= 0.98
 
 
 def test_holm_by_hand() -> None:

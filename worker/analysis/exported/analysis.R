@@ -129,12 +129,11 @@ wilcoxon <- function(differences) {
     p = min(1, 2 * sum(chances[seq_len(round(2 * smaller) + 1)])), smallest_p = 2^(1 - n),
     rank_biserial = (2 * positive - sum(ranks)) / sum(ranks)
   )
-  r <- found$rank_biserial
-  if (abs(r) < 1) {
-    error <- sqrt(n * (n + 1) * (2 * n + 1) / 6) / (n * (n + 1) / 2) / sqrt(1 - r^2)
-    found$rank_biserial_low <- tanh(atanh(r) - qnorm(0.975) * error)
-    found$rank_biserial_high <- tanh(atanh(r) + qnorm(0.975) * error)
-  }
+  # Wilson's interval of a share of so many trials: as variable as these ranks.
+  trials <- 3 * n * (n + 1) / (2 * (2 * n + 1))
+  ends <- 2 * wilson(trials * positive / sum(ranks), trials) - 1
+  found$rank_biserial_low <- max(ends[1], -1)
+  found$rank_biserial_high <- min(ends[2], 1)
   found
 }
 

@@ -181,13 +181,10 @@ def wilcoxon(differences):
         "smallest_p": 2.0 ** (1 - len(moved)),
         "rank_biserial": (2 * positive - total) / total,
     }
-    r, n = found["rank_biserial"], len(moved)
-    if abs(r) < 1:  # Fisher's z; where all point the same way it would claim too much
-        error = math.sqrt(n * (n + 1) * (2 * n + 1) / 6) / (n * (n + 1) / 2) / math.sqrt(1 - r**2)
-        found["rank_biserial_low"], found["rank_biserial_high"] = (
-            np.tanh(np.arctanh(r) + sign * 1.959963984540054 * error) for sign in (-1, 1)
-        )
-    return found
+    n = len(moved)
+    trials = 3 * n * (n + 1) / (2 * (2 * n + 1))  # Wilson's interval of a share of so many: as variable as these ranks
+    low, high = wilson(trials * positive / total, trials)
+    return found | {"rank_biserial_low": max(2 * low - 1, -1.0), "rank_biserial_high": min(2 * high - 1, 1.0)}
 
 
 def mixed_model(first, second):

@@ -1,8 +1,8 @@
 """A filter against the reference policy on the same unseen scenarios: differences with 95 % intervals.
 
 Every difference is paired by scenario, so that easy and hard scenarios cancel. Intervals of means of costs and
-preference use the normal approximation (hundreds of scenarios). Success is 0 or 1 and changes in few scenarios or none,
-where that approximation (and the bootstrap) claims too much: it gets Newcombe's score interval for paired proportions.
+preference are Student's. Success is 0 or 1 and changes in few scenarios or none, where they (and the bootstrap) claim
+too much: it gets Newcombe's score interval for paired proportions.
 """
 
 from collections.abc import Sequence
@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy import stats
 
-from worker.analysis.wilson import Z_95, wilson_interval
+from worker.analysis.wilson import wilson_interval
 from worker.domain.task import Task
 from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import FloatArray
@@ -99,8 +100,11 @@ def envelope(trajectories: Sequence[Trajectory], signals: Sequence[str]) -> dict
 
 
 def _with_interval(differences: FloatArray) -> dict[str, float]:
-    mean = float(differences.mean())
-    margin = Z_95 * float(differences.std(ddof=1)) / len(differences) ** 0.5 if len(differences) > 1 else float("inf")
+    """Student's t interval of their mean; without an end for a single one."""
+    mean, count = float(differences.mean()), len(differences)
+    if count < 2:
+        return {"delta": mean, "low": -float("inf"), "high": float("inf")}
+    margin = float(stats.t.ppf(0.975, count - 1)) * float(differences.std(ddof=1)) / count**0.5
     return {"delta": mean, "low": mean - margin, "high": mean + margin}
 
 
