@@ -13,16 +13,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy import stats
 
 from worker.analysis.comparison import result_pages
-from worker.analysis.study.bradley_terry import NO_SPREAD, error_of, strengths, why_not
-from worker.analysis.study.effect_sizes import holm
+from worker.analysis.study.bradley_terry import comparisons, fits, strengths
 from worker.domain.type_aliases import FloatArray
 
 RESULTS = Path("docs/results")
 METHODS, ROUNDS, TIE = 3, 3, 0.3
-PEOPLE, SPREADS, EFFECTS = (4, 8, 16, 24), (0.0, 1.0), (0.0, 1.0)
+PEOPLE, SPREADS, EFFECTS = (4, 8, 16, 24), (0.0, 1.0), (0.0, 1.0, 3.0, 5.0)
 Arms = tuple[tuple[int, ...], ...]
 ARMS: tuple[Arms, ...] = (((0, 1), (1, 2)), ((0, 1), (1, 2), (0, 2)), ((0, 1, 2), (1, 2)))
 IN_EACH_ARM, SPREADS_IN_ARMS = (4, 5, 8, 16), (0.0, 1.2)
@@ -50,31 +48,26 @@ def row(arms: Arms, people: int, spread: float, effect: float, studies: int) -> 
     pairs = list(combinations(range(METHODS), 2))
     same = [pair for pair in pairs if not effect or METHODS - 1 not in pair]
     offered, missed, naive_missed, hit = (dict.fromkeys(pairs, 0) for _ in range(4))
-    families = 0
+    tested, families, fitted = 0, 0, 0
     for _ in range(studies):
         wins = invented(people, spread, effect, rng, arms)
-        if why_not(wins):
-            continue
-        found = strengths(wins.sum(axis=0))
-        naive = naive_covariance(wins.sum(axis=0), found)
-        p_values: list[float | None] = []
-        for pair in pairs:
+        told = dict(zip(pairs, comparisons(wins), strict=True))
+        tested += sum(each["p"] is not None for each in told.values())
+        families += any(told[pair]["p"] is not None and told[pair]["p_holm"] < ALPHA for pair in same)
+        fitted += fits(wins)
+        naive = naive_covariance(wins.sum(axis=0)) if fits(wins) else None
+        for pair, each in told.items():
+            hit[pair] += each["p"] is not None and each["p"] < ALPHA
+            if naive is None or each["low"] is None:
+                continue
+            true = truth[pair[1]] - truth[pair[0]]
             contrast = np.zeros(METHODS)
             contrast[list(pair)] = -1, 1
-            error = error_of(wins, found, contrast)
-            if error is None or error[0] <= NO_SPREAD:
-                p_values.append(None)
-                continue
-            p = float(2 * stats.t.sf(abs(contrast @ found) / error[0], error[1]))
-            p_values.append(p)
-            off = abs(contrast @ (found - truth))
             offered[pair] += 1
-            missed[pair] += int(off > stats.t.ppf(0.975, error[1]) * error[0])
-            naive_missed[pair] += int(off > 1.96 * float(contrast @ naive @ contrast) ** 0.5)
-            hit[pair] += p < ALPHA
-        after = dict(zip(pairs, holm(p_values), strict=True))
-        families += any(p is not None and p < ALPHA for pair, p in after.items() if pair in same)
-    alarms = [100 * hit[pair] / max(offered[pair], 1) for pair in same]
+            missed[pair] += not each["low"] <= true <= each["high"]
+            error = float(contrast @ naive @ contrast) ** 0.5
+            naive_missed[pair] += abs(each["difference"] - true) > 1.96 * error
+    alarms = [100 * hit[pair] / studies for pair in same]
     different = [pair for pair in pairs if pair not in same]
     shown = max(sum(offered.values()), 1)
     return {
@@ -83,12 +76,11 @@ def row(arms: Arms, people: int, spread: float, effect: float, studies: int) -> 
         "spread": spread,
         "effect": effect,
         "studies": studies,
-        "offered_percent": round(100 * sum(offered.values()) / studies / len(pairs), 1),
+        "strengths_percent": round(100 * fitted / studies, 1),
+        "tested_percent": round(100 * tested / studies / len(pairs), 1),
         "misses_percent": round(100 * sum(missed.values()) / shown, 1),
         "misses_if_answers_counted_percent": round(100 * sum(naive_missed.values()) / shown, 1),
-        "false_alarms_percent": round(
-            100 * sum(hit[pair] for pair in same) / max(sum(offered[pair] for pair in same), 1), 1
-        ),
+        "false_alarms_percent": round(sum(alarms) / len(same), 1),
         "false_alarms_of_worst_pair_percent": round(max(alarms), 1),
         "false_alarms_of_family_percent": round(100 * families / studies, 1),
         "power_percent": round(100 * sum(hit[pair] for pair in different) / studies / len(different), 1)
@@ -97,8 +89,9 @@ def row(arms: Arms, people: int, spread: float, effect: float, studies: int) -> 
     }
 
 
-def naive_covariance(wins: FloatArray, found: FloatArray) -> FloatArray:
+def naive_covariance(wins: FloatArray) -> FloatArray:
     """Of the strengths, as if each answer came from another person. ``wins`` (methods, methods)."""
+    found = strengths(wins)
     chances = 1 / (1 + np.exp(found[None, :] - found[:, None]))
     weights = (wins + wins.T) * chances * (1 - chances)
     return np.asarray(np.linalg.pinv(np.diag(weights.sum(axis=1)) - weights), np.float64)

@@ -284,7 +284,9 @@ def _analysis(study: Study, plan: Plan) -> Iterator[str]:
         "method before).",
         "Head-to-heads: Bradley-Terry strengths, an equal answer as half a win for each, with a sandwich variance over "
         "people corrected for the people whom a difference rests on (Bell and McCaffrey 2002), t with Satterthwaite's "
-        "degrees of freedom, and Holm's method over their comparisons."
+        "degrees of freedom; where no finite strength fits or all answered alike, each person's share of wins, with "
+        "Wilson's interval of its mean (people as trials) and Wilcoxon's exact signed-rank test; Holm's method over "
+        "all comparisons."
         if evaluation.head_to_heads
         else "",
         "Which robot was made for them: exact two-sided binomial test against chance."

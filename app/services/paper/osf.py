@@ -267,7 +267,9 @@ def _analysis(study: Study, settings: StudySettings) -> Mapping[str, str]:
         + (
             "\n\nHead-to-heads: Bradley-Terry strengths, an equal answer as half a win for each, with a sandwich "
             "variance over people corrected for the people whom a difference rests on (Bell and McCaffrey 2002), and t "
-            "with Satterthwaite's degrees of freedom: people less one where everybody compares all, fewer in arms."
+            "with Satterthwaite's degrees of freedom: people less one where everybody compares all, fewer in arms. "
+            "Where no finite strength fits, as when one method is always preferred, or where all answered alike: "
+            "Wilcoxon's exact signed-rank test of each person's share of wins."
             if evaluation and evaluation.head_to_heads
             else ""
         )

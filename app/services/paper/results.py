@@ -253,31 +253,32 @@ def _head_to_heads(found: Result) -> Iterator[str]:
         f"{count(found['people'], 'person', 'people')} answered {count(found['answers'], 'head-to-head')}: left "
         f"{found['left']}, right {found['right']}, equal {found['equal']}."
     )
-    if not has_number(found):
+    if has_number(found):
+        yield (
+            "Bradley-Terry strengths (log odds, their sum is zero; an equal answer is half a win for each), with "
+            "intervals that count people:"
+        )
+        rows = [
+            (name_of(each["group"]), f"{number(each['strength'])}{interval(each['low'], each['high'])}")
+            for each in found["strengths"]
+        ]
+        yield table(("robot", "strength, 95 % interval"), rows)
+    else:
         yield f"Strengths are not computable, because {found['not_computable']}."
-        return
-    yield (
-        "Bradley-Terry strengths (log odds, their sum is zero; an equal answer is half a win for each), with intervals "
-        "and tests that count people (sandwich variance corrected for the people whom a difference rests on, t with "
-        "Satterthwaite's degrees of freedom, which are people less one where everybody compared all):"
-    )
-    rows = [
-        (name_of(each["group"]), f"{number(each['strength'])}{interval(each['low'], each['high'])}")
-        for each in found["strengths"]
-    ]
-    yield table(("robot", "strength, 95 % interval"), rows)
-    yield table(
-        ("comparison", "difference of strengths", "chance that the first named is preferred", "p", "p (Holm)"),
-        [
-            (
-                f"{name_of(each['second'])} \N{MINUS SIGN} {name_of(each['first'])}",
-                f"{number(each['difference'])}{interval(each['low'], each['high'])}",
-                f"{percent(each['chance'])}{share_interval(each['chance_low'], each['chance_high'])}",
-                p_value(each["p"], ""),
-                p_value(each["p_holm"], ""),
-            )
-            for each in found["comparisons"]
-        ],
+    if "comparisons" in found:
+        head = "comparison", "difference of strengths", "first named preferred in", "test", "p", "p (Holm)"
+        yield table(head, [_side_by_side(each) for each in found["comparisons"]])
+
+
+def _side_by_side(compared: Result) -> tuple[str, ...]:
+    tests = {"bradley_terry": "strengths", "wilcoxon": "Wilcoxon signed-rank", None: "\N{EN DASH}"}
+    return (
+        f"{name_of(compared['second'])} \N{MINUS SIGN} {name_of(compared['first'])}",
+        f"{number(compared['difference'])}{interval(compared['low'], compared['high'])}",
+        f"{percent(compared['chance'])}{share_interval(compared['chance_low'], compared['chance_high'])}",
+        tests[compared["test"]],
+        p_value(compared["p"], ""),
+        p_value(compared["p_holm"], ""),
     )
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from worker.analysis.study.bradley_terry import error_of, head_to_head_report, strengths
+from worker.analysis.wilson import wilson_interval
 
 
 def answers(person: str, left: str, right: str, *said: str) -> list[dict[str, Any]]:
@@ -74,11 +75,37 @@ def test_an_equal_is_half_a_win_and_sides_do_not_matter() -> None:
     assert first["comparisons"] == second["comparisons"]
 
 
-def test_where_all_answered_alike_no_strength_has_an_interval() -> None:
+def test_where_all_answered_alike_no_strength_has_an_interval_and_people_are_counted() -> None:
+    """Five people of one opinion: 1 in 16 by chance, two-sided."""
     rows = [row for p in "vwxyz" for row in answers(p, "a", "b", "left", "left", "right")]
     report = head_to_head_report(rows, ["a", "b"])
     assert [each["low"] for each in report["strengths"]] == [None, None]
-    assert report["comparisons"][0]["p"] is None
+    found = report["comparisons"][0]
+    assert (found["test"], found["p"], found["low"]) == ("wilcoxon", pytest.approx(1 / 16), None)
+    assert found["chance"] == pytest.approx(1 / 3)
+    assert (found["chance_low"], found["chance_high"]) == pytest.approx(wilson_interval(5 / 3, 5))
+
+
+def test_a_robot_that_everybody_prefers_is_found_although_no_strength_fits() -> None:
+    """Eight people prefer c to the two others always, and a to b as often as not."""
+    rows = []
+    for person in "stuvwxyz":
+        rows += answers(person, "c", "a", "left", "left") + answers(person, "b", "c", "right", "right")
+        rows += answers(person, "a", "b", "left" if person < "w" else "right", "equal")
+    report = head_to_head_report(rows, ["a", "b", "c"])
+    assert "always preferred" in report["not_computable"]
+    by_pair = {(e["first"], e["second"]): e for e in report["comparisons"]}
+    assert by_pair["a", "c"]["p"] == by_pair["b", "c"]["p"] == pytest.approx(2 / 2**8)
+    assert by_pair["a", "c"]["p_holm"] == pytest.approx(3 * 2 / 2**8)
+    assert by_pair["a", "c"]["chance"] == 1
+    assert by_pair["a", "c"]["chance_low"] == pytest.approx(wilson_interval(8, 8)[0])
+    assert by_pair["a", "b"]["p"] == 1
+    assert by_pair["a", "b"]["difference"] is None
+
+
+def test_who_sees_no_difference_at_all_is_no_evidence() -> None:
+    rows = [row for p in "uvwxyz" for row in answers(p, "a", "b", "equal", "equal")]
+    assert head_to_head_report(rows, ["a", "b"])["comparisons"][0]["p"] is None
 
 
 def test_the_same_answers_from_fewer_people_say_less() -> None:
@@ -91,5 +118,7 @@ def test_the_same_answers_from_fewer_people_say_less() -> None:
 def test_what_cannot_be_estimated_is_said() -> None:
     always = [row for p in "uvwxyz" for row in answers(p, "a", "b", "left")]
     assert "always preferred" in head_to_head_report(always, ["a", "b"])["not_computable"]
-    assert "4 are needed" in head_to_head_report(always[:2], ["a", "b"])["not_computable"]
+    few = head_to_head_report(always[:2], ["a", "b"])
+    assert "4 are needed" in few["not_computable"]
+    assert "comparisons" not in few
     assert head_to_head_report([], ["a", "b"])["answers"] == 0

@@ -389,13 +389,18 @@ def test_head_to_heads_with_equal_answers_are_computed_alike(
         assert_same(reported, script[name](study), name)
 
 
-@pytest.mark.parametrize("alone", [1, 2, 4])
-def test_head_to_heads_in_arms_are_computed_alike(script: dict[str, Any], tmp_path: Path, alone: int) -> None:
-    """``alone`` people compare the first two methods, where one or two are too few to tell."""
+@pytest.mark.parametrize(("alone", "always"), [(1, False), (2, False), (4, False), (2, True), (5, True)])
+def test_head_to_heads_in_arms_are_computed_alike(
+    script: dict[str, Any], tmp_path: Path, alone: int, always: bool
+) -> None:
+    """``alone`` people compare the first two methods, where one or two are too few to tell; ``always``: the last one
+    is always preferred, so that no strength fits.
+    """
     random, methods = np.random.default_rng(alone), ["reference", "prefft", "pbarl"]
     rows = [
         {"participant": f"P{number}", "left_method": left, "right_method": right, "counts": True}
         | {"response": "left" if answer == 0 else "right" if answer == 1 else random.choice(["left", "equal", "right"])}
+        | ({"response": "right"} if always and number >= alone else {})
         for number in range(alone + 6)
         for left, right in [methods[:2] if number < alone else methods[1:]]
         for answer in range(4 + number % 2)

@@ -548,12 +548,29 @@ is_connected <- function(won) {
   all(reached)
 }
 
-# Bradley and Terry's model as a logistic regression, with a sandwich variance over people.
+# Bradley and Terry's model as a logistic regression, with a sandwich variance over people. Where no finite strength
+# fits or nothing scatters, two groups are compared by the mean over people of how often they prefer the second.
 strengths <- function(study) {
   rows <- head_to_heads(study)
   groups <- study$groups
-  who <- unique(rows$participant)
-  if (study$blinded || length(who) < 4 || !is_connected(win_table(study))) return(NULL)
+  if (study$blinded || length(unique(rows$participant)) < 4) return(NULL)
+  model <- if (is_connected(win_table(study))) strengths_of(rows, groups) else list(shown = NULL, difference_of = function(pair) NULL)
+  pairs <- stack_rows(combn(length(groups), 2, simplify = FALSE, FUN = function(pair) {
+    result <- row_of(first = groups[pair[1]], second = groups[pair[2]], p = NA)
+    told <- model$difference_of(pair)
+    if (is.null(told$p)) {
+      shares <- shares_of(rows, groups[pair[1]], groups[pair[2]])
+      told[names(shares)] <- shares
+    }
+    result[names(told)] <- told
+    result
+  }))
+  pairs$p_holm <- holm(pairs$p)
+  stack_rows(list(model$shown, pairs))
+}
+
+# The strength of each group, and a function for the difference of two, by their numbers.
+strengths_of <- function(rows, groups) {
   design <- sapply(groups, function(group) (rows$left_method == group) - (rows$right_method == group))[, -1, drop = FALSE]
   won <- unname(SHARE[rows$response])
   fit <- suppressWarnings(glm(won ~ design - 1, family = binomial, control = list(epsilon = 1e-14, maxit = 100)))
@@ -566,23 +583,32 @@ strengths <- function(study) {
     margin <- if (is.na(error[2])) NA else qt(0.975, error[2]) * error[1]
     row_of(group = groups[i], strength = found[i], low = found[i] - margin, high = found[i] + margin, degrees_of_freedom = error[2])
   }))
-  pairs <- stack_rows(combn(length(groups), 2, simplify = FALSE, FUN = function(pair) {
+  difference_of <- function(pair) {
     difference <- found[pair[2]] - found[pair[1]]
     error <- error_of(centre[pair[2], ] - centre[pair[1], ])
-    result <- row_of(first = groups[pair[1]], second = groups[pair[2]], difference = difference, chance = plogis(difference), p = NA)
-    if (!is.na(error[1]) && error[1] > 1e-9) {
-      margin <- qt(0.975, error[2]) * error[1]
-      result$low <- difference - margin
-      result$high <- difference + margin
-      result$chance_low <- plogis(result$low)
-      result$chance_high <- plogis(result$high)
-      result$p <- 2 * pt(-abs(difference / error[1]), error[2])
-      result$degrees_of_freedom <- error[2]
-    }
-    result
-  }))
-  pairs$p_holm <- holm(pairs$p)
-  stack_rows(list(shown, pairs))
+    result <- list(difference = difference, chance = plogis(difference))
+    if (is.na(error[1]) || error[1] <= 1e-9) return(result)
+    ends <- difference + c(-1, 1) * qt(0.975, error[2]) * error[1]
+    c(result, list(
+      low = ends[1], high = ends[2], chance_low = plogis(ends[1]), chance_high = plogis(ends[2]),
+      p = 2 * pt(-abs(difference / error[1]), error[2]), degrees_of_freedom = error[2], test = "bradley_terry"
+    ))
+  }
+  list(shown = shown, difference_of = difference_of)
+}
+
+# How often each person who met both preferred the second: mean, Wilson's interval with people as trials, test.
+shares_of <- function(rows, first, second) {
+  straight <- rows$left_method == first & rows$right_method == second
+  turned <- rows$left_method == second & rows$right_method == first
+  won <- unname(SHARE[rows$response])
+  met <- straight | turned
+  if (length(unique(rows$participant[met])) < 4) return(list())
+  shares <- tapply(ifelse(straight, 1 - won, won)[met], as.character(rows$participant[met]), mean)
+  ends <- wilson(sum(shares), length(shares))
+  found <- list(chance = mean(shares), chance_low = ends[1], chance_high = ends[2])
+  beyond <- round(as.numeric(shares) - 0.5, 12)
+  if (all(beyond == 0)) found else c(found, list(p = wilcoxon(beyond)$p, test = "wilcoxon"))
 }
 
 # Standard error of a difference of strengths and its degrees of freedom; NA where too few people tell.

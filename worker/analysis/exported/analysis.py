@@ -674,7 +674,8 @@ def wins(study):
 def strengths(study):
     """Bradley and Terry's model as a logistic regression, with a sandwich variance over people.
 
-    Rows with a group: its strength; rows with first and second: the difference of strengths.
+    Rows with a group: its strength; rows with first and second: the difference of strengths, and how often the second
+    is preferred. Where no finite strength fits or nothing scatters, the latter is the mean over people.
     """
     rows = pd.DataFrame(wins(study))
     answers, groups = head_to_heads(study), study.groups
@@ -682,13 +683,26 @@ def strengths(study):
     if rows.empty or len(who) < 4:
         return []
     table = rows.pivot(index="group", columns="against", values="wins").loc[groups, groups].to_numpy()
-    if connected_components(table > 0, connection="strong")[0] > 1:
-        return []
+    fits = connected_components(table > 0, connection="strong")[0] == 1
+    result, difference_of = strengths_of(answers, groups) if fits else ([], lambda i, j: {})
+    pairs = []
+    for i, j in combinations(range(len(groups)), 2):
+        found = difference_of(i, j)
+        if "p" not in found:
+            found |= shares_of(answers, groups[i], groups[j])
+        pairs.append({"first": groups[i], "second": groups[j], **found})
+    for pair, p in zip(pairs, holm([each.get("p") for each in pairs]), strict=True):
+        pair["p_holm"] = p
+    return result + pairs
+
+
+def strengths_of(answers, groups):
+    """The strength of each group, and a function for the difference of two, by their numbers."""
     design = np.array(
         [[(each.left_method == g) - (each.right_method == g) for g in groups] for each in answers.itertuples()], float
     )
     won = answers["response"].map({"left": 1.0, "equal": 0.5, "right": 0.0}).to_numpy(float)
-    clusters = pd.factorize(answers["participant"])[0]
+    clusters, who = pd.factorize(answers["participant"])
     fit = GLM(won, design[:, 1:], family=Binomial()).fit(tol=1e-12, maxiter=100)
     centre = (np.eye(len(groups)) - 1 / len(groups))[:, 1:]
     found = centre @ fit.params
@@ -704,21 +718,34 @@ def strengths(study):
             margin = stats.t.ppf(0.975, freedom) * error
             row |= {"low": found[i] - margin, "high": found[i] + margin, "degrees_of_freedom": freedom}
         result.append(row)
-    pairs = []
-    for i, j in combinations(range(len(groups)), 2):
+
+    def difference_of(i, j):
         difference = found[j] - found[i]
         error, freedom = error_of_strengths(scores, information, centre[j] - centre[i])
-        pair = {"first": groups[i], "second": groups[j], "difference": difference, "chance": special.expit(difference)}
+        pair = {"difference": difference, "chance": special.expit(difference)}
         if error > 1e-9:
             margin = stats.t.ppf(0.975, freedom) * error
             pair["low"], pair["high"] = difference - margin, difference + margin
             pair["chance_low"], pair["chance_high"] = special.expit(pair["low"]), special.expit(pair["high"])
             pair["p"] = 2 * stats.t.sf(abs(difference / error), freedom)
-            pair["degrees_of_freedom"] = freedom
-        pairs.append(pair)
-    for pair, p in zip(pairs, holm([each.get("p") for each in pairs]), strict=True):
-        pair["p_holm"] = p
-    return result + pairs
+            pair |= {"degrees_of_freedom": freedom, "test": "bradley_terry"}
+        return pair
+
+    return result, difference_of
+
+
+def shares_of(answers, first, second):
+    """How often each person who met both preferred the second: mean, Wilson's interval with people as trials, test."""
+    won = answers["response"].map({"left": 0.0, "equal": 0.5, "right": 1.0})
+    straight = (answers["left_method"] == first) & (answers["right_method"] == second)
+    turned = (answers["left_method"] == second) & (answers["right_method"] == first)
+    shares = won.where(straight, 1 - won)[straight | turned].groupby(answers["participant"]).mean().to_numpy()
+    if len(shares) < 4:
+        return {}
+    low, high = wilson(shares.sum(), len(shares))
+    found = {"chance": shares.mean(), "chance_low": low, "chance_high": high}
+    beyond = (shares - 0.5).round(12)
+    return found | ({"p": wilcoxon(beyond)["p"], "test": "wilcoxon"} if beyond.any() else {})
 
 
 def error_of_strengths(scores, information, contrast):

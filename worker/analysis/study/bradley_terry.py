@@ -6,6 +6,10 @@ the sandwich over people (Liang and Zeger 1986), since answers of one person res
 difference it is corrected for the people whom that difference rests on, with Satterthwaite's degrees of freedom (Bell
 and McCaffrey 2002, Survey Methodology 28, 169): where everybody compares all, people - 1, and fewer in arms. What is
 estimated is what holds for somebody drawn at random.
+
+No finite strength fits where some methods were always preferred, and nothing scatters where all answered alike. There
+two methods are compared by the share of wins of each person who met both: its mean with Wilson's interval, people being
+the trials, and Wilcoxon's exact signed-rank test of how far it is from one half.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,7 +21,8 @@ from scipy import stats
 from scipy.sparse.csgraph import connected_components
 
 from worker.analysis.study.effect_sizes import holm
-from worker.analysis.study.hypothesis_tests import not_computable, plain
+from worker.analysis.study.hypothesis_tests import not_computable, plain, signed_rank
+from worker.analysis.wilson import wilson_interval
 from worker.domain.type_aliases import FloatArray
 
 FEWEST_PEOPLE = 4
@@ -33,9 +38,10 @@ def head_to_head_report(answers: Sequence[Mapping[str, Any]], groups: Sequence[s
     """``answers``: rows with participant, left, right (of ``groups``) and response, those that count.
 
     people, answers, equal, left (shares of the sides, ties apart); wins[row][column]: how often row was preferred to
-    column, an equal as one half; strengths[] (group, strength, low, high, degrees_of_freedom) and comparisons[] (first,
-    second, difference of strengths second minus first, low, high, p, p_holm, degrees_of_freedom, and the chance with
-    its interval that second is preferred), or ``not_computable``. No interval and no p where too few people tell.
+    column, an equal as one half; strengths[] (group, strength, low, high, degrees_of_freedom), or ``not_computable``;
+    comparisons[] (first, second, difference of strengths second minus first, low, high, degrees_of_freedom, the chance
+    with its interval that second is preferred, p, p_holm, and ``test``: what the p is of, bradley_terry or wilcoxon).
+    None for whatever too few people tell; without comparisons where fewer than FEWEST_PEOPLE have compared anything.
     """
     rows = [each for each in answers if each["left"] in groups and each["right"] in groups]
     people = list(dict.fromkeys(each["participant"] for each in rows))
@@ -55,20 +61,22 @@ def head_to_head_report(answers: Sequence[Mapping[str, Any]], groups: Sequence[s
         "groups": list(groups),
         "wins": wins.sum(axis=0).tolist(),
     }
-    reason = why_not(wins)
-    return report | (not_computable(reason) if reason else _estimated(wins, groups))
-
-
-def why_not(wins: FloatArray) -> str | None:
-    """Why there are no strengths, in words; None where there are. ``wins``: (people, methods, methods).
-
-    They exist if no group of methods won everything against the rest (Ford 1957).
-    """
     if len(wins) < FEWEST_PEOPLE:
-        return f"{len(wins)} {'person has' if len(wins) == 1 else 'people have'} compared; {FEWEST_PEOPLE} are needed"
-    if connected_components(wins.sum(axis=0) > 0, connection="strong")[0] > 1:
-        return "some methods were always preferred to others, or never met them, so that no finite strength fits"
-    return None
+        who = "person has" if len(wins) == 1 else "people have"
+        return report | not_computable(f"{len(wins)} {who} compared; {FEWEST_PEOPLE} are needed")
+    compared = {"comparisons": [_named(groups, each) for each in comparisons(wins)]}
+    if not fits(wins):
+        reason = "some methods were always preferred to others, or never met them, so that no finite strength fits"
+        return report | not_computable(reason) | compared
+    return report | {"strengths": _estimated(wins, groups)} | compared
+
+
+def fits(wins: FloatArray) -> bool:
+    """Whether there are strengths: if no group of methods won everything against the rest (Ford 1957).
+
+    ``wins``: (people, methods, methods).
+    """
+    return bool(connected_components(wins.sum(axis=0) > 0, connection="strong")[0] == 1)
 
 
 def strengths(wins: FloatArray) -> FloatArray:
@@ -108,11 +116,20 @@ def error_of(wins: FloatArray, found: FloatArray, contrast: FloatArray) -> tuple
     return None if degrees < FEWEST_DEGREES else (float(((scale * seen) ** 2).sum()) ** 0.5, degrees)
 
 
-def head_to_head_p(wins: FloatArray, found: FloatArray, first: int, second: int) -> float | None:
-    """Of two methods, by their numbers; None where too few people tell, or all answered alike."""
-    error = error_of(wins, found, np.eye(len(found))[second] - np.eye(len(found))[first])
-    p: float | None = _compared("", "", float(found[second] - found[first]), error)["p"]
-    return p
+def comparisons(wins: FloatArray) -> list[dict[str, Any]]:
+    """Every two methods, by their numbers; see head_to_head_report. ``wins``: (people, methods, methods)."""
+    count = wins.shape[-1]
+    found = strengths(wins.sum(axis=0)) if len(wins) >= FEWEST_PEOPLE and fits(wins) else None
+    compared = []
+    for first, second in combinations(range(count), 2):
+        contrast = np.eye(count)[second] - np.eye(count)[first]
+        told = None if found is None else _by_strengths(wins, found, contrast)
+        if told is None or told["p"] is None:
+            told = _by_shares(wins[:, first, second], wins[:, second, first], told)
+        compared.append({"first": first, "second": second, **told})
+    for each, corrected in zip(compared, holm([each["p"] for each in compared]), strict=True):
+        each["p_holm"] = corrected
+    return compared
 
 
 def _chances(found: FloatArray) -> FloatArray:
@@ -124,19 +141,17 @@ def _information(met: FloatArray, expected: FloatArray) -> FloatArray:
     return np.asarray(np.diag(weights.sum(axis=1)) - weights, np.float64)
 
 
-def _estimated(wins: FloatArray, groups: Sequence[str]) -> dict[str, Any]:
+def _estimated(wins: FloatArray, groups: Sequence[str]) -> list[dict[str, Any]]:
     found, count = strengths(wins.sum(axis=0)), len(groups)
-    shown, comparisons = [], []
+    shown = []
     for i, group in enumerate(groups):
         strength = _between(float(found[i]), error_of(wins, found, np.eye(count)[i] - 1 / count))
         shown.append({"group": group, "strength": plain(found[i])} | strength)
-    for first, second in combinations(range(count), 2):
-        difference = float(found[second] - found[first])
-        error = error_of(wins, found, np.eye(count)[second] - np.eye(count)[first])
-        comparisons.append(_compared(groups[first], groups[second], difference, error))
-    for each, corrected in zip(comparisons, holm([each["p"] for each in comparisons]), strict=True):
-        each["p_holm"] = corrected
-    return {"strengths": shown, "comparisons": comparisons}
+    return shown
+
+
+def _named(groups: Sequence[str], compared: Mapping[str, Any]) -> dict[str, Any]:
+    return {**compared, "first": groups[compared["first"]], "second": groups[compared["second"]]}
 
 
 def _between(estimate: float, error: tuple[float, float] | None) -> dict[str, Any]:
@@ -147,15 +162,29 @@ def _between(estimate: float, error: tuple[float, float] | None) -> dict[str, An
     return {"low": estimate - margin, "high": estimate + margin, "degrees_of_freedom": error[1]}
 
 
-def _compared(first: str, second: str, difference: float, error: tuple[float, float] | None) -> dict[str, Any]:
-    """No p and no interval where there is no spread."""
-    if error is not None and error[0] <= NO_SPREAD:
-        error = None
-    compared: dict[str, Any] = {"first": first, "second": second, "difference": difference}
-    compared |= _between(difference, error)
-    compared |= {
+def _by_strengths(wins: FloatArray, found: FloatArray, contrast: FloatArray) -> dict[str, Any]:
+    """No p and no interval where there is no spread, or where too few people tell."""
+    difference, error = float(contrast @ found), error_of(wins, found, contrast)
+    told = {"difference": difference, **_between(difference, error)}
+    told |= {
         name: None if end is None else float(1 / (1 + np.exp(-end)))
-        for name, end in (("chance", difference), ("chance_low", compared["low"]), ("chance_high", compared["high"]))
+        for name, end in (("chance", difference), ("chance_low", told["low"]), ("chance_high", told["high"]))
     }
-    compared["p"] = plain(2 * stats.t.sf(abs(difference / error[0]), error[1])) if error else None
-    return compared
+    if error is None or error[0] <= NO_SPREAD:
+        return {**told, "p": None, "test": None}
+    return {**told, "p": plain(2 * stats.t.sf(abs(difference / error[0]), error[1])), "test": "bradley_terry"}
+
+
+def _by_shares(first: FloatArray, second: FloatArray, told: Mapping[str, Any] | None) -> dict[str, Any]:
+    """By how often each person preferred which, (P,), (P,); ``told``: what strengths tell nevertheless."""
+    met = first + second > 0
+    shares, people = second[met] / (first + second)[met], int(met.sum())
+    known = dict(told or dict.fromkeys(("difference", "low", "high", "degrees_of_freedom"))) | {"p": None, "test": None}
+    if people < FEWEST_PEOPLE:
+        return dict.fromkeys(("chance", "chance_low", "chance_high")) | known
+    low, high = wilson_interval(float(shares.sum()), people)
+    known |= {"chance": float(shares.mean()), "chance_low": low, "chance_high": high}
+    beyond = (shares - 0.5).round(12)  # else thirds on either side would be no ties
+    if not beyond.any():
+        return known
+    return known | {"p": signed_rank(beyond)[1], "test": "wilcoxon"}

@@ -4,9 +4,9 @@ What somebody says of a method is 3 (the middle of the scale) + their own level 
 noise of one rating, rounded and cut to 1 to 5. One method is better than all the others by the effect on average. A
 share of those who begin drops out, and counts in no test. Every invented study is tested as the page of results
 would: ratings for a difference of means (paired t, between arms Welch's), for their order (cumulative link model) or
-for equivalence; head-to-heads by Bradley-Terry strengths; corrected by Holm over all comparisons of the design, of
-which one that this test cannot make counts as not found. Intervals of the power are Wilson's, 95 %: they say how far
-the simulation may be off.
+for equivalence; head-to-heads by Bradley-Terry strengths, or Wilcoxon's test where they say nothing; corrected by Holm
+over all comparisons of the design, of which one that this test cannot make counts as not found. Intervals of the power
+are Wilson's, 95 %: they say how far the simulation may be off.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from worker.analysis.study.between import equivalence_between, means_of, welch_t
-from worker.analysis.study.bradley_terry import head_to_head_p, strengths, why_not
+from worker.analysis.study.bradley_terry import comparisons
 from worker.analysis.study.cumulative_link import cumulative_link, cumulative_link_between
 from worker.analysis.study.effect_sizes import holm
 from worker.analysis.study.hypothesis_tests import FEWEST_PAIRED, equivalence, paired_t
@@ -169,10 +169,7 @@ def _head_to_heads_p(truth: Truth, worth: FloatArray, meets: Any, rng: np.random
         won = (np.where(truth.ties & (np.abs(felt) < _TIE), 0.5, felt > 0)).sum(axis=1)
         both = meets[:, first] & meets[:, second]
         wins[:, first, second], wins[:, second, first] = both * won, both * (truth.head_to_heads - won)
-    if why_not(wins):
-        return [None for _ in pairs]
-    found = strengths(wins.sum(axis=0))
-    return [head_to_head_p(wins, found, first, second) for first, second in pairs]
+    return [each["p"] for each in comparisons(wins)]
 
 
 def _is_found(truth: Truth, p_values: Sequence[float | None]) -> bool:
