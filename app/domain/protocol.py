@@ -271,7 +271,8 @@ class PlannedTest(Choice):
     CUMULATIVE_LINK = (
         "cumulative_link",
         "Cumulative link mixed model",
-        "Takes ratings as an order and not as distances; counts people.",
+        "Takes ratings as an order and not as distances; counts people. Plan another beside it: where ratings hardly "
+        "overlap it cannot be computed.",
     )
     EQUIVALENCE = (
         "equivalence",
@@ -283,7 +284,8 @@ class PlannedTest(Choice):
     CUMULATIVE_LINK_BETWEEN = (
         "cumulative_link_between",
         "Cumulative link model between arms",
-        "Takes ratings as an order and not as distances; counts people, and spreads may differ.",
+        "Takes ratings as an order and not as distances; counts people, and spreads may differ. Plan another beside "
+        "it: where ratings hardly overlap it cannot be computed.",
     )
     EQUIVALENCE_BETWEEN = (
         "equivalence_between",
