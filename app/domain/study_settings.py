@@ -23,7 +23,8 @@ from app.domain.protocol import (
     check_instruments,
 )
 from app.installed_tasks.by_name import USUAL_CLIP_STEPS
-from app.installed_tasks.description import LONGEST_CLIP_STEPS, SHORTEST_CLIP_STEPS, none_or_enough
+from app.installed_tasks.description import LONGEST_CLIP_STEPS, SHORTEST_CLIP_STEPS
+from app.installed_tasks.refinements import none_or_enough
 from app.questionnaires import library
 
 

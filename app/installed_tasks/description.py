@@ -10,11 +10,11 @@ from xml.etree import ElementTree
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 from pydantic_core import ErrorDetails
 
+from app.installed_tasks.refinements import none_or_enough
+
 DESCRIPTION, PICTURE, CHECKPOINT = "task.toml", "picture.svg", "checkpoint"
 SHORTEST_CLIP_STEPS, LONGEST_CLIP_STEPS = 20, 600
 """Control steps of 0.1 s."""
-SHORTEST_REFINEMENT = 8_000
-"""Environment steps; half of them are the filter's own, before anything is learned."""
 NAME = "[a-z][a-z0-9_]{0,39}"
 PICTURE_FRAME = "0 0 240 150"
 _SHAPES = {"g", "path", "circle", "ellipse", "rect", "line", "polyline", "polygon"}
@@ -27,13 +27,6 @@ def _flowing(text: str) -> str:
     if "{" in text or "}" in text:
         raise ValueError("must not have braces, which mean a variable in the texts of pages")
     return "\n\n".join(" ".join(paragraph.split()) for paragraph in re.split(r"\n\s*\n", text.strip()))
-
-
-def none_or_enough(steps: int) -> int:
-    """Environment steps of a refinement. Raises ValueError for so few that nothing would be learned."""
-    if 0 < steps < SHORTEST_REFINEMENT:
-        raise ValueError(f"must be 0, for none, or at least {SHORTEST_REFINEMENT:,}")
-    return steps
 
 
 def _code(language: str) -> str:

@@ -53,9 +53,9 @@ def test_a_share_of_the_pairs_can_follow_the_person_beside_the_random_ones(
 @pytest.mark.parametrize(
     ("steps", "changed", "complaint"),
     [
-        ("60000", {}, None),
+        ("90000", {}, None),
         ("500", {}, "Must be 0, for none, or at least 8,000."),
-        ("60000", {"method": "printed"}, "Only the studio&#39;s own filters are refined"),
+        ("90000", {"method": "printed"}, "Only the studio&#39;s own filters are refined"),
         ("", {"task": "feeding"}, None),
     ],
 )
@@ -65,7 +65,7 @@ def test_the_last_filter_can_be_refined(
     settings = created(experimenter, database, {"refinement_steps": steps, **changed}, complaint)
     if settings is None:
         return
-    assert settings.refinement_steps == 60_000
+    assert settings.refinement_steps == 90_000
     assert "the last one refined" in experimenter.get("/studies/pilot").text
 
 

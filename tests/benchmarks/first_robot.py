@@ -6,7 +6,7 @@ short of clips. From the last answer on they look at the waiting page like a bro
     python -m tests.benchmarks.first_robot --steps 1000 --people 2
     python -m tests.benchmarks.first_robot --whole --labels 60 --methods reference pbarl somebody_else average
     python -m tests.benchmarks.first_robot --whole --unhurried --people 1 --at-once 2
-    python -m tests.benchmarks.first_robot --whole --unhurried --labels 40 --people 1 --refine 60000
+    python -m tests.benchmarks.first_robot --whole --unhurried --labels 40 --people 1 --refine 90000
 """
 
 import argparse

@@ -19,6 +19,7 @@ from app.domain.models import Model, ModelKind, Run, RunKind, RunStatus
 from app.domain.preferences import LabelEvent, Query, count_labels
 from app.domain.run_keys import AHEAD, SCENARIO, WHOLE, RunKey
 from app.domain.studies import Participant, Study
+from app.installed_tasks.refinements import answers_ahead
 from app.services.evaluation import evaluation_plan, self_setting
 from worker.domain import scenarios
 from worker.jobs.clips import made_pairs, preview_films, repairs
@@ -27,7 +28,6 @@ from worker.jobs.runtime import due_evaluation, due_lending
 from worker.jobs.runtime.due_work import (
     answers_known,
     filter_due,
-    first_half,
     is_refinement_due,
     last_answers,
     last_exclusions,
@@ -209,8 +209,9 @@ def _stale_models(session: Session, study: Study, succeeded: Collection[str], tr
             if milestone and str(reward) in succeeded and study.material is None:  # no simulator, no filter
                 jobs.append(Job(replace(reward, kind=RunKind.FILTER, labels=milestone), study.id))
         if is_refinement_due(settings, count):
-            half = RunKey(RunKind.REFINEMENT, participant_id=participant_id, subject=AHEAD, labels=first_half(settings))
-            jobs.append(Job(half, study.id))
+            first = answers_ahead(settings.labels_per_participant)
+            ahead = RunKey(RunKind.REFINEMENT, participant_id=participant_id, subject=AHEAD, labels=first)
+            jobs.append(Job(ahead, study.id))
         if not labels or study.material is not None or participant_id not in rating:
             continue
         arm, shown = rating[participant_id], participant_id in begun

@@ -13,6 +13,7 @@ from app.domain.models import Model, ModelKind
 from app.domain.protocol import EvaluatedMethod, EvaluationMode, EvaluationSettings, Language
 from app.domain.studies import Participant, Study
 from app.installed_tasks import catalogue, hints
+from app.installed_tasks.refinements import SHARE_AHEAD, answers_ahead
 from app.questionnaires import library
 from app.services.answers import hint_offers
 from app.services.evaluation import evaluation_plan, unblinding
@@ -168,9 +169,9 @@ def _procedure(session: Session, study: Study) -> Iterator[str]:
         if study.material is None
         else "",
         "The filter of all answers was then refined by soft actor-critic for "
-        f"{settings.refinement_steps:,} environment steps, 85 % of them on the preference learned from the "
-        "first half of the answers and from its execution mode on; the refined policy was kept where it was better and "
-        "no worse in these respects."
+        f"{settings.refinement_steps:,} environment steps, {percent(SHARE_AHEAD, 0)} of them on the preference learned "
+        f"from the first {answers_ahead(settings.labels_per_participant)} answers and from its execution mode on; the "
+        "refined policy was kept where it was better and no worse in these respects."
         if settings.refinement_steps
         else "",
     )

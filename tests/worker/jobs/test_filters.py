@@ -11,7 +11,7 @@ from app.domain.models import Model, ModelKind, RunKind
 from app.domain.preferences import LabelEvent, Query, Response
 from app.domain.run_keys import RunKey
 from app.domain.studies import Participant, Study
-from app.installed_tasks.description import SHORTEST_REFINEMENT
+from app.installed_tasks.refinements import SHORTEST_REFINEMENT
 from app.services.answers import accuracy
 from app.services.answers.misfit import Misfit
 from app.storage import ArtefactStore

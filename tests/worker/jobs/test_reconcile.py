@@ -14,7 +14,7 @@ from app.domain.preferences import Exclusion, LabelEvent, Query, Response
 from app.domain.protocol import PAPER_METHODS, EvaluationSettings
 from app.domain.studies import Participant, Study
 from app.domain.study_settings import StudySettings
-from app.installed_tasks.description import SHORTEST_REFINEMENT
+from app.installed_tasks.refinements import SHORTEST_REFINEMENT
 from tests.worker.invented import job_of
 from worker.domain import scenarios
 from worker.jobs import reconcile
@@ -91,7 +91,7 @@ def test_the_tenth_label_asks_for_a_reward_model_and_then_for_the_milestones_fil
     assert found() == {}
 
 
-def test_a_refinement_is_begun_with_half_the_answers_while_the_others_are_given(
+def test_a_refinement_is_begun_with_the_first_answers_while_the_others_are_given(
     database: Database, labels: Callable[[int], list[Query]], found: Callable[[], dict[str, int]]
 ) -> None:
     with database.writing() as session:

@@ -1,6 +1,6 @@
 """The refinement of a person's last filter, which takes minutes: most of it is done while they still answer.
 
-What is made ahead follows the first half of the answers, whenever it is made, so that the same answers give the same
+What is made ahead follows the first of the answers, whenever it is made, so that the same answers give the same
 filter. It lies in a folder of the person's until their last filter goes on from there; if it is missing, it is made
 then.
 """
@@ -17,6 +17,7 @@ from app.domain.preferences import count_labels
 from app.domain.run_keys import AHEAD
 from app.domain.studies import Participant, Study
 from app.files.unfinished import REFINEMENT
+from app.installed_tasks.refinements import answers_ahead
 from worker.compute import filter_fitting, refining
 from worker.compute.filter_fitting import T, TrainPatiently
 from worker.compute.pools import Lane
@@ -64,7 +65,7 @@ def _made_ahead(
     """The folder of what is made ahead, as far as it is; None: the answers that it would follow say nothing."""
     with context.database.reading() as session:
         settings = session.get_one(Study, job.study_id).settings
-        first = due_work.first_half(settings)
+        first = answers_ahead(settings.labels_per_participant)
         followed = dataset.load_preferences(session, context.store, job.participant, first)
     if followed.pairs is None:
         return None

@@ -7,6 +7,7 @@ from app.domain.models import RunKind
 from app.domain.preferences import LEARNED_FROM, Exclusion, LabelEvent, Query, count_labels
 from app.domain.studies import Participant, Study
 from app.domain.study_settings import StudySettings
+from app.installed_tasks.refinements import answers_ahead
 from worker.jobs.runtime.records import Job
 
 
@@ -34,14 +35,10 @@ def filter_due(settings: StudySettings, answered: int) -> int:
     return max((milestone for milestone in settings.milestones if milestone <= answered), default=0)
 
 
-def first_half(settings: StudySettings) -> int:
-    """How many answers a refinement follows as far as it is made ahead."""
-    return settings.labels_per_participant // 2
-
-
 def is_refinement_due(settings: StudySettings, answered: int) -> bool:
     """Whether it can be made ahead: none of the answers that it follows can be undone any more."""
-    return settings.refinement_steps > 0 and first_half(settings) < answered < settings.labels_per_participant
+    wanted = settings.labels_per_participant
+    return settings.refinement_steps > 0 and answers_ahead(wanted) < answered < wanted
 
 
 def last_exclusions(session: Session, people: Select[int]) -> dict[int, int]:

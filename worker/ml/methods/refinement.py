@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from app.installed_tasks.refinements import SHARE_AHEAD
 from worker.domain.trajectory import SIGNALS, Trajectory
 from worker.domain.type_aliases import Float32Array
 from worker.ml.filters.filter_problem import (
@@ -60,7 +61,7 @@ OWN_SHARE = 3
 class Refinement:
     """How much is learned."""
 
-    steps: int = 60_000
+    steps: int = 90_000
     """of the environment"""
     warm_up_steps: int = 4_000
     """of these, made by the filter"""
@@ -81,7 +82,7 @@ class Refinement:
     """the tie is to what the policy was then: it goes far, and never far at once"""
     stroke_weight: float = 0.3
     """of strokes in the sketchy reward, beside the distance"""
-    share_ahead: float = 0.85
+    share_ahead: float = SHARE_AHEAD
     """of the steps, for a reward model of fewer answers"""
 
     @property

@@ -15,6 +15,7 @@ from typing import Any
 
 import gymnasium
 
+from app.installed_tasks.refinements import answers_ahead
 from worker.domain.scenarios import RESIDUAL, first_of
 from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import Act
@@ -148,14 +149,15 @@ def fit_pbarl(setting: Setting) -> tuple[Act, tuple[str, ...]]:
 
 
 def fit_pbarl_refined(setting: Setting) -> tuple[Act, tuple[str, ...]]:
-    """The studio's filter with its refinement, most of which is made for the first half of the labels."""
+    """The studio's filter with its refinement, most of which is made for the first of the labels."""
     problem, reference, config = setting.problem, setting.reference(_gate(setting)), setting.config.refinement
     beginning = refinement.Beginning(setting.make_env, setting.pool, reference)
-    half = replace(problem, reward=setting.asked().fit(setting.asked().labels.first(setting.labels // 2)))
-    mode = mode_search.find_mode(half, setting.surface(), setting.pool, reference, setting.collect)
+    first = setting.asked().labels.first(answers_ahead(setting.labels))
+    early = replace(problem, reward=setting.asked().fit(first))
+    mode = mode_search.find_mode(early, setting.surface(), setting.pool, reference, setting.collect)
     with TemporaryDirectory() as folder:
         checkpoint = Checkpoint(Path(folder))
-        refinement.refine_ahead(half, mode, beginning, config, checkpoint)
+        refinement.refine_ahead(early, mode, beginning, config, checkpoint)
 
         def refined(draft: FilterDraft) -> FilterDraft:
             if not refinement.is_promising(problem, draft, reference, config, checkpoint, setting.collect):

@@ -1,0 +1,23 @@
+"""What both programs know of refinements (worker.ml.methods.refinement): how long, and what is done ahead."""
+
+SHORTEST_REFINEMENT = 8_000
+"""Environment steps; half of them are the filter's own, before anything is learned."""
+SHARE_AHEAD = 0.9
+"""of the steps, made while the person still answers"""
+ENOUGH_AHEAD = 25
+"""So many answers lead to nearly as much as all of them (docs/results/few_answers.md)."""
+
+
+def none_or_enough(steps: int) -> int:
+    """Environment steps of a refinement. Raises ValueError for so few that nothing would be learned."""
+    if 0 < steps < SHORTEST_REFINEMENT:
+        raise ValueError(f"must be 0, for none, or at least {SHORTEST_REFINEMENT:,}")
+    return steps
+
+
+def answers_ahead(labels: int) -> int:
+    """How many of a person's answers a refinement follows as far as it is made ahead.
+
+    The first quarter, so that there is time for it, if these are enough; never more than half of them.
+    """
+    return min(max(labels // 4, ENOUGH_AHEAD), labels // 2)
