@@ -4,8 +4,8 @@ SHORTEST_REFINEMENT = 8_000
 """Environment steps; half of them are the filter's own, before anything is learned."""
 SHARE_AHEAD = 0.9
 """of the steps, made while the person still answers"""
-ENOUGH_AHEAD = 25
-"""So many answers lead to nearly as much as all of them (docs/results/few_answers.md)."""
+ANSWERS_AHEAD = 50
+"""which that part follows; with 25 of a hundred less was gained (docs/results/rivals.md)"""
 
 
 def none_or_enough(steps: int) -> int:
@@ -16,8 +16,5 @@ def none_or_enough(steps: int) -> int:
 
 
 def answers_ahead(labels: int) -> int:
-    """How many of a person's answers a refinement follows as far as it is made ahead.
-
-    The first quarter, so that there is time for it, if these are enough; never more than half of them.
-    """
-    return min(max(labels // 4, ENOUGH_AHEAD), labels // 2)
+    """How many of a person's answers a refinement follows as far as it is made ahead: half of them at most."""
+    return min(labels // 2, ANSWERS_AHEAD)
