@@ -1,6 +1,6 @@
 """Chromium for the browser tests, one for each file, and a participant with a link to open in it."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -146,24 +146,34 @@ STYLES_ARE_THERE = """async () => {
 }"""
 
 
-LOOKED_AT: dict[str | None, dict[str, Any]] = {"light": {}, "dark": {"runOnly": ["color-contrast"]}}
+LOOKED_AT: dict[str, dict[str, Any]] = {"light": {}, "dark": {"runOnly": ["color-contrast"]}}
 """What the themes differ in is colours: the rest is the same page, and looked at once."""
 
 
 def serious_findings(page: Page) -> list[str]:
-    """What axe finds wrong in either theme for people who use assistive technology, once nothing moves any more.
+    """What axe finds wrong in either theme for people who use assistive technology.
 
     Whoever has just left a page first waits for something that only the next one has.
     """
-    page.evaluate(STYLES_ARE_THERE)  # not wait_for_function: the pages forbid what it evaluates
     found = []
-    for scheme in ("light", "dark", None):
-        page.emulate_media(color_scheme=scheme or "null")
-        page.evaluate(SETTLED)  # a button that is still fading in has the contrast of no state a person reads
-        violations = Axe().run(page, options=LOOKED_AT[scheme]).response["violations"] if scheme else []
-        found += [
-            f"{scheme}: {each['id']}: {each['nodes'][0]['html']}"
-            for each in violations
-            if each["impact"] in ("serious", "critical")
-        ]
+    for scheme in ("light", "dark"):
+        page.emulate_media(color_scheme="dark" if scheme == "dark" else "light")
+        found += [f"{scheme}: {each}" for each in findings(page, ("serious", "critical"), LOOKED_AT[scheme])]
+    page.emulate_media(color_scheme="null")
+    page.evaluate(SETTLED)
     return found
+
+
+def findings(page: Page, impacts: Collection[str] | None = None, options: dict[str, Any] | None = None) -> list[str]:
+    """What axe finds wrong in the page as it is, by default of any impact, once nothing moves any more.
+
+    A button that is still fading in has the contrast of no state a person reads.
+    """
+    page.evaluate(STYLES_ARE_THERE)  # not wait_for_function: the pages forbid what it evaluates
+    page.evaluate(SETTLED)
+    violations = Axe().run(page, options=options).response["violations"]
+    return [
+        f"{each['id']}: {each['nodes'][0]['html']}"
+        for each in violations
+        if impacts is None or each["impact"] in impacts
+    ]
