@@ -3,7 +3,9 @@
 from dataclasses import replace
 from itertools import count
 
+import numpy as np
 import pytest
+from scipy import stats
 
 from app.domain.clips import Clip
 from app.domain.preferences import Label, LabelEvent, Purpose, Query, Response
@@ -192,6 +194,20 @@ def test_who_gets_slower_with_every_answer_is_seen_to() -> None:
     assert judged.slowing is not None
     assert judged.slowing.per_hundred.value == pytest.approx(170.5, abs=2.0)  # 1.01^100 - 1
     assert "slowing" in judged.flags
+
+
+@pytest.mark.parametrize("number", [20, 200])
+def test_the_trend_of_times_has_the_interval_of_a_regression(number: int) -> None:
+    """Times are whole milliseconds, so three digits of the regression on their logarithms are the same."""
+    rng = np.random.default_rng(number)
+    times = np.exp(rng.normal(8.7, 0.5, number)).astype(int)
+    judged = of([answer(response_time_ms=int(time), clip_ms=6000) for time in times])
+    found = stats.linregress(np.arange(number), np.log(times / 6000))
+    margin = stats.t.ppf(0.975, number - 2) * found.stderr
+    assert judged.slowing is not None
+    ends = judged.slowing.per_hundred.low, judged.slowing.per_hundred.high
+    expected = [100 * (np.exp(100 * (found.slope + side * margin)) - 1) for side in (-1, 1)]
+    assert ends == pytest.approx(expected, rel=2e-3)
 
 
 def test_less_agreement_in_the_second_half_is_there_to_be_seen() -> None:

@@ -417,9 +417,12 @@ def test_head_to_heads_in_arms_are_computed_alike(
     )
     reported = head_to_head_tables(report)["strengths"]
     assert_same(reported, script["strengths"](study), "strengths")
+    assert (script["head_to_heads_figure"](study) is None) == always
     if shutil.which("Rscript"):
         call = (
-            "source(commandArgs(TRUE)[1]); write.csv(strengths(read_study(commandArgs(TRUE)[2])), commandArgs(TRUE)[3])"
+            "source(commandArgs(TRUE)[1]); study <- read_study(commandArgs(TRUE)[2]); pdf(NULL); "
+            f"stopifnot(head_to_heads_figure(study) == {'FALSE' if always else 'TRUE'}); "
+            "write.csv(strengths(study), commandArgs(TRUE)[3])"
         )
         run("Rscript", "-e", call, ANALYSIS / "analysis.R", tmp_path / "csv", tmp_path / "strengths.csv")
         assert_same(reported, pd.read_csv(tmp_path / "strengths.csv", index_col=0).to_dict("records"), "strengths")

@@ -903,7 +903,7 @@ ratings_of_each_person <- function(study) {
 
 head_to_heads_figure <- function(study) {
   found <- strengths(study)
-  if (is.null(found)) return(FALSE)
+  if (is.null(found$strength)) return(FALSE)
   found <- found[!is.na(found$strength), ]
   found <- found[order(found$strength), ]
   par(mar = c(5, 10, 2, 1))
