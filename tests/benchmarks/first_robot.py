@@ -7,6 +7,7 @@ short of clips. From the last answer on they look at the waiting page like a bro
     python -m tests.benchmarks.first_robot --whole --labels 60 --methods reference pbarl somebody_else average
     python -m tests.benchmarks.first_robot --whole --unhurried --people 1 --at-once 2
     python -m tests.benchmarks.first_robot --whole --unhurried --labels 40 --people 1 --refine 90000
+    python -m tests.benchmarks.first_robot --whole --prepared --pace 12 --labels 100 --people 1 --refine 90000
 """
 
 import argparse
@@ -31,6 +32,7 @@ from app.domain.run_keys import AHEAD, RunKey
 from app.domain.studies import Participant, Study
 from app.domain.study_settings import PAPER_PROTOCOL, StudySettings
 from app.services.evaluation import donors, evaluation_plan
+from app.services.monitoring import dashboard
 from app.services.participants import enrolment
 from app.services.studies import studies
 from app.storage import ArtefactStore
@@ -54,6 +56,7 @@ def main() -> None:
     parser.add_argument("--pace", type=float, default=PACE_S, help="seconds between two answers")
     parser.add_argument("--at-once", type=int, default=0, help="so many more, who give their last answers together")
     parser.add_argument("--unhurried", action="store_true", help="the last answer comes when all is made ahead")
+    parser.add_argument("--prepared", action="store_true", help="people come once clips and what is lent are there")
     parser.add_argument("--refine", type=int, default=0, help="steps of the last filter's refinement")
     parser.add_argument("--whole", action="store_true", help="filters, promise and trials as studies usually have them")
     options = parser.parse_args()
@@ -73,6 +76,8 @@ def main() -> None:
             )
             groups = [1] * options.people + ([options.at_once] if options.at_once else [])
             tokens = [[enrolment.add_participant(session, study) for _ in range(count)] for count in groups]
+        if options.prepared:
+            _until("not everything is prepared", partial(_is_prepared, database, study, evaluation.methods))
         store = ArtefactStore(Path(directory) / "artefacts")
         for invited in tokens:
             with ExitStack() as browsers:
@@ -135,20 +140,31 @@ def _until(missing: str, seen: Callable[[], bool]) -> None:
     wait_until(PATIENCE_S, missing, lambda: seen() or None)
 
 
+def _is_prepared(database: Database, study: Study, methods: Sequence[EvaluatedMethod]) -> bool:
+    """The study's clips, and filters of types of users if any are lent."""
+    with database.reading() as session:
+        pool = dashboard.study_overview(session, study).pool
+    return pool.made >= pool.wanted and _lent_are_fitted(database, methods)
+
+
 def _is_made_ahead(database: Database, each: Answering) -> bool:
     """Filters of others, films of all that is not their own robot, and the larger part of a refinement."""
     ahead = RunKey(RunKind.FILMS, participant_id=each.participant.id, subject=AHEAD)
     filters = select(Run.id).where(Run.kind.in_((RunKind.FILTER, RunKind.REFINEMENT)), Run.status == RunStatus.RUNNING)
     with database.reading() as session:
-        asked = session.scalars(select(SharedFilter)).all()
-        fitted = [shared.artefact_sha256 for shared in asked]
         running = session.scalar(filters.where(Run.participant_id == each.participant.id).limit(1))
         drawn = session.scalars(select(DonorDraw).where(DonorDraw.participant_id == each.participant.id)).all()
         keys = [str(ahead), *(str(donors.key_of_films(loan)) for loan in drawn)]
         filmed = session.scalars(select(Run.status).where(Run.workflow_id.in_(keys))).all()
     lent = sum(method in FROM_OTHERS for method in each.methods)
     all_filmed = filmed == [RunStatus.SUCCEEDED] * (1 + lent)
-    return bool(fitted) == bool(lent) and None not in fitted and all_filmed and running is None
+    return _lent_are_fitted(database, each.methods) and all_filmed and running is None
+
+
+def _lent_are_fitted(database: Database, methods: Sequence[EvaluatedMethod]) -> bool:
+    with database.reading() as session:
+        fitted = session.scalars(select(SharedFilter.artefact_sha256)).all()
+    return bool(fitted) == any(method in FROM_OTHERS for method in methods) and None not in fitted
 
 
 def _wait(database: Database, people: Sequence[Answering]) -> None:
