@@ -131,6 +131,17 @@ def test_a_refinement_for_whoever_answers_comes_before_those_that_are_lent(datab
     assert sorted(mixed, key=waits.urgency) == [ahead, shared, of_gone]
 
 
+def test_what_the_last_filter_goes_on_from_comes_before_an_earlier_filter(database: Database, study: Study) -> None:
+    with database.writing() as session:
+        answering = add_person(session, study, seen=1)
+    ahead = job_of(f"refinement/participant-{answering.id}/ahead/labels-20", study.id)
+    early = job_of(f"filter/participant-{answering.id}/labels-20", study.id)
+    with database.reading() as session:
+        waits = WhoWaits.look(session)
+    assert sorted([early, ahead], key=waits.urgency) == [ahead, early]
+    assert waits.urgency(early).level == waits.urgency(ahead).level
+
+
 def test_nobody_waits_for_the_numbers_of_a_method_that_can_be_shown(database: Database, study: Study) -> None:
     with database.writing() as session:
         person = add_person(session, study, Awaited.ROBOTS, seen=1, waiting=60)
@@ -325,8 +336,9 @@ def test_a_training_of_many_minutes_does_not_stop_the_other_lanes(database: Data
         pass
 
 
-def test_clips_of_a_study_without_participants_leave_a_processor_to_a_training_for_somebody(
-    database: Database, study: Study
+@pytest.mark.parametrize("lane", [Lane.LEARNING, Lane.PATIENT])
+def test_clips_of_a_study_without_participants_leave_a_processor_to_what_is_learned_for_somebody(
+    database: Database, study: Study, lane: Lane
 ) -> None:
     with database.writing() as session:
         present = add_person(session, study, None, seen=1)
@@ -335,13 +347,13 @@ def test_clips_of_a_study_without_participants_leave_a_processor_to_a_training_f
     with database.reading() as session:
         lanes.who_waits = WhoWaits.look(session)
     first = lanes.gate(Lane.CLIPS).passed(lambda: lanes.who_waits.urgency(clips(unopened)))
-    with lanes.working(Lane.PATIENT, films(present)):
+    with lanes.working(lane, job_of(f"refinement/participant-{present.id}/ahead/labels-20", study.id)):
         assert not lanes._holds_back(Lane.CLIPS, Level.UNOPENED), "there are two processors"
         with first:
             assert lanes._holds_back(Lane.CLIPS, Level.UNOPENED)
             assert not lanes._holds_back(Lane.CLIPS, Level.POOL), "whose study has participants"
     with lanes.gate(Lane.CLIPS).passed(lambda: lanes.who_waits.urgency(clips(unopened))):
-        assert not lanes._holds_back(Lane.CLIPS, Level.UNOPENED), "nothing is trained"
+        assert not lanes._holds_back(Lane.CLIPS, Level.UNOPENED), "nothing is learned"
 
 
 def test_what_goes_wrong_in_one_task_reaches_the_job(database: Database, study: Study) -> None:

@@ -3,7 +3,7 @@
 A job's tasks go in one by one, so work that began earlier gives way within one task (a few rollouts, a film); trainings
 of many minutes ask is_needed_elsewhere() and pause at a checkpoint. Lanes share the processors: while work that
 somebody waits for is in any lane but the patient one, no lane takes tasks that nobody is here for. Clips of a study
-without participants leave a processor to the patient lane.
+without participants leave a processor to what is learned for somebody.
 """
 
 import time
@@ -74,11 +74,12 @@ class Lanes:
         return level >= Level.UNOPENED and self._takes_all_processors(lane)
 
     def _takes_all_processors(self, lane: Lane) -> bool:
-        """Whether one task more in the lane would leave none to a training that is for somebody."""
-        is_trained = any(
-            where == Lane.PATIENT and self._level(job) < Level.UNOPENED for where, job in tuple(self._in_hand)
+        """Whether one task more in the lane would leave none to what is learned for somebody."""
+        is_learned = any(
+            where in (Lane.LEARNING, Lane.PATIENT) and self._level(job) < Level.UNOPENED
+            for where, job in tuple(self._in_hand)
         )
-        return is_trained and self._gates[lane].inside >= max(1, self.compute.size(lane) - 1)
+        return is_learned and self._gates[lane].inside >= max(1, self.compute.size(lane) - 1)
 
     def _level(self, job: Job) -> Level:
         return self.who_waits.urgency(job).level

@@ -56,7 +56,7 @@ class Urgency(NamedTuple):
     step: int
 
 
-_ORDER = (RunKind.REWARD, RunKind.FILTER, RunKind.SHARED, RunKind.METHOD, RunKind.FILMS)
+_ORDER = (RunKind.REWARD, RunKind.REFINEMENT, RunKind.FILTER, RunKind.SHARED, RunKind.METHOD, RunKind.FILMS)
 _STEPS = {RunKind.CLIPS: 0} | {kind: step for step, kind in enumerate(_ORDER)}
 _LAST_STEP = len(_ORDER)
 
@@ -128,8 +128,8 @@ class WhoWaits:
         is_here = Level.ANSWERING if person.present and not person.awaited else Level.POOL
         if job.about.subject == MADE:  # nobody waits for it: as long as there is none, the study's rule chooses
             return Urgency(is_here, _BEGINNING, 0)
-        if job.kind == RunKind.REFINEMENT:  # ahead, of their own last filter: before those that are lent
-            return Urgency(is_here, person.seen_at or _BEGINNING, _LAST_STEP)
+        if job.kind == RunKind.REFINEMENT:  # ahead, of their last filter: nobody will wait for their earlier ones
+            return Urgency(is_here, person.seen_at or _BEGINNING, _STEPS[RunKind.REFINEMENT])
         found = _of_person(person, job)
         return found._replace(level=max(found.level, Level.DUE)) if job.key in self.measuring else found
 
