@@ -56,7 +56,7 @@ def refine(context: WorkerContext, run_id: int, job: Job, reward: str, draft: st
 
 
 def _make_ahead(context: WorkerContext, run_id: int, job: Job) -> None:
-    # Not in the patient lane, whose processes got a tenth of a processor beside an earlier filter and clips.
+    # Not in the patient lane, whose processes get next to nothing beside an earlier filter and clips.
     _made_ahead(context, run_id, job, Lane.LEARNING, partial(_has_answered_everything, context, job))
 
 
