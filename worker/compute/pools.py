@@ -44,7 +44,7 @@ class Lane(StrEnum):
     REWARDS = "rewards"
     """Seconds each, one at a time: somebody is answering, and the next pairs are chosen by the newest model."""
     LEARNING = "learning"
-    """Filters and reports: a minute or so."""
+    """Filters, their refinements, which make room for whoever waits, and reports."""
     PATIENT = "patient"
     """Trainings of many minutes, one core each, and only with what the others leave."""
     EXPERIMENTS = "experiments"
