@@ -22,10 +22,11 @@ from functools import partial
 from pathlib import Path
 
 from sqlalchemy import select
+from sqlalchemy.orm import Session
 
 from app.db import Database
 from app.domain.evaluation import DonorDraw, Film, SharedFilter, Trial
-from app.domain.models import Run, RunKind, RunStatus
+from app.domain.models import Model, ModelKind, Run, RunKind, RunStatus
 from app.domain.preferences import count_labels
 from app.domain.protocol import FROM_OTHERS, EvaluatedMethod, EvaluationSettings
 from app.domain.run_keys import AHEAD, RunKey
@@ -222,8 +223,15 @@ def _report_runs(database: Database, participant_id: int) -> None:
         for run in runs:
             if run.finished_at and run.kind != RunKind.REWARD:
                 _say(f"    {run.workflow_id}: {(run.finished_at - run.started_at).total_seconds():.0f} s")
+                _say_stages(session, run)
         clips = session.scalars(select(Run).where(Run.kind == RunKind.CLIPS, Run.status == RunStatus.SUCCEEDED)).all()
     _say(f"    (runs that made clips for studies so far: {len(clips)})")
+
+
+def _say_stages(session: Session, run: Run) -> None:
+    for model in session.scalars(select(Model).where(Model.run_id == run.id, Model.kind == ModelKind.FILTER)):
+        stages = model.metrics["seconds"].items()
+        _say("      " + ", ".join(f"{stage} {seconds:.0f} s" for stage, seconds in stages))
 
 
 def _say(text: str) -> None:

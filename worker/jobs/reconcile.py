@@ -28,9 +28,11 @@ from worker.jobs.runtime import due_evaluation, due_lending
 from worker.jobs.runtime.due_work import (
     answers_known,
     filter_due,
+    gives_way,
     is_refinement_due,
     last_answers,
     last_exclusions,
+    people_here,
     present_ids,
     reward_due,
 )
@@ -199,18 +201,19 @@ def _stale_models(session: Session, study: Study, succeeded: Collection[str], tr
     given_pairs = select(Query.id).where(Query.participant_id == Participant.id).exists()
     returned = set(session.scalars(present_ids(study).where(Participant.earlier_id.is_not(None), given_pairs)))
     counts = dict.fromkeys(returned, 0) | count_labels(session, present_ids(study))
+    here, first = set(session.scalars(people_here(study))), answers_ahead(settings.labels_per_participant)
     for participant_id, count in sorted(counts.items()):
         known = answers_known(settings, count, answers.get(participant_id, 0), exclusions.get(participant_id))
         labels = reward_due(settings, count)
+        ahead = RunKey(RunKind.REFINEMENT, participant_id=participant_id, subject=AHEAD, labels=first)
         reward = RunKey(RunKind.REWARD, participant_id=participant_id, labels=labels, answers=known)
         if labels or participant_id in returned:  # who comes back is known before the first answer
             jobs.append(Job(reward, study.id))
             milestone = filter_due(settings, count)
-            if milestone and str(reward) in succeeded and study.material is None:  # no simulator, no filter
+            waits = gives_way(settings, count) and participant_id in here and str(ahead) not in succeeded
+            if milestone and str(reward) in succeeded and not waits and study.material is None:  # no simulator, no filter
                 jobs.append(Job(replace(reward, kind=RunKind.FILTER, labels=milestone), study.id))
         if is_refinement_due(settings, count):
-            first = answers_ahead(settings.labels_per_participant)
-            ahead = RunKey(RunKind.REFINEMENT, participant_id=participant_id, subject=AHEAD, labels=first)
             jobs.append(Job(ahead, study.id))
         if not labels or study.material is not None or participant_id not in rating:
             continue

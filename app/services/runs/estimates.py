@@ -24,6 +24,7 @@ TRUST_IN_USUAL = 0.25
 FILMS_AT_A_TIME = 2
 """The worker shows films to the participant in steps of so many."""
 PRESENT_WITHIN = timedelta(seconds=90)
+"""Waiting pages look again every few seconds, browsers let hidden ones do so once a minute."""
 
 
 def usual_s(session: Session, study: Study, kind: RunKind, what: str = "") -> float | None:

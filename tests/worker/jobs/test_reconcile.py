@@ -36,12 +36,14 @@ def found(database: Database) -> Callable[[], dict[str, int]]:
 
 @pytest.fixture
 def labels(add_clips: AddClips, answer: Answer, study: Study) -> Callable[[int], list[Query]]:
-    """Fill the pool, then give so many answers."""
+    """Fill the pool, then give so many answers; then so many more."""
+    pairs: list[tuple[Clip, Clip]] = []
 
     def give(count: int) -> list[Query]:
-        clips = [add_clips(scenarios.of_pool(study.seed, index)) for index in range(4)]
-        pairs = [(four[i], four[j]) for four in clips for i in range(4) for j in range(i)]
-        return [answer(*pairs[index], Response.LEFT) for index in range(count)]
+        if not pairs:
+            clips = [add_clips(scenarios.of_pool(study.seed, index)) for index in range(4)]
+            pairs.extend((four[i], four[j]) for four in clips for i in range(4) for j in range(i))
+        return [answer(*pairs.pop(0), Response.LEFT) for _ in range(count)]
 
     return give
 
@@ -102,6 +104,30 @@ def test_a_refinement_is_begun_with_the_first_answers_while_the_others_are_given
     assert set(found()) == {"reward/participant-1/labels-10", "refinement/participant-1/ahead/labels-10"}
     assert not due_work.is_refinement_due(settings, 10), "the tenth answer can still be undone"
     assert not due_work.is_refinement_due(settings, 20), "the last filter goes on from there by itself"
+
+
+def test_an_earlier_filter_waits_for_what_is_refined_ahead_while_its_person_is_here(
+    database: Database, labels: Callable[[int], list[Query]], found: Callable[[], dict[str, int]]
+) -> None:
+    """Nobody waits for it, and both need the same processors."""
+    with database.writing() as session:
+        study = session.get_one(Study, 1)
+        study.stored_settings = {**study.stored_settings, "refinement_steps": SHORTEST_REFINEMENT}
+    ahead, earlier = "refinement/participant-1/ahead/labels-10", "filter/participant-1/labels-10"
+
+    def due_for_somebody_last_seen(since: timedelta) -> set[str]:
+        with database.writing() as session:
+            session.get_one(Participant, 1).last_seen_at = now() - since
+        return set(found())
+
+    labels(10)
+    succeed(database, "reward/participant-1/labels-10")
+    assert due_for_somebody_last_seen(timedelta()) == set(), "the refinement is due with the next answer"
+    assert due_for_somebody_last_seen(timedelta(minutes=10)) == {earlier}
+    labels(1)
+    assert due_for_somebody_last_seen(timedelta()) == {ahead}
+    succeed(database, ahead)
+    assert due_for_somebody_last_seen(timedelta()) == {earlier}
 
 
 def test_a_last_answer_that_is_changed_makes_the_last_models_stale(

@@ -3,17 +3,24 @@
 from sqlalchemy import Select, func, select
 from sqlalchemy.orm import Session
 
+from app.db import now
 from app.domain.models import RunKind
 from app.domain.preferences import LEARNED_FROM, Exclusion, LabelEvent, Query, count_labels
 from app.domain.studies import Participant, Study
 from app.domain.study_settings import StudySettings
 from app.installed_tasks.refinements import answers_ahead
+from app.services.runs.estimates import PRESENT_WITHIN
 from worker.jobs.runtime.records import Job
 
 
 def present_ids(study: Study) -> Select[int]:
     """Everybody in the study who has not withdrawn."""
     return select(Participant.id).where(Participant.study_id == study.id, Participant.withdrawn_at.is_(None))
+
+
+def people_here(study: Study) -> Select[int]:
+    """Everybody in the study who is at their pages."""
+    return present_ids(study).where(Participant.last_seen_at > now() - PRESENT_WITHIN)
 
 
 def last_answers(session: Session, people: Select[int]) -> dict[int, int]:
@@ -39,6 +46,12 @@ def is_refinement_due(settings: StudySettings, answered: int) -> bool:
     """Whether it can be made ahead: none of the answers that it follows can be undone any more."""
     wanted = settings.labels_per_participant
     return settings.refinement_steps > 0 and answers_ahead(wanted) < answered < wanted
+
+
+def gives_way(settings: StudySettings, answered: int) -> bool:
+    """Whether an earlier filter waits while its person is here: what the last one goes on from is about to be made."""
+    wanted = settings.labels_per_participant
+    return settings.refinement_steps > 0 and answers_ahead(wanted) <= answered < wanted
 
 
 def last_exclusions(session: Session, people: Select[int]) -> dict[int, int]:

@@ -20,10 +20,9 @@ from app.domain.protocol import FROM_OTHERS
 from app.domain.run_keys import AHEAD, BEFORE_AFTER, LENT, MADE
 from app.domain.studies import Awaited, Participant, Study
 from app.services.evaluation import donors
+from app.services.runs.estimates import PRESENT_WITHIN
 from worker.jobs.runtime.records import Job
 
-PRESENT_WITHIN = timedelta(seconds=90)
-"""Waiting pages look again every few seconds, browsers let hidden ones do so once a minute."""
 ASKED_WITHIN = timedelta(minutes=10)
 """So long after unblinding a report is what an experimenter waits for."""
 _BEGINNING = datetime(1970, 1, 1, tzinfo=UTC)
