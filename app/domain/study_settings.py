@@ -180,7 +180,8 @@ class StudySettings(BaseModel):
                 "yes",
                 "Yes",
                 "A second tap, which people may pass over, names a quality such as speed or force. The model hears the "
-                "answer once more, about that quality alone. Structured models of simulated clips only.",
+                "answer once more, about that quality alone; scripted users' robots got no better by it "
+                "(docs/results/mattered.md). Structured models of simulated clips only.",
             ),
         ),
         simulated=True,
@@ -195,7 +196,8 @@ class StudySettings(BaseModel):
                 "yes",
                 "Yes",
                 "After the introduction people may tick up to two hints, such as \u201cslower near me\u201d, and "
-                "change them later. Each is heard as one more answer. Structured models of simulated clips only.",
+                "change them later. Each is heard as one more answer; scripted users' robots got no better by it "
+                "(docs/results/hints.md). Structured models of simulated clips only.",
             ),
         ),
         simulated=True,
@@ -327,7 +329,7 @@ class StudySettings(BaseModel):
         (50,),
         Section.LEARNING,
         "Also train a filter after",
-        "Numbers of answers, with commas. One is always trained at the end.",
+        "Numbers of answers, with commas. One is always trained at the end; what it is refined from comes first.",
         unit="answers",
         simulated=True,
     )
