@@ -143,18 +143,20 @@ class FilterFit:
         known: Sequence[Trajectory],
         steps: int,
         begun: Path | None,
-        train: TrainPatiently[FilterDraft | None],
+        train: TrainPatiently[tuple[FilterDraft, ...]],
     ) -> FilterDraft | None:
         """The person's refined policy in place of the mode, if it is better; None: nobody needs it any more.
 
         ``known``: the pool's rollouts; ``begun``: the folder of refine_ahead(); ``train``: calls what it is given with
-        a folder for checkpoints, in a compute process, until that gives a draft.
+        a folder for checkpoints, in a compute process, until that gives drafts.
         """
         training = self._training(draft, known, steps)
         if begun and refining.is_ahead(begun, training.config) and not self._is_promising(training, begun):
             return given_up(draft)
-        refined = train(partial(refining.train, training, begun))
-        return refined and gate_refined(self.problem, refined, training.reference, self.collect, self.progress)
+        drafts = train(partial(refining.train, training, begun))
+        if not drafts:
+            return None
+        return gate_refined(self.problem, drafts, training.reference, self.collect, self.progress)
 
     def _is_promising(self, training: refining.Training, begun: Path) -> bool:
         self.progress("checking what the refinement has come to", 0.34)

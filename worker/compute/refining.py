@@ -2,10 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import torch
 
+from worker.compute.learning import run_scenarios
 from worker.domain.trajectory import Trajectory
 from worker.ml.filters.filter_problem import FilterDraft, FilterProblem
 from worker.ml.methods.refinement import Beginning, Refinement, refine, refine_ahead
@@ -25,8 +27,8 @@ class Training:
     config: Refinement
 
 
-def train(training: Training, begun: Path | None, folder: Path) -> FilterDraft | None:
-    """The draft with its refined policy; None: it paused at a checkpoint in the folder.
+def train(training: Training, begun: Path | None, folder: Path) -> tuple[FilterDraft, ...]:
+    """The drafts of refine(); none: it paused at a checkpoint in the folder.
 
     ``begun``: the folder of what train_ahead() made, which stays as it is.
     """
@@ -37,7 +39,7 @@ def train(training: Training, begun: Path | None, folder: Path) -> FilterDraft |
     try:
         return refine(training.problem, training.draft, _beginning(training), training.config, Checkpoint(folder))
     except Paused:
-        return None
+        return ()
 
 
 def train_ahead(training: Training, folder: Path) -> bool:
@@ -60,4 +62,5 @@ def is_ahead(folder: Path, config: Refinement) -> bool:
 
 
 def _beginning(training: Training) -> Beginning:
-    return Beginning(registry.environment_class(training.task), training.known, training.reference)
+    collect = partial(run_scenarios, training.task)
+    return Beginning(registry.environment_class(training.task), training.known, training.reference, collect)

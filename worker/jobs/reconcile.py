@@ -211,7 +211,8 @@ def _stale_models(session: Session, study: Study, succeeded: Collection[str], tr
             jobs.append(Job(reward, study.id))
             milestone = filter_due(settings, count)
             waits = gives_way(settings, count) and participant_id in here and str(ahead) not in succeeded
-            if milestone and str(reward) in succeeded and not waits and study.material is None:  # no simulator, no filter
+            is_next = str(reward) in succeeded and not waits
+            if milestone and is_next and study.material is None:  # no simulator, no filter
                 jobs.append(Job(replace(reward, kind=RunKind.FILTER, labels=milestone), study.id))
         if is_refinement_due(settings, count):
             jobs.append(Job(ahead, study.id))

@@ -45,7 +45,7 @@ def refine(context: WorkerContext, run_id: int, job: Job, reward: str, draft: st
     begun = None if shared else _made_ahead(context, run_id, job, lane, is_outdated)
     fit = fits.fitting(context, run_id, job, context.store.read(reward), shared=shared)
     with _folder(context, run_id, job, shared) as folder:
-        train: TrainPatiently[FilterDraft | None] = _trainer(context, run_id, folder, lane, is_outdated, bool)
+        train: TrainPatiently[tuple[FilterDraft, ...]] = _trainer(context, run_id, folder, lane, is_outdated, bool)
         known = fits.pool_rollouts(context, job)
         result = fit.refine(fits.load_draft(context, draft), known, settings.refinement_steps, begun, train)
         artefact = context.store.put(filter_fitting.draft_to_bytes(result)) if result else ""

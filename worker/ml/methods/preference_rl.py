@@ -142,14 +142,16 @@ class PreferenceRl:
         self.replay.rows[: self.replay.count] = tensors["replay"]
         self.signals[: self.replay.count] = tensors["signals"].numpy()
         if is_new := counts["reward"] != self.reward_mark:
-            self._reward_anew()
+            self.reward_anew(self.reward)
         learner.load_state(tensors, counts["updates"])
         torch.set_rng_state(tensors["torch_rng"])
         self.rng.bit_generator.state = counts["rng"]
         self._goes_on = not is_new
         self._begin()
 
-    def _reward_anew(self) -> None:
+    def reward_anew(self, reward: EpisodeReward) -> None:
+        """From here on this is what episodes are rewarded by, those in the replay included."""
+        self.reward = reward
         for start, end in pairwise([0, *self.ends]):
             states, actions, rewards, *_ = self.replay.split(self.replay.rows[start:end])
             anew = self.reward(self.signals[start:end], states.numpy(), actions.numpy())

@@ -3,7 +3,7 @@
 A network imitates the mode; soft actor-critic goes on from there, on R-hat and a sketchy reward (guided()). Its
 replay begins with the rollouts that are there already (Ball et al. 2023, arXiv 2302.02948). It is tied to what it was
 some time before, as prefft_anchored is to where it began, less and less while it learns: without a tie it forgets the
-task before it finds anything better (docs/method.md, section 5).
+task before it finds anything better. Where it forgets it all the same it goes back (docs/method.md, section 5).
 """
 
 import hashlib
@@ -23,14 +23,15 @@ from worker.ml.filters.filter_problem import (
     FilterAct,
     FilterDraft,
     FilterProblem,
+    GateTrial,
     ReportProgress,
     act_of,
 )
-from worker.ml.filters.gate import acceptable, to_beat, try_on
+from worker.ml.filters.gate import keeps_task, to_beat, try_on
 from worker.ml.filters.shield import limits_of
 from worker.ml.methods import pbrl_hri
 from worker.ml.methods.preference_rl import EpisodeReward, MakeEnv, PreferenceRl, learned
-from worker.ml.methods.prefft import TiedLearner
+from worker.ml.methods.watched import WatchedLearner, best_in, price_in
 from worker.ml.policies.checkpoint import Checkpoint
 from worker.ml.policies.demonstrations import Demonstrations
 from worker.ml.policies.imitation import imitate
@@ -50,9 +51,7 @@ LEAST_LIFT = 1.1
 """times what the mode gains the refined policy has to gain: a residual, which follows otherwise, often gains as much"""
 LOOKED_AT = 40
 """of the gate's scenarios, to see whether a refinement is promising"""
-_AVERAGE = "average."
-"""So begin the names of what the policy is made of in a checkpoint."""
-_STROKES = SIGNALS.index("strokes")
+_STROKES, _UNDONE = SIGNALS.index("strokes"), SIGNALS.index("undelivered")
 OWN_SHARE = 3
 """How often the imitation sees the filter's own states, beside those of the rollouts that were there."""
 
@@ -79,7 +78,9 @@ class Refinement:
     prefft"""
     last_tie: float = 0.3
     hold_every_steps: int = 12_000
-    """the tie is to what the policy was then: it goes far, and never far at once"""
+    """the tie is to what the policy was then: it goes far, and never far at once; see WatchedLearner"""
+    price: float = 0.5
+    """of every step with the task undone, once it was lost, in standard deviations of R-hat"""
     stroke_weight: float = 0.3
     """of strokes in the sketchy reward, beside the distance"""
     share_ahead: float = SHARE_AHEAD
@@ -99,7 +100,8 @@ class Beginning:
     known: Sequence[Trajectory]
     """rollouts of many behaviours, for the replay"""
     reference: Sequence[Trajectory]
-    """of the frozen policy, for the unit of the sketchy reward"""
+    """of the frozen policy in the gate's scenarios: the unit of the sketchy reward, and what the task is kept by"""
+    collect: Collect
 
 
 def refine_ahead(
@@ -115,16 +117,21 @@ def refine(
     beginning: Beginning,
     config: Refinement,
     checkpoint: Checkpoint | None = None,
-) -> FilterDraft:
+) -> tuple[FilterDraft, ...]:
     """Train the person's refined policy; gate_refined() decides whether it takes the filter's place.
 
-    With a checkpoint, a training that was killed goes on where it was, with the same result, and one of
-    refine_ahead() goes on with this reward model.
+    Returns the draft with the last policy, and with what had gained most on the way while the task was kept. With a
+    checkpoint, a training that was killed goes on where it was, with the same result, and one of refine_ahead() goes
+    on with this reward model.
     """
     started = time.perf_counter()
     learner = _train(problem, draft, beginning, config, checkpoint)
-    weights = draft.weights.changed(refined=learner.average.policy().weights)
-    return replace(draft, weights=weights).timed("refinement", started)
+    drafts = (_with(draft, actor) for actor in (learner.average, learner.best) if actor is not None)
+    return tuple(each.timed("refinement", started) for each in drafts)
+
+
+def _with(draft: FilterDraft, actor: Actor) -> FilterDraft:
+    return replace(draft, weights=draft.weights.changed(refined=actor.policy().weights))
 
 
 def is_promising(
@@ -135,7 +142,7 @@ def is_promising(
     checkpoint: Checkpoint,
     collect: Collect,
 ) -> bool:
-    """Whether what refine_ahead() came to is better than the mode, by the reward model of all answers.
+    """Whether the best that refine_ahead() came to is better than the mode, by the reward model of all answers.
 
     If not, somebody would wait for the rest, which is hardly worth their time. How often that would have become better
     after all was not measured.
@@ -145,10 +152,17 @@ def is_promising(
         return True
     policy = looked_into(problem.policy)
     actor = Actor(torch.from_numpy(policy.offset), torch.from_numpy(policy.scale), policy.action_size, config.hidden)
-    actor.load_state_dict({name.removeprefix(_AVERAGE): kept[0][name] for name in kept[0] if name.startswith(_AVERAGE)})
-    so_far = act_of(problem.task.modes, problem.policy, draft.weights.changed(refined=actor.policy().weights, gate=1.0))
-    trial, _ = try_on(problem, so_far, 1.0, 0.0, reference[:LOOKED_AT], collect)
+    actor.load_state_dict(best_in(kept[0]))
+    trial, _ = _tried(problem, _with(draft, actor), 1.0, reference[:LOOKED_AT], collect)
     return trial.preference > to_beat(problem, draft, reference)
+
+
+def _tried(
+    problem: FilterProblem, draft: FilterDraft, gate: float, reference: Sequence[Trajectory], collect: Collect
+) -> tuple[GateTrial, Sequence[Trajectory]]:
+    act = act_of(problem.task.modes, problem.policy, draft.weights.changed(gate=gate))
+    trial, driven = try_on(problem, act, gate, 0.0, reference, collect)
+    return replace(trial, refined=True), driven
 
 
 def given_up(draft: FilterDraft) -> FilterDraft:
@@ -163,7 +177,7 @@ def _train(
     config: Refinement,
     checkpoint: Checkpoint | None,
     until: int | None = None,
-) -> TiedLearner:
+) -> WatchedLearner:
     kept = checkpoint.read() if checkpoint else None
     settings = SacConfig(
         problem.task.observation,
@@ -181,8 +195,9 @@ def _train(
         torch.manual_seed(problem.seed)
         reward = guided(reference, learned(problem.reward), config.stroke_weight)
         mark = hashlib.sha256(problem.reward.to_bytes()).hexdigest()
-        training = PreferenceRl(beginning.make_env, reward, settings, [*beginning.known, *reference], mark)
-        learner = TiedLearner(settings, offset, scale, training.actions, config.first_tie)
+        priced = _priced(reward, price_in(kept[0]) if kept else 0.0)
+        training = PreferenceRl(beginning.make_env, priced, settings, [*beginning.known, *reference], mark)
+        learner = WatchedLearner(settings, offset, scale, training.actions, config.first_tie)
         if kept is None:
             _imitate(learner, training, act_of(problem.task.modes, problem.policy, draft.weights), config)
         else:
@@ -190,12 +205,35 @@ def _train(
 
         def move_tie(training: PreferenceRl, _: Learner) -> None:
             learner.weight = config.first_tie + training.steps / config.steps * (config.last_tie - config.first_tie)
-            if (training.steps - settings.random_steps) % config.hold_every_steps < config.environments:
-                learner.hold()
+            learned_for = training.steps - settings.random_steps
+            is_time = learned_for % config.hold_every_steps < config.environments <= learned_for
+            if is_time and training.steps < config.ahead_steps:  # later on somebody waits
+                look()
+
+        def look() -> None:
+            """Hold it where it is, or go back."""
+            trial, _ = _tried(problem, _with(draft, learner.average), 1.0, reference, beginning.collect)
+            if _keeps_task(problem, trial, reference):
+                learner.passed(trial.preference)
+            else:
+                learner.failed(config.price)
+                training.reward_anew(_priced(reward, learner.price))
+                for _ in range(config.critic_again_updates):
+                    learner.update(training.replay, actor=False)
 
         training.learn(learner, checkpoint, move_tie, until)
         training.close()
     return learner
+
+
+def _priced(reward: EpisodeReward, price: float) -> EpisodeReward:
+    """The same, less so much in every step with the task undone."""
+
+    def both(signals: Float32Array, observations: Float32Array, actions: Float32Array) -> npt.NDArray[np.floating]:
+        rewards: npt.NDArray[np.floating] = reward(signals, observations, actions) - price * signals[:, _UNDONE]
+        return rewards
+
+    return both
 
 
 def guided(reference: Sequence[Trajectory], learned: EpisodeReward, stroke_weight: float) -> EpisodeReward:
@@ -216,7 +254,7 @@ def guided(reference: Sequence[Trajectory], learned: EpisodeReward, stroke_weigh
     return both
 
 
-def _imitate(learner: TiedLearner, training: PreferenceRl, act: FilterAct, config: Refinement) -> None:
+def _imitate(learner: WatchedLearner, training: PreferenceRl, act: FilterAct, config: Refinement) -> None:
     """Begin as the filter, which makes the warm-up's steps."""
 
     def disturbed(states: Float32Array) -> Float32Array:
@@ -235,26 +273,30 @@ def _imitate(learner: TiedLearner, training: PreferenceRl, act: FilterAct, confi
 
 def gate_refined(
     problem: FilterProblem,
-    draft: FilterDraft,
+    drafts: Sequence[FilterDraft],
     reference: Sequence[Trajectory],
     collect: Collect,
     progress: ReportProgress = lambda stage, share: None,
 ) -> FilterDraft:
-    """As much of the refined policy as keeps the task and is better enough than the mode; else the mode."""
-    if not draft.weights.refined:
-        return draft
-    started, alone = time.perf_counter(), to_beat(problem, draft, reference)
-    for gate in STRENGTHS:
+    """As much of the refined policy as keeps the task and is better enough than the mode; else the mode.
+
+    ``drafts``: of refine(). What had been best on the way is tried where the last one is not good enough.
+    """
+    started, (draft, *_) = time.perf_counter(), drafts
+    least = LEAST_LIFT * to_beat(problem, draft, reference)
+    for candidate, gate in [*((each, 1.0) for each in drafts[:-1]), *((drafts[-1], gate) for gate in STRENGTHS)]:
         progress(f"checking {gate:.0%} of the refined policy on held-out scenarios", 0.35)
-        weights = draft.weights.changed(gate=gate)
-        act = act_of(problem.task.modes, problem.policy, weights)
-        trial, driven = try_on(problem, act, gate, 0.0, reference, collect)
-        draft = replace(draft, trials=(*draft.trials, replace(trial, refined=True)))
-        keeps = acceptable(problem, trial, reference) and trial.success_change >= -LARGEST_LOSS
-        if keeps and trial.preference > LEAST_LIFT * alone:
+        trial, driven = _tried(problem, candidate, gate, reference, collect)
+        draft = replace(draft, trials=(*draft.trials, trial))
+        if trial.preference > max(least, 0.0) and _keeps_task(problem, trial, reference):
+            weights = candidate.weights.changed(gate=gate)
             tested = limits_of(problem.task.observation, problem.task.action, driven, reference)
             draft = replace(draft, weights=weights, tested=tested, notes=(*draft.notes, _REFINED))
             return draft.timed("gate_refined", started)
     notes = (*draft.notes, "The refined policy was no better on held-out scenarios and is off.")
     draft = replace(draft, weights=draft.weights.changed(refined={}), notes=notes)
     return draft.timed("gate_refined", started)
+
+
+def _keeps_task(problem: FilterProblem, trial: GateTrial, reference: Sequence[Trajectory]) -> bool:
+    return keeps_task(problem, trial, reference) and trial.success_change >= -LARGEST_LOSS
