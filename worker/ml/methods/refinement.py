@@ -213,7 +213,7 @@ def _train(
         def look() -> None:
             """Hold it where it is, or go back."""
             trial, _ = _tried(problem, _with(draft, learner.average), 1.0, reference, beginning.collect)
-            if _keeps_task(problem, trial, reference):
+            if keeps_task(problem, trial, reference):
                 learner.passed(trial.preference)
             else:
                 learner.failed(config.price)
