@@ -246,6 +246,15 @@ def test_a_training_that_went_back_and_paused_ends_with_the_same_policies(
     assert weights_of(in_narrow(narrowly, reference, Checkpoint(tmp_path))) == weights_of(watched)
 
 
+def test_what_was_begun_before_there_were_prices_is_gone_on_with(reference: list[Trajectory], tmp_path: Path) -> None:
+    draft, beginning, checkpoint = FilterDraft(GATED), Beginning(World, [], reference, collect), Checkpoint(tmp_path)
+    refinement.refine_ahead(problem(), draft, beginning, SHORT, checkpoint)
+    kept = checkpoint.read()
+    assert kept is not None
+    checkpoint.write({name: each for name, each in kept[0].items() if name not in {"price", "best_gain"}}, kept[1])
+    assert weights_of(refined(draft, reference, checkpoint=checkpoint)) == weights_of(refined(draft, reference))
+
+
 def test_what_was_made_ahead_is_promising_only_to_whoever_likes_it(reference: list[Trajectory], tmp_path: Path) -> None:
     likes = problem(StructuredReward(-REWARD.weights))
     draft, beginning = FilterDraft(GATED), Beginning(World, [], reference, collect)

@@ -288,7 +288,7 @@ def gate_refined(
         progress(f"checking {gate:.0%} of the refined policy on held-out scenarios", 0.35)
         trial, driven = _tried(problem, candidate, gate, reference, collect)
         draft = replace(draft, trials=(*draft.trials, trial))
-        if trial.preference > max(least, 0.0) and _keeps_task(problem, trial, reference):
+        if trial.preference > max(least, 0.0) and _may_be_shipped(problem, trial, reference):
             weights = candidate.weights.changed(gate=gate)
             tested = limits_of(problem.task.observation, problem.task.action, driven, reference)
             draft = replace(draft, weights=weights, tested=tested, notes=(*draft.notes, _REFINED))
@@ -298,5 +298,5 @@ def gate_refined(
     return draft.timed("gate_refined", started)
 
 
-def _keeps_task(problem: FilterProblem, trial: GateTrial, reference: Sequence[Trajectory]) -> bool:
+def _may_be_shipped(problem: FilterProblem, trial: GateTrial, reference: Sequence[Trajectory]) -> bool:
     return keeps_task(problem, trial, reference) and trial.success_change >= -LARGEST_LOSS

@@ -43,7 +43,7 @@ class WatchedLearner(TiedLearner):
     def load_state(self, tensors: dict[str, Tensor], updates: int) -> None:
         """See Learner."""
         super().load_state(tensors, updates)
-        self.price, self.best_gain = price_in(tensors), float(tensors["best_gain"])
+        self.price, self.best_gain = price_in(tensors), float(tensors.get("best_gain", -math.inf))
         if self.best_gain > -math.inf:
             self.best = copy.deepcopy(self.average)
             self.best.load_state_dict(best_in(tensors))
@@ -56,5 +56,5 @@ def best_in(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
 
 
 def price_in(tensors: dict[str, Tensor]) -> float:
-    """What a step with the task undone costs in a state of a learner."""
-    return float(tensors["price"])
+    """What a step with the task undone costs in a state of a learner; nothing in one of before there were prices."""
+    return float(tensors.get("price", 0.0))
