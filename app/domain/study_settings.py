@@ -329,7 +329,7 @@ class StudySettings(BaseModel):
         (50,),
         Section.LEARNING,
         "Also train a filter after",
-        "Numbers of answers, with commas. One is always trained at the end; what it is refined from comes first.",
+        "Numbers of answers, with commas. One is always trained at the end; its refinement comes before earlier ones.",
         unit="answers",
         simulated=True,
     )
