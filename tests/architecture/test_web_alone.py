@@ -14,7 +14,7 @@ from packaging.requirements import Requirement
 from app.paths import ROOT
 from app.settings import Settings
 
-LOCK, WEB_LOCK = ROOT / "requirements.lock", ROOT / "requirements-web.lock"
+LOCK, WEB_LOCK, DEV_LOCK = (ROOT / f"requirements{part}.lock" for part in ("", "-web", "-dev"))
 COMPOSE = yaml.safe_load((ROOT / "docker-compose.yml").read_text())
 CLUSTER = {name: each for name, each in COMPOSE["services"].items() if "cluster" in each.get("profiles", ())}
 ELSEWHERE = re.compile(r"AWS_|POSTGRES_|ROOT_")
@@ -79,6 +79,10 @@ def test_the_lock_of_the_web_server_is_what_its_dependencies_need() -> None:
         _needed_by(Requirement(line), needed)
     everything = pins(LOCK)
     assert pins(WEB_LOCK) == {name: pin for name, pin in everything.items() if name in needed}
+
+
+def test_what_is_installed_to_run_is_what_the_tests_run_with() -> None:
+    assert pins(LOCK).items() <= pins(DEV_LOCK).items()
 
 
 def test_every_module_of_the_web_server_is_imported_with_nothing_else_installed() -> None:
