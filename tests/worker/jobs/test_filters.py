@@ -1,8 +1,12 @@
 """When a filter is trained, and when not."""
 
 from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
+import torch
 from sqlalchemy import func, select
 
 from app.db import Database
@@ -17,6 +21,7 @@ from app.services.answers.misfit import Misfit
 from app.storage import ArtefactStore
 from tests.worker.at_hand import at_once
 from worker.compute.pools import Compute
+from worker.jobs.learning import fits, refinement, reward_models
 from worker.jobs.learning.filters import (
     NothingToLearnFrom,
     notes_on_foresight,
@@ -28,6 +33,8 @@ from worker.jobs.runtime import records
 from worker.jobs.runtime.context import WorkerContext
 from worker.jobs.runtime.due_work import answers_known, is_outdated
 from worker.jobs.runtime.records import Job
+from worker.ml.methods.refinement import Refinement
+from worker.ml.policies.checkpoint import PAUSE_FILE, Abandoned, Checkpoint, ask_to_pause, begin_again
 
 
 @pytest.fixture
@@ -77,13 +84,19 @@ def answered(
     return say
 
 
-def outdated_at(context: WorkerContext, participant: Participant, milestone: int, *, begun: bool) -> bool:
+def filter_at(context: WorkerContext, participant: Participant, milestone: int) -> Job:
+    """The training of a filter that knows the answers of now."""
     with context.database.reading() as session:
         settings = session.get_one(Study, participant.study_id).settings
         last_answer = session.scalar(select(func.max(LabelEvent.id))) or 0
-        known = answers_known(settings, milestone, last_answer, None)
-        key = RunKey(RunKind.FILTER, participant_id=participant.id, labels=milestone, answers=known)
-        return is_outdated(session, Job(key, participant.study_id), begun=begun)
+    known = answers_known(settings, milestone, last_answer, None)
+    key = RunKey(RunKind.FILTER, participant_id=participant.id, labels=milestone, answers=known)
+    return Job(key, participant.study_id)
+
+
+def outdated_at(context: WorkerContext, participant: Participant, milestone: int, *, begun: bool) -> bool:
+    with context.database.reading() as session:
+        return is_outdated(session, filter_at(context, participant, milestone), begun=begun)
 
 
 def test_of_two_milestones_that_were_passed_only_the_newer_filter_is_trained(
@@ -124,6 +137,77 @@ def test_only_the_filter_of_all_answers_and_those_for_several_people_are_refined
     assert is_refined(wanted, early, shared=True)
     assert not is_refined(wanted, early, shared=False)
     assert not is_refined(settings, last, shared=True)
+
+
+WHOLE = Refinement(SHORTEST_REFINEMENT).ahead_steps
+
+
+def go_half_way(folder: Path) -> bool:
+    return go_on(folder, WHOLE // 2)
+
+
+def go_on(folder: Path, until: int = WHOLE) -> bool:
+    """As a training does: from its checkpoint, and no pause that was asked for before counts."""
+    begin_again(folder)
+    begun = Checkpoint(folder).read_counts() or {"steps": 0}
+    Checkpoint(folder).write({"nothing": torch.zeros(1)}, {"steps": until, "begun_at": begun["steps"]})
+    return True
+
+
+def come_too_late(folder: Path) -> bool:
+    raise Abandoned(folder.name)
+
+
+@pytest.fixture
+def refining(monkeypatch: pytest.MonkeyPatch, context: WorkerContext, participant: Participant) -> Callable[..., None]:
+    """Have refinements be made by such a function, in a compute process."""
+    with context.database.writing() as session:
+        study = session.get_one(Study, participant.study_id)
+        study.stored_settings = {**study.stored_settings, "refinement_steps": SHORTEST_REFINEMENT}
+    monkeypatch.setattr(reward_models, "fit", lambda *_: SimpleNamespace(stored=b""))
+    monkeypatch.setattr(fits, "pool_rollouts", lambda *_: [])
+    monkeypatch.setattr(fits, "load_draft", lambda *_: None)
+
+    def by(part: Callable[[Path], bool], **then: Any) -> None:
+        fit = SimpleNamespace(refine_ahead=lambda known, steps, train: train(part), **then)
+        monkeypatch.setattr(fits, "fitting", lambda *_, **__: fit)
+
+    return by
+
+
+def test_the_last_filter_goes_on_from_what_is_made_ahead_and_leaves_whoever_still_makes_it_alone(
+    context: WorkerContext, participant: Participant, answered: Callable[[int], None], refining: Callable[..., None]
+) -> None:
+    theirs = context.store.unfinished.folder(participant.id)
+    found: dict[str, Any] = {}
+
+    def refine(draft: object, known: object, steps: int, begun: Path, train: object) -> None:
+        (first,) = [each for each in theirs.glob("ahead-*") if each != begun]
+        found["asked to pause"] = (first / PAUSE_FILE).exists()
+        found["left off at"] = (Checkpoint(first).read_counts() or {})["steps"]
+        found.update(Checkpoint(begun).read_counts() or {})
+
+    answered(15)
+    job, run_id = begin(context, participant, RunKind.REFINEMENT)
+    refining(go_half_way)
+    refinement.refine_ahead(context, job, run_id, at_once)
+    (ahead,) = theirs.glob("ahead-*")
+    ask_to_pause(ahead)  # with the last answer; the training has not looked yet
+    answered(5)
+    _, run_id = begin(context, participant, RunKind.FILTER)
+    refining(go_on, refine=refine)
+    job = filter_at(context, participant, 20)
+    refinement.refine(context, run_id, job, context.store.put(b"reward"), "", shared=False)
+    assert found == {"asked to pause": True, "left off at": WHOLE // 2, "begun_at": WHOLE // 2, "steps": WHOLE}
+
+
+def test_what_is_made_ahead_ends_when_the_last_filter_has_cleared_it_away(
+    context: WorkerContext, participant: Participant, answered: Callable[[int], None], refining: Callable[..., None]
+) -> None:
+    answered(15)
+    job, run_id = begin(context, participant, RunKind.REFINEMENT)
+    refining(come_too_late)
+    refinement.refine_ahead(context, job, run_id, at_once)
 
 
 def test_without_a_reward_model_the_run_says_why_there_is_no_filter(

@@ -1,12 +1,11 @@
 """The refinement of a person's last filter, which takes minutes: most of it is done while they still answer.
 
 What is made ahead follows the first of the answers, whenever it is made, so that the same answers give the same
-filter. It lies in a folder of the person's until their last filter goes on from there; if it is missing, it is made
-then.
+filter. It lies in a folder of the person's until their last filter goes on from there; what is missing is made then.
 """
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -27,6 +26,7 @@ from worker.jobs.runtime.context import Step, WorkerContext
 from worker.jobs.runtime.records import Job
 from worker.ml.filters.filter_problem import FilterDraft
 from worker.ml.methods.refinement import Refinement
+from worker.ml.policies.checkpoint import Abandoned, go_on_from
 
 
 def refine_ahead(context: WorkerContext, job: Job, run_id: int, step: Step) -> None:
@@ -42,7 +42,7 @@ def refine(context: WorkerContext, run_id: int, job: Job, reward: str, draft: st
         return draft
     lane = Lane.PATIENT if shared else Lane.LEARNING  # somebody waits for their last filter
     is_outdated = (lambda: False) if shared else partial(_is_outdated, context, job)
-    begun = None if shared else _made_ahead(context, run_id, job, lane, is_outdated)
+    begun = None if shared else _begun(context, run_id, job, is_outdated)
     fit = fits.fitting(context, run_id, job, context.store.read(reward), shared=shared)
     with _folder(context, run_id, job, shared) as folder:
         train: TrainPatiently[tuple[FilterDraft, ...]] = _trainer(context, run_id, folder, lane, is_outdated, bool)
@@ -51,37 +51,67 @@ def refine(context: WorkerContext, run_id: int, job: Job, reward: str, draft: st
         artefact = context.store.put(filter_fitting.draft_to_bytes(result)) if result else ""
         context.store.unfinished.forget(folder)
     if artefact and begun:
-        context.store.unfinished.forget(begun)
+        for done in begun.parent.glob(f"{AHEAD}-*"):
+            context.store.unfinished.forget(done)
     return artefact
 
 
 def _make_ahead(context: WorkerContext, run_id: int, job: Job) -> None:
-    # Not in the patient lane, whose processes get next to nothing beside an earlier filter and clips.
-    _made_ahead(context, run_id, job, Lane.LEARNING, partial(_has_answered_everything, context, job))
+    folder = _folder_ahead(context, job)
+    if folder is None:
+        return
+    with suppress(Abandoned):  # the last filter is there already, and has cleared away
+        _train_ahead(context, run_id, job, folder, partial(_has_answered_everything, context, job))
 
 
-def _made_ahead(
-    context: WorkerContext, run_id: int, job: Job, lane: Lane, is_outdated: Callable[[], bool]
-) -> Path | None:
-    """The folder of what is made ahead, as far as it is; None: the answers that it would follow say nothing."""
+def _begun(context: WorkerContext, run_id: int, job: Job, is_outdated: Callable[[], bool]) -> Path | None:
+    """The folder of all that is made ahead; None: the answers that it would follow say nothing.
+
+    What is not whole is made in another folder: a busy machine may still be at work on it in the first one, and would
+    have it pause.
+    """
+    there = _folder_ahead(context, job)
+    if there is None:
+        return None
     with context.database.reading() as session:
-        settings = session.get_one(Study, job.study_id).settings
-        first = answers_ahead(settings.labels_per_participant)
+        steps = session.get_one(Study, job.study_id).settings.refinement_steps
+    if refining.is_ahead(there, Refinement(steps)):
+        return there
+    here = there.with_name(f"{there.name}-{run_id}")
+    here.mkdir(exist_ok=True)
+    context.store.unfinished.bring(here)
+    go_on_from(there, here)
+    _train_ahead(context, run_id, job, here, is_outdated)
+    return here
+
+
+def _folder_ahead(context: WorkerContext, job: Job) -> Path | None:
+    """Where that is made which follows the first of somebody's answers; None: they say nothing."""
+    with context.database.reading() as session:
+        first = answers_ahead(session.get_one(Study, job.study_id).settings.labels_per_participant)
         followed = dataset.load_preferences(session, context.store, job.participant, first)
     if followed.pairs is None:
         return None
     folder = context.store.unfinished.folder(job.participant) / f"{AHEAD}-{followed.label_hash[:16]}"
     folder.mkdir(parents=True, exist_ok=True)
     context.store.unfinished.bring(folder)
+    return folder
+
+
+def _train_ahead(context: WorkerContext, run_id: int, job: Job, folder: Path, is_outdated: Callable[[], bool]) -> None:
+    """From the checkpoint in this folder on."""
+    with context.database.reading() as session:
+        settings = session.get_one(Study, job.study_id).settings
     if refining.is_ahead(folder, Refinement(settings.refinement_steps)):
-        return folder
+        return
+    first = answers_ahead(settings.labels_per_participant)
     fitted = reward_models.fit(context, run_id, job.participant, Lane.LEARNING, first)
     if fitted is None:
-        return None
+        return
     known, fit = fits.pool_rollouts(context, job), fits.fitting(context, run_id, job, fitted.stored)
-    train: TrainPatiently[bool] = _trainer(context, run_id, folder, lane, is_outdated, bool)
+    # Not in the patient lane, whose processes get next to nothing beside an earlier filter and clips.
+    train: TrainPatiently[bool] = _trainer(context, run_id, folder, Lane.LEARNING, is_outdated, bool)
     fit.refine_ahead(known, settings.refinement_steps, train)
-    return folder
 
 
 def _trainer(

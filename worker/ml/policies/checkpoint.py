@@ -103,8 +103,8 @@ def begin_again(folder: Path) -> None:
 
 
 def go_on_from(begun: Path, folder: Path) -> None:
-    """Have the training in this folder go on from another one's checkpoint, if it has none of its own."""
-    if not (folder / STATE_FILE).exists():
+    """Have the training in this folder go on from another one's checkpoint, if there is one, and none of its own."""
+    if (begun / STATE_FILE).exists() and not (folder / STATE_FILE).exists():
         with written_whole(folder / STATE_FILE) as draft:
             shutil.copyfile(begun / STATE_FILE, draft)
 
