@@ -75,7 +75,7 @@ class DonorRule(StrEnum):
     MEAN_OF_PEOPLE = "mean_of_people"
     """All candidates together."""
     TYPE_OF_USER = "type_of_user"
-    """Nobody was there yet: one of the types of users, by lot in the same way."""
+    """Nobody was there yet who had not been lent twice: one of the types of users, by lot in the same way."""
     MEAN_OF_TYPES = "mean_of_types"
     """Too few people were there yet: all types of users together."""
     WITHDREW = "withdrew"

@@ -61,7 +61,7 @@ class EvaluatedMethod(Choice):
     SOMEBODY_ELSE = (
         "somebody_else",
         "Somebody else\N{RIGHT SINGLE QUOTATION MARK}s",
-        "The personal filter of another participant, drawn by lot; of a usual type of user while there is none.",
+        "The personal filter of another participant, drawn by lot; of a usual type of user while too few are there.",
     )
     AVERAGE = "average", "Average", "One filter for everybody, of what earlier participants want on average."
     SELF_SET = (

@@ -119,6 +119,20 @@ def test_types_of_users_only_stand_in_until_enough_people_have_finished(
         assert draw(session, study, person) is drawn, "people stay drawn, whoever comes after them"
 
 
+def test_one_finished_person_is_not_lent_to_everybody_who_waits(database: Database, study: Study) -> None:
+    with database.writing() as session:
+        waiting = [factories.make_participant(session, study)[0] for _ in range(8)]
+        strangers = []
+        for _ in range(4):
+            drawn = [draw(session, study, person) for person in waiting]
+            strangers.append(sum(each.rule == DonorRule.BY_LOT for each in drawn))
+            lent = Counter(each.donors.people for each in drawn if each.donors.people)
+            assert max(lent.values(), default=0) <= 3
+            arrive(session, study)
+    assert strangers[:2] == [0, 2], "the others still meet a type of user"
+    assert 4 <= strangers[2] < strangers[3]
+
+
 def test_an_average_is_of_three_others_at_least(database: Database, study: Study) -> None:
     with database.writing() as session:
         people = [arrive(session, study) for _ in range(4)]

@@ -21,7 +21,8 @@ from app.services.evaluation import evaluation_plan, unblinding
 FEWEST_PEOPLE = 3
 """An average of fewer would tell too much about each of them."""
 SLACK = 1
-"""Loans by which one donor may be ahead of another and still be drawn."""
+"""Loans by which one donor may be ahead of another and still be drawn. Where everybody who has finished has been lent
+more often, types of users stand in: a robot that all others are shown says more of its one donor than of strangers."""
 Name = TypeVar("Name", int, str)
 
 
@@ -65,8 +66,10 @@ def is_superseded(session: Session, study: Study, participant: Participant, draw
     """Whether types of users were drawn, before enough people had finished, and by now they have."""
     if drawn.rule not in (DonorRule.TYPE_OF_USER, DonorRule.MEAN_OF_TYPES):
         return False
-    enough = 1 if drawn.method == EvaluatedMethod.SOMEBODY_ELSE else FEWEST_PEOPLE
-    return len(candidates(session, study, participant)) >= enough
+    people = candidates(session, study, participant)
+    if drawn.method == EvaluatedMethod.SOMEBODY_ELSE:
+        return _can_lend(people, _loans(session, study))
+    return len(people) >= FEWEST_PEOPLE
 
 
 def find(session: Session, participant_id: int, method: str) -> DonorDraw | None:
@@ -122,22 +125,32 @@ def _one(
 
     With no slack, people who finish one after the other would each get the filter of the one before.
     """
-    mine = select(DonorDraw).join(Participant, Participant.id == DonorDraw.participant_id)
-    mine = mine.where(Participant.study_id == study.id, Participant.is_preview.is_(False))
-    earlier = session.scalars(mine.where(DonorDraw.method == EvaluatedMethod.SOMEBODY_ELSE)).all()
-    lent = Counter[int | str]()
-    for each in earlier:
-        lent.update(each.donors.people)
-        lent.update(each.donors.types)
+    lent = _loans(session, study)
 
     def drawn(names: Sequence[Name]) -> Name:
         least = min(lent[name] for name in names)
         eligible = [name for name in names if lent[name] <= least + SLACK]
         return min(eligible, key=lambda name: evaluation_plan.mark(study.key_secret, "donor", participant.number, name))
 
-    if people:
+    if _can_lend(people, lent):
         return DonorRule.BY_LOT, Donors(people=(drawn(people),), candidates=tuple(people))
-    return DonorRule.TYPE_OF_USER, Donors(types=(drawn(types),))
+    return DonorRule.TYPE_OF_USER, Donors(types=(drawn(types),), candidates=tuple(people))
+
+
+def _loans(session: Session, study: Study) -> Counter[int | str]:
+    """How often each person and each type of user is lent as somebody else."""
+    drawn = select(DonorDraw).join(Participant, Participant.id == DonorDraw.participant_id)
+    drawn = drawn.where(Participant.study_id == study.id, Participant.is_preview.is_(False))
+    lent = Counter[int | str]()
+    for each in session.scalars(drawn.where(DonorDraw.method == EvaluatedMethod.SOMEBODY_ELSE)):
+        lent.update(each.donors.people)
+        lent.update(each.donors.types)
+    return lent
+
+
+def _can_lend(people: Sequence[int], lent: Counter[int | str]) -> bool:
+    """Whether any of these has not been lent too often yet."""
+    return any(lent[number] <= SLACK for number in people)
 
 
 def shared_filters(session: Session, study: Study) -> Sequence[SharedFilter]:
