@@ -156,7 +156,9 @@ class FilterFit:
         drafts = train(partial(refining.train, training, begun))
         if not drafts:
             return None
-        return gate_refined(self.problem, drafts, training.reference, self.collect, self.progress)
+        return gate_refined(
+            self.problem, drafts, training.reference, self._check_reference, self.collect, self.progress
+        )
 
     def _is_promising(self, training: refining.Training, begun: Path) -> bool:
         self.progress("checking what the refinement has come to", 0.34)
@@ -165,6 +167,7 @@ class FilterFit:
 
     def refine_ahead(self, known: Sequence[Trajectory], steps: int, train: TrainPatiently[bool]) -> None:
         """The larger part of a refinement, around this reward model's mode."""
+        self._check_reference()  # while nobody waits for it
         train(partial(refining.train_ahead, self._training(self.find_mode(known), known, steps)))
 
     def _training(self, draft: FilterDraft, known: Sequence[Trajectory], steps: int) -> refining.Training:
@@ -315,6 +318,9 @@ class FilterFit:
 
     def _gate_reference(self) -> Sequence[Trajectory]:
         return self.reference(self.problem.config.gate_block(self.problem.task))
+
+    def _check_reference(self) -> Sequence[Trajectory]:
+        return self.reference(self.problem.config.check_block(self.problem.task))
 
     def _act_of(self, weights: FilterWeights) -> FilterAct:
         return filter_problem.act_of(self.problem.task.modes, self._policy_of(weights), weights)

@@ -60,6 +60,7 @@ PROFILES = {
             mode_attempts=2,
             gates=(0.5,),
             gate_scenarios=12,
+            check_scenarios=12,
             residual_rounds=1,
             residual_rollouts=12,
             value_steps=200,

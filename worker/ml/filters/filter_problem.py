@@ -44,6 +44,8 @@ class Collect(Protocol):
         ...
 
 
+CHECK_FROM = 10_000
+"""of the gate's scenarios; the ones before are those of a gate, however many that has"""
 USUAL_STEPS = 100
 """Control steps of an episode, in which the counts of episodes below are meant."""
 
@@ -60,6 +62,8 @@ class FilterConfig:
     """strengths at which the last of them is tried when none at full strength was acceptable"""
     gate_scenarios: int = 80
     """of USUAL_STEPS control steps; see gate_block()"""
+    check_scenarios: int = 200
+    """of USUAL_STEPS control steps, in which a refined policy is tried once more; see check_block()"""
     success_tolerance: float = 0.035
     """largest accepted loss of success on the gate's scenarios, as a share of episodes"""
     force_limit_n: float = 10.0
@@ -87,6 +91,10 @@ class FilterConfig:
     def gate_block(self, task: Task) -> range:
         """Scenarios on which a setting is tried before it is accepted."""
         return first_of(GATE, _affordable(self.gate_scenarios, task))
+
+    def check_block(self, task: Task) -> range:
+        """Scenarios in which nothing has been tried on the way to what is accepted there."""
+        return first_of(GATE, _affordable(self.check_scenarios, task), skip=CHECK_FROM)
 
     def residual_block(self, task: Task, number: int) -> range:
         """Scenarios in which the filter is rolled out before round ``number`` of residual learning."""

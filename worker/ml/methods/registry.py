@@ -151,6 +151,7 @@ def fit_pbarl(setting: Setting) -> tuple[Act, tuple[str, ...]]:
 def fit_pbarl_refined(setting: Setting) -> tuple[Act, tuple[str, ...]]:
     """The studio's filter with its refinement, most of which is made for the first of the labels."""
     problem, reference, config = setting.problem, setting.reference(_gate(setting)), setting.config.refinement
+    more_reference = partial(setting.reference, problem.config.check_block(problem.task))
     beginning = refinement.Beginning(setting.make_env, setting.pool, reference, setting.collect)
     first = setting.asked().labels.first(answers_ahead(setting.labels))
     early = replace(problem, reward=setting.asked().fit(first))
@@ -163,7 +164,7 @@ def fit_pbarl_refined(setting: Setting) -> tuple[Act, tuple[str, ...]]:
             if not refinement.is_promising(problem, draft, reference, config, checkpoint, setting.collect):
                 return refinement.given_up(draft)
             drafts = refinement.refine(problem, draft, beginning, config, checkpoint)
-            return refinement.gate_refined(problem, drafts, reference, setting.collect)
+            return refinement.gate_refined(problem, drafts, reference, more_reference, setting.collect)
 
         return _shipped(problem, _fitted(setting, refined))
 
