@@ -143,9 +143,9 @@ debrief-C_hf-much = Wo er Sie berühren soll, drückt er viel stärker.
 debrief-C_fd-less = Er verschüttet weniger auf Sie (um { $percent } %).
 debrief-C_fd-more = Er verschüttet mehr auf Sie (um { $percent } %).
 debrief-C_fd-much = Er verschüttet viel mehr auf Sie.
-debrief-C_fdv-less = Essen oder Trinken gelangt langsamer in Ihren Mund (um { $percent } %).
-debrief-C_fdv-more = Essen oder Trinken gelangt schneller in Ihren Mund (um { $percent } %).
-debrief-C_fdv-much = Essen oder Trinken gelangt viel schneller in Ihren Mund.
+debrief-C_fdv-less = Was er Ihnen reicht, gelangt langsamer in Ihren Mund (um { $percent } %).
+debrief-C_fdv-more = Was er Ihnen reicht, gelangt schneller in Ihren Mund (um { $percent } %).
+debrief-C_fdv-much = Was er Ihnen reicht, gelangt viel schneller in Ihren Mund.
 debrief-done = Abschließen
 
 ## Das Ende

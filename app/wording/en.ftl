@@ -148,9 +148,9 @@ debrief-C_hf-much = Where it is meant to touch you, it presses much harder.
 debrief-C_fd-less = It spills less on you (by { $percent } %).
 debrief-C_fd-more = It spills more on you (by { $percent } %).
 debrief-C_fd-much = It spills much more on you.
-debrief-C_fdv-less = Food or drink enters your mouth more slowly (by { $percent } %).
-debrief-C_fdv-more = Food or drink enters your mouth more quickly (by { $percent } %).
-debrief-C_fdv-much = Food or drink enters your mouth much more quickly.
+debrief-C_fdv-less = What it gives you enters your mouth more slowly (by { $percent } %).
+debrief-C_fdv-more = What it gives you enters your mouth more quickly (by { $percent } %).
+debrief-C_fdv-much = What it gives you enters your mouth much more quickly.
 debrief-done = Finish
 
 ## The end

@@ -210,6 +210,27 @@ def test_what_is_made_ahead_ends_when_the_last_filter_has_cleared_it_away(
     refinement.refine_ahead(context, job, run_id, at_once)
 
 
+def test_what_was_to_be_made_ahead_leaves_no_folder_once_everything_is_answered(
+    context: WorkerContext, participant: Participant, answered: Callable[[int], None], refining: Callable[..., None]
+) -> None:
+    theirs = context.store.unfinished.folder(participant.id)
+
+    def last_answer_meanwhile(known: object, steps: int, train: Callable[[Callable[[Path], bool]], bool]) -> None:
+        answered(5)
+        for folder in theirs.glob("ahead-*"):  # as the last filter does when it is done
+            context.store.unfinished.forget(folder)
+        train(go_on)
+
+    answered(15)
+    job, run_id = begin(context, participant, RunKind.REFINEMENT)
+    refining(go_on)
+    fit = SimpleNamespace(refine_ahead=last_answer_meanwhile)
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(fits, "fitting", lambda *_, **__: fit)
+        refinement.refine_ahead(context, job, run_id, at_once)
+    assert list(theirs.glob("ahead-*")) == []
+
+
 def test_without_a_reward_model_the_run_says_why_there_is_no_filter(
     context: WorkerContext, participant: Participant
 ) -> None:
