@@ -40,6 +40,9 @@ from worker.whole_files import written_whole
 CHEAP_FIRST = (
     "pbarl",
     "pbarl_refined",
+    "pbarl_no_mode",
+    "pbarl_no_residual",
+    "pbarl_no_caution",
     "sliders",
     "preferential_bo",
     "clusters_3",

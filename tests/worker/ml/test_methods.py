@@ -109,7 +109,13 @@ def action_reward() -> MlpReward:
 @pytest.fixture
 def setting(action_reward: MlpReward) -> Setting:
     config = FilterConfig(
-        gates=(1.0,), gate_scenarios=4, residual_rounds=1, residual_rollouts=4, value_steps=20, adapter_steps=10
+        gates=(1.0,),
+        gate_scenarios=4,
+        check_scenarios=6,
+        residual_rounds=1,
+        residual_rollouts=4,
+        value_steps=20,
+        adapter_steps=10,
     )
     family = invented.TASK.modes
     modes = family.sample(30, np.random.default_rng(0))

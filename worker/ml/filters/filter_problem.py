@@ -26,6 +26,7 @@ from worker.domain.type_aliases import Act, Float32Array
 from worker.ml.filters.action_encoder import ResidualAdapter
 from worker.ml.filters.filter_module import FilterWeights, build, state_of
 from worker.ml.filters.filter_onnx import OnnxFilter, to_onnx
+from worker.ml.filters.response_surface import CAUTION
 from worker.ml.filters.shield import widest
 from worker.ml.policies.asked_policy import AskedPolicy
 from worker.ml.policies.gaussian import GaussianPolicy
@@ -58,6 +59,8 @@ class FilterConfig:
     """modes tried on held-out scenarios at full strength, each chosen knowing what came of those before"""
     modes_to_choose_from: int = 2
     """acceptable ones after which no further is tried"""
+    success_caution: float = CAUTION
+    """standard deviations by which the surface's log odds of success count less while a mode is sought"""
     gates: tuple[float, ...] = (0.6, 0.3)
     """strengths at which the last of them is tried when none at full strength was acceptable"""
     gate_scenarios: int = 80

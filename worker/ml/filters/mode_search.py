@@ -49,7 +49,7 @@ def find_mode(
             break
         progress("searching the person's way of doing the task", 0.1 * attempt)
         rejected = len(tried) - len(accepted)
-        careful = CAUTION * (1 + rejected)
+        careful = problem.config.success_caution * (1 + rejected)
         mode = best_mode(surface, wishes, problem.seed, caution=_caution(problem), success_caution=careful)
         if not mode.any() or any(np.array_equal(mode, earlier) for _, earlier in tried):
             break

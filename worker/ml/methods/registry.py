@@ -148,6 +148,12 @@ def fit_pbarl(setting: Setting) -> tuple[Act, tuple[str, ...]]:
     return _shipped(setting.problem, _fitted(setting))
 
 
+def fit_without(setting: Setting, **changed: Any) -> tuple[Act, tuple[str, ...]]:
+    """The quick filter without one of its parts: an ablation. ``changed``: of the FilterConfig."""
+    problem = replace(setting.problem, config=replace(setting.problem.config, **changed))
+    return fit_pbarl(replace(setting, problem=problem))
+
+
 def fit_pbarl_refined(setting: Setting) -> tuple[Act, tuple[str, ...]]:
     """The studio's filter with its refinement, most of which is made for the first of the labels."""
     problem, reference, config = setting.problem, setting.reference(_gate(setting)), setting.config.refinement
@@ -289,6 +295,9 @@ METHODS: Mapping[str, FitMethod] = {
     "reference": fit_reference,
     "pbarl": fit_pbarl,
     "pbarl_refined": fit_pbarl_refined,
+    "pbarl_no_mode": partial(fit_without, mode_attempts=0),
+    "pbarl_no_residual": partial(fit_without, residual_rounds=0),
+    "pbarl_no_caution": partial(fit_without, success_caution=0.0),
     "pbarl_printed": partial(fit_as_printed, list_length=10),
     "pbarl_n1": partial(fit_as_printed, list_length=1),
     "pbarl_n20": partial(fit_as_printed, list_length=20),
