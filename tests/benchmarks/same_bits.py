@@ -32,6 +32,7 @@ from worker.ml.filters.filter_problem import FilterConfig, act_of
 from worker.ml.methods import registry
 from worker.ml.methods.preference_rl import PolicyAct
 from worker.ml.methods.prefft import FineTuning
+from worker.ml.methods.refinement import Beginning, Refinement, refine
 from worker.ml.methods.registry import MethodConfig
 from worker.ml.rewards import reward_training
 from worker.ml.teachers import TASTES, User
@@ -52,7 +53,11 @@ FILTER = FilterConfig(
     adapter_steps=20,
 )
 FINE_TUNING = FineTuning(steps=400, warm_up_steps=200, critic_first_updates=20, cloning_steps=50)
-TERMS = BenchmarkConfig(labels=20, smallest_pool=4, filter=FILTER, methods=MethodConfig(fine_tuning=FINE_TUNING))
+REFINEMENT = Refinement(
+    steps=400, warm_up_steps=200, imitation_steps=50, critic_first_updates=20, critic_again_updates=10
+)
+METHODS = MethodConfig(fine_tuning=FINE_TUNING, refinement=REFINEMENT)
+TERMS = BenchmarkConfig(labels=20, smallest_pool=4, filter=FILTER, methods=METHODS)
 
 
 def main() -> None:
@@ -110,6 +115,9 @@ def learned(bench: BenchmarkUser) -> Iterator[tuple[str, Iterable[bytes]]]:
     draft = pbarl.fit_studio(setting.problem, setting.surface(), setting.pool, gate, setting.collect).shielded()
     yield "filter", [draft.weights.to_bytes()]
     yield "filter.onnx", [act_of(bench.task.modes, setting.problem.policy, draft.weights).exported.stored]
+    beginning = Beginning(setting.make_env, setting.pool, gate, setting.collect)
+    for refined in refine(setting.problem, draft, beginning, REFINEMENT):
+        yield "refined filter", [refined.weights.to_bytes()]
     tuned = registry.fit("prefft", setting).act
     assert isinstance(tuned, PolicyAct)
     yield "fine-tuned policy", (array.tobytes() for _, array in sorted(tuned.policy.weights.items()))
