@@ -331,14 +331,52 @@ def test_strokes_count_where_the_task_is_done_by_strokes(reference: list[Traject
     signals = np.zeros((2, len(SIGNALS)), np.float32)
     signals[1, STROKES] = 1.0
     without, counted = (
-        refinement.guided(some, lambda signals, observations, actions: np.zeros(len(signals)), 0.3)(
-            signals, signals, signals
-        )
-        for some in (reference, stroking)
+        refinement.guided(some, nothing_learned, 0.3, 1.0)(signals, signals, signals) for some in (reference, stroking)
     )
     spread = float(np.concatenate([each.signals[:, STROKES] for each in stroking]).std())
     assert np.ptp(without) == 0.0
     assert counted[1] - counted[0] == pytest.approx(0.3 / spread)
+
+
+def test_force_costs_something_beyond_what_the_reference_policy_presses_with(reference: list[Trajectory]) -> None:
+    pressing = [replace(each, contact_force_n=np.full(STEPS, 3.0, np.float32)) for each in reference]
+    signals = np.zeros((5, len(SIGNALS)), np.float32)
+    signals[:, SIGNALS.index("force_at_target_n")] = (0.0, 3.0, 3.0, 3.0, 3.0)
+    signals[:, SIGNALS.index("force_away_n")] = (0.0, 0.0, 1.0, 2.0, 40.0)
+    rewards = refinement.guided(pressing, nothing_learned, 0.0, 0.5)(signals, signals, signals)
+    np.testing.assert_allclose(rewards - rewards[0], [0.0, 0.0, -0.25, -0.5, -1.5], atol=1e-6)
+
+
+class Hitting(World):
+    """The same world, where the person is hit while the first joint's action is below LOST."""
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """See gymnasium."""
+        observation, reward, terminated, truncated, info = super().step(action)
+        info["signals"]["force_away_n"] = 20.0 * (action[0] < LOST)
+        return observation, reward, terminated, truncated, info
+
+
+def test_a_refinement_keeps_away_from_where_people_would_be_hit(reference: list[Trajectory]) -> None:
+    hasty = replace(LONGER, first_tie=0.1, last_tie=0.1)
+    hits, misses = (
+        first_joint(
+            refinement.refine(
+                problem(),
+                FilterDraft(GATED),
+                Beginning(Hitting, [], reference, collect),
+                replace(hasty, force_price=price),
+            )[0].weights
+        )
+        for price in (0.0, 1.0)
+    )
+    assert hits < LOST
+    assert misses > LOST
+
+
+def nothing_learned(signals: np.ndarray, observations: np.ndarray, actions: np.ndarray) -> np.ndarray:
+    """An R-hat that has no wishes."""
+    return np.zeros(len(signals))
 
 
 def _copy(folder: Path, name: str) -> Path:

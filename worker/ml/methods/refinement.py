@@ -28,7 +28,7 @@ from worker.ml.filters.filter_problem import (
     act_of,
 )
 from worker.ml.filters.gate import keeps_task, to_beat, try_on
-from worker.ml.filters.shield import limits_of
+from worker.ml.filters.shield import FORCE_QUANTILE, FORCE_RAMP_N, limits_of
 from worker.ml.methods import pbrl_hri
 from worker.ml.methods.preference_rl import EpisodeReward, MakeEnv, PreferenceRl, learned
 from worker.ml.methods.watched import WatchedLearner, best_in, price_in
@@ -52,6 +52,8 @@ LEAST_LIFT = 1.1
 LOOKED_AT = 40
 """of the gate's scenarios, to see whether a refinement is promising"""
 _STROKES, _UNDONE = SIGNALS.index("strokes"), SIGNALS.index("undelivered")
+_FORCES = [SIGNALS.index("force_at_target_n"), SIGNALS.index("force_away_n")]
+MOST_RAMPS = 3.0
 OWN_SHARE = 3
 """How often the imitation sees the filter's own states, beside those of the rollouts that were there."""
 
@@ -83,6 +85,9 @@ class Refinement:
     """of every step with the task undone, once it was lost, in standard deviations of R-hat"""
     stroke_weight: float = 0.3
     """of strokes in the sketchy reward, beside the distance"""
+    force_price: float = 1.0
+    """of FORCE_RAMP_N more on the person than is usual (guided()), in standard deviations of R-hat; at most MOST_RAMPS of
+    it are priced, or a single blow would be all that is learned from"""
     share_ahead: float = SHARE_AHEAD
     """of the steps, for a reward model of fewer answers"""
 
@@ -193,7 +198,7 @@ def _train(
     offset, scale = torch.from_numpy(policy.offset), torch.from_numpy(policy.scale)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(problem.seed)
-        reward = guided(reference, learned(problem.reward), config.stroke_weight)
+        reward = guided(reference, learned(problem.reward), config.stroke_weight, config.force_price)
         mark = hashlib.sha256(problem.reward.to_bytes()).hexdigest()
         priced = _priced(reward, price_in(kept[0]) if kept else 0.0)
         training = PreferenceRl(beginning.make_env, priced, settings, [*beginning.known, *reference], mark)
@@ -236,22 +241,28 @@ def _priced(reward: EpisodeReward, price: float) -> EpisodeReward:
     return both
 
 
-def guided(reference: Sequence[Trajectory], learned: EpisodeReward, stroke_weight: float) -> EpisodeReward:
-    """The reward that is learned from: PbRL-HRI's, and where a task is done by strokes each of them counts, too.
+def guided(
+    reference: Sequence[Trajectory], learned: EpisodeReward, stroke_weight: float, force_price: float
+) -> EpisodeReward:
+    """The reward that is learned from: PbRL-HRI's, more for strokes where a task is done by them, and less for force.
 
-    Both in standard deviations over reference rollouts. A critic that is asked for a policy's value does not know that
-    episodes end: without it strokes that come too late cost nothing (docs/results/rivals.md).
+    Distance and strokes in standard deviations over reference rollouts. A critic that is asked for a policy's value
+    does not know that episodes end: without the latter strokes that come too late cost nothing. R-hat forgives a blow
+    that is short; so force has a price where it is more than 95 of 100 reference episodes reach (decision 162;
+    docs/results/rivals.md).
     """
     approaching = pbrl_hri.sketchy(reference, learned)
     unit = float(np.concatenate([each.signals[:, _STROKES] for each in reference]).std())
-    if unit == 0.0:
-        return approaching
+    worth = stroke_weight / unit if unit else 0.0
+    usual = float(np.quantile([each.contact_force_n.max() for each in reference], FORCE_QUANTILE))
 
-    def both(signals: Float32Array, observations: Float32Array, actions: Float32Array) -> npt.NDArray[np.floating]:
+    def reward(signals: Float32Array, observations: Float32Array, actions: Float32Array) -> npt.NDArray[np.floating]:
+        force = signals[:, _FORCES].sum(axis=1)
+        too_much = np.clip((force - usual) / FORCE_RAMP_N, 0.0, MOST_RAMPS)
         rewards: npt.NDArray[np.floating] = approaching(signals, observations, actions)
-        return rewards + stroke_weight / unit * signals[:, _STROKES]
+        return rewards + worth * signals[:, _STROKES] - force_price * too_much
 
-    return both
+    return reward
 
 
 def _imitate(learner: WatchedLearner, training: PreferenceRl, act: FilterAct, config: Refinement) -> None:
