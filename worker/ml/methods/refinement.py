@@ -86,8 +86,8 @@ class Refinement:
     stroke_weight: float = 0.3
     """of strokes in the sketchy reward, beside the distance"""
     force_price: float = 1.0
-    """of FORCE_RAMP_N more on the person than is usual (guided()), in standard deviations of R-hat; at most MOST_RAMPS of
-    it are priced, or a single blow would be all that is learned from"""
+    """of FORCE_RAMP_N more on the person than is usual (guided()), in standard deviations of R-hat; at most MOST_RAMPS
+    of it are priced, or a single blow would be all that is learned from"""
     share_ahead: float = SHARE_AHEAD
     """of the steps, for a reward model of fewer answers"""
 
