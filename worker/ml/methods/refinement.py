@@ -260,7 +260,8 @@ def guided(
         force = signals[:, _FORCES].sum(axis=1)
         too_much = np.clip((force - usual) / FORCE_RAMP_N, 0.0, MOST_RAMPS)
         rewards: npt.NDArray[np.floating] = approaching(signals, observations, actions)
-        return rewards + worth * signals[:, _STROKES] - force_price * too_much
+        rewards = rewards + worth * signals[:, _STROKES] - force_price * too_much
+        return rewards
 
     return reward
 
