@@ -65,7 +65,7 @@ class FilterConfig:
     """strengths at which the last of them is tried when none at full strength was acceptable"""
     gate_scenarios: int = 80
     """of USUAL_STEPS control steps; see gate_block()"""
-    check_scenarios: int = 200
+    check_scenarios: int = 400
     """of USUAL_STEPS control steps, in which a refined policy is tried once more; see check_block()"""
     success_tolerance: float = 0.035
     """largest accepted loss of success on the gate's scenarios, as a share of episodes"""
