@@ -171,8 +171,8 @@ def _procedure(session: Session, study: Study) -> Iterator[str]:
         "The filter of all answers was then refined by soft actor-critic for "
         f"{settings.refinement_steps:,} environment steps, {percent(SHARE_AHEAD, 0)} of them on the preference learned "
         f"from the first {answers_ahead(settings.labels_per_participant)} answers and from its execution mode on; "
-        "force on the person beyond what 95 % of the episodes of the pre-trained policy stay below had a price. The refined "
-        "policy was kept where it was better and, in further scenarios too, no worse in these respects."
+        "force on the person beyond what 95 % of the episodes of the pre-trained policy stay below had a price. The "
+        "refined policy was kept where it was better and, in further scenarios too, no worse in these respects."
         if settings.refinement_steps
         else "",
     )
