@@ -291,13 +291,11 @@ def fit_latent(setting: Setting) -> tuple[Act, tuple[str, ...]]:
     return fit_pbarl(setting.with_reward(reward))
 
 
+# What is new comes last: a method has its colour in pictures by its place.
 METHODS: Mapping[str, FitMethod] = {
     "reference": fit_reference,
     "pbarl": fit_pbarl,
     "pbarl_refined": fit_pbarl_refined,
-    "pbarl_no_mode": partial(fit_without, mode_attempts=0),
-    "pbarl_no_residual": partial(fit_without, residual_rounds=0),
-    "pbarl_no_caution": partial(fit_without, success_caution=0.0),
     "pbarl_printed": partial(fit_as_printed, list_length=10),
     "pbarl_n1": partial(fit_as_printed, list_length=1),
     "pbarl_n20": partial(fit_as_printed, list_length=20),
@@ -315,6 +313,9 @@ METHODS: Mapping[str, FitMethod] = {
     "average": partial(fit_clusters, count=1),
     "clusters_3": partial(fit_clusters, count=3),
     "latent_people": fit_latent,
+    "pbarl_no_mode": partial(fit_without, mode_attempts=0),
+    "pbarl_no_residual": partial(fit_without, residual_rounds=0),
+    "pbarl_no_caution": partial(fit_without, success_caution=0.0),
 }
 """Episodes seen with a blur of 0.11 (0.35) spreads of a pair are ordered wrongly in about 5 (15) of 100 pairs, if their
 differences are normal: as often as answers are, and three times as often."""
