@@ -1,4 +1,4 @@
-"""What both programs know of refinements (worker.ml.methods.refinement): how long, and what is done ahead."""
+"""What both programs know of refinements (worker.ml.reinforcement.refinement): how long, and what is done ahead."""
 
 SHORTEST_REFINEMENT = 8_000
 """Environment steps; half of them are the filter's own, before anything is learned."""

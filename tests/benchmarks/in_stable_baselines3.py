@@ -30,10 +30,10 @@ from worker.domain.type_aliases import Act, Float32Array
 from worker.experiments.benchmark_cell import PAPER_USERS, BenchmarkConfig, BenchmarkUser, Cell
 from worker.experiments.rollout_cache import RolloutCache
 from worker.ml.methods import steered_rl
-from worker.ml.methods.preference_rl import TRAINING_SCENARIOS, EpisodeReward
 from worker.ml.methods.residual_rl import Corrected
 from worker.ml.methods.steered_rl import Steering
 from worker.ml.policies.gaussian import GaussianPolicy
+from worker.ml.reinforcement.preference_rl import TRAINING_SCENARIOS, EpisodeReward
 from worker.ml.rewards.reward_models import UNDONE, RewardModel
 from worker.tasks import registry
 from worker.whole_files import written_whole

@@ -30,10 +30,10 @@ from worker.experiments.rollout_cache import RolloutCache
 from worker.ml.filters import pbarl
 from worker.ml.filters.filter_problem import FilterConfig, act_of
 from worker.ml.methods import registry
-from worker.ml.methods.preference_rl import PolicyAct
 from worker.ml.methods.prefft import FineTuning
-from worker.ml.methods.refinement import Beginning, Refinement, refine
 from worker.ml.methods.registry import MethodConfig
+from worker.ml.reinforcement.preference_rl import PolicyAct
+from worker.ml.reinforcement.refinement import Beginning, Refinement, refine
 from worker.ml.rewards import reward_training
 from worker.ml.teachers import TASTES, User
 from worker.sim.rollout import rollout

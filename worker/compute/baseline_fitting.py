@@ -24,10 +24,10 @@ from worker.ml.filters.filter_module import FilterWeights
 from worker.ml.filters.filter_problem import FilterProblem
 from worker.ml.filters.response_surface import ResponseSurface
 from worker.ml.methods import registry
-from worker.ml.methods.preference_rl import PolicyAct
 from worker.ml.methods.prefft import FineTuning
 from worker.ml.methods.registry import MethodConfig, Setting
 from worker.ml.policies.checkpoint import Checkpoint, Paused, begin_again
+from worker.ml.reinforcement.preference_rl import PolicyAct
 from worker.ml.rewards.action_ranking import can_rank
 from worker.ml.rewards.loading import load_reward_model
 from worker.ml.rewards.reward_models import RewardModel

@@ -41,9 +41,10 @@ from worker.ml.filters.filter_problem import (
 )
 from worker.ml.filters.policy_choice import SURE
 from worker.ml.filters.response_surface import ResponseSurface
-from worker.ml.methods.refinement import Refinement, gate_refined, given_up, is_promising
 from worker.ml.policies.checkpoint import Checkpoint
 from worker.ml.policies.reference import ReferencePolicy
+from worker.ml.reinforcement.refinement import Refinement, given_up, is_promising
+from worker.ml.reinforcement.refinement_gate import gate_refined
 from worker.ml.rewards.loading import load_reward_model
 from worker.tasks import registry
 

@@ -34,9 +34,9 @@ from worker.ml.methods.latent_people import Latent
 from worker.ml.methods.pbrl_hri import FromScratch
 from worker.ml.methods.prefft import FineTuning
 from worker.ml.methods.prefft_lagrangian import Constraint
-from worker.ml.methods.refinement import Refinement
 from worker.ml.methods.registry import METHODS, MethodConfig
 from worker.ml.methods.steered_rl import Steering
+from worker.ml.reinforcement.refinement import Refinement
 from worker.ml.teachers import Manner, Taste, random_taste
 from worker.sim.costs import preference_rewards, stakes
 from worker.tasks import registry

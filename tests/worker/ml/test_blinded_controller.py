@@ -25,8 +25,8 @@ from worker.ml.filters.filter_module import FilterWeights, build, state_of
 from worker.ml.filters.filter_problem import act_of
 from worker.ml.filters.pbarl_printed import PrintedEncoder
 from worker.ml.methods.best_of_n import BestOfN
-from worker.ml.methods.preference_rl import PolicyAct
 from worker.ml.policies.torch_module import FrozenPolicy
+from worker.ml.reinforcement.preference_rl import PolicyAct
 
 POLICY = invented.small_policy()
 FROZEN = FrozenPolicy(POLICY.weights)

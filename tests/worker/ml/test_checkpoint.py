@@ -9,11 +9,12 @@ import pytest
 
 from tests.worker import invented
 from tests.worker.ml.test_methods import POLICY, REWARD, World
-from worker.ml.methods import preference_rl, prefft
+from worker.ml.methods import prefft
 from worker.ml.methods.prefft import FineTuning
 from worker.ml.policies import checkpoint
 from worker.ml.policies.checkpoint import Abandoned, Checkpoint, Paused
 from worker.ml.policies.gaussian import GaussianPolicy
+from worker.ml.reinforcement import preference_rl
 
 CONFIG = FineTuning(steps=480, warm_up_steps=120, critic_first_updates=20, cloning_steps=50, tie_weight=1.0)
 DIES_AT = 300

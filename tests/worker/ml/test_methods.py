@@ -19,15 +19,18 @@ from worker.ml.filters import response_surface
 from worker.ml.filters.filter_module import load_state
 from worker.ml.filters.filter_problem import FilterConfig, FilterProblem
 from worker.ml.filters.fitted_q import ActionValue
-from worker.ml.methods import pbrl_hri, preference_rl, prefft, registry
+from worker.ml.methods import prefft, registry
 from worker.ml.methods.best_of_n import BestOfN, fit_best_of_n
 from worker.ml.methods.latent_people import Latent
 from worker.ml.methods.pbrl_hri import FromScratch
 from worker.ml.methods.prefft import FineTuning
 from worker.ml.methods.prefft_lagrangian import Constraint
-from worker.ml.methods.refinement import Refinement
 from worker.ml.methods.registry import METHODS, MethodConfig, NobodyToAsk, Setting
 from worker.ml.methods.steered_rl import Steering
+from worker.ml.reinforcement import preference_rl
+from worker.ml.reinforcement.guided_reward import sketchy
+from worker.ml.reinforcement.refinement import Refinement
+from worker.ml.reinforcement.tied_learner import gaussian_divergence
 from worker.ml.rewards.reward_models import MlpReward, StructuredReward
 
 POLICY = invented.small_policy()
@@ -188,7 +191,7 @@ def test_the_divergence_is_that_of_gaussians() -> None:
     expected = torch.distributions.kl_divergence(
         torch.distributions.Normal(mean, log_std.exp()), torch.distributions.Normal(other, other_log_std.exp())
     )
-    torch.testing.assert_close(prefft.gaussian_divergence(mean, log_std, other, other_log_std), expected.sum(-1))
+    torch.testing.assert_close(gaussian_divergence(mean, log_std, other, other_log_std), expected.sum(-1))
 
 
 def fine_tuned(tie_weight: float) -> np.ndarray:
@@ -231,7 +234,7 @@ def test_the_sketchy_reward_is_minus_the_distance_in_the_references_spread_plus_
     reference = collect(POLICY.mean, range(3), 0.0, 0)
     for number, each in enumerate(reference):
         each.signals[:, DISTANCE] = number
-    both = pbrl_hri.sketchy(reference, lambda signals, observations, actions: np.full(len(signals), 10.0))
+    both = sketchy(reference, lambda signals, observations, actions: np.full(len(signals), 10.0))
     signals = np.zeros((2, len(SIGNALS)), np.float32)
     signals[:, DISTANCE] = (0.0, 3.0)
     spread = float(np.std([0.0, 1.0, 2.0]))

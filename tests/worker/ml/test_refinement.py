@@ -23,9 +23,10 @@ from worker.ml.filters.filter_problem import (
     GateTrial,
     act_of,
 )
-from worker.ml.methods import refinement
-from worker.ml.methods.refinement import Beginning, Refinement
 from worker.ml.policies.checkpoint import Checkpoint, Paused, ask_to_pause, begin_again, go_on_from
+from worker.ml.reinforcement import refinement, refinement_gate
+from worker.ml.reinforcement.guided_reward import guided
+from worker.ml.reinforcement.refinement import Beginning, Refinement
 from worker.ml.rewards.reward_models import StructuredReward
 
 SEEN = invented.observations(300, np.random.default_rng(9))
@@ -77,7 +78,7 @@ def gate_refined(
     """Checked in scenarios that the gate does not have, where the frozen policy is as good as in these."""
     driven = collect(POLICY.mean, CHECKED, 0.0, 0)
     checked = [replace(each, success=reference[0].success) for each in driven]
-    return refinement.gate_refined(problem, drafts, reference, lambda: checked, drive)
+    return refinement_gate.gate_refined(problem, drafts, reference, lambda: checked, drive)
 
 
 def weights_of(drafts: Sequence[FilterDraft]) -> list[bytes]:
@@ -264,7 +265,7 @@ def test_what_was_best_on_the_way_is_tried_where_the_last_policy_loses_the_task(
     strict = replace(problem(), config=FilterConfig(success_tolerance=0.05))
     succeeding = [replace(each, success=True) for each in reference]
     best = watched[-1]
-    gated = refinement.gate_refined(strict, [blind, best], succeeding, lambda: succeeding, narrowly)
+    gated = refinement_gate.gate_refined(strict, [blind, best], succeeding, lambda: succeeding, narrowly)
     assert gated.weights == best.weights.changed(gate=1.0)
     assert [trial.success_change < -0.5 for trial in gated.trials] == [True, False, False]
 
@@ -331,7 +332,7 @@ def test_strokes_count_where_the_task_is_done_by_strokes(reference: list[Traject
     signals = np.zeros((2, len(SIGNALS)), np.float32)
     signals[1, STROKES] = 1.0
     without, counted = (
-        refinement.guided(some, nothing_learned, 0.3, 1.0)(signals, signals, signals) for some in (reference, stroking)
+        guided(some, nothing_learned, 0.3, 1.0)(signals, signals, signals) for some in (reference, stroking)
     )
     spread = float(np.concatenate([each.signals[:, STROKES] for each in stroking]).std())
     assert np.ptp(without) == 0.0
@@ -343,7 +344,7 @@ def test_force_costs_something_beyond_what_the_reference_policy_presses_with(ref
     signals = np.zeros((5, len(SIGNALS)), np.float32)
     signals[:, SIGNALS.index("force_at_target_n")] = (0.0, 3.0, 3.0, 3.0, 3.0)
     signals[:, SIGNALS.index("force_away_n")] = (0.0, 0.0, 1.0, 2.0, 40.0)
-    rewards = refinement.guided(pressing, nothing_learned, 0.0, 0.5)(signals, signals, signals)
+    rewards = guided(pressing, nothing_learned, 0.0, 0.5)(signals, signals, signals)
     np.testing.assert_allclose(rewards - rewards[0], [0.0, 0.0, -0.25, -0.5, -1.5], atol=1e-6)
 
 

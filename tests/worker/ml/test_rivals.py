@@ -17,11 +17,11 @@ from worker.ml.methods import bayesian_modes, clusters, latent_people, residual_
 from worker.ml.methods.behaviour_flow import fit_flow
 from worker.ml.methods.dsrl import OwnNoise
 from worker.ml.methods.latent_people import Latent
-from worker.ml.methods.preference_rl import learned
 from worker.ml.methods.prefft_lagrangian import Constraint, Price
 from worker.ml.methods.residual_rl import Corrected
 from worker.ml.methods.steered_rl import Steering
 from worker.ml.policies.sac import Replay
+from worker.ml.reinforcement.preference_rl import learned
 from worker.ml.rewards.reward_models import UNDONE
 
 SEEN = invented.observations(200, np.random.default_rng(9))

@@ -25,8 +25,8 @@ from worker.jobs.runtime import due_work
 from worker.jobs.runtime.context import Step, WorkerContext
 from worker.jobs.runtime.records import Job
 from worker.ml.filters.filter_problem import FilterDraft
-from worker.ml.methods.refinement import Refinement
 from worker.ml.policies.checkpoint import Abandoned, go_on_from
+from worker.ml.reinforcement.refinement import Refinement
 
 
 def refine_ahead(context: WorkerContext, job: Job, run_id: int, step: Step) -> None:

@@ -25,11 +25,11 @@ from worker.ml.export.bundle import described_space
 from worker.ml.export.run_controller import INPUT, OUTPUT, Controller
 from worker.ml.filters.filter_onnx import LARGEST_DIFFERENCE, ExportDiffers, OnnxFilter
 from worker.ml.filters.filter_problem import FilterAct
-from worker.ml.methods.preference_rl import PolicyAct
 from worker.ml.policies.asked_policy import AskedPolicy
 from worker.ml.policies.policy_onnx import IR_VERSION, OPSET
 from worker.ml.policies.reference import ReferencePolicy
 from worker.ml.policies.stored_policy import stored_policy
+from worker.ml.reinforcement.preference_rl import PolicyAct
 
 SCHEMA_VERSION = 1
 LENGTH_BYTES = 1 << 20

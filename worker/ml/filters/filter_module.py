@@ -142,7 +142,7 @@ class PrintedTransform(nn.Module):
 
 
 class RefinedTransform(nn.Module):
-    """The person's refined policy in place of mode and residual (worker.ml.methods.refinement)."""
+    """The person's refined policy in place of mode and residual (worker.ml.reinforcement.refinement)."""
 
     def __init__(self, refined: FrozenPolicy) -> None:
         super().__init__()

@@ -1,6 +1,6 @@
 """The studio's filter, stage by stage: a person's execution mode, gated, and a residual adapter around it, gated again.
 
-A refined policy (worker.ml.methods.refinement) takes the residual's place where it is better than the mode.
+A refined policy (worker.ml.reinforcement.refinement) takes the residual's place where it is better than the mode.
 Every stage takes a draft and returns a better one.
 """
 

@@ -5,20 +5,15 @@ here both have standard deviation 1 per step over the reference policy's rollout
 labels while it learns; here they are the same ones as for every other method, given beforehand.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import torch
 
 from worker.domain.spaces import Space
-from worker.domain.trajectory import SIGNALS, Trajectory
-from worker.ml.methods.preference_rl import EpisodeReward, MakeEnv, PreferenceRl
 from worker.ml.policies.gaussian import GaussianPolicy
 from worker.ml.policies.sac import Learner, SacConfig
-
-_DISTANCE = SIGNALS.index("distance_m")
+from worker.ml.reinforcement.preference_rl import EpisodeReward, MakeEnv, PreferenceRl
 
 
 @dataclass(frozen=True)
@@ -29,20 +24,6 @@ class FromScratch:
     random_steps: int = 4_000
     hidden: int = 128
     environments: int = 4
-
-
-def sketchy(reference: Sequence[Trajectory], learned: EpisodeReward) -> EpisodeReward:
-    """Minus the distance in standard deviations over reference rollouts, plus the learned reward."""
-    distances = np.concatenate([each.signals[:, _DISTANCE] for each in reference])
-    unit = max(float(distances.std()), 1e-6)
-
-    def both(
-        signals: npt.NDArray[np.float32], observations: npt.NDArray[np.float32], actions: npt.NDArray[np.float32]
-    ) -> npt.NDArray[np.floating]:
-        rewards: npt.NDArray[np.floating] = learned(signals, observations, actions) - signals[:, _DISTANCE] / unit
-        return rewards
-
-    return both
 
 
 def train(

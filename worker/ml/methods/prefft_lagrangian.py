@@ -19,10 +19,10 @@ from worker.domain.type_aliases import Float32Array
 from worker.ml.filters.filter_problem import Collect
 from worker.ml.filters.gate import successes
 from worker.ml.methods import prefft
-from worker.ml.methods.preference_rl import EpisodeReward, MakeEnv, PolicyAct, PreferenceRl
 from worker.ml.methods.prefft import FineTuning
 from worker.ml.policies.gaussian import GaussianPolicy
 from worker.ml.policies.sac import Learner, Replay
+from worker.ml.reinforcement.preference_rl import EpisodeReward, MakeEnv, PolicyAct, PreferenceRl
 from worker.ml.rewards.reward_models import UNDONE
 
 _UNDONE = SIGNALS.index(UNDONE)

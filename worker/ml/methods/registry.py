@@ -33,7 +33,6 @@ from worker.ml.methods import (
     pbrl_hri,
     prefft,
     prefft_lagrangian,
-    refinement,
     residual_rl,
     sliders,
 )
@@ -42,13 +41,16 @@ from worker.ml.methods.best_of_n import fit_best_of_n
 from worker.ml.methods.latent_people import Latent
 from worker.ml.methods.pbrl_hri import FromScratch
 from worker.ml.methods.people import Person
-from worker.ml.methods.preference_rl import Env, MakeEnv, PolicyAct, learned
 from worker.ml.methods.prefft import TIED, FineTuning
 from worker.ml.methods.prefft_lagrangian import Constraint, Price
-from worker.ml.methods.refinement import Refinement
 from worker.ml.methods.steered_rl import Steering
 from worker.ml.policies.checkpoint import Checkpoint
 from worker.ml.policies.reference import looked_into
+from worker.ml.reinforcement import refinement
+from worker.ml.reinforcement.guided_reward import sketchy
+from worker.ml.reinforcement.preference_rl import Env, MakeEnv, PolicyAct, learned
+from worker.ml.reinforcement.refinement import Refinement
+from worker.ml.reinforcement.refinement_gate import gate_refined
 from worker.ml.rewards.reward_models import RewardModel
 
 
@@ -170,7 +172,7 @@ def fit_pbarl_refined(setting: Setting) -> tuple[Act, tuple[str, ...]]:
             if not refinement.is_promising(problem, draft, reference, config, checkpoint, setting.collect):
                 return refinement.given_up(draft)
             drafts = refinement.refine(problem, draft, beginning, config, checkpoint)
-            return refinement.gate_refined(problem, drafts, reference, more_reference, setting.collect)
+            return gate_refined(problem, drafts, reference, more_reference, setting.collect)
 
         return _shipped(problem, _fitted(setting, refined))
 
@@ -208,7 +210,7 @@ def fit_pbrl_hri(setting: Setting) -> tuple[Act, tuple[str, ...]]:
     """SAC from scratch on the distance and the learned reward."""
     problem, config = setting.problem, setting.config.from_scratch
     reference = setting.reference(_gate(setting))
-    reward = pbrl_hri.sketchy(reference, learned(problem.reward))
+    reward = sketchy(reference, learned(problem.reward))
     policy = pbrl_hri.train(
         setting.make_env, looked_into(problem.policy), reward, problem.task.observation, config, problem.seed
     )

@@ -11,9 +11,9 @@ import numpy as np
 
 from worker.domain.spaces import Space
 from worker.domain.type_aliases import Float32Array
-from worker.ml.methods.preference_rl import EpisodeReward, MakeEnv
 from worker.ml.methods.steered_rl import SteeredAct, Steering, steer
 from worker.ml.policies.gaussian import GaussianPolicy
+from worker.ml.reinforcement.preference_rl import EpisodeReward, MakeEnv
 
 
 @dataclass(frozen=True)

@@ -16,9 +16,9 @@ import torch
 from worker.domain.spaces import Space
 from worker.domain.trajectory import SIGNALS
 from worker.domain.type_aliases import Float32Array
-from worker.ml.methods.preference_rl import Env, EpisodeReward, MakeEnv, PreferenceRl
 from worker.ml.policies.gaussian import GaussianPolicy
 from worker.ml.policies.sac import Learner, SacConfig
+from worker.ml.reinforcement.preference_rl import Env, EpisodeReward, MakeEnv, PreferenceRl
 from worker.ml.rewards.reward_models import UNDONE
 
 _UNDONE = SIGNALS.index(UNDONE)

@@ -9,8 +9,8 @@ import math
 import torch
 from torch import Tensor
 
-from worker.ml.methods.prefft import TiedLearner
 from worker.ml.policies.sac import Actor
+from worker.ml.reinforcement.tied_learner import TiedLearner
 
 
 class WatchedLearner(TiedLearner):

@@ -8,52 +8,35 @@ task before it finds anything better. Where it forgets it all the same it goes b
 
 import hashlib
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 import torch
 
 from app.installed_tasks.refinements import SHARE_AHEAD
-from worker.domain.trajectory import SIGNALS, Trajectory
+from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import Float32Array
 from worker.ml.filters.filter_problem import (
     Collect,
     FilterAct,
     FilterDraft,
     FilterProblem,
-    GateTrial,
-    ReportProgress,
     act_of,
 )
-from worker.ml.filters.gate import keeps_task, to_beat, try_on
-from worker.ml.filters.shield import FORCE_QUANTILE, FORCE_RAMP_N, limits_of
-from worker.ml.methods import pbrl_hri
-from worker.ml.methods.preference_rl import EpisodeReward, MakeEnv, PreferenceRl, learned
-from worker.ml.methods.watched import WatchedLearner, best_in, price_in
+from worker.ml.filters.gate import keeps_task, to_beat
 from worker.ml.policies.checkpoint import Checkpoint
 from worker.ml.policies.demonstrations import Demonstrations
 from worker.ml.policies.imitation import imitate
 from worker.ml.policies.reference import looked_into
 from worker.ml.policies.sac import Actor, Learner, SacConfig
+from worker.ml.reinforcement.guided_reward import guided, priced
+from worker.ml.reinforcement.preference_rl import MakeEnv, PreferenceRl, learned
+from worker.ml.reinforcement.refinement_gate import try_refined
+from worker.ml.reinforcement.watched_learner import WatchedLearner, best_in, price_in
 
-_REFINED = (
-    "The filter was refined by reinforcement learning on the learned preference. It began as the execution mode that "
-    "is shown, and may have gone elsewhere since."
-)
-STRENGTHS = (1.0, 0.8, 0.6)
-"""Tried in this order, blended with the reference policy."""
-LARGEST_LOSS = 0.01
-"""of success in the scenarios of the check. In truth two points may be lost: who loses that much passes in one of eight
-cases, who loses half a point in more than nine of ten (decision 161)"""
-LEAST_LIFT = 1.1
-"""times what the mode gains the refined policy has to gain: a residual, which follows otherwise, often gains as much"""
 LOOKED_AT = 40
 """of the gate's scenarios, to see whether a refinement is promising"""
-_STROKES, _UNDONE = SIGNALS.index("strokes"), SIGNALS.index("undelivered")
-_FORCES = [SIGNALS.index("force_at_target_n"), SIGNALS.index("force_away_n")]
-MOST_RAMPS = 3.0
 OWN_SHARE = 3
 """How often the imitation sees the filter's own states, beside those of the rollouts that were there."""
 
@@ -77,7 +60,7 @@ class Refinement:
     learning_rate: float = 5e-4
     first_tie: float = 1.0
     """weight of the KL divergence from what it is tied to, the imitation at first, in units of the spread of Q; see
-    prefft"""
+    TiedLearner"""
     last_tie: float = 0.3
     hold_every_steps: int = 12_000
     """the tie is to what the policy was then: it goes far, and never far at once; see WatchedLearner"""
@@ -86,8 +69,7 @@ class Refinement:
     stroke_weight: float = 0.3
     """of strokes in the sketchy reward, beside the distance"""
     force_price: float = 1.0
-    """of FORCE_RAMP_N more on the person than is usual (guided()), in standard deviations of R-hat; at most MOST_RAMPS
-    of it are priced, or a single blow would be all that is learned from"""
+    """of FORCE_RAMP_N more on the person than is usual, in standard deviations of R-hat; see guided()"""
     share_ahead: float = SHARE_AHEAD
     """of the steps, for a reward model of fewer answers"""
 
@@ -158,16 +140,8 @@ def is_promising(
     policy = looked_into(problem.policy)
     actor = Actor(torch.from_numpy(policy.offset), torch.from_numpy(policy.scale), policy.action_size, config.hidden)
     actor.load_state_dict(best_in(kept[0]))
-    trial, _ = _tried(problem, _with(draft, actor), 1.0, reference[:LOOKED_AT], collect)
+    trial, _ = try_refined(problem, _with(draft, actor), 1.0, reference[:LOOKED_AT], collect)
     return trial.preference > to_beat(problem, draft, reference)
-
-
-def _tried(
-    problem: FilterProblem, draft: FilterDraft, gate: float, reference: Sequence[Trajectory], collect: Collect
-) -> tuple[GateTrial, Sequence[Trajectory]]:
-    act = act_of(problem.task.modes, problem.policy, draft.weights.changed(gate=gate))
-    trial, driven = try_on(problem, act, gate, 0.0, reference, collect)
-    return replace(trial, refined=True), driven
 
 
 def given_up(draft: FilterDraft) -> FilterDraft:
@@ -200,8 +174,8 @@ def _train(
         torch.manual_seed(problem.seed)
         reward = guided(reference, learned(problem.reward), config.stroke_weight, config.force_price)
         mark = hashlib.sha256(problem.reward.to_bytes()).hexdigest()
-        priced = _priced(reward, price_in(kept[0]) if kept else 0.0)
-        training = PreferenceRl(beginning.make_env, priced, settings, [*beginning.known, *reference], mark)
+        first_reward = priced(reward, price_in(kept[0]) if kept else 0.0)
+        training = PreferenceRl(beginning.make_env, first_reward, settings, [*beginning.known, *reference], mark)
         learner = WatchedLearner(settings, offset, scale, training.actions, config.first_tie)
         if kept is None:
             _imitate(learner, training, act_of(problem.task.modes, problem.policy, draft.weights), config)
@@ -217,53 +191,18 @@ def _train(
 
         def look() -> None:
             """Hold it where it is, or go back."""
-            trial, _ = _tried(problem, _with(draft, learner.average), 1.0, reference, beginning.collect)
+            trial, _ = try_refined(problem, _with(draft, learner.average), 1.0, reference, beginning.collect)
             if keeps_task(problem, trial, reference):
                 learner.passed(trial.preference)
             else:
                 learner.failed(config.price)
-                training.reward_anew(_priced(reward, learner.price))
+                training.reward_anew(priced(reward, learner.price))
                 for _ in range(config.critic_again_updates):
                     learner.update(training.replay, actor=False)
 
         training.learn(learner, checkpoint, move_tie, until)
         training.close()
     return learner
-
-
-def _priced(reward: EpisodeReward, price: float) -> EpisodeReward:
-    """The same, less so much in every step with the task undone."""
-
-    def both(signals: Float32Array, observations: Float32Array, actions: Float32Array) -> npt.NDArray[np.floating]:
-        rewards: npt.NDArray[np.floating] = reward(signals, observations, actions) - price * signals[:, _UNDONE]
-        return rewards
-
-    return both
-
-
-def guided(
-    reference: Sequence[Trajectory], learned: EpisodeReward, stroke_weight: float, force_price: float
-) -> EpisodeReward:
-    """The reward that is learned from: PbRL-HRI's, more for strokes where a task is done by them, and less for force.
-
-    Distance and strokes in standard deviations over reference rollouts. A critic that is asked for a policy's value
-    does not know that episodes end: without the latter strokes that come too late cost nothing. R-hat forgives a blow
-    that is short; so force has a price where it is more than 95 of 100 reference episodes reach (decision 162;
-    docs/results/rivals.md).
-    """
-    approaching = pbrl_hri.sketchy(reference, learned)
-    unit = float(np.concatenate([each.signals[:, _STROKES] for each in reference]).std())
-    worth = stroke_weight / unit if unit else 0.0
-    usual = float(np.quantile([each.contact_force_n.max() for each in reference], FORCE_QUANTILE))
-
-    def reward(signals: Float32Array, observations: Float32Array, actions: Float32Array) -> npt.NDArray[np.floating]:
-        force = signals[:, _FORCES].sum(axis=1)
-        too_much = np.clip((force - usual) / FORCE_RAMP_N, 0.0, MOST_RAMPS)
-        rewards: npt.NDArray[np.floating] = approaching(signals, observations, actions)
-        rewards = rewards + worth * signals[:, _STROKES] - force_price * too_much
-        return rewards
-
-    return reward
 
 
 def _imitate(learner: WatchedLearner, training: PreferenceRl, act: FilterAct, config: Refinement) -> None:
@@ -281,36 +220,3 @@ def _imitate(learner: WatchedLearner, training: PreferenceRl, act: FilterAct, co
     imitate(learner.actor, demonstrations, config.imitation_steps, early=-1, watch=lambda _: None)
     learner.average.load_state_dict(learner.actor.state_dict())
     learner.hold()
-
-
-def gate_refined(
-    problem: FilterProblem,
-    drafts: Sequence[FilterDraft],
-    reference: Sequence[Trajectory],
-    more_reference: Callable[[], Sequence[Trajectory]],
-    collect: Collect,
-    progress: ReportProgress = lambda stage, share: None,
-) -> FilterDraft:
-    """As much of the refined policy as keeps the task and is better enough than the mode; else the mode.
-
-    ``drafts``: of refine(). What had been best on the way is tried where the last one is not good enough.
-    ``more_reference``: the frozen policy in the scenarios of the check, which what passes the gate is tried in, too.
-    """
-    started, (draft, *_) = time.perf_counter(), drafts
-    least = LEAST_LIFT * to_beat(problem, draft, reference)
-    for candidate, gate in [*((each, 1.0) for each in drafts[:-1]), *((drafts[-1], gate) for gate in STRENGTHS)]:
-        progress(f"checking {gate:.0%} of the refined policy on held-out scenarios", 0.35)
-        trial, driven = _tried(problem, candidate, gate, reference, collect)
-        draft = replace(draft, trials=(*draft.trials, trial))
-        if trial.preference <= max(least, 0.0) or not keeps_task(problem, trial, reference):
-            continue
-        checked, _ = _tried(problem, candidate, gate, more_reference(), collect)
-        draft = replace(draft, trials=(*draft.trials, checked))
-        if keeps_task(problem, checked, more_reference()) and checked.success_change >= -LARGEST_LOSS:
-            weights = candidate.weights.changed(gate=gate)
-            tested = limits_of(problem.task.observation, problem.task.action, driven, reference)
-            draft = replace(draft, weights=weights, tested=tested, notes=(*draft.notes, _REFINED))
-            return draft.timed("gate_refined", started)
-    notes = (*draft.notes, "The refined policy was no better on held-out scenarios and is off.")
-    draft = replace(draft, weights=draft.weights.changed(refined={}), notes=notes)
-    return draft.timed("gate_refined", started)

@@ -1,4 +1,4 @@
-"""Reinforcement learning on a learned reward: what PrefFT and PbRL-HRI share. The learner is that of sac.
+"""Reinforcement learning on a learned reward: what a refinement and the rivals share. The learner is that of sac.
 
 Environments report the measured ``signals`` of every step in their info; their own reward is ignored. An episode is
 rewarded when it is over, as a whole, so that the reward model may be one that remembers what came before.

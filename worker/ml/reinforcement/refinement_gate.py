@@ -1,0 +1,71 @@
+"""Whether a refined policy takes the filter's place, and how much of it."""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+from worker.domain.trajectory import Trajectory
+from worker.ml.filters.filter_problem import (
+    Collect,
+    FilterDraft,
+    FilterProblem,
+    GateTrial,
+    ReportProgress,
+    act_of,
+)
+from worker.ml.filters.gate import keeps_task, to_beat, try_on
+from worker.ml.filters.shield import limits_of
+
+_REFINED = (
+    "The filter was refined by reinforcement learning on the learned preference. It began as the execution mode that "
+    "is shown, and may have gone elsewhere since."
+)
+STRENGTHS = (1.0, 0.8, 0.6)
+"""Tried in this order, blended with the reference policy."""
+LARGEST_LOSS = 0.01
+"""of success in the scenarios of the check. In truth two points may be lost: who loses that much passes in one of eight
+cases, who loses half a point in more than nine of ten (decision 161)"""
+LEAST_LIFT = 1.1
+"""times what the mode gains the refined policy has to gain: a residual, which follows otherwise, often gains as much"""
+
+
+def try_refined(
+    problem: FilterProblem, draft: FilterDraft, gate: float, reference: Sequence[Trajectory], collect: Collect
+) -> tuple[GateTrial, Sequence[Trajectory]]:
+    """A refined draft at this strength; see try_on()."""
+    act = act_of(problem.task.modes, problem.policy, draft.weights.changed(gate=gate))
+    trial, driven = try_on(problem, act, gate, 0.0, reference, collect)
+    return replace(trial, refined=True), driven
+
+
+def gate_refined(
+    problem: FilterProblem,
+    drafts: Sequence[FilterDraft],
+    reference: Sequence[Trajectory],
+    more_reference: Callable[[], Sequence[Trajectory]],
+    collect: Collect,
+    progress: ReportProgress = lambda stage, share: None,
+) -> FilterDraft:
+    """As much of the refined policy as keeps the task and is better enough than the mode; else the mode.
+
+    ``drafts``: of refine(). What had been best on the way is tried where the last one is not good enough.
+    ``more_reference``: the frozen policy in the scenarios of the check, which what passes the gate is tried in, too.
+    """
+    started, (draft, *_) = time.perf_counter(), drafts
+    least = LEAST_LIFT * to_beat(problem, draft, reference)
+    for candidate, gate in [*((each, 1.0) for each in drafts[:-1]), *((drafts[-1], gate) for gate in STRENGTHS)]:
+        progress(f"checking {gate:.0%} of the refined policy on held-out scenarios", 0.35)
+        trial, driven = try_refined(problem, candidate, gate, reference, collect)
+        draft = replace(draft, trials=(*draft.trials, trial))
+        if trial.preference <= max(least, 0.0) or not keeps_task(problem, trial, reference):
+            continue
+        checked, _ = try_refined(problem, candidate, gate, more_reference(), collect)
+        draft = replace(draft, trials=(*draft.trials, checked))
+        if keeps_task(problem, checked, more_reference()) and checked.success_change >= -LARGEST_LOSS:
+            weights = candidate.weights.changed(gate=gate)
+            tested = limits_of(problem.task.observation, problem.task.action, driven, reference)
+            draft = replace(draft, weights=weights, tested=tested, notes=(*draft.notes, _REFINED))
+            return draft.timed("gate_refined", started)
+    notes = (*draft.notes, "The refined policy was no better on held-out scenarios and is off.")
+    draft = replace(draft, weights=draft.weights.changed(refined={}), notes=notes)
+    return draft.timed("gate_refined", started)
