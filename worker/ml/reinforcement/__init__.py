@@ -1,1 +1,1 @@
-"""Reinforcement learning on a learned reward, and the refinement of a filter by it."""
+"""Reinforcement learning on learned rewards."""
