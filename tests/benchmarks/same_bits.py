@@ -115,7 +115,7 @@ def learned(bench: BenchmarkUser) -> Iterator[tuple[str, Iterable[bytes]]]:
     draft = pbarl.fit_studio(setting.problem, setting.surface(), setting.pool, gate, setting.collect).shielded()
     yield "filter", [draft.weights.to_bytes()]
     yield "filter.onnx", [act_of(bench.task.modes, setting.problem.policy, draft.weights).exported.stored]
-    beginning = Beginning(setting.make_env, setting.pool, gate, setting.collect)
+    beginning = Beginning(setting.make_env, setting.pool, gate, gate, setting.collect)
     for refined in refine(setting.problem, draft, beginning, REFINEMENT):
         yield "refined filter", [refined.weights.to_bytes()]
     tuned = registry.fit("prefft", setting).act

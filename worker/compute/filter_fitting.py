@@ -172,7 +172,9 @@ class FilterFit:
         train(partial(refining.train_ahead, self._training(self.find_mode(known), known, steps)))
 
     def _training(self, draft: FilterDraft, known: Sequence[Trajectory], steps: int) -> refining.Training:
-        return refining.Training(self.task, self.problem, draft, known, self._gate_reference(), Refinement(steps))
+        watched = self.reference(self.problem.config.watch_block(self.problem.task))
+        reference, config = self._gate_reference(), Refinement(steps)
+        return refining.Training(self.task, self.problem, draft, known, reference, watched, config)
 
     def keep_promise(self, draft: FilterDraft) -> FilterDraft:
         """The filter behind its shield, as far as the promise about harm can be made of it."""

@@ -24,6 +24,7 @@ class Training:
     draft: FilterDraft
     known: Sequence[Trajectory]
     reference: Sequence[Trajectory]
+    watched: Sequence[Trajectory]
     config: Refinement
 
 
@@ -63,4 +64,5 @@ def is_ahead(folder: Path, config: Refinement) -> bool:
 
 def _beginning(training: Training) -> Beginning:
     collect = partial(run_scenarios, training.task)
-    return Beginning(registry.environment_class(training.task), training.known, training.reference, collect)
+    make_env = registry.environment_class(training.task)
+    return Beginning(make_env, training.known, training.reference, training.watched, collect)

@@ -61,6 +61,7 @@ PROFILES = {
             gates=(0.5,),
             gate_scenarios=12,
             check_scenarios=12,
+            watch_scenarios=12,
             residual_rounds=1,
             residual_rollouts=12,
             value_steps=200,

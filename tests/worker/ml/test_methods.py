@@ -115,6 +115,7 @@ def setting(action_reward: MlpReward) -> Setting:
         gates=(1.0,),
         gate_scenarios=4,
         check_scenarios=6,
+        watch_scenarios=4,
         residual_rounds=1,
         residual_rollouts=4,
         value_steps=20,

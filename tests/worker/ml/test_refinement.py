@@ -38,6 +38,7 @@ SHORT = Refinement(
     critic_again_updates=50,
     hidden=16,
     environments=2,
+    largest_loss=1.0,
 )
 LONGER = replace(SHORT, steps=1_500, critic_first_updates=150, critic_again_updates=150, learning_rate=5e-3)
 CHECKED = range(100, 110)
@@ -69,7 +70,7 @@ def refined(
     drive: Collect = collect,
 ) -> tuple[FilterDraft, ...]:
     """After ``config``: the last policy, then the best on the way."""
-    return refinement.refine(problem(), draft, Beginning(World, [], reference, drive), config, checkpoint)
+    return refinement.refine(problem(), draft, Beginning(World, [], reference, reference, drive), config, checkpoint)
 
 
 def gate_refined(
@@ -187,7 +188,7 @@ def test_what_was_begun_on_half_the_answers_goes_where_all_of_them_say(
     reference: list[Trajectory], tmp_path: Path
 ) -> None:
     likes = problem(StructuredReward(-REWARD.weights))
-    draft, beginning = FilterDraft(GATED), Beginning(World, [], reference, collect)
+    draft, beginning = FilterDraft(GATED), Beginning(World, [], reference, reference, collect)
     config = replace(LONGER, steps=900, share_ahead=0.5)
     refinement.refine_ahead(likes, draft, beginning, config, Checkpoint(tmp_path))
     ahead = Checkpoint(tmp_path).read_counts()
@@ -232,10 +233,10 @@ def in_narrow(
     drive: Collect, reference: list[Trajectory], checkpoint: Checkpoint | None = None
 ) -> tuple[FilterDraft, ...]:
     """What a refinement comes to there that is tried by ``drive`` on the way."""
-    strict = replace(problem(), config=FilterConfig(success_tolerance=0.05))
-    beginning = Beginning(Narrow, [], [replace(each, success=True) for each in reference], drive)
-    looking = replace(LONGER, first_tie=0.1, last_tie=0.1, hold_every_steps=250, price=1.0)
-    return refinement.refine(strict, FilterDraft(GATED), beginning, looking, checkpoint)
+    succeeding = [replace(each, success=True) for each in reference]
+    beginning = Beginning(Narrow, [], succeeding, succeeding, drive)
+    looking = replace(LONGER, first_tie=0.1, last_tie=0.1, hold_every_steps=250, largest_loss=0.05, price=1.0)
+    return refinement.refine(problem(), FilterDraft(GATED), beginning, looking, checkpoint)
 
 
 @pytest.fixture(scope="module")
@@ -259,15 +260,25 @@ def test_where_the_task_gets_lost_it_goes_back_and_the_task_gets_a_price(
     assert LOST < first_joint(best.weights) < first_joint(GATED) - 0.05
 
 
-def test_what_was_best_on_the_way_is_tried_where_the_last_policy_loses_the_task(
-    reference: list[Trajectory], blind: FilterDraft, watched: tuple[FilterDraft, ...]
+@pytest.mark.parametrize(
+    ("lost", "is_last", "gate"), [(0, True, 1.0), (2, True, 0.6), (3, False, 1.0), (4, False, 0.8)]
+)
+def test_less_of_the_last_policy_is_tried_where_it_loses_the_task_and_then_what_was_best_on_the_way(
+    reference: list[Trajectory], watched: tuple[FilterDraft, ...], lost: int, is_last: bool, gate: float
 ) -> None:
+    drives = list[FilterAct]()
+
+    def later(act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
+        """Lost where the first ``lost`` filters are tried."""
+        assert isinstance(act, FilterAct)
+        drives.append(act)
+        return [replace(each, success=len(drives) > lost) for each in collect(act, scenarios, noise, seed)]
+
     strict = replace(problem(), config=FilterConfig(success_tolerance=0.05))
     succeeding = [replace(each, success=True) for each in reference]
-    best = watched[-1]
-    gated = refinement_gate.gate_refined(strict, [blind, best], succeeding, lambda: succeeding, narrowly)
-    assert gated.weights == best.weights.changed(gate=1.0)
-    assert [trial.success_change < -0.5 for trial in gated.trials] == [True, False, False]
+    gated = refinement_gate.gate_refined(strict, watched, succeeding, lambda: succeeding, later)
+    assert gated.weights == watched[0 if is_last else 1].weights.changed(gate=gate)
+    assert [trial.success_change < -0.5 for trial in gated.trials] == [True] * lost + [False, False]
 
 
 def test_a_training_that_went_back_and_paused_ends_with_the_same_policies(
@@ -288,7 +299,11 @@ def test_a_training_that_went_back_and_paused_ends_with_the_same_policies(
 
 
 def test_what_was_begun_before_there_were_prices_is_gone_on_with(reference: list[Trajectory], tmp_path: Path) -> None:
-    draft, beginning, checkpoint = FilterDraft(GATED), Beginning(World, [], reference, collect), Checkpoint(tmp_path)
+    draft, beginning, checkpoint = (
+        FilterDraft(GATED),
+        Beginning(World, [], reference, reference, collect),
+        Checkpoint(tmp_path),
+    )
     refinement.refine_ahead(problem(), draft, beginning, SHORT, checkpoint)
     kept = checkpoint.read()
     assert kept is not None
@@ -298,7 +313,7 @@ def test_what_was_begun_before_there_were_prices_is_gone_on_with(reference: list
 
 def test_what_was_made_ahead_is_promising_only_to_whoever_likes_it(reference: list[Trajectory], tmp_path: Path) -> None:
     likes = problem(StructuredReward(-REWARD.weights))
-    draft, beginning = FilterDraft(GATED), Beginning(World, [], reference, collect)
+    draft, beginning = FilterDraft(GATED), Beginning(World, [], reference, reference, collect)
     config, checkpoint = replace(LONGER, share_ahead=0.9), Checkpoint(tmp_path)
     assert refinement.is_promising(problem(), draft, reference, config, checkpoint, collect), "nothing was made ahead"
     refinement.refine_ahead(problem(), draft, beginning, config, checkpoint)
@@ -313,7 +328,7 @@ def test_a_training_that_changed_its_mind_and_paused_ends_with_the_same_policy(
     reference: list[Trajectory], tmp_path: Path
 ) -> None:
     likes = problem(StructuredReward(-REWARD.weights))
-    draft, beginning = FilterDraft(GATED), Beginning(World, [], reference, collect)
+    draft, beginning = FilterDraft(GATED), Beginning(World, [], reference, reference, collect)
     refinement.refine_ahead(likes, draft, beginning, SHORT, Checkpoint(tmp_path))
     whole, paused = _copy(tmp_path, "whole"), _copy(tmp_path, "paused")
     went_through = refined(draft, reference, checkpoint=Checkpoint(whole))
@@ -365,7 +380,7 @@ def test_a_refinement_keeps_away_from_where_people_would_be_hit(reference: list[
             refinement.refine(
                 problem(),
                 FilterDraft(GATED),
-                Beginning(Hitting, [], reference, collect),
+                Beginning(Hitting, [], reference, reference, collect),
                 replace(hasty, force_price=price),
             )[0].weights
         )

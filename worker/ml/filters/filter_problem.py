@@ -45,7 +45,7 @@ class Collect(Protocol):
         ...
 
 
-CHECK_FROM = 10_000
+CHECK_FROM, WATCH_FROM = 10_000, 20_000
 """of the gate's scenarios; the ones before are those of a gate, however many that has"""
 USUAL_STEPS = 100
 """Control steps of an episode, in which the counts of episodes below are meant."""
@@ -67,6 +67,8 @@ class FilterConfig:
     """of USUAL_STEPS control steps; see gate_block()"""
     check_scenarios: int = 400
     """of USUAL_STEPS control steps, in which a refined policy is tried once more; see check_block()"""
+    watch_scenarios: int = 200
+    """of USUAL_STEPS control steps, in which a policy is tried while it is refined; see watch_block()"""
     success_tolerance: float = 0.035
     """largest accepted loss of success on the gate's scenarios, as a share of episodes"""
     force_limit_n: float = 10.0
@@ -98,6 +100,10 @@ class FilterConfig:
     def check_block(self, task: Task) -> range:
         """Scenarios in which nothing has been tried on the way to what is accepted there."""
         return first_of(GATE, _affordable(self.check_scenarios, task), skip=CHECK_FROM)
+
+    def watch_block(self, task: Task) -> range:
+        """Scenarios in which a policy that is being refined is tried, again and again."""
+        return first_of(GATE, _affordable(self.watch_scenarios, task), skip=WATCH_FROM)
 
     def residual_block(self, task: Task, number: int) -> range:
         """Scenarios in which the filter is rolled out before round ``number`` of residual learning."""

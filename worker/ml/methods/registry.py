@@ -160,7 +160,8 @@ def fit_pbarl_refined(setting: Setting) -> tuple[Act, tuple[str, ...]]:
     """The studio's filter with its refinement, most of which is made for the first of the labels."""
     problem, reference, config = setting.problem, setting.reference(_gate(setting)), setting.config.refinement
     more_reference = partial(setting.reference, problem.config.check_block(problem.task))
-    beginning = refinement.Beginning(setting.make_env, setting.pool, reference, setting.collect)
+    watched = setting.reference(problem.config.watch_block(problem.task))
+    beginning = refinement.Beginning(setting.make_env, setting.pool, reference, watched, setting.collect)
     first = setting.asked().labels.first(answers_ahead(setting.labels))
     early = replace(problem, reward=setting.asked().fit(first))
     mode = mode_search.find_mode(early, setting.surface(), setting.pool, reference, setting.collect)

@@ -32,7 +32,7 @@ from worker.ml.policies.reference import looked_into
 from worker.ml.policies.sac import Actor, Learner, SacConfig
 from worker.ml.reinforcement.guided_reward import guided, priced
 from worker.ml.reinforcement.preference_rl import MakeEnv, PreferenceRl, learned
-from worker.ml.reinforcement.refinement_gate import try_refined
+from worker.ml.reinforcement.refinement_gate import LARGEST_LOSS, try_refined
 from worker.ml.reinforcement.watched_learner import WatchedLearner, best_in, price_in
 
 LOOKED_AT = 40
@@ -64,6 +64,8 @@ class Refinement:
     last_tie: float = 0.3
     hold_every_steps: int = 12_000
     """the tie is to what the policy was then: it goes far, and never far at once; see WatchedLearner"""
+    largest_loss: float = LARGEST_LOSS
+    """of success in the scenarios in which it is tried on the way; what loses more goes back"""
     price: float = 0.5
     """of every step with the task undone, once it was lost, in standard deviations of R-hat"""
     stroke_weight: float = 0.3
@@ -87,7 +89,9 @@ class Beginning:
     known: Sequence[Trajectory]
     """rollouts of many behaviours, for the replay"""
     reference: Sequence[Trajectory]
-    """of the frozen policy in the gate's scenarios: the unit of the sketchy reward, and what the task is kept by"""
+    """of the frozen policy in the gate's scenarios: the unit of the sketchy reward"""
+    watched: Sequence[Trajectory]
+    """of the frozen policy in the scenarios in which it is tried on the way: what the task is kept by"""
     collect: Collect
 
 
@@ -168,7 +172,7 @@ def _train(
         learning_rate=config.learning_rate,
         critic_first_updates=config.critic_first_updates if kept is None else config.critic_again_updates,
     )
-    policy, reference = looked_into(problem.policy), beginning.reference
+    policy, reference, watched = looked_into(problem.policy), beginning.reference, beginning.watched
     offset, scale = torch.from_numpy(policy.offset), torch.from_numpy(policy.scale)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(problem.seed)
@@ -191,8 +195,8 @@ def _train(
 
         def look() -> None:
             """Hold it where it is, or go back."""
-            trial, _ = try_refined(problem, _with(draft, learner.average), 1.0, reference, beginning.collect)
-            if keeps_task(problem, trial, reference):
+            trial, _ = try_refined(problem, _with(draft, learner.average), 1.0, watched, beginning.collect)
+            if keeps_task(problem, trial, watched) and trial.success_change >= -config.largest_loss:
                 learner.passed(trial.preference)
             else:
                 learner.failed(config.price)

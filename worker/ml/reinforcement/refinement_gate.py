@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import product
 
 from worker.domain.trajectory import Trajectory
 from worker.ml.filters.filter_problem import (
@@ -53,7 +54,7 @@ def gate_refined(
     """
     started, (draft, *_) = time.perf_counter(), drafts
     least = LEAST_LIFT * to_beat(problem, draft, reference)
-    for candidate, gate in [*((each, 1.0) for each in drafts[:-1]), *((drafts[-1], gate) for gate in STRENGTHS)]:
+    for candidate, gate in product(drafts, STRENGTHS):
         progress(f"checking {gate:.0%} of the refined policy on held-out scenarios", 0.35)
         trial, driven = try_refined(problem, candidate, gate, reference, collect)
         draft = replace(draft, trials=(*draft.trials, trial))
