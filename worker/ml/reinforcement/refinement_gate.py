@@ -49,7 +49,7 @@ def gate_refined(
 ) -> FilterDraft:
     """As much of the refined policy as keeps the task and is better enough than the mode; else the mode.
 
-    ``drafts``: of refine(). What had been best on the way is tried where the last one is not good enough.
+    ``drafts``: of refine(). What had been best on the way is tried where nothing of the last one is good enough.
     ``more_reference``: the frozen policy in the scenarios of the check, which what passes the gate is tried in, too.
     """
     started, (draft, *_) = time.perf_counter(), drafts
