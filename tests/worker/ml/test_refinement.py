@@ -208,6 +208,18 @@ def test_a_tie_to_what_it_was_lately_lets_it_go_further_than_one_to_the_imitatio
     assert goes < stays - 0.03
 
 
+def test_it_is_tried_in_scenarios_of_its_own_on_the_way(reference: list[Trajectory]) -> None:
+    tried = set[int]()
+
+    def noting(act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
+        tried.update(scenarios)
+        return collect(act, scenarios, noise, seed)
+
+    beginning = Beginning(World, [], reference, collect(POLICY.mean, CHECKED, 0.0, 0), noting)
+    refinement.refine(problem(), FilterDraft(GATED), beginning, replace(SHORT, hold_every_steps=100))
+    assert tried == set(CHECKED)
+
+
 class Narrow(World):
     """The same world, where the task stays undone while the first joint's action is below LOST."""
 
@@ -299,11 +311,8 @@ def test_a_training_that_went_back_and_paused_ends_with_the_same_policies(
 
 
 def test_what_was_begun_before_there_were_prices_is_gone_on_with(reference: list[Trajectory], tmp_path: Path) -> None:
-    draft, beginning, checkpoint = (
-        FilterDraft(GATED),
-        Beginning(World, [], reference, reference, collect),
-        Checkpoint(tmp_path),
-    )
+    draft, checkpoint = FilterDraft(GATED), Checkpoint(tmp_path)
+    beginning = Beginning(World, [], reference, reference, collect)
     refinement.refine_ahead(problem(), draft, beginning, SHORT, checkpoint)
     kept = checkpoint.read()
     assert kept is not None
