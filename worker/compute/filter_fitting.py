@@ -151,8 +151,9 @@ class FilterFit:
         ``known``: the pool's rollouts; ``begun``: the folder of refine_ahead(); ``train``: calls what it is given with
         a folder for checkpoints, in a compute process, until that gives drafts.
         """
-        training = self._training(draft, known, steps)
-        if begun and refining.is_ahead(begun, training.config) and not self._is_promising(training, begun):
+        is_ahead = begun is not None and refining.is_ahead(begun, Refinement(steps))
+        training = self._training(draft, known, steps, watched=not is_ahead)
+        if begun and is_ahead and not self._is_promising(training, begun):
             return given_up(draft)
         drafts = train(partial(refining.train, training, begun))
         if not drafts:
@@ -169,12 +170,15 @@ class FilterFit:
     def refine_ahead(self, known: Sequence[Trajectory], steps: int, train: TrainPatiently[bool]) -> None:
         """The larger part of a refinement, around this reward model's mode."""
         self._check_reference()  # while nobody waits for it
-        train(partial(refining.train_ahead, self._training(self.find_mode(known), known, steps)))
+        train(partial(refining.train_ahead, self._training(self.find_mode(known), known, steps, watched=True)))
 
-    def _training(self, draft: FilterDraft, known: Sequence[Trajectory], steps: int) -> refining.Training:
-        watched = self.reference(self.problem.config.watch_block(self.problem.task))
+    def _training(
+        self, draft: FilterDraft, known: Sequence[Trajectory], steps: int, *, watched: bool
+    ) -> refining.Training:
+        """``watched``: whether it is tried on the way, as it is until refine_ahead() is done."""
+        looks = self.reference(self.problem.config.watch_block(self.problem.task)) if watched else ()
         reference, config = self._gate_reference(), Refinement(steps)
-        return refining.Training(self.task, self.problem, draft, known, reference, watched, config)
+        return refining.Training(self.task, self.problem, draft, known, reference, looks, config)
 
     def keep_promise(self, draft: FilterDraft) -> FilterDraft:
         """The filter behind its shield, as far as the promise about harm can be made of it."""

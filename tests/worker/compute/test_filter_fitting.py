@@ -1,11 +1,24 @@
 """Drafts survive being stored between two stages, and a filter that costs the task says so."""
 
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
+import torch
 
-from worker.compute import filter_fitting
+from tests.worker.at_hand import AtHand
+from worker.compute import filter_fitting, learning
+from worker.compute.filter_fitting import FilterFit
+from worker.compute.pools import Lane
+from worker.domain.trajectory import SIGNALS, Trajectory
 from worker.ml.filters.filter_module import FilterWeights
-from worker.ml.filters.filter_problem import FilterDraft, GateTrial
+from worker.ml.filters.filter_problem import FilterConfig, FilterDraft, GateTrial
+from worker.ml.policies.checkpoint import Checkpoint
+from worker.ml.reinforcement.refinement import Refinement
+from worker.ml.rewards.reward_models import StructuredReward
+from worker.tasks import registry
 
 
 def test_a_draft_comes_back_as_it_was_stored() -> None:
@@ -38,3 +51,36 @@ def test_a_filter_that_costs_more_success_than_allowed_warns_against_its_use(del
     warnings = filter_fitting._warnings({"success": {"delta": delta}}, tolerance=0.035)
     assert bool(warnings) == warned
     assert all("Do not run this filter on a person" in warning for warning in warnings)
+
+
+class Drives(AtHand):
+    """Drives nothing, and knows where it should have."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.scenarios = set[int]()
+
+    def run_all(self, lane: Lane, beat: Callable[[], None], function: Any, arguments: list[tuple[Any, ...]]) -> Any:
+        """See Compute."""
+        assert function is learning.run_scenarios
+        self.scenarios.update(*(scenarios for _, _, scenarios, *_ in arguments))
+        return [[] for _ in arguments]
+
+
+@pytest.mark.parametrize(("ahead", "tried"), [(True, False), (False, True)])
+def test_who_waits_for_the_rest_does_not_wait_for_scenarios_of_looks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ahead: bool, tried: bool
+) -> None:
+    steps, compute, config = 1_000, Drives(), FilterConfig()
+    monkeypatch.setattr(filter_fitting, "is_promising", lambda *_: True)
+    made = Refinement(steps).ahead_steps - (0 if ahead else 1)
+    Checkpoint(tmp_path).write({"a": torch.zeros(1)}, {"steps": made})
+    task = registry.task("feeding")
+    reward = StructuredReward(np.ones((1, len(SIGNALS)))).to_bytes()
+    fit = FilterFit("feeding", compute, lambda: None, reward, 0, config, lambda stage, share: None, {})
+
+    def nobody_needs_it(part: Callable[[Path], Sequence[FilterDraft]]) -> None: ...
+
+    known: list[Trajectory] = []
+    assert fit.refine(FilterDraft(FilterWeights()), known, steps, tmp_path, nobody_needs_it) is None
+    assert bool(compute.scenarios & set(config.watch_block(task))) == tried
