@@ -12,7 +12,7 @@ The bundle is unzipped; without ``upstream`` the policy is its own. Topics, all 
                                            forward_command_controller takes its commands)
     ~/state        out  String             ok, slow, stop, stale, refused, and why
 
-The loop is the bundle's own (serve_filter.py), so watchdog and shield are those of ``run_filter.py --serve``: a policy
+The loop is the bundle's own, so watchdog and shield are those of ``run_filter.py --serve``: a policy
 that is late slows the robot and then stops it. Beside that, an observation older than ``stale_s`` stops it, and so does
 one that the bundle does not belong to, until ~/reset. When this node is gone nothing is said: the robot's own watchdog
 must stop it then.

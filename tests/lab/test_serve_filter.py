@@ -26,8 +26,8 @@ from worker.domain.trajectory import SIGNALS, Trajectory
 from worker.experiments.lab_ranges import first_found
 from worker.ml.export import bundle
 from worker.ml.export.bundle import BundleContents, Provenance, RecordedSteps
+from worker.ml.export.filter_loop import FilterLoop, Refused, require_same
 from worker.ml.export.interface import interface_of
-from worker.ml.export.serve_filter import FilterLoop, Refused, require_same
 from worker.ml.filters.filter_module import FilterWeights
 from worker.ml.filters.filter_problem import FilterAct, act_of
 from worker.ml.policies import asked_policy

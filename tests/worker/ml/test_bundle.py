@@ -96,6 +96,7 @@ def test_everything_promised_is_inside_and_nothing_else(written: bytes) -> None:
                 "MODEL_CARD.md",
                 "action_encoder.safetensors",
                 "filter.onnx",
+                "filter_loop.py",
                 "manifest.json",
                 "policy.onnx",
                 "policy_client.py",
@@ -190,7 +191,7 @@ def test_the_card_of_a_laboratorys_filter_says_nothing_of_our_robot_and_person(u
 def test_the_bundle_runs_on_its_own_and_confirms_itself(unzipped: Path) -> None:
     finished = run(unzipped)
     assert finished.returncode == 0, finished.stderr
-    assert "11 files match" in finished.stdout
+    assert "12 files match" in finished.stdout
     assert "OK: policy and filter reproduce their recorded actions" in finished.stdout
 
 
@@ -410,7 +411,7 @@ class TestSignature:
         without = [sys.executable, "-I", "-c", code]
         finished = subprocess.run(without, cwd=directory, capture_output=True, text=True, check=False)
         assert finished.returncode == 0, finished.stderr
-        assert "11 files match" in finished.stdout
+        assert "12 files match" in finished.stdout
         assert "Signature: not checked" in finished.stdout
         insisting = [*without, "--key", key.fingerprint]
         assert subprocess.run(insisting, cwd=directory, capture_output=True, check=False).returncode == 1

@@ -21,7 +21,7 @@ from worker.domain.spaces import Space
 from worker.domain.task import Task
 from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import Float32Array
-from worker.ml.export import run_filter, serve_filter
+from worker.ml.export import filter_loop, run_filter, serve_filter
 from worker.ml.export.interface import interface_of
 from worker.ml.export.model_card import model_card
 from worker.ml.filters import shield
@@ -38,6 +38,7 @@ MANIFEST, SIGNATURE = "manifest.json", "signature.json"
 LARGEST_BYTES = 256 << 20
 """Of all files of a bundle together; those written so far have a hundredth of it."""
 _TIMESTAMP = (1980, 1, 1, 0, 0, 0)
+_SCRIPTS = (run_filter, serve_filter, filter_loop, policy_client)
 _LIBRARIES = ("numpy", "onnx", "onnxruntime", "onnxscript", "safetensors", "torch")
 
 
@@ -104,9 +105,7 @@ def write(contents: BundleContents) -> bytes:
         **_policy_files(contents.policy),
         "reward_model.safetensors": contents.reward.to_bytes(),
         "action_encoder.safetensors": contents.weights.to_bytes(),
-        "run_filter.py": Path(run_filter.__file__).read_bytes(),
-        "serve_filter.py": Path(serve_filter.__file__).read_bytes(),
-        "policy_client.py": Path(policy_client.__file__).read_bytes(),
+        **{Path(str(each.__file__)).name: Path(str(each.__file__)).read_bytes() for each in _SCRIPTS},
         "recorded/observations.npy": _npy(recording.observations),
         "recorded/policy_means.npy": _npy(recording.policy_means),
         "recorded/actions.npy": _npy(exported.batch(recording.observations, recording.policy_means)),

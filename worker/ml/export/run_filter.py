@@ -14,7 +14,7 @@
     python run_filter.py --serve 8001 --upstream ws://localhost:8000
         Stand between a policy server and a client, both in the websocket protocol of openpi. With --upstream
         module:function the policy is called in this process, and without --upstream it is the bundle's own.
-        serve_filter.py says how. Needs also: python -m pip install websockets msgpack
+        filter_loop.py says how. Needs also: python -m pip install websockets msgpack
 
 In a control loop, load the filter once and call it at every step:
 
