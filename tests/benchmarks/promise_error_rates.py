@@ -19,8 +19,9 @@ from tqdm import tqdm
 from worker.analysis.comparison import result_pages
 from worker.analysis.filters.promise import Outcome, Promise
 from worker.compute import harm_tests
+from worker.ml.filters.filter_draft import FilterDraft
 from worker.ml.filters.filter_module import FilterWeights
-from worker.ml.filters.filter_problem import FilterConfig, FilterDraft
+from worker.ml.filters.filter_problem import FilterConfig
 
 TITLE = "# How often a promise about harm is made wrongly"
 VERSIONS = (1, 2, 3)

@@ -28,16 +28,17 @@ from app.installed_tasks.by_name import usual_refinement_steps
 from tests.worker.at_hand import AtHand
 from worker.analysis.comparison import result_pages
 from worker.analysis.filters.promise import HARMS, Promise, harms, outcome_of
-from worker.compute import filter_fitting, learning, simulation
-from worker.compute.filter_fitting import FilterFit, moves_nothing
+from worker.compute import learning, simulation
+from worker.compute.filter_fitting import FilterFit
 from worker.domain.scenarios import PROMISE_TEST, first_of
 from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import FloatArray
 from worker.experiments.benchmark_cell import BenchmarkConfig, BenchmarkUser, Cell
 from worker.experiments.rollout_cache import RolloutCache
-from worker.ml.filters import filter_problem
+from worker.ml.filters import filter_act
+from worker.ml.filters.filter_draft import FilterDraft
 from worker.ml.filters.filter_module import FilterWeights
-from worker.ml.filters.filter_problem import FilterConfig, FilterDraft
+from worker.ml.filters.filter_problem import FilterConfig
 from worker.ml.teachers import random_taste
 from worker.whole_files import written_whole
 
@@ -80,8 +81,8 @@ def _measured(task: str, number: int, done: Sequence[Row], options: argparse.Nam
         missing = [name for name in variants if (name, str(first)) not in {(r["variant"], r["first"]) for r in done}]
         reference = bench.rollout_cache.reference(scenarios) if missing else []
         for name in missing:
-            act = filter_problem.act_of(bench.task.modes, simulation.reference_policy(task), variants[name])
-            same = moves_nothing(variants[name])
+            act = filter_act.act_of(bench.task.modes, simulation.reference_policy(task), variants[name])
+            same = variants[name].moves_nothing
             driven = reference if same else learning.run_scenarios(task, act, scenarios, 0.0, 0)
             yield _row(bench, number, name, first, draft, reference, driven)
 
@@ -89,7 +90,7 @@ def _measured(task: str, number: int, done: Sequence[Row], options: argparse.Nam
 def _draft(task: str, number: int, bench: BenchmarkUser, kept: Path) -> FilterDraft:
     """The finished filter, as a study's worker makes it; fitted once."""
     if kept.exists():
-        return filter_fitting.draft_from_bytes(kept.read_bytes())
+        return FilterDraft.from_bytes(kept.read_bytes())
     fit = FilterFit(
         task=task,
         compute=AtHand(),
@@ -112,8 +113,8 @@ def _draft(task: str, number: int, bench: BenchmarkUser, kept: Path) -> FilterDr
     draft = replace(draft, weights=bare.changed(shield=draft.tested), seconds=seconds)
     kept.parent.mkdir(parents=True, exist_ok=True)
     with written_whole(kept) as path:
-        path.write_bytes(filter_fitting.draft_to_bytes(draft))
-    return filter_fitting.draft_from_bytes(kept.read_bytes())
+        path.write_bytes(draft.to_bytes())
+    return FilterDraft.from_bytes(kept.read_bytes())
 
 
 def _refined(fit: FilterFit, mode: FilterDraft, known: Sequence[Trajectory]) -> FilterDraft:

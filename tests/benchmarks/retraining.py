@@ -24,7 +24,7 @@ from app.domain.study_settings import PAPER_PROTOCOL
 from app.installed_tasks import catalogue
 from worker.analysis.comparison import result_pages
 from worker.analysis.filters.promise import Outcome
-from worker.compute import learning
+from worker.compute import filter_finishing, learning
 from worker.compute.filter_fitting import FilterFit
 from worker.compute.pools import Compute, Lane
 from worker.domain.trajectory import Trajectory
@@ -113,7 +113,7 @@ def _run(
     mark()
     draft = fitting.keep_promise(draft)
     mark()
-    finished = fitting.finish(draft, PROVENANCE, {})
+    finished = filter_finishing.finish(fitting, draft, PROVENANCE, {})
     mark()
     seconds = {name: round(marks[index + 1] - marks[index], 2) for index, name in enumerate(STAGES)}
     evaluation = finished.metrics["evaluation"]

@@ -19,7 +19,7 @@ from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import Act
 from worker.ml.export import blinded_controller as controller
 from worker.ml.export.blinded_controller import Blinded
-from worker.ml.filters import filter_problem
+from worker.ml.filters import filter_act
 from worker.ml.filters.filter_module import FilterWeights
 from worker.ml.filters.filter_problem import FilterProblem
 from worker.ml.filters.response_surface import ResponseSurface
@@ -85,7 +85,7 @@ def controller_of_reference(task: str) -> bytes:
 def controller_of_filter(task: str, weights: bytes) -> bytes:
     """The frozen policy with somebody's filter behind it as a controller."""
     personal = FilterWeights.from_bytes(weights)
-    act = filter_problem.act_of(tasks.task(task).modes, simulation.policy_in(task, personal.mode), personal)
+    act = filter_act.act_of(tasks.task(task).modes, simulation.policy_in(task, personal.mode), personal)
     return controller.of_act(act, observations(task))
 
 

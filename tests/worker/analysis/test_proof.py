@@ -10,15 +10,17 @@ import numpy as np
 import pytest
 
 from worker.analysis.filters.proof import case_against
-from worker.compute import learning
-from worker.compute.filter_fitting import FilterFit, Finished
+from worker.compute import filter_finishing, learning
+from worker.compute.filter_finishing import Finished
+from worker.compute.filter_fitting import FilterFit
 from worker.compute.pools import Compute
 from worker.domain.trajectory import SIGNALS, Trajectory
 from worker.domain.type_aliases import Act
 from worker.ml.export import bundle
 from worker.ml.export.bundle import Provenance
+from worker.ml.filters.filter_draft import FilterDraft
 from worker.ml.filters.filter_module import FilterWeights
-from worker.ml.filters.filter_problem import FilterConfig, FilterDraft
+from worker.ml.filters.filter_problem import FilterConfig
 from worker.ml.rewards.reward_models import StructuredReward
 
 
@@ -81,7 +83,7 @@ def finish(weights: FilterWeights, liked: Mapping[str, float]) -> Finished:
         references={},
     )
     provenance = Provenance("demo", "P07", 1, 50, "ab" * 32, 1, "2026-01-02T03:04:05Z", "", "none")
-    return fitting.finish(FilterDraft(weights), provenance, {})
+    return filter_finishing.finish(fitting, FilterDraft(weights), provenance, {})
 
 
 def test_the_published_filter_is_then_the_reference_policy_itself_and_says_so() -> None:

@@ -9,12 +9,13 @@ import pytest
 import torch
 
 from tests.worker.at_hand import AtHand
-from worker.compute import filter_fitting, learning
+from worker.compute import filter_finishing, filter_fitting, learning
 from worker.compute.filter_fitting import FilterFit
 from worker.compute.pools import Lane
 from worker.domain.trajectory import SIGNALS, Trajectory
+from worker.ml.filters.filter_draft import FilterDraft, GateTrial
 from worker.ml.filters.filter_module import FilterWeights
-from worker.ml.filters.filter_problem import FilterConfig, FilterDraft, GateTrial
+from worker.ml.filters.filter_problem import FilterConfig
 from worker.ml.policies.checkpoint import Checkpoint
 from worker.ml.reinforcement.refinement import Refinement
 from worker.ml.rewards.reward_models import StructuredReward
@@ -32,7 +33,7 @@ def test_a_draft_comes_back_as_it_was_stored() -> None:
     draft = FilterDraft(
         weights, {"value": np.ones(3, np.float32)}, (trial,), ("a note",), {"mode": 1.5}, tested, promised
     )
-    again = filter_fitting.draft_from_bytes(filter_fitting.draft_to_bytes(draft))
+    again = FilterDraft.from_bytes(draft.to_bytes())
     assert again.weights.mode == draft.weights.mode
     assert (again.weights.gate, again.trials, again.notes, again.seconds, again.promise) == (
         draft.weights.gate,
@@ -48,7 +49,7 @@ def test_a_draft_comes_back_as_it_was_stored() -> None:
 
 @pytest.mark.parametrize(("delta", "warned"), [(-0.10, True), (-0.035, False), (0.01, False)])
 def test_a_filter_that_costs_more_success_than_allowed_warns_against_its_use(delta: float, warned: bool) -> None:
-    warnings = filter_fitting._warnings({"success": {"delta": delta}}, tolerance=0.035)
+    warnings = filter_finishing._warnings({"success": {"delta": delta}}, tolerance=0.035)
     assert bool(warnings) == warned
     assert all("Do not run this filter on a person" in warning for warning in warnings)
 

@@ -15,7 +15,7 @@ from app.services.answers.misfit import Misfit, misfit_of
 from app.services.exports.export_formats import provenance_of
 from app.services.monitoring import dashboard
 from app.services.participants import visits
-from worker.compute import filter_fitting, learning
+from worker.compute import filter_finishing, learning
 from worker.compute.pools import Lane
 from worker.jobs.learning import dataset, fits, refinement
 from worker.jobs.runtime import due_work, records
@@ -117,7 +117,7 @@ def fit_stage(
     else:
         stages = {"residual": fit.train_residual, "gate": fit.gate_residual, "promise": fit.keep_promise}
         result = stages[stage](fits.load_draft(context, draft))
-    return context.store.put(filter_fitting.draft_to_bytes(result))
+    return context.store.put(result.to_bytes())
 
 
 def _publish(context: WorkerContext, run_id: int, job: Job, reward: str, draft: str) -> None:
@@ -148,7 +148,7 @@ def _publish(context: WorkerContext, run_id: int, job: Job, reward: str, draft: 
         deviations=export.deviations,
     )
     learned = {**(model.metrics if model else {}), "foresight_notes": notes}
-    finished = fit.finish(fits.load_draft(context, draft), provenance, learned)
+    finished = filter_finishing.finish(fit, fits.load_draft(context, draft), provenance, learned)
     packed = finished.bundle if context.key is None else bundle.signed(finished.bundle, context.key.signed)
     model_artefact, bundle_artefact = context.store.put(finished.filter_weights), context.store.put(packed)
     with context.database.writing() as session:

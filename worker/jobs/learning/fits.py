@@ -3,14 +3,14 @@
 from app.domain.studies import Participant, Study
 from app.domain.study_settings import StudySettings
 from worker.analysis.filters.promise import Promise
-from worker.compute import filter_fitting
 from worker.compute.filter_fitting import FilterFit
 from worker.domain.trajectory import Trajectory
 from worker.jobs.learning import dataset
 from worker.jobs.runtime import records
 from worker.jobs.runtime.context import WorkerContext
 from worker.jobs.runtime.records import Job
-from worker.ml.filters.filter_problem import FilterConfig, FilterDraft
+from worker.ml.filters.filter_draft import FilterDraft
+from worker.ml.filters.filter_problem import FilterConfig
 
 _BEFORE, _AFTER = 0.15, 0.7
 """How far a fit is before its refinement and after it."""
@@ -44,7 +44,7 @@ def pool_rollouts(context: WorkerContext, job: Job) -> list[Trajectory]:
 
 def load_draft(context: WorkerContext, artefact: str) -> FilterDraft:
     """A stored draft of a filter."""
-    return filter_fitting.draft_from_bytes(context.store.read(artefact))
+    return FilterDraft.from_bytes(context.store.read(artefact))
 
 
 def filter_config(settings: StudySettings) -> FilterConfig:

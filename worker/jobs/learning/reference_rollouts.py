@@ -9,7 +9,7 @@ from worker.compute.pools import Computing, Lane
 from worker.domain.scenarios import EVALUATION, first_of, of_promise
 from worker.domain.trajectory import Trajectory
 from worker.jobs.learning.fits import filter_config, promise_of
-from worker.ml.filters import filter_problem
+from worker.ml.filters import filter_act
 from worker.tasks import registry
 
 
@@ -28,7 +28,7 @@ def make_ready(
     """
     policy = simulation.reference_policy(task)
     if settings.method is Method.STUDIO:
-        filter_problem.trace(registry.task(task).modes, policy)
+        filter_act.trace(registry.task(task).modes, policy)
     act = policy.mean
     for scenarios in reference_blocks(task, settings):
         key, made = (task, scenarios), list[Trajectory]()

@@ -17,14 +17,14 @@ from app.domain.run_keys import AHEAD
 from app.domain.studies import Participant, Study
 from app.files.unfinished import REFINEMENT
 from app.installed_tasks.refinements import answers_ahead
-from worker.compute import filter_fitting, refining
+from worker.compute import refining
 from worker.compute.filter_fitting import T, TrainPatiently
 from worker.compute.pools import Lane
 from worker.jobs.learning import dataset, fits, patience, reward_models
 from worker.jobs.runtime import due_work
 from worker.jobs.runtime.context import Step, WorkerContext
 from worker.jobs.runtime.records import Job
-from worker.ml.filters.filter_problem import FilterDraft
+from worker.ml.filters.filter_draft import FilterDraft
 from worker.ml.policies.checkpoint import Abandoned, go_on_from
 from worker.ml.reinforcement.refinement import Refinement
 
@@ -48,7 +48,7 @@ def refine(context: WorkerContext, run_id: int, job: Job, reward: str, draft: st
         train: TrainPatiently[tuple[FilterDraft, ...]] = _trainer(context, run_id, folder, lane, is_outdated, bool)
         known = fits.pool_rollouts(context, job)
         result = fit.refine(fits.load_draft(context, draft), known, settings.refinement_steps, begun, train)
-        artefact = context.store.put(filter_fitting.draft_to_bytes(result)) if result else ""
+        artefact = context.store.put(result.to_bytes()) if result else ""
         context.store.unfinished.forget(folder)
     if artefact and begun:
         for done in begun.parent.glob(f"{AHEAD}-*"):

@@ -10,7 +10,7 @@ from app.domain.evaluation import SharedFilter
 from app.domain.models import ModelKind
 from app.domain.studies import Participant, Study
 from app.services.participants import withdrawal
-from worker.compute import baseline_fitting, shared_reward
+from worker.compute import baseline_fitting, filter_finishing, shared_reward
 from worker.compute.pools import Lane
 from worker.jobs.learning import dataset, filters, fits
 from worker.jobs.runtime import due_lending, records
@@ -60,7 +60,7 @@ def _rewards(session: Session, job: Job, shared: SharedFilter) -> list[str]:
 def _prove(context: WorkerContext, job: Job, run_id: int, reward: str, draft: str, started: float) -> None:
     """The same burden of proof as of a personal filter, for the wishes it was fitted to."""
     fitting = fits.fitting(context, run_id, job, context.store.read(reward), shared=True)
-    proven = fitting.prove(fits.load_draft(context, draft))
+    proven = filter_finishing.prove(fitting, fits.load_draft(context, draft))
     weights, beat = proven.draft.weights.to_bytes(), context.beat(run_id)
     controller = context.compute.run(Lane.LEARNING, beat, baseline_fitting.controller_of_filter, fitting.task, weights)
     artefact = context.store.put(controller)

@@ -46,6 +46,13 @@ class FilterWeights:
     refined: Mapping[str, Float32Array] = field(default_factory=dict)
     """weights of the person's refined policy, which acts in place of mode and residual; empty: it was not refined"""
 
+    @property
+    def moves_nothing(self) -> bool:
+        """Whether the filter leaves the reference policy as it is."""
+        without_residual = not self.encoder or self.residual_share == 0.0
+        off = without_residual and not any(self.mode.values()) and not self.refined
+        return self.gate == 0.0 or (self.method == "studio" and off)
+
     def changed(self, **values: Any) -> Self:
         """The same with some values replaced."""
         return replace(self, **values)

@@ -1,7 +1,6 @@
-"""What a filter is fitted for, what is known of it between two stages of a fit, and the filter as a callable.
+"""What a filter is fitted for: task, policy, reward, and how much is tried.
 
-Drafts are plain arrays and can be stored. Rollouts are made by a callable that is passed in, so nothing in here knows
-the simulation:
+Rollouts are made by a callable that is passed in, so nothing in here knows the simulation:
 
     collect(act, scenarios, noise, seed) -> one Trajectory per scenario, in order
 
@@ -10,26 +9,15 @@ with act(observation (D,)) -> action (7,), and ``noise`` the standard deviation 
 over processes.
 """
 
-import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
 
-import numpy as np
-import torch
-
-from worker.domain.modes import ModeFamily
 from worker.domain.scenarios import GATE, RESIDUAL, first_of
 from worker.domain.task import Task
 from worker.domain.trajectory import Trajectory
-from worker.domain.type_aliases import Act, Float32Array
-from worker.ml.filters.action_encoder import ResidualAdapter
-from worker.ml.filters.filter_module import FilterWeights, build, state_of
-from worker.ml.filters.filter_onnx import OnnxFilter, to_onnx
+from worker.domain.type_aliases import Act
 from worker.ml.filters.response_surface import CAUTION
-from worker.ml.filters.shield import widest
-from worker.ml.policies.asked_policy import AskedPolicy
-from worker.ml.policies.gaussian import GaussianPolicy
 from worker.ml.policies.reference import ReferencePolicy
 from worker.ml.rewards.reward_models import RewardModel
 
@@ -130,93 +118,6 @@ class FilterProblem:
     config: FilterConfig = FilterConfig()
 
 
-@dataclass(frozen=True)
-class GateTrial:
-    """One setting tried on the gate's scenarios."""
-
-    gate: float
-    residual_share: float
-    preference: float
-    """mean change of the learned return, in standard deviations of the reference's returns"""
-    success_change: float
-    """share of episodes"""
-    p95_force_n: float
-    """95 % of the episodes stay below this force on the person"""
-    refined: bool = False
-    """whether it was the person's refined policy, in place of mode and residual"""
-
-
-@dataclass(frozen=True)
-class FilterDraft:
-    """A filter between two stages. Plain values and arrays."""
-
-    weights: FilterWeights
-    value: Mapping[str, Float32Array] = field(default_factory=dict)
-    """state of the action value, so that a later round goes on from it"""
-    trials: tuple[GateTrial, ...] = ()
-    """in their order, except that the chosen mode's comes after the other modes'"""
-    notes: tuple[str, ...] = ()
-    seconds: Mapping[str, float] = field(default_factory=dict)
-    tested: Mapping[str, Float32Array] = field(default_factory=dict)
-    """what the filter stayed within when it was tried (shield.limits_of)"""
-    promise: Mapping[str, Any] = field(default_factory=dict)
-    """a Promise (worker.analysis.filters.promise) and the tests that earned it, as plain values; empty: none"""
-    choice: Mapping[str, float] = field(default_factory=dict)
-    """the chance of each of several policies to be the best; empty: it is a filter"""
-
-    def timed(self, stage: str, started: float) -> "FilterDraft":
-        """The same with the seconds since ``started`` added to a stage."""
-        spent = self.seconds.get(stage, 0.0) + time.perf_counter() - started
-        return replace(self, seconds={**self.seconds, stage: round(spent, 3)})
-
-    def shielded(self) -> "FilterDraft":
-        """The same with a shield around what was tested."""
-        return replace(self, weights=self.weights.changed(shield=self.tested))
-
-
 def _affordable(episodes: int, task: Task) -> int:
     """So many episodes of the usual length, or fewer longer ones: a fit takes about the same time in every task."""
     return max(1, round(episodes * min(1.0, USUAL_STEPS / task.episode_steps)))
-
-
-@dataclass(frozen=True)
-class FilterAct:
-    """The exported filter around the frozen policy, as a rollout's callable: what is evaluated is what is shipped."""
-
-    policy: ReferencePolicy
-    exported: OnnxFilter
-    gate: float = 1.0
-    """an extra gate on top of the exported one, to try gates without exporting again"""
-
-    def __call__(self, observation: Float32Array) -> Float32Array:
-        """(D,) -> (7,)"""
-        mean = self.policy.mean(observation)
-        return mean + np.float32(self.gate) * (self.exported(observation, mean) - mean)
-
-    def batch(self, observations: Float32Array) -> Float32Array:
-        """(B, D) -> (B, 7)"""
-        means = self.policy.mean(observations)
-        return means + np.float32(self.gate) * (self.exported.batch(observations, means) - means)
-
-
-def trace(family: ModeFamily, policy: ReferencePolicy) -> None:
-    """Export a mode without and with a residual and shield: act_of() then takes a hundredth of a second here."""
-    encoders: list[Mapping[str, Float32Array]] = [{}]
-    if isinstance(policy, GaussianPolicy):
-        untrained = ResidualAdapter(torch.from_numpy(policy.offset), torch.from_numpy(policy.scale))
-        encoders.append(state_of(untrained))
-    for encoder in encoders:
-        for limits in ({}, widest(family.observation, policy.action_size)):
-            act_of(family, policy, FilterWeights(encoder=encoder, shield=limits))
-
-
-def act_of(family: ModeFamily, policy: ReferencePolicy, weights: FilterWeights) -> FilterAct:
-    """Export a filter for rollouts."""
-    rng = np.random.default_rng(0)
-    spread = 0.3 * rng.standard_normal((64, len(policy.offset)))
-    observations = (policy.offset + spread).astype(np.float32)
-    if isinstance(policy, AskedPolicy):  # a server is asked about nothing that was invented
-        means = rng.uniform(-1.0, 1.0, (len(observations), policy.action_size)).astype(np.float32)
-    else:
-        means = policy.mean(observations)
-    return FilterAct(policy, OnnxFilter(to_onnx(build(family, policy, weights), observations, means)))

@@ -6,7 +6,8 @@ import numpy as np
 
 from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import Act, FloatArray
-from worker.ml.filters.filter_problem import Collect, FilterDraft, FilterProblem, GateTrial
+from worker.ml.filters.filter_draft import FilterDraft, GateTrial
+from worker.ml.filters.filter_problem import Collect, FilterProblem
 
 
 def try_on(

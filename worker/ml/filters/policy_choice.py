@@ -14,8 +14,9 @@ import numpy as np
 from app.installed_tasks.lab import REFERENCE
 from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import FloatArray
+from worker.ml.filters.filter_draft import FilterDraft, GateTrial
 from worker.ml.filters.filter_module import FilterWeights
-from worker.ml.filters.filter_problem import FilterDraft, FilterProblem, GateTrial
+from worker.ml.filters.filter_problem import FilterProblem
 from worker.ml.filters.gate import keeps_task, trial_of
 from worker.ml.rewards.reward_models import RewardModel
 

@@ -4,8 +4,9 @@ from collections.abc import Sequence
 
 from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import FloatArray
+from worker.ml.filters.filter_act import FilterAct, act_of
 from worker.ml.filters.filter_module import FilterWeights
-from worker.ml.filters.filter_problem import Collect, FilterAct, FilterProblem, act_of
+from worker.ml.filters.filter_problem import Collect, FilterProblem
 from worker.ml.filters.gate import keeps_task, try_on
 
 

@@ -19,8 +19,9 @@ from app.installed_tasks.refinements import answers_ahead
 from worker.domain.scenarios import RESIDUAL, first_of
 from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import Act
-from worker.ml.filters import filter_problem, mode_search, pbarl
-from worker.ml.filters.filter_problem import Collect, FilterDraft, FilterProblem
+from worker.ml.filters import filter_act, mode_search, pbarl
+from worker.ml.filters.filter_draft import FilterDraft
+from worker.ml.filters.filter_problem import Collect, FilterProblem
 from worker.ml.filters.pbarl_printed import PrintedConfig
 from worker.ml.filters.printed_filter import fit_printed
 from worker.ml.filters.response_surface import ResponseSurface
@@ -352,7 +353,7 @@ def _shipped(problem: FilterProblem, draft: FilterDraft) -> tuple[Act, tuple[str
 
 def _exported(problem: FilterProblem, draft: FilterDraft) -> Act:
     """What is evaluated is what would be shipped: the ONNX file."""
-    return filter_problem.act_of(problem.task.modes, problem.policy, draft.weights)
+    return filter_act.act_of(problem.task.modes, problem.policy, draft.weights)
 
 
 class _Meter:

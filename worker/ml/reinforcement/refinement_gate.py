@@ -6,14 +6,9 @@ from dataclasses import replace
 from itertools import product
 
 from worker.domain.trajectory import Trajectory
-from worker.ml.filters.filter_problem import (
-    Collect,
-    FilterDraft,
-    FilterProblem,
-    GateTrial,
-    ReportProgress,
-    act_of,
-)
+from worker.ml.filters.filter_act import act_of
+from worker.ml.filters.filter_draft import FilterDraft, GateTrial
+from worker.ml.filters.filter_problem import Collect, FilterProblem, ReportProgress
 from worker.ml.filters.gate import keeps_task, to_beat, try_on
 from worker.ml.filters.shield import limits_of
 
