@@ -1,0 +1,209 @@
+"""What filters give people who are not linear, and whether a refinement, which leans more on the model, still pays.
+
+    python -m tests.benchmarks.refined_for_others
+
+Per task and person of tests/benchmarks/nonlinear_people.py: 200 answers, a reward model as a study's, the quick filter
+and the refined one, driven through unseen scenarios beside the reference policy and judged by what they truly want. On
+one core at the lowest priority; what has a row in the table is never run again.
+"""
+
+import argparse
+import csv
+import os
+from collections.abc import Mapping, Sequence
+from functools import partial
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from app.services.answers.accuracy import ENOUGH_EVIDENCE
+from tests.benchmarks.answered_pool import Answered, AnsweredPool
+from tests.benchmarks.nonlinear_people import ON_TIME_S, PEOPLE, Person
+from tests.benchmarks.rivals_report import gains_of, gains_text, successes_of, successes_text
+from worker.analysis.comparison import result_pages
+from worker.compute import learning, simulation
+from worker.compute.population import prior_of
+from worker.domain.scenarios import EVALUATION, first_of
+from worker.domain.trajectory import Trajectory
+from worker.domain.type_aliases import FloatArray
+from worker.experiments.benchmark_person import BenchmarkPerson
+from worker.experiments.rollout_cache import RolloutCache
+from worker.ml.filters.filter_problem import FilterProblem
+from worker.ml.filters.response_surface import ResponseSurface
+from worker.ml.methods import registry as methods
+from worker.ml.methods.people import Labels
+from worker.ml.methods.registry import Setting
+from worker.ml.rewards import misfit, reward_training
+from worker.ml.rewards.reward_models import RewardModel
+from worker.ml.teachers import TASTES
+from worker.tasks import registry
+from worker.whole_files import written_whole
+
+TITLE = "# What filters give people who are not linear"
+QUICK, REFINED = "pbarl", "pbarl_refined"
+ANSWERS = 200
+Row = Mapping[str, Any]
+
+
+def main() -> None:
+    """Fit and drive what has no row."""
+    options = _options()
+    os.nice(19 - os.nice(0))
+    torch.set_num_threads(1)
+    table = options.output.with_suffix(".csv")
+    rows: list[Row] = list(csv.DictReader(table.open())) if table.exists() else []
+    planned = product(range(options.seeds), options.tasks, options.people, (QUICK, REFINED))
+    missing = [each for each in planned if each not in {_name_of(row) for row in rows}]
+    for task in dict.fromkeys(each[1] for each in missing):
+        bench = Bench(task, options.work_directory / "rollouts")
+        for seed, _, name, method in tqdm([each for each in missing if each[1] == task], unit="filter"):
+            rows.append(bench.row(PEOPLE[name], seed, method, options.scenarios))
+            _write(rows, options.output)
+    _write(rows, options.output)
+
+
+class Bench:
+    """One task, its pool and its reference policy's rollouts."""
+
+    def __init__(self, task: str, rollouts: Path) -> None:
+        self.pool = AnsweredPool(task, rollouts)
+        self.cache = RolloutCache(task, rollouts)
+
+    def row(self, person: Person, seed: int, method: str, scenarios: int) -> Row:
+        """Answer, learn, fit, drive, judge."""
+        task = self.pool.task
+        answered = self.pool.answered(person, ANSWERS, seed)
+        ratios = self.pool.ratios(answered, ANSWERS)
+        fitted = methods.fit(method, self._setting(person, answered, seed))
+        unseen = first_of(EVALUATION, scenarios, skip=seed * scenarios)
+        reference, driven = self.cache.reference(unseen), learning.run_scenarios(task.name, fitted.act, unseen, 0.0, 0)
+        before, after = (
+            np.array([person.wishes(task, each).sum() for each in episodes]) for episodes in (reference, driven)
+        )
+        evidence = misfit.evidence(ratios)
+        return {
+            "seed": seed,
+            "task": task.name,
+            "person": person.name,
+            "method": method,
+            "does_not_fit": max(ratios, key=lambda each: ratios[each]) if evidence >= ENOUGH_EVIDENCE else "",
+            "cpu_s": round(fitted.cpu_s),
+            "gains": gains_text((after - before) / np.abs(before.mean())),
+            "successes": successes_text([each.success for each in driven]),
+            "successes_reference": successes_text([each.success for each in reference]),
+            "worst_force_n": _worst(driven),
+            "worst_force_reference_n": _worst(reference),
+            "notes": " ".join(fitted.notes),
+        }
+
+    def _setting(self, person: Person, answered: Answered, seed: int) -> Setting:
+        pool, task = self.pool, self.pool.task
+        labels = Labels(pool.segments.take(answered.rows), answered.answers)
+        learn = partial(self._learned, seed=seed)
+        asked = BenchmarkPerson(
+            TASTES["neutral"],  # nobody asks for it: what is wanted is said by the function
+            labels,
+            pool.scale,
+            person.manner,
+            pool.clips,
+            pool.clip_pairs,
+            pool.clip_steps,
+            lambda _, episode: person.wishes(task, episode),
+            learn,
+        )
+        reward = learn(labels)
+        return Setting(
+            problem=FilterProblem(task, simulation.reference_policy(task.name), reward, seed),
+            labels=ANSWERS,
+            pool=pool.clips,
+            surface=lambda: ResponseSurface.load(simulation.surface_file(task.name), task.modes),
+            action_reward=lambda: reward,
+            reference=self.cache.reference,
+            collect=lambda *drive: learning.run_scenarios(task.name, *drive),
+            make_env=registry.environment_class(task.name),
+            person=asked,
+        )
+
+    def _learned(self, labels: Labels, seed: int) -> RewardModel:
+        """As a study's worker learns it."""
+        name, scale = self.pool.task.name, self.pool.scale
+        return reward_training.fit(
+            labels.pairs,
+            labels.targets,
+            "structured",
+            seed,
+            scale=scale,
+            prior=prior_of(name, scale.spread),
+            reference=simulation.reference_rollouts(name),
+        ).model
+
+
+def _worst(episodes: Sequence[Trajectory]) -> float:
+    return round(max(float(each.contact_force_n.max()) for each in episodes), 1)
+
+
+def _name_of(row: Row) -> tuple[int, str, str, str]:
+    return int(row["seed"]), row["task"], row["person"], row["method"]
+
+
+def _write(rows: Sequence[Row], output: Path) -> None:
+    if not rows:
+        return
+    with written_whole(output.with_suffix(".csv")) as path, path.open("w", newline="") as stream:
+        writer = csv.DictWriter(stream, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+    page = output.with_suffix(".md")
+    page.write_text(result_pages.page(page, TITLE, _table(rows)))
+
+
+def _table(rows: Sequence[Row]) -> str:
+    found = {_name_of(row): row for row in rows}
+    lines = [
+        "| task | person | seed | model does not fit | quick: gain, % | success, points | worst force, N"
+        " | refined: gain, % | success, points | worst force, N | of the reference | refined gains more, points |",
+        "|---" * 12 + "|",
+    ]
+    for seed, task, person in dict.fromkeys(name[:3] for name in found):
+        quick, refined = (found.get((seed, task, person, method)) for method in (QUICK, REFINED))
+        some = quick or refined
+        more = "-" if quick is None or refined is None else _interval(100 * (gains_of(refined) - gains_of(quick)))
+        lines.append(
+            f"| {task} | {person} | {seed} | {some['does_not_fit'] or '-' if some else '-'} | {_said(quick)}"
+            f" | {_said(refined)} | {some['worst_force_reference_n'] if some else '-'} | {more} |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def _said(row: Row | None) -> str:
+    if row is None:
+        return "- | - | -"
+    success = 100 * (successes_of(row) - successes_of(row, "successes_reference")).mean()
+    return f"{_interval(100 * gains_of(row))} | {success:+.1f} | {row['worst_force_n']}"
+
+
+def _interval(values: FloatArray) -> str:
+    """Mean with its 95 % interval over scenarios."""
+    mean, half = float(values.mean()), 1.96 * float(values.std(ddof=1)) / np.sqrt(len(values))
+    return f"{mean:+.1f} [{mean - half:+.1f}, {mean + half:+.1f}]"
+
+
+def _options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--tasks", nargs="+", choices=[*ON_TIME_S], default=["feeding"])
+    parser.add_argument("--people", nargs="+", choices=[*PEOPLE], default=[*PEOPLE])
+    parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--scenarios", type=int, default=200)
+    parser.add_argument("--work-directory", type=Path, default=Path("data/benchmark"), help="of rollouts")
+    parser.add_argument(
+        "--output", type=Path, default=Path("docs/results/refined_for_others"), help="stem of both files"
+    )
+    return parser.parse_args()
+
+
+if __name__ == "__main__":
+    main()
