@@ -116,6 +116,7 @@ RUN: dict[str, str | Elsewhere | OnlyParsed] = {
     "misfit": ROLLOUTS,
     "more_ways": ROLLOUTS,
     "other_users": ROLLOUTS,
+    "refined_for_others": ROLLOUTS,
     "comparison_report": "results/paper_form",
     "contact_sheet": "sheets feeding --films 1 --steps 5 --no-people",
     "disagreement": "feeding --file cells.csv --shares 1 --scenarios 12",

@@ -101,6 +101,18 @@ def test_the_first_robot_is_foretold_from_what_it_took_before(database: Database
     assert "About 2 minutes to go" in look(), "PrefFT beside the filter, then two of six films: 100 + 10 s"
 
 
+def test_the_first_participant_is_foretold_what_their_own_earlier_work_took(
+    database: Database, study: Study, person: tuple[Participant, str], look: Look
+) -> None:
+    with database.writing() as session:
+        here = session.get_one(Study, study.id)
+        own = EvaluationSettings(methods=(EvaluatedMethod.REFERENCE, EvaluatedMethod.PBARL), trials=2)
+        here.stored_settings = here.settings.model_copy(update={"evaluation": own}).model_dump(mode="json")
+        took(session, person[0], here, RunKind.FILMS, 60, "ahead")
+        at_work(session, person[0], here, RunKind.FILTER, 0.5, for_s=90)
+    assert "About 2 minutes to go" in look(), "as long again as the filter took so far, and two of four films"
+
+
 def test_a_filter_of_others_that_is_not_fitted_yet_counts_and_its_trouble_is_told(
     database: Database, study: Study, person: tuple[Participant, str], look: Look
 ) -> None:

@@ -8,7 +8,7 @@ from sqlalchemy.orm import Session
 from app.domain.evaluation import SharedFilter
 from app.domain.models import Model, ModelKind, Run, RunKind, RunStatus
 from app.domain.protocol import FROM_OTHERS, EvaluatedMethod, EvaluationMode
-from app.domain.run_keys import BEFORE_AFTER, CONTROLLERS, SHARED_FILTER, TRIALS
+from app.domain.run_keys import AHEAD, BEFORE_AFTER, CONTROLLERS, SHARED_FILTER, TRIALS
 from app.domain.studies import Participant
 from app.services.evaluation import donors, evaluation_plan
 from app.services.runs import estimates
@@ -114,6 +114,8 @@ def _run_of(session: Session, shared: SharedFilter) -> Run | None:
 def _showing(session: Session, participant: Participant, what: str) -> _Part:
     """The first films, or all controllers: the others are made while the first robot is rated."""
     usual = estimates.usual_s(session, participant.study, RunKind.FILMS, what)
+    if usual is None and what == TRIALS:  # for the first participant: about as many films, of the reference policy
+        usual = estimates.usual_s(session, participant.study, RunKind.FILMS, AHEAD)
     settings = evaluation_plan.settings_for(participant.study, participant.arm)
     if what == CONTROLLERS or usual is None or settings is None:
         return _part(session, participant, RunKind.FILMS, what)
