@@ -14,6 +14,9 @@ IN_WORDS: Mapping[str, str] = {
     "changing": "weights that change from the first answer to the last",
 }
 """What explains answers, by the names of worker.ml.rewards.misfit."""
+DOUBT = 2.0
+"""Evidence beyond which nothing follows the model far, though it says too little for a flag. Of 100 linear people none
+gave so much in 100 or 200 answers; who gives it, and what it spares them: docs/results/refined_for_others.md."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +40,13 @@ def misfit_of(models: Sequence[Model]) -> Misfit | None:
     None while it has not been shown that the model does not fit. How often that is said wrongly, however often one
     looks: docs/results/misfit.md.
     """
+    found = doubt_of(models)
+    return found if found is not None and found.evidence >= ENOUGH_EVIDENCE else None
+
+
+def doubt_of(models: Sequence[Model]) -> Misfit | None:
+    """The same for less evidence: whether the model may not fit."""
     found = models[-1].metrics.get("misfit") if models else None
-    if not isinstance(found, dict) or not found.get("evidence", 0.0) >= ENOUGH_EVIDENCE:
+    if not isinstance(found, dict) or not found.get("evidence", 0.0) > DOUBT:
         return None
     return Misfit(str(found["explanation"]), float(found["evidence"]))

@@ -1,8 +1,9 @@
 """When a filter is trained, and when not."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
+from types import MappingProxyType, SimpleNamespace
 from typing import Any
 
 import pytest
@@ -33,6 +34,8 @@ from worker.jobs.runtime import records
 from worker.jobs.runtime.context import WorkerContext
 from worker.jobs.runtime.due_work import answers_known, is_outdated
 from worker.jobs.runtime.records import Job
+from worker.ml.filters.filter_draft import FilterDraft
+from worker.ml.filters.filter_module import FilterWeights
 from worker.ml.policies.checkpoint import PAUSE_FILE, Abandoned, Checkpoint, ask_to_pause, begin_again
 from worker.ml.reinforcement.refinement import Refinement
 
@@ -48,11 +51,17 @@ def begin(context: WorkerContext, participant: Participant, kind: RunKind, answe
         return job, records.begin_run(session, job, seed=1)
 
 
-def save_model(context: WorkerContext, participant: Participant, kind: ModelKind, label_hash: str) -> None:
+def save_model(
+    context: WorkerContext,
+    participant: Participant,
+    kind: ModelKind,
+    label_hash: str,
+    metrics: Mapping[str, Any] = MappingProxyType({}),
+) -> None:
     _, run_id = begin(context, participant, RunKind(kind.value), label_hash)
     with context.database.writing() as session:
         records.set_labels(session, run_id, 10, label_hash)
-        records.save_model(session, run_id, kind, "0" * 64, {})
+        records.save_model(session, run_id, kind, "0" * 64, dict(metrics))
 
 
 def count_filters(context: WorkerContext) -> int:
@@ -199,6 +208,31 @@ def test_the_last_filter_goes_on_from_what_is_made_ahead_and_leaves_whoever_stil
     job = filter_at(context, participant, 20)
     refinement.refine(context, run_id, job, context.store.put(b"reward"), "", shared=False)
     assert found == {"asked to pause": True, "left off at": WHOLE // 2, "begun_at": WHOLE // 2, "steps": WHOLE}
+
+
+@pytest.mark.parametrize(("evidence", "refined"), [(None, True), (1.9, True), (2.1, False)])
+def test_nobody_is_refined_whose_answers_something_richer_explains_twice_as_well(
+    context: WorkerContext,
+    participant: Participant,
+    answered: Callable[[int], None],
+    refining: Callable[..., None],
+    monkeypatch: pytest.MonkeyPatch,
+    evidence: float | None,
+    refined: bool,
+) -> None:
+    answered(20)
+    found = {} if evidence is None else {"evidence": evidence, "explanation": "arrival"}
+    save_model(context, participant, ModelKind.REWARD, "all labels", {"misfit": found})
+    _, run_id = begin(context, participant, RunKind.FILTER)
+    refining(go_on, refine=lambda draft, *_: replace(draft, notes=("refined",)))
+    monkeypatch.setattr(fits, "load_draft", lambda *_: FilterDraft(FilterWeights(mode={"speed_far": 0.2})))
+    job = filter_at(context, participant, 20)
+    (note,) = FilterDraft.from_bytes(
+        context.store.read(refinement.refine(context, run_id, job, context.store.put(b"reward"), "", shared=False))
+    ).notes
+    assert (note == "refined") == refined
+    assert refined or "when the robot arrives" in note
+    assert list(context.store.unfinished.folder(participant.id).glob("ahead-*")) == []
 
 
 def test_what_is_made_ahead_ends_when_the_last_filter_has_cleared_it_away(

@@ -6,22 +6,25 @@ filter. It lies in a folder of the person's until their last filter goes on from
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from sqlalchemy import select
 
+from app.domain.models import ModelKind
 from app.domain.preferences import count_labels
 from app.domain.run_keys import AHEAD
 from app.domain.studies import Participant, Study
 from app.files.unfinished import REFINEMENT
 from app.installed_tasks.refinements import answers_ahead
+from app.services.answers.misfit import Misfit, doubt_of
 from worker.compute import refining
 from worker.compute.filter_fitting import T, TrainPatiently
 from worker.compute.pools import Lane
 from worker.jobs.learning import dataset, fits, patience, reward_models
-from worker.jobs.runtime import due_work
+from worker.jobs.runtime import due_work, records
 from worker.jobs.runtime.context import Step, WorkerContext
 from worker.jobs.runtime.records import Job
 from worker.ml.filters.filter_draft import FilterDraft
@@ -38,8 +41,12 @@ def refine(context: WorkerContext, run_id: int, job: Job, reward: str, draft: st
     """The artefact of the refined filter, or of the same one where none is to be refined; empty: nobody needs it."""
     with context.database.reading() as session:
         settings = session.get_one(Study, job.study_id).settings
+        newest = None if shared else records.newest_model(session, job.participant, ModelKind.REWARD)
     if not fits.is_refined(settings, job, shared):
         return draft
+    if doubt := doubt_of([newest] if newest else []):
+        _clear_away(context, job)
+        return context.store.put(_unrefined(fits.load_draft(context, draft), doubt).to_bytes())
     lane = Lane.PATIENT if shared else Lane.LEARNING  # somebody waits for their last filter
     is_outdated = (lambda: False) if shared else partial(_is_outdated, context, job)
     begun = None if shared else _begun(context, run_id, job, is_outdated)
@@ -51,9 +58,20 @@ def refine(context: WorkerContext, run_id: int, job: Job, reward: str, draft: st
         artefact = context.store.put(result.to_bytes()) if result else ""
         context.store.unfinished.forget(folder)
     if artefact and begun:
-        for done in begun.parent.glob(f"{AHEAD}-*"):
-            context.store.unfinished.forget(done)
+        _clear_away(context, job)
     return artefact
+
+
+def _unrefined(draft: FilterDraft, doubt: Misfit) -> FilterDraft:
+    """The same filter; a refinement follows the reward model further than it can be trusted."""
+    note = f"The filter was not refined, because {doubt.words} may explain the answers better than weighted signals do."
+    return replace(draft, notes=(*draft.notes, note))
+
+
+def _clear_away(context: WorkerContext, job: Job) -> None:
+    """Forget what was made ahead."""
+    for done in context.store.unfinished.folder(job.participant).glob(f"{AHEAD}-*"):
+        context.store.unfinished.forget(done)
 
 
 def _make_ahead(context: WorkerContext, run_id: int, job: Job) -> None:
