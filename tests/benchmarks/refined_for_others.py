@@ -1,10 +1,11 @@
-"""What filters give people who are not linear, and whether a refinement, which leans more on the model, still pays.
+"""What filters give people who are not linear, whether a refinement still pays, and from whom studies withhold it.
 
     python -m tests.benchmarks.refined_for_others
 
-Per task and person of tests/benchmarks/nonlinear_people.py: 200 answers, a reward model as a study's, the quick filter
-and the refined one, driven through unseen scenarios beside the reference policy and judged by what they truly want. On
-one core at the lowest priority; what has a row in the table is never run again.
+First, in minutes: in how many people of each kind something richer explains the answers so well that no refinement is
+made. Then per task and person of tests/benchmarks/nonlinear_people.py: 200 answers, a reward model as a study's, the
+quick filter and the refined one whatever is known of the person, driven through unseen scenarios beside the reference
+policy and judged by what they truly want. On one core at the lowest priority; what has a row is never run again.
 """
 
 import argparse
@@ -20,7 +21,8 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from app.services.answers.accuracy import ENOUGH_EVIDENCE
+from app.services.answers.accuracy import ENOUGH_EVIDENCE, wilson
+from app.services.answers.misfit import DOUBT
 from tests.benchmarks.answered_pool import Answered, AnsweredPool
 from tests.benchmarks.nonlinear_people import ON_TIME_S, PEOPLE, Person
 from tests.benchmarks.rivals_report import gains_of, gains_text, successes_of, successes_text
@@ -39,13 +41,17 @@ from worker.ml.methods.people import Labels
 from worker.ml.methods.registry import Setting
 from worker.ml.rewards import misfit, reward_training
 from worker.ml.rewards.reward_models import RewardModel
-from worker.ml.teachers import TASTES
+from worker.ml.teachers import TASTES, random_taste
+from worker.sim.costs import preference_rewards
 from worker.tasks import registry
 from worker.whole_files import written_whole
 
 TITLE = "# What filters give people who are not linear"
 QUICK, REFINED = "pbarl", "pbarl_refined"
 ANSWERS = 200
+LOOKED_AFTER = (60, 100, 200)
+"""answers; fewer are not looked at"""
+LINEAR, SEED = "linear", 78
 Row = Mapping[str, Any]
 
 
@@ -55,15 +61,18 @@ def main() -> None:
     os.nice(19 - os.nice(0))
     torch.set_num_threads(1)
     table = options.output.with_suffix(".csv")
-    rows: list[Row] = list(csv.DictReader(table.open())) if table.exists() else []
+    rows = _rows(table)
     planned = product(range(options.seeds), options.tasks, options.people, (QUICK, REFINED))
     missing = [each for each in planned if each not in {_name_of(row) for row in rows}]
-    for task in dict.fromkeys(each[1] for each in missing):
+    counted = options.output.with_name(f"{options.output.name}_withheld.csv")
+    for task in options.tasks:
         bench = Bench(task, options.work_directory / "rollouts")
+        if not _rows(counted, task):
+            _append(counted, bench.withheld(options.of_a_kind, options.linear))
         for seed, _, name, method in tqdm([each for each in missing if each[1] == task], unit="filter"):
-            rows.append(bench.row(PEOPLE[name], seed, method, options.scenarios))
-            _write(rows, options.output)
-    _write(rows, options.output)
+            _append(table, [bench.row(PEOPLE[name], seed, method, options.scenarios)])
+            _report(options.output, counted)
+    _report(options.output, counted)
 
 
 class Bench:
@@ -72,6 +81,32 @@ class Bench:
     def __init__(self, task: str, rollouts: Path) -> None:
         self.pool = AnsweredPool(task, rollouts)
         self.cache = RolloutCache(task, rollouts)
+
+    def withheld(self, of_a_kind: int, linear: int) -> list[Row]:
+        """How many people of each kind give more evidence than DOUBT, by the number of their answers."""
+        drawn = [self._linear(number) for number in range(linear)]
+        kinds = {LINEAR: [(each, 0) for each in drawn]}
+        kinds |= {name: [(person, seed) for seed in range(of_a_kind)] for name, person in PEOPLE.items()}
+        return [self._counted(name, people) for name, people in tqdm(kinds.items(), unit="kind")]
+
+    def _linear(self, number: int) -> Person:
+        taste = random_taste(f"{LINEAR}-{number}", np.random.default_rng([number, SEED]))
+        return Person(
+            taste.name,
+            lambda task, seen: preference_rewards(
+                task, seen.costs, seen.signals, taste.omega, per_signal=taste.per_signal
+            ),
+        )
+
+    def _counted(self, kind: str, people: Sequence[tuple[Person, int]]) -> Row:
+        found = []
+        for person, seed in people:
+            answered = self.pool.answered(person, ANSWERS, seed)
+            found.append([misfit.evidence(self.pool.ratios(answered, count)) > DOUBT for count in LOOKED_AFTER])
+        counts = dict(zip(LOOKED_AFTER, np.sum(found, axis=0).tolist(), strict=True))
+        return {"task": self.pool.task.name, "kind": kind, "people": len(people)} | {
+            f"after_{count}": number for count, number in counts.items()
+        }
 
     def row(self, person: Person, seed: int, method: str, scenarios: int) -> Row:
         """Answer, learn, fit, drive, judge."""
@@ -150,18 +185,41 @@ def _name_of(row: Row) -> tuple[int, str, str, str]:
     return int(row["seed"]), row["task"], row["person"], row["method"]
 
 
-def _write(rows: Sequence[Row], output: Path) -> None:
-    if not rows:
-        return
-    with written_whole(output.with_suffix(".csv")) as path, path.open("w", newline="") as stream:
+def _rows(table: Path, task: str = "") -> list[Row]:
+    found = list(csv.DictReader(table.open())) if table.exists() else []
+    return [row for row in found if not task or row["task"] == task]
+
+
+def _append(table: Path, more: Sequence[Row]) -> None:
+    rows = [*_rows(table), *more]
+    with written_whole(table) as path, path.open("w", newline="") as stream:
         writer = csv.DictWriter(stream, list(rows[0]), lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
+
+
+def _report(output: Path, counted: Path) -> None:
     page = output.with_suffix(".md")
-    page.write_text(result_pages.page(page, TITLE, _table(rows)))
+    tables = f"{_of_withheld(_rows(counted))}\n{_of_filters(_rows(output.with_suffix('.csv')))}"
+    page.write_text(result_pages.page(page, TITLE, tables))
 
 
-def _table(rows: Sequence[Row]) -> str:
+def _of_withheld(rows: Sequence[Row]) -> str:
+    lines = [
+        "| task | people | of | " + " | ".join(f"withheld after {count} answers" for count in LOOKED_AFTER) + " |",
+        "|---" * (3 + len(LOOKED_AFTER)) + "|",
+    ]
+    for row in rows:
+        people = int(row["people"])
+        shares = (wilson(int(row[f"after_{count}"]), people) for count in LOOKED_AFTER)
+        said = " | ".join(
+            f"{each.correct / each.scored:.0%} [{100 * each.low:.0f}, {100 * each.high:.0f}]" for each in shares
+        )
+        lines.append(f"| {row['task']} | {row['kind']} | {people} | {said} |")
+    return "\n".join(lines) + "\n"
+
+
+def _of_filters(rows: Sequence[Row]) -> str:
     found = {_name_of(row): row for row in rows}
     lines = [
         "| task | person | seed | model does not fit | quick: gain, % | success, points | worst force, N"
@@ -198,6 +256,8 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--people", nargs="+", choices=[*PEOPLE], default=[*PEOPLE])
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--scenarios", type=int, default=200)
+    parser.add_argument("--of-a-kind", type=int, default=15, help="people whose evidence is counted")
+    parser.add_argument("--linear", type=int, default=100, help="linear people whose evidence is counted")
     parser.add_argument("--work-directory", type=Path, default=Path("data/benchmark"), help="of rollouts")
     parser.add_argument(
         "--output", type=Path, default=Path("docs/results/refined_for_others"), help="stem of both files"

@@ -15,8 +15,8 @@ IN_WORDS: Mapping[str, str] = {
 }
 """What explains answers, by the names of worker.ml.rewards.misfit."""
 DOUBT = 2.0
-"""Evidence beyond which nothing follows the model far, though it says too little for a flag. Of 100 linear people none
-gave so much in 100 or 200 answers; who gives it, and what it spares them: docs/results/refined_for_others.md."""
+"""Evidence beyond which nothing follows the model far, though it says too little for a flag. Who gives so much, how
+many linear people do, and what it spares the others: docs/results/refined_for_others.md."""
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from app.installed_tasks import catalogue, hints
 from app.installed_tasks.refinements import SHARE_AHEAD, answers_ahead
 from app.questionnaires import library
 from app.services.answers import hint_offers
+from app.services.answers.misfit import DOUBT
 from app.services.evaluation import evaluation_plan, unblinding
 from app.services.exports import codebook, export_formats
 from app.services.paper import people
@@ -172,7 +173,9 @@ def _procedure(session: Session, study: Study) -> Iterator[str]:
         f"{settings.refinement_steps:,} environment steps, {percent(SHARE_AHEAD, 0)} of them on the preference learned "
         f"from the first {answers_ahead(settings.labels_per_participant)} answers and from its execution mode on; "
         "force on the person beyond what 95 % of the episodes of the pre-trained policy stay below had a price. The "
-        "refined policy was kept where it was better and, in further scenarios too, no worse in these respects."
+        "refined policy was kept where it was better and, in further scenarios too, no worse in these respects. "
+        f"Nobody's filter was refined whose answers were more than {DOUBT:g} times as probable under a richer model than under "
+        "weighted sums of signals."
         if settings.refinement_steps
         else "",
     )
