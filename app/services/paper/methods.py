@@ -174,8 +174,8 @@ def _procedure(session: Session, study: Study) -> Iterator[str]:
         f"from the first {answers_ahead(settings.labels_per_participant)} answers and from its execution mode on; "
         "force on the person beyond what 95 % of the episodes of the pre-trained policy stay below had a price. The "
         "refined policy was kept where it was better and, in further scenarios too, no worse in these respects. "
-        f"Nobody's filter was refined whose answers were more than {DOUBT:g} times as probable under a richer model than under "
-        "weighted sums of signals."
+        f"Nobody's filter was refined whose answers were more than {DOUBT:g} times as probable under a richer model "
+        "than under weighted sums of signals."
         if settings.refinement_steps
         else "",
     )
