@@ -194,7 +194,7 @@ def test_a_model_that_does_not_fit_is_a_flag_until_a_newer_one_does(
         for labels, each in enumerate(evidence, 10):
             metrics = factories.reward_metrics() | {"misfit": {"evidence": each, "explanation": "arrival"}}
             factories.make_model(session, study, participant, ModelKind.REWARD, metrics, labels=labels)
-    assert ('class="flag">model does not fit' in experimenter.get("/studies/pilot").text) is flagged
+    assert ('class="flag">beyond weighted signals' in experimenter.get("/studies/pilot").text) is flagged
     assert ("when the robot arrives" in experimenter.get("/studies/pilot/participants/P01").text) is flagged
 
 

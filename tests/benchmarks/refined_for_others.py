@@ -30,7 +30,7 @@ from worker.analysis.comparison import result_pages
 from worker.compute import learning, simulation
 from worker.compute.population import prior_of
 from worker.domain.scenarios import EVALUATION, first_of
-from worker.domain.trajectory import Trajectory
+from worker.domain.trajectory import SIGNALS, Trajectory
 from worker.domain.type_aliases import FloatArray
 from worker.experiments.benchmark_person import BenchmarkPerson
 from worker.experiments.rollout_cache import RolloutCache
@@ -39,7 +39,8 @@ from worker.ml.filters.response_surface import ResponseSurface
 from worker.ml.methods import registry as methods
 from worker.ml.methods.people import Labels
 from worker.ml.methods.registry import Setting
-from worker.ml.rewards import misfit, reward_training
+from worker.ml.rewards import misfit
+from worker.ml.rewards.model_choice import fit_by_evidence
 from worker.ml.rewards.reward_models import RewardModel
 from worker.ml.teachers import TASTES, random_taste
 from worker.sim.costs import preference_rewards
@@ -166,12 +167,13 @@ class Bench:
     def _learned(self, labels: Labels, seed: int) -> RewardModel:
         """As a study's worker learns it."""
         name, scale = self.pool.task.name, self.pool.scale
-        return reward_training.fit(
+        return fit_by_evidence(
             labels.pairs,
             labels.targets,
-            "structured",
             seed,
             scale=scale,
+            signal_names=SIGNALS,
+            scene=misfit.scene_of(self.pool.task.observation),
             prior=prior_of(name, scale.spread),
             reference=simulation.reference_rollouts(name),
         ).model

@@ -16,7 +16,7 @@ from worker.compute.simulation import reference_rollouts, run_episode, signal_pr
 from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import Act, Float32Array, FloatArray
 from worker.ml.rewards.loading import load_reward_model
-from worker.ml.rewards.reward_models import NEVER_WANTED, RewardModel, StructuredReward
+from worker.ml.rewards.reward_models import NEVER_WANTED, RewardModel
 from worker.ml.rewards.segments import SegmentPairs
 from worker.ml.rewards.signal_scale import SignalScale
 from worker.tasks import registry
@@ -72,30 +72,32 @@ def fit_reward(
     ``hints``: (H, S) which way the person wishes the signals, as in reward_training.fit().
     Raises ValueError for a kind there is not, and simulation.NoPredictor where the task's signals cannot be foreseen.
     """
-    from worker.ml.rewards import misfit, reward_training
+    from worker.ml.rewards import misfit, model_choice, reward_training
 
     if kind not in get_args(reward_training.RewardKind):
         raise ValueError(f"There is no reward model of the kind {kind!r}.")
     simulated = None if recorded_signals is not None else registry.task(task)
     names = recorded_signals or () if simulated is None else simulated.signals
     prior = prior_of(task if recorded_signals is None else None, scale.spread, [_model(each) for each in earlier])
-    fitted = reward_training.fit(
-        pairs,
-        targets,
-        cast(reward_training.RewardKind, kind),
-        seed,
-        scale=scale,
-        reference=reference_rollouts(task) if recorded_signals is None else (),
-        prior=prior,
-        signal_names=names,
-        costs=NEVER_WANTED if simulated is None else (*NEVER_WANTED, *simulated.costs),
-        predictor=signal_predictor(task) if kind == "predicted" else None,
-        mattered=mattered,
-        hints=hints,
-    )
+    known: dict[str, Any] = {
+        "scale": scale,
+        "reference": reference_rollouts(task) if recorded_signals is None else (),
+        "prior": prior,
+        "signal_names": names,
+        "costs": NEVER_WANTED if simulated is None else (*NEVER_WANTED, *simulated.costs),
+        "mattered": mattered,
+        "hints": hints,
+    }
+    scene = [] if simulated is None else misfit.scene_of(simulated.observation)
+    if kind == "structured":
+        fitted = model_choice.fit_by_evidence(pairs, targets, seed, scene=scene, **known)
+    else:
+        predictor = signal_predictor(task) if kind == "predicted" else None
+        fitted = reward_training.fit(
+            pairs, targets, cast(reward_training.RewardKind, kind), seed, predictor=predictor, **known
+        )
     metrics = {**fitted.metrics, "pooled_from": len(earlier)}
-    if isinstance(fitted.model, StructuredReward):
-        scene = [] if simulated is None else misfit.scene_of(simulated.observation)
+    if kind == "predicted":
         metrics["misfit"] = misfit.look(pairs, np.asarray(targets, np.float64), scale, names, scene)
     return fitted.model.to_bytes(), metrics
 

@@ -15,8 +15,8 @@ IN_WORDS: Mapping[str, str] = {
 }
 """What explains answers, by the names of worker.ml.rewards.misfit."""
 DOUBT = 2.0
-"""Evidence beyond which nothing follows the model far, though it says too little for a flag. Who gives so much, how
-many linear people do, and what it spares the others: docs/results/refined_for_others.md."""
+"""Evidence from which on the structured model has further terms (worker.ml.rewards.model_choice), though it says too
+little for a flag. Who gives so much, and how many linear people do: docs/results/refined_for_others.md."""
 
 
 @dataclass(frozen=True)
@@ -27,6 +27,13 @@ class Misfit:
     """What explains most, one of IN_WORDS."""
     evidence: float
     """How many times as probable richer models make the answers."""
+    is_learned: bool = False
+    """Whether the reward model has terms for it."""
+
+    @property
+    def is_shown(self) -> bool:
+        """Whether there is enough evidence for a flag."""
+        return self.evidence >= ENOUGH_EVIDENCE
 
     @property
     def words(self) -> str:
@@ -41,12 +48,14 @@ def misfit_of(models: Sequence[Model]) -> Misfit | None:
     looks: docs/results/misfit.md.
     """
     found = doubt_of(models)
-    return found if found is not None and found.evidence >= ENOUGH_EVIDENCE else None
+    return found if found is not None and found.is_shown else None
 
 
 def doubt_of(models: Sequence[Model]) -> Misfit | None:
-    """The same for less evidence: whether the model may not fit."""
-    found = models[-1].metrics.get("misfit") if models else None
+    """The same for less evidence: whether weighted signals alone may not fit."""
+    metrics = models[-1].metrics if models else {}
+    found = metrics.get("misfit")
     if not isinstance(found, dict) or not found.get("evidence", 0.0) > DOUBT:
         return None
-    return Misfit(str(found["explanation"]), float(found["evidence"]))
+    explanation = str(found["explanation"])
+    return Misfit(explanation, float(found["evidence"]), metrics.get("further") == explanation)

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from app.domain.choices import Method, Strategy
+from app.domain.choices import Method, RewardKind, Strategy
 from app.domain.models import Model, ModelKind
 from app.domain.protocol import EvaluatedMethod, EvaluationMode, EvaluationSettings, Language
 from app.domain.studies import Participant, Study
@@ -163,6 +163,10 @@ def _procedure(session: Session, study: Study) -> Iterator[str]:
         f"The reward model was “{settings.reward_kind.label}”, trained anew every "
         f"{count(settings.retrain_every_labels, 'answer')}"
         f", starting from {_starting_from(session, study)}.",
+        "Where models with further terms (worst moments, the time of arrival, weights that differ by distance or by "
+        f"pose) made somebody's answers more than {DOUBT:g} times as probable, theirs had those that explained most."
+        if settings.reward_kind is RewardKind.STRUCTURED
+        else "",
         f"Action filters were trained after {listed(map(str, settings.milestones))} answers and measured on "
         f"{settings.evaluation_scenarios} unseen simulated scenarios each; they were allowed to cost "
         f"{percent(settings.success_tolerance)} of success, and to be worse than the pre-trained policy in at most "
@@ -173,9 +177,7 @@ def _procedure(session: Session, study: Study) -> Iterator[str]:
         f"{settings.refinement_steps:,} environment steps, {percent(SHARE_AHEAD, 0)} of them on the preference learned "
         f"from the first {answers_ahead(settings.labels_per_participant)} answers and from its execution mode on; "
         "force on the person beyond what 95 % of the episodes of the pre-trained policy stay below had a price. The "
-        "refined policy was kept where it was better and, in further scenarios too, no worse in these respects. "
-        f"Nobody's filter was refined whose answers were more than {DOUBT:g} times as probable under a richer model "
-        "than under weighted sums of signals."
+        "refined policy was kept where it was better and, in further scenarios too, no worse in these respects."
         if settings.refinement_steps
         else "",
     )

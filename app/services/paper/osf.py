@@ -14,7 +14,6 @@ from app.domain.study_settings import StudySettings
 from app.installed_tasks import hints
 from app.questionnaires import library
 from app.services.answers import hint_offers
-from app.services.answers.misfit import DOUBT
 from app.services.evaluation import unblinding
 from app.services.exports import codebook, export_formats
 from app.services.paper import recruitment
@@ -105,9 +104,7 @@ def _design(study: Study, settings: StudySettings) -> Mapping[str, str]:
         + "\n\n"
         + paragraph(
             f"Filters of all answers are refined by soft actor-critic for {settings.refinement_steps:,} environment "
-            "steps and kept so where that is better by the learned preference and no worse for the task. Left out are "
-            f"people whose answers are more than {DOUBT:g} times as probable under a richer model than under weighted "
-            "sums of signals."
+            "steps and kept so where that is better by the learned preference and no worse for the task."
             if settings.refinement_steps
             else "",
             f"Each method is met in one block of {count(evaluation.trials, 'trial')} "

@@ -210,19 +210,23 @@ def test_the_last_filter_goes_on_from_what_is_made_ahead_and_leaves_whoever_stil
     assert found == {"asked to pause": True, "left off at": WHOLE // 2, "begun_at": WHOLE // 2, "steps": WHOLE}
 
 
-@pytest.mark.parametrize(("evidence", "refined"), [(None, True), (1.9, True), (2.1, False)])
-def test_nobody_is_refined_whose_answers_something_richer_explains_twice_as_well(
+@pytest.mark.parametrize(
+    ("evidence", "learned", "refined"),
+    [(None, "", True), (1.9, "", True), (2.1, "", False), (2.1, "arrival", True), (30.0, "arrival", True)],
+)
+def test_nobody_is_refined_by_a_model_that_something_richer_explains_the_answers_twice_as_well_as(
     context: WorkerContext,
     participant: Participant,
     answered: Callable[[int], None],
     refining: Callable[..., None],
     monkeypatch: pytest.MonkeyPatch,
     evidence: float | None,
+    learned: str,
     refined: bool,
 ) -> None:
     answered(20)
     found = {} if evidence is None else {"evidence": evidence, "explanation": "arrival"}
-    save_model(context, participant, ModelKind.REWARD, "all labels", {"misfit": found})
+    save_model(context, participant, ModelKind.REWARD, "all labels", {"misfit": found, "further": learned})
     _, run_id = begin(context, participant, RunKind.FILTER)
     refining(go_on, refine=lambda draft, *_: replace(draft, notes=("refined",)))
     monkeypatch.setattr(fits, "load_draft", lambda *_: FilterDraft(FilterWeights(mode={"speed_far": 0.2})))
@@ -286,6 +290,9 @@ def test_the_card_of_a_filter_says_that_its_model_does_not_fit_and_what_would() 
     (note,) = notes_on_misfit(Misfit("arrival", 30.0))
     assert "does not fit this person" in note
     assert "explained better by when the robot arrives" in note
+    (note,) = notes_on_misfit(Misfit("arrival", 3.0, is_learned=True))
+    assert "terms for when the robot arrives" in note
+    assert notes_on_misfit(Misfit("arrival", 3.0)) == []
     assert notes_on_misfit(None) == []
 
 

@@ -11,7 +11,7 @@ from app.domain.preferences import count_labels
 from app.domain.studies import Participant, Study
 from app.errors import AppError
 from app.services.answers import accuracy
-from app.services.answers.misfit import Misfit, misfit_of
+from app.services.answers.misfit import Misfit, doubt_of
 from app.services.exports.export_formats import provenance_of
 from app.services.monitoring import dashboard
 from app.services.participants import visits
@@ -133,7 +133,7 @@ def _publish(context: WorkerContext, run_id: int, job: Job, reward: str, draft: 
         notes = [
             *notes_on_script(participant),
             *notes_on_foresight(dashboard.curve_of(session, job.participant)),
-            *notes_on_misfit(misfit_of([model] if model else [])),
+            *notes_on_misfit(doubt_of([model] if model else [])),
             *notes_on_visits(session, participant),
         ]
     provenance = Provenance(
@@ -179,8 +179,13 @@ def notes_on_foresight(curve: accuracy.Curve) -> Sequence[str]:
 
 def notes_on_misfit(misfit: Misfit | None) -> Sequence[str]:
     """What the model card has to say about a reward model that does not fit the person."""
-    if misfit is None:
+    if misfit is None or not (misfit.is_learned or misfit.is_shown):
         return []
+    if misfit.is_learned:
+        return [
+            f"Weighted signals alone explain this person's answers less well than with terms for {misfit.words}, which "
+            "the reward model behind this filter has."
+        ]
     return [
         "The reward model behind this filter adds up weighted signals, and that does not fit this person: their answers"
         f" are explained better by {misfit.words}. The filter may suit them less than it could."

@@ -32,7 +32,7 @@ def variation(
     others = others[distance >= min(apart, distance.max())]
     (changes, success), (before, success_before) = surface.predict(others), surface.predict(mode)
     lost = np.maximum(success_before - success - SUCCESS_TOLERANCE, 0.0)
-    log_odds = model.weights @ (changes - before).T * shown / model.temperature
+    log_odds = model.weights_of_signals @ (changes - before).T * shown / model.temperature
     best = np.unique(np.where(lost > lost.min(), -np.inf, log_odds).argmax(axis=1))
     told = acquisition.information_gain(probability_right(log_odds[:, best]))
     found: FloatArray = others[best[np.argmax(told)]]

@@ -134,8 +134,8 @@ def further_differences(
 def further_sums(pairs: SegmentPairs, signal_names: Sequence[str], scene: Sequence[int] = ()) -> dict[str, FloatArray]:
     """The richer models' features of both sides, (N, 2, F) each."""
     columns = {name: pairs.signals[..., place].astype(np.float64) for place, name in enumerate(signal_names)}
-    begins = pairs.observations[:, :, 0, list(scene)].astype(np.float64)
-    held = (begins - begins.mean(axis=(0, 1))) / np.maximum(begins.std(axis=(0, 1)), _SMALLEST_SPREAD)
+    mean, deviation = richer_features.usual_scene(pairs, scene)
+    held = (pairs.observations[:, :, 0, list(scene)].astype(np.float64) - mean) / deviation
     return {name: each.sum(axis=-2) for name, each in richer_features.measured(columns, held).items()}
 
 

@@ -6,7 +6,7 @@ is right and is soon out of the way where it is not: nobody is pulled towards pe
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -49,6 +49,13 @@ class Population:
         shrunk = SHARED * covariance + OWN * np.diag(np.diag(covariance))
         return cls(name, weights.mean(axis=0), shrunk + FLOOR * cls.anybody(weights.shape[-1]).covariance)
 
+    def with_further(self, count: int, deviation: float) -> Self:
+        """See Prior."""
+        size = len(self.mean)
+        covariance = np.diag(np.full(size + count, deviation**2))
+        covariance[:size, :size] = self.covariance
+        return replace(self, mean=np.append(self.mean, np.zeros(count)), covariance=covariance)
+
 
 @dataclass(frozen=True)
 class Prior:
@@ -61,6 +68,10 @@ class Prior:
         """Nobody is known."""
         return cls((Population.anybody(size),))
 
+    def with_further(self, count: int, deviation: float) -> "Prior":
+        """With so many more weights of which nobody knows more than N(0, deviation^2)."""
+        return Prior(tuple(each.with_further(count, deviation) for each in self.populations))
+
     def or_like(self, name: str, weights: npt.ArrayLike) -> "Prior":
         """Or like P people with these weights, (P, S); too few are left out."""
         given = np.asarray(weights, np.float64)
@@ -69,4 +80,5 @@ class Prior:
 
 def standardised_weights(models: Sequence[RewardModel], spread: FloatArray) -> list[FloatArray]:
     """What earlier participants' reward models weigh, (S,) each as in Population; ``spread`` (S,) as in SignalScale."""
-    return [each.weights.mean(axis=0) * spread for each in models if isinstance(each, StructuredReward)]
+    linear = [each for each in models if isinstance(each, StructuredReward)]
+    return [each.weights_of_signals.mean(axis=0) * spread for each in linear]

@@ -247,9 +247,14 @@ class StructuredReward(RewardModel):
         )
         return cls(tensors["weights"].astype(np.float64), least_per_step=least, most_per_step=most)
 
+    @property
+    def weights_of_signals(self) -> FloatArray:
+        """(E, S), without those of anything else that a subclass reads."""
+        return self.weights
+
     def signal_weights(self, reference: Sequence[Recorded] = ()) -> FloatArray:
         """(E, S) normalised reward per unit of each signal; exact for this kind."""
-        return self.weights / self.normalisation.scale
+        return self.weights_of_signals / self.normalisation.scale
 
     @property
     def size(self) -> int:

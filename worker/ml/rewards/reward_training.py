@@ -15,10 +15,12 @@ from worker.domain.type_aliases import FloatArray
 from worker.ml.rewards import calibration
 from worker.ml.rewards.bradley_terry import probability_of_answer, probability_right, slope_of_answer
 from worker.ml.rewards.calibration import HeldOut
+from worker.ml.rewards.misfit import RICHER_DEVIATION
 from worker.ml.rewards.network_training import MlpTraining, TransformerTraining, fit_mlp, fit_transformer
 from worker.ml.rewards.predicted_reward import PredictedReward
 from worker.ml.rewards.prior import Population, Prior
 from worker.ml.rewards.reward_models import NEVER_WANTED, UNDONE, Normalisation, RewardModel, StructuredReward
+from worker.ml.rewards.richer_reward import FurtherTerms, RicherReward
 from worker.ml.rewards.segments import SegmentPairs
 from worker.ml.rewards.signal_predictor import SignalPredictor
 from worker.ml.rewards.signal_scale import SignalScale
@@ -59,6 +61,7 @@ def fit(
     predictor: SignalPredictor | None = None,
     mattered: npt.ArrayLike | None = None,
     hints: npt.ArrayLike | None = None,
+    further: FurtherTerms | None = None,
 ) -> FitResult:
     """Fit an ensemble to N pairs and their targets P(right preferred) in {0, 1/2, 1}.
 
@@ -73,6 +76,7 @@ def fit(
     linear in signals. The answer is then heard once more, about these signals alone.
     ``hints``: (H, S) which way somebody wishes the signals, for the same kinds: -1 less, 1 more, 0 neither. Each is
     heard as one more answer, between clips that differ in these signals alone.
+    ``further``: terms beside the signals, for the structured kind.
     Raises ValueError for targets outside {0, 1/2, 1}, a count that differs from the pairs', or a missing predictor.
     """
     started = time.perf_counter()
@@ -81,7 +85,14 @@ def fit(
     known = prior or Prior.standard(len(signal_names))
     extra = _Extra.of(len(pairs), len(signal_names), mattered, hints)
     model: RewardModel
-    if kind == "structured":
+    if kind == "structured" and further is not None:
+        completed = further.completed(pairs)
+        wider = further.scale_of(scale or SignalScale.of(pairs), completed)
+        more = completed.signals.shape[-1] - pairs.signals.shape[-1]
+        open_to_more = known.with_further(more, RICHER_DEVIATION), signal_names, costs, extra.widened(more)
+        linear, found = _fit_structured(completed, answers, seed, wider, *open_to_more)
+        model = RicherReward.with_terms(linear, further)
+    elif kind == "structured":
         spread = scale or SignalScale.of(pairs)
         model, found = _fit_structured(pairs, answers, seed, spread, known, signal_names, costs, extra)
     elif kind == "predicted":
@@ -153,6 +164,10 @@ class _Extra:
         named = np.zeros((count, width), bool) if mattered is None else np.asarray(mattered, bool)
         return cls(named, np.zeros((0, width)) if hints is None else np.asarray(hints, np.float64))
 
+    def widened(self, more: int) -> "_Extra":
+        """Beside so many further terms, of which nothing was said."""
+        return _Extra(np.pad(self.named, ((0, 0), (0, more))), np.pad(self.hints, ((0, 0), (0, more))))
+
     def without(self, left_out: npt.NDArray[np.bool_]) -> "_Extra":
         """Without some of the answers."""
         return replace(self, named=self.named[~left_out])
@@ -183,7 +198,7 @@ def _fit_structured(
     deviation = 1.96 * np.sqrt(np.diag(covariance))
     weights = {
         name: {"mean": float(value), "low": float(value - margin), "high": float(value + margin)}
-        for name, value, margin in zip(signal_names, mean, deviation, strict=True)
+        for name, value, margin in zip(signal_names, mean, deviation, strict=False)  # of the signals alone
     }
     return StructuredReward(members, least_per_step=scale.least_per_step, most_per_step=scale.most_per_step), {
         "weights": weights,

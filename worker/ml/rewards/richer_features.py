@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from worker.domain.type_aliases import FloatArray
+from worker.ml.rewards.segments import SegmentPairs
 
 ARRIVED_M = 0.10
 FAR_M = 0.30
@@ -27,6 +28,8 @@ _POSED = (
     *("distance_m", "speed_squared_m2_s2", "near_speed_squared_m2_s2", "lateral_offset_m", "height_above_target_m"),
     "undelivered",
 )
+
+_SMALLEST_SPREAD = 1e-6
 
 Columns = Mapping[str, FloatArray]
 """(..., T) by the signal's name"""
@@ -66,6 +69,17 @@ _GROUPS: Mapping[str, tuple[Callable[[Columns, FloatArray], FloatArray], Sequenc
     "poses": (poses, _POSED),
 }
 """What each is made of."""
+
+
+def of_group(name: str, signals: Columns, scene: FloatArray) -> FloatArray:
+    """(..., T, F) of the group of this name."""
+    return _GROUPS[name][0](signals, scene)
+
+
+def usual_scene(pairs: SegmentPairs, scene: Sequence[int]) -> tuple[FloatArray, FloatArray]:
+    """Mean and standard deviation of how these clips begin, (C,) each; ``scene``: columns of the observation."""
+    begins = pairs.observations[:, :, 0, list(scene)].astype(np.float64)
+    return begins.mean(axis=(0, 1)), np.maximum(begins.std(axis=(0, 1)), _SMALLEST_SPREAD)
 
 
 def measured(signals: Columns, scene: FloatArray) -> dict[str, FloatArray]:

@@ -1,0 +1,115 @@
+"""Further terms of the structured reward: who gets them, what they foresee, and that nobody else notices."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from app.services.answers import misfit as flag
+from tests.worker.ml.test_misfit import DISTANCE, SCENE, SPEED, STEPS, TILT, answers_to, pairs, total
+from worker.domain.trajectory import SIGNALS
+from worker.domain.type_aliases import FloatArray
+from worker.ml.rewards import misfit, model_choice, reward_training
+from worker.ml.rewards.loading import load_reward_model
+from worker.ml.rewards.model_choice import fit_by_evidence
+from worker.ml.rewards.prior import Prior
+from worker.ml.rewards.reward_training import FitResult
+from worker.ml.rewards.richer_reward import RicherReward
+from worker.ml.rewards.segments import SegmentPairs
+from worker.ml.rewards.signal_scale import SignalScale
+
+__all__ = ["pairs"]
+LEARNED_FROM = 150
+
+
+def lateness(pairs: SegmentPairs) -> FloatArray:
+    """How far from step 35 the robot arrives, which no sum of signals says."""
+    arrived = np.argmax(pairs.signals[..., DISTANCE] < 0.1, axis=-1)
+    return np.abs(np.where((pairs.signals[..., DISTANCE] < 0.1).any(axis=-1), arrived, STEPS) - 35.0)
+
+
+def learned(pairs: SegmentPairs, answers: FloatArray) -> FitResult:
+    some = pairs.take(np.arange(LEARNED_FROM))
+    return fit_by_evidence(
+        some, answers[:LEARNED_FROM], 0, scale=SignalScale.of(some), signal_names=SIGNALS, scene=SCENE
+    )
+
+
+def foreseen(result: FitResult, pairs: SegmentPairs, answers: FloatArray) -> float:
+    """The share of answers foreseen that it was not fitted to."""
+    fresh = np.arange(LEARNED_FROM, len(pairs))
+    hits: FloatArray = (result.model.probability_right(pairs.take(fresh)) > 0.5) == (answers[fresh] > 0.5)
+    return float(hits.mean())
+
+
+@pytest.fixture(scope="module")
+def on_time(pairs: SegmentPairs) -> FitResult:
+    return learned(pairs, answers_to(-lateness(pairs), mistakes=0.0))
+
+
+def test_whoever_wants_the_robot_on_time_gets_terms_for_it_and_is_foreseen_better(
+    pairs: SegmentPairs, on_time: FitResult
+) -> None:
+    answers = answers_to(-lateness(pairs), mistakes=0.0)
+    assert (on_time.metrics["further"], on_time.model.kind) == ("arrival", "richer")
+    some = pairs.take(np.arange(LEARNED_FROM))
+    scale = SignalScale.of(some)
+    linear = reward_training.fit(some, answers[:LEARNED_FROM], "structured", 0, scale=scale)
+    assert foreseen(on_time, pairs, answers) > foreseen(linear, pairs, answers) + 0.1
+
+
+def test_whose_answers_sums_explain_gets_exactly_the_model_of_sums(pairs: SegmentPairs) -> None:
+    answers = answers_to(-total(pairs, SPEED) - 0.5 * total(pairs, TILT))
+    result = learned(pairs, answers)
+    some = pairs.take(np.arange(LEARNED_FROM))
+    linear = reward_training.fit(some, answers[:LEARNED_FROM], "structured", 0, scale=SignalScale.of(some))
+    assert result.metrics["further"] == ""
+    assert result.model.to_bytes() == linear.model.to_bytes()
+
+
+def test_weights_that_change_are_noticed_and_not_learned(pairs: SegmentPairs) -> None:
+    turning = np.linspace(-1.0, 1.0, len(pairs))[:, None] * total(pairs, SPEED)
+    result = learned(pairs, answers_to(turning, mistakes=0.0))
+    assert result.metrics["misfit"]["explanation"] == misfit.CHANGING
+    assert result.metrics["misfit"]["evidence"] > model_choice.DOUBT
+    assert (result.metrics["further"], result.model.kind) == ("", "structured")
+
+
+def test_it_comes_back_from_its_file(pairs: SegmentPairs, on_time: FitResult) -> None:
+    again = load_reward_model(on_time.model.to_bytes())
+    assert isinstance(again, RicherReward)
+    for model in (again, on_time.model):
+        np.testing.assert_allclose(
+            model.raw_rewards(pairs.signals, pairs.observations, pairs.actions),
+            on_time.model.raw_rewards(pairs.signals, pairs.observations, pairs.actions),
+            rtol=1e-4,
+            atol=1e-4,
+        )
+
+
+def test_to_whoever_asks_for_weights_of_signals_it_gives_those_alone(on_time: FitResult) -> None:
+    assert on_time.model.signal_weights(()).shape == (on_time.model.size, len(SIGNALS))
+    assert on_time.metrics["weights"].keys() == set(SIGNALS)
+
+
+def test_steps_that_were_not_shown_are_worth_nothing(pairs: SegmentPairs, on_time: FitResult) -> None:
+    shown = np.arange(STEPS) < 45
+    cut = SegmentPairs(pairs.signals[:, :, :45], pairs.observations[:, :, :45], pairs.actions[:, :, :45])
+    filled = replace(
+        pairs,
+        signals=np.where(shown[:, None], pairs.signals, np.float32(0.0)),
+        mask=np.broadcast_to(shown, (len(pairs), 2, STEPS)),
+    )
+    np.testing.assert_allclose(on_time.model.logits(filled), on_time.model.logits(cut), rtol=1e-5, atol=1e-5)
+
+
+def test_a_wider_prior_knows_of_the_signals_what_it_knew() -> None:
+    narrow = Prior.standard(2).or_like("somebody", [[1.0, 2.0], [3.0, 1.0], [2.0, 4.0]])
+    for before, after in zip(narrow.populations, narrow.with_further(3, 0.5).populations, strict=True):
+        np.testing.assert_array_equal(after.mean, [*before.mean, 0.0, 0.0, 0.0])
+        np.testing.assert_array_equal(after.covariance[:2, :2], before.covariance)
+        np.testing.assert_array_equal(after.covariance[2:], np.eye(5)[2:] * 0.25)
+
+
+def test_pages_speak_of_the_evidence_that_the_model_goes_by() -> None:
+    assert flag.DOUBT == model_choice.DOUBT

@@ -1,0 +1,112 @@
+"""The structured reward with further terms, for people whose answers weighted sums of signals do not explain."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Self
+
+import numpy as np
+
+from worker.domain.trajectory import Recorded
+from worker.domain.type_aliases import Float32Array, FloatArray
+from worker.ml.rewards import richer_features
+from worker.ml.rewards.reward_models import RewardModel, StructuredReward
+from worker.ml.rewards.segments import SegmentPairs
+from worker.ml.rewards.signal_scale import SignalScale
+
+_MEAN, _DEVIATION = "scene_mean", "scene_deviation"
+
+
+@dataclass(frozen=True)
+class FurtherTerms:
+    """What is read beside the signals for one explanation of richer_features."""
+
+    explanation: str
+    signal_names: tuple[str, ...]
+    """of the columns of signals"""
+    scene: tuple[int, ...]
+    """columns of the observation that say how an episode begins"""
+    scene_mean: FloatArray
+    scene_deviation: FloatArray
+    """(C,) of these in the clips that were compared"""
+
+    @classmethod
+    def of(cls, pairs: SegmentPairs, explanation: str, signal_names: Sequence[str], scene: Sequence[int]) -> Self:
+        """For what was compared."""
+        mean, deviation = richer_features.usual_scene(pairs, scene)
+        return cls(explanation, tuple(signal_names), tuple(scene), mean, deviation)
+
+    def added_to(self, signals: Float32Array, observations: Float32Array) -> FloatArray:
+        """(..., T, S), (..., T, D) from an episode's start -> (..., T, S + F)"""
+        measured = np.asarray(signals, np.float64)
+        columns = {name: measured[..., place] for place, name in enumerate(self.signal_names)}
+        begins = observations[..., 0, list(self.scene)].astype(np.float64)
+        held = (begins - self.scene_mean) / self.scene_deviation
+        return np.concatenate([measured, richer_features.of_group(self.explanation, columns, held)], axis=-1)
+
+    def completed(self, pairs: SegmentPairs) -> SegmentPairs:
+        """The pairs with the further terms as signals."""
+        return replace(pairs, signals=self.added_to(pairs.signals, pairs.observations).astype(np.float32))
+
+    def scale_of(self, known: SignalScale, completed: SegmentPairs) -> SignalScale:
+        """That of the signals, and of the further terms in the pairs, which are not limited: a worst moment of a clip
+        is not one per step."""
+        further = SignalScale.of(completed).spread[len(known.spread) :]
+        unlimited = np.full(len(further), np.inf)
+        return SignalScale(
+            np.append(known.spread, further),
+            np.append(known.least_per_step, -unlimited),
+            np.append(known.most_per_step, unlimited),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class RicherReward(StructuredReward):
+    """Linear in the signals and in further terms, which depend on what came before in the episode."""
+
+    kind: ClassVar[str] = "richer"
+    terms: FurtherTerms
+
+    @classmethod
+    def with_terms(cls, fitted: StructuredReward, terms: FurtherTerms) -> Self:
+        """A structured model that was fitted to completed pairs, and what completes them."""
+        return cls(
+            weights=fitted.weights,
+            least_per_step=fitted.least_per_step,
+            most_per_step=fitted.most_per_step,
+            terms=terms,
+        )
+
+    def known_signals(self, signals: Float32Array, observations: Float32Array, actions: Float32Array) -> FloatArray:
+        """See StructuredReward."""
+        return self.terms.added_to(signals, observations)
+
+    @property
+    def weights_of_signals(self) -> FloatArray:
+        """See StructuredReward."""
+        return self.weights[:, : len(self.terms.signal_names)]
+
+    def signal_weights(self, reference: Sequence[Recorded] = ()) -> FloatArray:
+        """(E, S) of the linear reward that comes closest in these episodes; without any, as if nothing was added."""
+        return RewardModel.signal_weights(self, reference) if reference else super().signal_weights()
+
+    def tensors(self) -> dict[str, Float32Array]:
+        """See RewardModel."""
+        scene = {_MEAN: self.terms.scene_mean, _DEVIATION: self.terms.scene_deviation}
+        return super().tensors() | {name: each.astype(np.float32) for name, each in scene.items()}
+
+    def config(self) -> dict[str, Any]:
+        """See RewardModel."""
+        read = {name: list(getattr(self.terms, name)) for name in ("signal_names", "scene")}
+        return super().config() | read | {"explanation": self.terms.explanation}
+
+    @classmethod
+    def from_tensors(cls, tensors: Mapping[str, Float32Array], config: Mapping[str, Any]) -> Self:
+        """See RewardModel."""
+        terms = FurtherTerms(
+            str(config["explanation"]),
+            tuple(config["signal_names"]),
+            tuple(config["scene"]),
+            tensors[_MEAN].astype(np.float64),
+            tensors[_DEVIATION].astype(np.float64),
+        )
+        return cls.with_terms(StructuredReward.from_tensors(tensors, config), terms)
