@@ -13,8 +13,9 @@ from worker.ml.rewards import misfit, model_choice, reward_training
 from worker.ml.rewards.loading import load_reward_model
 from worker.ml.rewards.model_choice import fit_by_evidence
 from worker.ml.rewards.prior import Prior
+from worker.ml.rewards.reward_models import NEVER_WANTED
 from worker.ml.rewards.reward_training import FitResult
-from worker.ml.rewards.richer_reward import RicherReward
+from worker.ml.rewards.richer_reward import FurtherTerms, RicherReward
 from worker.ml.rewards.segments import SegmentPairs
 from worker.ml.rewards.signal_scale import SignalScale
 
@@ -73,6 +74,18 @@ def test_weights_that_change_are_noticed_and_not_learned(pairs: SegmentPairs) ->
     assert result.metrics["misfit"]["explanation"] == misfit.CHANGING
     assert result.metrics["misfit"]["evidence"] > model_choice.DOUBT
     assert (result.metrics["further"], result.model.kind) == ("", "structured")
+
+
+def test_nobody_is_taken_to_like_the_worst_moment_of_what_nobody_wants(pairs: SegmentPairs) -> None:
+    hardest = pairs.signals[..., SIGNALS.index("force_away_n")].max(axis=-1)
+    some = pairs.take(np.arange(LEARNED_FROM))
+    scale, terms = SignalScale.of(some), FurtherTerms.of(some, "worst_moments", SIGNALS, SCENE)
+    answers = answers_to(hardest, mistakes=0.0)[:LEARNED_FROM]
+    for costs, liked in ((NEVER_WANTED, False), ((), True)):
+        model = reward_training.fit(some, answers, "structured", 0, scale=scale, costs=costs, further=terms).model
+        assert isinstance(model, RicherReward)
+        worst = len(SIGNALS) + terms.amounts.index("force_away_n")
+        assert (model.weights[:, worst].mean() > 1e-3) == liked
 
 
 def test_it_comes_back_from_its_file(pairs: SegmentPairs, on_time: FitResult) -> None:

@@ -84,24 +84,26 @@ def fit(
     metrics: dict[str, Any] = {"kind": kind, "trained_on": len(pairs), "seed": seed}
     known = prior or Prior.standard(len(signal_names))
     extra = _Extra.of(len(pairs), len(signal_names), mattered, hints)
+    unwanted = _columns(signal_names, costs)
     model: RewardModel
     if kind == "structured" and further is not None:
         completed = further.completed(pairs)
         wider = further.scale_of(scale or SignalScale.of(pairs), completed)
         more = completed.signals.shape[-1] - pairs.signals.shape[-1]
-        open_to_more = known.with_further(more, RICHER_DEVIATION), signal_names, costs, extra.widened(more)
+        unwanted += [len(signal_names) + column for column in _columns(further.amounts, costs)]
+        open_to_more = known.with_further(more, RICHER_DEVIATION), signal_names, unwanted, extra.widened(more)
         linear, found = _fit_structured(completed, answers, seed, wider, *open_to_more)
         model = RicherReward.with_terms(linear, further)
     elif kind == "structured":
         spread = scale or SignalScale.of(pairs)
-        model, found = _fit_structured(pairs, answers, seed, spread, known, signal_names, costs, extra)
+        model, found = _fit_structured(pairs, answers, seed, spread, known, signal_names, unwanted, extra)
     elif kind == "predicted":
         if predictor is None:
             raise ValueError("The kind 'predicted' needs a predictor of the signals.")
         foreseen = predictor.completed(pairs.signals, pairs.observations, pairs.actions).astype(np.float32)
         completed = replace(pairs, signals=foreseen)
         wider = _wider(scale or SignalScale.of(completed), completed)
-        linear, found = _fit_structured(completed, answers, seed, wider, known, signal_names, costs, extra)
+        linear, found = _fit_structured(completed, answers, seed, wider, known, signal_names, unwanted, extra)
         model = PredictedReward.with_predictor(linear, predictor)
     elif kind == "mlp":
         model, found = fit_mlp(pairs, answers, seed, mlp or MlpTraining())
@@ -116,6 +118,10 @@ def fit(
     metrics["training_accuracy"] = _accuracy(model, pairs, answers)
     metrics["fit_seconds"] = round(time.perf_counter() - started, 4)
     return FitResult(model, metrics)
+
+
+def _columns(names: Sequence[str], wanted: Sequence[str]) -> list[int]:
+    return [column for column, name in enumerate(names) if name in wanted]
 
 
 def _wider(measured: SignalScale, foreseen: SegmentPairs) -> SignalScale:
@@ -188,11 +194,10 @@ def _fit_structured(
     scale: SignalScale,
     prior: Prior,
     signal_names: Sequence[str],
-    never_wanted: Sequence[str],
+    costs: Sequence[int],
     extra: _Extra,
 ) -> tuple[StructuredReward, dict[str, Any]]:
     features = pairs.signal_differences() / scale.spread
-    costs = [column for column, name in enumerate(signal_names) if name in never_wanted]
     mean, covariance, shares = posterior(*extra.heard(features, answers), prior, costs)
     members = antithetic(mean, covariance, np.random.default_rng(seed)) / scale.spread
     deviation = 1.96 * np.sqrt(np.diag(covariance))

@@ -76,6 +76,11 @@ def of_group(name: str, signals: Columns, scene: FloatArray) -> FloatArray:
     return _GROUPS[name][0](signals, scene)
 
 
+def amounts_of(name: str) -> tuple[str, ...]:
+    """The signals of which the group's features are amounts, in their order; none: they are no amounts of a signal."""
+    return {"worst_moments": _MOMENTS, "phases": (*_PHASED, *_PHASED)}.get(name, ())
+
+
 def usual_scene(pairs: SegmentPairs, scene: Sequence[int]) -> tuple[FloatArray, FloatArray]:
     """Mean and standard deviation of how these clips begin, (C,) each; ``scene``: columns of the observation."""
     begins = pairs.observations[:, :, 0, list(scene)].astype(np.float64)

@@ -35,6 +35,11 @@ class FurtherTerms:
         mean, deviation = richer_features.usual_scene(pairs, scene)
         return cls(explanation, tuple(signal_names), tuple(scene), mean, deviation)
 
+    @property
+    def amounts(self) -> tuple[str, ...]:
+        """The signals of which the further terms are amounts, or none."""
+        return richer_features.amounts_of(self.explanation)
+
     def added_to(self, signals: Float32Array, observations: Float32Array) -> FloatArray:
         """(..., T, S), (..., T, D) from an episode's start -> (..., T, S + F)"""
         measured = np.asarray(signals, np.float64)
