@@ -18,6 +18,10 @@ DOUBT = 2.0
 """Evidence from which on the structured model has further terms (worker.ml.rewards.model_choice), though it says too
 little for a flag. Who gives so much, and how many linear people do: docs/results/refined_for_others.md."""
 
+COARSE = frozenset({"arrival"})
+"""Explanations by whose terms no filter is refined: arrival is read by the second, and a policy that goes as far as it
+is led arrives some tenths too early or too late for whom that matters (docs/results/refined_for_others.md)."""
+
 
 @dataclass(frozen=True)
 class Misfit:
@@ -34,6 +38,11 @@ class Misfit:
     def is_shown(self) -> bool:
         """Whether there is enough evidence for a flag."""
         return self.evidence >= ENOUGH_EVIDENCE
+
+    @property
+    def may_be_refined_by(self) -> bool:
+        """Whether the reward model says it well enough to be followed far."""
+        return self.is_learned and self.explanation not in COARSE
 
     @property
     def words(self) -> str:

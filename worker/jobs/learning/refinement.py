@@ -45,7 +45,7 @@ def refine(context: WorkerContext, run_id: int, job: Job, reward: str, draft: st
     if not fits.is_refined(settings, job, shared):
         return draft
     doubt = doubt_of([newest] if newest else [])
-    if doubt and not doubt.is_learned:
+    if doubt and not doubt.may_be_refined_by:
         _clear_away(context, job)
         return context.store.put(_unrefined(fits.load_draft(context, draft), doubt).to_bytes())
     lane = Lane.PATIENT if shared else Lane.LEARNING  # somebody waits for their last filter
@@ -65,7 +65,9 @@ def refine(context: WorkerContext, run_id: int, job: Job, reward: str, draft: st
 
 def _unrefined(draft: FilterDraft, doubt: Misfit) -> FilterDraft:
     """The same filter; a refinement follows the reward model further than it can be trusted."""
-    note = f"The filter was not refined, because {doubt.words} may explain the answers better than weighted signals do."
+    note = (
+        f"The filter was not refined: {doubt.words} may count, which the reward model says not well enough to go far."
+    )
     return replace(draft, notes=(*draft.notes, note))
 
 

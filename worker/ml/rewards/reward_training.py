@@ -86,17 +86,19 @@ def fit(
     extra = _Extra.of(len(pairs), len(signal_names), mattered, hints)
     unwanted = _columns(signal_names, costs)
     model: RewardModel
-    if kind == "structured" and further is not None:
-        completed = further.completed(pairs)
-        wider = further.scale_of(scale or SignalScale.of(pairs), completed)
-        more = completed.signals.shape[-1] - pairs.signals.shape[-1]
-        unwanted += [len(signal_names) + column for column in _columns(further.amounts, costs)]
-        open_to_more = known.with_further(more, RICHER_DEVIATION), signal_names, unwanted, extra.widened(more)
-        linear, found = _fit_structured(completed, answers, seed, wider, *open_to_more)
-        model = RicherReward.with_terms(linear, further)
-    elif kind == "structured":
+    if kind == "structured":
         spread = scale or SignalScale.of(pairs)
-        model, found = _fit_structured(pairs, answers, seed, spread, known, signal_names, unwanted, extra)
+        linear, found = _fit_structured(pairs, answers, seed, spread, known, signal_names, unwanted, extra)
+        model = linear
+        if further is not None:
+            completed = further.completed(pairs)
+            more = completed.signals.shape[-1] - len(signal_names)
+            unwanted += [len(signal_names) + column for column in _columns(further.amounts, costs)]
+            spread, known = further.scale_of(spread, completed), known.with_further(more, RICHER_DEVIATION)
+            richer, found = _fit_structured(
+                completed, answers, seed, spread, known, signal_names, unwanted, extra.widened(more)
+            )
+            model = RicherReward.with_terms(richer, further, linear.weights)
     elif kind == "predicted":
         if predictor is None:
             raise ValueError("The kind 'predicted' needs a predictor of the signals.")

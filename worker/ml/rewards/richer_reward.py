@@ -6,14 +6,13 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from worker.domain.trajectory import Recorded
 from worker.domain.type_aliases import Float32Array, FloatArray
 from worker.ml.rewards import richer_features
-from worker.ml.rewards.reward_models import RewardModel, StructuredReward
+from worker.ml.rewards.reward_models import StructuredReward
 from worker.ml.rewards.segments import SegmentPairs
 from worker.ml.rewards.signal_scale import SignalScale
 
-_MEAN, _DEVIATION = "scene_mean", "scene_deviation"
+_MEAN, _DEVIATION, _OF_SUMS = "scene_mean", "scene_deviation", "of_sums"
 
 
 @dataclass(frozen=True)
@@ -70,15 +69,18 @@ class RicherReward(StructuredReward):
 
     kind: ClassVar[str] = "richer"
     terms: FurtherTerms
+    of_sums: FloatArray
+    """(E, S) the weights without further terms: modes are searched by them, as nobody knows what modes do to terms"""
 
     @classmethod
-    def with_terms(cls, fitted: StructuredReward, terms: FurtherTerms) -> Self:
-        """A structured model that was fitted to completed pairs, and what completes them."""
+    def with_terms(cls, fitted: StructuredReward, terms: FurtherTerms, of_sums: FloatArray) -> Self:
+        """A structured model that was fitted to completed pairs, what completes them, and weights without that."""
         return cls(
             weights=fitted.weights,
             least_per_step=fitted.least_per_step,
             most_per_step=fitted.most_per_step,
             terms=terms,
+            of_sums=of_sums,
         )
 
     def known_signals(self, signals: Float32Array, observations: Float32Array, actions: Float32Array) -> FloatArray:
@@ -88,16 +90,12 @@ class RicherReward(StructuredReward):
     @property
     def weights_of_signals(self) -> FloatArray:
         """See StructuredReward."""
-        return self.weights[:, : len(self.terms.signal_names)]
-
-    def signal_weights(self, reference: Sequence[Recorded] = ()) -> FloatArray:
-        """(E, S) of the linear reward that comes closest in these episodes; without any, as if nothing was added."""
-        return RewardModel.signal_weights(self, reference) if reference else super().signal_weights()
+        return self.of_sums
 
     def tensors(self) -> dict[str, Float32Array]:
         """See RewardModel."""
-        scene = {_MEAN: self.terms.scene_mean, _DEVIATION: self.terms.scene_deviation}
-        return super().tensors() | {name: each.astype(np.float32) for name, each in scene.items()}
+        more = {_MEAN: self.terms.scene_mean, _DEVIATION: self.terms.scene_deviation, _OF_SUMS: self.of_sums}
+        return super().tensors() | {name: each.astype(np.float32) for name, each in more.items()}
 
     def config(self) -> dict[str, Any]:
         """See RewardModel."""
@@ -114,4 +112,5 @@ class RicherReward(StructuredReward):
             tensors[_MEAN].astype(np.float64),
             tensors[_DEVIATION].astype(np.float64),
         )
-        return cls.with_terms(StructuredReward.from_tensors(tensors, config), terms)
+        of_sums = tensors[_OF_SUMS].astype(np.float64)
+        return cls.with_terms(StructuredReward.from_tensors(tensors, config), terms, of_sums)
