@@ -1,11 +1,11 @@
-"""What filters give people who are not linear, whether a refinement still pays, and from whom studies withhold it.
+"""What filters give people who are not linear, how many are noticed, and whether a refinement pays for them.
 
     python -m tests.benchmarks.refined_for_others
 
-First, in minutes: in how many people of each kind something richer explains the answers so well that no refinement is
-made. Then per task and person of tests/benchmarks/nonlinear_people.py: 200 answers, a reward model as a study's, the
-quick filter and the refined one whatever is known of the person, driven through unseen scenarios beside the reference
-policy and judged by what they truly want. On one core at the lowest priority; what has a row is never run again.
+First, in minutes: in how many people of each kind something richer explains the answers so well that the reward model
+has terms for it. Then per task and person of tests/benchmarks/nonlinear_people.py: 200 answers, the reward model of a
+study, the quick filter and the refined one, driven through unseen scenarios beside the reference policy and judged by
+what they truly want. On one core at the lowest priority; what has a row is never run again.
 """
 
 import argparse
@@ -65,11 +65,11 @@ def main() -> None:
     rows = _rows(table)
     planned = product(range(options.seeds), options.tasks, options.people, (QUICK, REFINED))
     missing = [each for each in planned if each not in {_name_of(row) for row in rows}]
-    counted = options.output.with_name(f"{options.output.name}_withheld.csv")
+    counted = options.output.with_name(f"{options.output.name}_doubt.csv")
     for task in options.tasks:
         bench = Bench(task, options.work_directory / "rollouts")
         if not _rows(counted, task):
-            _append(counted, bench.withheld(options.of_a_kind, options.linear))
+            _append(counted, bench.in_doubt(options.of_a_kind, options.linear))
         for seed, _, name, method in tqdm([each for each in missing if each[1] == task], unit="filter"):
             _append(table, [bench.row(PEOPLE[name], seed, method, options.scenarios)])
             _report(options.output, counted)
@@ -83,7 +83,7 @@ class Bench:
         self.pool = AnsweredPool(task, rollouts)
         self.cache = RolloutCache(task, rollouts)
 
-    def withheld(self, of_a_kind: int, linear: int) -> list[Row]:
+    def in_doubt(self, of_a_kind: int, linear: int) -> list[Row]:
         """How many people of each kind give more evidence than DOUBT, by the number of their answers."""
         drawn = [self._linear(number) for number in range(linear)]
         kinds = {LINEAR: [(each, 0) for each in drawn]}
@@ -202,13 +202,13 @@ def _append(table: Path, more: Sequence[Row]) -> None:
 
 def _report(output: Path, counted: Path) -> None:
     page = output.with_suffix(".md")
-    tables = f"{_of_withheld(_rows(counted))}\n{_of_filters(_rows(output.with_suffix('.csv')))}"
+    tables = f"{_of_doubt(_rows(counted))}\n{_of_filters(_rows(output.with_suffix('.csv')))}"
     page.write_text(result_pages.page(page, TITLE, tables))
 
 
-def _of_withheld(rows: Sequence[Row]) -> str:
+def _of_doubt(rows: Sequence[Row]) -> str:
     lines = [
-        "| task | people | of | " + " | ".join(f"withheld after {count} answers" for count in LOOKED_AFTER) + " |",
+        "| task | people | of | " + " | ".join(f"in doubt after {count} answers" for count in LOOKED_AFTER) + " |",
         "|---" * (3 + len(LOOKED_AFTER)) + "|",
     ]
     for row in rows:
