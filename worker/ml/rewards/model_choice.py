@@ -14,8 +14,8 @@ from worker.ml.rewards.segments import SegmentPairs
 from worker.ml.rewards.signal_scale import SignalScale
 
 DOUBT = 2.0
-"""Evidence against weighted sums from which on further terms are learned: less than for a flag, since terms that are not
-needed are no false word about anybody (docs/results/refined_for_others.md)."""
+"""Evidence against weighted sums from which on further terms are learned: less than for a flag, since terms that are
+not needed are no false word about anybody (docs/results/refined_for_others.md)."""
 
 
 def fit_by_evidence(
