@@ -249,7 +249,7 @@ class _Rounds:
 
         What the engine was told and has not begun is still due, and counts, unless it seems to have forgotten it.
         """
-        begun = Counter(key.partition("/")[0] for key in self._runner.in_hand)
+        begun = Counter(key.partition("/")[0] for key in tuple(self._runner.in_hand))
         for job, attempt in sorted(due, key=lambda each: self._runner.lanes.who_waits.urgency(each[0])):
             level = self._runner.lanes.who_waits.urgency(job).level
             places = engine.QUEUES[job.kind] + (engine.RESERVE if level <= Level.ANSWERING else 0)

@@ -76,7 +76,7 @@ class JobRunner(DBOSConfiguredInstance):
         super().__init__("job runner")
         self.context, self.lanes = context, lanes
         self.in_hand: set[str] = set()
-        """keys of runs that this process is working on"""
+        """keys of runs that this process is working on; other threads add and remove: look at a copy of it"""
         self.stored: dict[str, set[str]] = {}
         """artefacts of work that has not succeeded yet, by key: nothing else may know of them"""
 
@@ -117,7 +117,7 @@ class JobRunner(DBOSConfiguredInstance):
 
     def leave_nothing_of_erased(self) -> None:
         """Another worker may have erased somebody's last traces while this one was still at work for them."""
-        for key in [each for each in self.stored if each not in self.in_hand]:
+        for key in [each for each in tuple(self.stored) if each not in self.in_hand]:
             about, store = run_keys.read(key), self.context.store
             with self.context.database.writing() as session:
                 if about is None or not _is_erased(session, about):

@@ -97,6 +97,17 @@ def test_what_was_made_for_somebody_whom_another_worker_has_erased_is_removed(
     assert not store.unfinished.folder(job.participant).exists()
 
 
+def test_work_may_begin_while_it_is_looked_for_what_is_left(runner: JobRunner) -> None:
+    class Beginning(set[str]):
+        def __contains__(self, key: object) -> bool:
+            runner.stored.setdefault("filter/participant-9/labels-10", set())
+            return True
+
+    runner.in_hand, runner.stored = Beginning(), {"filter/participant-8/labels-10": set()}
+    runner.leave_nothing_of_erased()
+    assert len(runner.stored) == 2
+
+
 def test_a_sign_of_life_is_given_for_everything_in_hand(database: Database, job: Job, study: Study) -> None:
     """Whatever a step does, writing a large file for instance, nobody else takes it over meanwhile."""
     with database.writing() as session:
