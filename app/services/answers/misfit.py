@@ -20,7 +20,7 @@ little for a flag. Who gives so much, and how many linear people do: docs/result
 
 COARSE = frozenset({"arrival"})
 """Explanations by whose terms no filter is refined: arrival is read by the second, and a policy that goes as far as it
-is led arrives some tenths too early or too late for whom that matters (docs/results/refined_for_others.md)."""
+is led lost much for whom that matters, most likely by some tenths (docs/results/refined_for_others.md)."""
 
 
 @dataclass(frozen=True)

@@ -100,6 +100,11 @@ def test_it_comes_back_from_its_file(pairs: SegmentPairs, on_time: FitResult) ->
         )
 
 
+def test_a_file_with_terms_that_there_are_not_is_no_reward_model(on_time: FitResult) -> None:
+    with pytest.raises(ValueError, match="no terms for 'arriver'"):
+        load_reward_model(on_time.model.to_bytes().replace(b"arrival", b"arriver"))
+
+
 def test_to_whoever_asks_for_weights_of_signals_it_gives_those_alone(on_time: FitResult) -> None:
     assert on_time.model.signal_weights(()).shape == (on_time.model.size, len(SIGNALS))
     assert on_time.metrics["weights"].keys() == set(SIGNALS)

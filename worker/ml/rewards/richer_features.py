@@ -69,6 +69,8 @@ _GROUPS: Mapping[str, tuple[Callable[[Columns, FloatArray], FloatArray], Sequenc
     "poses": (poses, _POSED),
 }
 """What each is made of."""
+EXPLANATIONS = (*_GROUPS,)
+"""The names of the groups."""
 
 
 def of_group(name: str, signals: Columns, scene: FloatArray) -> FloatArray:

@@ -17,7 +17,7 @@ _MEAN, _DEVIATION, _OF_SUMS = "scene_mean", "scene_deviation", "of_sums"
 
 @dataclass(frozen=True)
 class FurtherTerms:
-    """What is read beside the signals for one explanation of richer_features."""
+    """What is read beside the signals for one explanation of richer_features. Raises ValueError for none of them."""
 
     explanation: str
     signal_names: tuple[str, ...]
@@ -27,6 +27,12 @@ class FurtherTerms:
     scene_mean: FloatArray
     scene_deviation: FloatArray
     """(C,) of these in the clips that were compared"""
+
+    def __post_init__(self) -> None:
+        if self.explanation not in richer_features.EXPLANATIONS:
+            raise ValueError(f"There are no terms for {self.explanation!r}.")
+        if not len(self.scene) == len(self.scene_mean) == len(self.scene_deviation):
+            raise ValueError("Every column of the scene needs a mean and a deviation.")
 
     @classmethod
     def of(cls, pairs: SegmentPairs, explanation: str, signal_names: Sequence[str], scene: Sequence[int]) -> Self:
