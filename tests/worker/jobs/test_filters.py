@@ -225,6 +225,7 @@ def test_nobody_is_refined_by_a_model_that_something_richer_explains_the_answers
     refined: bool,
 ) -> None:
     answered(20)
+    (context.store.unfinished.folder(participant.id) / "ahead-of-before").mkdir(parents=True)
     found = {} if evidence is None else {"evidence": evidence, "explanation": learned or "arrival"}
     save_model(context, participant, ModelKind.REWARD, "all labels", {"misfit": found, "further": learned})
     _, run_id = begin(context, participant, RunKind.FILTER)
