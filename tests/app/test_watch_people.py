@@ -181,6 +181,17 @@ def test_the_advice_is_shown_only_where_the_study_wants_it(
     assert ("more answers could gain" in experimenter.get("/studies/advised/participants/P01").text) is shown
 
 
+@pytest.mark.parametrize(("further", "said"), [("arrival", "the model has terms for it"), ("", "has no terms for it")])
+def test_the_experimenter_reads_whether_the_model_has_terms_for_what_explains_more(
+    experimenter: TestClient, study: Study, participant: Participant, database: Database, further: str, said: str
+) -> None:
+    found = {"misfit": {"evidence": 25.0, "explanation": "arrival"}, "further": further}
+    with database.writing() as session:
+        metrics = factories.reward_metrics() | found
+        factories.make_model(session, study, participant, ModelKind.REWARD, metrics, labels=70)
+    assert said in experimenter.get("/studies/pilot/participants/P01").text
+
+
 @pytest.mark.parametrize(("evidence", "flagged"), [([25.0], True), ([19.0], False), ([25.0, 3.0], False)])
 def test_a_model_that_does_not_fit_is_a_flag_until_a_newer_one_does(
     experimenter: TestClient,
