@@ -9,7 +9,7 @@ from app.services.answers import misfit as flag
 from tests.worker.ml.test_misfit import DISTANCE, SCENE, SPEED, STEPS, TILT, answers_to, pairs, total
 from worker.domain.trajectory import SIGNALS
 from worker.domain.type_aliases import FloatArray
-from worker.ml.rewards import misfit, model_choice, reward_training
+from worker.ml.rewards import misfit, model_choice, reward_training, richer_features
 from worker.ml.rewards.loading import load_reward_model
 from worker.ml.rewards.model_choice import fit_by_evidence
 from worker.ml.rewards.prior import Prior
@@ -103,6 +103,14 @@ def test_it_comes_back_from_its_file(pairs: SegmentPairs, on_time: FitResult) ->
 def test_a_file_with_terms_that_there_are_not_is_no_reward_model(on_time: FitResult) -> None:
     with pytest.raises(ValueError, match="no terms for 'arriver'"):
         load_reward_model(on_time.model.to_bytes().replace(b"arrival", b"arriver"))
+
+
+def test_a_file_of_a_version_with_other_terms_is_refused_in_words(
+    on_time: FitResult, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(richer_features, "KNOTS", (0, 20, 30, 40, 50))
+    with pytest.raises(ValueError, match="another version: learn it anew"):
+        load_reward_model(on_time.model.to_bytes())
 
 
 def test_to_whoever_asks_for_weights_of_signals_it_gives_those_alone(on_time: FitResult) -> None:

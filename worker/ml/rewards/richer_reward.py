@@ -45,6 +45,12 @@ class FurtherTerms:
         """The signals of which the further terms are amounts, or none."""
         return richer_features.amounts_of(self.explanation)
 
+    @property
+    def width(self) -> int:
+        """How many numbers a step has: signals and further terms."""
+        one_step = np.zeros((1, len(self.signal_names))), np.zeros((1, max(self.scene, default=0) + 1))
+        return self.added_to(*(each.astype(np.float32) for each in one_step)).shape[-1]
+
     def added_to(self, signals: Float32Array, observations: Float32Array) -> FloatArray:
         """(..., T, S), (..., T, D) from an episode's start -> (..., T, S + F)"""
         measured = np.asarray(signals, np.float64)
@@ -77,6 +83,13 @@ class RicherReward(StructuredReward):
     terms: FurtherTerms
     of_sums: FloatArray
     """(E, S) the weights without further terms: modes are searched by them, as nobody knows what modes do to terms"""
+
+    def __post_init__(self) -> None:
+        if self.weights.shape[1] != self.terms.width:
+            raise ValueError(
+                f"Terms for {self.terms.explanation!r} need {self.terms.width} weights, not {self.weights.shape[1]}. "
+                "The model is of another version: learn it anew."
+            )
 
     @classmethod
     def with_terms(cls, fitted: StructuredReward, terms: FurtherTerms, of_sums: FloatArray) -> Self:
