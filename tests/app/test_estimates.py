@@ -23,14 +23,22 @@ LABELS = 10
 _numbers = count()
 
 
-def took(session: Session, person: Participant, study: Study, kind: RunKind, seconds: float, what: str = "") -> None:
+def took(
+    session: Session,
+    person: Participant,
+    study: Study,
+    kind: RunKind,
+    seconds: float,
+    what: str = "",
+    labels: int = LABELS,
+) -> None:
     """A finished piece of work."""
     middle = f"{what}/" if what else ""
     run = factories.make_run(session, study, person, kind=kind, started_at=now() - timedelta(seconds=seconds))
-    run.workflow_id = f"{kind}/participant-{person.id}/{middle}labels-{LABELS}/answer-{next(_numbers)}"
+    run.workflow_id = f"{kind}/participant-{person.id}/{middle}labels-{labels}/answer-{next(_numbers)}"
     run.finished_at = run.started_at + timedelta(seconds=seconds)
     if kind in (RunKind.REWARD, RunKind.FILTER, RunKind.METHOD):
-        columns = {"artefact_sha256": "0" * 64, "label_count": LABELS, "label_hash": "0" * 64, "seed": 1}
+        columns = {"artefact_sha256": "0" * 64, "label_count": labels, "label_hash": "0" * 64, "seed": 1}
         metrics = {"method": what}
         model = ModelKind(kind.value)
         session.add(Model(run_id=run.id, participant_id=person.id, kind=model, metrics=metrics, **columns))
@@ -160,6 +168,18 @@ def test_other_settings_and_given_up_trainings_say_nothing(database: Database, s
         assert estimates.usual_s(session, other, RunKind.FILTER) is None
         factories.make_run(session, study, None, kind=RunKind.FILTER, started_at=now())
         assert estimates.usual_s(session, study, RunKind.FILTER) == pytest.approx(60)
+
+
+def test_a_last_filter_takes_as_long_as_other_last_filters_whatever_milestones_took(
+    database: Database, study: Study
+) -> None:
+    with database.writing() as session:
+        earlier, _ = factories.make_participant(session, study)
+        for labels in (2, 4, 6):
+            took(session, earlier, study, RunKind.FILTER, 30, labels=labels)
+        assert estimates.usual_s(session, study, RunKind.FILTER) == pytest.approx(30), "nothing nearer is known yet"
+        took(session, earlier, study, RunKind.FILTER, 90)
+        assert estimates.usual_s(session, study, RunKind.FILTER) == pytest.approx(90)
 
 
 def test_one_slow_day_does_not_spoil_the_estimate(database: Database, study: Study) -> None:

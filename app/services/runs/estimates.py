@@ -30,7 +30,8 @@ PRESENT_WITHIN = timedelta(seconds=90)
 def usual_s(session: Session, study: Study, kind: RunKind, what: str = "") -> float | None:
     """Median seconds of the newest runs of the same work: same task, same settings that matter, first attempts.
 
-    ``what``: the method that is trained, or what the films are for. Trainings that left no model were given up.
+    ``what``: the method that is trained, or what the films are for. Trainings that left no model were given up. Those
+    for all of somebody's labels count where there are any: only they are refined, and looked at for harm to the end.
     """
     runs = (
         select(Run, Study)
@@ -41,11 +42,9 @@ def usual_s(session: Session, study: Study, kind: RunKind, what: str = "") -> fl
         runs = runs.join(Model, Model.run_id == Run.id)
     rows = session.execute(runs.order_by(Run.id.desc()).limit(LOOKED_AT)).all()
     alike = {of.id: _what_matters(kind, of.settings) for of in {of for _, of in rows} | {study}}
-    seconds = [
-        (run.finished_at - run.started_at).total_seconds()
-        for run, of in rows
-        if run.finished_at and _what(run) == what and alike[of.id] == alike[study.id]
-    ]
+    same = [(run, of) for run, of in rows if _what(run) == what and alike[of.id] == alike[study.id]]
+    last = [(run, of) for run, of in same if _labels(run) == of.settings.labels_per_participant]
+    seconds = [(run.finished_at - run.started_at).total_seconds() for run, _ in last or same if run.finished_at]
     return median(seconds[:RECENT]) if seconds else None
 
 
