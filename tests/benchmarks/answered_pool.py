@@ -12,7 +12,7 @@ from worker.domain.trajectory import SIGNALS
 from worker.domain.type_aliases import FloatArray
 from worker.experiments.rollout_cache import RolloutCache
 from worker.ml import acquisition
-from worker.ml.rewards import misfit
+from worker.ml.rewards.beyond_sums import misfit
 from worker.ml.rewards.bradley_terry import probability_right
 from worker.ml.rewards.reward_training import posterior
 from worker.ml.rewards.segments import SegmentPairs

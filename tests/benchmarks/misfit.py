@@ -30,7 +30,7 @@ from worker.analysis.wilson import wilson_interval
 from worker.domain.task import Task
 from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import FloatArray
-from worker.ml.rewards import misfit
+from worker.ml.rewards.beyond_sums import misfit
 from worker.ml.teachers import Manner, Taste, User, random_taste
 from worker.sim.costs import preference_rewards
 from worker.whole_files import written_whole

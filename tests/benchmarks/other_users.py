@@ -5,8 +5,9 @@
 Per task and person: 200 answers to pairs of a pool as large as a study's, a reward model, the mode that the search
 finds for it (no trials, no residual), driven through unseen scenarios. Every episode is judged by the true wishes of
 everybody, tests/benchmarks/nonlinear_people.py and the paper's three types, so each mode also shows what it would be to
-the others. Where the model does not fit (worker.ml.rewards.misfit), the mode for the richer model that explains most is
-driven, too. On one core; finished modes are kept under --work-directory, so that it can be repeated to go on.
+the others. Where the model does not fit (worker.ml.rewards.beyond_sums.misfit), the mode for the richer model that
+explains most is driven, too. On one core; finished modes are kept under --work-directory, so that it can be repeated to
+go on.
 """
 
 import argparse
@@ -34,7 +35,7 @@ from worker.domain.trajectory import SIGNALS, Trajectory
 from worker.domain.type_aliases import FloatArray
 from worker.experiments.rollout_cache import BEHAVIOURS_PER_SCENARIO, RolloutCache
 from worker.ml.filters.response_surface import RIDGE, ResponseSurface, best_mode, monomials
-from worker.ml.rewards import misfit
+from worker.ml.rewards.beyond_sums import misfit
 from worker.ml.rewards.prior import DEVIATION, Population, Prior
 from worker.ml.rewards.reward_training import fit, posterior
 from worker.ml.rewards.segments import SegmentPairs

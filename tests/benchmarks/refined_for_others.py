@@ -39,8 +39,8 @@ from worker.ml.filters.response_surface import ResponseSurface
 from worker.ml.methods import registry as methods
 from worker.ml.methods.people import Labels
 from worker.ml.methods.registry import Setting
-from worker.ml.rewards import misfit
-from worker.ml.rewards.model_choice import fit_by_evidence
+from worker.ml.rewards.beyond_sums import misfit
+from worker.ml.rewards.beyond_sums.choice import fit_by_evidence
 from worker.ml.rewards.reward_models import RewardModel
 from worker.ml.teachers import TASTES, random_taste
 from worker.sim.costs import preference_rewards

@@ -72,7 +72,8 @@ def fit_reward(
     ``hints``: (H, S) which way the person wishes the signals, as in reward_training.fit().
     Raises ValueError for a kind there is not, and simulation.NoPredictor where the task's signals cannot be foreseen.
     """
-    from worker.ml.rewards import misfit, model_choice, reward_training
+    from worker.ml.rewards import reward_training
+    from worker.ml.rewards.beyond_sums import choice, misfit
 
     if kind not in get_args(reward_training.RewardKind):
         raise ValueError(f"There is no reward model of the kind {kind!r}.")
@@ -90,7 +91,7 @@ def fit_reward(
     }
     scene = [] if simulated is None else misfit.scene_of(simulated.observation)
     if kind == "structured":
-        fitted = model_choice.fit_by_evidence(pairs, targets, seed, scene=scene, **known)
+        fitted = choice.fit_by_evidence(pairs, targets, seed, scene=scene, **known)
     else:
         predictor = signal_predictor(task) if kind == "predicted" else None
         fitted = reward_training.fit(

@@ -13,10 +13,10 @@ IN_WORDS: Mapping[str, str] = {
     "poses": "weights that depend on how person and robot are placed at the start",
     "changing": "weights that change from the first answer to the last",
 }
-"""What explains answers, by the names of worker.ml.rewards.misfit."""
+"""What explains answers, by the names of worker.ml.rewards.beyond_sums.misfit."""
 DOUBT = 2.0
-"""Evidence from which on the structured model has further terms (worker.ml.rewards.model_choice), though it says too
-little for a flag. Who gives so much, and how many linear people do: docs/results/refined_for_others.md."""
+"""Evidence from which on the structured model has further terms (worker.ml.rewards.beyond_sums.choice), though it says
+too little for a flag. Who gives so much, and how many linear people do: docs/results/refined_for_others.md."""
 
 COARSE = frozenset({"arrival"})
 """Explanations by whose terms no filter is refined: arrival is read by the second, and a policy that goes as far as it

@@ -8,7 +8,7 @@ from app.services.answers.accuracy import ENOUGH_EVIDENCE
 from app.services.answers.misfit import IN_WORDS
 from worker.domain.trajectory import SIGNALS
 from worker.domain.type_aliases import FloatArray
-from worker.ml.rewards import misfit, richer_features
+from worker.ml.rewards.beyond_sums import explanations, misfit
 from worker.ml.rewards.bradley_terry import probability_of_answer, probability_right
 from worker.ml.rewards.segments import SegmentPairs
 from worker.ml.rewards.signal_scale import SignalScale
@@ -65,7 +65,7 @@ def test_whoever_minds_the_worst_moment_is_flagged_for_that(pairs: SegmentPairs)
 
 
 def test_whoever_wants_the_robot_neither_early_nor_late_is_flagged_for_that(pairs: SegmentPairs) -> None:
-    arrival = (pairs.signals[..., DISTANCE] < richer_features.ARRIVED_M).argmax(axis=-1)
+    arrival = (pairs.signals[..., DISTANCE] < explanations.ARRIVED_M).argmax(axis=-1)
     assert looked(pairs, answers_to(-np.abs(arrival - 35.0))) == (True, "arrival")
 
 

@@ -5,9 +5,9 @@ from typing import Any
 
 from safetensors.numpy import load
 
+from worker.ml.rewards.beyond_sums.terms import RicherReward
 from worker.ml.rewards.predicted_reward import PredictedReward
 from worker.ml.rewards.reward_models import MlpReward, Normalisation, RewardModel, StructuredReward, stored_config
-from worker.ml.rewards.richer_reward import RicherReward
 
 _KINDS: tuple[type[RewardModel], ...] = (StructuredReward, PredictedReward, RicherReward, MlpReward)
 """Those that need no torch."""

@@ -13,14 +13,14 @@ from scipy.special import softmax
 from worker.domain.trajectory import SIGNALS, Trajectory
 from worker.domain.type_aliases import FloatArray
 from worker.ml.rewards import calibration
+from worker.ml.rewards.beyond_sums.misfit import RICHER_DEVIATION
+from worker.ml.rewards.beyond_sums.terms import FurtherTerms, RicherReward
 from worker.ml.rewards.bradley_terry import probability_of_answer, probability_right, slope_of_answer
 from worker.ml.rewards.calibration import HeldOut
-from worker.ml.rewards.misfit import RICHER_DEVIATION
 from worker.ml.rewards.network_training import MlpTraining, TransformerTraining, fit_mlp, fit_transformer
 from worker.ml.rewards.predicted_reward import PredictedReward
 from worker.ml.rewards.prior import Population, Prior
 from worker.ml.rewards.reward_models import NEVER_WANTED, UNDONE, Normalisation, RewardModel, StructuredReward
-from worker.ml.rewards.richer_reward import FurtherTerms, RicherReward
 from worker.ml.rewards.segments import SegmentPairs
 from worker.ml.rewards.signal_predictor import SignalPredictor
 from worker.ml.rewards.signal_scale import SignalScale

@@ -15,7 +15,7 @@ import numpy as np
 
 from worker.domain.spaces import Space
 from worker.domain.type_aliases import FloatArray
-from worker.ml.rewards import richer_features
+from worker.ml.rewards.beyond_sums import explanations
 from worker.ml.rewards.bradley_terry import probability_of_answer, probability_right, slope_of_answer
 from worker.ml.rewards.calibration import cross_entropy
 from worker.ml.rewards.prior import DEVIATION
@@ -134,9 +134,9 @@ def further_differences(
 def further_sums(pairs: SegmentPairs, signal_names: Sequence[str], scene: Sequence[int] = ()) -> dict[str, FloatArray]:
     """The richer models' features of both sides, (N, 2, F) each."""
     columns = {name: pairs.signals[..., place].astype(np.float64) for place, name in enumerate(signal_names)}
-    mean, deviation = richer_features.usual_scene(pairs, scene)
+    mean, deviation = explanations.usual_scene(pairs, scene)
     held = (pairs.observations[:, :, 0, list(scene)].astype(np.float64) - mean) / deviation
-    return {name: each.sum(axis=-2) for name, each in richer_features.measured(columns, held).items()}
+    return {name: each.sum(axis=-2) for name, each in explanations.measured(columns, held).items()}
 
 
 def by_spread(differences: FloatArray) -> FloatArray:

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from worker.ml.rewards import misfit
+from worker.ml.rewards.beyond_sums import misfit
+from worker.ml.rewards.beyond_sums.terms import FurtherTerms
 from worker.ml.rewards.reward_training import FitResult, fit
-from worker.ml.rewards.richer_reward import FurtherTerms
 from worker.ml.rewards.segments import SegmentPairs
 from worker.ml.rewards.signal_scale import SignalScale
 

@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from worker.domain.type_aliases import Float32Array, FloatArray
-from worker.ml.rewards import richer_features
+from worker.ml.rewards.beyond_sums import explanations
 from worker.ml.rewards.reward_models import StructuredReward
 from worker.ml.rewards.segments import SegmentPairs
 from worker.ml.rewards.signal_scale import SignalScale
@@ -17,7 +17,7 @@ _MEAN, _DEVIATION, _OF_SUMS = "scene_mean", "scene_deviation", "of_sums"
 
 @dataclass(frozen=True)
 class FurtherTerms:
-    """What is read beside the signals for one explanation of richer_features. Raises ValueError for none of them."""
+    """What is read beside the signals for one of the explanations. Raises ValueError for none of them."""
 
     explanation: str
     signal_names: tuple[str, ...]
@@ -29,7 +29,7 @@ class FurtherTerms:
     """(C,) of these in the clips that were compared"""
 
     def __post_init__(self) -> None:
-        if self.explanation not in richer_features.EXPLANATIONS:
+        if self.explanation not in explanations.NAMES:
             raise ValueError(f"There are no terms for {self.explanation!r}.")
         if not len(self.scene) == len(self.scene_mean) == len(self.scene_deviation):
             raise ValueError("Every column of the scene needs a mean and a deviation.")
@@ -37,13 +37,13 @@ class FurtherTerms:
     @classmethod
     def of(cls, pairs: SegmentPairs, explanation: str, signal_names: Sequence[str], scene: Sequence[int]) -> Self:
         """For what was compared."""
-        mean, deviation = richer_features.usual_scene(pairs, scene)
+        mean, deviation = explanations.usual_scene(pairs, scene)
         return cls(explanation, tuple(signal_names), tuple(scene), mean, deviation)
 
     @property
     def amounts(self) -> tuple[str, ...]:
         """The signals of which the further terms are amounts, or none."""
-        return richer_features.amounts_of(self.explanation)
+        return explanations.amounts_of(self.explanation)
 
     @property
     def width(self) -> int:
@@ -57,7 +57,7 @@ class FurtherTerms:
         columns = {name: measured[..., place] for place, name in enumerate(self.signal_names)}
         begins = observations[..., 0, list(self.scene)].astype(np.float64)
         held = (begins - self.scene_mean) / self.scene_deviation
-        return np.concatenate([measured, richer_features.of_group(self.explanation, columns, held)], axis=-1)
+        return np.concatenate([measured, explanations.of_group(self.explanation, columns, held)], axis=-1)
 
     def completed(self, pairs: SegmentPairs) -> SegmentPairs:
         """The pairs with the further terms as signals."""

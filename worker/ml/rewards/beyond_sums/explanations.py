@@ -70,7 +70,7 @@ _GROUPS: Mapping[str, tuple[Callable[[Columns, FloatArray], FloatArray], Sequenc
     "poses": (poses, _POSED),
 }
 """What each is made of."""
-EXPLANATIONS = (*_GROUPS,)
+NAMES = (*_GROUPS,)
 """The names of the groups."""
 
 

@@ -9,13 +9,14 @@ from app.services.answers import misfit as flag
 from tests.worker.ml.test_misfit import DISTANCE, SCENE, SPEED, STEPS, TILT, answers_to, pairs, total
 from worker.domain.trajectory import SIGNALS
 from worker.domain.type_aliases import FloatArray
-from worker.ml.rewards import misfit, model_choice, reward_training, richer_features
+from worker.ml.rewards import reward_training
+from worker.ml.rewards.beyond_sums import choice, explanations, misfit
+from worker.ml.rewards.beyond_sums.choice import fit_by_evidence
+from worker.ml.rewards.beyond_sums.terms import FurtherTerms, RicherReward
 from worker.ml.rewards.loading import load_reward_model
-from worker.ml.rewards.model_choice import fit_by_evidence
 from worker.ml.rewards.prior import Prior
 from worker.ml.rewards.reward_models import NEVER_WANTED
 from worker.ml.rewards.reward_training import FitResult
-from worker.ml.rewards.richer_reward import FurtherTerms, RicherReward
 from worker.ml.rewards.segments import SegmentPairs
 from worker.ml.rewards.signal_scale import SignalScale
 
@@ -72,7 +73,7 @@ def test_weights_that_change_are_noticed_and_not_learned(pairs: SegmentPairs) ->
     turning = np.linspace(-1.0, 1.0, len(pairs))[:, None] * total(pairs, SPEED)
     result = learned(pairs, answers_to(turning, mistakes=0.0))
     assert result.metrics["misfit"]["explanation"] == misfit.CHANGING
-    assert result.metrics["misfit"]["evidence"] > model_choice.DOUBT
+    assert result.metrics["misfit"]["evidence"] > choice.DOUBT
     assert (result.metrics["further"], result.model.kind) == ("", "structured")
 
 
@@ -108,7 +109,7 @@ def test_a_file_with_terms_that_there_are_not_is_no_reward_model(on_time: FitRes
 def test_a_file_of_a_version_with_other_terms_is_refused_in_words(
     on_time: FitResult, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(richer_features, "KNOTS", (0, 20, 30, 40, 50))
+    monkeypatch.setattr(explanations, "KNOTS", (0, 20, 30, 40, 50))
     with pytest.raises(ValueError, match="another version: learn it anew"):
         load_reward_model(on_time.model.to_bytes())
 
@@ -138,4 +139,4 @@ def test_a_wider_prior_knows_of_the_signals_what_it_knew() -> None:
 
 
 def test_pages_speak_of_the_evidence_that_the_model_goes_by() -> None:
-    assert flag.DOUBT == model_choice.DOUBT
+    assert flag.DOUBT == choice.DOUBT

@@ -1,0 +1,1 @@
+"""What weighted sums do not explain."""
