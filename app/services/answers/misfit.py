@@ -6,16 +6,17 @@ from dataclasses import dataclass
 from app.domain.models import Model
 from app.services.answers.accuracy import ENOUGH_EVIDENCE
 
+CHANGING = "changing"
 IN_WORDS: Mapping[str, str] = {
     "worst_moments": "the worst moment, such as the highest speed or the hardest touch",
     "arrival": "when the robot arrives",
     "phases": "weights that differ between far away and close up",
     "poses": "weights that depend on how person and robot are placed at the start",
-    "changing": "weights that change from the first answer to the last",
+    CHANGING: "weights that change from the first answer to the last",
 }
 """What explains answers, by the names of worker.ml.rewards.beyond_sums.misfit."""
 DOUBT = 2.0
-"""Evidence from which on the structured model has further terms (worker.ml.rewards.beyond_sums.choice), though it says
+"""Evidence from which on the structured model follows it (worker.ml.rewards.beyond_sums.choice), though it says
 too little for a flag. Who gives so much, and how many linear people do: docs/results/refined_for_others.md."""
 
 COARSE = frozenset({"arrival"})
@@ -32,7 +33,7 @@ class Misfit:
     evidence: float
     """How many times as probable richer models make the answers."""
     is_learned: bool = False
-    """Whether the reward model has terms for it."""
+    """Whether the reward model follows it."""
 
     @property
     def is_shown(self) -> bool:
@@ -43,6 +44,13 @@ class Misfit:
     def may_be_refined_by(self) -> bool:
         """Whether the reward model says it well enough to be followed far."""
         return self.is_learned and self.explanation not in COARSE
+
+    @property
+    def in_model(self) -> str:
+        """What the reward model makes of it, in words."""
+        if not self.is_learned:
+            return "the model has no terms for it"
+        return "the model follows the last answers" if self.explanation == CHANGING else "the model has terms for it"
 
     @property
     def words(self) -> str:

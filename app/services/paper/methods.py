@@ -164,7 +164,9 @@ def _procedure(session: Session, study: Study) -> Iterator[str]:
         f"{count(settings.retrain_every_labels, 'answer')}"
         f", starting from {_starting_from(session, study)}.",
         "Where models with further terms (worst moments, the time of arrival, weights that differ by distance or by "
-        f"pose) made somebody's answers more than {DOUBT:g} times as probable, theirs had those that explained most."
+        f"pose) made somebody's answers more than {DOUBT:g} times as probable, theirs had those that explained most; "
+        "where that was weights that move along with the number of the answer, it had their mean over the last quarter "
+        "of the answers."
         if settings.reward_kind is RewardKind.STRUCTURED
         else "",
         f"Action filters were trained after {listed(map(str, settings.milestones))} answers and measured on "

@@ -293,6 +293,9 @@ def test_the_card_of_a_filter_says_that_its_model_does_not_fit_and_what_would() 
     assert "explained better by when the robot arrives" in note
     (note,) = notes_on_misfit(Misfit("arrival", 3.0, is_learned=True))
     assert "terms for when the robot arrives" in note
+    (note,) = notes_on_misfit(Misfit("changing", 3.0, is_learned=True))
+    assert "weights that change from the first answer to the last" in note
+    assert "over the last quarter of the answers" in note
     assert notes_on_misfit(Misfit("arrival", 3.0)) == []
     assert notes_on_misfit(None) == []
 

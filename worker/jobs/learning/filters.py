@@ -11,7 +11,7 @@ from app.domain.preferences import count_labels
 from app.domain.studies import Participant, Study
 from app.errors import AppError
 from app.services.answers import accuracy
-from app.services.answers.misfit import Misfit, doubt_of
+from app.services.answers.misfit import CHANGING, Misfit, doubt_of
 from app.services.exports.export_formats import provenance_of
 from app.services.monitoring import dashboard
 from app.services.participants import visits
@@ -181,6 +181,11 @@ def notes_on_misfit(misfit: Misfit | None) -> Sequence[str]:
     """What the model card has to say about a reward model that does not fit the person."""
     if misfit is None or not (misfit.is_learned or misfit.is_shown):
         return []
+    if misfit.is_learned and misfit.explanation == CHANGING:
+        return [
+            f"This person's answers are explained better by {misfit.words}. The reward model behind this filter has "
+            "their mean over the last quarter of the answers."
+        ]
     if misfit.is_learned:
         return [
             f"Weighted signals alone explain this person's answers less well than with terms for {misfit.words}, which "

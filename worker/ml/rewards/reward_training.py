@@ -13,8 +13,9 @@ from scipy.special import softmax
 from worker.domain.trajectory import SIGNALS, Trajectory
 from worker.domain.type_aliases import FloatArray
 from worker.ml.rewards import calibration
+from worker.ml.rewards.beyond_sums.changing import ChangingWeights
 from worker.ml.rewards.beyond_sums.misfit import RICHER_DEVIATION
-from worker.ml.rewards.beyond_sums.terms import FurtherTerms, RicherReward
+from worker.ml.rewards.beyond_sums.terms import FurtherTerms
 from worker.ml.rewards.bradley_terry import probability_of_answer, probability_right, slope_of_answer
 from worker.ml.rewards.calibration import HeldOut
 from worker.ml.rewards.network_training import MlpTraining, TransformerTraining, fit_mlp, fit_transformer
@@ -61,7 +62,7 @@ def fit(
     predictor: SignalPredictor | None = None,
     mattered: npt.ArrayLike | None = None,
     hints: npt.ArrayLike | None = None,
-    further: FurtherTerms | None = None,
+    further: FurtherTerms | ChangingWeights | None = None,
 ) -> FitResult:
     """Fit an ensemble to N pairs and their targets P(right preferred) in {0, 1/2, 1}.
 
@@ -76,7 +77,7 @@ def fit(
     linear in signals. The answer is then heard once more, about these signals alone.
     ``hints``: (H, S) which way somebody wishes the signals, for the same kinds: -1 less, 1 more, 0 neither. Each is
     heard as one more answer, between clips that differ in these signals alone.
-    ``further``: terms beside the signals, for the structured kind.
+    ``further``: what is read beside the signals, for the structured kind.
     Raises ValueError for targets outside {0, 1/2, 1}, a count that differs from the pairs', or a missing predictor.
     """
     started = time.perf_counter()
@@ -98,7 +99,7 @@ def fit(
             richer, found = _fit_structured(
                 completed, answers, seed, spread, known, signal_names, unwanted, extra.widened(more)
             )
-            model = RicherReward.with_terms(richer, further, linear.weights)
+            model = further.reward(richer, linear)
     elif kind == "predicted":
         if predictor is None:
             raise ValueError("The kind 'predicted' needs a predictor of the signals.")

@@ -147,7 +147,12 @@ def by_spread(differences: FloatArray) -> FloatArray:
 
 
 def changing(sums: FloatArray) -> FloatArray:
-    """(N, S) the sums times the answer's number, in deviations from the middle one."""
-    order = np.arange(len(sums)) - (len(sums) - 1) / 2
-    moved: FloatArray = sums * (order / order.std())[:, None]
+    """(N, S) the sums times the answer's number."""
+    moved: FloatArray = sums * order(len(sums))[:, None]
     return moved
+
+
+def order(answers: int) -> FloatArray:
+    """(N,) the number of each answer, in deviations from the middle one."""
+    number = np.arange(answers) - (answers - 1) / 2
+    return np.asarray(number / number.std(), np.float64)

@@ -49,7 +49,7 @@ class FurtherTerms:
     def width(self) -> int:
         """How many numbers a step has: signals and further terms."""
         one_step = np.zeros((1, len(self.signal_names))), np.zeros((1, max(self.scene, default=0) + 1))
-        return self.added_to(*(each.astype(np.float32) for each in one_step)).shape[-1]
+        return int(self.added_to(*(each.astype(np.float32) for each in one_step)).shape[-1])
 
     def added_to(self, signals: Float32Array, observations: Float32Array) -> FloatArray:
         """(..., T, S), (..., T, D) from an episode's start -> (..., T, S + F)"""
@@ -73,6 +73,10 @@ class FurtherTerms:
             np.append(known.least_per_step, -unlimited),
             np.append(known.most_per_step, unlimited),
         )
+
+    def reward(self, fitted: StructuredReward, linear: StructuredReward) -> "RicherReward":
+        """From what was fitted to completed pairs, and to them without further terms."""
+        return RicherReward.with_terms(fitted, self, linear.weights)
 
 
 @dataclass(frozen=True, kw_only=True)
