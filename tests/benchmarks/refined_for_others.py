@@ -3,9 +3,10 @@
     python -m tests.benchmarks.refined_for_others
 
 First, in minutes: in how many people of each kind something richer explains the answers so well that the reward model
-has terms for it. Then per task and person of tests/benchmarks/nonlinear_people.py: 200 answers, the reward model of a
-study, the quick filter and the refined one, driven through unseen scenarios beside the reference policy and judged by
-what they truly want. On one core at the lowest priority; what has a row is never run again.
+follows it, and what is foreseen of their wishes by that (tests/benchmarks/doubt.py). Then per task and person of
+tests/benchmarks/nonlinear_people.py: 200 answers, the reward model of a study, the quick filter and the refined one,
+driven through unseen scenarios beside the reference policy and judged by what they truly want. On one core at the
+lowest priority; what has a row is never run again.
 """
 
 import argparse
@@ -21,16 +22,16 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from app.services.answers.accuracy import ENOUGH_EVIDENCE, wilson
-from app.services.answers.misfit import DOUBT
+from app.services.answers.accuracy import ENOUGH_EVIDENCE
+from tests.benchmarks import doubt
 from tests.benchmarks.answered_pool import Answered, AnsweredPool
+from tests.benchmarks.doubt import ANSWERS
 from tests.benchmarks.nonlinear_people import ON_TIME_S, PEOPLE, Person
 from tests.benchmarks.rivals_report import gains_of, gains_text, successes_of, successes_text
 from worker.analysis.comparison import result_pages
 from worker.compute import learning, simulation
-from worker.compute.population import prior_of
 from worker.domain.scenarios import EVALUATION, first_of
-from worker.domain.trajectory import SIGNALS, Trajectory
+from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import FloatArray
 from worker.experiments.benchmark_person import BenchmarkPerson
 from worker.experiments.rollout_cache import RolloutCache
@@ -40,19 +41,12 @@ from worker.ml.methods import registry as methods
 from worker.ml.methods.people import Labels
 from worker.ml.methods.registry import Setting
 from worker.ml.rewards.beyond_sums import misfit
-from worker.ml.rewards.beyond_sums.choice import fit_by_evidence
-from worker.ml.rewards.reward_models import RewardModel
-from worker.ml.teachers import TASTES, random_taste
-from worker.sim.costs import preference_rewards
+from worker.ml.teachers import TASTES
 from worker.tasks import registry
 from worker.whole_files import written_whole
 
 TITLE = "# What filters give people who are not linear"
 QUICK, REFINED = "pbarl", "pbarl_refined"
-ANSWERS = 200
-LOOKED_AFTER = (60, 100, 200)
-"""answers; fewer are not looked at"""
-LINEAR, SEED = "linear", 78
 Row = Mapping[str, Any]
 
 
@@ -69,7 +63,7 @@ def main() -> None:
     for task in options.tasks:
         bench = Bench(task, options.work_directory / "rollouts")
         if not _rows(counted, task):
-            _append(counted, bench.in_doubt(options.of_a_kind, options.linear))
+            _append(counted, doubt.counted(bench.pool, doubt.kinds(options.linear, options.of_a_kind)))
         for seed, _, name, method in tqdm([each for each in missing if each[1] == task], unit="filter"):
             _append(table, [bench.row(PEOPLE[name], seed, method, options.scenarios)])
             _report(options.output, counted)
@@ -82,32 +76,6 @@ class Bench:
     def __init__(self, task: str, rollouts: Path) -> None:
         self.pool = AnsweredPool(task, rollouts)
         self.cache = RolloutCache(task, rollouts)
-
-    def in_doubt(self, of_a_kind: int, linear: int) -> list[Row]:
-        """How many people of each kind give more evidence than DOUBT, by the number of their answers."""
-        drawn = [self._linear(number) for number in range(linear)]
-        kinds = {LINEAR: [(each, 0) for each in drawn]}
-        kinds |= {name: [(person, seed) for seed in range(of_a_kind)] for name, person in PEOPLE.items()}
-        return [self._counted(name, people) for name, people in tqdm(kinds.items(), unit="kind")]
-
-    def _linear(self, number: int) -> Person:
-        taste = random_taste(f"{LINEAR}-{number}", np.random.default_rng([number, SEED]))
-        return Person(
-            taste.name,
-            lambda task, seen: preference_rewards(
-                task, seen.costs, seen.signals, taste.omega, per_signal=taste.per_signal
-            ),
-        )
-
-    def _counted(self, kind: str, people: Sequence[tuple[Person, int]]) -> Row:
-        found = []
-        for person, seed in people:
-            answered = self.pool.answered(person, ANSWERS, seed)
-            found.append([misfit.evidence(self.pool.ratios(answered, count)) > DOUBT for count in LOOKED_AFTER])
-        counts = dict(zip(LOOKED_AFTER, np.sum(found, axis=0).tolist(), strict=True))
-        return {"task": self.pool.task.name, "kind": kind, "people": len(people)} | {
-            f"after_{count}": number for count, number in counts.items()
-        }
 
     def row(self, person: Person, seed: int, method: str, scenarios: int) -> Row:
         """Answer, learn, fit, drive, judge."""
@@ -139,7 +107,7 @@ class Bench:
     def _setting(self, person: Person, answered: Answered, seed: int) -> Setting:
         pool, task = self.pool, self.pool.task
         labels = Labels(pool.segments.take(answered.rows), answered.answers)
-        learn = partial(self._learned, seed=seed)
+        learn = partial(doubt.learned, pool, seed=seed)
         asked = BenchmarkPerson(
             TASTES["neutral"],  # nobody asks for it: what is wanted is said by the function
             labels,
@@ -163,20 +131,6 @@ class Bench:
             make_env=registry.environment_class(task.name),
             person=asked,
         )
-
-    def _learned(self, labels: Labels, seed: int) -> RewardModel:
-        """As a study's worker learns it."""
-        name, scale = self.pool.task.name, self.pool.scale
-        return fit_by_evidence(
-            labels.pairs,
-            labels.targets,
-            seed,
-            scale=scale,
-            signal_names=SIGNALS,
-            scene=misfit.scene_of(self.pool.task.observation),
-            prior=prior_of(name, scale.spread),
-            reference=simulation.reference_rollouts(name),
-        ).model
 
 
 def _worst(episodes: Sequence[Trajectory]) -> float:
@@ -202,23 +156,8 @@ def _append(table: Path, more: Sequence[Row]) -> None:
 
 def _report(output: Path, counted: Path) -> None:
     page = output.with_suffix(".md")
-    tables = f"{_of_doubt(_rows(counted))}\n{_of_filters(_rows(output.with_suffix('.csv')))}"
+    tables = f"{doubt.table(_rows(counted))}\n{_of_filters(_rows(output.with_suffix('.csv')))}"
     page.write_text(result_pages.page(page, TITLE, tables))
-
-
-def _of_doubt(rows: Sequence[Row]) -> str:
-    lines = [
-        "| task | people | of | " + " | ".join(f"in doubt after {count} answers" for count in LOOKED_AFTER) + " |",
-        "|---" * (3 + len(LOOKED_AFTER)) + "|",
-    ]
-    for row in rows:
-        people = int(row["people"])
-        shares = (wilson(int(row[f"after_{count}"]), people) for count in LOOKED_AFTER)
-        said = " | ".join(
-            f"{each.correct / each.scored:.0%} [{100 * each.low:.0f}, {100 * each.high:.0f}]" for each in shares
-        )
-        lines.append(f"| {row['task']} | {row['kind']} | {people} | {said} |")
-    return "\n".join(lines) + "\n"
 
 
 def _of_filters(rows: Sequence[Row]) -> str:
