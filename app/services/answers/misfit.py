@@ -19,10 +19,6 @@ DOUBT = 2.0
 """Evidence from which on the structured model follows it (worker.ml.rewards.beyond_sums.choice), though it says
 too little for a flag. Who gives so much, and how many linear people do: docs/results/refined_for_others.md."""
 
-COARSE = frozenset({"arrival"})
-"""Explanations by whose terms no filter is refined: arrival is read by the second, and a policy that goes as far as it
-is led lost much for whom that matters, most likely by some tenths (docs/results/refined_for_others.md)."""
-
 
 @dataclass(frozen=True)
 class Misfit:
@@ -39,11 +35,6 @@ class Misfit:
     def is_shown(self) -> bool:
         """Whether there is enough evidence for a flag."""
         return self.evidence >= ENOUGH_EVIDENCE
-
-    @property
-    def may_be_refined_by(self) -> bool:
-        """Whether the reward model says it well enough to be followed far."""
-        return self.is_learned and self.explanation not in COARSE
 
     @property
     def in_model(self) -> str:

@@ -212,7 +212,7 @@ def test_the_last_filter_goes_on_from_what_is_made_ahead_and_leaves_whoever_stil
 
 @pytest.mark.parametrize(
     ("evidence", "learned", "refined"),
-    [(None, "", True), (1.9, "", True), (2.1, "", False), (2.1, "phases", True), (30.0, "arrival", False)],
+    [(None, "", True), (1.9, "", True), (2.1, "", False), (2.1, "phases", True), (30.0, "arrival", True)],
 )
 def test_nobody_is_refined_by_a_model_that_something_richer_explains_the_answers_twice_as_well_as(
     context: WorkerContext,

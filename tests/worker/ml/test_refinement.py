@@ -129,6 +129,19 @@ def test_a_refined_policy_that_is_hardly_better_than_the_mode_leaves_it_to_a_res
     assert is_kept or (gated.weights == GATED and "no better" in gated.notes[-1])
 
 
+@pytest.mark.parametrize(("against", "is_kept"), [(0, True), (2, False)])
+def test_a_refined_policy_stays_only_where_the_answers_say_clearly_that_it_is_better(
+    reference: list[Trajectory], learned: FilterDraft, against: int, is_kept: bool
+) -> None:
+    """The reward model's mean always says so; two of its eight members may say the contrary."""
+    liked = np.where(np.arange(REWARD.size) < against, -1.0, 1.0)
+    doubtful = replace(REWARD, weights=REWARD.weights * liked[:, None])
+    gated = gate_refined(problem(doubtful), [learned], reference, collect)
+    assert gated.trials[0].preference > 0.0
+    assert bool(gated.weights.refined) == is_kept
+    assert ("do not say clearly enough" in gated.notes[-1]) != is_kept
+
+
 def test_a_refined_policy_that_loses_the_task_leaves_the_filter_as_it_was(reference: list[Trajectory]) -> None:
     def failing(act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
         return [replace(each, success=False) for each in collect(act, scenarios, noise, seed)]

@@ -45,7 +45,7 @@ def refine(context: WorkerContext, run_id: int, job: Job, reward: str, draft: st
     if not fits.is_refined(settings, job, shared):
         return draft
     doubt = doubt_of([newest] if newest else [])
-    if doubt and not doubt.may_be_refined_by:
+    if doubt and not doubt.is_learned:
         _clear_away(context, job)
         return context.store.put(_unrefined(fits.load_draft(context, draft), doubt).to_bytes())
     lane = Lane.PATIENT if shared else Lane.LEARNING  # somebody waits for their last filter

@@ -29,6 +29,8 @@ class GateTrial:
     """95 % of the episodes stay below this force on the person"""
     refined: bool = False
     """whether it was the person's refined policy, in place of mode and residual"""
+    chance: float | None = None
+    """that it raises the return, as the members of the reward model see it; None: of an earlier version"""
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """Trying a filter on held-out scenarios, and what makes it acceptable: better for the person, task and forces kept."""
 
 from collections.abc import Sequence
+from statistics import NormalDist
 
 import numpy as np
 
@@ -8,6 +9,7 @@ from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import Act, FloatArray
 from worker.ml.filters.filter_draft import FilterDraft, GateTrial
 from worker.ml.filters.filter_problem import Collect, FilterProblem
+from worker.ml.rewards.reward_models import RewardModel
 
 
 def try_on(
@@ -35,7 +37,19 @@ def trial_of(
     before, after = problem.reward.returns(reference), problem.reward.returns(filtered)
     unit = max(float(before.std()), 1e-9)
     success = float((successes(filtered) - successes(reference)).mean())
-    return GateTrial(gate, residual_share, float((after - before).mean()) / unit, success, _p95_force_n(filtered))
+    gain = float((after - before).mean()) / unit
+    chance = chance_of_gain(problem.reward, reference, filtered)
+    return GateTrial(gate, residual_share, gain, success, _p95_force_n(filtered), chance=chance)
+
+
+def chance_of_gain(reward: RewardModel, reference: Sequence[Trajectory], filtered: Sequence[Trajectory]) -> float:
+    """That the mean return is larger than the reference policy's, taking the members for draws of a normal posterior.
+
+    Of the same scenarios. How far they are like others is not in it: that is what trials in many of them are for.
+    """
+    gains = (reward.member_returns(filtered) - reward.member_returns(reference)).mean(axis=1)
+    deviation = float(gains.std())
+    return NormalDist().cdf(float(gains.mean()) / deviation) if deviation else float(gains.mean() > 0.0)
 
 
 def signal_changes(reference: Sequence[Trajectory], filtered: Sequence[Trajectory]) -> FloatArray:

@@ -101,6 +101,13 @@ class RewardModel(ABC):
         """Mean over members of the summed normalised rewards of each trajectory, (N,)."""
         return np.array([self.rewards_of(trajectory).sum() for trajectory in trajectories])
 
+    def member_returns(self, trajectories: Sequence[Trajectory]) -> FloatArray:
+        """Summed normalised rewards of each trajectory under every member, (E, N)."""
+        of_steps = (
+            self.episode_rewards(each.signals, each.observations[: len(each)], each.actions) for each in trajectories
+        )
+        return np.stack([rewards.sum(axis=-1) for rewards in of_steps], axis=1)
+
     def rewards_of(self, trajectory: Trajectory) -> FloatArray:
         """Mean over members of the normalised reward of every step, (T,)."""
         steps = len(trajectory)
@@ -141,12 +148,12 @@ class RewardModel(ABC):
         sums = np.array([each.signals.sum(axis=0, dtype=np.float64) for each in reference])
         scale = np.maximum(sums.std(axis=0), 1e-9)
         features = (sums - sums.mean(axis=0)) / scale
-        returns = np.array([self._member_returns(each) for each in reference])
+        returns = np.array([self._returns_of(each) for each in reference])
         gram = features.T @ features + np.eye(features.shape[1])
         weights: FloatArray = np.linalg.solve(gram, features.T @ (returns - returns.mean(axis=0))).T / scale
         return np.where(sums.std(axis=0) > 1e-9, weights, 0.0)
 
-    def _member_returns(self, trajectory: Recorded) -> FloatArray:
+    def _returns_of(self, trajectory: Recorded) -> FloatArray:
         """(E,)"""
         steps = len(trajectory)
         rewards = self.step_rewards(trajectory.signals, trajectory.observations[:steps], trajectory.actions)
