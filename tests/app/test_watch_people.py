@@ -181,11 +181,24 @@ def test_the_advice_is_shown_only_where_the_study_wants_it(
     assert ("more answers could gain" in experimenter.get("/studies/advised/participants/P01").text) is shown
 
 
-@pytest.mark.parametrize(("further", "said"), [("arrival", "the model has terms for it"), ("", "has no terms for it")])
-def test_the_experimenter_reads_whether_the_model_has_terms_for_what_explains_more(
-    experimenter: TestClient, study: Study, participant: Participant, database: Database, further: str, said: str
+@pytest.mark.parametrize(
+    ("explanation", "further", "said"),
+    [
+        ("arrival", "arrival", "the model has terms for it"),
+        ("changing", "changing", "the model follows the last answers"),
+        ("arrival", "", "the model has no terms for it"),
+    ],
+)
+def test_the_experimenter_reads_what_the_model_makes_of_what_explains_more(
+    experimenter: TestClient,
+    study: Study,
+    participant: Participant,
+    database: Database,
+    explanation: str,
+    further: str,
+    said: str,
 ) -> None:
-    found = {"misfit": {"evidence": 25.0, "explanation": "arrival"}, "further": further}
+    found = {"misfit": {"evidence": 25.0, "explanation": explanation}, "further": further}
     with database.writing() as session:
         metrics = factories.reward_metrics() | found
         factories.make_model(session, study, participant, ModelKind.REWARD, metrics, labels=70)
