@@ -120,7 +120,8 @@ def test_work_under_way_is_abandoned_and_neither_draft_nor_late_result_nor_note_
     with context.database.reading() as session:
         assert erasure.unfinished(session) == [participant.id]
     work.may_go_on.set()
-    assert until(lambda: erase(runner, settings, participant.id))
+    erased = until(lambda: erase(runner, settings, participant.id))
+    assert erased, (runner.in_hand, [(each.workflow_id, each.status) for each in DBOS.list_workflows()])
     assert traces(settings) == []
     assert DBOS.list_workflows() == []
     with context.database.reading() as session:
