@@ -97,13 +97,14 @@ def test_what_was_made_for_somebody_whom_another_worker_has_erased_is_removed(
     assert not store.unfinished.folder(job.participant).exists()
 
 
-def test_work_may_begin_while_it_is_looked_for_what_is_left(runner: JobRunner) -> None:
+def test_work_may_begin_while_it_is_looked_for_what_is_left(runner: JobRunner, monkeypatch: pytest.MonkeyPatch) -> None:
     class Beginning(set[str]):
         def __contains__(self, key: object) -> bool:
             runner.stored.setdefault("filter/participant-9/labels-10", set())
             return True
 
-    runner.in_hand, runner.stored = Beginning(), {"filter/participant-8/labels-10": set()}
+    monkeypatch.setattr(runner, "in_hand", Beginning())
+    monkeypatch.setattr(runner, "stored", {"filter/participant-8/labels-10": set()})
     runner.leave_nothing_of_erased()
     assert len(runner.stored) == 2
 
