@@ -10,7 +10,7 @@ from typing import Any
 from worker.analysis.comparison import result_pages
 from worker.analysis.comparison.comparison_rows import REFERENCE, Row, compared
 from worker.analysis.comparison.published import published
-from worker.analysis.comparison.table_files import DESCRIPTIONS, METHOD, Tables, read
+from worker.analysis.comparison.table_files import DESCRIPTIONS, Tables, default_in, read
 
 TOLERANCE = 0.05
 """Largest loss of success with which a method counts as keeping the task."""
@@ -47,9 +47,14 @@ def generated(tables: Tables, made: Mapping[str, Any]) -> str:
     return "\n\n".join(part for part in parts if part)
 
 
+def _default(tables: Tables) -> str:
+    return default_in({row["method"] for row in tables["table1"]})
+
+
 def _claim(tables: Tables) -> str:
     """The paper's sentence, "PbARL keeps the task and raises the preference", with every exception by name."""
-    rows = [row for row in tables["table1"] if row["method"] == METHOD]
+    default = _default(tables)
+    rows = [row for row in tables["table1"] if row["method"] == default]
     if not rows:
         return ""
     failing = {
@@ -61,7 +66,7 @@ def _claim(tables: Tables) -> str:
         "raises R-hat (interval above 0)": [row for row in rows if row["preference_delta_low"] <= 0],
         "raises r^H (interval above 0)": [row for row in rows if row["true_preference_delta_low"] <= 0],
     }
-    lines = [f"## `{METHOD}`, cell by cell", ""]
+    lines = [f"## `{default}`, cell by cell", ""]
     for claim, failed in failing.items():
         names = [f"{row['task']}, {row['user']}" for row in failed]
         lines += _counted(f"{claim}: {len(rows) - len(failed)} of {len(rows)}", names)
@@ -73,9 +78,10 @@ def _baselines(tables: Tables) -> str:
     rows = tables["paired"]
     if not rows:
         return ""
+    default = _default(tables)
     lines = [
-        f"## Where a baseline is better than `{METHOD}`",
-        f"Differences `{METHOD}` minus baseline, paired by scenario, in the seeds that both were run with.",
+        f"## Where a baseline is better than `{default}`",
+        f"Differences `{default}` minus baseline, paired by scenario, in the seeds that both were run with.",
         "Ahead and behind: by more than the 95 % interval.",
         "",
     ]
@@ -107,9 +113,10 @@ def _personal(tables: Tables, groups: Sequence[Sequence[str]]) -> str:
             parts.append(_group(own) + ("\n\n" + _matrix(of_group) if number == 0 else ""))
     if not parts:
         return ""
+    method = _default(tables)
     introduction = f"""\
 ## Whose filter serves whom
-Every user of a task is served by every `{METHOD}` filter of the group. Gains are changes of that user's true return, in
+Every user of a task is served by every `{method}` filter of the group. Gains are changes of that user's true return, in
 % of what they mind and like under the reference policy; the own filter's advantage is over the best of somebody else's
 in the group, chosen on the same scenarios. Success is in points. Everybody for everybody:
 [personalisation.csv](personalisation.csv)."""

@@ -7,7 +7,7 @@ new measurement (``python -m tests.benchmarks.comparison_report docs/results/all
 import csv
 import io
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +23,8 @@ from worker.analysis.comparison.comparison_rows import (
     table_rows,
 )
 
-METHOD, BASELINES = "pbarl", ("prefft", "prefft_anchored", "pbrl_hri")
-"""The studio's default, and the baselines it is paired with scenario by scenario."""
+METHOD, REFINED, BASELINES = "pbarl", "pbarl_refined", ("prefft", "prefft_anchored", "pbrl_hri")
+"""The studio's default, what it is with a refinement, and the baselines it is paired with scenario by scenario."""
 
 Tables = Mapping[str, Sequence[Row]]
 """By name of the file, without .csv"""
@@ -44,16 +44,22 @@ _TEXTS = {"task", "user", "method", "baseline", "trained_for", "judged_by", "ite
 
 def tables(cells: Cells, groups: Sequence[Sequence[str]], users: Sequence[Row]) -> Tables:
     """All of them. ``groups``: users who are compared with each other; ``users``: the rows of users.csv."""
+    default = default_in({method for _, _, method in cells})
     return {
         "table1": table_rows(cells),
-        "paired": [row for baseline in BASELINES for row in against(cells, METHOD, baseline)],
-        "personalisation": personalisation_rows(cells, METHOD, groups),
-        "seeds": seed_rows(cells, METHOD, groups),
+        "paired": [row for baseline in BASELINES for row in against(cells, default, baseline)],
+        "personalisation": personalisation_rows(cells, default, groups),
+        "seeds": seed_rows(cells, default, groups),
         "costs": cost_rows(cells),
         "effort": spent_rows(cells),
         "fits": fit_rows(cells),
         "users": users,
     }
+
+
+def default_in(methods: Container[str]) -> str:
+    """The studio's default among these: refined where nothing else of it was run."""
+    return REFINED if REFINED in methods and METHOD not in methods else METHOD
 
 
 def to_csv(rows: Sequence[Row]) -> str:
