@@ -111,6 +111,14 @@ def test_a_file_with_terms_that_there_are_not_is_no_reward_model(on_time: FitRes
         load_reward_model(on_time.model.to_bytes().replace(b"arrival", b"arriver"))
 
 
+def test_a_file_that_names_signals_or_columns_which_there_are_not_costs_no_memory(on_time: FitResult) -> None:
+    assert isinstance(on_time.model, RicherReward)
+    with pytest.raises(ValueError, match="need the signals distance_m"):
+        replace(on_time.model.terms, signal_names=("speed_m_s",))
+    far_away = replace(on_time.model.terms, scene=(10**15,), scene_mean=np.zeros(1), scene_deviation=np.ones(1))
+    assert far_away.width == on_time.model.terms.width
+
+
 def test_a_file_of_a_version_with_other_terms_is_refused_in_words(
     on_time: FitResult, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -79,6 +79,11 @@ def of_group(name: str, signals: Columns, scene: FloatArray) -> FloatArray:
     return _GROUPS[name][0](signals, scene)
 
 
+def read_by(name: str) -> Sequence[str]:
+    """The signals that the group of this name is made of."""
+    return _GROUPS[name][1]
+
+
 def amounts_of(name: str) -> tuple[str, ...]:
     """The signals of which the group's features are amounts, in their order; none: they are no amounts of a signal."""
     return {"worst_moments": _MOMENTS, "phases": (*_PHASED, *_PHASED)}.get(name, ())

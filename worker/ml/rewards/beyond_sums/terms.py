@@ -31,6 +31,8 @@ class FurtherTerms:
     def __post_init__(self) -> None:
         if self.explanation not in explanations.NAMES:
             raise ValueError(f"There are no terms for {self.explanation!r}.")
+        if missing := {*explanations.read_by(self.explanation)} - {*self.signal_names}:
+            raise ValueError(f"Terms for {self.explanation!r} need the signals {', '.join(sorted(missing))}.")
         if not len(self.scene) == len(self.scene_mean) == len(self.scene_deviation):
             raise ValueError("Every column of the scene needs a mean and a deviation.")
 
@@ -48,8 +50,9 @@ class FurtherTerms:
     @property
     def width(self) -> int:
         """How many numbers a step has: signals and further terms."""
-        one_step = np.zeros((1, len(self.signal_names))), np.zeros((1, max(self.scene, default=0) + 1))
-        return int(self.added_to(*(each.astype(np.float32) for each in one_step)).shape[-1])
+        nothing = {name: np.zeros(1) for name in self.signal_names}
+        further = explanations.of_group(self.explanation, nothing, np.zeros(len(self.scene)))
+        return len(self.signal_names) + int(further.shape[-1])
 
     def added_to(self, signals: Float32Array, observations: Float32Array) -> FloatArray:
         """(..., T, S), (..., T, D) from an episode's start -> (..., T, S + F)"""
