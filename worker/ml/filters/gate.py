@@ -9,7 +9,6 @@ from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import Act, FloatArray
 from worker.ml.filters.filter_draft import FilterDraft, GateTrial
 from worker.ml.filters.filter_problem import Collect, FilterProblem
-from worker.ml.rewards.reward_models import RewardModel
 
 
 def try_on(
@@ -34,20 +33,19 @@ def trial_of(
     filtered: Sequence[Trajectory],
 ) -> GateTrial:
     """What rollouts say, beside the reference policy's of the same scenarios."""
-    before, after = problem.reward.returns(reference), problem.reward.returns(filtered)
-    unit = max(float(before.std()), 1e-9)
+    before, after = (problem.reward.member_returns(driven) for driven in (reference, filtered))
+    gains = (after - before).mean(axis=1)
+    unit = max(float(before.mean(axis=0).std()), 1e-9)
     success = float((successes(filtered) - successes(reference)).mean())
-    gain = float((after - before).mean()) / unit
-    chance = chance_of_gain(problem.reward, reference, filtered)
-    return GateTrial(gate, residual_share, gain, success, _p95_force_n(filtered), chance=chance)
+    force = _p95_force_n(filtered)
+    return GateTrial(gate, residual_share, float(gains.mean()) / unit, success, force, chance=chance_of_gain(gains))
 
 
-def chance_of_gain(reward: RewardModel, reference: Sequence[Trajectory], filtered: Sequence[Trajectory]) -> float:
-    """That the mean return is larger than the reference policy's, taking the members for draws of a normal posterior.
+def chance_of_gain(gains: FloatArray) -> float:
+    """That the mean gain is above 0, taking those of the reward model's members, (E,), for draws of a normal posterior.
 
-    Of the same scenarios. How far they are like others is not in it: that is what trials in many of them are for.
+    Of the scenarios at hand. How far they are like others is not in it: that is what trials in many of them are for.
     """
-    gains = (reward.member_returns(filtered) - reward.member_returns(reference)).mean(axis=1)
     deviation = float(gains.std())
     return NormalDist().cdf(float(gains.mean()) / deviation) if deviation else float(gains.mean() > 0.0)
 
