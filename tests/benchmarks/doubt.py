@@ -11,7 +11,7 @@ from tqdm import tqdm
 from app.services.answers.accuracy import wilson
 from app.services.answers.misfit import DOUBT
 from tests.benchmarks.answered_pool import Answered, AnsweredPool
-from tests.benchmarks.nonlinear_people import PEOPLE, Person
+from tests.benchmarks.nonlinear_people import PEOPLE, Person, of_taste
 from worker.compute import simulation
 from worker.compute.population import prior_of
 from worker.domain.trajectory import SIGNALS
@@ -22,7 +22,6 @@ from worker.ml.rewards.beyond_sums import misfit
 from worker.ml.rewards.beyond_sums.choice import fit_by_evidence
 from worker.ml.rewards.reward_models import RewardModel
 from worker.ml.teachers import random_taste
-from worker.sim.costs import preference_rewards
 
 ANSWERS = 200
 LOOKED_AFTER = (60, 100, ANSWERS)
@@ -93,10 +92,7 @@ def _foreseen(row: Row, count: int) -> str:
 
 def _linear(number: int) -> Person:
     taste = random_taste(f"{LINEAR}-{number}", np.random.default_rng([number, SEED]))
-    return Person(
-        taste.name,
-        lambda task, seen: preference_rewards(task, seen.costs, seen.signals, taste.omega, per_signal=taste.per_signal),
-    )
+    return Person(taste.name, of_taste(taste))
 
 
 def _counted(pool: AnsweredPool, kind: Kind) -> Row:

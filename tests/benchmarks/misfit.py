@@ -15,7 +15,6 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -24,15 +23,11 @@ from tqdm import tqdm
 from app.services.answers.accuracy import ENOUGH_EVIDENCE
 from tests.benchmarks import answered_pool
 from tests.benchmarks.answered_pool import AnsweredPool
-from tests.benchmarks.nonlinear_people import ON_TIME_S, PEOPLE, Person, as_type
+from tests.benchmarks.nonlinear_people import ON_TIME_S, PEOPLE, Person, as_type, of_taste
 from worker.analysis.comparison import result_pages
 from worker.analysis.wilson import wilson_interval
-from worker.domain.task import Task
-from worker.domain.trajectory import Trajectory
-from worker.domain.type_aliases import FloatArray
 from worker.ml.rewards.beyond_sums import misfit
-from worker.ml.teachers import Manner, Taste, User, random_taste
-from worker.sim.costs import preference_rewards
+from worker.ml.teachers import Manner, User, random_taste
 from worker.whole_files import written_whole
 
 TITLE = "# Whether the studio notices that a model does not fit"
@@ -74,19 +69,12 @@ def everybody(seed: int) -> Iterator[tuple[str, str, Person]]:
     """Name, mistakes as written in the table, and the person; of the population somebody else with every seed."""
     linear = {user.value: Person(user.value, as_type(user)) for user in User}
     somebody = random_taste(f"person-{seed}", np.random.default_rng([seed, 31]))
-    linear["population"] = Person("population", _wishes_of(somebody))
+    linear["population"] = Person("population", of_taste(somebody))
     for name, person in linear.items():
         for mistakes in MISTAKES:
             yield name, f"{mistakes:.2f}", replace(person, manner=Manner(mistakes=mistakes))
     for name, person in PEOPLE.items():
         yield name, "", person
-
-
-def _wishes_of(taste: Taste) -> Any:
-    def wishes(task: Task, episode: Trajectory) -> FloatArray:
-        return preference_rewards(task, episode.costs, episode.signals, taste.omega, "calibrated", taste.per_signal)
-
-    return wishes
 
 
 def _looked_at(pool: AnsweredPool, name: str, mistakes: str, person: Person, seed: int) -> Row:

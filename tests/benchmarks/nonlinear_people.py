@@ -20,7 +20,7 @@ from worker.domain.spaces import CONTROL_STEP_S
 from worker.domain.task import Task
 from worker.domain.trajectory import SIGNALS, Trajectory
 from worker.domain.type_aliases import FloatArray
-from worker.ml.teachers import OMEGA, Manner, ScriptedTeacher, User
+from worker.ml.teachers import OMEGA, Manner, ScriptedTeacher, Taste, User
 from worker.sim.costs import cost_items, preference_rewards
 
 ARRIVED_M = 0.1
@@ -41,6 +41,13 @@ Wishes = Callable[[Task, Trajectory], FloatArray]
 def as_type(user: User, share: float = 1.0) -> Wishes:
     """So much of what one of the paper's types wants, with calibrated costs: a sum of signals."""
     return lambda task, episode: share * preference_rewards(task, episode.costs, episode.signals, OMEGA[user])
+
+
+def of_taste(taste: Taste) -> Wishes:
+    """What somebody wants who is linear, by the weights of their items and signals."""
+    return lambda task, seen: preference_rewards(
+        task, seen.costs, seen.signals, taste.omega, per_signal=taste.per_signal
+    )
 
 
 def worst_moment(task: Task, episode: Trajectory) -> FloatArray:

@@ -203,7 +203,7 @@ def test_gains_of_somebody_who_also_likes_things_are_shares_of_all_that_matters_
     assert found["cautious", "cautious"]["gain"] == pytest.approx(6.0 / (20.0 - HARDNESS.mean()))
 
 
-def test_the_refined_default_is_judged_by_everybody_where_it_stands_alone(tmp_path: Path) -> None:
+def test_the_refined_default_is_judged_by_everybody_where_it_stands_alone() -> None:
     refined = [replace(each, method="pbarl_refined") if each.method == "pbarl" else each for each in RUNS]
     alone, beside = (tables(pooled(runs), [USERS], []) for runs in (refined, [*refined, *RUNS[3:6]]))
     quick = tables(pooled(RUNS), [USERS], [])
