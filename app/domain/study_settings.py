@@ -338,8 +338,8 @@ class StudySettings(BaseModel):
         Section.LEARNING,
         "Refine the last filter for",
         "By reinforcement learning, most of it while people answer; the rest takes a minute or two, in which the "
-        "participant waits. Filters gain more by it, and differ less from other people's. 0: not at all; empty: what "
-        "suits the task (docs/results/rivals.md, docs/results/refined).",
+        "participant waits. Filters gain more by it, and most differ less from other people's. 0: not at all; empty: "
+        "what suits the task (docs/results/rivals.md, docs/results/refined).",
         unit="steps",
         ge=0,
         le=1_000_000,
