@@ -64,5 +64,5 @@ def _tested(
         batch = scenarios[len(pairs) : min(len(pairs) + BATCH, most)]
         pairs += zip(drive_reference(batch), drive(batch), strict=True)
         test = counted(promise, pairs, strength, error)
-        if test.earned or len(pairs) >= most or promise.is_lost(test.harmed, error):
+        if test.earned or len(pairs) >= most or promise.is_lost(len(pairs), test.harmed, error):
             return test

@@ -19,10 +19,12 @@ from typing import Any
 from worker.domain.task import Task
 from worker.domain.trajectory import Trajectory
 
-HOPED_FOR = 0.2
+HOPED_FOR = 0.3
 """Of the promised share: filters that harm so rarely are recognised soonest."""
-PATIENCE = 1.75
+PATIENCE = 5
 """After so many times the scenarios that suffice without harm, a strength has not earned the promise."""
+FOR_THE_STRONGER = 0.8
+"""Of the error that is left: what each strength may use, because the weaker ones are seldom asked."""
 BATCH = 30
 """Scenarios between two looks; the same whatever the number of processes."""
 HARMS = ("force", "spills", "failure")
@@ -39,12 +41,17 @@ class Promise:
     """largest accepted growth of an episode's largest force on the person"""
     spilled: float = 0.25
     """largest accepted growth of what is spilled, as a share of the portion"""
+    planned: int = 3
+    """filters of one person; the last of them matters most"""
 
     def error_of(self, attempt: int, version: int) -> float:
-        """The share of the error that one test may use: the ``attempt``-th strength, from 0 on, of the ``version``-th
-        filter of one person, from 1 on. All of them together make less than 1 - confidence, however many there are.
+        """What one test may use of the error: the ``attempt``-th strength, from 0 on, of the ``version``-th filter of
+        one person, from 1 on. All of them together make less than 1 - confidence, however many there are: the filter
+        that is planned as the last may use half, the others 1 / (k (k + 1)) of the other half.
         """
-        return (1.0 - self.confidence) / math.pow(2.0, attempt + 1) / (version * (version + 1))
+        other = version if version < self.planned else version - 1
+        of_version = 0.5 if version == self.planned else 0.5 / (other * (other + 1))
+        return (1.0 - self.confidence) * of_version * FOR_THE_STRONGER * math.pow(1.0 - FOR_THE_STRONGER, attempt)
 
     def needed(self, error: float) -> int:
         """Scenarios that suffice when none is harmed."""
@@ -67,9 +74,10 @@ class Promise:
         """Whether enough has been seen to make the promise."""
         return self.evidence(scenarios, harmed) >= math.log(1.0 / error)
 
-    def is_lost(self, harmed: int, error: float) -> bool:
-        """Whether it could not be earned any more if no further scenario were harmed."""
-        return not self.is_earned(self.most(error), harmed, error)
+    def is_lost(self, scenarios: int, harmed: int, error: float) -> bool:
+        """Whether so much speaks against it as would have to speak for it, or no harm any more could not earn it."""
+        against = self.evidence(scenarios, harmed) <= math.log(error)
+        return against or not self.is_earned(self.most(error), harmed, error)
 
 
 @dataclass(frozen=True)

@@ -61,6 +61,7 @@ def promise_of(settings: StudySettings) -> Promise:
         confidence=settings.harm_confidence,
         force_n=settings.harm_force_n,
         spilled=settings.harm_spilled,
+        planned=len(settings.milestones),
     )
 
 

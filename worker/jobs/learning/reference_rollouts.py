@@ -57,7 +57,7 @@ def promise_block(settings: StudySettings, study_seed: int) -> range:
     if settings.method is not Method.STUDIO:
         return range(0)
     promise = promise_of(settings)
-    return of_promise(study_seed)[: promise.batches(promise.needed(promise.error_of(0, len(settings.milestones))))]
+    return of_promise(study_seed)[: promise.batches(promise.needed(promise.error_of(0, promise.planned)))]
 
 
 def _no_beat() -> None:
