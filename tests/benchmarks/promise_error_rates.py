@@ -3,7 +3,7 @@
     python -m tests.benchmarks.promise_error_rates --output docs/results/promise_error_rates
 
 Every simulated person has three filters, tested as the worker tests them: strength after strength, batch after batch,
-until the promise is earned. How often a scenario is harmed is known here. Nothing is rolled out; a minute.
+until the promise is earned. How often a scenario is harmed is known here. Nothing is rolled out; minutes.
 """
 
 import argparse
@@ -18,23 +18,22 @@ from tqdm import tqdm
 
 from worker.analysis.comparison import result_pages
 from worker.analysis.filters.promise import Outcome, Promise
-from worker.compute import harm_tests
+from worker.compute.harm_tests import STRENGTHS, weakened_until_promised
 from worker.ml.filters.filter_draft import FilterDraft
 from worker.ml.filters.filter_module import FilterWeights
-from worker.ml.filters.filter_problem import FilterConfig
 
 TITLE = "# How often a promise about harm is made wrongly"
 VERSIONS = (1, 2, 3)
-STRENGTHS = (1.0, *FilterConfig().gates)
 CALM, PRESSED = Outcome(2.0, 0.0, True), Outcome(99.0, 0.0, True)
 CASES = (
-    ("at every strength as often as promised", (1.0, 1.0, 1.0)),
-    ("a tenth more often", (1.1, 1.1, 1.1)),
-    ("twice, at 60 % as often as promised, at 30 % half as often", (2.0, 1.0, 0.5)),
-    ("half as often", (0.5, 0.5, 0.5)),
-    ("a fifth as often", (0.2, 0.2, 0.2)),
-    ("a tenth as often", (0.1, 0.1, 0.1)),
-    ("never", (0.0, 0.0, 0.0)),
+    ("at every strength as often as promised", (1.0,) * 4),
+    ("a tenth more often", (1.1,) * 4),
+    ("twice, at 80 % and 60 % as often as promised, at 30 % half as often", (2.0, 1.0, 1.0, 0.5)),
+    ("half as often", (0.5,) * 4),
+    ("two fifths as often", (0.4,) * 4),
+    ("a fifth as often", (0.2,) * 4),
+    ("a tenth as often", (0.1,) * 4),
+    ("never", (0.0,) * 4),
 )
 """How often truly harmed, in promised shares, at each strength."""
 
@@ -78,7 +77,7 @@ def _row(promise: Promise, words: str, rates: Sequence[float], people: int) -> d
 
 def _tested(promise: Promise, version: int, truly: Sequence[float], rng: np.random.Generator) -> FilterDraft:
     rate_of = dict(zip(STRENGTHS, truly, strict=True))
-    return harm_tests.weakened_until_promised(
+    return weakened_until_promised(
         FilterDraft(FilterWeights(mode={"speed_far": 0.5})),
         promise,
         version,

@@ -146,7 +146,8 @@ class FilterFit:
             return harm_tests.untested(draft, self.promise, self.version)
         started = time.perf_counter()
         chooses = isinstance(self.problem.task.modes, PolicyChoice)  # there is no half of another policy
-        strengths, scenarios = (1.0, *(() if chooses else self.config.gates)), of_promise(self.study_seed)
+        strengths = harm_tests.STRENGTHS[: 1 if chooses else None]
+        scenarios = of_promise(self.study_seed)
 
         def drive(weights: FilterWeights, some: range) -> Sequence[Outcome]:
             self.progress("testing what the filter may do to people", 0.86)

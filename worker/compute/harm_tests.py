@@ -12,6 +12,8 @@ from worker.ml.filters.filter_module import FilterWeights
 Drive = Callable[[FilterWeights, range], Sequence[Outcome]]
 """What came of a filter in these scenarios."""
 DriveReference = Callable[[range], Sequence[Outcome]]
+STRENGTHS = (1.0, 0.8, 0.6, 0.3)
+"""of a filter, in the order of the tests"""
 
 
 def weakened_until_promised(

@@ -9,13 +9,12 @@ import pytest
 
 from tests.worker import invented
 from worker.analysis.filters.promise import BATCH, Outcome, Promise, counted, harms, sentence
-from worker.compute import harm_tests
+from worker.compute.harm_tests import STRENGTHS, weakened_until_promised
 from worker.ml.filters.filter_draft import FilterDraft
 from worker.ml.filters.filter_module import FilterWeights
 
 PROMISE = Promise()
 CALM, PRESSED = Outcome(2.0, 0.0, True), Outcome(9.0, 0.0, True)
-STRENGTHS = (1.0, 0.6, 0.3)
 
 
 @pytest.mark.parametrize(
@@ -55,7 +54,7 @@ def test_the_filter_that_is_planned_as_the_last_earns_it_with_the_fewest_scenari
 
 
 def test_who_harms_two_fifths_as_often_as_promised_is_seldom_weakened() -> None:
-    kept = [draft_of((0.02, 0.0, 0.0), person, PROMISE.planned).weights.gate for person in range(100)]
+    kept = [draft_of((0.02, 0.0, 0.0, 0.0), person, PROMISE.planned).weights.gate for person in range(100)]
     assert kept.count(1.0) >= 75
 
 
@@ -68,27 +67,27 @@ def draft_of(harm_rates: Sequence[float], seed: int, version: int = 1, promise: 
         return [PRESSED if harmed else CALM for harmed in rng.random(len(scenarios)) < rate_of[weights.gate]]
 
     draft = FilterDraft(FilterWeights(mode={"speed_far": 0.5}))
-    return harm_tests.weakened_until_promised(
+    return weakened_until_promised(
         draft, promise, version, STRENGTHS, range(4_000), drive, lambda some: [CALM] * len(some)
     )
 
 
 def test_a_filter_that_harms_nobody_stays_as_it_is() -> None:
-    kept = draft_of((0.0, 0.0, 0.0), 0)
+    kept = draft_of((0.0,) * 4, 0)
     assert kept.weights.gate == 1.0
     (test,) = kept.promise["tests"]
     assert (test["scenarios"], test["harmed"], test["earned"]) == (PROMISE.batches(128), 0, True)
 
 
 def test_a_filter_that_harms_is_weakened_until_it_does_not() -> None:
-    kept = draft_of((0.5, 0.0, 0.0), 0)
-    assert kept.weights.gate == 0.6
+    kept = draft_of((0.5, 0.0, 0.0, 0.0), 0)
+    assert kept.weights.gate == 0.8
     assert [test["earned"] for test in kept.promise["tests"]] == [False, True]
     assert kept.promise["tests"][0]["scenarios"] == BATCH, "what is lost is not driven any further"
 
 
 def test_one_that_harms_at_every_strength_becomes_the_reference_policy() -> None:
-    kept = draft_of((0.5, 0.4, 0.3), 0)
+    kept = draft_of((0.5, 0.4, 0.4, 0.3), 0)
     assert kept.weights == FilterWeights(gate=0.0)
     assert "at no strength" in kept.notes[-1]
 
@@ -98,7 +97,7 @@ def test_at_the_promised_share_it_is_made_wrongly_no_more_often_than_stated() ->
     people, often = 400, Promise(share=0.3)
 
     def made_wrongly(person: int) -> bool:
-        filters = (draft_of((0.3, 0.3, 0.3), 10 * person + version, version, often) for version in (1, 2, 3))
+        filters = (draft_of((0.3,) * 4, 10 * person + version, version, often) for version in (1, 2, 3))
         return any(each.weights.gate > 0.0 for each in filters)
 
     allowed = 0.05 * people
