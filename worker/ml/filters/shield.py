@@ -1,5 +1,7 @@
 """The shield inside filter.onnx: outside what was tested the action returns smoothly to the reference policy's.
 
+Near the skin it also takes back what of the action would strike it (touch_limit).
+
     action' = mean + (1 - activity) (action - mean),     activity = x^2 (3 - 2 x),    x = clip(largest excess, 0, 1)
 
 An excess is how far a number has left its limits, in units of a ramp behind them. Limited are every number of the
@@ -17,6 +19,8 @@ from torch import Tensor, nn
 from worker.domain.spaces import Space
 from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import Float32Array
+from worker.ml.filters import touch_limit
+from worker.ml.filters.touch_limit import NAMES, TouchLimit, touch_limits
 
 FORCE, DISTANCE = "force_on_person_n", "tool_to_target_m"
 """Fields of our tasks; a laboratory's have neither, and are limited by what was seen and done alone."""
@@ -45,8 +49,10 @@ class Shield(nn.Module):
     def __init__(self, space: Space, limits: Mapping[str, Float32Array]) -> None:
         super().__init__()
         self.place = space.slice_of(DISTANCE) if "near_action" in limits else None
+        self.touch = TouchLimit(space, limits) if NAMES[0] in limits else None
         for name, array in limits.items():
-            self.register_buffer(name, torch.from_numpy(np.array(array, np.float32)))
+            if name not in NAMES:
+                self.register_buffer(name, torch.from_numpy(np.array(array, np.float32)))
 
     def forward(self, observation: Tensor, mean: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         """See the class."""
@@ -60,7 +66,11 @@ class Shield(nn.Module):
             excesses.append(nearness * (_length(action) - self.near_action[0]) / self.near_action[1])
         excess = torch.cat(excesses, -1).amax(-1, keepdim=True).clamp(0.0, 1.0)
         activity = excess * excess * (3.0 - 2.0 * excess)
-        return mean + (1.0 - activity) * change, activity
+        action = mean + (1.0 - activity) * change
+        if self.touch is None:
+            return action, activity
+        action, taken = self.touch(observation, action)
+        return action, torch.maximum(activity, taken)
 
 
 def _excess(values: Tensor, low: Tensor, high: Tensor, ramp: Tensor) -> Tensor:
@@ -92,7 +102,7 @@ def limits_of(
         near = np.linalg.norm(seen[:, names[DISTANCE]], axis=1) <= NEAR_M + COMING_NEAR_M
         size = float(np.linalg.norm(done[near], axis=1).max(initial=0.0))
         limits["near_action"] = np.array([size, max(RAMP * size, NARROWEST)], np.float32)
-    return limits
+    return {**limits, **touch_limits(observation, tested, reference)}
 
 
 def widest(observation: Space, action_size: int) -> dict[str, Float32Array]:
@@ -102,6 +112,10 @@ def widest(observation: Space, action_size: int) -> dict[str, Float32Array]:
     limits = {f"{name}_{end}": np.full(size, ends[end], np.float32) for name, size in sizes.items() for end in ends}
     if DISTANCE in [field.name for field in observation.fields]:
         limits["near_action"] = np.array([1e6, 1.0], np.float32)
+        limits |= {
+            "touch_motion": np.ones((action_size + 1, 3), np.float32),
+            "touch_depth": np.array([1e6], np.float32),
+        }
     return limits
 
 
@@ -132,4 +146,11 @@ def described(observation: Space, action: Space, limits: Mapping[str, Float32Arr
         size, ramp = limits["near_action"].tolist()
         found["size_of_action_near_person"] = {"within_m": NEAR_M, "from_m": NEAR_M + COMING_NEAR_M}
         found["size_of_action_near_person"] |= {"high": size, "ramp": ramp}
+    if "touch_depth" in limits:
+        found["depth_of_step"] = {
+            "within_m": touch_limit.NEAR_M,
+            "from_m": touch_limit.NEAR_M + touch_limit.COMING_NEAR_M,
+        }
+        motion, (deepest,) = limits["touch_motion"].tolist(), limits["touch_depth"].tolist()
+        found["depth_of_step"] |= {"deepest_m": deepest, "tool_motion_m_per_action": motion}
     return found
