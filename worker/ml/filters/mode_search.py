@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -14,7 +13,7 @@ from worker.ml.filters.filter_module import FilterWeights
 from worker.ml.filters.filter_problem import Collect, FilterProblem, ReportProgress
 from worker.ml.filters.gate import acceptable, signal_changes, successes, try_on
 from worker.ml.filters.response_surface import CAUTION, ResponseSurface, best_mode
-from worker.ml.filters.shield import limits_of
+from worker.ml.filters.shield import limits_of, untried
 from worker.ml.rewards.reward_models import StructuredReward
 
 
@@ -36,6 +35,7 @@ def find_mode(
     """
     started = time.perf_counter()
     wishes = problem.reward.signal_weights(pool)
+    off = FilterWeights(shield=untried(problem.task.observation, problem.policy.action_size, reference))
     tried: list[tuple[GateTrial, FloatArray]] = []
     accepted: list[tuple[GateTrial, FloatArray, Sequence[Trajectory]]] = []
     for attempt in range(problem.config.mode_attempts):
@@ -48,16 +48,16 @@ def find_mode(
         if not mode.any() or any(np.array_equal(mode, earlier) for _, earlier in tried):
             break
         progress(f"checking mode {attempt + 1} on held-out scenarios", 0.03 + 0.1 * attempt)
-        trial, driven = try_on(problem, _act_in(problem, mode), 1.0, 0.0, reference, collect)
+        trial, driven = try_on(problem, _act_in(problem, off, mode), 1.0, 0.0, reference, collect)
         tried.append((trial, mode))
         if acceptable(problem, trial, reference):
             accepted.append((trial, mode, driven))
         surface = surface.with_observed(mode, signal_changes(reference, driven), successes(driven))
     if not tried:
-        return _without_mode("The labels do not yet say clearly what to change; the mode is off.", [], started)
+        return _without_mode(off, "The labels do not yet say clearly what to change; the mode is off.", [], started)
     for gate in problem.config.gates if not accepted else ():
         progress(f"checking the mode at {gate:.0%} on held-out scenarios", 0.32)
-        act = replace(_act_in(problem, tried[-1][1]), gate=gate)
+        act = _act_in(problem, off.changed(gate=gate), tried[-1][1])
         weakened, driven = try_on(problem, act, gate, 0.0, reference, collect)
         tried.append((weakened, tried[-1][1]))
         if acceptable(problem, weakened, reference):
@@ -66,9 +66,9 @@ def find_mode(
     trials = [trial for trial, _ in tried]
     if not accepted:
         note = "No mode was better while keeping the task and the forces; the mode is off."
-        return _without_mode(note, trials, started)
+        return _without_mode(off, note, trials, started)
     chosen, mode, driven = max(accepted, key=lambda each: each[0].preference)
-    weights = FilterWeights(mode=problem.task.modes.named(mode), gate=chosen.gate)
+    weights = off.changed(mode=problem.task.modes.named(mode), gate=chosen.gate)
     ordered = (*(trial for trial in trials if trial is not chosen), chosen)
     tested = limits_of(problem.task.observation, problem.task.action, driven, reference)
     return FilterDraft(weights, trials=ordered, tested=tested).timed("mode", started)
@@ -80,9 +80,10 @@ def _caution(problem: FilterProblem) -> float:
     return 0.0 if knows_people else CAUTION
 
 
-def _act_in(problem: FilterProblem, mode: FloatArray) -> FilterAct:
-    return act_of(problem.task.modes, problem.policy, FilterWeights(mode=problem.task.modes.named(mode)))
+def _act_in(problem: FilterProblem, weights: FilterWeights, mode: FloatArray) -> FilterAct:
+    named = problem.task.modes.named(mode)
+    return act_of(problem.task.modes, problem.policy, weights.changed(mode=named))
 
 
-def _without_mode(note: str, trials: Sequence[GateTrial], started: float) -> FilterDraft:
-    return FilterDraft(FilterWeights(), trials=tuple(trials), notes=(note,)).timed("mode", started)
+def _without_mode(off: FilterWeights, note: str, trials: Sequence[GateTrial], started: float) -> FilterDraft:
+    return FilterDraft(off, trials=tuple(trials), notes=(note,)).timed("mode", started)

@@ -102,7 +102,7 @@ def limits_of(
         near = np.linalg.norm(seen[:, names[DISTANCE]], axis=1) <= NEAR_M + COMING_NEAR_M
         size = float(np.linalg.norm(done[near], axis=1).max(initial=0.0))
         limits["near_action"] = np.array([size, max(RAMP * size, NARROWEST)], np.float32)
-    return {**limits, **touch_limits(observation, tested, reference)}
+    return {**limits, **touch_limits(observation, reference)}
 
 
 def widest(observation: Space, action_size: int) -> dict[str, Float32Array]:
@@ -117,6 +117,12 @@ def widest(observation: Space, action_size: int) -> dict[str, Float32Array]:
             "touch_depth": np.array([1e6], np.float32),
         }
     return limits
+
+
+def untried(observation: Space, action_size: int, reference: Sequence[Trajectory]) -> dict[str, Float32Array]:
+    """Limits of a filter that has not been tried yet: how hard it may reach the skin alone, if that can be said."""
+    limits = touch_limits(observation, reference)
+    return {**widest(observation, action_size), **limits} if limits else {}
 
 
 def _box(name: str, space: Space, values: Float32Array) -> dict[str, Float32Array]:

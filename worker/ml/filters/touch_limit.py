@@ -107,17 +107,15 @@ def _steps(space: Space, rollouts: Sequence[Trajectory]) -> _Steps:
     return steps.only(free & (np.linalg.norm(steps.to_target, axis=1) <= NEAR_M))
 
 
-def touch_limits(
-    space: Space, tested: Sequence[Trajectory], reference: Sequence[Trajectory]
-) -> dict[str, Float32Array]:
+def touch_limits(space: Space, reference: Sequence[Trajectory]) -> dict[str, Float32Array]:
     """How actions move the tool near the person, (A + 1, 3) in m, and the usual depth, (1,) in m.
 
     Empty where the task does not observe what it takes, or the way into the skin does not follow from the actions.
     """
     if not {FORCE, DISTANCE, OUTWARD} <= {field.name for field in space.fields}:
         return {}
-    everything, usual = _steps(space, [*tested, *reference]), _steps(space, reference)
-    free = everything.only(~everything.touch)
+    steps = _steps(space, reference)
+    free = steps.only(~steps.touch)
     if len(free.touch) < LEAST_STEPS:
         return {}
     with_one = np.column_stack([free.actions, np.ones(len(free.actions))])
@@ -125,9 +123,7 @@ def touch_limits(
     inward, missed = free.along_outward(free.motion), free.along_outward(free.motion - free.predicted(learned))
     if missed.var() > (1.0 - EXPLAINED) * inward.var():
         return {}
-    depth = usual.along_outward(usual.to_target - usual.predicted(learned))
-    kinds = ((depth[usual.touch], USUAL_TOUCH), (depth[~usual.touch], USUAL_STEP))
-    deepest = max((float(np.quantile(some, share)) for some, share in kinds if len(some)), default=None)
-    if deepest is None:
-        return {}
+    depth = steps.along_outward(steps.to_target - steps.predicted(learned))
+    kinds = ((depth[steps.touch], USUAL_TOUCH), (depth[~steps.touch], USUAL_STEP))
+    deepest = max(float(np.quantile(some, share)) for some, share in kinds if len(some))
     return {"touch_motion": learned.astype(np.float32), "touch_depth": np.array([deepest], np.float32)}
