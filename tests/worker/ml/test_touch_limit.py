@@ -1,0 +1,115 @@
+"""How hard a step may reach the skin: what is learned from the reference policy, what of an action is taken back."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from tests.worker import invented
+from worker.domain.trajectory import Trajectory
+from worker.ml.filters.filter_act import act_of
+from worker.ml.filters.filter_module import FilterWeights
+from worker.ml.filters.shield import untried
+from worker.ml.filters.touch_limit import LEAST_STEPS, NEAR_M, TOUCH_N, USUAL_TOUCH, TouchLimit, touch_limits
+
+SPACE = invented.TASK.observation
+FORCE, TO_TARGET, OUTWARD = (
+    SPACE.slice_of(name) for name in ("force_on_person_n", "tool_to_target_m", "target_outward")
+)
+MOTION_M = np.random.default_rng(5).uniform(-0.02, 0.02, (invented.A, 3))
+"""Of the tool in one step, by the numbers of the action."""
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def approach(seed: int, noise_m: float = 0.0, steps: int = 40) -> Trajectory:
+    """An episode about the target, on the skin of a person who lies under the plane z = 0."""
+    rng = np.random.default_rng(seed)
+    episode = invented.trajectory(rng, steps=steps)
+    actions, seen, tool = np.zeros((steps, invented.A)), episode.observations.copy(), np.array([0.0, 0.0, 0.02])
+    for step in range(steps + 1):
+        seen[step, TO_TARGET], seen[step, OUTWARD] = -tool, UP
+        seen[step, FORCE] = 100.0 * max(0.0, -tool[2])
+        if step < steps:
+            some = rng.uniform(-1, 1, (4, invented.A))
+            actions[step] = some[np.linalg.norm(tool + some @ MOTION_M, axis=1).argmin()]
+            tool = tool + actions[step] @ MOTION_M + noise_m * rng.standard_normal(3)
+    return replace(episode, observations=seen.astype(np.float32), actions=actions.astype(np.float32))
+
+
+REFERENCE = [approach(seed) for seed in range(30)]
+LIMITS = touch_limits(SPACE, REFERENCE)
+
+
+def limited(height_m: float, action: np.ndarray, beside_m: float = 0.0) -> tuple[np.ndarray, float]:
+    """What is left of an action of which the tool is so high above the skin, and the share that was taken."""
+    seen = np.zeros((1, SPACE.size), np.float32)
+    seen[0, TO_TARGET], seen[0, OUTWARD] = (beside_m, 0.0, -height_m), UP
+    left, share = TouchLimit(SPACE, LIMITS)(torch.from_numpy(seen), torch.from_numpy(action[None].astype(np.float32)))
+    return left.numpy()[0].astype(np.float64), float(share)
+
+
+def motion(action: np.ndarray) -> np.ndarray:
+    """Of the tool, as was learned."""
+    learned = LIMITS["touch_motion"].astype(np.float64)
+    moved: np.ndarray = action @ learned[:-1] + learned[-1]
+    return moved
+
+
+INWARD = -np.sign(MOTION_M[:, 2])
+"""The action that goes straight for the skin."""
+
+
+def test_how_actions_move_the_tool_is_learned_from_steps_without_a_touch() -> None:
+    np.testing.assert_allclose(LIMITS["touch_motion"][:-1], MOTION_M, atol=2e-3)
+
+
+def test_the_depth_is_that_of_usual_touches() -> None:
+    depths = []
+    for episode in REFERENCE:
+        seen = episode.observations.astype(np.float64)
+        free = (seen[:-1, FORCE.start] < TOUCH_N) & (np.linalg.norm(seen[:-1, TO_TARGET], axis=1) <= NEAR_M)
+        ends = seen[:-1, TO_TARGET][:, 2] - np.array([motion(action)[2] for action in episode.actions])
+        depths += [*ends[free & (seen[1:, FORCE.start] >= TOUCH_N)]]
+    assert LIMITS["touch_depth"][0] == pytest.approx(np.quantile(depths, USUAL_TOUCH), abs=1e-5)
+
+
+def test_of_a_blow_only_what_leads_too_deep_is_taken_back() -> None:
+    deepest = float(LIMITS["touch_depth"][0])
+    assert motion(INWARD)[2] < -deepest - 0.01, "a blow"
+    left, share = limited(0.01, INWARD)
+    assert -(0.01 + motion(left)[2]) == pytest.approx(deepest, abs=1e-5)
+    away = LIMITS["touch_motion"][:-1, 2] / np.linalg.norm(LIMITS["touch_motion"][:-1, 2])
+    taken = INWARD - left
+    np.testing.assert_allclose(taken, away * (away @ taken), atol=1e-5)
+    assert share == pytest.approx(np.linalg.norm(taken) / np.linalg.norm(INWARD), rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("height_m", "action", "beside_m"), [(0.01, -INWARD, 0.0), (0.09, INWARD, 0.0), (0.01, INWARD, 0.16)]
+)
+def test_who_leaves_or_is_not_there_yet_is_let_alone(height_m: float, action: np.ndarray, beside_m: float) -> None:
+    left, share = limited(height_m, action, beside_m)
+    np.testing.assert_array_equal(left, action.astype(np.float32))
+    assert share == 0.0
+
+
+def test_nothing_is_limited_by_what_cannot_be_foretold() -> None:
+    assert not touch_limits(SPACE, [approach(seed, noise_m=0.05) for seed in range(30)])
+    assert not touch_limits(SPACE, [approach(1, steps=LEAST_STEPS // 2)])
+
+
+def test_the_exported_filter_does_the_same() -> None:
+    """Any action: the shield of an untried filter has no other limits."""
+    policy, family = invented.small_policy(), invented.TASK.modes
+    mode = FilterWeights(mode=family.named([0.8, 0.6, 0.0, 0.0, 0.9]))
+    seen = np.concatenate([episode.observations[:-1] for episode in REFERENCE[:4]])
+    means = policy.mean(seen)
+    shield = untried(SPACE, invented.A, REFERENCE)
+    bare, (action, activity) = (
+        act_of(family, policy, weights).exported.run(seen, means) for weights in (mode, mode.changed(shield=shield))
+    )
+    left, share = TouchLimit(SPACE, LIMITS)(torch.from_numpy(seen), torch.from_numpy(bare[0]))
+    assert 0.01 < (activity > 0).mean() < 0.9
+    np.testing.assert_allclose(action, left.clamp(-1.0, 1.0).numpy(), atol=1e-5)
+    np.testing.assert_allclose(activity, share.numpy(), atol=1e-4)
