@@ -147,6 +147,12 @@ def _promise(manifest: Mapping[str, Any]) -> str:
     return f"## Promise about harm\n\n{said} Scenarios are those of the simulation, not of a real room."
 
 
+_NO_BLOWS = (
+    " Near the person a step that would strike the skin harder than the reference policy usually touches it loses what"
+    " of it leads there."
+)
+
+
 def _shield(manifest: Mapping[str, Any]) -> str:
     """What the filter does outside what was tested."""
     shield = manifest.get("shield")
@@ -156,8 +162,8 @@ def _shield(manifest: Mapping[str, Any]) -> str:
     measured = "" if active is None else f" On the unseen scenarios it was active in {active:.1%} of the control steps."
     return (
         "## Shield\n\nWhere observation, force, or the change of the action leave what was tested, the action returns"
-        " smoothly to the reference policy's. How far is the graph's output `shield`, from 0 (not at all) to 1; the"
-        f" limits are in the manifest.{measured}"
+        f" smoothly to the reference policy's.{_NO_BLOWS if 'depth_of_step' in shield['limits'] else ''} How far is the"
+        f" graph's output `shield`, from 0 (not at all) to 1; the limits are in the manifest.{measured}"
     )
 
 

@@ -1,12 +1,11 @@
 """The shield inside filter.onnx: outside what was tested the action returns smoothly to the reference policy's.
 
-Near the skin it also takes back what of the action would strike it (touch_limit).
-
     action' = mean + (1 - activity) (action - mean),     activity = x^2 (3 - 2 x),    x = clip(largest excess, 0, 1)
 
 An excess is how far a number has left its limits, in units of a ramp behind them. Limited are every number of the
 observation, the force on the person among them, the change that the filter makes to every number of the action, and
-the size of the action near the person. It has no memory, so what is shown about one step holds for every episode.
+the size of the action near the person. After that, what of the action would strike the skin is taken back (touch_limit).
+It has no memory, so what is shown about one step holds for every episode.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,10 +19,8 @@ from worker.domain.spaces import Space
 from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import Float32Array
 from worker.ml.filters import touch_limit
-from worker.ml.filters.touch_limit import NAMES, TouchLimit, touch_limits
+from worker.ml.filters.touch_limit import DISTANCE, FORCE, NAMES, TouchLimit, length, touch_limits
 
-FORCE, DISTANCE = "force_on_person_n", "tool_to_target_m"
-"""Fields of our tasks; a laboratory's have neither, and are limited by what was seen and done alone."""
 RAMP = 0.25
 """of a range's width, behind which the filter is off"""
 NARROWEST = 0.01
@@ -62,8 +59,8 @@ class Shield(nn.Module):
             _excess(change, self.change_low, self.change_high, self.change_ramp),
         ]
         if self.place is not None:
-            nearness = ((NEAR_M + COMING_NEAR_M - _length(observation[:, self.place])) / COMING_NEAR_M).clamp(0.0, 1.0)
-            excesses.append(nearness * (_length(action) - self.near_action[0]) / self.near_action[1])
+            nearness = ((NEAR_M + COMING_NEAR_M - length(observation[:, self.place])) / COMING_NEAR_M).clamp(0.0, 1.0)
+            excesses.append(nearness * (length(action) - self.near_action[0]) / self.near_action[1])
         excess = torch.cat(excesses, -1).amax(-1, keepdim=True).clamp(0.0, 1.0)
         activity = excess * excess * (3.0 - 2.0 * excess)
         action = mean + (1.0 - activity) * change
@@ -75,10 +72,6 @@ class Shield(nn.Module):
 
 def _excess(values: Tensor, low: Tensor, high: Tensor, ramp: Tensor) -> Tensor:
     return torch.maximum((low - values) / ramp, (values - high) / ramp).amax(-1, keepdim=True)
-
-
-def _length(vectors: Tensor) -> Tensor:
-    return (vectors * vectors).sum(-1, keepdim=True).sqrt()
 
 
 def limits_of(

@@ -4,8 +4,8 @@
     action' = action + near (limit - depth) g / |g|^2,    g = -J outward           where depth > limit, else as it is
 
 Nearly all high forces are blows: the tool comes from free air, and the force follows how deep the step would have ended
-(correlation .75 in Itch Scratching). Only the part of the action that leads into the skin is taken back, so whoever
-wants it fast keeps that along the skin.
+(decision 168). Only the part of the action that leads into the skin is taken back, so whoever wants it fast keeps that
+along the skin.
 """
 
 from collections.abc import Mapping, Sequence
@@ -51,16 +51,16 @@ class TouchLimit(nn.Module):
         to_target, outward = observation[:, self.place], observation[:, self.outward]
         motion = action @ self.touch_motion[:-1] + self.touch_motion[-1]
         depth = ((to_target - motion) * outward).sum(-1, keepdim=True)
-        distance = (to_target * to_target).sum(-1, keepdim=True).sqrt()
-        near = ((NEAR_M + COMING_NEAR_M - distance) / COMING_NEAR_M).clamp(0.0, 1.0)
+        near = ((NEAR_M + COMING_NEAR_M - length(to_target)) / COMING_NEAR_M).clamp(0.0, 1.0)
         inward = -outward @ self.touch_motion[:-1].T
         size = (inward * inward).sum(-1, keepdim=True).clamp(min=1e-12)
         taken = near * (depth - self.touch_depth).clamp(min=0.0) * inward / size
-        share = _length(taken) / _length(action).clamp(min=1e-6)
+        share = length(taken) / length(action).clamp(min=1e-6)
         return action - taken, share.clamp(0.0, 1.0)
 
 
-def _length(vectors: Tensor) -> Tensor:
+def length(vectors: Tensor) -> Tensor:
+    """(B, K) -> (B, 1)"""
     return (vectors * vectors).sum(-1, keepdim=True).sqrt()
 
 
