@@ -4,8 +4,8 @@
 
 An excess is how far a number has left its limits, in units of a ramp behind them. Limited are every number of the
 observation, the force on the person among them, the change that the filter makes to every number of the action, and
-the size of the action near the person. After that, what of the action would strike the skin is taken back (touch_limit).
-It has no memory, so what is shown about one step holds for every episode.
+the size of the action near the person. After that, what of the action would strike the skin is taken back
+(touch_limit). It has no memory, so what is shown about one step holds for every episode.
 """
 
 from collections.abc import Mapping, Sequence
