@@ -37,6 +37,13 @@ def approach(seed: int, noise_m: float = 0.0, steps: int = 40) -> Trajectory:
     return replace(episode, observations=seen.astype(np.float32), actions=actions.astype(np.float32))
 
 
+def touched_anywhere(episode: Trajectory) -> Trajectory:
+    """The same with touches that have nothing to do with the depth of a step."""
+    seen = episode.observations.copy()
+    seen[:, FORCE] = np.random.default_rng(episode.scenario).random((len(seen), 1)) < 0.1
+    return replace(episode, observations=seen)
+
+
 REFERENCE = [approach(seed) for seed in range(30)]
 LIMITS = touch_limits(SPACE, REFERENCE)
 
@@ -97,6 +104,7 @@ def test_who_leaves_or_is_not_there_yet_is_let_alone(height_m: float, action: np
 def test_nothing_is_limited_by_what_cannot_be_foretold() -> None:
     assert not touch_limits(SPACE, [approach(seed, noise_m=0.05) for seed in range(30)])
     assert not touch_limits(SPACE, [approach(1, steps=LEAST_STEPS // 2)])
+    assert not touch_limits(SPACE, [touched_anywhere(episode) for episode in REFERENCE]), "as by the rim of a cup"
 
 
 def test_the_exported_filter_does_the_same() -> None:

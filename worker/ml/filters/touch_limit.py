@@ -28,7 +28,8 @@ NEAR_M, COMING_NEAR_M = 0.10, 0.05
 TOUCH_N = 0.3
 """Forces from here on are touches."""
 USUAL_TOUCH, USUAL_STEP = 0.75, 0.95
-"""Quantiles of the depths of the reference policy's touches, and of its steps that touch nobody."""
+"""Quantiles of the depths of the reference policy's touches, and of its steps that touch nobody. Where the latter is
+deeper, as with a cup's rim, depth says nothing about touches."""
 LEAST_STEPS, EXPLAINED = 100, 0.7
 """Steps to learn the motion from, and what of the way into the skin has to follow from the action."""
 NAMES = ("touch_motion", "touch_depth")
@@ -110,20 +111,20 @@ def _steps(space: Space, rollouts: Sequence[Trajectory]) -> _Steps:
 def touch_limits(space: Space, reference: Sequence[Trajectory]) -> dict[str, Float32Array]:
     """How actions move the tool near the person, (A + 1, 3) in m, and the usual depth, (1,) in m.
 
-    Empty where the task does not observe what it takes, or the way into the skin does not follow from the actions.
+    Empty where the task does not observe what it takes, or touches do not follow from the actions.
     """
     if not {FORCE, DISTANCE, OUTWARD} <= {field.name for field in space.fields}:
         return {}
     steps = _steps(space, reference)
     free = steps.only(~steps.touch)
-    if len(free.touch) < LEAST_STEPS:
+    if len(free.touch) < LEAST_STEPS or not steps.touch.any():
         return {}
     with_one = np.column_stack([free.actions, np.ones(len(free.actions))])
     learned = np.asarray(np.linalg.lstsq(with_one, free.motion, rcond=None)[0], np.float64)
     inward, missed = free.along_outward(free.motion), free.along_outward(free.motion - free.predicted(learned))
-    if missed.var() > (1.0 - EXPLAINED) * inward.var():
-        return {}
     depth = steps.along_outward(steps.to_target - steps.predicted(learned))
-    kinds = ((depth[steps.touch], USUAL_TOUCH), (depth[~steps.touch], USUAL_STEP))
-    deepest = max(float(np.quantile(some, share)) for some, share in kinds if len(some))
-    return {"touch_motion": learned.astype(np.float32), "touch_depth": np.array([deepest], np.float32)}
+    limit = float(np.quantile(depth[steps.touch], USUAL_TOUCH))
+    foretold = missed.var() <= (1.0 - EXPLAINED) * inward.var() and limit > np.quantile(depth[~steps.touch], USUAL_STEP)
+    if not foretold:
+        return {}
+    return {"touch_motion": learned.astype(np.float32), "touch_depth": np.array([limit], np.float32)}
