@@ -65,7 +65,7 @@ def of_act(act: Act, observations: Float32Array) -> bytes:
     """
     if isinstance(act, PolicyAct):
         stored = _of_policy(act.policy)
-    elif isinstance(act, FilterAct) and act.gate == 1.0:
+    elif isinstance(act, FilterAct):
         stored = _of_filter(act)
     else:
         raise NotExportable(f"{type(act).__name__} cannot be written as a controller.")

@@ -23,18 +23,14 @@ class FilterAct:
 
     policy: ReferencePolicy
     exported: OnnxFilter
-    gate: float = 1.0
-    """an extra gate on top of the exported one, to try gates without exporting again"""
 
     def __call__(self, observation: Float32Array) -> Float32Array:
         """(D,) -> (7,)"""
-        mean = self.policy.mean(observation)
-        return mean + np.float32(self.gate) * (self.exported(observation, mean) - mean)
+        return self.exported(observation, self.policy.mean(observation))
 
     def batch(self, observations: Float32Array) -> Float32Array:
         """(B, D) -> (B, 7)"""
-        means = self.policy.mean(observations)
-        return means + np.float32(self.gate) * (self.exported.batch(observations, means) - means)
+        return self.exported.batch(observations, self.policy.mean(observations))
 
 
 def trace(family: ModeFamily, policy: ReferencePolicy) -> None:

@@ -42,7 +42,7 @@ class FilterWeights:
     encoder: Mapping[str, Float32Array] = field(default_factory=dict)
     """state of ResidualAdapter or PrintedEncoder; empty: none was trained"""
     shield: Mapping[str, Float32Array] = field(default_factory=dict)
-    """limits of the shield (shield.limits_of); empty: there is none"""
+    """limits of the shield (shield.untried, then shield.limits_of); empty: there is none"""
     refined: Mapping[str, Float32Array] = field(default_factory=dict)
     """weights of the person's refined policy, which acts in place of mode and residual; empty: it was not refined"""
 
