@@ -262,7 +262,7 @@ def test_a_shield_is_told_in_manifest_card_and_script(contents: BundleContents, 
     assert high == limits["observation_high"][0]
     assert manifest["shield"]["limits"]["depth_of_step"]["deepest_m"] == limits["touch_depth"][0]
     assert "active in 50.0% of the control steps" in card
-    assert "would strike the skin" in card
+    assert "not every blow is foreseen" in card
     assert sentence in card
     assert run(tmp_path).returncode == 0
     np.save(tmp_path / "o.npy", recording.observations)

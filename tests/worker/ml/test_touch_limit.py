@@ -8,10 +8,11 @@ import torch
 
 from tests.worker import invented
 from worker.domain.trajectory import Trajectory
-from worker.ml.filters.filter_act import act_of
+from worker.ml.filters import filter_onnx
+from worker.ml.filters.filter_act import act_of, trace
 from worker.ml.filters.filter_module import FilterWeights
 from worker.ml.filters.shield import untried
-from worker.ml.filters.touch_limit import LEAST_STEPS, NEAR_M, TOUCH_N, USUAL_TOUCH, TouchLimit, touch_limits
+from worker.ml.filters.touch_limit import LEAST_STEPS, NAMES, NEAR_M, TOUCH_N, USUAL_TOUCH, TouchLimit, touch_limits
 
 SPACE = invented.TASK.observation
 FORCE, TO_TARGET, OUTWARD = (
@@ -121,3 +122,13 @@ def test_the_exported_filter_does_the_same() -> None:
     assert 0.01 < (activity > 0).mean() < 0.9
     np.testing.assert_allclose(action, left.clamp(-1.0, 1.0).numpy(), atol=1e-5)
     np.testing.assert_allclose(activity, share.numpy(), atol=1e-4)
+
+
+def test_nobody_waits_for_a_graph_with_or_without_this_limit() -> None:
+    policy, family = invented.small_policy(), invented.TASK.modes
+    trace(family, policy)
+    known = len(filter_onnx._templates)
+    limits = untried(SPACE, invented.A, REFERENCE)
+    for shield in (limits, {name: limit for name, limit in limits.items() if name not in NAMES}):
+        act_of(family, policy, FilterWeights(mode=family.named([0.5, 0.0, 0.0, 0.0, 0.1]), shield=shield))
+    assert len(filter_onnx._templates) == known

@@ -148,8 +148,8 @@ def _promise(manifest: Mapping[str, Any]) -> str:
 
 
 _NO_BLOWS = (
-    " Near the person a step that would strike the skin harder than the reference policy usually touches it loses what"
-    " of it leads there."
+    " Near the person a step that is foreseen to strike the skin harder than the reference policy usually touches it"
+    " loses what of it leads there; not every blow is foreseen."
 )
 
 

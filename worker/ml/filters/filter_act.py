@@ -12,6 +12,7 @@ from worker.ml.filters.action_encoder import ResidualAdapter
 from worker.ml.filters.filter_module import FilterWeights, build, state_of
 from worker.ml.filters.filter_onnx import OnnxFilter, to_onnx
 from worker.ml.filters.shield import widest
+from worker.ml.filters.touch_limit import NAMES
 from worker.ml.policies.asked_policy import AskedPolicy
 from worker.ml.policies.gaussian import GaussianPolicy
 from worker.ml.policies.reference import ReferencePolicy
@@ -39,8 +40,10 @@ def trace(family: ModeFamily, policy: ReferencePolicy) -> None:
     if isinstance(policy, GaussianPolicy):
         untrained = ResidualAdapter(torch.from_numpy(policy.offset), torch.from_numpy(policy.scale))
         encoders.append(state_of(untrained))
+    every = widest(family.observation, policy.action_size)
+    untouched = {name: limit for name, limit in every.items() if name not in NAMES}
     for encoder in encoders:
-        for limits in ({}, widest(family.observation, policy.action_size)):
+        for limits in ({}, untouched, every):
             act_of(family, policy, FilterWeights(encoder=encoder, shield=limits))
 
 

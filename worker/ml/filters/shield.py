@@ -99,7 +99,7 @@ def limits_of(
 
 
 def widest(observation: Space, action_size: int) -> dict[str, Float32Array]:
-    """Limits that nothing leaves, for tracing."""
+    """Limits that nothing leaves, for tracing; without NAMES those of a filter whose touches cannot be foretold."""
     sizes = {"observation": observation.size, "change": action_size}
     ends = {"low": -1e6, "high": 1e6, "ramp": 1.0}
     limits = {f"{name}_{end}": np.full(size, ends[end], np.float32) for name, size in sizes.items() for end in ends}

@@ -3,7 +3,7 @@
     depth = -outward . (tool - target + motion),    motion = a J + b     m, where the step would end with nobody there
     action' = action + near (limit - depth) g / |g|^2,    g = -J outward           where depth > limit, else as it is
 
-Nearly all high forces are blows: the tool comes from free air, and the force follows how deep the step would have ended
+Most high forces are blows: the tool comes from free air, and the force follows how deep the step would have ended
 (decision 168). Only the part of the action that leads into the skin is taken back, so whoever wants it fast keeps that
 along the skin.
 """
